@@ -7,6 +7,8 @@ import pytest
 from tsfusion import Intrinsics, open_dataset
 from tsfusion.core.config import ScanConfig
 from tsfusion.datasets.dataset import frame_of
+from tsfusion.datasets.synthetic.street_drive import DRIVES
+from tsfusion.datasets.trajectory_files import read_kitti
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
 from tsfusion.scanner.keyframe_selection import KeyframeSelector
@@ -104,3 +106,17 @@ def test_rates_on_real_scenes(data):
     kitchen, street = counts.values()
     assert 30 <= kitchen[0] <= 36, counts  # of 125 in 16.5 s: two a second
     assert 14 <= street[0] <= 18, counts  # of 30 at 10 Hz: five a second
+
+
+@pytest.mark.parametrize(("name", "wanted"), [("kitti06", 428), ("kitti07", 242)])
+def test_drives_have_as_many_keyframes_as_the_paper_fused(data, name, wanted):
+    poses = read_kitti(data("kitti_odometry") / "poses" / f"{DRIVES[name].sequence}.txt")
+    made = KeyframeSelector(ScanConfig(distance=DRIVES[name].keyframe_distance), outdoors=True)
+    grey = np.zeros((4, 4), dtype=np.uint8)
+    frame = Frame(sensor="stereo", left=grey, right=grey, intrinsics=Intrinsics(4, 4, 2, 2), baseline_fx=1.0)
+    taken = 0
+    for T in poses:
+        if made.reason(frame, T):
+            made.accept(frame, T)
+            taken += 1
+    assert taken == wanted

@@ -22,6 +22,7 @@ from tsfusion.datasets.formats.tum import TUM
 from tsfusion.datasets.registry import SYNTHETIC, Found, Layout, describe, find, layouts, open_as
 from tsfusion.datasets.rosbag.dataset import Bag
 from tsfusion.datasets.synthetic.dataset import Synthetic
+from tsfusion.datasets.synthetic.street_drive import DRIVES, StreetDrive
 
 __all__ = [
     "KITTI",
@@ -40,6 +41,7 @@ __all__ = [
     "ScanNet",
     "Selection",
     "SevenScenes",
+    "StreetDrive",
     "Synthetic",
     "describe",
     "find",
@@ -71,4 +73,5 @@ def open_dataset(path: str | Path, /, *, unpack: bool = False, **options: Any) -
     if len(words) > 2:
         raise DatasetError(f"{path!s}: expected synthetic:WORLD or synthetic:WORLD:SENSOR")
     given = dict(zip(("world", "sensor"), filter(None, words), strict=False))
-    return open_as(SYNTHETIC[0], Synthetic, {**given, **options})
+    opener = StreetDrive if given.get("world") in DRIVES else Synthetic
+    return open_as(SYNTHETIC[0], opener, {**given, **options})

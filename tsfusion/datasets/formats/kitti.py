@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.cameras import RecordedCamera
 from tsfusion.datasets.dataset import Frames, keep_posed, require_folder, require_frames
-from tsfusion.datasets.readers import intrinsics_of, read_lines
+from tsfusion.datasets.readers import intrinsics_of, read_color, read_lines
 from tsfusion.datasets.trajectory_files import checked_pose, nanoseconds, read_kitti
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
@@ -91,8 +91,9 @@ class KITTI(KITTIFrames):
     """One sequence as stereo disparity (`modality="stereo"`) or as Velodyne scans (`"lidar"`).
 
     Stereo: the left camera's frame, disparity in 1/16 px by semi-global matching at each access; colour is
-    the grey image. LiDAR: points in the Velodyne's axes (x forward, z up), pose inv(Tr)·P·Tr; scans are as
-    recorded, not corrected for the car's motion.
+    the grey image, or `image_2` where the calibration says that it is the left camera's.
+    LiDAR: points in the Velodyne's axes (x forward, z up), pose inv(Tr)·P·Tr; scans are as recorded, not
+    corrected for the car's motion.
 
     Args:
         root: the benchmark's folder, holding `sequences/` and `poses/`.
@@ -124,6 +125,7 @@ class KITTI(KITTIFrames):
             place / "calib.txt", dict.fromkeys(("P0", "P1") if modality == "stereo" else ("Tr",), 12)
         )
         trajectory = _trajectory(root, sequence, poses, posed=posed)
+        self._colored: dict[int, Path] = {}
         self._frames, found = keep_posed(
             list(self._left), [trajectory.get(n) for n in self._left], posed=posed, skipped=self.skipped
         )
@@ -132,12 +134,19 @@ class KITTI(KITTIFrames):
         self._with_color = color
         if modality == "stereo":
             self.intrinsics, self.baseline_fx = _stereo_camera(calibration, place / "calib.txt")
+            if np.array_equal(calibration.get("P2", ()), calibration["P0"]):  # never in the benchmark itself
+                self._colored = files_by_frame(place / "image_2", ".png")
             self._describe_camera("calib.txt")
         else:
             T_cam0_velo = checked_pose(calibration["Tr"].reshape(3, 4), f"{place / 'calib.txt'}: Tr")
             T_velo_cam0 = np.linalg.inv(T_cam0_velo)
             found = [None if T is None else T_velo_cam0 @ T @ T_cam0_velo for T in found]
         self._poses = found
+
+    def _color(self, number: int, left: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        if number not in self._colored:
+            return super()._color(number, left)
+        return read_color(self._colored[number], left.shape)
 
 
 def _is_sequence(path: Path) -> bool:

@@ -1,0 +1,216 @@
+# SPDX-License-Identifier: MIT
+"""Streets along KITTI's paths: clear of the path, known surfaces, true stereo, whole recordings."""
+
+import hashlib
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from geometry_checks import move
+
+from tsfusion.core.errors import DatasetError
+from tsfusion.datasets import KITTI, StreetDrive, open_dataset
+from tsfusion.datasets.synthetic import roadside, worlds
+from tsfusion.datasets.synthetic.recorded_drive import record
+from tsfusion.evaluation.known_surfaces import WorldSurface
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory):
+    """Poses in KITTI's format: round a block of 40×30 m and a little on, in its axes (y down, z forward)."""
+    lines = []
+    for index in range(150):
+        way, share = divmod(index, 36)[0] % 4, index % 36 / 36
+        angle = -np.pi / 2 * (way + max(0.0, share - 0.75) * 4)
+        corner = [(0, 0), (0, 40), (-30, 40), (-30, 0)][way]
+        ahead = [(0, 0), (0, 40), (-30, 40), (-30, 0)][(way + 1) % 4]
+        x, z = np.array(corner) + share * (np.array(ahead) - corner)
+        y, cosine, sine = 0.02 * z, np.cos(angle), np.sin(angle)
+        lines.append(f"{cosine} 0 {sine} {x} 0 1 0 {y} {-sine} 0 {cosine} {z}")
+    file = tmp_path_factory.mktemp("poses") / "06.txt"
+    file.write_text("\n".join(lines))
+    return file
+
+
+@pytest.fixture(scope="module")
+def drive(path):
+    return StreetDrive("kitti06", kitti=path, width=240)
+
+
+def points_of(depth, drive, index):
+    K, (v, u) = drive.intrinsics, np.nonzero(depth)
+    z = depth[v, u]
+    points = np.stack([(u - K.cx) / K.fx * z, (v - K.cy) / K.fy * z, z], axis=1)
+    return move(drive.pose(index), points), z
+
+
+def test_equal_arguments_give_equal_bytes_in_any_order(path, drive):
+    def digest(frame):
+        return hashlib.sha256(frame.left.tobytes() + frame.right.tobytes() + frame.color.tobytes()).digest()
+
+    again = StreetDrive("kitti06", kitti=path, width=240)
+    assert [digest(drive.frame(i)) for i in (3, 70)] == [digest(again.frame(i)) for i in (70, 3)][::-1]
+    assert digest(drive.frame(3)) != digest(StreetDrive("kitti06", kitti=path, width=240, seed=1).frame(3))
+    assert drive.frame(3).left.std() > 25
+
+
+def test_what_is_rendered_lies_on_the_known_surface(drive):
+    kinds = set()
+    for index in (5, 33, 100):
+        points, z = (part[::4] for part in points_of(drive.depth(index), drive, index))
+        error = np.abs(drive.distance(points))
+        assert len(points) > 2500
+        assert np.quantile(error, 0.98) < 1e-4
+        assert (error < 0.01 + 0.001 * z).all()  # slopes and bends
+        renderer, T = drive._rendering(), drive._eye(index, 0.0)
+        kinds |= set(np.unique(renderer._cast(T, renderer._tiles(T), renderer._pixels)[1]))
+    assert {-1, -2, -3, -4} < kinds
+    surface = WorldSurface(drive.world, points[::20], edges=False)
+    np.testing.assert_allclose(surface.distance(points[::20]), drive.distance(points[::20]), atol=1e-9)
+    up = -drive._upright[2] @ np.array(drive._poses)[:, :3, 1].mean(axis=0)
+    assert up == pytest.approx(1)
+
+
+def test_tiles_lose_no_solid(drive):
+    """Rays that may meet every solid meet the same as those that look in their tile's list."""
+    renderer, T = drive._rendering(), drive._eye(40, 0.0)
+    starts, _, nearest = renderer._tiles(T)
+    every = np.argsort(nearest, kind="stable").astype(np.int32)
+    ends = np.arange(len(starts), dtype=np.int32)
+    whole = (np.repeat(0, len(ends)).astype(np.int32), every, nearest)
+    whole[0][1:] = len(every)  # the first tile lists all of them
+    first = np.flatnonzero(np.arange(len(renderer._pixels)) >= 0)[::7]
+    listed, _ = renderer._cast(T, renderer._tiles(T), renderer._pixels[first])
+    renderer_all = _cast_all(renderer, T, whole, renderer._pixels[first])
+    np.testing.assert_array_equal(listed, renderer_all)
+
+
+def _cast_all(renderer, T, lists, pixels):
+    from tsfusion.datasets.synthetic.street_views import REACH
+    from tsfusion.kernels.street_raycast import cast_view
+
+    distance, hit = np.empty(len(pixels)), np.empty(len(pixels), dtype=np.int32)
+    ground = renderer._ground
+    cast_view(
+        T, renderer._rays(pixels), np.zeros(len(pixels), np.int32), *lists, renderer._solids, ground.heights,
+        ground.apart, ground.layout, REACH, distance, hit,
+    )  # fmt: skip
+    return distance
+
+
+def test_the_right_picture_agrees_with_the_left_ones_depth(path):
+    drive = StreetDrive("kitti06", kitti=path, width=480, noise=False)
+    frame, depth = drive.frame(60), drive.depth(60)
+    v, u = np.mgrid[: depth.shape[0], : depth.shape[1]].astype(np.float32)
+    disparity = np.where(depth > 0, drive.baseline_fx / np.maximum(depth, 1), 0).astype(np.float32)
+
+    def error(shift):
+        warped = cv2.remap(frame.right, u - disparity + shift, v, cv2.INTER_LINEAR).astype(int)
+        seen = (u > disparity + 3) & (depth > 0) & (depth < 60)
+        return np.median(np.abs(warped - frame.left)[seen])
+
+    assert error(0) <= 3  # of 255: exposures differ by two percent
+    assert min(error(-2), error(2)) > 2 * error(0)
+
+
+@pytest.mark.parametrize("name", ["kitti06", "kitti07"])
+def test_nothing_stands_in_the_way(data, name):
+    drive = StreetDrive(name, kitti=data("kitti_odometry"))
+    cameras = np.array(drive._poses)[::3, :3, 3]
+    solids = drive.world.solids
+    houses = solids[np.isin(solids[:, 9], (roadside.HOUSE, roadside.TILES))]
+    for rows, clearance in ((houses, 3), (solids, 1)):
+        world = replace(drive.world, solids=rows, ground=None)
+        assert WorldSurface(world, np.empty((0, 3)), edges=False).distance(cameras).min() > clearance
+    height = drive.world.ground.distance(drive.world.turned(cameras))
+    assert 1.4 < height.min() < 1.65 < height.max() < 1.9
+    beside = [
+        np.linalg.norm(solids[:, 1:3] - place, axis=1) for place in drive.world.turned(cameras)[::20, :2]
+    ]
+    built = [(np.isin(solids[:, 9], (roadside.HOUSE,)) & (away < 45)).sum() for away in beside]
+    assert min(built) >= 3  # along the whole path
+
+
+def test_a_recording_appears_whole_and_goes_on_where_it_stopped(path, tmp_path):
+    drive, folder = StreetDrive("kitti06", kitti=path, count=5, width=96), tmp_path / "drive"
+    done = []
+
+    def stop_after_three(count, total):
+        done.append(count)
+        if count == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        record(drive, folder, color=True, progress=stop_after_three)
+    assert not folder.exists()
+    rendered, own = [], drive._frame
+    drive._frame = lambda index: rendered.append(index) or own(index)
+    record(drive, folder, color=True)
+    assert rendered == [3, 4]
+    assert [child.name for child in tmp_path.iterdir()] == ["drive"]
+    record(drive, folder, color=True)
+    assert rendered == [3, 4]
+    dataset = open_dataset(folder)
+    assert isinstance(dataset, KITTI)
+    assert len(dataset) == 5
+    for index in (0, 4):
+        frame, expected = dataset.frame(index), own(index)
+        for name in ("left", "right", "color"):
+            np.testing.assert_array_equal(getattr(frame, name), getattr(expected, name))
+        np.testing.assert_allclose(dataset.pose(index), drive.pose(index), atol=1e-12)
+    assert dataset.frame(0).baseline_fx == pytest.approx(drive.baseline_fx)
+    assert len(StreetDrive("kitti06", kitti=folder)) == 5  # its poses are a path too
+    with pytest.raises(
+        DatasetError, match="holds something else than synthetic kitti06; choose another folder"
+    ):
+        record(StreetDrive("kitti06", kitti=path, count=4, width=96), folder, color=True)
+
+
+def test_pykitti_reads_a_recording(path, tmp_path):
+    pykitti = pytest.importorskip("pykitti")
+    drive = StreetDrive("kitti06", kitti=path, count=2, width=96)
+    record(drive, tmp_path / "drive")
+    theirs = pykitti.odometry(str(tmp_path / "drive"), "06")
+    np.testing.assert_array_equal(np.asarray(theirs.get_cam1(1)), drive.frame(1).right)
+    assert theirs.calib.b_gray == pytest.approx(drive.baseline_fx / drive.intrinsics.fx)
+    np.testing.assert_allclose(theirs.poses[1], drive.pose(1))
+    assert theirs.timestamps[1].total_seconds() == pytest.approx(0.1)
+
+
+def test_missing_poses_are_one_clear_line(tmp_path, monkeypatch):
+    monkeypatch.delenv("TSFUSION_DATA", raising=False)
+    with pytest.raises(DatasetError, match=r"path of KITTI 07 is needed: say --option kitti=FOLDER"):
+        open_dataset("synthetic:kitti07")
+    with pytest.raises(
+        DatasetError, match=r"poses/06.txt does not exist: expected the true poses of KITTI 06"
+    ):
+        open_dataset("synthetic:kitti06", kitti=tmp_path)
+    with pytest.raises(DatasetError, match="sensor of kitti06 must be stereo, got 'lidar'"):
+        open_dataset("synthetic:kitti06:lidar", kitti=tmp_path)
+
+
+def test_the_tables_agree_with_the_kernels(drive):
+    drive._rendering()
+    from tsfusion.kernels import street_shading, street_things, synthetic_raycast
+
+    for name in (
+        *(
+            "HOUSE",
+            "TILES",
+            "BODY",
+            "CABIN",
+            "TYRE",
+            "POLE",
+            "TRUNK",
+            "CROWN",
+            "HEDGE",
+            "SIGN",
+            "FENCE",
+            "BIN",
+        ),
+        "SUNK",
+    ):
+        assert getattr(street_things, name) == getattr(roadside, name)
+    assert tuple(roadside.SUN) == street_shading.SUN
+    assert (synthetic_raycast.AXLE, synthetic_raycast.PRISM) == (worlds.AXLE, worlds.PRISM)
