@@ -88,7 +88,7 @@ def wall_color(u, v, house, salt, g, foot):
         row = ti.floor(v / 0.083)
         x = u / 0.25 + 0.5 * cell(ti.cast(row, ti.i32), 7, 5)
         tone = cell_at(x, row + 0.5, salt) - 0.5
-        near = tm.clamp(0.12 / foot - 1.0, 0.0, 1.0)
+        near = tm.clamp(0.1 / foot - 1.5, 0.0, 1.0)
         upright = inside((fract(x) - 0.5) * 0.25 - 0.125, 0.007, foot)
         joint = ti.max(upright, inside(v - 0.083 * row, 0.008, foot))
         rgb = rgb3(0.46, 0.25, 0.17) * (1 + 0.5 * near * tone + 0.25 * g[1] + 0.2 * g[3])
