@@ -13,7 +13,7 @@ from tsfusion.core.errors import DatasetError
 from tsfusion.datasets import KITTI, StreetDrive, open_dataset
 from tsfusion.datasets.synthetic import roadside, worlds
 from tsfusion.datasets.synthetic.recorded_drive import record
-from tsfusion.evaluation.known_surfaces import WorldSurface
+from tsfusion.evaluation.known_surfaces import WorldSurface, drive_surface
 
 
 @pytest.fixture(scope="module")
@@ -66,8 +66,12 @@ def test_what_is_rendered_lies_on_the_known_surface(drive):
         renderer, T = drive._rendering(), drive._eye(index, 0.0)
         kinds |= set(np.unique(renderer._cast(T, renderer._tiles(T), renderer._pixels)[1]))
     assert {-1, -2, -3, -4} < kinds
-    surface = WorldSurface(drive.world, points[::20], edges=False)
+    surface = drive_surface(drive, [5, 100], voxel_size=0.2, max_range=25)
     np.testing.assert_allclose(surface.distance(points[::20]), drive.distance(points[::20]), atol=1e-9)
+    assert len(surface.seen) > 1000
+    apart = [np.linalg.norm(surface.seen - drive.pose(i)[:3, 3], axis=1) for i in (5, 100)]
+    assert np.min(apart, axis=0).max() < 40  # 25 m deep, at the edge of the image
+    assert np.abs(drive.distance(surface.seen)).max() < 0.002
     up = -drive._upright[2] @ np.array(drive._poses)[:, :3, 1].mean(axis=0)
     assert up == pytest.approx(1)
 

@@ -242,7 +242,7 @@ def test_the_tables_of_solids_and_materials_agree_with_the_kernel():
     ("settings", "match"),
     [
         ({"world": "moon"}, "world must be one of room, street, .*room-.*, got 'moon'"),
-        ({"sensor": "sonar"}, "must be kinect, stereo or lidar, got 'sonar'"),
+        ({"sensor": "sonar"}, "must be kinect, tof, stereo or lidar, got 'sonar'"),
         ({"count": 0}, "expected count >= 1, .*got count 0"),
         ({"path": "loop"}, "path must be one of circle, tour, handheld, got 'loop'"),
         ({"world": "street", "path": "tour"}, "path must be one of drive, got 'tour'"),
@@ -279,3 +279,18 @@ def test_rays_meet_what_the_twin_meets_first(world):
     found = np.where(depth_metres(keyframe) < 5.9, depth_metres(keyframe), 0)
     agree = np.abs(found - expected) < 2e-4
     assert agree.mean() > 0.99  # the rest graze an edge
+
+
+def test_a_kinect_v2_at_the_desk_has_its_noise_and_loses_outlines():
+    dataset, clean = (Synthetic("desk", count=600, noise=noise, width=320) for noise in (True, False))
+    assert (dataset.sensor, dataset.camera.size, dataset[0].sensor) == ("tof", (240, 320), "tof")
+    poses = np.array([dataset.pose(index) for index in range(0, 600, 5)])
+    assert dataset.distance(poses[:, :3, 3]).min() > 0.15
+    noisy, true = (each[300].depth.astype(float) * DEPTH_SCALE for each in (dataset, clean))
+    lost = (true > 0) & (noisy == 0)
+    assert 0.002 < lost.mean() < 0.05
+    error = (noisy - true)[(noisy > 0) & (true > 0)]
+    assert 0.001 < np.median(np.abs(error)) / 0.6745 < 0.006
+    assert 0.002 < (np.abs(error) > 0.03).mean() < 0.05  # between front and back
+    assert np.abs(clean.distance(points_world(clean[300])[::50])).max() < 1e-4
+    assert Synthetic("desk").camera.size == (480, 640)

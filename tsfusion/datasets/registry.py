@@ -100,8 +100,8 @@ PLAIN = (
 SYNTHETIC = (
     "synthetic",
     "no files: synthetic:WORLD, or synthetic:WORLD:SENSOR; worlds: room (also -untextured, -plain, -bare), "
-    "street, corridor, rooms; sensors: kinect, stereo, lidar; or kitti06, kitti07: stereo pairs along "
-    "KITTI's path, with --option kitti=FOLDER, which holds its poses",
+    "street, corridor, rooms, desk; sensors: kinect, tof, stereo, lidar; or kitti06, kitti07: stereo pairs "
+    "along KITTI's path, with --option kitti=FOLDER, which holds its poses",
 )
 
 

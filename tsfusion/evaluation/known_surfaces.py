@@ -10,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import MissingDependency
+from tsfusion.datasets.synthetic.street_drive import StreetDrive
 from tsfusion.datasets.synthetic.worlds import BOX, CYLINDER, GROUND, ROOM, Solids, World
 from tsfusion.evaluation import surface_error
+from tsfusion.geometry import se3
 from tsfusion.geometry.mesh import Mesh
 
 COMPLETE_WITHIN = 1.5  # voxels
@@ -116,6 +118,29 @@ class ReferenceSurface:
         """(n,) index of the face that holds the nearest sample."""
         face: NDArray[np.int64] = self._face[surface_error.nearest(points, self._samples)[1]]
         return face
+
+
+def drive_surface(
+    drive: StreetDrive, frames: Iterable[int], *, voxel_size: float, max_range: float
+) -> WorldSurface:
+    """Surface of a street, and the part of it within `max_range` metres of the cameras of some frames.
+
+    What was seen has one point a cell of 1.5 voxels in which one image has at least two pixels. The drive's
+    width decides how far that is; its noise does not matter.
+    """
+    cell, K = COMPLETE_WITHIN * voxel_size, drive.intrinsics
+    v, u = np.mgrid[: drive.size[0], : drive.size[1]]
+    rays = np.stack([(u - K.cx) / K.fx, (v - K.cy) / K.fy, np.ones(u.shape)], axis=-1)
+    found = [np.empty((0, 3))]
+    for index in frames:
+        depth = drive.depth(index)
+        near = (depth > 0) & (depth < max_range)
+        T = drive.pose(index)
+        assert T is not None
+        points = se3.apply(T, rays[near] * depth[near, None])
+        found.append(surface_error.one_per_cell(points, cell, at_least=2))
+    seen = surface_error.one_per_cell(np.concatenate(found), cell)
+    return WorldSurface(drive.world, seen, edges=False)
 
 
 def measure(mesh: Mesh, truth: KnownSurface, voxel_size: float) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.dataset import Frames
-from tsfusion.datasets.synthetic import loop_worlds, worlds
+from tsfusion.datasets.synthetic import desk_world, loop_worlds, worlds
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
 
@@ -20,6 +20,13 @@ FRAME_NS = 100_000_000  # nominal: ten keyframes a second
 DEPTH_SCALE = 1e-4  # metres per unit
 DISPARITY_SCALE = 1 / 16  # pixels per unit
 KINECT_RANGE = 6.0  # metres; the uint16 depth ends at 6.5
+TOF_RANGE = (0.5, 4.5)  # metres
+SENSORS = {
+    "kinect": KINECT_RANGE + 1,
+    "tof": KINECT_RANGE + 1,
+    "stereo": 200.0,
+    "lidar": None,
+}  # metres of reach
 
 # LiDAR axes (x forward, y left, z up) in camera axes.
 _T_CAMERA_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
@@ -51,6 +58,7 @@ class SyntheticLidar:
 CAMERAS = {
     "room": SyntheticCamera((240, 320), Intrinsics(292.5, 292.5, 159.5, 119.5), 0.12),
     "street": SyntheticCamera((188, 620), Intrinsics(353.5, 353.5, 309.5, 91.5), 0.54),
+    "desk": SyntheticCamera((480, 640), Intrinsics(468.60, 468.61, 318.27, 243.99), 0.12),  # CoRBS'
 }
 LIDARS = {"room": SyntheticLidar(lowest=-45.0, highest=45.0, max_range=30.0), "street": SyntheticLidar()}
 WORLDS: dict[str, Callable[[int], worlds.World]] = {  # by the number of keyframes
@@ -58,6 +66,7 @@ WORLDS: dict[str, Callable[[int], worlds.World]] = {  # by the number of keyfram
     "street": lambda count: worlds.street(max(80.0, count + 40.0)),
     "corridor": lambda _: loop_worlds.ring(),
     "rooms": lambda _: loop_worlds.rooms(),
+    "desk": lambda _: desk_world.desk(),
     **{
         name: lambda _, name=name: worlds.room(name)  # type: ignore[misc]
         for name in ("room-untextured", "room-plain", "room-bare")
@@ -66,17 +75,20 @@ WORLDS: dict[str, Callable[[int], worlds.World]] = {  # by the number of keyfram
 
 
 class Synthetic(Frames):
-    """Posed keyframes of the `room` or the `street`, seen by one kind of sensor.
+    """Posed keyframes of the `room`, the `street`, …, seen by one kind of sensor.
 
     Equal arguments give equal bytes, whatever the thread count and the order of access. Noise:
 
     - kinect: Gaussian, σ = 0.0012 + 0.0019 (z - 0.4)² m; uint16 depth in 0.1 mm; nothing beyond 6 m.
+    - tof: a Kinect v2's: σ = (0.0012 + 0.0004 z²) / √cos of the angle to the surface; pixels at outlines lie
+      between front and back or are lost; nothing where the surface is grazed, below 0.5 or beyond 4.5 m.
     - stereo: disparity error 0.35 px correlated over 2.5 px and 0.15 px white, 1 % outliers of 4 px; ×16.
     - lidar: 64 × 900 rays, range error 2 cm, 2 % lost, grazing rays lost. Points carry colour.
 
     Args:
         world: a name in `WORLDS` (`room`, `street`, …), or a `World` of your own, seen with the room's camera
             and LiDAR.
+        sensor: `kinect`, `tof`, `stereo` or `lidar`; default `tof` at the desk, else `kinect`.
         count: keyframes, spread over the whole path; default the first 40 of as many as let a scanner follow
             it (`World.steps`). The room's path is a closed circle, the street's goes on by a metre each.
         seed: of the noise; the world does not change.
@@ -92,7 +104,7 @@ class Synthetic(Frames):
     def __init__(
         self,
         world: str | worlds.World = "room",
-        sensor: str = "kinect",
+        sensor: str | None = None,
         *,
         count: int | None = None,
         seed: int = 0,
@@ -103,8 +115,11 @@ class Synthetic(Frames):
     ) -> None:
         if isinstance(world, str) and world not in WORLDS:
             raise DatasetError(f"world must be one of {', '.join(WORLDS)}, got {world!r}")
-        if sensor not in ("kinect", "stereo", "lidar"):
-            raise DatasetError(f"sensor of a synthetic world must be kinect, stereo or lidar, got {sensor!r}")
+        sensor = sensor or ("tof" if world == "desk" else "kinect")
+        if sensor not in SENSORS:
+            raise DatasetError(
+                f"sensor of a synthetic world must be kinect, tof, stereo or lidar, got {sensor!r}"
+            )
         given, count = count, USUAL_COUNT if count is None else count
         if count < 1 or seed < 0 or (width is not None and width < 16):
             raise DatasetError(
@@ -154,6 +169,9 @@ class Synthetic(Frames):
         if self.sensor == "kinect":
             depth = kinect(z, rng if self._noise else None)
             return Frame(depth=depth, depth_scale=DEPTH_SCALE, **common)
+        if self.sensor == "tof":
+            depth = time_of_flight(z, incidence.reshape(height, width), rng if self._noise else None)
+            return Frame(depth=depth, depth_scale=DEPTH_SCALE, **common)
         baseline_fx = self.camera.baseline * self.camera.intrinsics.fx
         disparity = stereo(z, baseline_fx, rng if self._noise else None)
         return Frame(disparity=disparity, disparity_scale=DISPARITY_SCALE, baseline_fx=baseline_fx, **common)
@@ -170,7 +188,7 @@ class Synthetic(Frames):
         rays = len(self._directions)
         distance, incidence = np.empty(rays), np.empty(rays)
         color = np.empty((rays if self._with_color else 0, 3), dtype=np.uint8)
-        reach = {"kinect": KINECT_RANGE + 1, "stereo": 200.0, "lidar": self.lidar.max_range}[self.sensor]
+        reach = SENSORS[self.sensor] or self.lidar.max_range
         kernels.cast(T, self._directions, self.world.near(T[:3, 3], reach), distance, incidence, color)
         return distance, incidence, color
 
@@ -194,6 +212,27 @@ def kinect(z: NDArray[np.float64], rng: np.random.Generator | None) -> NDArray[n
     valid = (z > 0) & (z < KINECT_RANGE)
     if rng is not None:
         z = z + (0.0012 + 0.0019 * (z - 0.4) ** 2) * rng.standard_normal(z.shape)
+    units = np.clip(np.rint(z / DEPTH_SCALE), 0, 65535)
+    return np.where(valid, units, 0).astype(np.uint16)
+
+
+def time_of_flight(
+    z: NDArray[np.float64], incidence: NDArray[np.float64], rng: np.random.Generator | None
+) -> NDArray[np.uint16]:
+    """(H, W) metres and |cosines| → uint16 of 0.1 mm, with a Kinect v2's errors; 0 = no return.
+
+    Noise by distance and angle after Fankhauser et al. 2015; at outlines two surfaces share a pixel's light.
+    """
+    valid = (z > TOF_RANGE[0]) & (z < TOF_RANGE[1])
+    if rng is not None:
+        near, far = (morph(z, np.ones((3, 3), np.uint8)) for morph in (cv2.erode, cv2.dilate))
+        outline = far - near > 0.03 + 0.03 * z
+        share = rng.random(z.shape)
+        mixed = near + rng.random(z.shape) * (far - near)
+        z = np.where(outline & (share < 0.3), mixed, z)
+        valid &= ~(outline & (share > 0.7)) & (incidence > 0.12)
+        sigma = (0.0012 + 0.0004 * z**2) / np.sqrt(np.maximum(incidence, 0.1))
+        z = z + sigma * rng.standard_normal(z.shape)
     units = np.clip(np.rint(z / DEPTH_SCALE), 0, 65535)
     return np.where(valid, units, 0).astype(np.uint16)
 
