@@ -53,6 +53,9 @@ def test_equal_arguments_give_equal_bytes_in_any_order(path, drive):
     assert [digest(drive.frame(i)) for i in (3, 70)] == [digest(again.frame(i)) for i in (70, 3)][::-1]
     assert digest(drive.frame(3)) != digest(StreetDrive("kitti06", kitti=path, width=240, seed=1).frame(3))
     assert drive.frame(3).left.std() > 25
+    assert (
+        drive.fingerprint() == again.fingerprint() != StreetDrive("kitti06", kitti=path, seed=1).fingerprint()
+    )
 
 
 def test_what_is_rendered_lies_on_the_known_surface(drive):

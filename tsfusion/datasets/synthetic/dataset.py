@@ -21,6 +21,7 @@ DEPTH_SCALE = 1e-4  # metres per unit
 DISPARITY_SCALE = 1 / 16  # pixels per unit
 KINECT_RANGE = 6.0  # metres; the uint16 depth ends at 6.5
 TOF_RANGE = (0.5, 4.5)  # metres
+COLOR_NOISE = 3.0  # levels, of the camera beside the time-of-flight sensor
 SENSORS = {
     "kinect": KINECT_RANGE + 1,
     "tof": KINECT_RANGE + 1,
@@ -82,6 +83,7 @@ class Synthetic(Frames):
     - kinect: Gaussian, σ = 0.0012 + 0.0019 (z - 0.4)² m; uint16 depth in 0.1 mm; nothing beyond 6 m.
     - tof: a Kinect v2's: σ = (0.0012 + 0.0004 z²) / √cos of the angle to the surface; pixels at outlines lie
       between front and back or are lost; nothing where the surface is grazed, below 0.5 or beyond 4.5 m.
+      Colour has white noise of 3 levels.
     - stereo: disparity error 0.35 px correlated over 2.5 px and 0.15 px white, 1 % outliers of 4 px; ×16.
     - lidar: 64 × 900 rays, range error 2 cm, 2 % lost, grazing rays lost. Points carry colour.
 
@@ -171,6 +173,9 @@ class Synthetic(Frames):
             return Frame(depth=depth, depth_scale=DEPTH_SCALE, **common)
         if self.sensor == "tof":
             depth = time_of_flight(z, incidence.reshape(height, width), rng if self._noise else None)
+            if self._noise and common["color"] is not None:
+                noisy = common["color"] + COLOR_NOISE * rng.standard_normal((height, width, 3))
+                common["color"] = np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
             return Frame(depth=depth, depth_scale=DEPTH_SCALE, **common)
         baseline_fx = self.camera.baseline * self.camera.intrinsics.fx
         disparity = stereo(z, baseline_fx, rng if self._noise else None)

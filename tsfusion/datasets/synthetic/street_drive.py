@@ -130,7 +130,7 @@ class StreetDrive(Frames):
         small = StreetRenderer(self.world.solids, self._ground, (29, 96), CAMERA.scaled(96 / SIZE[1]))
         for index in range(0, len(self), 50):
             light = small.view(self._eye(index, 0.0))[1] * _exposure(index)[0]
-            digest.update(np.rint(255 * light).astype(np.uint8).tobytes())
+            digest.update(np.rint(255 * np.clip(light, 0, 1)).astype(np.uint8).tobytes())
         return digest.hexdigest()
 
     def _frame(self, index: int) -> Frame:
