@@ -66,7 +66,12 @@ def run(
         signals = stack.enter_context(_signals())
         try:
             gateway, watchdog, report = _open(
-                stack, server, {DEFAULT_MAP: volume, **(volumes or {})}, signals, guest, on_health
+                stack,
+                server,
+                {DEFAULT_MAP: volume, **(volumes or {})},
+                signals,
+                guest=guest,
+                on_health=on_health,
             )
         except _StoppedAtStart:
             return 0
@@ -88,6 +93,7 @@ def _open(
     server: ServerConfig,
     volumes: dict[str, VolumeConfig],
     signals: list[int],
+    *,
     guest: str | None,
     on_health: Callable[[Health], None],
 ) -> tuple[Gateway, Watchdog, "_ReadingReport"]:

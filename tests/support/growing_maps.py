@@ -27,7 +27,9 @@ from tsfusion.wire.map_events import (
 SESSION = bytes(range(16))
 
 
-def surface_update(volume: Volume, cells: NDArray[np.int32], surface: str | None, **fields: object) -> SurfaceUpdate:
+def surface_update(
+    volume: Volume, cells: NDArray[np.int32], surface: str | None, **fields: object
+) -> SurfaceUpdate:
     """The triangles of cells as a server sends them."""
     mesh = volume.extract_mesh(blocks=cells, surface=surface)
     cells = np.unique(cells, axis=0).astype(np.int32)
@@ -96,7 +98,9 @@ class GrowingMap:
         self._next = time.monotonic() + self._pause
         self.volume.integrate(keyframe)
         blocks = self.volume.take_dirty()
-        self._unrefined = np.unique(np.concatenate((self._unrefined, self.volume.cells_to_mesh(blocks))), axis=0)
+        self._unrefined = np.unique(
+            np.concatenate((self._unrefined, self.volume.cells_to_mesh(blocks))), axis=0
+        )
         self.poses.append(keyframe.T_world_camera)
         who = {"clients": (SESSION,), "client": np.zeros(len(np.unique(cells_of(blocks), axis=0)), np.int32)}
         return [
@@ -119,7 +123,9 @@ class GrowingMap:
     def health(self, problems: tuple[str, ...] = ()) -> Health:
         """Of a server that would have this map."""
         fused, stats = len(self.poses), self.volume.stats()
-        delays = Spread(count=fused, mean=80, p50=70 + 5 * np.sin(fused), p95=120 + 9 * np.cos(fused), max=200)
+        delays = Spread(
+            count=fused, mean=80, p50=70 + 5 * np.sin(fused), p95=120 + 9 * np.cos(fused), max=200
+        )
         one = MapHealth(
             state="busy", problem="", keyframes_durable=fused + 2, keyframes_fused=fused, waiting=2, rejected={},
             quarantined=0, sessions=1, journal_bytes=10**6, journal_damaged=0, fuser_restarts=0,

@@ -26,8 +26,15 @@ class TimeLine:
 class MapFeed(Protocol):
     """What is shown, event by event. For one thread, but for `weights`."""
 
-    title: str  # of what is watched, for a person
-    time_line: TimeLine | None  # None = only now can be shown
+    @property
+    def title(self) -> str:
+        """Name of what is watched, for a person."""
+        ...
+
+    @property
+    def time_line(self) -> TimeLine | None:
+        """The times that `seek` takes; None = only now can be shown."""
+        ...
 
     def maps(self) -> list[str]:
         """Names of the maps that `choose` takes."""
