@@ -31,7 +31,7 @@ def compare_scans(dataset: Dataset, folders: Sequence[Path], *, voxel_size: floa
     given = dataset.timestamps_ns
     times = [(i + 1) * NOMINAL_NS if given is None else int(given[i]) for i in range(len(dataset))]
     stamps = {stamp: index for index, stamp in enumerate(times)}
-    tracked = [_poses(folder / "trajectory.txt") for folder in folders]
+    tracked = [_poses(_trajectory_of_mesh(folder)) for folder in folders]
     fused = set().union(*(_poses(folder / "keyframes.txt") for folder in folders))
     common = sorted(set(stamps).intersection(*tracked) - fused)[::_STEP]
     found = []
@@ -46,6 +46,12 @@ def compare_scans(dataset: Dataset, folders: Sequence[Path], *, voxel_size: floa
             )
         )
     return found
+
+
+def _trajectory_of_mesh(folder: Path) -> Path:
+    """The trajectory that the mesh of a scan goes with: closed loops have moved the map, too."""
+    corrected = folder / "trajectory-corrected.txt"
+    return corrected if corrected.exists() else folder / "trajectory.txt"
 
 
 def _poses(path: Path) -> dict[int, NDArray[np.float64]]:
