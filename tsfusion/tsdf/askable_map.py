@@ -27,6 +27,7 @@ from tsfusion.tsdf.surface_tiles import SurfaceTiles
 from tsfusion.tsdf.surface_values import SurfaceView
 
 MOST_SURFACES = 2  # that answers are kept of
+MOST_NEW_CUBES = 2  # of a surface that is not kept, in an answer about cells
 
 
 class AskableMap(ReadableMap):
@@ -281,7 +282,10 @@ class AskableMap(ReadableMap):
                 reach=reach,
             )
         least = self._checked_min_weight(None)
-        found = self._mesh_keys(keys, least, self._tiles_of(surface, least).values)
+        kept = self._tiles_of(surface, least)
+        if (count := kept.affordable(keys, MOST_NEW_CUBES)) < len(keys):
+            keys, rest = keys[:count], int(keys[count])
+        found = self._mesh_keys(keys, least, kept.values)
         return found, None if rest is None else unpack_keys(np.array([rest]))[0]
 
     def cell_stamps(self, cells: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:

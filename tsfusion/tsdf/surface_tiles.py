@@ -77,6 +77,18 @@ class SurfaceTiles:
             self._listed = self._store.count
         return self._numbers
 
+    def affordable(self, keys: NDArray[np.int64], most: int) -> int:
+        """How many of the first blocks lie in cubes that are kept, and in so many that are not."""
+        if self._view is values_of:
+            return len(keys)
+        numbers, first = np.unique(_tile_of(keys), return_index=True)
+        new = sorted(
+            place
+            for number, place in zip(numbers.tolist(), first.tolist(), strict=True)
+            if self._values.get(number) is None
+        )
+        return new[most] if len(new) > most else len(keys)
+
     def mesh(self, number: int) -> Mesh:
         """The mesh of a cube's cells."""
         piece = self._meshes.get(number)
