@@ -45,27 +45,27 @@ def heard(served: Served, link: sockets.AnySocket) -> tuple[Scanned, list[bytes]
 
 
 def test_a_keyframe_is_told_with_its_picture_as_it_came(tmp_path: Path) -> None:
-    with (
-        serving_here(tmp_path) as served,
-        viewer(served) as link,
-        connected(sockets.push, served.addresses.data) as push,
-    ):
-        sent = record(1)
-        push.send_multipart(sent)  # nobody watches yet
+    with serving_here(tmp_path) as served, connected(sockets.push, served.addresses.data) as push:
+        push.send_multipart(record(1))  # nobody watches yet
         served.until(lambda: served.durable == 1)
-        served.until(lambda: link.poll(0) or is_watched(served))
-        sent = record(2)
-        push.send_multipart(sent)
-        push.send_multipart(sent)  # once more, on its way
-        scanned, frames = heard(served, link)
-        assert frames == [sent[2]]
-        assert frames[0][:2] == b"\xff\xd8"
-        assert (scanned.session, scanned.seq, scanned.client) == (bytes(16), 2, "")
-        assert (scanned.intrinsics, scanned.shape, scanned.late) == (CAMERA, SHAPE, False)
-        np.testing.assert_array_equal(scanned.pose, wall(2).T_world_camera[:3].ravel())
-        push.send_multipart(record(3))
-        again, _ = heard(served, link)
-        assert (again.seq, again.number, again.epoch) == (3, scanned.number + 1, scanned.epoch)
+        with viewer(served) as link:
+            check_told(served, link, push)
+
+
+def check_told(served: Served, link: sockets.AnySocket, push: sockets.AnySocket) -> None:
+    served.until(lambda: link.poll(0) or is_watched(served))
+    sent = record(2)
+    push.send_multipart(sent)
+    push.send_multipart(sent)  # once more, on its way
+    scanned, frames = heard(served, link)
+    assert frames == [sent[2]]
+    assert frames[0][:2] == b"\xff\xd8"
+    assert (scanned.session, scanned.seq, scanned.client) == (bytes(16), 2, "")
+    assert (scanned.intrinsics, scanned.shape, scanned.late) == (CAMERA, SHAPE, False)
+    np.testing.assert_array_equal(scanned.pose, wall(2).T_world_camera[:3].ravel())
+    push.send_multipart(record(3))
+    again, _ = heard(served, link)
+    assert (again.seq, again.number, again.epoch) == (3, scanned.number + 1, scanned.epoch)
 
 
 def test_pictures_take_so_many_bytes_and_the_newest_comes_late(

@@ -23,8 +23,12 @@ def triangles_of(cells: NDArray[np.int32], first_face: NDArray[np.int32], mesh: 
 
 def fresh(volume: Volume, surface: Surface | None = None) -> Surfaces:
     """The cells of a map, meshed now."""
-    found, _ = volume.next_cells(surface=surface, most=1 << 20)
-    cells = triangles_of(found.cells, found.first_face, found.mesh)
+    cells: Surfaces = {}
+    found, following = volume.next_cells(surface=surface)
+    cells |= triangles_of(found.cells, found.first_face, found.mesh)
+    while following is not None:
+        found, following = volume.next_cells(following, surface=surface)
+        cells |= triangles_of(found.cells, found.first_face, found.mesh)
     return {cell: triangles for cell, triangles in cells.items() if triangles}
 
 

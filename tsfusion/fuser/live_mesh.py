@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from tsfusion.tsdf.volume import Volume
 
 _REFINED_AT_ONCE = 256  # blocks: about 50 ms
+_REFINED_BETWEEN = 64  # likewise, while the next keyframe may be near
 _QUIET_S = 1.0  # without a record: the next one is not near
 _REFINE_REST_FACTOR = 40.0  # else no more for so many times as long as it took: few keyframes wait for it
 _REST_FACTOR = 3  # no mesh for three times as long as the last took: a quarter of a busy fuser's time
@@ -134,7 +135,8 @@ class LiveMesh:
         Call it only while there is nothing else to do: a keyframe that comes meanwhile waits.
         """
         began = time.monotonic()
-        cells, self._unrefined = self._unrefined[:_REFINED_AT_ONCE], self._unrefined[_REFINED_AT_ONCE:]
+        count = _REFINED_AT_ONCE if began >= self._quiet_from else _REFINED_BETWEEN
+        cells, self._unrefined = self._unrefined[:count], self._unrefined[count:]
         try:
             with self._sparing():
                 found = self._volume.mesh_cells(cells)
