@@ -20,6 +20,7 @@ _NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
 _FLAGS = (
     "--headless", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-first-run",
     "--disable-background-networking", "--disable-extensions", "--hide-scrollbars", "--remote-debugging-pipe",
+    "--disable-features=BackForwardCache",  # a page that is left would keep its connections
 )  # fmt: skip
 DEADLINE = 120.0  # seconds
 

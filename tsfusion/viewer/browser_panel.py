@@ -23,6 +23,8 @@ WHOLE, BY_HAND, _FOLLOW = "Whole map", "By hand", "Follow "
 _SETTLED = 1.5  # seconds after a move of ours, in which a browser still tells older places
 _MOVED = 0.02  # of the distance to the target: further away, somebody moved the camera
 _RENDER = 30.0  # seconds that a browser may take for a picture
+_NARROW = 576  # pixels: up to there viser puts the panel over the lower half of the picture
+_COVERED = 0.5
 _MARK = (213, 94, 0)
 
 
@@ -32,7 +34,7 @@ class Shown(Protocol):
     voxel_size: float
     map_name: str
 
-    def whole_view(self, aspect: float) -> View | None:
+    def whole_view(self, aspect: float, covered: float) -> View | None:
         """All of the map."""
         ...
 
@@ -104,7 +106,9 @@ class BrowserPanel:
 
     def _wanted(self) -> View | None:
         if self._camera.value == WHOLE:
-            return self._shown.whole_view(self._client.camera.aspect)
+            camera = self._client.camera
+            covered = _COVERED if camera.image_width <= _NARROW else 0.0
+            return self._shown.whole_view(camera.aspect, covered)
         for session, name in self._shown.scanners():
             if self._camera.value == _FOLLOW + name:
                 return self._shown.scanner_view(session)

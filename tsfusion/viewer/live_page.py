@@ -216,12 +216,12 @@ class LivePage:
 
     # What the panels of browsers ask
 
-    def whole_view(self, aspect: float) -> View | None:
+    def whole_view(self, aspect: float, covered: float) -> View | None:
         """See `browser_panel.Shown`, with what follows."""
         version = self._tiles.version
         if self._sample is None or self._sample[0] != version:
             self._sample = (version, map_views.sample(self._tiles))
-        return map_views.whole(self._sample[1], self._up.direction, aspect)
+        return map_views.whole(self._sample[1], self._up.direction, aspect, covered=covered)
 
     def scanner_view(self, session: bytes) -> View | None:
         pose = self._marks.pose(session)

@@ -43,11 +43,12 @@ def sample(tiles: MapTiles) -> Sample:
     return Sample(points, np.concatenate([mesh.normals[::step] for mesh in meshes]).astype(np.float64))
 
 
-def whole(surface: Sample, up: NDArray[np.float64], aspect: float) -> View | None:
+def whole(surface: Sample, up: NDArray[np.float64], aspect: float, *, covered: float = 0.0) -> View | None:
     """From above, from the side that shows most of the surface; None = there is nothing to see.
 
     Args:
         aspect: width / height of the picture.
+        covered: share of the picture's height, at its lower end, that is not to be seen.
     """
     if len(surface.points) < 3:
         return None
@@ -58,13 +59,17 @@ def whole(surface: Sample, up: NDArray[np.float64], aspect: float) -> View | Non
     level = np.cos(turns)[:, None] * east + np.sin(turns)[:, None] * north
     toward = math.cos(_ELEVATION) * level + math.sin(_ELEVATION) * up  # from the target to the camera
     best = np.maximum(surface.normals @ toward.T, 0).sum(axis=0).argmax()
-    return _fitted(surface.points, toward[best], up, aspect)
+    return _fitted(surface.points, (toward[best], up), aspect, covered)
 
 
 def _fitted(
-    points: NDArray[np.float64], toward: NDArray[np.float64], up: NDArray[np.float64], aspect: float
+    points: NDArray[np.float64],
+    directions: tuple[NDArray[np.float64], NDArray[np.float64]],
+    aspect: float,
+    covered: float,
 ) -> View:
     """The nearest camera in a direction from which nearly all points are in the picture."""
+    toward, up = directions
     right = np.cross(up, toward)
     right /= np.linalg.norm(right)
     above = np.cross(toward, right)
@@ -73,17 +78,14 @@ def _fitted(
     points = inside if len(inside) > 2 else points
     x, y, z = points @ right, points @ above, points @ toward
     tall = _FILLED * math.tan(FOV / 2)
-    wide = tall * aspect
-    # A camera at depth d sees |x − cx| ≤ wide (d − z): both sides touch where cx is between
-    distances = []
-    centre = []
-    for across, reach in ((x, wide), (y, tall)):
-        upper, lower = (across + reach * z).max(), (across - reach * z).min()
-        centre.append((upper + lower) / 2)
-        distances.append((upper - lower) / (2 * reach))
+    # A camera at (cx, cy, d) sees what has −first (d − z) ≤ x − cx ≤ last (d − z), and y alike
+    sides = [(x, tall * aspect, tall * aspect), (y, tall * (1 - 2 * covered), tall)]
+    ends = [((p - first * z).min(), (p + last * z).max(), first, last) for p, first, last in sides]
+    d = max((high - low) / (first + last) for low, high, first, last in ends)
+    cx, cy = ((low + first * d + high - last * d) / 2 for low, high, first, last in ends)
     middle = float(np.median(z))
-    target = centre[0] * right + centre[1] * above + middle * toward
-    return View(target + (max(distances) - middle) * toward, target, up)
+    target = cx * right + cy * above + middle * toward
+    return View(target + (d - middle) * toward, target, up)
 
 
 def behind(T_world_camera: NDArray[np.float64], up: NDArray[np.float64], *, distance: float) -> View:

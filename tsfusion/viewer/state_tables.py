@@ -8,7 +8,7 @@ from tsfusion.core.readable_numbers import counted, grouped, size
 from tsfusion.geometry.color_scales import as_hex, of_number
 from tsfusion.wire.health import ClientHealth, Health
 
-_TEXT = "font-size:.85em;line-height:1.5;padding:0 .6em .4em;overflow-wrap:anywhere"
+_TEXT = "font-size:.85em;line-height:1.5;padding:0 .9em .4em .6em;overflow-wrap:anywhere"
 _GOOD, _BAD = "#009e73", "#d55e00"
 _ADDRESS = 40  # characters of a name that are shown
 

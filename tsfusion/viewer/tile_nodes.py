@@ -16,7 +16,10 @@ from tsfusion.viewer.vertex_colors import VertexColors
 if TYPE_CHECKING:
     import viser
 
-PAUSE = 0.4  # seconds between two versions of a tile, at least
+# Seconds between two versions of a tile, at least. A browser drops a model as soon as it is given another
+# one, and shows that only once it is read: so each is a node of its own, and the last one stays meanwhile.
+PAUSE = 1.0
+_CUT_PAUSE = 0.25  # while somebody moves the clip plane
 _MARGIN = 1.0  # of a tile's edge that its triangles may reach beyond it
 
 
@@ -42,6 +45,8 @@ class TileNodes:
         self._sent_at: dict[Key, float] = {}
         self._sides: dict[Key, Side] = {}  # of what is in the scene
         self._nodes: dict[Key, viser.GlbHandle] = {}
+        self._last: dict[Key, tuple[viser.GlbHandle, float]] = {}  # versions before, and when they go
+        self._cut: set[Key] = set()  # wait because of the clipping
         self._hidden: set[Key] = set()  # have changed while they were not to be seen
         self.clipping = Clipping()
         self.voxel_size = 1.0
@@ -58,9 +63,17 @@ class TileNodes:
 
     def clear(self) -> None:
         """Take everything out of the scene."""
-        for node in self._nodes.values():
+        for node in (*self._nodes.values(), *(node for node, _ in self._last.values())):
             node.remove()
-        for kept in (self._nodes, self._waiting, self._sent_at, self._sides, self._hidden):
+        for kept in (
+            self._nodes,
+            self._last,
+            self._waiting,
+            self._sent_at,
+            self._sides,
+            self._hidden,
+            self._cut,
+        ):
             kept.clear()
 
     def changed(self, keys: Iterable[Key]) -> None:
@@ -76,9 +89,10 @@ class TileNodes:
             node = self._nodes.get(key)
             if side == "hidden":
                 if node is not None:
-                    node.visible = False
+                    self._hide(key, node)
             elif key in self._hidden or side == "part" or side != shown:
                 self._hidden.discard(key)
+                self._cut.add(key)
                 self.changed((key,))
             elif node is not None:
                 node.visible = True
@@ -86,13 +100,19 @@ class TileNodes:
     def send(self, now: float) -> int:
         """Send what is due; the number of tiles that were."""
         count = 0
+        for key, (node, end) in list(self._last.items()):
+            if now >= end:
+                del self._last[key]
+                node.remove()
         for key in list(self._waiting):
-            if self._sent_at.get(key, -np.inf) + PAUSE > now:
+            pause = _CUT_PAUSE if key in self._cut else PAUSE
+            if self._sent_at.get(key, -np.inf) + pause > now:
                 continue
             if self._bucket.wait(1.0, now) > 0:
                 break
             del self._waiting[key]
-            size = self._send(key)
+            size = self._send(key, now + pause)
+            self._cut.discard(key)
             if size:
                 self._sent_at[key] = now
                 self._bucket.spend(size)
@@ -105,37 +125,45 @@ class TileNodes:
         mesh = Mesh(tile.mesh.vertices, tile.mesh.faces, tile.mesh.normals, self._colors.colors(key, tile))
         return mesh if self.clipping.side(tile.bounds) == "whole" else self.clipping.cut(mesh)
 
-    def _send(self, key: Key) -> int:
-        """Bring a tile into the scene as it is now; the bytes that takes."""
-        tile, node = self._tiles.tiles.get(key), self._nodes.get(key)
-        side = "hidden" if tile is None else self.clipping.side(tile.bounds)
-        if tile is None or side == "hidden":
-            if tile is None and node is not None:
-                self._nodes.pop(key).remove()
-                self._sides.pop(key, None)
-            elif node is not None:
-                node.visible = False
-            if tile is not None:
-                self._hidden.add(key)
-            return 0
-        mesh = self.shown_mesh(key, tile)
-        self._sides[key] = side
-        if not len(mesh.faces):
-            if node is not None:
-                node.visible = False
-            return 0
-        return self._put(key, mesh)
+    def _send(self, key: Key, end: float) -> int:
+        """Bring a tile into the scene as it is now; the bytes that takes.
 
-    def _put(self, key: Key, mesh: Mesh) -> int:
+        Args:
+            end: when the version before goes.
+        """
+        tile, node = self._tiles.tiles.get(key), self._nodes.get(key)
+        if tile is None:
+            if node is not None:
+                self._hide(key, node)
+                self._nodes.pop(key).remove()
+            self._sides.pop(key, None)
+            return 0
+        side = self.clipping.side(tile.bounds)
+        mesh = None if side == "hidden" else self.shown_mesh(key, tile)
+        if mesh is None or not len(mesh.faces):
+            self._hidden.add(key)
+            if node is not None:
+                self._hide(key, node)
+            return 0
+        self._sides[key] = side
+        return self._put(key, mesh, end)
+
+    def _hide(self, key: Key, node: "viser.GlbHandle") -> None:
+        node.visible = False
+        if key in self._last:
+            self._last.pop(key)[0].remove()
+
+    def _put(self, key: Key, mesh: Mesh, end: float) -> int:
         edge = self._tiles.edge * CELL * self.voxel_size
         corner = edge * (np.array(key, np.float64) - _MARGIN)
         assert mesh.colors is not None
         content = tile_glb.encode(mesh.vertices, mesh.faces, mesh.colors, corner, self.voxel_size)
+        names = ["/map/" + "_".join(map(str, key)) + version for version in ("", "b")]
         node = self._nodes.get(key)
-        if node is None:
-            name = "/map/" + "_".join(map(str, key))
-            self._nodes[key] = self._scene.add_glb(name, content, cast_shadow=False, receive_shadow=False)
-        else:
-            node.glb_data = content
-            node.visible = True
+        if key in self._last:
+            self._last.pop(key)[0].remove()
+        if node is not None:
+            self._last[key] = (node, end)
+            names.remove(node.name)
+        self._nodes[key] = self._scene.add_glb(names[0], content, cast_shadow=False, receive_shadow=False)
         return len(content)
