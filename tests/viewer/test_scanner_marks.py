@@ -47,8 +47,8 @@ def drawn(marks: ScannerMarks, now: float = 100.0) -> DrawnScene:
 
 
 def test_a_camera_stands_where_it_was_last_with_its_picture_small(marks: ScannerMarks) -> None:
-    marks.note_seen(seen(ANNA, 2, pose(0.2)))
     marks.note_seen(seen(ANNA, 1, pose(0.1)))
+    marks.note_seen(seen(ANNA, 2, pose(0.2)))
     node: Any = drawn(marks).nodes[f"/scanners/{ANNA.hex()}"]
     assert node.position.tolist() == [0.2, 0, 0]
     assert np.allclose(np.roll(node.wxyz, -1), quaternion(pose(0)[:3, :3]))
@@ -116,3 +116,40 @@ def test_a_long_path_is_thinned_and_a_jump_is_no_line(marks: ScannerMarks) -> No
     points = np.asarray(drawn(marks).nodes[f"/paths/{ANNA.hex()}"].points)
     assert 2000 < len(points) < 3100
     assert np.linalg.norm(points[:, 1] - points[:, 0], axis=1).max() < 1.3
+
+
+def paths(*seqs: int) -> PathsFound:
+    found = (np.array(seqs, np.int64), np.array([pose(seq) for seq in seqs]).reshape(-1, 4, 4))
+    return PathsFound({ANNA: found} if seqs else {})
+
+
+def xs(marks: ScannerMarks) -> list[float]:
+    return sorted(marks.positions()[:, 0].tolist())
+
+
+def test_a_keyframe_that_came_after_the_paths_were_asked_for_stays(marks: ScannerMarks) -> None:
+    for seq in (1, 2, 3):
+        marks.note_seen(seen(ANNA, seq, pose(seq)))
+    marks.note_paths(paths(1, 2))
+    assert xs(marks) == [1, 2, 3]
+    assert marks.pose(ANNA) is not None
+
+
+def test_a_map_that_is_rewound_has_the_path_of_its_time(marks: ScannerMarks) -> None:
+    marks.note_paths(paths(1, 2, 3, 4))
+    marks.note_seen(seen(ANNA, 4, pose(4)))
+    drawn(marks, 0.0)
+    for seq in (3, 2):  # back in time
+        marks.note_seen(seen(ANNA, seq, pose(seq)))
+    marks.note_paths(paths(1, 2))
+    marks.note_seen(seen(ANNA, 2, pose(2)))
+    node: Any = drawn(marks, 10.0).nodes[f"/scanners/{ANNA.hex()}"]
+    assert xs(marks) == [1, 2]
+    assert node.position.tolist() == [2, 0, 0]
+    marks.note_paths(paths())  # before the first keyframe
+    assert f"/scanners/{ANNA.hex()}" not in drawn(marks, 20.0).nodes
+    assert (xs(marks), marks.pose(ANNA)) == ([], None)
+    marks.note_paths(paths(1, 2, 3, 4))
+    marks.note_seen(seen(ANNA, 4, pose(4)))
+    assert f"/scanners/{ANNA.hex()}" in drawn(marks, 30.0).nodes
+    assert xs(marks) == [1, 2, 3, 4]

@@ -13,7 +13,8 @@ from tsfusion.core.readable_numbers import counted
 from tsfusion.pipelines.map_rewinding import RewoundMap
 from tsfusion.tsdf import map_history
 from tsfusion.tsdf.block_store import cells_of, pack_keys, unpack_keys
-from tsfusion.tsdf.mesh_tiles import CellMeshes
+from tsfusion.tsdf.map_cells import CellMeshes
+from tsfusion.tsdf.mesh_tiles import WholeMapValues
 from tsfusion.tsdf.volume import Volume
 from tsfusion.wire.map_events import Cleared, LinkSeen, MapEvent, PathsFound, ScannerSeen, SurfaceUpdate
 from tsfusion.wire.record_header import KeyframeHeader, unpack_keyframe
@@ -45,8 +46,7 @@ class PiecewiseMap:
     ) -> None:
         self._name, self._map, self._note, self._send, self._attend = name, rewound, note, send, attend
         self._volume: Volume | None = None
-        self._raw: CellMeshes | None = None
-        self._refined: CellMeshes | None = None  # of the map as it is
+        self._values: WholeMapValues | None = None  # refined, of the map as it is
         self._is_refining = False
         self._shown = set[int]()  # keys of cells with triangles
         self._stale = self._unrefined = _NONE  # sorted keys of cells
@@ -91,7 +91,7 @@ class PiecewiseMap:
         elif len(self._unrefined):
             self._show_refined()
         else:
-            self._refined = None
+            self._values = None
             return False
         return True
 
@@ -102,10 +102,10 @@ class PiecewiseMap:
 
     def _take(self, volume: Volume) -> None:
         """Show another volume."""
-        self._volume, self._raw, self._refined = volume, volume.cell_meshes("raw"), None
+        self._volume, self._values = volume, None
         volume.set_pause(self._pause)
         volume.take_dirty()
-        keys = self._raw.keys()
+        keys = np.sort(pack_keys(volume.blocks().coordinates))
         self._stale = np.union1d(keys, np.array(sorted(self._shown), np.int64))
         self._unrefined = _NONE if self._is_raw else keys
 
@@ -115,7 +115,7 @@ class PiecewiseMap:
 
     def _move(self) -> None:
         """Let keyframes come and go for a while, then mesh some of what changed."""
-        self._refined = None
+        self._values = None
         self._tell()
         until = time.monotonic() + _MOVING_S
         while not self._map.is_there and time.monotonic() < until:
@@ -139,25 +139,29 @@ class PiecewiseMap:
             self._unrefined = np.union1d(self._unrefined, pack_keys(volume.cells_to_mesh(blocks)))
 
     def _show_raw(self) -> None:
-        assert self._raw is not None
-        self._show(self._stale[:CELLS], self._raw, is_refined=self._is_raw)
+        assert self._volume is not None
+        found = self._volume.mesh_cells(unpack_keys(self._stale[:CELLS]), "raw")
+        self._show(found, is_refined=self._is_raw)
         self._stale = self._stale[CELLS:]
 
     def _show_refined(self) -> None:
-        assert self._volume is not None
-        self._refined = self._refined or self._volume.cell_meshes()
+        volume, keys = self._volume, self._unrefined[:CELLS]
+        assert volume is not None
+        self._values = self._values or volume.whole_values()
         self._is_refining = True
         try:
-            self._show(self._unrefined[:CELLS], self._refined, is_refined=True)
+            found = volume.mesh_cells(unpack_keys(keys), values=self._values)
         except _Interrupted:
             return
         finally:
             self._is_refining = False
+        self._values.forget_before(int(keys[-1]))
+        self._show(found, is_refined=True)
         self._unrefined = self._unrefined[CELLS:]
 
-    def _show(self, keys: NDArray[np.int64], meshes: CellMeshes, *, is_refined: bool) -> None:
+    def _show(self, found: CellMeshes, *, is_refined: bool) -> None:
         """Send the triangles of some cells; those that have none, and had none, are left out."""
-        mesh, first = meshes.mesh(keys)
+        keys, first = pack_keys(found.cells), found.first_face
         has_faces = np.diff(first) > 0
         was_shown = np.fromiter((key in self._shown for key in keys.tolist()), bool, len(keys))
         told = has_faces | was_shown
@@ -168,9 +172,8 @@ class PiecewiseMap:
             client = None
             if len(self._sessions) == 1:
                 client = np.zeros(int(told.sum()), np.int32)
-            self._send(
-                [SurfaceUpdate(unpack_keys(keys[told]), first, mesh, is_refined, self._sessions, client)]
-            )
+            update = SurfaceUpdate(found.cells[told], first, found.mesh, is_refined, self._sessions, client)
+            self._send([update])
 
     def _send_place(self) -> None:
         """Show where the keyframes are that the map has."""

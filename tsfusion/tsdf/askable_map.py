@@ -231,14 +231,21 @@ class AskableMap(ReadableMap):
         """
         return self.current_slice(low, high, **options).distances()
 
-    def mesh_cells(self, cells: NDArray[np.int32], surface: Surface | None = None) -> CellMeshes:
+    def mesh_cells(
+        self,
+        cells: NDArray[np.int32],
+        surface: Surface | None = None,
+        *,
+        values: SurfaceView | None = None,
+    ) -> CellMeshes:
         """The mesh of `extract_mesh(blocks=cells)`, and which of its faces are each cell's.
 
         Args:
             cells: (n, 3) int32 block coordinates; of a block that the map does not have there are none.
+            values: of `whole_values`, for the very triangles of the whole map's mesh.
         """
         keys = np.unique(pack_keys(cells))
-        return self._mesh_keys(keys, self._checked_min_weight(None), self._view(surface))
+        return self._mesh_keys(keys, self._checked_min_weight(None), values or self._view(surface))
 
     def _mesh_keys(self, keys: NDArray[np.int64], min_weight: float, view: SurfaceView) -> CellMeshes:
         is_there = self._store.slots_of(keys) >= 0

@@ -4,8 +4,6 @@
 A tile is a run of blocks in the order of their keys: it has the vertices on its blocks' voxel edges and the
 triangles of their cells. Tiles come last first: a cell's other vertices lie towards +x, +y, +z, in tiles that
 are known by then. Vertices are counted from the end of the whole mesh, whose length shows with the last tile.
-
-`CellMeshes` gives the same triangles some cells at a time, each lot a mesh of its own.
 """
 
 from collections.abc import Iterator
@@ -14,11 +12,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.mesh_parts import MeshPart
 from tsfusion.tsdf import field_regularizer, mesh_extraction
 from tsfusion.tsdf.block_store import CELL_STEPS, BlockStore
-from tsfusion.tsdf.surface_values import SurfaceView, values_of
+from tsfusion.tsdf.surface_values import SurfaceView
 
 _FARTHEST = int(CELL_STEPS.max())  # what the keys of blocks that share a cell differ by at most
 
@@ -48,7 +45,7 @@ def tiles(store: BlockStore, min_weight: float, view: SurfaceView) -> Iterator[M
     """
     size = field_regularizer.BATCH
     keys = np.sort(store.keys)
-    values = _Batches(keys, view, size)
+    values = WholeMapValues(keys, view, size)
     buffers = mesh_extraction.MeshBuffers()
     beyond = _Numbered(keys[:0], np.zeros((0, 24), np.uint64), keys[:0])
     done = 0
@@ -109,43 +106,16 @@ def _bits(planes: NDArray[np.uint64]) -> NDArray[np.uint8]:
     return np.unpackbits(octets, axis=1, bitorder="little")
 
 
-class CellMeshes:
-    """The cells of a map, meshed some at a time: together they are the triangles of the whole map's mesh.
+class WholeMapValues:
+    """A `SurfaceView` whose values are those of the whole map: its blocks are solved in the same batches.
 
-    Of use as long as the map stays as it is (of the raw surface: always), and in the order of the keys:
-    values that were solved are kept for cells with larger ones.
+    Of use as long as the map stays as it is.
 
+    Args:
+        keys: sorted, of all blocks of the map.
+        view: reads the surface.
+        size: blocks a batch.
     """
-
-    def __init__(self, store: BlockStore, min_weight: float, view: SurfaceView) -> None:
-        self._store, self._min_weight = store, min_weight
-        self._batches: _Batches | None = None
-        if view is not values_of:
-            self._batches = _Batches(self.keys(), view, field_regularizer.BATCH)
-        self._buffers = mesh_extraction.MeshBuffers()
-
-    def keys(self) -> NDArray[np.int64]:
-        """Sorted keys of the map's blocks: those of all cells with triangles are among them."""
-        return np.sort(self._store.keys)
-
-    def mesh(self, wanted: NDArray[np.int64]) -> tuple[Mesh, NDArray[np.int32]]:
-        """The mesh of some cells, and (n + 1,) where the faces of each begin.
-
-        Args:
-            wanted: (n,) sorted distinct keys of their blocks; one that the map lacks has no faces.
-        """
-        there = wanted[self._store.slots_of(wanted) >= 0]
-        view = self._batches or values_of
-        mesh, rows = mesh_extraction.extract_rows(there, self._store, self._min_weight, self._buffers, view)
-        begins = np.append(self._buffers.first.array[: len(rows), 1], np.int32(len(mesh.faces)))
-        first = begins[np.searchsorted(rows, wanted)]
-        if self._batches is not None and len(wanted):
-            self._batches.forget_before(int(wanted[-1]) - _FARTHEST)
-        return mesh, np.append(first, np.int32(len(mesh.faces)))
-
-
-class _Batches:
-    """A `SurfaceView` whose values are those of the whole map: its blocks are solved in the same batches."""
 
     def __init__(self, keys: NDArray[np.int64], view: SurfaceView, size: int) -> None:
         self._keys, self._view, self._size = keys, view, size
@@ -175,8 +145,8 @@ class _Batches:
             del self._solved[number]
 
     def forget_before(self, key: int) -> None:
-        """Let go of batches in which every key is smaller."""
-        for number in [one for one in self._solved if self._last(one) < key]:
+        """Let go of batches that no cell from this key on reads."""
+        for number in [one for one in self._solved if self._last(one) < key - _FARTHEST]:
             del self._solved[number]
 
     def _last(self, number: int) -> int:

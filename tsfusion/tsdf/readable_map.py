@@ -33,7 +33,7 @@ from tsfusion.tsdf import (
 from tsfusion.tsdf.block_store import BlockStore, cells_of, pack_keys, unpack_keys
 from tsfusion.tsdf.map_difference import MapDifference
 from tsfusion.tsdf.mesh_extraction import MeshBuffers, extract
-from tsfusion.tsdf.mesh_tiles import CellMeshes, tiles
+from tsfusion.tsdf.mesh_tiles import WholeMapValues, tiles
 from tsfusion.tsdf.surface_values import SurfaceView, values_of
 from tsfusion.tsdf.texture_images import Keyframes
 
@@ -119,9 +119,9 @@ class ReadableMap:
         finally:
             self._mesh_buffers = buffers
 
-    def cell_meshes(self, surface: Surface | None = None) -> CellMeshes:
-        """The triangles of `extract_mesh`, some cells at a time, as long as the map stays as it is."""
-        return CellMeshes(self._store, self._checked_min_weight(None), self._view(surface))
+    def whole_values(self, surface: Surface | None = None) -> WholeMapValues:
+        """What `extract_mesh` of the whole map meshes, for `mesh_cells`, while the map stays as it is."""
+        return WholeMapValues(np.sort(self._store.keys), self._view(surface), field_regularizer.BATCH)
 
     def mesh_parts(
         self, folder: str | os.PathLike[str], min_weight: float | None = None, *, up: Up | None = None

@@ -81,9 +81,8 @@ class ScannerMarks:
     def note_seen(self, event: ScannerSeen) -> None:
         """Take a keyframe into account."""
         scanner = self._scanner(event.session)
-        if scanner.newest is None or event.seq >= scanner.newest.seq:
-            scanner.newest, scanner.pose = event, event.T_world_camera
-            scanner.picture = event.picture or scanner.picture
+        scanner.newest, scanner.pose = event, event.T_world_camera  # an earlier one: the map is rewound
+        scanner.picture = event.picture or scanner.picture
         position = event.T_world_camera[:3, 3]
         scanner.first.setdefault(event.seq, position)
         scanner.now[event.seq] = position
@@ -93,16 +92,16 @@ class ScannerMarks:
         """Take the places of all keyframes into account; what came after them stays."""
         for session, scanner in self._scanners.items():
             if session not in event.paths and scanner.is_found:
-                scanner.now, scanner.is_drawn = {}, False
+                scanner.now, scanner.newest, scanner.pose, scanner.is_drawn = {}, None, None, False
         for session, (seqs, poses) in event.paths.items():
             scanner = self._scanner(session)
             numbers = seqs.tolist()
             last = max(numbers, default=-1)
-            later = {seq: place for seq, place in scanner.now.items() if seq > last}
+            newest = last if scanner.newest is None else scanner.newest.seq
+            later = {seq: place for seq, place in scanner.now.items() if last < seq <= newest}
             scanner.now = dict(zip(numbers, poses[:, :3, 3], strict=True)) | later
             for seq, place in scanner.now.items():
                 scanner.first.setdefault(seq, place)
-            newest = last if scanner.newest is None else scanner.newest.seq
             if newest in numbers:
                 scanner.pose = poses[numbers.index(newest)]
             scanner.is_found, scanner.is_drawn = True, False
@@ -130,6 +129,8 @@ class ScannerMarks:
 
     def _place(self, session: bytes, scanner: _Scanner, now: float) -> None:
         if scanner.pose is None:
+            if (gone := scanner.nodes.pop("scanners", None)) is not None:
+                gone.remove()
             return
         wxyz, position = np.roll(quaternion(scanner.pose[:3, :3]), 1), scanner.pose[:3, 3]
         node = scanner.nodes.get("scanners")
