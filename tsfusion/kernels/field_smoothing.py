@@ -62,6 +62,15 @@ def neighbour(
     return found
 
 
+@ti.func
+def link(
+    number: ti.template(), starts: ti.template(), around: ti.template(), bits, b, o, i, links: ti.template()
+):
+    """Row i of `links`: the numbers of the cells beside cell o, the number of rows where there is none."""
+    for side in ti.static(range(6)):
+        links[i, side] = neighbour(number, starts, around, bits, b, o, side // 2, side % 2, links.shape[0])
+
+
 @ti.kernel
 def list_voxels(
     values: ti.types.ndarray(dtype=ti.f32, ndim=2),
@@ -86,10 +95,7 @@ def list_voxels(
                     y[i] = values[b, o]
                     x[i] = values[b, o]
                     weight[i] = ti.cast(lane_weight(sums[slots[b], o]), ti.f32) / WEIGHT_ONE
-                    for side in ti.static(range(6)):
-                        links[i, side] = neighbour(
-                            number, starts, around, 3, b, o, side // 2, side % 2, links.shape[0]
-                        )
+                    link(number, starts, around, 3, b, o, i, links)
 
 
 @ti.func
@@ -176,18 +182,7 @@ def list_parents(
                     i = coarse_starts[b] + coarse_number[b, c]
                     coarse_y[i] = 0.0
                     coarse_weight[i] = 0.0
-                    for side in ti.static(range(6)):
-                        coarse_links[i, side] = neighbour(
-                            coarse_number,
-                            coarse_starts,
-                            around,
-                            bits - 1,
-                            b,
-                            c,
-                            side // 2,
-                            side % 2,
-                            coarse_links.shape[0],
-                        )
+                    link(coarse_number, coarse_starts, around, bits - 1, b, c, i, coarse_links)
             for o in range(number.shape[1]):
                 if number[b, o] >= 0:
                     k = starts[b] + number[b, o]

@@ -7,11 +7,11 @@ regulariser, whose `bend` and `relax` then solve it: paper eq. 3 with no weight 
 
 import taichi as ti
 
-from tsfusion.kernels.field_smoothing import neighbour
+from tsfusion.kernels.field_smoothing import link
 from tsfusion.kernels.integrate import CUBE
-from tsfusion.kernels.normal_smoothing import value_at
+from tsfusion.kernels.normal_smoothing import block_at, value_at
 from tsfusion.kernels.surface_cells import case_of, corner_planes, lowest
-from tsfusion.kernels.voxel_traversal import RUN, vec3i
+from tsfusion.kernels.voxel_traversal import RUN, offset_in_block, vec3i, voxel_of
 from tsfusion.kernels.voxel_values import BANDS
 
 UNSEEN = 1  # voxels to solve
@@ -21,11 +21,6 @@ SEEN_WEIGHT = 0.2  # of a seen value against the smoothness: noise at the rim do
 EARLY = 1 << 20  # layer of a voxel that has no value yet
 
 vec3f = ti.types.vector(3, ti.f32)
-
-
-@ti.func
-def voxel_of(o):
-    return vec3i(o >> 6, (o >> 3) & 7, o & 7)
 
 
 @ti.kernel
@@ -127,13 +122,14 @@ def mark_unseen(
                         block = -1
                         last = 1 << 20
                         for z in range(p[2] - columns[c, 2], p[2] + columns[c, 2] + 1):
-                            d = ti.cast(vec3i(x, y, z) - p, ti.f32)
+                            q = vec3i(x, y, z)
+                            d = ti.cast(q - p, ti.f32)
                             if abs(normal.dot(d)) <= slab + slope * d.norm():
                                 if z >> 3 != last:
                                     last = z >> 3
                                     block = row_of(keys, count, column + last)
                                 if block >= 0:
-                                    i = ((x & 7) << 6) | ((y & 7) << 3) | (z & 7)
+                                    i = offset_in_block(q)
                                     there = values[block, i]
                                     if not (there == there):
                                         marks[block, i] = ti.u8(UNSEEN)
@@ -158,10 +154,9 @@ def number_marked(
                     for k in range(6 * RING):
                         q = voxel_of(o)
                         q[k // (2 * RING)] += k % RING + 1 if k // RING % 2 == 0 else -(k % RING + 1)
-                        row = around[b, ((q[0] >> 3) + 1) * 9 + ((q[1] >> 3) + 1) * 3 + (q[2] >> 3) + 1]
+                        row = block_at(around, b, q)
                         if row >= 0:
-                            i = ((q[0] & 7) << 6) | ((q[1] & 7) << 3) | (q[2] & 7)
-                            if marks[row, i] == UNSEEN:
+                            if marks[row, offset_in_block(q)] == UNSEEN:
                                 taken = BESIDE
                 number[b, o] = ti.select(taken > 0, n, -1)
                 n += ti.cast(taken > 0, ti.i32)
@@ -195,10 +190,7 @@ def list_marked(
                     x[i] = value
                     weight[i] = ti.select(seen, ti.f32(SEEN_WEIGHT), 0.0)
                     layer[i] = ti.select(seen, 0, EARLY)
-                    for side in ti.static(range(6)):
-                        links[i, side] = neighbour(
-                            number, starts, sides, 3, b, o, side // 2, side % 2, links.shape[0]
-                        )
+                    link(number, starts, sides, 3, b, o, i, links)
 
 
 @ti.kernel
@@ -231,30 +223,6 @@ def extend(
                 layer[i] = sweep
                 given += 1
     return given
-
-
-@ti.kernel
-def write_marked(
-    rows: ti.types.ndarray(dtype=ti.i32, ndim=1),  # of the listed blocks, which of them to write
-    marks: ti.types.ndarray(dtype=ti.u8, ndim=2),
-    number: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    starts: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    layer: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    x: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    filled: ti.types.ndarray(dtype=ti.f32, ndim=2),
-):
-    """Values of the voxels that were solved; NaN elsewhere."""
-    for run in range(rows.shape[0] * RUN):  # run loop: kernels/__init__.py
-        if run % RUN == 0:
-            r = run // RUN
-            b = rows[r]
-            for o in range(CUBE):
-                value = ti.math.nan
-                if marks[b, o] == UNSEEN:
-                    i = starts[b] + number[b, o]
-                    if layer[i] != EARLY:
-                        value = x[i]
-                filled[r, o] = value
 
 
 @ti.kernel

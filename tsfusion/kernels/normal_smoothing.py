@@ -8,18 +8,24 @@ the centre row of (I + λ D2ᵀD2)⁻¹, as many samples a side as were seen.
 import taichi as ti
 
 from tsfusion.kernels.integrate import CUBE
-from tsfusion.kernels.voxel_traversal import RUN, vec3i
+from tsfusion.kernels.voxel_traversal import RUN, offset_in_block, vec3i, voxel_of
 
 vec3f = ti.types.vector(3, ti.f32)
 
 
 @ti.func
+def block_at(around: ti.template(), b, p):
+    """Row of the block that holds a voxel, −1 where there is none; p is relative to block b."""
+    return around[b, ((p[0] >> 3) + 1) * 9 + ((p[1] >> 3) + 1) * 3 + (p[2] >> 3) + 1]
+
+
+@ti.func
 def value_at(values: ti.template(), around: ti.template(), b, p):
     """Value of the voxel with block-relative coordinates p, NaN where unseen."""
-    row = around[b, ((p[0] >> 3) + 1) * 9 + ((p[1] >> 3) + 1) * 3 + (p[2] >> 3) + 1]
+    row = block_at(around, b, p)
     value = ti.math.nan
     if row >= 0:
-        value = values[row, ((p[0] & 7) << 6) | ((p[1] & 7) << 3) | (p[2] & 7)]
+        value = values[row, offset_in_block(p)]
     return value
 
 
@@ -59,7 +65,7 @@ def smooth_along_normals(
                     here = values[rows[r], o]
                 result = here
                 if abs(here) <= reach:
-                    p = vec3i(o >> 6, (o >> 3) & 7, o & 7)
+                    p = voxel_of(o)
                     normal = vec3f(0.0)
                     for a in ti.static(range(3)):
                         step = vec3i(0)

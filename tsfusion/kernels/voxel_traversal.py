@@ -198,6 +198,12 @@ def offset_in_block(voxel):
 
 
 @ti.func
+def voxel_of(o):
+    """Where the voxel of this number lies in its block."""
+    return vec3i(o >> 6, (o >> 3) & 7, o & 7)
+
+
+@ti.func
 def block_key(voxel):
     """Key of the block that holds a voxel."""
     return pack(voxel[0] >> 3, voxel[1] >> 3, voxel[2] >> 3)

@@ -123,7 +123,10 @@ def _solve(
     if len(level.links):
         _relax(level, voxels)
     filled = np.empty((len(part), CUBE), np.float32)
-    kernels.write_marked(_rows(local, part), marks, level.number, level.starts, layer, level.x, filled)
+    level.number[marks != kernels.UNSEEN] = field_smoothing.NONE
+    level.x[layer == kernels.EARLY] = np.nan
+    values.fill(np.nan)  # they are not asked for
+    field_smoothing.write_values(_rows(local, part), values, level.number, level.starts, level.x, filled)
     return filled
 
 
