@@ -29,7 +29,7 @@ with BottomLine() as line:
 
 
 def shown(rows: int, columns: int, **variables: str) -> str:
-    """What a terminal of this size is sent."""
+    """Bytes that a terminal of this size is sent."""
     leader, follower = pty.openpty()
     fcntl.ioctl(follower, termios.TIOCSWINSZ, struct.pack("HHHH", rows, columns, 0, 0))
     process = subprocess.Popen(

@@ -279,7 +279,7 @@ def test_a_sensor_chosen_in_the_environment_counts(
 
 
 def test_flags_of_the_environment_are_not_refused(here: Here, monkeypatch: pytest.MonkeyPatch) -> None:
-    """They may be meant for other commands."""
+    """Variables may be meant for other commands."""
     monkeypatch.setenv("TSFUSION_VOXEL_SIZE", "0.5")
     monkeypatch.setattr("tsfusion.wire.queries._PING_TIMEOUT", 0.2)
     assert "no server" in one_line(here("mesh", NOBODY, "a.ply"))

@@ -89,7 +89,7 @@ class Link:
 
 
 class ModelServer:
-    """What a server promises, without files and sockets."""
+    """Promises of a server, without files and sockets."""
 
     def __init__(self, rng: random.Random) -> None:
         self.rng = rng
@@ -174,7 +174,7 @@ class World:
         self.sender._wait = lambda now: None  # type: ignore[method-assign]
 
     def kill_client(self) -> None:
-        """What it had under way may still arrive."""
+        """Records that it had under way may still arrive."""
         self.deaths += 1
         self.data.reopen()
         old = self.data.old
@@ -237,7 +237,7 @@ class World:
         )
 
     def cut_data(self) -> None:
-        """What was under way arrives later, in part, or never."""
+        """Records under way arrive later, in part, or never."""
         self.data.reopen()
         kept = self.rng.randrange(len(self.data.old[-1]) + 1)
         self.data.old[-1] = deque(list(self.data.old[-1])[:kept])

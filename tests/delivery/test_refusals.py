@@ -144,7 +144,7 @@ def test_what_is_larger_than_the_server_takes_is_not_sent(tmp_path: Path) -> Non
 
 
 def test_a_real_server_refuses_some_and_fuses_the_rest(tmp_path: Path) -> None:
-    """Those that look from too far away; what is kept aside is not sent again, by nobody."""
+    """Keyframes that look from too far away are refused; what is kept aside is not sent again, by nobody."""
     spool = tmp_path / "spool"
     with serving(tmp_path / "state", quota_extent=10.0) as server:
         with Client(server.address, spool=spool, policy="spool_all") as client:

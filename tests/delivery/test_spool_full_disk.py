@@ -47,7 +47,7 @@ def messages_of(caplog: pytest.LogCaptureFixture, level: int) -> list[str]:
 
 
 def delivered(spool: Path, count: int) -> list[int]:
-    """What a server gets of a spool that was left behind."""
+    """Keyframes that a server gets of a spool that was left behind."""
     with scripted() as server, joined(server, spool=spool) as client:
         client.flush(DEADLINE)
         assert client.stats.durable == count

@@ -236,7 +236,7 @@ def test_bad_times_and_bad_messages(server: Server) -> None:
 
 
 def test_what_is_too_large_is_an_error_of_the_fuser(server: Server) -> None:
-    """What only the map knows: how large its voxels are, and whether there are so many."""
+    """Bounds that only the map knows: how large its voxels are, and whether there are so many."""
     before = counts(server).get("failed", 0)
     with MapClient(server.address, timeout=EASY) as asked:
         for box, farthest in ((BOX, 20.0), ((-90, -90, -90, 90, 90, 90), 0.1)):
@@ -334,7 +334,7 @@ def test_keys_say_whose_map_may_be_asked(tmp_path: Path) -> None:
 
 
 def test_an_older_server_is_named() -> None:
-    """It answers a ping, and drops a command that it does not know."""
+    """A server of then answers a ping, and drops a command that it does not know."""
     context: zmq.Context[Any] = zmq.Context()
     link = sockets.router(context)
     port = link.bind_to_random_port("tcp://127.0.0.1")

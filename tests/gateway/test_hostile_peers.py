@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What goes wrong around a server: strangers, full disks, missing files. Its other clients do not notice."""
+"""Mishaps around a server: strangers, full disks, missing files. Its other clients do not notice."""
 
 import os
 import time

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What may go of a journal: only what two checkpoints hold, whatever became of those who wrote them."""
+"""Records that may leave a journal: those that two checkpoints hold, whatever became of who wrote them."""
 
 from typing import Any, cast
 
@@ -103,7 +103,7 @@ def test_a_keyframe_that_somebody_asks_for_stays_in_the_index() -> None:
 
 
 def test_what_a_dead_fuser_had_covers_nothing() -> None:
-    """It had fused all ten; the checkpoint has four, and the next fuser begins there."""
+    """A fuser that fused all ten is ended; the checkpoint has four, and the next fuser begins there."""
     retention, folder, session = ten_segments()
     retention.on_ready()
     session.in_map = 4

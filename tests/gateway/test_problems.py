@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a person would call a problem: told while it is there, since when, logged at its begin and its end."""
+"""Problems as a person names them: told while they last, and since when; logged at begin and end."""
 
 import logging
 import os

@@ -20,7 +20,7 @@ def area(mesh: Mesh) -> float:
 
 @pytest.fixture(scope="module")
 def sphere() -> Mesh:
-    """Its colour is its place, so that colours can be checked anywhere."""
+    """A mesh whose colour is its place, so that colours can be checked anywhere."""
     mesh = volume_of(sphere_views(0.2, 6)).extract_mesh()
     colors = np.round((mesh.vertices + 0.3) * 400).astype(np.uint8)
     return replace(mesh, colors=colors, guessed=mesh.vertices[mesh.faces[:, 0], 0] > 0)

@@ -345,7 +345,7 @@ def test_a_segment_of_rubbish_costs_itself_alone(tmp_path: Path, caplog: pytest.
 def test_a_segment_that_cannot_be_read_is_not_passed_over(
     tmp_path: Path, what: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its keyframes may be there at the next start, when those behind them are in the map."""
+    """Keyframes in it may be there at the next start, when those behind them are in the map."""
     write(tmp_path, 12, 4000)
     before = Journal(tmp_path, BIG).found
     readable = sum(found.position.segment != 2 for found in before)
@@ -393,7 +393,7 @@ def test_a_segment_that_cannot_be_read_is_not_passed_over(
 def test_only_bad_sectors_are_read_as_damage(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """What the system refuses for want of memory may be there the next time."""
+    """Files that the system refuses for want of memory may be there the next time."""
     write(tmp_path, 3)
     monkeypatch.setattr(os, "pread", refuse(errno.ENOMEM))
     with pytest.raises(JournalError) as raised:

@@ -175,7 +175,7 @@ def test_a_record_is_not_acknowledged_in_a_file_that_vanished_meanwhile(
 def test_a_record_of_a_file_whose_place_is_not_known_is_taken_back(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It was reported as not written: nobody may find it beside the one that comes again."""
+    """A record was reported as not written: nobody may find it beside the one that comes again."""
     log = Journal(tmp_path, BIG)
     fill(log, 1)
     with monkeypatch.context() as patched:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What was acknowledged is read back, after any end of the process and beside any damage."""
+"""Acknowledged records are read back, after any end of the process and beside any damage."""
 
 import os
 import signal

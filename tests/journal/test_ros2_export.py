@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What is exported is what was journaled, to two independent readers of ROS 2 bags."""
+"""Exported bags hold what was journaled, to two independent readers of ROS 2 bags."""
 
 import builtins
 import json

@@ -214,7 +214,7 @@ def test_no_length_makes_a_reader_ask_for_more_than_the_file(
 
 
 def test_frames_that_do_not_fill_their_record_make_it_none(tmp_path: Path) -> None:
-    """Its CRC is right: somebody made it up."""
+    """A record whose CRC is right was made up by somebody."""
     segment = Segment(tmp_path, closed=False)
     place = segment.places[0]
     raw = bytearray(segment.whole[place.offset : segment.ends[0]])

@@ -20,7 +20,7 @@ Here = Callable[..., "subprocess.CompletedProcess[str]"]  # of the fixture `here
 
 
 def environment() -> dict[str, str]:
-    """This one without tsfusion's own variables."""
+    """Variables of this process without tsfusion's own variables."""
     return {key: value for key, value in os.environ.items() if not key.startswith("TSFUSION_")}
 
 

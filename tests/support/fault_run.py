@@ -134,7 +134,7 @@ def cases(counts: dict[tuple[str, str, str], int], process: str) -> list[Case]:
 
 
 class Report(Struct):
-    """What a watcher saw."""
+    """Findings of a watcher."""
 
     happened: bool
     counts: list[tuple[str, str, str, int]]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What an attacked server shows of itself all the time: memory, health, and how long it takes to answer."""
+"""Figures that an attacked server shows all the time: memory, health, and how long it takes to answer."""
 
 import contextlib
 import threading

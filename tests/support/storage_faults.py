@@ -36,7 +36,7 @@ CALL = "faulty call"
 
 
 class Promises:
-    """What a process was told, on the disk."""
+    """Numbers that a process was promised, on the disk."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -93,7 +93,7 @@ def use_checkpoints(folder: Path, promises: Promises) -> None:
 
 
 def problems(folder: Path, promises: Promises) -> list[str]:
-    """What is not as it was promised."""
+    """Promises that were not kept."""
     found = []
     log = Journal(folder / "journal", SEGMENT_BYTES)
     seqs = [entry.seq for entry in log.found]

@@ -62,10 +62,10 @@ class SumMap:
         self._total = 0
 
     def warm_up(self) -> None:
-        """There is nothing to compile."""
+        """Compile nothing: there are no kernels."""
 
     def limit_memory(self, nbytes: int) -> None:
-        """It takes none."""
+        """Ignore the limit: sums take next to nothing."""
 
     def set_pause(self, pause: Callable[[], None]) -> None:
         """Nothing takes long."""

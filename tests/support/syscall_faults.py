@@ -237,7 +237,7 @@ def _process_of(thread: int) -> int:
 
 
 def _path(thread: int, number: int, arguments: list[int]) -> str:
-    """What a call is about: a path, or the link of its descriptor."""
+    """Subject of a call: a path, or the link of its descriptor."""
     kind = CALLS[number][1]
     if kind == "mmap":
         return _link(thread, arguments[4])

@@ -68,7 +68,7 @@ def test_a_map_is_read_and_written_in_little_more_memory_than_it_takes(tmp_path:
 
 
 def test_a_map_takes_no_more_than_it_may_however_it_has_grown(tmp_path: Path) -> None:
-    """What fits does not depend on when the map was saved and read, and what does not leaves it as it was."""
+    """Room does not depend on when the map was saved and read; what finds none leaves the map as it was."""
     once, again = volume_of([]), volume_of([])
     fitted: list[list[int]] = [[], []]
     most = volume_of(VIEWS[:2]).stats().bytes

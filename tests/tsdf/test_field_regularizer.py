@@ -169,7 +169,7 @@ def test_an_empty_map_and_absent_blocks() -> None:
 
 @pytest.mark.parametrize("sensor", ["kinect", "stereo"])
 def test_a_part_equals_the_whole_to_a_hundredth_voxel(monkeypatch: pytest.MonkeyPatch, sensor: str) -> None:
-    """What a keyframe changes is found again by solving its blocks and those around; nothing else moves."""
+    """Changes by a keyframe are found again by solving its blocks and those around; nothing else moves."""
     random = np.random.default_rng(0)
     *views, last = (with_noise(view, 0.004, random) for view in sphere_views(0.5, 8))
     volume = volume_of(views, sensor=sensor, regularizer="off")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What should not be in the map: lone pixels, and things that have moved on. And what should: thin things."""
+"""Lone pixels and things that have moved on should not be in the map; thin things should."""
 
 from dataclasses import replace
 

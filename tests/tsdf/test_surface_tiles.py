@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What is kept of answers: the same as asked anew, whatever happened to the map."""
+"""Surfaces kept of answers: the same as asked anew, whatever happened to the map."""
 
 from collections.abc import Iterator
 

@@ -235,7 +235,7 @@ def test_a_lost_camera_finds_itself():
 
 
 def test_a_lost_tracker_goes_on_where_it_has_been_before():
-    """It walks on for 4 m, is covered, and wakes up where it was long ago: the world is the same."""
+    """The sensor walks on for 4 m, is covered, and wakes up where it was long ago: the world is the same."""
     dataset = Synthetic("corridor", count=520, width=320)
     alone = RGBDLocalizer()
     for index in range(34, 46):
@@ -280,7 +280,7 @@ def straight(count: int, drift: OdometryDrift | None = None) -> OdometryChain:
 
 
 def claim(old: int, new: int, *, off: float = 0.0, sigma: float = 0.02) -> Loop:
-    """That `new` stands where odometry puts it, `off` metres farther along."""
+    """Check that `new` stands where odometry puts it, `off` metres farther along."""
     return Loop(old, new, se3.exp(np.array([0.5 * (new - old) + off, 0, 0, 0, 0, 0])), sigma)
 
 
