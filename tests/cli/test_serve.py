@@ -71,7 +71,8 @@ def test_serve_answers_and_ends_well(tmp_path: Path) -> None:
     ("flags", "message"),
     [
         (("--memory", "much"), "expected a number of bytes such as 2GB, 512MiB or 2000000000, got 'much'"),
-        (("--memory", "1MB"), "fuser_memory_bytes must be >= 268435456, got 1000000"),
+        (("--memory", "1MB"), "--memory: fuser_memory_bytes must be >= 268435456, got 1000000"),
+        (("--disk", "0"), "--disk: fuser_disk_bytes must be "),
         (("--cache", "."), "--cache has no effect without --memory: all blocks stay in memory"),
     ],
 )

@@ -124,7 +124,12 @@ def _configuration(file: Path | None, settings: dict[str, Any]) -> "Config":
     from tsfusion.core.errors import InvalidConfig
 
     sizes = {name: options.byte_count(settings[name]) for name in ("fuser_memory_bytes", "fuser_disk_bytes")}
-    chosen = options.configuration(file, **{**settings, **sizes})
+    try:
+        chosen = options.configuration(file, **{**settings, **sizes})
+    except InvalidConfig as error:  # of a setting that has not its flag's name
+        flags = {"fuser_memory_bytes must": "--memory", "fuser_disk_bytes must": "--disk"}
+        flag = next((flag for begin, flag in flags.items() if str(error).startswith(begin)), None)
+        raise error if flag is None else InvalidConfig(f"{flag}: {error}") from error
     server = chosen.server
     if server.fuser_disk_bytes is None:
         if sizes["fuser_memory_bytes"] is not None:
