@@ -12,6 +12,7 @@ from keyframes_and_servers import wall
 
 from tsfusion.core.errors import InvalidKeyframe
 from tsfusion.delivery import outcomes
+from tsfusion.delivery.number_runs import NumberRuns
 from tsfusion.delivery.outbox import Outbox
 from tsfusion.delivery.spool import Spool, Waiting
 from tsfusion.journal import Position
@@ -85,6 +86,37 @@ def test_a_rejection_counts_once_and_few_are_remembered(
     for seq in range(2, 9):
         outbox.reject(seq, "crash")
     assert list(outbox._outcomes._rejected_seqs) == [7, 8]
+
+
+def test_a_rejection_behind_its_acknowledgement_counts_once(tmp_path: Path) -> None:
+    """An older server tells whoever was silent how far its session is, and then what was rejected of it."""
+    spool = Spool(tmp_path, 1 << 20)
+    outbox = Outbox(spool)
+    outbox._corrections.add(4)
+    for seq in range(1, 7):
+        spool.add(Waiting(seq, Position(1, 0), 100, is_correction=seq == 4))
+    outbox.acknowledge(6, 5)
+    assert outbox.stats().fused == 4
+    for _ in range(2):  # a server may tell it twice
+        outbox.reject(2, "MapFull")
+    outbox.reject(4, "MapFull")
+    outbox.reject(6, "MapFull")
+    outbox.acknowledge(6, 6)
+    stats = outbox.stats()
+    assert (stats.fused, stats.rejected, stats.corrections_refused) == (3, {"MapFull": 2}, {"MapFull": 1})
+    assert outbox.is_fused
+    outbox.close()
+
+
+def test_numbers_of_fused_keyframes_take_no_room() -> None:
+    runs = NumberRuns()
+    for number in (1, 2, 3, 5, 6, 9):
+        runs.append(number)
+    assert [number in runs for number in range(11)] == [n in (1, 2, 3, 5, 6, 9) for n in range(11)]
+    runs.keep_newest(2)
+    assert (runs.first, len(runs), 3 in runs, 6 in runs) == (5, 3, False, True)
+    runs.keep_newest(0)
+    assert (runs.first, len(runs), 9 in runs) == (None, 0, False)
 
 
 def test_what_the_map_has_not_answered_takes_no_room(tmp_path: Path) -> None:

@@ -12,6 +12,22 @@ class NumberRuns:
         self._runs: deque[range] = deque()
         self._count = 0
 
+    def __contains__(self, number: int) -> bool:
+        for run in reversed(self._runs):
+            if run.start <= number:
+                return number in run
+        return False
+
+    @property
+    def first(self) -> int | None:
+        """The lowest number; None = there is none."""
+        return self._runs[0].start if self._runs else None
+
+    def keep_newest(self, runs: int) -> None:
+        """Forget the oldest numbers, down to so many runs."""
+        while len(self._runs) > runs:
+            self._count -= len(self._runs.popleft())
+
     def __len__(self) -> int:
         return self._count
 

@@ -23,6 +23,7 @@ from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.wire.keyframe_times import KeyframeTimes, Stamps
 
 _CHECK_INTERVAL = 0.5  # seconds between two calls of what `wait` was given to check
+_FUSED_RUNS = 4096  # of numbers without a gap, that are remembered as fused: a rejection may come behind
 
 
 class Outbox:
@@ -45,6 +46,7 @@ class Outbox:
         self.spool_problem = ""  # why the spool cannot keep what comes; empty = it can
         self._outstanding = 0  # of the oldest in the spool, so many are on their way
         self._unfused = NumberRuns()  # durable, and not answered by the map
+        self._fused = NumberRuns()  # keyframes that were counted as fused, the newest ones
         self._last_fused = self._last_meshed = 0  # numbers
         self._settled = 0  # the map has everything up to this number, each keyframe at its newest pose
         self._corrections_waiting = 0
@@ -311,7 +313,7 @@ class Outbox:
                     self._corrections.remove(seq)
                 else:
                     taken += 1
-                    self._outcomes.fused += not self._outcomes.is_rejected(seq)
+                    self._count_fused(seq)
             if taken:
                 self._rate.note(self.clock(), taken, is_more_waiting=self.behind > 0)
             for one in stamps:
@@ -321,6 +323,13 @@ class Outbox:
                     self.note_meshed(one.seq)
             self._changed.notify_all()
             return bool(dropped)
+
+    def _count_fused(self, seq: int) -> None:
+        """Count a keyframe that the map has answered, unless it was rejected. The lock is held."""
+        if not self._outcomes.is_rejected(seq):
+            self._outcomes.fused += 1
+            self._fused.append(seq)
+            self._fused.keep_newest(_FUSED_RUNS)
 
     def note_meshed(self, seq: int) -> None:
         """Note that the mesh shows everything up to `seq`."""
@@ -341,12 +350,18 @@ class Outbox:
     def reject(self, seq: int, reason: str, message: str = "") -> tuple[str, bool] | None:
         """Count a record that the server has and the map will not take.
 
+        An older server may tell that it has answered a record before it tells that it rejected it: then that
+        was counted as fused, and is no more.
+
         Returns its kind in words, and whether it is the first of this session for that reason; None = it was
         counted before.
         """
         with self._lock:
-            is_correction = seq in self._corrections
+            was_fused, first = seq in self._fused, self._fused.first
+            was_corrected = first is not None and first <= seq <= self._last_fused and not was_fused
+            is_correction = seq in self._corrections or was_corrected
             is_first = self._outcomes.reject(seq, reason, message, is_correction=is_correction)
+            self._outcomes.fused -= was_fused and is_first is not None
             return None if is_first is None else ("correction" if is_correction else "keyframe", is_first)
 
     @property
