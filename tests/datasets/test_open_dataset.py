@@ -93,7 +93,7 @@ def test_layouts_are_listed_with_what_they_expect():
         (lambda root: (root / "file").write_text("x") and root / "file", r"file is not a folder"),
         (lambda root: root, r"is in no layout known here: .*7-Scenes.*; `tsfusion datasets` says"),
         (lambda _: "synthetic:moon", r"world must be one of room, street, .*, got 'moon'"),
-        (lambda _: "synthetic:room:radar", r"must be kinect, stereo or lidar, got 'radar'"),
+        (lambda _: "synthetic:room:radar", r"must be kinect, tof, stereo or lidar, got 'radar'"),
         (lambda _: "synthetic:room:kinect:x", r"expected synthetic:WORLD"),
     ],
 )

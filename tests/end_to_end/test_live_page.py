@@ -65,7 +65,7 @@ def test_a_page_follows_its_map_whatever_happens(tmp_path: Path) -> None:
         url = address_of(viewer)
         place = urlsplit(url).netloc
         page.open(url, **SIZE)
-        page.wait("document.body.innerText.includes('Connected')")
+        page.wait("document.body.innerText.includes('connected')")
         seen = Seen(page)
         client = stack.enter_context(Client(address, spool=tmp_path / "spool"))
 

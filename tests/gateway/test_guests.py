@@ -38,7 +38,7 @@ def test_a_guest_watches_and_sends_nothing(tmp_path: Path, limited: bool) -> Non
         health = ask(served, dealer, messages.Command(name="health")).health
         assert health is not None
         assert list(health.maps) == ["default"]
-        served.until(lambda: served.gateway._subscriptions.watched("default"))
+        served.until(lambda: served.gateway._subscriptions.watched(sockets.mesh_topic("default")))
 
         denied = served.greet(dealer, "default")
         assert (denied.reason, denied.message) == ("map", "this key may only watch")

@@ -54,6 +54,7 @@ class SumMap:
     model = SimpleNamespace(surface="raw")
     most_blocks = 1
     quota = None  # nothing of it is used up
+    stamp = drops = 0  # it has no blocks that change
 
     def __init__(self, config: VolumeConfig) -> None:
         self.config = config
@@ -86,6 +87,9 @@ class SumMap:
 
     def extract_mesh(self, *_: object, **__: object) -> Mesh:
         return Mesh(np.zeros((0, 3), np.float32), _NOTHING, np.zeros((0, 3), np.float32))
+
+    def mesh_cells(self, *_: object) -> Any:
+        return SimpleNamespace(cells=_NOTHING, first_face=np.zeros(1, np.int32), mesh=self.extract_mesh())
 
     def map_hash(self) -> str:
         return _hex(self._total)

@@ -85,7 +85,7 @@ replay tum --trajectory missing.txt | missing.txt is missing | expected a trajec
 replay tum --trajectory file | file is no trajectory | expected 8 numbers a line (TUM)
 replay tum --trajectory other_times.txt | other_times.txt has no pose at the time of any frame | expected one clock
 replay synthetic:cave | got 'cave' | world must be one of room
-replay synthetic:room:sonar | got 'sonar' | must be kinect, stereo or lidar
+replay synthetic:room:sonar | got 'sonar' | must be kinect, tof, stereo or lidar
 replay synthetic:room --option count=0 | got count 0 | expected count >= 1
 replay synthetic:room --option focal=3 | takes no `focal` | it takes world, sensor
 replay synthetic:room --option path=spiral | got 'spiral' | path must be one of circle

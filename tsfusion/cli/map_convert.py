@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 EXAMPLES = (
     "tsfusion map convert out/latest/map.tsf field.vdb --field distance",
-    "tsfusion map convert my-maps yard.yaml --map yard --heights 0.1 1.8 --above-floor",
+    "tsfusion map convert my-maps yard.yaml --heights 0.1 1.8 --above-floor",
 )
 _FORMATS = ".npz .zarr .vdb .tsf .ply .glb .obj .stl; slice: .yaml .pgm .png .npz"
 Out = Annotated[
@@ -38,7 +38,7 @@ SliceBox = Annotated[
     typer.Option("--box", metavar="U0 V0 U1 V1", help="Of a slice, metres; default: all."),
 ]
 AboveFloor = Annotated[
-    bool, typer.Option("--above-floor", help="Count them from the floor; else from the map's origin.")
+    bool, typer.Option("--above-floor", help="From the floor, not the map's origin.")
 ]
 Resolution = Annotated[float | None, typer.Option(metavar="METRES", help="Cell of a slice; default a voxel.")]
 
