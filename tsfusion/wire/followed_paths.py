@@ -13,7 +13,7 @@ from tsfusion.wire.map_events import MapEvent, PathsFound, ScannerSeen
 from tsfusion.wire.mesh_updates import Scanned
 from tsfusion.wire.questions import Keyframes
 
-_PAUSE_S = 2.0  # between two times that all are asked for
+_PAUSE_S = 2.0  # for each answer of the last time, until all are asked for again
 _Page = tuple[NDArray[np.int64], NDArray[np.float64]]
 
 
@@ -24,6 +24,7 @@ class FollowedPaths:
         self._is_due = True
         self._next = 0.0  # time.monotonic()
         self._asked: Keyframes | None = None
+        self._answers = 0  # of this time, or the last
         self._pages: dict[bytes, list[_Page]] = defaultdict(list)
         self._epoch = ""
         self._moved: dict[bytes, NDArray[np.float64]] = {}  # T_map_odometry by session
@@ -33,8 +34,8 @@ class FollowedPaths:
     def question(self, now: float) -> Keyframes | None:
         """What to ask now; None = nothing."""
         if self._asked is None and self._is_due and now >= self._next:
-            self._is_due, self._next = False, now + _PAUSE_S
-            self._asked = Keyframes()
+            self._is_due, self._next = False, now + _PAUSE_S * max(self._answers, 1)
+            self._asked, self._answers = Keyframes(), 0
             self._pages.clear()
         return self._asked
 
@@ -51,6 +52,7 @@ class FollowedPaths:
             self._asked, self._is_due = None, True
             return []
         self._epoch = epoch
+        self._answers += 1
         try:
             self._add_page(arrays)
             last = arrays["last_session"].tobytes(), int(arrays["last"])

@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: MIT
+"""Where keyframes are, as one follows it: page by page, again when they moved, never too often."""
+
+import numpy as np
+import pytest
+from health_snapshots import map_health
+from keyframes_and_servers import CAMERA, SHAPE, pose, wall
+
+from tsfusion.core.errors import DecodeError
+from tsfusion.fuser import watched_map
+from tsfusion.fuser.keyframe_poses import KeyframePoses
+from tsfusion.fuser.touched_by import TouchedBy
+from tsfusion.fuser.watched_map import WatchedMap
+from tsfusion.journal import Position
+from tsfusion.wire import corrections
+from tsfusion.wire.corrections import Correction
+from tsfusion.wire.followed_paths import FollowedPaths
+from tsfusion.wire.map_events import PathsFound
+from tsfusion.wire.mesh_updates import Scanned
+
+ONE, TWO, THREE = (bytes([i] * 16) for i in (1, 2, 3))
+
+
+def poses_of(counts: dict[bytes, int]) -> KeyframePoses:
+    poses = KeyframePoses(None, {})
+    for session, count in counts.items():
+        for i in range(count):
+            poses.add(session, 2 * i + 1, Position(1, 8 * i), wall(i))
+    return poses
+
+
+def asked(poses: KeyframePoses, follower: FollowedPaths, now: float = 0.0) -> tuple[PathsFound, int]:
+    """All paths, and how many answers they took."""
+    answers = WatchedMap(None, poses, TouchedBy(), None)  # type: ignore[arg-type]
+    for count in range(1, 100):
+        question = follower.question(now)
+        assert question is not None
+        if events := follower.on_keyframes("a", answers.answer(question)):
+            (found,) = events
+            assert isinstance(found, PathsFound)
+            return found, count
+    raise AssertionError("no end")
+
+
+@pytest.mark.parametrize("most", [1, 3, 5, 100])
+def test_pages_make_all_paths(monkeypatch: pytest.MonkeyPatch, most: int) -> None:
+    monkeypatch.setattr(watched_map, "KEYFRAMES_AT_ONCE", most)
+    poses = poses_of({TWO: 5, ONE: 3, THREE: 2})
+    poses.forget(ONE, np.array([3]))
+    poses.next()
+    poses.moved()
+    found, _ = asked(poses, FollowedPaths())
+    assert {key: seqs.tolist() for key, (seqs, _) in found.paths.items()} == {
+        ONE: [1, 5],
+        TWO: [1, 3, 5, 7, 9],
+        THREE: [1, 3],
+    }
+    np.testing.assert_array_equal(found.paths[TWO][1][4], pose(0.12))
+
+
+def test_paths_are_asked_for_again_but_not_too_often(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(watched_map, "KEYFRAMES_AT_ONCE", 1)
+    follower, poses = FollowedPaths(), poses_of({ONE: 4})
+    follower.on_health(map_health())
+    _, answers = asked(poses, follower)
+    assert answers == 4
+    follower.on_health(map_health())
+    assert follower.question(99.0) is None
+    follower.on_health(map_health(keyframes_moved=1))
+    assert follower.question(99.0) is not None
+    asked(poses, follower, 99.0)
+    follower.on_health(map_health(keyframes_moved=2))
+    assert follower.question(99.0 + 7.0) is None  # the last time took four answers
+    assert follower.question(99.0 + 8.0) is not None
+
+
+def test_scanners_are_shown_where_their_keyframes_come_to_be() -> None:
+    follower, poses = FollowedPaths(), poses_of({ONE: 2})
+    moved = corrections.checked({1: pose(5)}, T_map_odometry=pose(1))
+    assert isinstance(moved, Correction)
+    poses.correct(ONE, moved)
+    asked(poses, follower)
+    rows = tuple(pose(0.5)[:3].ravel().tolist())
+    scanned = Scanned(ONE, 5, rows, "e", 1, CAMERA, SHAPE, "robot")
+    seen = follower.on_scanned(scanned, b"jpeg")
+    assert (seen.session, seen.seq, seen.picture, seen.client, seen.shape) == (
+        ONE,
+        5,
+        b"jpeg",
+        "robot",
+        SHAPE,
+    )
+    np.testing.assert_array_equal(seen.T_world_camera, pose(1.5))
+    assert follower.question(99.0) is None
+    follower.on_scanned(Scanned(TWO, 9, rows, "e", 2), None)
+    follower.on_scanned(Scanned(TWO, 9, rows, "e", 2, late=True), b"jpeg")
+    assert follower.question(99.0) is None
+    follower.on_scanned(Scanned(TWO, 11, rows, "e", 4), None)  # one was missed
+    assert follower.question(99.0) is not None
+
+
+def test_what_makes_no_sense_is_asked_for_again() -> None:
+    follower = FollowedPaths()
+    question = follower.question(0.0)
+    answers = WatchedMap(None, poses_of({ONE: 2}), TouchedBy(), None)  # type: ignore[arg-type]
+    assert question is not None
+    good = answers.answer(question)
+    for name in good:
+        with pytest.raises(DecodeError):
+            follower.on_keyframes("a", {key: one for key, one in good.items() if key != name})
+    with pytest.raises(DecodeError):
+        follower.on_keyframes("a", {**good, "seqs": good["seqs"][:1]})
+    assert follower.question(0.0) == question
