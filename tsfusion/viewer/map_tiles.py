@@ -13,7 +13,7 @@ from tsfusion.geometry.up_direction import Up
 from tsfusion.wire.map_events import SurfaceUpdate
 
 CELL = 8  # voxels along a cell's edge
-EDGE = 8  # cells along a tile's edge: docs/view.md has what was measured with others
+EDGE = 8  # cells along a tile's edge: 5 700 triangles a tile of a kitchen at 2 cm
 GREY = 190  # of a surface whose colour nobody saw
 Key = tuple[int, int, int]
 

@@ -54,6 +54,7 @@ class SharedPanel:
     ) -> None:
         self._feed, self._modes = feed, modes
         self._orders, self._lock, self._slid_at = Orders(), threading.Lock(), 0.0
+        self._wanted_map: str | None = None  # until it is shown
         gui.set_panel_label("tsfusion")
         gui.main_panel.dock_right()
         self._head = gui.add_html(state_tables.summary(feed.title, "", "", ["waiting for the map"], ()))
@@ -112,14 +113,15 @@ class SharedPanel:
             if tuple(self._map.options) != names:
                 self._map.options = names
             self._map.visible = True
-            if map_name in names and self._map.value != map_name and self._orders.map_name is None:
-                self._map.value = map_name
+            if self._wanted_map in {None, map_name}:
+                self._wanted_map = None
+                self._map.value = map_name if map_name in names else self._map.value
         self._fit_time(self._feed.time_line)
 
     def _choice_of_maps(self, gui: "viser.GuiApi") -> Any:
         names = tuple(self._feed.maps()) or ("",)
         choice = gui.add_dropdown("Map", names, initial_value=names[0], visible=len(names) > 1)
-        choice.on_update(calm(lambda event: self._note_map(event.target.value)))
+        choice.on_update(calm(self._note_map))
         return choice
 
     def _time_slider(self, gui: "viser.GuiApi") -> Any:
@@ -141,10 +143,11 @@ class SharedPanel:
         with self._lock:
             self._orders.place, self._slid_at = int(event.target.value), time.monotonic()
 
-    def _note_map(self, name: str) -> None:
-        if name in self._feed.maps():
+    def _note_map(self, event: Any) -> None:
+        name = event.target.value
+        if event.client is not None and name in self._map.options:  # the feed is for the page's thread alone
             with self._lock:
-                self._orders.map_name = name
+                self._orders.map_name = self._wanted_map = name
 
     def _note(self, *, mode: str) -> None:
         if mode in self._modes:
