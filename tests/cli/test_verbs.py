@@ -123,6 +123,8 @@ complete_words tsfusion re
 complete_words tsfusion replay --voxel
 complete_words tsfusion scan --sensor re
 complete_words tsfusion journal ver
+complete_words tsfusion vi
+complete_words tsfusion serve --vi
 """
 
 
@@ -136,4 +138,11 @@ def test_bash_completes_verbs_flags_and_values(tmp_path: Path) -> None:
         ["bash", tmp_path / "script.sh"], capture_output=True, text=True, timeout=60, check=False,
         env={**env, "HOME": str(tmp_path), "PATH": f"{tmp_path}:{env['PATH']}"}, stdin=subprocess.DEVNULL,
     )  # fmt: skip
-    assert done.stdout.splitlines() == ["replay report", "--voxel-size", "realsense", "verify"], done.stderr
+    assert done.stdout.splitlines() == [
+        "replay report",
+        "--voxel-size",
+        "realsense",
+        "verify",
+        "view",
+        "--view",
+    ], done.stderr

@@ -283,6 +283,19 @@ replay tum_other_size | is the camera of images of 64×64, but these are 64×48 
 replay tum_color_camera | of the colour camera, and the depth camera has no file | give --calibration
 replay tum_empty_camera | K.txt: 0 numbers | or fx fy cx cy
 replay synthetic:room --intrinsics 500,500,80,60 | comes with what it needs of a camera | leave out --intrinsics
+# a live page
+view missing | missing does not exist | expected a server such as tcp://127.0.0.1:5555
+view http://localhost:80 | got 'http://localhost:80' | an address looks like tcp://
+view garbage.tsf --listen 127.0.0.1:0 | not a tsfusion map | expected the map.tsf of a server
+view small.tsf --server-key a.key --key a.key_secret | cannot read the key a.key_secret | `tsfusion keys new` makes one
+view small.tsf --control {nobody} | --control has no effect on small.tsf | it is no server
+view {nobody} --listen 5558 | got '5558' | a page listens at HOST:PORT, such as 127.0.0.1:5558
+view {nobody} --listen 192.0.2.7:0 | cannot show a page at 192.0.2.7:0 | choose another place, such as 127.0.0.1:0
+view {nobody} --listen 127.0.0.1:0 --token short | a token is | 8 to 128 letters
+view {nobody} --listen 127.0.0.1:0 --truth missing.txt | got missing.txt | a truth is a mesh or points
+demo --view=nowhere | got 'nowhere' | a page listens at HOST:PORT
+replay tum --view=192.0.2.7:80 | cannot show a page at 192.0.2.7:80 | choose another place
+serve --view=nowhere | got 'nowhere' | a page listens at HOST:PORT
 # what check finds
 check tum --option depth_scale=1e-8 | depth is unusable | check the depth scale
 check tum --option depth_scale=1 | it reads as 6.82e+03 m on average | --option depth_scale=0.001

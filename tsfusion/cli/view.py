@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 _ANSWER_SECONDS = 1.0  # for a server to say that it is there
 _SERVER = re.compile(r"[\w.-]+:\d{1,5}|\[[\da-fA-F:.]+\]:\d{1,5}", re.ASCII)
-_ERROR = "error [m]"  # as the page names it
+_ERROR = "Error [m]"  # as the page names it
 _NICENESS = 10  # of a page beside a run
 
 

@@ -21,6 +21,9 @@ from tsfusion.wire.curve import ClientKeys
 
 _COMMAND = (sys.executable, "-m", "tsfusion", "view", "--json", "--from-parent")
 _ANYWHERE = {"0.0.0.0": "127.0.0.1", "*": "127.0.0.1", "::": "::1"}  # how it is reached from here
+_COMMAND = (sys.executable, "-m", "tsfusion", "view", "--json", "--from-parent")
+_ANYWHERE = {"0.0.0.0": "127.0.0.1", "*": "127.0.0.1", "::": "::1"}  # how it is reached from here
+_WARNING = "tsfusion view: WARNING: "
 _END_SECONDS = 5.0
 _FOR_THE_VIEWER = ("TSFUSION_TOKEN", "TSFUSION_NO_BROWSER")
 
@@ -69,28 +72,14 @@ class ViewerChild:
             "--listen": self._place,
         }
         flags = [f"{flag}={value}" for flag, value in given.items() if value is not None]
-        kept = {
-            key: value
-            for key, value in os.environ.items()
-            if not key.startswith("TSFUSION_") or key in _FOR_THE_VIEWER
-        }
         try:
             self._process = subprocess.Popen(
-                [
-                    sys.executable,
-                    "-m",
-                    "tsfusion",
-                    "view",
-                    _reached(address),
-                    *flags,
-                    "--json",
-                    "--from-parent",
-                ],
+                [*_COMMAND, _reached(address), *flags],
                 stdin=subprocess.PIPE,  # closes when we die, however we die: it then ends by itself
                 stdout=subprocess.PIPE,
                 stderr=subprocess.STDOUT,
                 text=True,
-                env=kept,
+                env=_environment(),
                 **process.OWN_GROUP,  # Ctrl-C is ours to handle
             )
             assert self._process.stdin is not None
@@ -123,10 +112,10 @@ class ViewerChild:
         for line in map(str.strip, child.stdout):
             if line.startswith('{"url"'):
                 self._tell(json.loads(line)["url"])
-            elif line.startswith("tsfusion: "):
-                why = line.removeprefix("tsfusion")
-            elif line:
-                log.warning("page: %s", line.removeprefix("tsfusion view: WARNING: "))
+            elif line.startswith(_WARNING):
+                log.warning("page: %s", line.removeprefix(_WARNING))
+            elif line:  # the last one says why it ends
+                why = f": {line.removeprefix('tsfusion: ')}"
         status = child.wait()
         if not self._is_ending:
             log.warning("the page has ended with status %d%s; all else goes on", status, why)
@@ -135,9 +124,16 @@ class ViewerChild:
 def _reached(address: str) -> str:
     """The address to connect to, of one that is listened at."""
     host, port = sockets.parse_address(address)
-    return sockets.format_address(
-        {"0.0.0.0": "127.0.0.1", "*": "127.0.0.1", "::": "::1"}.get(host, host), port
-    )
+    return sockets.format_address(_ANYWHERE.get(host, host), port)
+
+
+def _environment() -> dict[str, str]:
+    """Our environment, without the flags that are meant for the run."""
+    return {
+        name: value
+        for name, value in os.environ.items()
+        if not name.startswith("TSFUSION_") or name in _FOR_THE_VIEWER
+    }
 
 
 @contextmanager
