@@ -161,6 +161,32 @@ def test_two_sessions_are_in_the_order_of_the_journal(tmp_path: Path) -> None:
     assert shown.volume.map_hash() == map_hash(decoded(wall(i)) for i in range(4))
 
 
+def last_touched(keyframes: list[tuple[bytes, int]], cells: list[tuple[int, ...]]) -> list[bytes]:
+    volume, by_stamp = Volume(RAW), [b""]
+    for session, view in keyframes:
+        volume.integrate(decoded(wall(view)))
+        by_stamp.append(session)
+    stamps = volume.cell_stamps(np.array(cells, np.int32))[1]
+    return [by_stamp[stamp] for stamp in stamps.tolist()]
+
+
+@pytest.mark.parametrize("place", [6, 5, 2])
+def test_whose_keyframe_touched_a_cell_last(place: int, tmp_path: Path) -> None:
+    folder = make_map(tmp_path, [0, 12], config=RAW)
+    make_map(folder, [13, 90], session=BOB, config=RAW)
+    make_map(folder, [1, 25], config=RAW)
+    keyframes = [(ANNA, 0), (ANNA, 12), (BOB, 13), (BOB, 90), (ANNA, 1), (ANNA, 25)]
+    shown = Shown(folder)
+    before = shown.volume.map_hash()
+    shown.seek(place)
+    cells = [cell for cell, one in shown.watched.cells.items() if len(one)]
+    found = [shown.watched.clients[cell] for cell in cells]
+    assert found == last_touched(keyframes[:place], cells)
+    assert len(set(found)) == len({session for session, _ in keyframes[:place]})
+    shown.seek(6)
+    assert shown.volume.map_hash() == before
+
+
 def test_a_new_wish_ends_a_long_piece_and_nothing_is_lost(tmp_path: Path) -> None:
     folder = make_map(tmp_path, range(3))
     watched, wishes = WatchedCells(), [False]

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from tsfusion import journal
 from tsfusion.core.errors import CheckpointError, DecodeError, InvalidKeyframe, JournalError, MapError
 from tsfusion.fuser.journaled_keyframes import JournaledKeyframes, JournaledSession, KeyframePlace
+from tsfusion.fuser.touched_by import TouchedBy
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.journal import state_folder
 from tsfusion.journal.mcap_layout import Record
@@ -65,6 +66,8 @@ class RewoundMap:
         self.left_out = Counter[str]()
         self._volume: Volume | None = None
         self._way = "on"  # or the map that `step` begins from: "empty", "saved"
+        self._touched_by = TouchedBy()
+        self._touched_again: int | None = 0  # keyframes, in order; None = it is known who touched what
         self._list(journaled)
         self.target = len(self.places)
         self._now = self._saved.copy()
@@ -196,6 +199,8 @@ class RewoundMap:
                 self._volume = self._load()
             else:
                 self._volume = Volume(self.header.config, memory_bytes=self._memory_bytes)
+            self._touched_by = TouchedBy()
+            self._touched_again = None if self._way == "empty" else 0
             self._way = "on"
             return True
         late = np.flatnonzero(self._now[self.target :] == _THERE)
@@ -215,17 +220,48 @@ class RewoundMap:
             self._add(int(np.argmax(self._now[: self.target] == _ABSENT)))
         return False
 
+    @property
+    def knows_clients(self) -> bool:
+        """Whether it is known whose keyframes touched each block last, as far as the journal has them."""
+        is_smoothed = self.header.config.checked_model().regularizer != "off"  # nothing may be taken away
+        return self._touched_again is None or is_smoothed or len(self.sessions) < 2
+
+    def find_clients(self) -> None:
+        """Find out whose the blocks of one more keyframe are: it is taken away and added again, in order."""
+        index = self._touched_again or 0
+        there = np.flatnonzero(self._now[index:] == _THERE)
+        if not len(there):
+            self._touched_again = None
+            return
+        index += int(there[0])
+        if self._retract(self.places[index], self.poses[index]):
+            self._now[index] = _ABSENT
+            self._add(index)
+        self._touched_again = index + 1
+
+    def clients_of(self, cells: NDArray[np.int32]) -> tuple[tuple[bytes, ...], NDArray[np.int32]]:
+        """Sessions, and the row in them of who touched each of (n, 3) cells last; −1 = not known."""
+        sessions, rows = self._touched_by.of(self.volume.cell_stamps(cells)[1])
+        known = [row for row, session in enumerate(sessions) if session]
+        new = np.full(len(sessions) + 1, -1, np.int32)  # the last stands for "not known"
+        new[known] = np.arange(len(known))
+        return tuple(sessions[row] for row in known), new[rows]
+
     def _add(self, index: int) -> None:
+        session = b""
         try:
             self.volume.integrate(_read(self.places[index], self.poses[index]))
-            self._now[index] = _THERE
+            self._now[index], session = _THERE, self.places[index].session
         except (MapError, DecodeError, InvalidKeyframe, JournalError) as error:
             self.left_out[str(error)] += 1
             self._now[index] = _LEFT_OUT
+        self._touched_by.note(self.volume.stamp, session)
 
     def _retract(self, place: KeyframePlace, T: NDArray[np.float64]) -> bool:
+        self._touched_again = 0
         try:
             self.volume.retract(_read(place, T))
+            self._touched_by.note(self.volume.stamp, b"")
         except (MapError, DecodeError, InvalidKeyframe, JournalError) as error:
             self.left_out[str(error)] += 1
             return False

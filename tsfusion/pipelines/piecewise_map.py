@@ -53,10 +53,9 @@ class PiecewiseMap:
         self._told: str | None = None
         self._is_behind = not rewound.is_there
         self._place = -1  # that paths and scanner were shown of
-        self._sessions = tuple(
-            bytes.fromhex(one.session)
-            for one in map_history.of_clients(map_history.sessions(rewound.header.meta))
-        )
+        histories = map_history.of_clients(map_history.sessions(rewound.header.meta))
+        saved = [bytes.fromhex(one.session) for one in histories]
+        self._sessions = tuple(dict.fromkeys([*saved, *rewound.sessions]))
 
     def begin(self) -> None:
         """Say what is shown."""
@@ -90,6 +89,8 @@ class PiecewiseMap:
             self._send_place()
         elif len(self._unrefined):
             self._show_refined()
+        elif not self._map.knows_clients:
+            self._find_clients()
         else:
             self._values = None
             return False
@@ -128,6 +129,18 @@ class PiecewiseMap:
         while len(self._stale) and time.monotonic() < until:
             self._show_raw()
         self._send_scanner()
+        self._tell()
+
+    def _find_clients(self) -> None:
+        """Find out whose blocks are; then show all cells again. The map stays as it is."""
+        assert self._volume is not None
+        until = time.monotonic() + _MOVING_S
+        while not self._map.knows_clients and time.monotonic() < until and not self._attend():
+            self._map.find_clients()
+        self._volume.take_dirty()
+        if self._map.knows_clients:
+            self._stale = np.array(sorted(self._shown), np.int64)
+            self._unrefined = _NONE if self._is_raw else self._stale
         self._tell()
 
     def _note_changes(self) -> None:
@@ -169,10 +182,10 @@ class PiecewiseMap:
         self._shown.update(keys[has_faces].tolist())
         if told.any():
             first = np.append(first[:-1][told], first[-1])
-            client = None
-            if len(self._sessions) == 1:
-                client = np.zeros(int(told.sum()), np.int32)
-            update = SurfaceUpdate(found.cells[told], first, found.mesh, is_refined, self._sessions, client)
+            sessions, client = self._sessions, np.zeros(int(told.sum()), np.int32)
+            if len(sessions) != 1:
+                sessions, client = self._map.clients_of(found.cells[told])
+            update = SurfaceUpdate(found.cells[told], first, found.mesh, is_refined, sessions, client)
             self._send([update])
 
     def _send_place(self) -> None:
