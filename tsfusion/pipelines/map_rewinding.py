@@ -160,6 +160,11 @@ class RewoundMap:
             found.setdefault(session, []).append((seq, T))
         return {key: _columns(sorted(each, key=lambda one: one[0])) for key, each in found.items()}
 
+    def last_of_sessions(self) -> list[int]:
+        """The last keyframe in the map of each session, in order."""
+        last = {self.places[index].session: index for index in np.flatnonzero(self._now == _THERE).tolist()}
+        return sorted(last.values())
+
     def seek(self, keyframes: int) -> None:
         """Want the map after so many keyframes; `step` goes there, the shortest way."""
         self.target = min(max(keyframes, 0), len(self.places))

@@ -128,7 +128,7 @@ class PiecewiseMap:
         until = time.monotonic() + _MOVING_S
         while len(self._stale) and time.monotonic() < until:
             self._show_raw()
-        self._send_scanner()
+        self._send_scanner(self._map.place - 1)
         self._tell()
 
     def _find_clients(self) -> None:
@@ -191,13 +191,13 @@ class PiecewiseMap:
     def _send_place(self) -> None:
         """Show where the keyframes are that the map has."""
         self._place, self._is_behind = self._map.place, False
+        for index in self._map.last_of_sessions():
+            self._send_scanner(index)
         self._send([PathsFound(self._map.keyframes_in())])
-        self._send_scanner()
         self._tell()
 
-    def _send_scanner(self) -> None:
-        """Show the last keyframe that came into the map."""
-        index = self._map.place - 1
+    def _send_scanner(self, index: int) -> None:
+        """Show a keyframe and its picture."""
         if 0 <= index < len(self._map.places):
             place = self._map.places[index]
             try:
