@@ -8,7 +8,7 @@ import pytest
 from corrected_maps import fresh_map
 from keyframes_and_servers import VOLUME, map_hash, pose, wall
 from saved_maps import ANNA, BOB, correct, decoded, forget, make_map
-from watched_cells import WatchedCells, corners, ordered
+from watched_surfaces import Cell, Held, ordered
 
 from tsfusion import Volume, VolumeConfig
 from tsfusion.core.config import override
@@ -28,7 +28,7 @@ class Shown:
     def __init__(self, folder: Path) -> None:
         journaled = JournaledKeyframes(state_folder.find_journal(folder))
         self.rewound = RewoundMap(folder / state_folder.MAP_FILE, journaled)
-        self.watched = WatchedCells()
+        self.watched = Held()
         self.map = PiecewiseMap("wall", self.rewound, send=self.watched.take)
         self.map.begin()
         self.finish()
@@ -62,13 +62,13 @@ def test_the_cells_make_up_the_whole_mesh(
     monkeypatch.setattr(piecewise_map, "CELLS", 50)
     folder = make_map(tmp_path, range(4), config=override(VOLUME, surface=surface))
     shown = Shown(folder)
-    assert np.array_equal(shown.watched.triangles(), ordered(corners(shown.volume.extract_mesh())))
-    assert set(shown.watched.refined.values()) == {True}
-    assert shown.watched.updates > len(shown.watched.cells) / 50
+    assert np.array_equal(shown.watched.triangles(), ordered(shown.volume.extract_mesh()))
+    assert not shown.watched.raw
+    assert shown.watched.updates > len(shown.watched.surfaces) / 50
     assert len(shown.watched.triangles()) > 1000
     assert shown.watched.problems == [""]
-    assert set(shown.watched.clients.values()) == {ANNA}
-    assert shown.watched.paths[ANNA][0].tolist() == [1, 2, 3, 4]
+    assert set(shown.watched.client.values()) == {ANNA}
+    assert list(shown.watched.paths[ANNA]) == [1, 2, 3, 4]
 
 
 @pytest.mark.parametrize("keyframes", [0, 1, 4, 5])
@@ -78,10 +78,10 @@ def test_the_map_after_some_keyframes(keyframes: int, tmp_path: Path) -> None:
     fresh = of_views(range(keyframes), RAW)
     assert shown.volume.map_hash() == fresh.map_hash()
     assert shown.volume.color_hash() == fresh.color_hash()
-    assert np.array_equal(shown.watched.triangles(), ordered(corners(fresh.extract_mesh())))
-    assert len(shown.watched.paths.get(ANNA, ((),))[0]) == keyframes
+    assert np.array_equal(shown.watched.triangles(), ordered(fresh.extract_mesh()))
+    assert len(shown.watched.paths.get(ANNA, ())) == keyframes
     if keyframes:
-        seen = shown.watched.scanners[-1]
+        seen = shown.watched.seen[-1]
         assert (seen.session, seen.seq, seen.shape) == (ANNA, keyframes, wall().shape)
         assert seen.picture is not None
         assert seen.picture.startswith(b"\xff\xd8")
@@ -94,9 +94,9 @@ def test_there_and_back_again_is_the_same_map(tmp_path: Path) -> None:
         shown.seek(place)
         hashes.append((place, shown.volume.map_hash()))
         mesh = shown.volume.extract_mesh(surface="raw")
-        meshes.append((place, ordered(corners(mesh)).tobytes()))
+        meshes.append((place, ordered(mesh).tobytes()))
         refined = shown.watched.triangles()
-        assert len(refined) == len(ordered(corners(shown.volume.extract_mesh())))
+        assert len(refined) == len(ordered(shown.volume.extract_mesh()))
     assert len(set(hashes)) == len({place for place, _ in hashes})
     assert len(set(meshes)) == len({place for place, _ in meshes})
     assert dict(hashes)[8] == map_hash(decoded(wall(i)) for i in range(8))
@@ -106,7 +106,7 @@ def test_after_a_walk_back_the_refined_surface_is_that_of_the_map(tmp_path: Path
     shown = Shown(make_map(tmp_path, range(6)))
     for place in (5, 4, 5):  # keyframe by keyframe, not from the file
         shown.seek(place)
-    new, fresh = shown.watched.triangles(), ordered(corners(shown.volume.extract_mesh()))
+    new, fresh = shown.watched.triangles(), ordered(shown.volume.extract_mesh())
     assert len(new) == len(fresh)
     centres = [np.sort(one.reshape(-1, 3, 3).mean(axis=1).round(3), axis=0) for one in (new, fresh)]
     assert np.abs(centres[0] - centres[1]).max() < VOLUME.voxel_size / 20
@@ -119,10 +119,10 @@ def test_what_the_saved_map_lacks_is_fused(tmp_path: Path) -> None:
     shown = Shown(folder)
     fresh = fresh_map(folder / "journal", RAW.voxel_size)
     assert shown.volume.map_hash() == fresh.map_hash()
-    assert shown.watched.paths[ANNA][0].tolist() == [1, 4, 5]
+    assert list(shown.watched.paths[ANNA]) == [1, 4, 5]
     assert "6 keyframes behind its journal" in shown.watched.problems[0]
     assert shown.watched.problems[-1] == ""
-    whole = ordered(corners(fresh.extract_mesh(surface="raw")))
+    whole = ordered(fresh.extract_mesh(surface="raw"))
     assert np.array_equal(shown.watched.triangles(), whole)
     for place in (0, 3):
         shown.seek(place)
@@ -156,12 +156,12 @@ def test_two_sessions_are_in_the_order_of_the_journal(tmp_path: Path) -> None:
     make_map(folder, range(3, 5), session=BOB, client="bob", config=RAW)
     shown = Shown(folder)
     shown.seek(4)
-    assert shown.watched.scanners[-1].client == "bob"
-    assert [len(shown.watched.paths[key][0]) for key in (ANNA, BOB)] == [3, 1]
+    assert shown.watched.seen[-1].client == "bob"
+    assert [len(shown.watched.paths[key]) for key in (ANNA, BOB)] == [3, 1]
     assert shown.volume.map_hash() == map_hash(decoded(wall(i)) for i in range(4))
 
 
-def last_touched(keyframes: list[tuple[bytes, int]], cells: list[tuple[int, ...]]) -> list[bytes]:
+def last_touched(keyframes: list[tuple[bytes, int]], cells: list[Cell]) -> list[bytes]:
     volume, by_stamp = Volume(RAW), [b""]
     for session, view in keyframes:
         volume.integrate(decoded(wall(view)))
@@ -179,8 +179,8 @@ def test_whose_keyframe_touched_a_cell_last(place: int, tmp_path: Path) -> None:
     shown = Shown(folder)
     before = shown.volume.map_hash()
     shown.seek(place)
-    cells = [cell for cell, one in shown.watched.cells.items() if len(one)]
-    found = [shown.watched.clients[cell] for cell in cells]
+    cells = list(shown.watched.surfaces)
+    found = [shown.watched.client[cell] for cell in cells]
     assert found == last_touched(keyframes[:place], cells)
     assert len(set(found)) == len({session for session, _ in keyframes[:place]})
     shown.seek(6)
@@ -189,20 +189,19 @@ def test_whose_keyframe_touched_a_cell_last(place: int, tmp_path: Path) -> None:
 
 def test_a_new_wish_ends_a_long_piece_and_nothing_is_lost(tmp_path: Path) -> None:
     folder = make_map(tmp_path, range(3))
-    watched, wishes = WatchedCells(), [False]
+    watched, wishes = Held(), [False]
     journaled = JournaledKeyframes(state_folder.find_journal(folder))
     rewound = RewoundMap(folder / state_folder.MAP_FILE, journaled)
     shown = PiecewiseMap("wall", rewound, send=watched.take, attend=lambda: wishes[0])
-    while True not in watched.refined.values():  # up to the first refined cells
-        wishes[0] = bool(watched.paths)
+    while not watched.paths:  # the raw surface is there then
         assert shown.work()
-        if wishes[0]:
-            assert True not in watched.refined.values()
-            break
+    wishes[0] = True
+    assert shown.work()
+    assert watched.raw == set(watched.surfaces)
     wishes[0] = False
     while shown.work():
         pass
-    assert np.array_equal(watched.triangles(), ordered(corners(rewound.volume.extract_mesh())))
+    assert np.array_equal(watched.triangles(), ordered(rewound.volume.extract_mesh()))
 
 
 def test_weights_are_those_of_the_map(tmp_path: Path) -> None:

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from saved_maps import BOB, make_map
-from watched_cells import WatchedCells, corners, ordered
+from saved_maps import ANNA, BOB, make_map
+from watched_surfaces import Held, ordered
 
 from tsfusion import Volume
 from tsfusion.core.errors import CheckpointError, JournalError, TsfusionError
@@ -41,24 +41,24 @@ def feed(state: Path) -> Iterator[SavedMapFeed]:
         yield feed
 
 
-def follow(feed: SavedMapFeed, until: Callable[[WatchedCells], bool], watched: WatchedCells) -> None:
+def follow(feed: SavedMapFeed, until: Callable[[Held], bool], watched: Held) -> None:
     deadline = time.monotonic() + DEADLINE_S
     while not until(watched):
         assert time.monotonic() < deadline, "the feed has not come so far"
         watched.take(feed.events(0.1))
 
 
-def is_whole(watched: WatchedCells) -> bool:
-    return bool(watched.paths) and all(watched.refined[key] for key, one in watched.cells.items() if len(one))
+def is_whole(watched: Held) -> bool:
+    return bool(watched.paths) and not watched.raw
 
 
 def mesh_of(state: Path, name: str) -> Any:
     file = state_folder.map_folder(state, name) / state_folder.MAP_FILE
-    return ordered(corners(Volume.load(file, 1).extract_mesh()))
+    return ordered(Volume.load(file, 1).extract_mesh())
 
 
 def test_maps_are_shown_chosen_and_taken_back_in_time(state: Path, feed: SavedMapFeed) -> None:
-    watched = WatchedCells()
+    watched = Held()
     assert (feed.maps(), feed.title) == (["attic", "hall", "yard"], f"{state.name}, map yard")
     assert feed.time_line is not None
     assert feed.time_line.keyframes == 2
@@ -69,7 +69,7 @@ def test_maps_are_shown_chosen_and_taken_back_in_time(state: Path, feed: SavedMa
     assert np.array_equal(feed.weights(points), volume.sample(points, surface="raw").weight)
 
     feed.choose("hall")
-    follow(feed, lambda seen: seen.map == "hall" and is_whole(seen), watched)
+    follow(feed, lambda seen: ANNA in seen.paths and is_whole(seen), watched)
     assert np.array_equal(watched.triangles(), mesh_of(state, "hall"))
     assert feed.time_line.keyframes == 4
     assert feed.title.endswith("map hall")
@@ -169,7 +169,7 @@ def test_triangles_wait_for_a_slow_page(state: Path, monkeypatch: pytest.MonkeyP
     assert len(updates) > 5
     assert page.waits > 1
     assert page.most <= 100_000 + largest
-    watched = WatchedCells()
+    watched = Held()
     watched.take(updates)
     assert np.array_equal(watched.triangles(), mesh_of(state, "hall"))
 
@@ -181,7 +181,7 @@ def test_a_run_has_no_other_time(state: Path, tmp_path: Path) -> None:
     page = Page(tmp_path)
     view_process._Viewing(page).run()  # type: ignore[arg-type]
     assert (page.sent[0].name, page.sent[0].time_line) == (tmp_path.name, None)
-    watched = WatchedCells()
+    watched = Held()
     for message in page.sent[1:]:
         watched.take(message.events)
     assert np.array_equal(watched.triangles(), mesh_of(state, "hall"))

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from tsfusion import Mesh, Volume
 from tsfusion.core.config import Surface
-from tsfusion.wire.map_events import Cleared, MapEvent, PathsFound, ScannerSeen, SurfaceUpdate
+from tsfusion.wire.map_events import Cleared, LinkSeen, MapEvent, PathsFound, ScannerSeen, SurfaceUpdate
 
 Cell = tuple[int, int, int]
 Surfaces = dict[Cell, frozenset[bytes]]  # the triangles of each cell that has some, as bytes of their corners
@@ -19,6 +19,12 @@ def triangles_of(cells: NDArray[np.int32], first_face: NDArray[np.int32], mesh: 
     corners = mesh.vertices[mesh.faces].reshape(-1, 9)
     rows = zip(cells.tolist(), first_face[:-1].tolist(), first_face[1:].tolist(), strict=True)
     return {(x, y, z): frozenset(one.tobytes() for one in corners[i:j]) for (x, y, z), i, j in rows}
+
+
+def ordered(mesh: Mesh) -> NDArray[np.float32]:
+    """(n, 9) corners of a mesh's triangles, in an order that depends on them alone."""
+    corners = mesh.vertices[mesh.faces].reshape(-1, 9)
+    return corners[np.lexsort(corners.T)]
 
 
 def fresh(volume: Volume, surface: Surface | None = None) -> Surfaces:
@@ -36,13 +42,20 @@ class Held:
     """What was shown by all events so far."""
 
     def __init__(self) -> None:
-        self.cleared = 0
+        self.cleared = self.updates = 0
         self.map, self.voxel_size = "", 0.0
         self.surfaces: Surfaces = {}
         self.raw: set[Cell] = set()  # cells that are not refined
         self.client: dict[Cell, bytes] = {}
         self.paths: dict[bytes, dict[int, NDArray[np.float64]]] = {}
         self.seen: list[ScannerSeen] = []
+        self.problems: list[str] = []
+
+    def triangles(self) -> NDArray[np.float32]:
+        """(n, 9) corners, as of `ordered`."""
+        found = b"".join(one for triangles in self.surfaces.values() for one in triangles)
+        corners = np.frombuffer(found, np.float32).reshape(-1, 9)
+        return corners[np.lexsort(corners.T)]
 
     def take(self, events: Iterable[MapEvent]) -> None:
         for event in events:
@@ -59,9 +72,12 @@ class Held:
                 }
             elif isinstance(event, ScannerSeen):
                 self.seen.append(event)
+            elif isinstance(event, LinkSeen):
+                self.problems.append(event.problem)
 
     def _take_surface(self, event: SurfaceUpdate) -> None:
         assert event.client is not None
+        self.updates += 1
         new = triangles_of(event.cells, event.first_face, event.mesh)
         for (cell, triangles), client in zip(new.items(), event.client.tolist(), strict=True):
             self.surfaces.pop(cell, None)
