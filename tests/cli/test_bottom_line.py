@@ -66,6 +66,7 @@ def test_the_last_line_answers_and_goes_away(rows: int, columns: int, color: boo
         re.sub(r"\x1b\[[0-9;]*m", "", line)
         for line in re.findall(rf"\x1b7\x1b\[{rows};1H\x1b\[2K(.*?)\x1b8", text)
     ]
+    assert not any("…" in line for line in lines)
     told = [line.partition("   ") for line in lines]
     assert [(head, figures.split(", ")[:2]) for head, _, figures in told] == [
         ("✓ starting · keeping up · lost 0 keyframes", [" 0.0/s", "5 fused"]),

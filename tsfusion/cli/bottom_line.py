@@ -53,13 +53,14 @@ class BottomLine:
             # The line feed makes room where the cursor is on the last line; setting the bounds moves it away.
             self._write(f"\n{_SAVE}\x1b[1;{rows - 1}r{_RESTORE}\x1b[1A")
             self._rows = rows
-        line = self._words(health)
+        line = self._words(health, columns - 1)
         line.truncate(columns - 1, overflow="ellipsis")
         with self._console.capture() as captured:
             self._console.print(line, end="", soft_wrap=True)
         self._write(f"{_SAVE}\x1b[{rows};1H\x1b[2K{captured.get()}{_RESTORE}")
 
-    def _words(self, health: Health) -> Text:
+    def _words(self, health: Health, columns: int) -> Text:
+        """The headline, and as many figures as there is room for."""
         fused = sum(one.keyframes_fused for one in health.maps.values())
         rate, _ = self._rates(fused, 0)
         head = headline(health, rate=max(rate or 0.0, 0.0))
@@ -67,8 +68,12 @@ class BottomLine:
             head = replace(head, doing="ending", trouble="")
         self._was_ready |= health.ready
         scanners = count_of(sum(one.state == "connected" for one in health.clients), "scanner")
-        figures = f"   {max(rate or 0.0, 0.0):4.1f}/s, {fused} fused, {scanners}"
-        return styled(head).append(figures, style="dim")
+        line = styled(head)
+        for figure in (f"   {max(rate or 0.0, 0.0):4.1f}/s", f", {fused} fused", f", {scanners}"):
+            if len(line) + len(figure) > columns:
+                break
+            line.append(figure, style="dim")
+        return line
 
     def _is_ours(self) -> bool:
         try:
