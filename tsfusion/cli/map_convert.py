@@ -37,9 +37,7 @@ SliceBox = Annotated[
     tuple[float, float, float, float] | None,
     typer.Option("--box", metavar="U0 V0 U1 V1", help="Of a slice, metres; default: all."),
 ]
-AboveFloor = Annotated[
-    bool, typer.Option("--above-floor", help="From the floor, not the map's origin.")
-]
+AboveFloor = Annotated[bool, typer.Option("--above-floor", help="Heights above the floor.")]
 Resolution = Annotated[float | None, typer.Option(metavar="METRES", help="Cell of a slice; default a voxel.")]
 
 
