@@ -10,9 +10,9 @@ import pytest
 from geometry_checks import move
 
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets import KITTI, StreetDrive, open_dataset
+from tsfusion.datasets import KITTI, StreetDrive, Synthetic, open_dataset
 from tsfusion.datasets.synthetic import roadside, worlds
-from tsfusion.datasets.synthetic.recorded_drive import record
+from tsfusion.datasets.synthetic.rendered_recordings import record
 from tsfusion.evaluation.known_surfaces import WorldSurface, drive_surface
 
 
@@ -183,6 +183,19 @@ def test_pykitti_reads_a_recording(path, tmp_path):
     assert theirs.calib.b_gray == pytest.approx(drive.baseline_fx / drive.intrinsics.fx)
     np.testing.assert_allclose(theirs.poses[1], drive.pose(1))
     assert theirs.timestamps[1].total_seconds() == pytest.approx(0.1)
+
+
+def test_a_desk_is_recorded_as_corbs_is(tmp_path):
+    desk = Synthetic("desk", count=4, width=64)
+    record(desk, tmp_path / "desk")
+    dataset = open_dataset(tmp_path / "desk")
+    assert (len(dataset), dataset.sensor, dataset.camera.intrinsics) == (4, "tof", desk.camera.intrinsics)
+    theirs, ours = dataset.frame(3), desk.frame(3)
+    np.testing.assert_array_equal(theirs.color, ours.color)
+    np.testing.assert_allclose(theirs.depth / 5000, ours.depth * 1e-4, atol=1.01e-4)
+    np.testing.assert_allclose(dataset.pose(3), desk.pose(3), atol=1e-8)
+    with pytest.raises(DatasetError, match="can be recorded as tof or as a drive, not as lidar"):
+        record(Synthetic("desk", "lidar", count=1), tmp_path / "scans")
 
 
 def test_missing_poses_are_one_clear_line(tmp_path, monkeypatch):

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""Render a drive along a KITTI path through a street into files, once.
+"""Render a synthetic world into files, once: a drive along a KITTI path, or a desk filmed by hand.
 
-    python scripts/record_drive.py kitti07 --kitti ~/kitti --out ~/drives/kitti07
+    python scripts/render_world.py kitti07 --kitti ~/kitti --out ~/drives/kitti07
     tsfusion scan ~/drives/kitti07
+    python scripts/render_world.py desk --out ~/drives/desk
 
-The folder is in the layout of KITTI's odometry benchmark. It appears when it is whole; a run that was
-interrupted goes on where it stopped. 1101 pairs take ten minutes on one core.
+A drive is written in the layout of KITTI's odometry benchmark, the desk in CoRBS'. The folder appears when
+it is whole; a run that was interrupted goes on where it stopped. 1101 pairs take ten minutes on one core.
 """
 
 import argparse
@@ -17,7 +18,9 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from tsfusion.core.errors import TsfusionError
-from tsfusion.datasets.synthetic.recorded_drive import record
+from tsfusion.datasets import Synthetic
+from tsfusion.datasets.synthetic.desk_world import STEPS
+from tsfusion.datasets.synthetic.rendered_recordings import record
 from tsfusion.datasets.synthetic.street_drive import DRIVES, StreetDrive
 
 
@@ -25,7 +28,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("drive", choices=list(DRIVES))
+    parser.add_argument("world", choices=[*DRIVES, "desk"])
     parser.add_argument("--kitti", metavar="PATH", help="folder with poses/NN.txt, or that file")
     parser.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="the folder to make")
     parser.add_argument("--count", type=int, metavar="N", help="the first N frames")
@@ -33,8 +36,7 @@ def main() -> int:
     parser.add_argument("--color", action="store_true", help="write the left camera's colour images too")
     options = parser.parse_args()
     try:
-        drive = StreetDrive(options.drive, kitti=options.kitti, count=options.count, seed=options.seed)
-        record(drive, options.out, color=options.color, progress=_Progress())
+        record(_opened(options), options.out, color=options.color, progress=_Progress())
     except TsfusionError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
@@ -43,6 +45,12 @@ def main() -> int:
         return 130
     print(options.out)
     return 0
+
+
+def _opened(options: argparse.Namespace) -> StreetDrive | Synthetic:
+    if options.world in DRIVES:
+        return StreetDrive(options.world, kitti=options.kitti, count=options.count, seed=options.seed)
+    return Synthetic(options.world, count=options.count or STEPS, seed=options.seed)
 
 
 class _Progress:
