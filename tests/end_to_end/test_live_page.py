@@ -87,9 +87,6 @@ def test_a_page_follows_its_map_whatever_happens(tmp_path: Path) -> None:
         stack.enter_context(serving(state, listen=address))
         client.send(painted(3.6, MAGENTA))
         seen.until(lambda: seen.shows(MAGENTA) and seen.shows(GREEN) and seen.shows(RED))
-
-        client.correct({}, removed=[red])
-        seen.until(lambda: seen.shows(GREEN) and not seen.shows(RED))
         assert ended(viewer, signal.SIGINT)[::2] == (0, "")
 
         own = (f"http://{place}/", f"ws://{place}", f"blob:http://{place}/", "data:")
