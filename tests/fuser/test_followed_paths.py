@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Where keyframes are, as one follows it: page by page, again when they moved, never too often."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 from health_snapshots import map_health
@@ -11,6 +14,7 @@ from tsfusion.fuser import watched_map
 from tsfusion.fuser.keyframe_poses import KeyframePoses
 from tsfusion.fuser.touched_by import TouchedBy
 from tsfusion.fuser.watched_map import WatchedMap
+from tsfusion.geometry.up_direction import HeldSensor
 from tsfusion.journal import Position
 from tsfusion.wire import corrections
 from tsfusion.wire.corrections import Correction
@@ -19,6 +23,7 @@ from tsfusion.wire.map_events import PathsFound
 from tsfusion.wire.mesh_updates import Scanned
 
 ONE, TWO, THREE = (bytes([i] * 16) for i in (1, 2, 3))
+HELD = HeldSensor(range(12))
 
 
 def poses_of(counts: dict[bytes, int]) -> KeyframePoses:
@@ -31,13 +36,16 @@ def poses_of(counts: dict[bytes, int]) -> KeyframePoses:
 
 def asked(poses: KeyframePoses, follower: FollowedPaths, now: float = 0.0) -> tuple[PathsFound, int]:
     """All paths, and how many answers they took."""
-    answers = WatchedMap(None, poses, TouchedBy(), None)  # type: ignore[arg-type]
+    volume: Any = SimpleNamespace(held=HELD)
+    answers = WatchedMap(volume, poses, TouchedBy(), None)  # type: ignore[arg-type]
     for count in range(1, 100):
         question = follower.question(now)
         assert question is not None
         if events := follower.on_keyframes("a", answers.answer(question)):
             (found,) = events
             assert isinstance(found, PathsFound)
+            assert found.held is not None
+            assert found.held.numbers == HELD.numbers
             return found, count
     raise AssertionError("no end")
 

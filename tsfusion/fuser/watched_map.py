@@ -72,6 +72,7 @@ class WatchedMap:
             "T_map_odometry": found.T_map_odometry,
             "last_session": np.array(list(session), np.uint8),
             "last": np.asarray(number, np.int64),
+            "held": np.array(self._volume.held.numbers),
         }
 
 

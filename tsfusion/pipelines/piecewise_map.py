@@ -193,7 +193,7 @@ class PiecewiseMap:
         self._place, self._is_behind = self._map.place, False
         for index in self._map.last_of_sessions():
             self._send_scanner(index)
-        self._send([PathsFound(self._map.keyframes_in())])
+        self._send([PathsFound(self._map.keyframes_in(), self._map.volume.held)])
         self._tell()
 
     def _send_scanner(self, index: int) -> None:

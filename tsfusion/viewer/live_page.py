@@ -119,6 +119,7 @@ class LivePage:
                 self._up.note_scanner(event)
                 self._marks.note_seen(event)
             case PathsFound():
+                self._up.note_paths(event)
                 self._marks.note_paths(event)
             case HealthSeen():
                 self._health = event.health

@@ -8,7 +8,7 @@ from tsfusion.geometry import up_direction
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.up_direction import HeldSensor, Up
 from tsfusion.viewer.map_tiles import MapTiles
-from tsfusion.wire.map_events import ScannerSeen
+from tsfusion.wire.map_events import PathsFound, ScannerSeen
 
 _FIRST = 2000  # triangles from which on it is looked for
 _LESS = 0.985  # cosine of 10°: a new direction counts that is further from the old one
@@ -31,6 +31,12 @@ class MapUp:
     def note_scanner(self, event: ScannerSeen) -> None:
         """Take into account how a sensor was held."""
         self._held.add(event.T_world_camera, "lidar" if event.intrinsics is None else "camera")
+
+    def note_paths(self, event: PathsFound) -> None:
+        """Take into account how the sensors of the whole map were held."""
+        if event.held is not None and event.held.is_known:
+            self._held = HeldSensor(event.held.numbers)
+            self._looked_at = 0  # what was found before was found without
 
     def note_given(self, up: Up | None) -> None:
         """Take a direction that comes with the map."""

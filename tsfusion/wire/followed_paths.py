@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DecodeError
+from tsfusion.geometry.up_direction import HeldSensor
 from tsfusion.wire.health import MapHealth
 from tsfusion.wire.map_events import MapEvent, PathsFound, ScannerSeen
 from tsfusion.wire.mesh_updates import Scanned
@@ -56,6 +57,7 @@ class FollowedPaths:
         try:
             self._add_page(arrays)
             last = arrays["last_session"].tobytes(), int(arrays["last"])
+            held = HeldSensor(arrays["held"].tolist())
         except (KeyError, IndexError, TypeError, ValueError) as error:
             raise DecodeError(f"an answer about keyframes is malformed: {error!r}") from error
         if last[0]:
@@ -64,7 +66,7 @@ class FollowedPaths:
             self._asked = Keyframes(session=last[0], after=last[1])
             return []
         self._asked = None
-        return [PathsFound({key: _joined(pages) for key, pages in self._pages.items()})]
+        return [PathsFound({key: _joined(pages) for key, pages in self._pages.items()}, held)]
 
     def _add_page(self, arrays: dict[str, NDArray[Any]]) -> None:
         upper = arrays["poses"].reshape(-1, 3, 4)

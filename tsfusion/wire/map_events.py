@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.mesh import Mesh
+from tsfusion.geometry.up_direction import HeldSensor
 from tsfusion.wire.health import Health
 
 
@@ -69,9 +70,11 @@ class PathsFound:
 
     Attributes:
         paths: by session: (n,) int64 numbers and (n, 4, 4) float64 T_world_camera.
+        held: how the sensors were held, by which up is found; None = nobody knows.
     """
 
     paths: dict[bytes, tuple[NDArray[np.int64], NDArray[np.float64]]]
+    held: HeldSensor | None = None
 
 
 @dataclass(frozen=True, eq=False)
