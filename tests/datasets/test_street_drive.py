@@ -58,6 +58,23 @@ def test_equal_arguments_give_equal_bytes_in_any_order(path, drive):
     )
 
 
+def test_the_ground_goes_on_beyond_its_border(drive):
+    """The last node's height counts there: nothing behind the arrays is read."""
+    ground = drive.world.ground
+    far = np.array([[1e4, 1e4, 0.0], [-1e4, 1e4, 0.0], [1e4, -1e4, 0.0], [-1e4, -1e4, 0.0]])
+    corners = ground.heights[[-1, -1, 0, 0], [-1, 0, -1, 0]]
+    np.testing.assert_array_equal(ground.height(far), corners)
+    renderer = drive._rendering()
+    T = np.eye(4)
+    T[:3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
+    T[:3, 3] = (*ground.layout[:2] + (np.array(ground.heights.shape)[::-1] - 1) * 4 + 5, corners[0] + 2)
+    depth = renderer.depth(T)[:, : drive.size[1] // 2]
+    v = np.arange(depth.shape[0])[-8:]
+    K = drive.intrinsics
+    expected = (2 - 0.13) * K.fy / (v - K.cy)
+    np.testing.assert_allclose(depth[-8:], np.repeat(expected[:, None], depth.shape[1], axis=1), rtol=1e-9)
+
+
 def test_what_is_rendered_lies_on_the_known_surface(drive):
     kinds = set()
     for index in (5, 33, 100):

@@ -21,8 +21,9 @@ _SECANTS = 7
 def sample(grid: ti.template(), x, y):
     """Bilinear value of a grid at (x, y) in its cells; the border's beyond it."""
     rows, columns = grid.shape[0], grid.shape[1]
-    x, y = tm.clamp(x, 0.0, columns - 1.000001), tm.clamp(y, 0.0, rows - 1.000001)
-    i, j = ti.cast(ti.floor(x), ti.i32), ti.cast(ti.floor(y), ti.i32)
+    x, y = tm.clamp(x, 0.0, ti.cast(columns - 1, ti.f64)), tm.clamp(y, 0.0, ti.cast(rows - 1, ti.f64))
+    i = ti.min(ti.cast(ti.floor(x), ti.i32), columns - 2)
+    j = ti.min(ti.cast(ti.floor(y), ti.i32), rows - 2)
     a, b = x - i, y - j
     low = ti.cast(grid[j, i], ti.f64) * (1 - a) + ti.cast(grid[j, i + 1], ti.f64) * a
     high = ti.cast(grid[j + 1, i], ti.f64) * (1 - a) + ti.cast(grid[j + 1, i + 1], ti.f64) * a

@@ -142,9 +142,8 @@ def _apart(
 
 def _bilinear(grid: NDArray[np.floating], at: Floats) -> Floats:
     """Values of a grid between its nodes, at (n, 2) of x, y in cells; the border's beyond it."""
-    x = np.clip(at[:, 0], 0, grid.shape[1] - 1.000001)
-    y = np.clip(at[:, 1], 0, grid.shape[0] - 1.000001)
-    i, j = np.floor(x).astype(int), np.floor(y).astype(int)
+    x, y = (np.clip(at[:, k], 0, grid.shape[1 - k] - 1) for k in (0, 1))
+    i, j = (np.minimum(np.floor(v).astype(int), grid.shape[1 - k] - 2) for k, v in ((0, x), (1, y)))
     a, b = x - i, y - j
     low = grid[j, i] * (1 - a) + grid[j, i + 1] * a
     high = grid[j + 1, i] * (1 - a) + grid[j + 1, i + 1] * a
