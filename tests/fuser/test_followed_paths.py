@@ -24,6 +24,7 @@ from tsfusion.wire.mesh_updates import Scanned
 
 ONE, TWO, THREE = (bytes([i] * 16) for i in (1, 2, 3))
 HELD = HeldSensor(range(12))
+HELD_MAP: Any = SimpleNamespace(held=HELD)
 
 
 def poses_of(counts: dict[bytes, int]) -> KeyframePoses:
@@ -36,8 +37,7 @@ def poses_of(counts: dict[bytes, int]) -> KeyframePoses:
 
 def asked(poses: KeyframePoses, follower: FollowedPaths, now: float = 0.0) -> tuple[PathsFound, int]:
     """All paths, and how many answers they took."""
-    volume: Any = SimpleNamespace(held=HELD)
-    answers = WatchedMap(volume, poses, TouchedBy(), None)  # type: ignore[arg-type]
+    answers = WatchedMap(HELD_MAP, poses, TouchedBy(), None)  # type: ignore[arg-type]
     for count in range(1, 100):
         question = follower.question(now)
         assert question is not None
@@ -112,7 +112,7 @@ def test_scanners_are_shown_where_their_keyframes_come_to_be() -> None:
 def test_what_makes_no_sense_is_asked_for_again() -> None:
     follower = FollowedPaths()
     question = follower.question(0.0)
-    answers = WatchedMap(None, poses_of({ONE: 2}), TouchedBy(), None)  # type: ignore[arg-type]
+    answers = WatchedMap(HELD_MAP, poses_of({ONE: 2}), TouchedBy(), None)  # type: ignore[arg-type]
     assert question is not None
     good = answers.answer(question)
     for name in good:
