@@ -13,7 +13,7 @@ FOV = math.radians(50)  # from top to bottom of the picture
 _ELEVATION = math.radians(42)
 _SIDES = 12  # that are tried
 _SAMPLE = 20  # points of a tile
-_SHARE = (2, 98)  # percent of the points that are in the picture
+_SHARE = (0.5, 99.5)  # percent of the points that are in the picture
 _FILLED = 0.92  # of the picture
 
 
