@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A live page in a real browser: its pixels, through a correction and a restart of the server."""
+"""A live page in a real browser: its pixels, through a correction and restarts of server and page."""
 
 import re
 import signal
@@ -20,7 +20,7 @@ from tsfusion import Client
 
 RED, GREEN, MAGENTA = (230, 20, 20), (20, 200, 20), (200, 20, 200)  # none is of the page itself
 TOKEN = {"TSFUSION_TOKEN": "open-sesame"}
-SIZE = {"width": 640, "height": 420}
+SIZE = {"width": 960, "height": 540}
 # Of three.js inside viser; and a browser's own words about a server that is away.
 _HARMLESS = re.compile(r"THREE\.Clock: This module has been|ERR_CONNECTION|WebSocket connection to")
 
@@ -59,7 +59,7 @@ class Seen:
         return bool(a[:, 1].mean() < b[:, 1].mean()) if len(a) and len(b) else None
 
     def shows(self, color: tuple[int, int, int]) -> bool:
-        return len(self.where(color)) > 300
+        return len(self.where(color)) > 1500  # a scanner's red axis has some hundred
 
 
 def test_a_page_follows_its_map_whatever_happens(tmp_path: Path) -> None:
@@ -69,6 +69,7 @@ def test_a_page_follows_its_map_whatever_happens(tmp_path: Path) -> None:
         viewer = stack.enter_context(viewing(address, "--listen", "127.0.0.1:0", **TOKEN))
         url = address_of(viewer)
         place = urlsplit(url).netloc
+        page.call("Emulation.setFocusEmulationEnabled", enabled=True)  # else it does not connect again
         page.open(url, **SIZE)
         seen = Seen(page)
         client = stack.enter_context(Client(address, spool=tmp_path / "spool"))
@@ -87,6 +88,12 @@ def test_a_page_follows_its_map_whatever_happens(tmp_path: Path) -> None:
         stack.enter_context(serving(state, listen=address))
         client.send(painted(3.6, MAGENTA))
         seen.until(lambda: seen.shows(MAGENTA) and seen.shows(GREEN) and seen.shows(RED))
+
+        assert ended(viewer, signal.SIGTERM)[0] == 0
+        viewer = stack.enter_context(viewing(address, "--listen", place, **TOKEN))
+        assert address_of(viewer) == url
+        client.correct({}, removed=[red])
+        seen.until(lambda: seen.shows(MAGENTA) and seen.shows(GREEN) and not seen.shows(RED))
         assert ended(viewer, signal.SIGINT)[::2] == (0, "")
 
         own = (f"http://{place}/", f"ws://{place}", f"blob:http://{place}/", "data:")
