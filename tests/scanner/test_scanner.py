@@ -96,6 +96,27 @@ def spooled(spools: Path, name: str) -> list[int]:
     return [keyframe.timestamp_ns // FRAME_NS - 1 for keyframe in JournalRecording(spools / name)]
 
 
+def test_another_rule_may_choose_the_keyframes(tmp_path: Path) -> None:
+    class EveryThird:
+        def reason(self, frame: Frame, _T: np.ndarray) -> str | None:
+            return None if frame.timestamp_ns // FRAME_NS % 3 else "third"
+
+        def accept(self, frame: Frame, _T: np.ndarray) -> None:
+            pass
+
+        def reset(self) -> None:
+            pass
+
+    client = Client(NOBODY, spool=tmp_path / "hall", map="hall", policy="spool_all")
+    with client:
+        scanner = Scanner(
+            Scripted("T" * 7), ScanConfig(), lambda _: client, map_name="hall", selector=EveryThird()
+        )
+        scanner.run(frames(7), lambda _: None)
+    assert scanner.state().selected == {"third": 2}
+    assert spooled(tmp_path, "hall") == [2, 5]
+
+
 def test_a_lost_sensor_sends_nothing(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, "tsfusion")
     with scanned(tmp_path, Scripted("LTTLLLTT"), 8) as scanner:

@@ -2,6 +2,7 @@
 """Selection of the map's keyframes. (Trackers have keyframes of their own.)"""
 
 from collections.abc import Callable
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,19 @@ from tsfusion.geometry.frame import Frame
 
 INDOORS, OUTDOORS = 0.1, 2.0  # metres between keyframes
 _STRIDE = 16  # pixels between those whose overlap is computed
+
+
+class Selector(Protocol):
+    """Rule that chooses keyframes."""
+
+    def reason(self, frame: Frame, T_world_camera: NDArray[np.float64]) -> str | None:
+        """Why the frame is one, in a word; None = it is not."""
+
+    def accept(self, frame: Frame, T_world_camera: NDArray[np.float64]) -> None:
+        """Make the frame the last keyframe."""
+
+    def reset(self) -> None:
+        """Make the next frame the first of a new world."""
 
 
 class KeyframeSelector:

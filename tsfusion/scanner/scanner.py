@@ -19,7 +19,7 @@ from tsfusion.core.config import MAP_NAME_LENGTH, ScanConfig
 from tsfusion.core.counts import count_of
 from tsfusion.delivery.outcomes import ClientStats
 from tsfusion.geometry.frame import Frame
-from tsfusion.scanner.keyframe_selection import KeyframeSelector
+from tsfusion.scanner.keyframe_selection import KeyframeSelector, Selector
 from tsfusion.scanner.localization.localizer import Localizer, Lost, Pose, PoseCorrections
 from tsfusion.scanner.tracked_trajectory import TrackedTrajectory
 
@@ -82,6 +82,7 @@ class Scanner:
         free_name: asks for the name of a map that nobody has; None = nobody can say.
         outdoors: see `KeyframeSelector`.
         most: largest number of submaps; then a lost sensor has to be found again in the last one. None = any.
+        selector: chooses the keyframes; None = one with the config's rules.
     """
 
     def __init__(
@@ -95,11 +96,12 @@ class Scanner:
         free_name: Callable[[], str | None] = lambda: None,
         outdoors: bool = False,
         most: int | None = None,
+        selector: Selector | None = None,
     ) -> None:
         self._localizer, self._config, self._most = localizer, config, most
         self._connect, self._map_name, self._taken = connect, map_name, {map_name, *taken}
         self._free_name = free_name
-        self._selector = KeyframeSelector(config, outdoors=outdoors)
+        self._selector = selector or KeyframeSelector(config, outdoors=outdoors)
         self._next: str | None = None  # the map of the submap that begins with the next pose
         self._lost_since: int | None = None
         self._why = ""
