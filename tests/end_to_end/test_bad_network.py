@@ -149,6 +149,16 @@ def test_it_is_as_slow_as_told(proxy: Proxy) -> None:
         assert time.monotonic() - started >= 0.1
 
 
+def test_lost_packets_come_later_and_all_of_them_come(proxy: Proxy) -> None:
+    proxy.lose(0.5, again_s=0.1)
+    with connected(proxy) as link:
+        content = bytes(range(256)) * 200
+        started = time.monotonic()
+        assert echoed(link, content) == content
+    assert time.monotonic() - started >= 0.1
+    assert 10 < proxy.lost < 2 * 36 + 40
+
+
 def test_a_frozen_link_loses_nothing(proxy: Proxy) -> None:
     with talking(proxy) as link:
         proxy.freeze(True)

@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 
 _CHUNK = 16 << 10  # bytes taken at once: what a throttled link holds beyond the kernel's buffers
 _BUFFER = 64 << 10  # of each socket, so that a slow link is felt at its other end
+_PACKET = 1460  # bytes, over Ethernet
 _PATIENCE = 10.0
 _PORT_TRIES = 32
 
@@ -30,6 +31,7 @@ class Proxy:
         address: connect a client here; its control socket is the next port, as with a server.
         carried: bytes passed on, both ways.
         flipped: bytes that were changed on the way.
+        lost: packets that were lost, and came later.
     """
 
     def __init__(self) -> None:
@@ -45,6 +47,8 @@ class Proxy:
         self._tasks: set[asyncio.Task[None]] = set()
         self._rate: float | None = None
         self._delay = 0.0
+        self._lost_share, self._again_s = 0.0, 0.0
+        self.lost = 0
         self._swallows = False
         self._free_at = 0.0  # when the throttled link has carried what it was given
         self._loop = asyncio.new_event_loop()
@@ -76,6 +80,14 @@ class Proxy:
     def delay(self, seconds: float) -> None:
         """Each way takes so long, and no connection carries more than 16 kB in that time."""
         self._delay = seconds
+
+    def lose(self, share: float, *, again_s: float = 0.05) -> None:
+        """Lose a share of the packets: TCP sends them again, so that they and all behind them come later.
+
+        Args:
+            again_s: seconds until a lost packet comes after all.
+        """
+        self._lost_share, self._again_s = share, again_s
 
     def freeze(self, frozen: bool) -> None:
         """Carry nothing, lose nothing: as when packets are lost and sent again later."""
@@ -130,6 +142,7 @@ class Proxy:
         """A good network again."""
         self.throttle(None)
         self.delay(0.0)
+        self.lose(0.0)
         self.freeze(False)
         self.jam(False)
         self.black_hole(False)
@@ -234,7 +247,7 @@ class Proxy:
     ) -> None:
         """Carry one direction of a connection until it ends."""
         while chunk := await self._read(reader, writer):
-            await asyncio.sleep(self._wait(len(chunk)))
+            await asyncio.sleep(self._wait(len(chunk)) + self._loss(len(chunk)))
             for way in ways:
                 await way.wait()
             if not self._swallows and writer not in self._forgotten:
@@ -262,6 +275,12 @@ class Proxy:
             if writer not in self._forgotten:  # else nobody tells the other end
                 raise
             return b""
+
+    def _loss(self, size: int) -> float:
+        """Seconds until the last packet of so many bytes is there; those lost together come together."""
+        lost = sum(self._rng.random() < self._lost_share for _ in range(-(-size // _PACKET)))
+        self.lost += lost
+        return self._again_s if lost else 0.0
 
     def _wait(self, size: int) -> float:
         now = self._loop.time()
