@@ -1,0 +1,375 @@
+# SPDX-License-Identifier: MIT
+"""scripts/reproduce_paper.py: its plan, its verdicts, its figures' data, and two modes from end to end."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from repository import ROOT
+
+from tsfusion.evaluation.trajectory_error import TrajectoryError
+from tsfusion.wire.keyframe_times import Spread
+
+sys.path.insert(0, str(ROOT / "scripts"))
+import _paper_events
+import _paper_figures
+import _paper_limits
+import _paper_outcome
+import _paper_report
+import _paper_runs
+import _paper_verdicts
+import _paper_worlds
+from _paper_frontend import PlannedKeyframes
+from _paper_outcome import Outcome
+from _paper_verdicts import Findings, Verdict
+from _paper_worlds import PaperWorld
+
+SCRIPT = ROOT / "scripts" / "reproduce_paper.py"
+WORLD = PaperWorld(
+    name="kitti06", title="a street", stands_for="06_KITTI", source="synthetic:street:stereo",
+    sensor="stereo", localizer="stereo", voxel_size=0.15, died_at=60, published_rmse=0.8, loops=True,
+)  # fmt: skip
+
+
+def outcome(mode: str = "decentralised", **more: Any) -> Outcome:
+    """A run that went well, with changes."""
+    fine: dict[str, Any] = {
+        "name": f"kitti06-{mode}", "world": "kitti06", "mode": mode, "map": "regularised", "number": 1,
+        "machine": "all of this machine", "frames": 1101, "located": 1101, "planned": 428, "sent": 428,
+        "fused": 428, "drained": True, "cores": 1.0, "robot_peak_bytes": 200_000_000,
+        "delay_ms": Spread(count=428, mean=90.0, p50=80.0, p95=200.0, p99=300.0, max=400.0),
+    }  # fmt: skip
+    return Outcome(**{**fine, **more})
+
+
+def error(rmse: float) -> TrajectoryError:
+    names = ("min", "max", "mean", "median", "std", "length", "drift_percent", "rotation_deg")
+    return TrajectoryError(count=9, rmse=rmse, **dict.fromkeys(names, 0.5))
+
+
+def slow(**more: Any) -> dict[str, Any]:
+    return {"delay_ms": Spread(count=60, mean=9e3, p50=9e3, p95=2e4, p99=2e4, max=2e4), **more}
+
+
+SMALL = "simulated small machine: 1 core, 1024 MiB"
+
+
+def judged(*outcomes: Outcome, **more: Any) -> dict[str, Verdict]:
+    return _paper_verdicts.verdicts(Findings(worlds=[WORLD], outcomes=list(outcomes), **more))
+
+
+def test_a_run_that_went_well_meets_its_claims() -> None:
+    made = judged(outcome(ate=error(0.4)))
+    names = ("delay", "delay target", "fused", "memory", "scanner", "drift")
+    assert {name: made[f"{name}, kitti06"].met for name in names} == dict.fromkeys(names, True)
+    assert made["versatility"].met is None  # nothing was swept
+    assert "explanation, kitti06" not in made  # there is no control
+
+
+@pytest.mark.parametrize(
+    ("name", "changes"),
+    [
+        ("delay", {"delay_ms": Spread(count=9, mean=501.0, p99=600.0)}),
+        ("delay", {"delay_ms": Spread(count=9, mean=50.0, p99=9e3)}),
+        ("delay", {"slope_ms_per_keyframe": 1.0}),
+        ("delay target", {"delay_ms": Spread(count=9, mean=101.0, p99=200.0)}),
+        ("fused", {"fused": 427}),
+        ("memory", {"growth_mib": 17.0}),
+        ("scanner", {"cores": 1.3}),
+        ("scanner", {"robot_peak_bytes": 251_000_000}),
+        ("drift", {"ate": error(0.1), "lost": 3}),
+    ],
+)
+def test_a_claim_that_is_missed_is_not_met(name: str, changes: dict[str, Any]) -> None:
+    verdict = judged(outcome(**changes))[f"{name}, kitti06"]
+    assert verdict.met is False
+    assert verdict.words
+    assert verdict.wanted
+    assert verdict.measured is not None
+
+
+def test_a_delay_of_no_keyframe_is_not_measured() -> None:
+    assert judged(outcome(delay_ms=Spread()))["delay, kitti06"].met is None
+
+
+@pytest.mark.parametrize(
+    ("unbounded", "bounded", "met", "says"),
+    [
+        (slow(death="killed", died_of="memory"), {"fused": 300}, True, "is not enough"),
+        (slow(), {}, False, "Bounding the queue is enough"),
+        ({}, {"fused": 300}, False, "Neither is needed"),
+    ],
+)
+def test_the_control_decides_what_explains_the_gain(
+    unbounded: dict[str, Any], bounded: dict[str, Any], met: bool, says: str
+) -> None:
+    made = judged(
+        outcome(),
+        outcome("traditional-unbounded", machine=SMALL, **unbounded),
+        outcome("traditional-bounded", machine=SMALL, **bounded),
+    )
+    verdict = made["explanation, kitti06"]
+    assert verdict.met is met
+    assert says in verdict.words
+    for mode in ("traditional-unbounded", "traditional-bounded", "decentralised"):
+        assert _paper_runs.MODES[mode] in verdict.words
+
+
+def test_a_decentralised_run_that_fails_too_explains_nothing() -> None:
+    bad = {"fused": 300}
+    made = judged(
+        outcome(**bad), outcome("traditional-unbounded", **bad), outcome("traditional-bounded", **bad)
+    )
+    assert made["explanation, kitti06"].met is False
+    assert "Neither reaches all of it" in made["explanation, kitti06"].words
+
+
+def test_the_baseline_is_said_to_die_where_it_did() -> None:
+    died = {"death": "killed with 1030 MiB resident", "died_of": "memory", "died_at": 77}
+    verdict = judged(outcome("traditional-unbounded", machine=SMALL, **died))["baseline, kitti06"]
+    assert verdict.met is True
+    assert "at keyframe 77" in verdict.words
+    assert "keyframe 60" in verdict.wanted
+    alive = judged(outcome("traditional-unbounded"))["baseline, kitti06"]
+    assert alive.met is False
+    assert "did not die" in alive.words
+
+
+def test_another_map_is_not_the_same() -> None:
+    name = _paper_runs.MODES["two-robots"]
+    run = {"map_hash": "a", "expected_hash": "a"}
+    assert judged(outcome("two-robots", **run))[name].met is True
+    assert judged(outcome("two-robots", **run | {"map_hash": "b"}))[name].met is False
+    assert judged(outcome("two-robots", **run | {"expected_hash": ""}))[name].met is None
+
+
+def test_surfaces_are_judged_by_f_score_at_equal_completeness() -> None:
+    def rows(f_score: float, completeness: float) -> list[dict[str, Any]]:
+        common = {"sensor": "stereo", "smoothness": None, "support": None}
+        return [
+            {**common, "method": "off", "f_score": 60.0, "completeness": 90.0},
+            {**common, "method": "regularised", "f_score": f_score, "completeness": completeness},
+            {"sensor": "stereo", "method": "ray", "smoothness": 0.0, "support": 3.0, "f_score": 50.0},
+            {"sensor": "stereo", "method": "ray", "smoothness": 9.0, "support": 3.0, "f_score": 55.0},
+        ]
+
+    found = judged(sweep=rows(71.0, 89.0))
+    assert found["surface, stereo"].met is True
+    assert found["versatility"].met is True
+    assert judged(sweep=rows(69.0, 89.0))["surface, stereo"].met is False
+    assert judged(sweep=rows(71.0, 80.0))["surface, stereo"].met is False
+
+
+def shifted(count: int, *, wrong_from: int) -> tuple[np.ndarray, np.ndarray]:
+    """(estimate, truth): a straight way, and one that leaves it at a frame."""
+    truth = np.tile(np.eye(4), (count, 1, 1))
+    truth[:, 2, 3] = np.arange(count)
+    estimate = truth.copy()
+    estimate[wrong_from:, 0, 3] += 5.0
+    return estimate, truth
+
+
+def test_the_error_is_cut_at_the_frame_where_the_baseline_died(tmp_path: Path) -> None:
+    estimate, truth = shifted(30, wrong_from=20)
+    kept = np.delete(np.arange(30), [3, 4, 25])  # late frames have no pose
+    path = tmp_path / _paper_outcome.POSES
+    np.savez(path, indices=kept, poses=estimate[kept], truth=truth[kept])
+    full, cut = _paper_outcome.error_until(path), _paper_outcome.error_until(path, 19)
+    assert full is not None
+    assert cut is not None
+    assert full.rmse > 1
+    assert cut.rmse < 1e-9
+    assert cut.count == 18
+    assert _paper_outcome.error_until(path, 0) is None  # one pose has no error
+    assert _paper_outcome.error_until(tmp_path / "none.npz") is None
+
+
+def test_the_cut_is_that_of_the_small_machine_where_both_died() -> None:
+    runs = [
+        outcome("traditional-unbounded", machine=SMALL, died_frame=100, name="small"),
+        outcome("traditional-unbounded", died_frame=700, name="whole"),
+        outcome("traditional-bounded", died_frame=9, name="control"),
+    ]
+    assert _paper_report.cut_frames(runs) == {("kitti06", "regularised", 1): 100}
+    assert _paper_report.cut_frames(runs[1:]) == {("kitti06", "regularised", 1): 700}
+    assert _paper_report.cut_frames([outcome()]) == {}
+
+
+def test_a_series_ends_with_a_cross_where_its_mode_died() -> None:
+    rows = [{"seq": str(n), "delay_ms": f"{10 * n}"} for n in range(1, 5)] + [{"seq": "5", "delay_ms": ""}]
+    series = _paper_figures.series_of(
+        outcome("traditional-unbounded", machine=SMALL, death="killed", died_of="memory"), rows
+    )
+    assert series.number.tolist() == [1, 2, 3, 4]
+    assert series.delay_ms.tolist() == [10.0, 20.0, 30.0, 40.0]
+    assert series.end == (4, 40.0)
+    assert series.died_of == "memory"
+    assert not series.dashed
+    alive = _paper_figures.series_of(outcome("traditional-bounded"), rows)
+    assert alive.end is None
+    assert alive.dashed  # the control on the whole machine
+
+
+def test_what_a_killed_front_end_wrote_is_told() -> None:
+    frame = {"due_ns": 5, "T_world_camera": None, "late": 0, "cpu_s": 0.1, "rss_bytes": 1, "queue": 1}
+    lines = [
+        {"event": "start", "t": 5},
+        {"event": "frame", "t": 9, "index": 0, "queue_bytes": 7, **frame},
+        {"event": "keyframe", "t": 10, "seq": 1, "captured_ns": 5, "sent_ns": 10},
+        {"event": "keyframe", "t": 20, "seq": 2, "captured_ns": 15, "sent_ns": 20},
+        {"event": "fused", "t": 30, "seq": 1, "fuse_start_ns": 11, "map_bytes": 4096},
+        {"event": "meshed", "t": 31},
+    ]
+    story = _paper_events.of([*map(json.dumps, lines), '{"event":"fused","t":4'])
+    assert story.fused == 1
+    assert [record.fused_ns for record in story.times] == [30, 0]
+    assert [record.meshed_ns for record in story.times] == [31, 0]
+    assert story.map_bytes == [(30, 4096)]
+    assert not story.ended
+    fields = _paper_outcome.of_story(story, [], _paper_limits.Death("memory", "killed"))
+    assert (fields["died_at"], fields["died_frame"], fields["sent"], fields["lost"]) == (1, 0, 2, 1)
+
+
+def test_memory_without_map_and_queue_is_what_grows() -> None:
+    rows = [_paper_outcome.MemoryRow(s, "server", (100 + s) << 20, s << 20, 0) for s in range(21)]
+    assert _paper_outcome.growth_mib(rows) == pytest.approx(0.0, abs=1e-6)  # the map alone grows
+    rows = [_paper_outcome.MemoryRow(s, "robot", (100 + s) << 20, 0, 0) for s in range(21)]
+    assert _paper_outcome.growth_mib(rows) == pytest.approx(10.0)
+
+
+def test_keyframes_are_chosen_to_be_as_many_as_wanted() -> None:
+    dataset = msgspec.structs.replace(WORLD, options={"count": 60}).open()
+    assert len(_paper_worlds.planned_keyframes(dataset, 20, outdoors=True)) == 20
+    usual = _paper_worlds.planned_keyframes(dataset, None, outdoors=True)
+    assert usual[0] == 0
+    assert 25 <= len(usual) <= 31  # every 2 m
+
+
+def test_a_planned_keyframe_that_was_dropped_is_the_next_frame() -> None:
+    class Seen:
+        def __init__(self, stamp: int) -> None:
+            self.timestamp_ns = stamp
+
+    rule: Any = PlannedKeyframes(np.array([0, 30, 60, 70]))
+    taken = []
+    for stamp in (0, 10, 20, 40, 50, 80, 90):  # 30, 60 and 70 were dropped
+        if rule.reason(Seen(stamp), np.eye(4)):
+            rule.accept(Seen(stamp), np.eye(4))
+            taken.append(stamp)
+    assert taken == [0, 40, 80]
+
+
+def test_a_process_that_outgrows_its_machine_is_killed() -> None:
+    command = "import time\nkept = bytearray(300 << 20)\ntime.sleep(60)"
+    with subprocess.Popen([sys.executable, "-c", command]) as child:
+        watch = _paper_limits.MemoryWatch(child, 150 << 20, _paper_outcome_rss)
+        code = child.wait(60)
+        watch.stop()
+    death = _paper_limits.death_of(code, watch, "")
+    assert death is not None
+    assert death.of == "memory"
+    assert "of 150 there are" in death.words
+
+
+def _paper_outcome_rss(pid: int) -> int:
+    from tsfusion.core import process
+
+    return process.tree_rss_bytes(pid)
+
+
+def test_a_share_of_the_time_is_a_share_of_the_work() -> None:
+    assert _paper_limits.calibrate(0.1) < 0.6
+
+
+def test_runs_have_names_of_their_own_and_come_after_what_they_need() -> None:
+    worlds = _paper_worlds.worlds(quick=False)
+    runs = _paper_runs.plan(worlds, _paper_runs.Limits(), quick=False, runs=2)
+    names = [run.name for run in runs]
+    assert len(set(names)) == len(names)
+    for place, run in enumerate(runs):
+        if run.mode in _paper_runs.AGAIN:
+            assert _paper_runs.source_of(run).name in names[:place]
+    only = _paper_runs.plan(worlds, _paper_runs.Limits(), quick=False, only=["two-robots"])
+    assert [run.mode for run in only] == ["decentralised", "two-robots"]
+
+
+def reproduce(*arguments: str | Path, data: Path) -> "subprocess.Popen[str]":
+    return subprocess.Popen(
+        [sys.executable, str(SCRIPT), *map(str, arguments)],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        env={**os.environ, "TSFUSION_DATA": str(data)},
+    )  # fmt: skip
+
+
+@pytest.fixture
+def interrupted(tmp_path: Path) -> tuple[str, ...]:
+    """Arguments of a command that was interrupted in its first run."""
+    modes = ("street-traditional-bounded", "street-decentralised")
+    arguments = ("--quick", "--frames", "12", "--pace", "2", "--out", str(tmp_path / "out"), "--only", *modes)
+    with reproduce(*arguments, data=tmp_path) as running:
+        assert running.stderr is not None
+        for line in running.stderr:
+            if line.startswith("[1/2]"):
+                running.send_signal(signal.SIGINT)
+                break
+        rest = running.stderr.read()
+    assert running.returncode == 130, rest
+    assert "the same command goes on" in rest
+    assert "Traceback" not in rest
+    return arguments
+
+
+def test_two_modes_from_end_to_end(interrupted: tuple[str, ...], tmp_path: Path) -> None:
+    with reproduce(*interrupted, data=tmp_path) as running:
+        said, told = running.communicate(timeout=240)
+    assert running.returncode == 0, told
+    assert "rendering" not in told  # kept by the one that was interrupted
+    out = tmp_path / "out"
+    record = json.loads((out / "run.json").read_text())
+    runs = {run["mode"]: run for run in record["runs"]}
+    assert set(runs) == {"traditional-bounded", "decentralised"}
+    for run in runs.values():
+        assert run["fused"] + sum(run["skipped"].values()) == run["sent"] > 0
+        assert run["delay_ms"]["count"] == run["fused"]
+        assert run["frames"] + run["late"] == 12
+        assert run["ate"]["count"] == run["located"]
+        assert run["map_hash"]
+    for verdict in record["verdicts"].values():
+        assert set(verdict) == {"met", "measured", "wanted", "words"}
+    assert "delay, street" in said
+    for name in ("delay.csv", "memory.csv", "ate.csv", "surface.csv"):
+        assert (out / name).read_text().startswith("run,")
+    assert (out / "figure3.png").read_bytes().startswith(b"\x89PNG")
+    assert (out / "runs" / "street-decentralised-regularised-1" / "picture-whole.png").exists()
+    page = (out / "report.html").read_text()
+    assert "http" not in page.replace("http-equiv", "").replace("http://www.w3.org", "")
+    began = time.monotonic()
+    with reproduce(*interrupted, data=tmp_path) as running:
+        _, told = running.communicate(timeout=240)
+    assert running.returncode == 0, told
+    assert "[1/2]" not in told
+    assert "measuring" not in told
+    assert time.monotonic() - began < 120
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--runs", "0"), "expected more than 0"),
+        (("--server-share", "2"), "at most 1"),
+        (("--only", "nowhere"), "no run has such a name"),
+    ],
+)
+def test_a_mistake_is_one_line(arguments: tuple[str, ...], message: str, tmp_path: Path) -> None:
+    with reproduce(*arguments, data=tmp_path) as running:
+        _, told = running.communicate(timeout=60)
+    assert running.returncode == 2
+    assert message in told.splitlines()[-1]
