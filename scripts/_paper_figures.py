@@ -136,34 +136,39 @@ def _draw_memory(axis: Any, outcome: Outcome, rows: list[dict[str, str]]) -> Non
 
 
 def versatility(rows: Sequence[dict[str, Any]], path: Path) -> bool:
-    """F-score over λ: a colour a sensor, a line a support; the maps of the runs and others beside."""
+    """F-score and mean error over λ: a colour a sensor, a line a support. False = nothing to draw."""
     from matplotlib.figure import Figure
 
     rays = [row for row in rows if row["method"] == "ray" and row["f_score"] is not None]
     if not rays:
         return False
-    figure = Figure(figsize=(8.6, 4.6), dpi=130, layout="constrained")
-    axis = figure.subplots()
-    for sensor in dict.fromkeys(row["sensor"] for row in rays):
-        supports = sorted({row["support"] for row in rays if row["sensor"] == sensor})
-        for support, style in zip(supports, (":", "--", "-", "-."), strict=False):
-            line = sorted(
-                (row["smoothness"], row["f_score"])
-                for row in rays
-                if (row["sensor"], row["support"]) == (sensor, support)
-            )
-            axis.plot(*zip(*line, strict=True), style, color=_SENSORS.get(sensor, "0.3"), marker="o",
-                      markersize=3.5, label=f"{sensor}, support {support:g} voxels")  # fmt: skip
+    figure = Figure(figsize=(12.6, 4.6), dpi=130, layout="constrained")
+    axes = figure.subplots(1, 2)
     least = min((row["smoothness"] for row in rays if row["smoothness"]), default=1.0)
-    axis.set_xscale("symlog", linthresh=least, linscale=0.6)
-    axis.set(xlabel="λ (0 = Curless and Levoy)", ylabel="F-score at one voxel, %")
-    axis.set_title(
+    shown = (("f_score", "F-score at one voxel, %"), ("mean_mm", "mean error as a share of λ = 0"))
+    for axis, (value, title) in zip(axes, shown, strict=True):
+        for sensor in dict.fromkeys(row["sensor"] for row in rays):
+            _draw_sensor(axis, sensor, [row for row in rays if row["sensor"] == sensor], value)
+        axis.set_xscale("symlog", linthresh=least, linscale=0.6)
+        axis.set(xlabel="λ (0 = Curless and Levoy)", ylabel=title)
+        axis.grid(True, alpha=0.3)
+    axes[1].legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    figure.suptitle(
         "One regularised per-ray integration for three sensors, by λ and support alone", fontsize=10
     )
-    axis.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5))
-    axis.grid(True, alpha=0.3)
     figure.savefig(path)
     return True
+
+
+def _draw_sensor(axis: Any, sensor: str, rows: list[dict[str, Any]], value: str) -> None:
+    """Lines of a sensor; an error is shown beside that without regularisation, as sensors differ much."""
+    supports = sorted({row["support"] for row in rows})
+    for support, style in zip(supports, (":", "--", "-", "-."), strict=False):
+        line = sorted((row["smoothness"], row[value]) for row in rows if row["support"] == support)
+        whole = line[0][1] if value == "mean_mm" else 1.0
+        label, color = f"{sensor}, support {support:g} voxels", _SENSORS.get(sensor, "0.3")
+        axis.plot([x for x, _ in line], [y / whole for _, y in line], style, marker="o", markersize=3.5,
+                  color=color, label=label)  # fmt: skip
 
 
 def _of(world: PaperWorld, outcomes: Sequence[Outcome]) -> list[Outcome]:

@@ -251,7 +251,7 @@ def _figures(drawn: dict[str, Path], word: str) -> str:
     captions = {
         "figure 3": "Delay from sensor to map, as the paper's figure 3: a cross is where a mode died.",
         "figure 4": "The same for the desk, as the paper's figure 4.",
-        "versatility": "F-score over λ; at λ = 0 the integration is plain.",
+        "versatility": "F-score, and mean error beside that of λ = 0, where the integration is plain.",
     }
     return "".join(
         page.picture(_url(path), captions.get(name, name)) for name, path in drawn.items() if word in name
