@@ -16,6 +16,7 @@ PAPER_MS = 500.0
 _LIVE = ("traditional-unbounded", "traditional-bounded", "decentralised", "slow-server", "slow-link")
 _COLORS = dict(zip(_LIVE, ("#d55e00", "#e69f00", "#0072b2", "#56b4e9", "#cc79a7"), strict=True))
 _SENSORS = {"stereo": "#0072b2", "kinect": "#d55e00", "tof": "#d55e00", "lidar": "#009e73"}
+_METHODS = {"off": "#d55e00", "regularised": "#0072b2", "vdbfusion": "#009e73", "open3d": "#cc79a7"}
 _TICKS_MS = [step * 10**power for power in range(6) for step in (1, 2, 5)]
 _MIB = 1 << 20
 
@@ -169,6 +170,29 @@ def _draw_sensor(axis: Any, sensor: str, rows: list[dict[str, Any]], value: str)
         label, color = f"{sensor}, support {support:g} voxels", _SENSORS.get(sensor, "0.3")
         axis.plot([x for x, _ in line], [y / whole for _, y in line], style, marker="o", markersize=3.5,
                   color=color, label=label)  # fmt: skip
+
+
+def surfaces(rows: Sequence[dict[str, Any]], path: Path) -> bool:
+    """Precision over completeness: the maps over the weight that a voxel needs, and other systems."""
+    from matplotlib.figure import Figure
+
+    whole = [row for row in rows if row["method"] != "ray" and row["f_score"] is not None]
+    sensors = list(dict.fromkeys(row["sensor"] for row in whole))
+    if not sensors:
+        return False
+    figure = Figure(figsize=(4.4 * len(sensors), 4.0), dpi=130, layout="constrained")
+    for axis, sensor in zip(figure.subplots(1, len(sensors), squeeze=False)[0], sensors, strict=True):
+        shown = [row for row in whole if row["sensor"] == sensor]
+        for method, color in _METHODS.items():
+            line = sorted((r["completeness"], r["precision"]) for r in shown if r["method"] == method)
+            own = [r for r in shown if r["method"] == method and r["min_weight"] is None]
+            axis.plot(*np.array(line).reshape(-1, 2).T, "-", color=color, linewidth=1.2, label=method)
+            axis.plot([r["completeness"] for r in own], [r["precision"] for r in own], "o", color=color)
+        axis.set(title=sensor, xlabel="completeness, %", ylabel="precision, %")
+        axis.grid(True, alpha=0.3)
+        axis.legend(fontsize=8)
+    figure.savefig(path)
+    return True
 
 
 def _of(world: PaperWorld, outcomes: Sequence[Outcome]) -> list[Outcome]:

@@ -162,6 +162,8 @@ def draw(folder: Path, found: Findings) -> dict[str, Path]:
             drawn[f"memory, {world.name}"] = path
     if _paper_figures.versatility(found.sweep, folder / "versatility.png"):
         drawn["versatility"] = folder / "versatility.png"
+    if _paper_figures.surfaces(found.sweep, folder / "surfaces.png"):
+        drawn["surfaces"] = folder / "surfaces.png"
     return drawn
 
 
@@ -211,7 +213,8 @@ def write_page(
         ("Figure 5: reconstructions", _reconstructions(folder, found)),
         ("Absolute trajectory error, metres", _ate(rows)),
         ("Memory", _figures(drawn, "memory")),
-        ("Versatility: λ and support over three sensors", _figures(drawn, "versatility") + _peers(found)),
+        ("Versatility: λ and support over three sensors", _figures(drawn, "versatility")),
+        ("Surfaces: the whole maps, at true poses", _figures(drawn, "surfaces") + _peers(found)),
         ("Every run", _runs(found)),
         ("Small machines, simulated", _limits(limits, told)),
         ("Errata of the paper", "".join(page.note(line) for line in ERRATA)),
@@ -251,6 +254,7 @@ def _figures(drawn: dict[str, Path], word: str) -> str:
     captions = {
         "figure 3": "Delay from sensor to map, as the paper's figure 3: a cross is where a mode died.",
         "figure 4": "The same for the desk, as the paper's figure 4.",
+        "surfaces": "Along a line a voxel needs more and more samples; the dot is the usual number.",
         "versatility": "F-score, and mean error beside that of λ = 0, where the integration is plain.",
     }
     return "".join(
@@ -293,7 +297,7 @@ def _ate(rows: Sequence[AteRow]) -> str:
 
 
 def _peers(found: Findings) -> str:
-    rows = [row for row in found.sweep if row["method"] != "ray"]
+    rows = [row for row in found.sweep if row["method"] != "ray" and row.get("min_weight") is None]
     if not rows:
         return ""
     names = ("f_score", "precision", "completeness", "mean_mm", "normal_deg")

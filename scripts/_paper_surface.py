@@ -11,7 +11,7 @@ import signal
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
@@ -29,6 +29,9 @@ from tsfusion.evaluation.known_surfaces import COMPLETE_WITHIN, KnownSurface, Wo
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.geometry.measured_points import points_world
 from tsfusion.geometry.mesh import Mesh
+
+if TYPE_CHECKING:
+    from tsfusion.tsdf.volume import Volume
 
 SEEN_BY = 4  # clean samples in a cell
 PICTURE = (1200, 750)
@@ -57,6 +60,7 @@ class SweepJob(Struct, frozen=True, kw_only=True, tag="sweep"):
     Attributes:
         keyframes: so many, evenly spread over `stretch` frames.
         smoothness, supports: λ and half-widths in voxels; each with each.
+        weights: samples that a voxel needs; the whole maps are meshed with each, besides the sensor's own.
         peers: of the other systems, those to run too.
     """
 
@@ -65,6 +69,7 @@ class SweepJob(Struct, frozen=True, kw_only=True, tag="sweep"):
     stretch: int
     smoothness: tuple[float, ...]
     supports: tuple[float, ...]
+    weights: tuple[float, ...] = ()
     peers: tuple[str, ...] = ()
 
 
@@ -121,33 +126,36 @@ def sweep(job: SweepJob) -> list[dict[str, Any]]:
     keyframes = [dataset[int(index)] for index in chosen]
     surface = known_surface(world, [int(index) for index in chosen])
     rows = []
-    for method, settings in _settings(job):
-        mesh = _fused(keyframes, world, settings)
-        rows.append(_row(world, method, settings, measure(mesh, surface, world.voxel_size)))
+    for settings in _settings(job):
+        mesh = _fused(keyframes, world, settings).extract_mesh()
+        rows.append(_row(world, "ray", settings, measure(mesh, surface, world.voxel_size)))
+    for name, settings in MAPS.items():
+        volume = _fused(keyframes, world, settings)
+        for weight in (None, *job.weights):
+            found = measure(volume.extract_mesh(weight), surface, world.voxel_size)
+            rows.append(_row(world, name, {"min_weight": weight}, found))
     for name in job.peers:
         rows.append(_row(world, name, {}, measure(_peer(name, keyframes, world), surface, world.voxel_size)))
     return rows
 
 
-def _settings(job: SweepJob) -> Iterator[tuple[str, dict[str, Any]]]:
-    """(method, settings) of each row: per-ray integration alone, then the maps of the live runs."""
+def _settings(job: SweepJob) -> Iterator[dict[str, Any]]:
+    """Settings of each row of per-ray integration alone."""
     for support in job.supports:
         width = {"min_support": support, "max_support": support, "surface": "raw"}
-        yield "ray", {"regularizer": "off", "smoothness": 0.0, **width}
+        yield {"regularizer": "off", "smoothness": 0.0, **width}
         for smoothness in job.smoothness:
-            yield "ray", {"regularizer": "ray", "smoothness": smoothness, **width}
-    for name, settings in MAPS.items():
-        yield name, dict(settings)
+            yield {"regularizer": "ray", "smoothness": smoothness, **width}
 
 
-def _fused(keyframes: list[Keyframe], world: PaperWorld, settings: dict[str, Any]) -> Mesh:
+def _fused(keyframes: list[Keyframe], world: PaperWorld, settings: dict[str, Any]) -> "Volume":
     from tsfusion.tsdf.volume import Volume
 
     config = {"voxel_size": world.voxel_size, "sensor": world.sensor, "color": False, **settings}
     volume = Volume(make_settings(VolumeConfig, config))
     for keyframe in keyframes:
         volume.integrate(keyframe)
-    return volume.extract_mesh()
+    return volume
 
 
 def _peer(name: str, keyframes: list[Keyframe], world: PaperWorld) -> Mesh:
@@ -164,6 +172,7 @@ def _row(world: PaperWorld, method: str, settings: dict[str, Any], found: dict[s
     return {
         "world": world.name, "sensor": world.sensor, "method": method,
         "smoothness": settings.get("smoothness"), "support": settings.get("min_support"),
+        "min_weight": settings.get("min_weight"),
         "mean_mm": found["accuracy_mm"]["mean"], "p95_mm": found["accuracy_mm"]["p95"],
         "precision": found["precision"], "completeness": found.get("completeness"),
         "f_score": found.get("f_score"), "normal_deg": found["normal_deg"]["median"],

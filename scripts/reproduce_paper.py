@@ -254,6 +254,7 @@ def sweep_job(world: PaperWorld, *, quick: bool) -> SweepJob:
         world=world, keyframes=8 if quick else 40, stretch=12 if quick else 80, peers=peers,
         smoothness=(1.0, 10.0, 100.0) if quick else (0.1, 1.0, 10.0, 100.0, 1000.0),
         supports=(3.0, 10.0) if quick else (3.0, 6.0, 10.0),
+        weights=(1.0, 2.0) if quick else (0.5, 1.0, 2.0, 3.0, 5.0, 8.0),
     )  # fmt: skip
 
 

@@ -154,21 +154,24 @@ def test_another_map_is_not_the_same() -> None:
 def test_surfaces_are_judged_by_f_score_at_equal_completeness() -> None:
     def rows(f_score: float, completeness: float, ray_f_score: float = 55.0) -> list[dict[str, Any]]:
         ray = {"sensor": "stereo", "method": "ray", "support": 3.0}
-        common = {"sensor": "stereo", "smoothness": None, "support": None}
+        off: dict[str, Any] = {"sensor": "stereo", "method": "off"}
         return [
-            {**common, "method": "off", "f_score": 60.0, "completeness": 90.0},
-            {**common, "method": "regularised", "f_score": f_score, "completeness": completeness},
+            {**off, "f_score": 60.0, "completeness": 90.0, "min_weight": None},
+            {**off, "f_score": 64.0, "completeness": 80.0, "min_weight": 2.0},
+            {"sensor": "stereo", "method": "regularised", "f_score": f_score, "completeness": completeness},
             {**ray, "smoothness": 0.0, "f_score": 50.0, "mean_mm": 9.0},
             {**ray, "smoothness": 9.0, "f_score": ray_f_score, "mean_mm": 8.0},
         ]
 
-    found = judged(sweep=rows(71.0, 89.0))
+    found = judged(sweep=rows(71.0, 90.0))
     assert found["surface, stereo"].met is True
     assert found["versatility"].met is True
     assert judged(sweep=rows(71.0, 89.0, 50.1))["versatility"].met is True  # its error is smaller
     assert judged(sweep=rows(71.0, 89.0, 49.0))["versatility"].met is False
-    assert judged(sweep=rows(69.0, 89.0))["surface, stereo"].met is False
-    assert judged(sweep=rows(71.0, 80.0))["surface, stereo"].met is False
+    assert judged(sweep=rows(69.0, 90.0))["surface, stereo"].met is False
+    less = judged(sweep=rows(71.0, 85.0))["surface, stereo"]
+    assert less.met is False
+    assert less.measured["gain"] == 9.0  # of 62, halfway between both weights
 
 
 def shifted(count: int, *, wrong_from: int) -> tuple[np.ndarray, np.ndarray]:
