@@ -153,7 +153,7 @@ def _desk(corbs: Path | None, limit: int | None) -> PaperWorld:
     if _has_world("desk"):
         return PaperWorld(
             title="rendered desk, a Kinect v2's errors", source="synthetic:desk", sensor="tof",
-            voxel_size=0.01, limit=limit or 300, **common,
+            voxel_size=0.01, options={"count": limit or 300}, limit=limit or 300, **common,
         )  # fmt: skip
     return PaperWorld(
         title="rendered room, Kinect noise, hand-held (no desk here)", source="synthetic:room",
