@@ -74,7 +74,7 @@ class Limits(Struct, frozen=True, kw_only=True):
         pace: the recording plays so many times slower than it was taken; 1 = in real time.
     """
 
-    robot: Machine = Machine(name="robot", cores=1, memory_bytes=1 << 30)
+    robot: Machine = Machine(name="robot", cores=1, memory_bytes=3 << 29)
     server_share: float = 0.35
     link_bytes_per_second: int = 2_500_000
     link_delay_s: float = 0.005  # each way
