@@ -22,6 +22,7 @@ from tsfusion.wire.keyframe_times import Spread
 OUTCOME, POSES = "outcome.json", "poses.npz"
 DELAY, MEMORY = "delay.csv", "memory.csv"
 _MIB = 1 << 20
+LOST_FOR_GOOD = 20  # frames without a pose at the end of a run
 _SETTLED_FROM = 0.5  # of a run: by then caches are full and kernels are loaded
 
 Poses = NDArray[np.float64]
@@ -46,8 +47,9 @@ class Outcome(Struct, frozen=True, kw_only=True):
 
     Attributes:
         machine: limits of the robot, in words.
-        death: how the front end ended before its time, in words; empty = it did not. `died_of`: in a word.
-        died_at: keyframes in the map by then; `died_frame`: index of the last frame it took.
+        death: how the front end ended before its time, in words; empty = it did not. `died_of`: in a word:
+            `memory`, `a lost sensor`.
+        died_at: keyframes in the map by then; `died_frame`: index of the last frame it took, or located.
         planned, sent, fused: keyframes. `skipped`: those that never entered the map, by reason.
         ate: of the poses as they were given, live, over the frames that got one; None = fewer than two.
         corrected: of the poses after loop closure.
@@ -99,13 +101,20 @@ def of_story(story: Story, rows: Sequence[MemoryRow], death: Death | None) -> di
     ledger = latency_ledger.summarise(story.times)
     located = [frame for frame in story.frames if frame.T_world_camera is not None]
     last = story.frames[-1] if story.frames else None
+    ended = last
+    if death is None and located and len(story.frames) - story.frames.index(located[-1]) > LOST_FOR_GOOD:
+        ended = located[-1]
+        death = Death(
+            "a lost sensor",
+            f"the localizer lost its way behind frame {ended.index}, and never found it again",
+        )
     stats = story.closing.get("stats", {})
     sent, fused = len(story.times), story.fused
     return {
         "death": death.words if death else "",
         "died_of": death.of if death else "",
         "died_at": fused if death else None,
-        "died_frame": last.index if death and last else None,
+        "died_frame": ended.index if death and ended else None,
         "frames": len(story.frames), "located": len(located), "late": last.late if last else 0,
         "lost": len(story.frames) - len(located), "sent": sent, "fused": fused,
         "skipped": {**stats.get("skipped", {}), **stats.get("rejected", {}), **stats.get("refused", {})},

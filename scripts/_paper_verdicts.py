@@ -154,7 +154,7 @@ def _baseline(found: Findings, world: PaperWorld) -> Verdict | None:
     }
     if dead:
         words = " ".join(
-            f"On the {run.machine} it died at keyframe {run.died_at}: {run.death}; "
+            f"On {_the(run.machine)} it ended at keyframe {run.died_at}: {run.death}; "
             f"{run.queue_peak} keyframes ({run.queue_peak_bytes / _MIB:.0f} MiB) waited at most, "
             f"the map had {run.map_bytes / _MIB:.0f} MiB."
             for run in dead
@@ -166,6 +166,10 @@ def _baseline(found: Findings, world: PaperWorld) -> Verdict | None:
             f"({most.queue_peak_bytes / _MIB:.0f} MiB), and the delay was {most.delay_ms.mean:.0f} ms."
         )
     return Verdict(met=bool(dead), measured=measured, wanted=wanted, words=words)
+
+
+def _the(machine: str) -> str:
+    return machine if machine.startswith("all") else f"the {machine}"
 
 
 def _localisation(found: Findings, world: PaperWorld) -> Verdict | None:

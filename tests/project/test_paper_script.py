@@ -136,7 +136,7 @@ def test_the_baseline_is_said_to_die_where_it_did() -> None:
     died = {"death": "killed with 1030 MiB resident", "died_of": "memory", "died_at": 77}
     verdict = judged(outcome("traditional-unbounded", machine=SMALL, **died))["baseline, kitti06"]
     assert verdict.met is True
-    assert "at keyframe 77" in verdict.words
+    assert "ended at keyframe 77" in verdict.words
     assert "keyframe 60" in verdict.wanted
     alive = judged(outcome("traditional-unbounded"))["baseline, kitti06"]
     assert alive.met is False
@@ -242,6 +242,23 @@ def test_what_a_killed_front_end_wrote_is_told() -> None:
     assert not story.ended
     fields = _paper_outcome.of_story(story, [], _paper_limits.Death("memory", "killed"))
     assert (fields["died_at"], fields["died_frame"], fields["sent"], fields["lost"]) == (1, 0, 2, 1)
+
+
+def test_a_localizer_that_never_found_its_way_again_is_the_end() -> None:
+    def lines(lost: int) -> list[str]:
+        frame = {"event": "frame", "late": 0, "cpu_s": 0.1, "rss_bytes": 1, "queue": 0, "queue_bytes": 0}
+        pose = np.eye(4).tolist()
+        return [
+            json.dumps(
+                frame | {"t": n, "due_ns": n, "index": 2 * n, "T_world_camera": pose if n < 5 else None}
+            )
+            for n in range(5 + lost)
+        ]
+
+    starved = _paper_outcome.of_story(_paper_events.of(lines(25)), [], None)
+    assert (starved["died_of"], starved["died_frame"], starved["lost"]) == ("a lost sensor", 8, 25)
+    assert "behind frame 8" in starved["death"]
+    assert _paper_outcome.of_story(_paper_events.of(lines(15)), [], None)["death"] == ""
 
 
 def test_memory_without_map_and_queue_is_what_grows() -> None:
