@@ -2,6 +2,7 @@
 """One live run from its beginning to its end: processes, limits, and what is kept of it."""
 
 import hashlib
+import os
 import shutil
 import subprocess
 import sys
@@ -142,9 +143,10 @@ def _decentralised(
 ) -> tuple[MemoryWatch, Death | None, list[Row], dict[str, Any]]:
     server = ServerConfig(listen="tcp://127.0.0.1:0", state=str(folder / STATE))
     with ExitStack() as stack:
-        target = stack.enter_context(
-            target_server.opened(None, folder / ".scratch", volume=run.volume, server=server)
-        )
+        with _on_cores(run.machine.cores):  # the server's processes inherit it
+            target = stack.enter_context(
+                target_server.opened(None, folder / ".scratch", volume=run.volume, server=server)
+            )
         assert target.child is not None
         address = stack.enter_context(_link(run, limits, target.child.listen, target.child.control))
         begun = time.monotonic()
@@ -165,6 +167,20 @@ def _decentralised(
         found["expected_hash"] = fresh_hash(folder / STATE, run.volume)
     grown = [row._replace(seconds=row.seconds + begun) for row in growth.rows]
     return watch, death, grown, found
+
+
+@contextmanager
+def _on_cores(count: int | None) -> Iterator[None]:
+    """What is started during the block may use so many cores; None = all."""
+    if count is None or not hasattr(os, "sched_setaffinity"):
+        yield
+        return
+    every = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, sorted(every)[:count])
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, every)
 
 
 @contextmanager

@@ -13,6 +13,7 @@ from tsfusion.core.config import VolumeConfig, make_settings
 Mode = Literal[
     "traditional-unbounded",
     "traditional-bounded",
+    "one-machine",
     "decentralised",
     "slow-server",
     "slow-link",
@@ -24,6 +25,7 @@ Mode = Literal[
 MODES: dict[str, str] = {
     "traditional-unbounded": "localisation and fusion in one process, unbounded queue",
     "traditional-bounded": "the same process, but the newest keyframe replaces the one that waits",
+    "one-machine": "scanner and server as two processes, on the machine of the modes before",
     "decentralised": "scanner and server",
     "slow-server": "scanner and a server that gets a share of its time only",
     "slow-link": "scanner and server, a slow and distant link between them",
@@ -32,8 +34,9 @@ MODES: dict[str, str] = {
     "killed-server": "the server is killed in the middle and started again",
     "lost-packets": "one packet in ten is lost",
 }
-LIVE: tuple[Mode, ...] = tuple(MODES)[:6]  # type: ignore[assignment]
-AGAIN: tuple[Mode, ...] = tuple(MODES)[6:]  # type: ignore[assignment] # the keyframes of a live run, sent again
+LIVE: tuple[Mode, ...] = tuple(MODES)[:7]  # type: ignore[assignment]
+AGAIN: tuple[Mode, ...] = tuple(MODES)[7:]  # type: ignore[assignment] # the keyframes of a live run, sent again
+ON_ONE_MACHINE: tuple[Mode, ...] = LIVE[:3]
 MAPS: dict[str, dict[str, Any]] = {
     "off": {"regularizer": "off", "surface": "raw"},
     "regularised": {"regularizer": "ray", "surface": "field"},
@@ -137,9 +140,10 @@ def _of_world(world: PaperWorld, limits: Limits, number: int, *, quick: bool, ma
     whole, found = Machine(), []
     maps = ("regularised",) if quick else ("off", "regularised")
     for each in maps:
-        for mode in LIVE[:5] if main else LIVE[:3]:
-            machine = limits.robot if mode.startswith("traditional") else whole
-            found.append(Run(world=world, mode=mode, map=each, machine=machine, number=number))
+        for mode in LIVE[:6] if main else LIVE[:4]:
+            if (mode, each) != ("one-machine", "off"):  # the second control, once
+                machine = limits.robot if mode in ON_ONE_MACHINE else whole
+                found.append(Run(world=world, mode=mode, map=each, machine=machine, number=number))
     if not quick:  # the control: as much machine for the traditional modes as for the decentralised one
         found += [
             Run(world=world, mode=mode, map="regularised", machine=whole, number=number)

@@ -277,11 +277,11 @@ def _slow(runs: Sequence[Outcome], what: str) -> Verdict | None:
 def _explanation(found: Findings, world: PaperWorld) -> Verdict | None:
     """Whether splitting the work in two explains the gain, or merely bounding the queue."""
     ours, bounded = _live(found, world), _live(found, world, "traditional-bounded")
-    unbounded = _live(found, world, "traditional-unbounded")
+    unbounded, beside = _live(found, world, "traditional-unbounded"), _live(found, world, "one-machine")
     if not ours or not bounded or not unbounded:
         return None
     parts, measured = [], {}
-    for run in (*unbounded, *bounded, *ours):
+    for run in (*unbounded, *bounded, *beside, *ours):
         late = 100 * run.late / max(run.late + run.frames, 1)
         end = (
             f", then it died of {run.died_of} (map {run.map_bytes / _MIB:.0f} MiB, "
@@ -300,13 +300,19 @@ def _explanation(found: Findings, world: PaperWorld) -> Verdict | None:
         }  # fmt: skip
     fine = [run for run in unbounded if _is_good(run)]
     enough = [run for run in bounded if _is_good(run)]
-    is_needed = not fine and not enough and all(_is_good(run) for run in ours)
+    split = [run for run in beside if _is_good(run)]
+    is_needed = not fine and not enough and not split and all(_is_good(run) for run in ours)
     if fine:
         says = f"Neither is needed: on {fine[0].machine} the unbounded baseline does as well."
     elif enough:
         says = f"Bounding the queue is enough on {enough[0].machine}: it explains the gain there."
+    elif split:
+        says = (
+            "Bounding the queue is not enough, and two processes are: a second machine is not needed beside "
+            f"{_the(split[0].machine)}."
+        )
     elif is_needed:
-        says = "Bounding the queue is not enough: keyframes, frames or time are lost without the split."
+        says = "Bounding the queue is not enough: without the split keyframes, frames or time are lost."
     else:
         says = "Neither reaches all of it here."
     return Verdict(

@@ -123,6 +123,19 @@ def test_the_control_decides_what_explains_the_gain(
         assert _paper_runs.MODES[mode] in verdict.words
 
 
+def test_two_processes_may_be_all_that_is_needed() -> None:
+    bad = {"fused": 300, "machine": SMALL}
+    made = judged(
+        outcome(),
+        outcome("traditional-unbounded", **bad),
+        outcome("traditional-bounded", **bad),
+        outcome("one-machine", machine=SMALL),
+    )
+    verdict = made["explanation, kitti06"]
+    assert verdict.met is False
+    assert "a second machine is not needed" in verdict.words
+
+
 def test_a_decentralised_run_that_fails_too_explains_nothing() -> None:
     bad = {"fused": 300}
     made = judged(
