@@ -44,7 +44,7 @@ def _line(named: tuple[str, Verdict]) -> tuple[str, ...]:
 
 def _errors(rows: Sequence[AteRow]) -> list[tuple[str, ...]]:
     names = ("min", "max", "mean", "median", "std", "rmse")
-    lines = [("run, metres", "part", *names, "drift %")]
+    lines: list[tuple[str, ...]] = [("run, metres", "part", *names, "drift %")]
     lines += [
         (
             row.outcome.name,

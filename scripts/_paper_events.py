@@ -94,7 +94,8 @@ def read(path: Path) -> Story:
 
 def of(lines: Iterable[str]) -> Story:
     """The story of some lines."""
-    story, times = Story(), {}
+    story = Story()
+    times: dict[int, KeyframeTimes] = {}
     for line in lines:
         try:
             event = json.loads(line)

@@ -13,7 +13,9 @@ from _paper_worlds import PaperWorld
 from numpy.typing import NDArray
 
 PAPER_MS = 500.0
-_COLORS = dict(zip(LIVE[:6], ("#d55e00", "#e69f00", "#009e73", "#0072b2", "#56b4e9", "#cc79a7"), strict=True))
+_COLORS: dict[str, str] = dict(
+    zip(LIVE[:6], ("#d55e00", "#e69f00", "#009e73", "#0072b2", "#56b4e9", "#cc79a7"), strict=True)
+)
 _SENSORS = {"stereo": "#0072b2", "kinect": "#d55e00", "tof": "#d55e00", "lidar": "#009e73"}
 _METHODS = {"off": "#d55e00", "regularised": "#0072b2", "vdbfusion": "#009e73", "open3d": "#cc79a7"}
 _TICKS_MS = [step * 10**power for power in range(6) for step in (1, 2, 5)]

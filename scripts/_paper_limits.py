@@ -145,7 +145,12 @@ def tree(pid: int) -> list[int]:
 def _throttle(pid: int, share: float) -> None:
     """Stop and continue until standard input is closed; then let all go on."""
     closed = threading.Event()
-    threading.Thread(target=lambda: (sys.stdin.read(), closed.set()), daemon=True).start()
+
+    def wait_for_end() -> None:
+        sys.stdin.read()
+        closed.set()
+
+    threading.Thread(target=wait_for_end, daemon=True).start()
     print("begun", flush=True)
     try:
         while not closed.is_set():

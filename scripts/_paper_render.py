@@ -9,6 +9,7 @@ Rendering takes processor time and Taichi, and neither belongs to a front end.
 import signal
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +51,9 @@ class RenderedRecording:
     def __len__(self) -> int:
         return len(self._poses)
 
+    def __iter__(self) -> Iterator[Keyframe]:
+        return (self[index] for index in range(len(self)))
+
     def __getitem__(self, index: int) -> Keyframe:
         return self.frame(index).keyframe(self._poses[index])
 
@@ -77,7 +81,7 @@ def render(dataset: Dataset, folder: Path, tell: Any = lambda _done, _all: None)
     for index in range(len(dataset)):
         if not _file(folder, index).exists():
             with durable_files.replacing(_file(folder, index)) as file:
-                np.savez(file, **_arrays(frame_of(dataset, index)))
+                np.savez(file, **_arrays(frame_of(dataset, index)))  # type: ignore[arg-type]
         tell(index + 1, len(dataset))
     first = frame_of(dataset, 0)
     K, stamps = first.intrinsics, dataset.timestamps_ns

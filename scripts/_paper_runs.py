@@ -36,6 +36,7 @@ MODES: dict[str, str] = {
 }
 LIVE: tuple[Mode, ...] = tuple(MODES)[:7]  # type: ignore[assignment]
 AGAIN: tuple[Mode, ...] = tuple(MODES)[7:]  # type: ignore[assignment] # the keyframes of a live run, sent again
+MapName = Literal["off", "regularised"]
 ON_ONE_MACHINE: tuple[Mode, ...] = LIVE[:3]
 MAPS: dict[str, dict[str, Any]] = {
     "off": {"regularizer": "off", "surface": "raw"},
@@ -91,7 +92,7 @@ class Run(Struct, frozen=True, kw_only=True):
 
     world: PaperWorld
     mode: Mode
-    map: Literal["off", "regularised"]
+    map: MapName
     machine: Machine  # of the process that localises
     number: int = 1
 
@@ -138,7 +139,7 @@ def source_of(run: Run) -> Run:
 
 def _of_world(world: PaperWorld, limits: Limits, number: int, *, quick: bool, main: bool) -> list[Run]:
     whole, found = Machine(), []
-    maps = ("regularised",) if quick else ("off", "regularised")
+    maps: tuple[MapName, ...] = ("regularised",) if quick else ("off", "regularised")
     for each in maps:
         for mode in LIVE[:6] if main else LIVE[:4]:
             if (mode, each) != ("one-machine", "off"):  # the second control, once
