@@ -8,6 +8,7 @@ import os
 import sys
 import tempfile
 import weakref
+from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -19,6 +20,7 @@ from tsfusion.core import durable_files
 from tsfusion.core.errors import InvalidConfig, MapFull
 
 _MOVES_PAGES = sys.platform == "linux"
+_HUGE_PAGE = 1 << 21  # bytes
 _STEP = 4096  # items more than are needed, at most: what is reserved counts against a memory limit
 MAX_ITEMS = (1 << 22) - 1  # × 512 voxels stays below the 2³¹ elements that a Taichi kernel can index
 
@@ -83,6 +85,9 @@ class GrowingArray:
             self._map = self._resized(size)
         except OSError as error:
             raise MemoryError(f"no memory for {size >> 20} MB: {error.strerror}") from error
+        if size >= _HUGE_PAGE:  # first touches and misses of the TLB cost more than the sums themselves
+            with suppress(OSError):  # of a system that has no huge pages
+                self._map.madvise(mmap.MADV_HUGEPAGE)
         # By address, not as a buffer of the map: Taichi's launches leave reference cycles around their
         # arguments, and a map with a buffer still exported refuses to be resized.
         address = ctypes.addressof(ctypes.c_char.from_buffer(self._map))
