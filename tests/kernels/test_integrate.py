@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from ray_maps import CASES, QUANTA, SEGMENTS, RayMap, random_segments, rays_along
 
+from tsfusion.kernels.voxel_traversal import SHARED
 from tsfusion.tsdf.block_store import unpack_keys
 
 
@@ -67,6 +68,35 @@ def test_what_is_taken_away_leaves_no_bit(case: str) -> None:
     for name, layer in here.store.layers().items():
         assert (layer[: len(before[name])] == before[name]).all()
         assert not layer[len(before[name]) :].any()
+
+
+@pytest.mark.parametrize("case", ["many", "crowded"])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_units_that_share_blocks_add_what_one_does(case: str, sign: int) -> None:
+    maps, updates, half = [RayMap(units) for units in (1, 2, 7)], [], len(CASES[case]) // 2
+    for here in maps:
+        here.apply(CASES[case][:half])  # then, some blocks are there and some are missing
+        if sign < 0:
+            here.apply(CASES[case])
+        updates.append(here.apply(CASES[case], sign))
+    assert len(set(updates)) == 1
+    for here in maps[1:]:
+        assert here.buffers.bands[:, SHARED].any()
+        assert (here.store.keys == maps[0].store.keys).all()
+        for name, layer in here.store.layers().items():
+            assert (layer == maps[0].store.layers()[name]).all()
+
+
+def test_windows_that_take_the_place_of_others_are_read_anew() -> None:
+    """Rays in turn through windows whose coordinates have equal low bits."""
+    ends = [np.array([256.0 * (i % 3), 64.0 * (i % 2) + 0.3 * i, i]) for i in range(40)]
+    segments = [(kernel_twins.fixed(end), np.array([1.0, 0.2, 0]), 2048) for end in ends]
+    rays = rays_along(segments)
+    here = RayMap()
+    assert here.apply(rays) == sum(len(kernel_twins.crossed(ray)) for ray in rays)
+    found = {voxel: int(here.store.sums[at]) for voxel, at in here.voxels().items()}
+    expected = kernel_twins.integrate(rays, QUANTA)
+    assert found == {voxel: (s << 27) + w for voxel, (s, w) in expected.items()}
 
 
 def test_many_missing_blocks_are_all_found() -> None:

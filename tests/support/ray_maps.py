@@ -57,19 +57,23 @@ CASES = {name: rays_along(segments) for name, segments in SEGMENTS.items()}
 
 
 class RayMap:
-    """A store and the means to put rays into it, without keyframes."""
+    """A store and the means to put rays into it, without keyframes.
 
-    def __init__(self) -> None:
+    Args:
+        units: that share the rays, on however many threads.
+    """
+
+    def __init__(self, units: int = 3) -> None:
         runtime.start(2)
         self.store = BlockStore(voxel_size=1.0, color=True, corrected=True)
         self.buffers = RayBuffers(color=True, regularised=True)
         self._integrator = Integrator(self.store, self.buffers, VolumeConfig(regularizer="off"))
+        self._integrator.units = units
 
     def apply(self, rays: NDArray[np.int32], sign: int = 1) -> int:
         """Add the rays, spread unevenly over bands."""
         buffers = self.buffers
         buffers.rays = np.vstack([rays, np.zeros((1, RAY_FIELDS), np.int32)])
-        buffers.deferred = np.zeros(len(buffers.rays), np.int32)
         buffers.colored = True
         cuts = np.sort(np.random.default_rng(0).integers(0, len(rays) + 1, BANDS - 1))
         edges = np.array([0, *cuts, len(rays)])

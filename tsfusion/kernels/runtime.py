@@ -43,3 +43,8 @@ def _leave_out_source_lines() -> None:
         from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 
         ASTTransformerContext.get_pos_info = lambda _context, _node: ""
+
+
+def threads() -> int:
+    """Number of threads that kernels run on; 1 before `start`."""
+    return _started_threads or 1

@@ -18,8 +18,8 @@ VOXEL, CROSSING, INTERVAL, LOSS = 0, 3, 6, 9
 DISTANCE, LENGTH, END, WEIGHT_COLOR = 12, 13, 14, 15
 
 # A band of the keyframe: a contiguous run of rays that one thread works on.
-BAND_FIELDS = 8
-START, COUNT, SAMPLES, WEIGHT, DEFERRED, UPDATES, ADDED, COST = 0, 1, 2, 3, 4, 5, 6, 7
+BAND_FIELDS = 16  # a cache line
+START, COUNT, SAMPLES, WEIGHT, DEFERRED, UPDATES, ADDED, COST, UNIT, SHARED = 0, 1, 2, 3, 4, 5, 6, 7, 8, 9
 
 MAX_CROSSED = 64  # voxels in one ray's band: 2 · 16 · √3 and the ends
 VOXEL_LIMIT = 1 << 20  # |voxel coordinate| < VOXEL_LIMIT − 64, so that a band stays inside 21 bits

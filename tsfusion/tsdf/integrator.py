@@ -13,7 +13,7 @@ from msgspec import Struct
 
 from tsfusion.core.config import VolumeConfig
 from tsfusion.core.errors import KeyframeTooLarge, MapError, MapFull, MapQuota, WeightOverflow
-from tsfusion.kernels import integrate, ray_smoothing
+from tsfusion.kernels import integrate, ray_smoothing, runtime
 from tsfusion.kernels.integrate import (
     ALL,
     ONLY_ADDED,
@@ -26,7 +26,7 @@ from tsfusion.kernels.integrate import (
     WEIGHT_LIMIT,
 )
 from tsfusion.kernels.sensor_noise import WEIGHT_ONE
-from tsfusion.kernels.voxel_traversal import COST, DEFERRED, FAR_COST, UPDATES, WEIGHT
+from tsfusion.kernels.voxel_traversal import COST, DEFERRED, FAR_COST, SHARED, UPDATES, WEIGHT
 from tsfusion.tsdf.block_store import BlockStore
 from tsfusion.tsdf.ray_buffers import BANDS, RayBuffers
 
@@ -36,6 +36,7 @@ _NO_LIMIT = 1 << 30  # blocks
 _BLOCK_COST = 1000  # of a block that is added: it takes 9 µs where memory is touched for the first time
 
 Part = tuple[int, int]  # bands first … last - 1
+NO_BANDS = (0, 0)
 
 
 class KeyframeQuota(Struct, frozen=True):
@@ -61,6 +62,7 @@ class Integrator:
         self._admitted = 0  # blocks of the map that deferred rays have been added to
         self._room = 0  # blocks that the keyframe may still add to the map, for its sender's share of it
         self._affordable = 0  # blocks that it may still add, for what they cost
+        self.units = min(runtime.threads(), BANDS)  # which add at the same time
 
     def apply(self, sign: int, quota: KeyframeQuota | None = None) -> int:
         """Add (+1) or take away (-1) the rays in the buffers; returns the number of voxel updates.
@@ -96,6 +98,11 @@ class Integrator:
             self._store.keep_within_memory()
         return updates
 
+    def warm_up(self) -> None:
+        """Compile what only some keyframes need."""
+        self._begin()
+        self._launch(NO_BANDS, +1)
+
     def _take_back(self, added: list[Part], sign: int, before: int) -> None:
         """Bring back the map of `before` blocks, whatever failed."""
         if self._store.count > self._admitted:  # blocks that nothing was added to yet
@@ -111,16 +118,17 @@ class Integrator:
         self._store.stamp += 1
         self._buffers.touched[:TOUCHED_HEADER] = 0
         self._buffers.reserve_touched(self._store.count)
+        self._buffers.share_out(self.units)
 
     def _parts(self) -> Iterator[Part]:
         """Bands in runs of limited weight; nearly always all of them."""
-        weights = self._buffers.bands[:, WEIGHT].astype(np.int64)
+        weights = np.cumsum(self._buffers.bands[:, WEIGHT], dtype=np.int64)  # of the bands up to each
         first = 0
-        for band in range(1, BANDS):
-            if weights[first : band + 1].sum() >= PART_WEIGHT:
-                yield first, band
-                first = band
-        yield first, BANDS
+        while first < BANDS:
+            before = int(weights[first - 1]) if first else 0
+            end = int(np.searchsorted(weights, before + PART_WEIGHT))  # first band that is too much
+            yield first, max(end, first + 1)
+            first = max(end, first + 1)
 
     def _add(self, part: Part, sign: int) -> None:
         """Add a part to the blocks the map has, and list the missing ones, until these are too many."""
@@ -244,8 +252,13 @@ class Integrator:
     ) -> None:
         """Add a part's rays to the blocks of slot ≥ `oldest`."""
         store, buffers = self._store, self._buffers
-        integrate.add_rays(
-            buffers.rays, buffers.bands, buffers.deferred, which, *part, sign, oldest, store.hash_keys,
-            store.hash_slots, buffers.missing, most_missing, store.stamp, store.stamps, store.places,
-            store.dirty, buffers.touched, store.sums, int(buffers.colored), store.color_rgn, store.color_b,
+        job = which, *part, self.units, sign, oldest, most_missing, store.stamp, buffers.colored
+        given = (
+            buffers.rays, buffers.bands, buffers.again, np.array(job, np.int32), store.hash_keys,
+            store.hash_slots, buffers.missing, buffers.scratch, buffers.owners, store.stamps, store.places,
+            store.dirty, buffers.touched, store.sums.reshape(-1), store.color_rgn.reshape(-1),
+            store.color_b.reshape(-1),
         )  # fmt: skip
+        integrate.add_rays(*given, False)
+        if self.units > 1 and (part == NO_BANDS or buffers.bands[part[0] : part[1], SHARED].any()):
+            integrate.add_rays(*given, True)

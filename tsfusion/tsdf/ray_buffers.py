@@ -9,8 +9,15 @@ from numpy.typing import NDArray
 from tsfusion.core.config import SensorModel, VolumeConfig
 from tsfusion.geometry.keyframe import Intrinsics, Keyframe
 from tsfusion.kernels import ray_smoothing, rays_from_images, rays_from_points, sensor_noise
-from tsfusion.kernels.integrate import CUBE, TOUCHED_COUNT, TOUCHED_HEADER, TOUCHED_MISSING, TOUCHED_OVERFLOW
-from tsfusion.kernels.voxel_traversal import BAND_FIELDS, MAX_CROSSED, RAY_FIELDS, SAMPLES
+from tsfusion.kernels.integrate import (
+    CUBE,
+    TOUCHED_COUNT,
+    TOUCHED_HEADER,
+    TOUCHED_MISSING,
+    TOUCHED_OVERFLOW,
+    UNIT_SCRATCH,
+)
+from tsfusion.kernels.voxel_traversal import BAND_FIELDS, COST, MAX_CROSSED, RAY_FIELDS, SAMPLES, UNIT
 from tsfusion.tsdf.growing_array import GrowingArray
 
 _FEW_MISSING = 1 << 15  # entries of the set for the blocks that a usual keyframe finds missing
@@ -27,11 +34,13 @@ class RayBuffers:
         self.color = color
         self.colored = False  # the current keyframe brings colour, and the map keeps it
         self.rays = np.zeros((0, RAY_FIELDS), np.int32)
-        self.deferred = np.zeros(0, np.int32)
+        self.again = np.zeros((2, 0), np.int32)
+        self.scratch = np.zeros(0, np.int64)
         self.bands = np.zeros((BANDS, BAND_FIELDS), np.int32)
         self.missing = np.zeros(_FEW_MISSING, np.int64)
         self._depths = np.zeros((BANDS, rays_from_images.TILE_SAMPLES), np.int32)
         self._touched = GrowingArray((), np.int32, 1024)
+        self._owners = GrowingArray((), np.int64, 1024)
         units = BANDS if regularised else 1
         self.signal = np.zeros((units, MAX_CROSSED, ray_smoothing.SIGNAL_FIELDS), np.float32)
         self.crossed = np.zeros((units, MAX_CROSSED, 2), np.int32)
@@ -52,9 +61,25 @@ class RayBuffers:
         """Slots of the blocks that the current keyframe touches."""
         return self.touched[TOUCHED_HEADER : TOUCHED_HEADER + self.touched[TOUCHED_COUNT]]
 
+    @property
+    def owners(self) -> NDArray[np.int64]:
+        """Which unit adds to a block, by slot (kernels/integrate.py)."""
+        return self._owners.array
+
     def reserve_touched(self, blocks: int) -> None:
         """Make room for touching all `blocks` of the map."""
         self._touched.reserve(TOUCHED_HEADER + blocks)
+        self._owners.reserve(blocks)
+
+    def share_out(self, units: int) -> None:
+        """Give each unit neighbouring bands, which cost about as much to add as those of any other."""
+        if self.again.shape[1] < len(self.rays):
+            self.again = np.zeros((2, len(self.rays)), np.int32)
+        if len(self.scratch) < units * UNIT_SCRATCH:
+            self.scratch = np.zeros(units * UNIT_SCRATCH, np.int64)
+        cost = self.bands[:, COST].astype(np.int64) + 1
+        before = np.cumsum(cost) - cost // 2
+        self.bands[:, UNIT] = np.minimum(before * units // int(cost.sum()), units - 1)
 
     def make_rays(self, keyframe: Keyframe, config: VolumeConfig) -> int:
         """Fill `rays`; returns the number of samples that went into them."""
@@ -123,12 +148,12 @@ class RayBuffers:
     @property
     def nbytes(self) -> int:
         arrays = [value for value in vars(self).values() if isinstance(value, np.ndarray)]
-        return sum(a.nbytes for a in arrays) + sum(g.array.nbytes for g in (self._touched, self._votes))
+        growing = self._touched, self._owners, self._votes
+        return sum(a.nbytes for a in arrays) + sum(g.array.nbytes for g in growing)
 
     def _reserve_rays(self, count: int) -> None:
         if len(self.rays) < count:
             self.rays = np.zeros((count, RAY_FIELDS), np.int32)
-            self.deferred = np.zeros(count, np.int32)
 
 
 def model_parameters(
