@@ -76,7 +76,9 @@ BITS = 15
 LEAST_PRODUCT, LEAST_VOTE = 1 << 18, 1 << 8
 LISTED = 2048  # updates that wait for each other
 
-UNIT_SCRATCH = WINDOW_SCRATCH + LISTED  # int64 of a unit: its windows, then its updates
+COLORS_AT = WINDOW_SCRATCH + LISTED
+LISTED_COLORS = 512  # votes, one int64: the voxel's place above the colour
+UNIT_SCRATCH = COLORS_AT + LISTED_COLORS  # int64 of a unit: its windows, its updates, its votes for colours
 
 # What a launch does, `job`: which rays of which bands, on how many units, sign, slots from which on, how many
 # blocks may be missing, number of the keyframe, whether colours count
@@ -169,14 +171,15 @@ def add(lanes: ti.template(), at, amount, atomically: ti.template()):
 
 @ti.func
 def vote_color(
-    at, sign_, packed, color_rgn: ti.template(), color_b: ti.template(), touched: ti.template(),
+    listed, sign_, color_rgn: ti.template(), color_b: ti.template(), touched: ti.template(),
     atomically: ti.template(),
 ):  # fmt: skip
-    """One vote for the colour in the low 24 bits of `packed`.
+    """Add a listed vote for a colour.
 
     A count just below 2¹⁶ has gone below none. A settled colour stays, whatever is added or taken away: it is
     no longer a sum.
     """
+    at, packed = ti.cast(listed >> 32, ti.i32), ti.cast(listed, ti.i32)
     votes = ti.cast(color_rgn[at] & 65535, ti.i32)
     if votes < COLOR_LIMIT or votes >= COLOR_LIMIT + (COLOR_LIMIT >> 1):
         red = ti.cast((packed >> 16) & 255, ti.i64)
@@ -195,25 +198,37 @@ def packed_step(rays: ti.template(), r, axis: ti.template(), towards):
 
 
 @ti.func
-def add_listed(scratch: ti.template(), first, end, sums: ti.template(), atomically: ti.template()):
-    """Add the listed updates: one after the other without a branch, so that misses of the cache overlap."""
-    for i in range(first, end):
+def add_listed(
+    scratch: ti.template(), base, tail: ti.template(), colors: ti.template(), added: ti.template(), sign_,
+    sums: ti.template(), color_rgn: ti.template(), color_b: ti.template(), touched: ti.template(),
+    atomically: ti.template(),
+):  # fmt: skip
+    """Add the listed updates: one after the other without a branch, so that misses of the cache overlap.
+
+    `tail` and `colors`: ends of the lists, which are empty then; `added` counts updates.
+    """
+    for i in range(base + WINDOW_SCRATCH, tail):
         update = scratch[i]
         lanes = ti.cast(ti.cast(update, ti.i32), ti.i64)
         product, vote = (lanes >> 9) - LEAST_PRODUCT, (lanes & 511) - LEAST_VOTE
         # both sums in one addition; their quotient minimises Σ w (x − m)²: paper eq. 2
         add(sums, ti.cast(update >> 32, ti.i32), (product << WEIGHT_BITS) + vote, atomically)
+    for i in range(base + COLORS_AT, colors):
+        vote_color(scratch[i], sign_, color_rgn, color_b, touched, atomically)
+    added += tail - (base + WINDOW_SCRATCH)
+    tail, colors = base + WINDOW_SCRATCH, base + COLORS_AT
 
 
 @ti.func
 def add_ray(
-    rays: ti.template(), r, sign_, scratch: ti.template(), base, tail: ti.template(), added: ti.template(),
-    last: ti.template(), blocks: ti.template(), oldest, mark, stamp, most_missing, hash_keys: ti.template(),
-    hash_slots: ti.template(), missing: ti.template(), owners: ti.template(), stamps: ti.template(),
-    places: ti.template(), dirty: ti.template(), touched: ti.template(), sums: ti.template(), has_color,
-    color_rgn: ti.template(), color_b: ti.template(), of_others: ti.template(),
+    rays: ti.template(), r, sign_, scratch: ti.template(), base, tail: ti.template(), colors: ti.template(),
+    added: ti.template(), last: ti.template(), blocks: ti.template(), oldest, mark, stamp, most_missing,
+    hash_keys: ti.template(), hash_slots: ti.template(), missing: ti.template(), owners: ti.template(),
+    stamps: ti.template(), places: ti.template(), dirty: ti.template(), touched: ti.template(),
+    sums: ti.template(), has_color, color_rgn: ti.template(), color_b: ti.template(),
+    of_others: ti.template(),
 ):  # fmt: skip
-    """Add a ray to every voxel it crosses, or list the updates until `tail`; `added` counts those that were.
+    """List a ray's update of every voxel it crosses, and its vote for a colour (`add_listed`).
 
     `last` and its `blocks`: the window entered last, by any ray. Returns the bits of what it crosses.
     """
@@ -241,10 +256,10 @@ def add_ray(
     )  # stop behind the end point: its voxel takes the colour
     inside = ti.cast(weight > 0, ti.i32)
     while inside == 1:
-        if tail > base + UNIT_SCRATCH - MOST_IN_WINDOW:
-            add_listed(scratch, base + WINDOW_SCRATCH, tail, sums, of_others)
-            added += tail - (base + WINDOW_SCRATCH)
-            tail = base + WINDOW_SCRATCH
+        if tail > base + COLORS_AT - MOST_IN_WINDOW or colors == base + UNIT_SCRATCH:
+            add_listed(
+                scratch, base, tail, colors, added, sign_, sums, color_rgn, color_b, touched, of_others
+            )  # fmt: skip
         if window[0] != last[0] or window[1] != last[1] or window[2] != last[2]:
             last = window
             blocks = open_window(window, scratch, base)
@@ -283,8 +298,8 @@ def add_ray(
             if has_color == 1 and until != length and leaves >= until:
                 until = length
                 if first >= 0:
-                    voxel_at = ti.cast(scratch[tail - 1] >> 32, ti.i32)
-                    vote_color(voxel_at, sign_, rays[r, WEIGHT_COLOR], color_rgn, color_b, touched, of_others)
+                    scratch[colors] = (scratch[tail - 1] >> 32 << 32) | (rays[r, WEIGHT_COLOR] & 0xFFFFFF)
+                    colors += 1
             if left != 0:  # into the window beside it, at the other side
                 step = vec3i(towards[0] & is_x, towards[1] & is_y, towards[2] & is_z)
                 window += step
@@ -331,7 +346,8 @@ def add_rays(
             base = unit * UNIT_SCRATCH
             for i in range(WINDOWS):
                 scratch[base + i] = 0
-            last, blocks, tail = vec3i(2147483647), 0, base + WINDOW_SCRATCH
+            last, blocks = vec3i(2147483647), 0
+            tail, colors, added = base + WINDOW_SCRATCH, base + COLORS_AT, 0
             for band in range(job[FIRST_BAND], job[LAST_BAND]):
                 if bands[band, UNIT] == unit:
                     start, count, updates = bands[band, START], bands[band, COUNT], 0
@@ -341,7 +357,7 @@ def add_rays(
                         count = bands[band, ADDED]
                     if ti.static(of_others):
                         count, updates = bands[band, SHARED], bands[band, UPDATES]
-                    added = updates - (tail - (base + WINDOW_SCRATCH))  # without those that wait since before
+                    updates -= added + tail  # of the bands before
                     deferred, shared, n = 0, 0, 0
                     while n < count:
                         r = start + n
@@ -350,9 +366,9 @@ def add_rays(
                         elif which == ONLY_DEFERRED:
                             r = again[LATER, r]
                         crossed = add_ray(
-                            rays, r, sign_, scratch, base, tail, added, last, blocks, oldest, mark, stamp,
-                            most_missing, hash_keys, hash_slots, missing, owners, stamps, places, dirty,
-                            touched, sums, has_color, color_rgn, color_b, of_others,
+                            rays, r, sign_, scratch, base, tail, colors, added, last, blocks, oldest, mark,
+                            stamp, most_missing, hash_keys, hash_slots, missing, owners, stamps, places,
+                            dirty, touched, sums, has_color, color_rgn, color_b, of_others,
                         )  # fmt: skip
                         if ti.static(not of_others):
                             if (crossed & BITS & OF_ANOTHER) != 0:
@@ -364,12 +380,14 @@ def add_rays(
                                 if which == ALL and touched[TOUCHED_OVERFLOW] == 1:
                                     count = n
                         n += 1
-                    bands[band, UPDATES] = added + (tail - (base + WINDOW_SCRATCH))
+                    bands[band, UPDATES] = updates + added + tail
                     if ti.static(not of_others):
                         bands[band, SHARED] = shared
                         if which == ALL:
                             bands[band, DEFERRED], bands[band, ADDED] = deferred, n
-            add_listed(scratch, base + WINDOW_SCRATCH, tail, sums, of_others)
+            add_listed(
+                scratch, base, tail, colors, added, sign_, sums, color_rgn, color_b, touched, of_others
+            )
 
 
 @ti.kernel
