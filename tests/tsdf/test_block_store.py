@@ -5,6 +5,7 @@ import numpy as np
 from ray_maps import CASES, RayMap
 
 from tsfusion.kernels import block_hash, runtime
+from tsfusion.tsdf.growing_array import GrowingArray
 
 
 def test_the_map_hash_finds_what_was_inserted_and_nothing_else() -> None:
@@ -26,3 +27,14 @@ def test_dropped_blocks_are_not_found_and_the_rest_are() -> None:
     here.store.drop(kept)
     found = here.store.slots_of(keys)
     assert (found == np.where(np.arange(len(keys)) < kept, np.arange(len(keys)), -1)).all()
+
+
+def test_layers_grow_by_whole_huge_pages_and_keep_what_they_hold() -> None:
+    rows = GrowingArray((512,), np.int64, 100)
+    rows.array[:] = np.arange(100)[:, None]
+    for needed in (1000, 5001, 9777):
+        rows.reserve(needed)
+        assert rows.capacity >= needed
+        assert rows.array.nbytes % (1 << 21) == 0  # else they would be split where memory moves
+        assert (rows.array[:100] == np.arange(100)[:, None]).all()
+        assert not rows.array[100:needed].any()

@@ -70,9 +70,16 @@ class GrowingArray:
             return
         ahead = min(2 * self.capacity, self.capacity + _STEP if _MOVES_PAGES else MAX_ITEMS, MAX_ITEMS)
         try:
-            self._grow(max(capacity, ahead))
+            self._grow(self._whole_pages(max(capacity, ahead)))
         except (MemoryError, MapFull):
             self._grow(capacity)  # near the limit, no more than is needed
+
+    def _whole_pages(self, capacity: int) -> int:
+        """So many items or a few more, that fill huge pages: only these are moved as they are."""
+        size = capacity * self.item_bytes
+        if size < _HUGE_PAGE or _HUGE_PAGE % self.item_bytes:
+            return capacity
+        return -(-size // _HUGE_PAGE) * (_HUGE_PAGE // self.item_bytes)
 
     def _grow(self, capacity: int) -> None:
         if not _MOVES_PAGES:
