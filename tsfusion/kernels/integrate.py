@@ -308,6 +308,63 @@ def add_ray(
     return crossed
 
 
+@ti.func
+def add_bands(
+    unit, rays: ti.template(), bands: ti.template(), again: ti.template(), job: ti.template(),
+    hash_keys: ti.template(), hash_slots: ti.template(), missing: ti.template(), scratch: ti.template(),
+    owners: ti.template(), stamps: ti.template(), places: ti.template(), dirty: ti.template(),
+    touched: ti.template(), sums: ti.template(), color_rgn: ti.template(), color_b: ti.template(),
+    of_others: ti.template(),
+):  # fmt: skip
+    """Add the rays of a unit's bands to its own blocks; or those that cross blocks `of_others` to these."""
+    which, stamp = job[WHICH], job[STAMP]
+    sign_, oldest, most_missing, has_color = job[SIGN], job[OLDEST], job[MOST_MISSING], job[HAS_COLOR]
+    mark = (ti.cast(stamp, ti.i64) << 32) | unit
+    base = unit * UNIT_SCRATCH
+    for i in range(WINDOWS):
+        scratch[base + i] = 0
+    last, blocks = vec3i(2147483647), 0
+    tail, colors, added = base + WINDOW_SCRATCH, base + COLORS_AT, 0
+    for band in range(job[FIRST_BAND], job[LAST_BAND]):
+        if bands[band, UNIT] == unit:
+            start, count, updates = bands[band, START], bands[band, COUNT], 0
+            if which == ONLY_DEFERRED:
+                count, updates = bands[band, DEFERRED], bands[band, UPDATES]
+            if which == ONLY_ADDED:
+                count = bands[band, ADDED]
+            if ti.static(of_others):
+                count, updates = bands[band, SHARED], bands[band, UPDATES]
+            updates -= added + tail  # of the bands before
+            deferred, shared, n = 0, 0, 0
+            while n < count:
+                r = start + n
+                if ti.static(of_others):
+                    r = again[OTHERS, r]
+                elif which == ONLY_DEFERRED:
+                    r = again[LATER, r]
+                crossed = add_ray(
+                    rays, r, sign_, scratch, base, tail, colors, added, last, blocks, oldest, mark,
+                    stamp, most_missing, hash_keys, hash_slots, missing, owners, stamps, places,
+                    dirty, touched, sums, has_color, color_rgn, color_b, of_others,
+                )  # fmt: skip
+                if ti.static(not of_others):
+                    if (crossed & BITS & OF_ANOTHER) != 0:
+                        again[OTHERS, start + shared] = r
+                        shared += 1
+                    if (crossed & BITS & ABSENT) != 0:
+                        again[LATER, start + deferred] = r
+                        deferred += 1
+                        if which == ALL and touched[TOUCHED_OVERFLOW] == 1:
+                            count = n
+                n += 1
+            bands[band, UPDATES] = updates + added + tail
+            if ti.static(not of_others):
+                bands[band, SHARED] = shared
+                if which == ALL:
+                    bands[band, DEFERRED], bands[band, ADDED] = deferred, n
+    add_listed(scratch, base, tail, colors, added, sign_, sums, color_rgn, color_b, touched, of_others)
+
+
 @ti.kernel
 def add_rays(
     rays: ti.types.ndarray(dtype=ti.i32, ndim=2),
@@ -326,7 +383,6 @@ def add_rays(
     sums: ti.types.ndarray(dtype=ti.i64, ndim=1),
     color_rgn: ti.types.ndarray(dtype=ti.i64, ndim=1),
     color_b: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    of_others: ti.template(),
 ):
     """Add to every voxel that each ray crosses in its band, in blocks of slot ≥ `OLDEST`.
 
@@ -335,59 +391,21 @@ def add_rays(
     more than `MOST_MISSING` of them every band ends after the ray that it is at: `ONLY_ADDED` are those.
 
     Units run at the same time, each through its own bands. A block is of the unit that comes to it first and
-    adds to it alone, without atomics. Rays that cross blocks of other units are listed, too; a second call
-    with `of_others` adds them to these blocks, with atomics. The layers are flat: slot · 512 + offset.
+    adds to it alone, without atomics. Rays that cross blocks of other units are listed, too, and added to
+    these when all units are through, with atomics. The layers are flat: slot · 512 + offset.
     """
     for run in range(job[UNITS] * RUN):  # run loop: kernels/__init__.py
         if run % RUN == 0:
-            unit, which, stamp = run // RUN, job[WHICH], job[STAMP]
-            sign_, oldest, most_missing, has_color = job[SIGN], job[OLDEST], job[MOST_MISSING], job[HAS_COLOR]
-            mark = (ti.cast(stamp, ti.i64) << 32) | unit
-            base = unit * UNIT_SCRATCH
-            for i in range(WINDOWS):
-                scratch[base + i] = 0
-            last, blocks = vec3i(2147483647), 0
-            tail, colors, added = base + WINDOW_SCRATCH, base + COLORS_AT, 0
-            for band in range(job[FIRST_BAND], job[LAST_BAND]):
-                if bands[band, UNIT] == unit:
-                    start, count, updates = bands[band, START], bands[band, COUNT], 0
-                    if which == ONLY_DEFERRED:
-                        count, updates = bands[band, DEFERRED], bands[band, UPDATES]
-                    if which == ONLY_ADDED:
-                        count = bands[band, ADDED]
-                    if ti.static(of_others):
-                        count, updates = bands[band, SHARED], bands[band, UPDATES]
-                    updates -= added + tail  # of the bands before
-                    deferred, shared, n = 0, 0, 0
-                    while n < count:
-                        r = start + n
-                        if ti.static(of_others):
-                            r = again[OTHERS, r]
-                        elif which == ONLY_DEFERRED:
-                            r = again[LATER, r]
-                        crossed = add_ray(
-                            rays, r, sign_, scratch, base, tail, colors, added, last, blocks, oldest, mark,
-                            stamp, most_missing, hash_keys, hash_slots, missing, owners, stamps, places,
-                            dirty, touched, sums, has_color, color_rgn, color_b, of_others,
-                        )  # fmt: skip
-                        if ti.static(not of_others):
-                            if (crossed & BITS & OF_ANOTHER) != 0:
-                                again[OTHERS, start + shared] = r
-                                shared += 1
-                            if (crossed & BITS & ABSENT) != 0:
-                                again[LATER, start + deferred] = r
-                                deferred += 1
-                                if which == ALL and touched[TOUCHED_OVERFLOW] == 1:
-                                    count = n
-                        n += 1
-                    bands[band, UPDATES] = updates + added + tail
-                    if ti.static(not of_others):
-                        bands[band, SHARED] = shared
-                        if which == ALL:
-                            bands[band, DEFERRED], bands[band, ADDED] = deferred, n
-            add_listed(
-                scratch, base, tail, colors, added, sign_, sums, color_rgn, color_b, touched, of_others
-            )
+            add_bands(
+                run // RUN, rays, bands, again, job, hash_keys, hash_slots, missing, scratch, owners, stamps,
+                places, dirty, touched, sums, color_rgn, color_b, False,
+            )  # fmt: skip
+    for run in range(job[UNITS] * RUN):
+        if run % RUN == 0:
+            add_bands(
+                run // RUN, rays, bands, again, job, hash_keys, hash_slots, missing, scratch, owners, stamps,
+                places, dirty, touched, sums, color_rgn, color_b, True,
+            )  # fmt: skip
 
 
 @ti.kernel

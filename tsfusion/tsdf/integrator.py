@@ -26,7 +26,7 @@ from tsfusion.kernels.integrate import (
     WEIGHT_LIMIT,
 )
 from tsfusion.kernels.sensor_noise import WEIGHT_ONE
-from tsfusion.kernels.voxel_traversal import COST, DEFERRED, FAR_COST, SHARED, UPDATES, WEIGHT
+from tsfusion.kernels.voxel_traversal import COST, DEFERRED, FAR_COST, UPDATES, WEIGHT
 from tsfusion.tsdf.block_store import BlockStore
 from tsfusion.tsdf.ray_buffers import BANDS, RayBuffers
 
@@ -36,7 +36,6 @@ _NO_LIMIT = 1 << 30  # blocks
 _BLOCK_COST = 1000  # of a block that is added: it takes 9 µs where memory is touched for the first time
 
 Part = tuple[int, int]  # bands first … last - 1
-NO_BANDS = (0, 0)
 
 
 class KeyframeQuota(Struct, frozen=True):
@@ -97,11 +96,6 @@ class Integrator:
         finally:
             self._store.keep_within_memory()
         return updates
-
-    def warm_up(self) -> None:
-        """Compile what only some keyframes need."""
-        self._begin()
-        self._launch(NO_BANDS, +1)
 
     def _take_back(self, added: list[Part], sign: int, before: int) -> None:
         """Bring back the map of `before` blocks, whatever failed."""
@@ -253,12 +247,9 @@ class Integrator:
         """Add a part's rays to the blocks of slot ≥ `oldest`."""
         store, buffers = self._store, self._buffers
         job = which, *part, self.units, sign, oldest, most_missing, store.stamp, buffers.colored
-        given = (
+        integrate.add_rays(
             buffers.rays, buffers.bands, buffers.again, np.array(job, np.int32), store.hash_keys,
             store.hash_slots, buffers.missing, buffers.scratch, buffers.owners, store.stamps, store.places,
             store.dirty, buffers.touched, store.sums.reshape(-1), store.color_rgn.reshape(-1),
             store.color_b.reshape(-1),
         )  # fmt: skip
-        integrate.add_rays(*given, False)
-        if self.units > 1 and (part == NO_BANDS or buffers.bands[part[0] : part[1], SHARED].any()):
-            integrate.add_rays(*given, True)

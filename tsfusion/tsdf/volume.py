@@ -273,7 +273,6 @@ class Volume(AskableMap):
             throwaway.integrate(keyframe)
             throwaway.retract(keyframe)
             throwaway.integrate(keyframe)
-        throwaway._integrator.warm_up()
         throwaway.extract_mesh(min_weight=0)
         throwaway.extract_mesh(min_weight=0, blocks=throwaway.take_dirty()[:1])
         for surface in {"raw", self.model.surface}:
