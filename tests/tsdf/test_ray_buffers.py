@@ -127,6 +127,31 @@ def test_rays_from_images_equal_the_twin(kind: str, bundled: bool) -> None:
     close(rays_of(buffers), expected)
 
 
+def test_the_colour_of_a_ray_is_the_mean_of_its_samples() -> None:
+    random = np.random.default_rng(17)
+    shape, voxel_size = (30, 41), 0.05  # tiles that the image cuts, and cells with holes
+    depth = np.where(random.random(shape) < 0.02, 0, 1000).astype(np.uint16)
+    color = random.integers(0, 256, (*shape, 3), np.uint8)
+    camera = Intrinsics(60.0, 60.0, 19.5, 14.5)
+    keyframe = Keyframe(depth=depth, intrinsics=camera, T_world_camera=np.eye(4), color=color)
+    buffers = RayBuffers(color=True, regularised=False)
+    buffers.make_rays(keyframe, VolumeConfig(voxel_size=voxel_size, outlier_filter=False))
+    expected = []
+    for top, left in np.ndindex(3, 4):
+        tile = depth[12 * top : 12 * top + 12, 12 * left : 12 * left + 12] / 1000
+        colors = color[12 * top : 12 * top + 12, 12 * left : 12 * left + 12].astype(int)
+        wide, high = kernel_twins.cell_shape(tile, 1 / 60 / voxel_size)
+        for y, x in np.ndindex(-(-tile.shape[0] // high), -(-tile.shape[1] // wide)):
+            cell = np.s_[y * high : (y + 1) * high, x * wide : (x + 1) * wide]
+            if tile[cell].any():
+                blue, green, red = colors[cell][tile[cell] > 0].sum(axis=0) // np.count_nonzero(tile[cell])
+                expected.append(red << 16 | green << 8 | blue)
+    found = rays_of(buffers)[:, 15] & 0xFFFFFF
+    assert wide * high > 1
+    assert (depth == 0).any()
+    assert found.tolist() == expected
+
+
 def test_a_plane_is_met_exactly_by_every_voxel_beside_a_ray() -> None:
     normal, offset = np.array([0.6, -0.48, 0.64]), 1.5
     keyframe = plane_keyframe(np.eye(4), normal, offset)

@@ -38,70 +38,85 @@ from tsfusion.kernels.voxel_traversal import (
     vec3i,
 )
 
-SIGNAL_FIELDS = 5  # t, y − t and then x̂ − t, A, and the two off-diagonals of L
+LANES = 8  # rays that are solved side by side, in vectors: a step of one waits for three divisions
+# Element i of lane k of a band's field stands at (band · FIELDS + field) · SIGNAL + i · LANES + k.
+SIGNAL = MAX_CROSSED * LANES
+SIGNAL_FIELDS = 4  # Σ w·m and then z, W, and the two off-diagonals of L
+STORED, WEIGHT, LEFT, FAR_LEFT = 0, SIGNAL, 2 * SIGNAL, 3 * SIGNAL
+CROSSED_FIELDS = 3  # t and then the vote, place of the block, voxel in it
+DISTANCE, PLACE, OFFSET = 0, SIGNAL, 2 * SIGNAL
+QUANTA = QUANTA_PER_VOXEL / 65536.0  # a unit of distance
 VOTE_SCALE = 16.0  # x̂ is averaged in sixteenths of a quantum
 VOTE_BITS = 24
 
 
 @ti.func
-def solve_signal(signal: ti.template(), band, n, smoothness):
-    """Solve (A + λ D2ᵀD2) x = A y in place by LDLᵀ: O(n), natural ends, identity for n < 3."""
-    d1 = ti.f32(1.0)
-    d2 = ti.f32(1.0)
-    l1_1 = ti.f32(0.0)  # L[i, i−1]
-    l2_1 = ti.f32(0.0)  # L[i+1, i−1]
-    l2_2 = ti.f32(0.0)  # L[i, i−2]
-    z1 = ti.f32(0.0)
-    z2 = ti.f32(0.0)
-    for i in range(n):
-        starts = ti.select(i <= n - 3, 1.0, 0.0)  # rows of D2 that hold i first, second, third
-        middles = ti.select(i >= 1 and i <= n - 2, 1.0, 0.0)
-        ends = ti.select(i >= 2, 1.0, 0.0)
-        a = signal[band, i, 2]
-        diagonal = a + smoothness * (starts + 4.0 * middles + ends)
-        d = diagonal - l1_1 * l1_1 * d1 - l2_2 * l2_2 * d2
-        z = a * signal[band, i, 1] - l1_1 * z1 - l2_2 * z2
-        l1 = (-2.0 * smoothness * (starts + middles) - l1_1 * d1 * l2_1) / d
-        l2 = smoothness * starts / d
-        signal[band, i, 1] = z / d
-        signal[band, i, 3] = l1
-        signal[band, i, 4] = l2
-        d2, d1 = d1, d
-        z2, z1 = z1, z
-        l1_1 = l1
-        l2_2, l2_1 = l2_1, l2
-    x1 = ti.f32(0.0)
-    x2 = ti.f32(0.0)
-    for k in range(n):
-        i = n - 1 - k
-        x = signal[band, i, 1] - signal[band, i, 3] * x1 - signal[band, i, 4] * x2
-        signal[band, i, 1] = x
-        x2, x1 = x1, x
+def factorise(
+    signal: ti.template(), crossed: ti.template(), at_signal, at_crossed, n: ti.template(),
+    total: ti.template(), longest, weighted, smoothness,
+):  # fmt: skip
+    """Solve L D z = A (y − t) of A + λ D2ᵀD2 = L D Lᵀ, with natural ends, for signals of n elements a lane
+    with weights that sum to `total`; z is y − t where n < 3.
+
+    What is read and written goes through arrays of the function, which no store to an argument may change:
+    so the lanes become vectors.
+    """
+    d1, d2 = ti.Vector([1.0] * LANES), ti.Vector([1.0] * LANES)
+    l1_1, l2_1, l2_2 = ti.Vector([0.0] * LANES), ti.Vector([0.0] * LANES), ti.Vector([0.0] * LANES)
+    z1, z2, z = ti.Vector([0.0] * LANES), ti.Vector([0.0] * LANES), ti.Vector([0.0] * LANES)
+    t, y, w = ti.Vector([0] * LANES), ti.Vector([0.0] * LANES), ti.Vector([0.0] * LANES)
+    for i in range(longest):
+        at = at_signal + i * LANES
+        for k in range(LANES):
+            w[k], y[k] = signal[at + WEIGHT + k], signal[at + STORED + k]
+            t[k] = crossed[at_crossed + DISTANCE + i * LANES + k]
+        for k in range(LANES):
+            starts = ti.select(i <= n[k] - 3, 1.0, 0.0)  # rows of D2 that hold i first, second, third
+            middles = ti.select((i >= 1) & (i <= n[k] - 2), 1.0, 0.0)
+            ends = ti.select(i >= 2, 1.0, 0.0)
+            off = y[k] / w[k] - ti.cast(t[k], ti.f32) * QUANTA
+            a = ti.select(weighted == 1, w[k] * n[k] / total[k], 1.0)
+            diagonal = a + smoothness * (starts + 4.0 * middles + ends)
+            d = diagonal - l1_1[k] * l1_1[k] * d1[k] - l2_2[k] * l2_2[k] * d2[k]
+            here = a * off - l1_1[k] * z1[k] - l2_2[k] * z2[k]
+            left = (-2.0 * smoothness * (starts + middles) - l1_1[k] * d1[k] * l2_1[k]) / d
+            z[k] = ti.select(n[k] >= 3, here / d, off)
+            d2[k] = d1[k]
+            d1[k] = d
+            z2[k] = z1[k]
+            z1[k] = here
+            l1_1[k] = left  # L[i, i−1]
+            l2_2[k] = l2_1[k]  # L[i, i−2]
+            l2_1[k] = smoothness * starts / d  # L[i+1, i−1]
+        for k in range(LANES):
+            signal[at + STORED + k] = z[k]
+            signal[at + LEFT + k] = l1_1[k]
+            signal[at + FAR_LEFT + k] = l2_1[k]
 
 
 @ti.func
-def read_signal(
-    signal: ti.template(),
-    band,
-    i,
-    distance,
-    slot,
-    o,
-    feedback,
-    sums: ti.template(),
-    correction: ti.template(),
+def substitute_back(
+    signal: ti.template(), crossed: ti.template(), at_signal, at_crossed, n: ti.template(), longest
 ):
-    """Read t, y − t and W of a crossed voxel, element i of a ray's signal. Returns W."""
-    packed = sums[slot, o]
-    w = ti.cast(lane_weight(packed), ti.f32)
-    s = ti.cast(lane_distance(packed), ti.f32)
-    if feedback == 1:
-        s += correction[slot, o]
-    t = ti.cast(distance, ti.f32) * (QUANTA_PER_VOXEL / 65536.0)
-    signal[band, i, 0] = t
-    signal[band, i, 1] = s / w - t
-    signal[band, i, 2] = w
-    return w
+    """Solve Lᵀ (x̂ − t) = z, a lane each, and put ⌊16 x̂ + ½⌋ in the place of t.
+
+    What stands behind a lane's end counts for nothing.
+    """
+    x1, x2, votes = ti.Vector([0.0] * LANES), ti.Vector([0.0] * LANES), ti.Vector([0] * LANES)
+    for back in range(longest):
+        i = longest - 1 - back
+        at = at_signal + i * LANES
+        for k in range(LANES):
+            x = signal[at + STORED + k] - signal[at + LEFT + k] * x1[k] - signal[at + FAR_LEFT + k] * x2[k]
+            x = ti.select(i < n[k], x, 0.0)
+            t = ti.cast(crossed[at_crossed + DISTANCE + i * LANES + k], ti.f32) * QUANTA
+            vote = (t + x) * VOTE_SCALE + 0.5
+            low = ti.cast(vote, ti.i32)
+            votes[k] = low - ti.cast(ti.cast(low, ti.f32) > vote, ti.i32)
+            x2[k] = x1[k]
+            x1[k] = x
+        for k in range(LANES):
+            crossed[at_crossed + DISTANCE + i * LANES + k] = votes[k]
 
 
 @ti.kernel
@@ -112,12 +127,12 @@ def smooth_rays(
     hash_slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
     places: ti.types.ndarray(dtype=ti.i32, ndim=1),
     smoothness: ti.f32,
-    weighted: ti.i32,  # A = diag(W) or I
+    weighted: ti.i32,  # A = diag(W), scaled to mean 1, or I
     feedback: ti.i32,  # y from the stored regularised values, or from the raw sums
     sums: ti.types.ndarray(dtype=ti.i64, ndim=2),
     correction: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    signal: ti.types.ndarray(dtype=ti.f32, ndim=3),
-    crossed: ti.types.ndarray(dtype=ti.i32, ndim=3),
+    signal: ti.types.ndarray(dtype=ti.f32, ndim=1),
+    crossed: ti.types.ndarray(dtype=ti.i32, ndim=1),
     votes: ti.types.ndarray(dtype=ti.i64, ndim=2),
 ):
     """Gather y along each ray, solve, and add x̂ to `votes` as (Σ x̂ · 16) · 2²⁴ + n."""
@@ -125,40 +140,55 @@ def smooth_rays(
     for run in range(bands.shape[0] * RUN):  # run loop: kernels/__init__.py
         if run % RUN == 0:
             band = run // RUN
-            last = vec3i(2147483647)
-            slot = -1
-            for r in range(bands[band, START], bands[band, START] + bands[band, COUNT]):
-                if ray_weight(rays, r) > 0:
-                    walk = begin_walk(rays, r)
-                    n = 0
-                    total = ti.f32(0.0)
-                    inside = 1
-                    while inside == 1 and n < MAX_CROSSED:
-                        block = walk.voxel >> 3
-                        if block[0] != last[0] or block[1] != last[1] or block[2] != last[2]:
-                            last = block
-                            slot = map_find(hash_keys, hash_slots, hash_mask, block_key(walk.voxel))
-                        o = offset_in_block(walk.voxel)
-                        total += read_signal(
-                            signal, band, n, walk.distance, slot, o, feedback, sums, correction
-                        )
-                        crossed[band, n, 0] = places[slot]
-                        crossed[band, n, 1] = o
-                        n += 1
-                        step, next_crossing = next_step(walk.crossing)
-                        if next_crossing >= rays[r, LENGTH]:
-                            inside = 0
-                        advance(walk, step)
-                    for i in range(n):
-                        signal[band, i, 2] = ti.select(weighted == 1, signal[band, i, 2] * n / total, 1.0)
-                    if n >= 3:
-                        solve_signal(signal, band, n, smoothness)
-                    for i in range(n):
-                        x = signal[band, i, 0] + signal[band, i, 1]
-                        vote = ti.cast(ti.floor(x * VOTE_SCALE + 0.5), ti.i64)
-                        ti.atomic_add(
-                            votes[crossed[band, i, 0], crossed[band, i, 1]], (vote << VOTE_BITS) + 1
-                        )
+            last, slot, place = vec3i(2147483647), -1, -1
+            first, end = bands[band, START], bands[band, START] + bands[band, COUNT]
+            at_signal, at_crossed = band * SIGNAL_FIELDS * SIGNAL, band * CROSSED_FIELDS * SIGNAL
+            counts, totals = ti.Vector([0] * LANES), ti.Vector([0.0] * LANES)
+            while first < end:
+                longest = 0
+                for k in range(LANES):
+                    r, n, total = first + k, 0, ti.f32(0.0)
+                    inside = 0
+                    if r < end:
+                        inside = ti.cast(ray_weight(rays, r) > 0, ti.i32)
+                    if inside == 1:
+                        walk = begin_walk(rays, r)
+                        length = rays[r, LENGTH]
+                        while inside == 1 and n < MAX_CROSSED:
+                            block = walk.voxel >> 3
+                            if block[0] != last[0] or block[1] != last[1] or block[2] != last[2]:
+                                last = block
+                                slot = map_find(hash_keys, hash_slots, hash_mask, block_key(walk.voxel))
+                                place = places[slot]
+                            o = offset_in_block(walk.voxel)
+                            packed = sums[slot, o]
+                            weight = ti.cast(lane_weight(packed), ti.f32)
+                            stored = ti.cast(lane_distance(packed), ti.f32)
+                            if feedback == 1:
+                                stored += correction[slot, o]
+                            signal[at_signal + STORED + n * LANES + k] = stored
+                            signal[at_signal + WEIGHT + n * LANES + k] = weight
+                            crossed[at_crossed + DISTANCE + n * LANES + k] = walk.distance
+                            crossed[at_crossed + PLACE + n * LANES + k] = place
+                            crossed[at_crossed + OFFSET + n * LANES + k] = o
+                            total += weight
+                            n += 1
+                            step, next_crossing = next_step(walk.crossing)
+                            if next_crossing >= length:
+                                inside = 0
+                            advance(walk, step)
+                    counts[k], totals[k] = n, total
+                    longest = ti.max(longest, n)
+                factorise(
+                    signal, crossed, at_signal, at_crossed, counts, totals, longest, weighted, smoothness
+                )
+                substitute_back(signal, crossed, at_signal, at_crossed, counts, longest)
+                for k in range(LANES):
+                    for i in range(counts[k]):
+                        at = at_crossed + i * LANES + k
+                        vote = (ti.cast(crossed[at + DISTANCE], ti.i64) << VOTE_BITS) + 1
+                        ti.atomic_add(votes[crossed[at + PLACE], crossed[at + OFFSET]], vote)
+                first += LANES
 
 
 @ti.kernel

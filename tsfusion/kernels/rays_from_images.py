@@ -25,13 +25,15 @@ from tsfusion.kernels.sensor_noise import (
     noise_sigma,
     vec3,
 )
-from tsfusion.kernels.voxel_traversal import RUN, write_band, write_ray
+from tsfusion.kernels.voxel_traversal import RUN, vec3i, write_band, write_ray
 
 TILE = 12  # divided by both sides of every cell
 TILE_SAMPLES = TILE * TILE
 CELLS = ((2, 1), (2, 2), (3, 2), (3, 3), (4, 3), (4, 4), (6, 4), (6, 6), (12, 6), (12, 12))  # wide, high
 CELL_AREA = 1.0  # voxels across the ray
 PLANE_STEP = 2  # a plane is fitted to every second pixel of every second row
+LEAST, GREATEST, SUM = 0, TILE, 2 * TILE  # of the depths in each column of a row of cells
+MOST_SUMMED = 1 << 27  # so deep are twelve pixels whose sum has 31 bits
 LEAST_PLANE = 9  # of these, for a plane
 PLANE_NOISE = 2.0  # the most mean squared residual of a plane, in σ² …
 PLANE_ROUGHNESS = 0.1 * 1024.0  # … and, squared, on top of it: 2⁻¹⁰ voxel
@@ -64,63 +66,75 @@ def camera_of(rows: ti.template()):
 
 
 @ti.func
-def depth_at(image: ti.template(), confidence: ti.template(), reading, v, u):
-    """Depth of a pixel in 2⁻¹⁰ voxel; 0 = no usable return. All float32."""
-    raw = ti.cast(image[v, u], ti.f32)
+def depth_of(raw, reading):
+    """Depth of a pixel's number in 2⁻¹⁰ voxel; 0 = no usable return. All float32, and no branch: a row of a
+    tile is read in vectors."""
     z = raw * reading.scale
     if reading.is_disparity == 1:
         z = reading.scale / ti.max(raw, 1e-9)
-    q = 0
     # False for NaN as well
-    if raw > 0.0 and z >= reading.near and z <= reading.far:
-        q = ti.cast(z * reading.per_metre, ti.i32)
-        if reading.has_confidence == 1:
-            if confidence[v, u] == 0:
-                q = 0
+    usable = (raw > 0.0) & (z >= reading.near) & (z <= reading.far)
+    return ti.select(usable, ti.cast(z * reading.per_metre, ti.i32), 0)
+
+
+@ti.func
+def depth_at(image: ti.template(), confidence: ti.template(), reading, v, u):
+    """Depth of a pixel in 2⁻¹⁰ voxel; 0 = no usable return."""
+    q = depth_of(ti.cast(image[v, u], ti.f32), reading)
+    if reading.has_confidence == 1:
+        if confidence[v, u] == 0:
+            q = 0
     return q
 
 
 @ti.func
-def load_tile(
-    image: ti.template(), confidence: ti.template(), reading, left, top, depths: ti.template(), band
-):
-    """Fill `depths[band]` with the tile's depths. Returns their count and sum."""
+def load_tile(image: ti.template(), confidence: ti.template(), reading, left, top, depths: ti.template()):
+    """Fill `depths` with the tile's depths. Returns their count and sum."""
     bottom = ti.min(TILE, image.shape[0] - top)
     right = ti.min(TILE, image.shape[1] - left)
     if bottom < TILE or right < TILE:
         for i in range(TILE_SAMPLES):
-            depths[band, i] = 0
+            depths[i] = 0
+        for y in range(bottom):
+            for x in range(right):
+                depths[y * TILE + x] = depth_of(ti.cast(image[top + y, left + x], ti.f32), reading)
+    else:
+        for y in range(TILE):
+            for x in range(TILE):
+                depths[y * TILE + x] = depth_of(ti.cast(image[top + y, left + x], ti.f32), reading)
+    if reading.has_confidence == 1:
+        for y in range(bottom):
+            for x in range(right):
+                if confidence[top + y, left + x] == 0:
+                    depths[y * TILE + x] = 0
     valid = 0
     total = ti.i64(0)
-    for y in range(bottom):
-        for x in range(right):
-            q = depth_at(image, confidence, reading, top + y, left + x)
-            depths[band, y * TILE + x] = q
-            valid += ti.cast(q > 0, ti.i32)
-            total += q
+    for i in range(TILE_SAMPLES):
+        valid += ti.cast(depths[i] > 0, ti.i32)
+        total += depths[i]
     return valid, total
 
 
 @ti.func
-def fit_plane(depths: ti.template(), band, anchor, sigma):
+def fit_plane(depths: ti.template(), anchor, sigma):
     """Least squares q = c + x·slope_x + y·slope_y over a lattice of the tile; depths and `sigma` in 2⁻¹⁰
     voxel, `anchor` near the depths."""
     sx, sy, sxx, sxy, syy, n = 0, 0, 0, 0, 0, 0
-    sq, sxq, syq, sqq = ti.i64(0), ti.i64(0), ti.i64(0), ti.i64(0)
+    sq, sxq, syq, sqq = 0, 0, 0, ti.i64(0)
     for row in range(TILE // PLANE_STEP):
         y = row * PLANE_STEP
-        row_n, row_x, row_xx, row_q, row_xq = 0, 0, 0, ti.i64(0), ti.i64(0)
+        row_n, row_x, row_xx, row_q, row_xq = 0, 0, 0, 0, 0
         for column in range(TILE // PLANE_STEP):
             x = column * PLANE_STEP
-            q = depths[band, y * TILE + x]
-            if q > 0:
-                d = ti.cast(ti.min(ti.max(q - anchor, -(1 << 20)), 1 << 20), ti.i64)
-                row_n += 1
-                row_x += x
-                row_xx += x * x
-                row_q += d
-                row_xq += d * x
-                sqq += d * d
+            q = depths[y * TILE + x]
+            here = ti.cast(q > 0, ti.i32)
+            d = ti.select(q > 0, ti.min(ti.max(q - anchor, -(1 << 20)), 1 << 20), 0)
+            row_n += here
+            row_x += x * here
+            row_xx += x * x * here
+            row_q += d
+            row_xq += d * x
+            sqq += ti.cast(d, ti.i64) * d
         n += row_n
         sx += row_x
         sy += y * row_n
@@ -149,12 +163,12 @@ def fit_plane(depths: ti.template(), band, anchor, sigma):
 
 
 @ti.func
-def tile_plane(model: ti.template(), unit, mean, depths: ti.template(), band):
+def tile_plane(model: ti.template(), unit, mean, depths: ti.template()):
     """The plane of a tile of `mean` depth (metres), if it is flat and noise does not hide it."""
     plane = Plane(0, 0.0, 0.0)
     sigma = noise_sigma(model, mean)
     if sigma < PLANE_SIGMA * model[VOXEL_SIZE]:
-        plane = fit_plane(depths, band, ti.cast(mean / unit, ti.i32), sigma / unit)
+        plane = fit_plane(depths, ti.cast(mean / unit, ti.i32), sigma / unit)
     return plane
 
 
@@ -180,33 +194,65 @@ def cell_shape(pixel):
 
 
 @ti.func
-def layer_sums(depths: ti.template(), band, cell, above, up_to):
+def layer_sums(depths: ti.template(), cell, above, up_to):
     """The cell's samples with depths in (`above`, `up_to`], as a `Layer`."""
     low, deepest, n, sum_q, sum_x, sum_y = 1 << 30, 0, 0, ti.i64(0), 0, 0
     for y in range(cell.y, cell.y + cell.high):
         for x in range(cell.x, cell.x + cell.wide):
-            q = depths[band, y * TILE + x]
-            if q > above and q <= up_to:
-                low = ti.min(low, q)
-                deepest = ti.max(deepest, q)
-                n += 1
-                sum_q += q
-                sum_x += x
-                sum_y += y
+            q = depths[y * TILE + x]
+            inside = (q > above) & (q <= up_to)
+            one = ti.cast(inside, ti.i32)
+            low = ti.min(low, ti.select(inside, q, 1 << 30))
+            deepest = ti.max(deepest, ti.select(inside, q, 0))
+            n += one
+            sum_q += ti.select(inside, q, 0)
+            sum_x += x * one
+            sum_y += y * one
     return Layer(low, up_to, deepest, n, sum_q, sum_x, sum_y)
 
 
 @ti.func
-def nearest_layer(model: ti.template(), unit, depths: ti.template(), band, cell, above):
+def column_sums(depths: ti.template(), first, high, columns: ti.template()):
+    """Least, greatest and sum of the depths in each column of `high` rows of a tile."""
+    for x in range(TILE):
+        columns[LEAST + x] = 1 << 30
+        columns[GREATEST + x] = 0
+        columns[SUM + x] = 0
+    for y in range(first, first + high):
+        for x in range(TILE):
+            q = depths[y * TILE + x]
+            columns[LEAST + x] = ti.min(columns[LEAST + x], q)
+            columns[GREATEST + x] = ti.max(columns[GREATEST + x], q)
+            columns[SUM + x] += q
+
+
+@ti.func
+def full_layer(columns: ti.template(), cell):
+    """All samples of a cell; n = 0 unless every pixel has one, of a depth of which twelve can be summed."""
+    low, deepest, sum_q = 1 << 30, 0, ti.i64(0)
+    for x in range(cell.x, cell.x + cell.wide):
+        low = ti.min(low, columns[LEAST + x])
+        deepest = ti.max(deepest, columns[GREATEST + x])
+        sum_q += columns[SUM + x]
+    area = cell.wide * cell.high
+    n = ti.select((low > 0) & (deepest < MOST_SUMMED), area, 0)
+    sum_x, sum_y = cell.x * area + area * (cell.wide - 1) // 2, cell.y * area + area * (cell.high - 1) // 2
+    return Layer(low, 1 << 30, deepest, n, sum_q, sum_x, sum_y)
+
+
+@ti.func
+def nearest_layer(model: ti.template(), unit, depths: ti.template(), columns: ti.template(), cell, above):
     """The nearest samples of a cell beyond depth `above` that may belong to one surface (n = 0: none), and
     whether there are samples behind them."""
-    layer = layer_sums(depths, band, cell, above, 1 << 30)
+    layer = full_layer(columns, cell)
+    if above > 0 or layer.n == 0:
+        layer = layer_sums(depths, cell, above, 1 << 30)
     if layer.n > 0:
         tolerance = ti.cast(ti.min(layer_depth(model, layer.low * unit) / unit, 1e9), ti.i32)
         layer.up_to = layer.low + tolerance
     more = layer.n > 1 and layer.deepest > layer.up_to
     if more:
-        layer = layer_sums(depths, band, cell, above, layer.up_to)
+        layer = layer_sums(depths, cell, above, layer.up_to)
     return layer, more
 
 
@@ -226,33 +272,47 @@ def is_supported(image: ti.template(), confidence: ti.template(), reading, cell,
 
 
 @ti.func
+def color_sums(color: ti.template(), left, top, first, high, columns: ti.template()):
+    """Sum of blue, green and red in each column of `high` rows of a tile, as far as the image goes."""
+    for x in range(3 * TILE):
+        columns[x] = 0
+    right = ti.min(3 * TILE, color.shape[1] - 3 * left)
+    for y in range(top + first, ti.min(top + first + high, color.shape[0])):
+        for x in range(right):
+            columns[x] += ti.cast(color[y, 3 * left + x], ti.i32)
+
+
+@ti.func
 def layer_color(
-    color: ti.template(), has_color, confidence: ti.template(), has_confidence, depths: ti.template(), band,
-    cell, layer,
+    color: ti.template(), has_color, confidence: ti.template(), has_confidence, depths: ti.template(),
+    colors: ti.template(), cell, layer,
 ):  # fmt: skip
     """Mean colour 0xRRGGBB and summed confidence of a layer's samples."""
-    red, green, blue, trust = 0, 0, 0, 0
-    for y in range(cell.y, cell.y + cell.high):
+    n, bgr, trust = layer.n, vec3i(0), 0
+    if n == cell.wide * cell.high and has_confidence == 0:
         for x in range(cell.x, cell.x + cell.wide):
-            q = depths[band, y * TILE + x]
-            if q >= layer.low and q <= layer.up_to:
-                if has_confidence == 1:
-                    trust += ti.cast(confidence[cell.top + y, cell.left + x], ti.i32)
-                if has_color == 1:
-                    blue += ti.cast(color[cell.top + y, cell.left + x, 0], ti.i32)
-                    green += ti.cast(color[cell.top + y, cell.left + x, 1], ti.i32)
-                    red += ti.cast(color[cell.top + y, cell.left + x, 2], ti.i32)
-    n = layer.n
+            for c in ti.static(range(3)):
+                bgr[c] += colors[3 * x + c]
+    else:
+        for y in range(cell.y, cell.y + cell.high):
+            for x in range(cell.x, cell.x + cell.wide):
+                q = depths[y * TILE + x]
+                if q >= layer.low and q <= layer.up_to:
+                    if has_confidence == 1:
+                        trust += ti.cast(confidence[cell.top + y, cell.left + x], ti.i32)
+                    if has_color == 1:
+                        for c in ti.static(range(3)):
+                            bgr[c] += ti.cast(color[cell.top + y, 3 * (cell.left + x) + c], ti.i32)
     if has_confidence == 0:
         trust = 255 * n
-    return ((red // n) << 16) | ((green // n) << 8) | (blue // n), trust
+    return ((bgr[2] // n) << 16) | ((bgr[1] // n) << 8) | (bgr[0] // n), trust
 
 
 @ti.func
 def write_layer_ray(
     rays: ti.template(), r, first, model: ti.template(), camera, plane, unit,
-    color: ti.template(), has_color, confidence: ti.template(), has_confidence, depths: ti.template(), band,
-    cell, layer,
+    color: ti.template(), has_color, confidence: ti.template(), has_confidence, depths: ti.template(),
+    colors: ti.template(), cell, layer,
 ):  # fmt: skip
     """Write ray `r` through the mean of a layer's samples; returns its weight, 0 if it is out of reach, and
     what it costs to add it.
@@ -269,7 +329,9 @@ def write_layer_ray(
     if in_reach(p):
         rgb, trust = 0, 255 * n
         if has_confidence == 1 or has_color == 1:
-            rgb, trust = layer_color(color, has_color, confidence, has_confidence, depths, band, cell, layer)
+            rgb, trust = layer_color(
+                color, has_color, confidence, has_confidence, depths, colors, cell, layer
+            )
         gradient = vec3(0.0)
         if plane.is_flat == 1:
             gradient = plane_gradient(
@@ -288,14 +350,13 @@ def rays_from_image(
     image: ti.types.ndarray(ndim=2),
     is_disparity: ti.i32,
     scale: ti.f64,  # depth = image · scale, or scale / image
-    color: ti.types.ndarray(dtype=ti.u8, ndim=3),
+    color: ti.types.ndarray(dtype=ti.u8, ndim=2),  # (H, 3 W): blue, green, red
     has_color: ti.i32,
     confidence: ti.types.ndarray(dtype=ti.u8, ndim=2),
     has_confidence: ti.i32,
     camera_rows: ti.types.ndarray(dtype=ti.f64, ndim=2),  # (4, 3): `Camera`
     model: ti.types.ndarray(dtype=ti.f64, ndim=1),
     bundle: ti.i32,
-    depths: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (bands, TILE_SAMPLES)
     rays: ti.types.ndarray(dtype=ti.i32, ndim=2),
     bands: ti.types.ndarray(dtype=ti.i32, ndim=2),
 ):
@@ -315,29 +376,35 @@ def rays_from_image(
             last_tile = ti.cast(ti.cast(band + 1, ti.i64) * tiles // count, ti.i32)
             first_ray = first_tile * TILE_SAMPLES
             out = first_ray
+            depths, columns = ti.Vector([0] * TILE_SAMPLES), ti.Vector([0] * (3 * TILE))
+            colors = ti.Vector([0] * (3 * TILE))
             samples, total_weight, total_cost = 0, 0, ti.i64(0)
             for tile in range(first_tile, last_tile):
                 left, top = tile % tiles_x * TILE, tile // tiles_x * TILE
-                valid, total = load_tile(image, confidence, reading, left, top, depths, band)
+                valid, total = load_tile(image, confidence, reading, left, top, depths)
                 wide, high, plane = 1, 1, Plane(0, 0.0, 0.0)
                 if valid > 0 and bundle == 1:
                     mean = ti.cast(total, ti.f64) / valid * unit
                     wide, high = cell_shape(mean * ti.max(camera.du.norm(), camera.dv.norm()))
-                    plane = tile_plane(model, unit, mean, depths, band)
+                    plane = tile_plane(model, unit, mean, depths)
                 across = TILE // wide
                 cells = ti.select(valid > 0, across * (TILE // high), 0)
                 for c in range(cells):
                     cell = Cell(left, top, c % across * wide, c // across * high, wide, high)
+                    if cell.x == 0:
+                        column_sums(depths, cell.y, high, columns)
+                        if has_color == 1:
+                            color_sums(color, left, top, cell.y, high, colors)
                     above = 0
                     while above >= 0:  # one layer of depth after the other
-                        layer, more = nearest_layer(model, unit, depths, band, cell, above)
+                        layer, more = nearest_layer(model, unit, depths, columns, cell, above)
                         keep = layer.n > 0
                         if layer.n == 1 and model[DROPS_LONE_SAMPLES] > 0.0:
                             keep = 1 == is_supported(image, confidence, reading, cell, layer)
                         if keep:
                             weight, cost = write_layer_ray(
                                 rays, out, first_ray, model, camera, plane, unit, color, has_color,
-                                confidence, has_confidence, depths, band, cell, layer,
+                                confidence, has_confidence, depths, colors, cell, layer,
                             )  # fmt: skip
                             if weight > 0:
                                 total_weight += weight

@@ -17,13 +17,13 @@ from tsfusion.kernels.integrate import (
     TOUCHED_OVERFLOW,
     UNIT_SCRATCH,
 )
-from tsfusion.kernels.voxel_traversal import BAND_FIELDS, COST, MAX_CROSSED, RAY_FIELDS, SAMPLES, UNIT
+from tsfusion.kernels.voxel_traversal import BAND_FIELDS, COST, RAY_FIELDS, SAMPLES, UNIT
 from tsfusion.tsdf.growing_array import GrowingArray
 
 _FEW_MISSING = 1 << 15  # entries of the set for the blocks that a usual keyframe finds missing
 BANDS = 64  # units of parallel work; fixed, so that nothing depends on the thread count
 FULL_WEIGHT_SIGMA = 0.25  # voxels: noise below this no longer shows in the map
-_NOTHING = {len(shape): np.zeros(shape, np.uint8) for shape in ((1,), (1, 3), (1, 1, 3))}
+_NOTHING = {len(shape): np.zeros(shape, np.uint8) for shape in ((1,), (1, 3))}
 
 
 class RayBuffers:
@@ -38,12 +38,11 @@ class RayBuffers:
         self.scratch = np.zeros(0, np.int64)
         self.bands = np.zeros((BANDS, BAND_FIELDS), np.int32)
         self.missing = np.zeros(_FEW_MISSING, np.int64)
-        self._depths = np.zeros((BANDS, rays_from_images.TILE_SAMPLES), np.int32)
         self._touched = GrowingArray((), np.int32, 1024)
         self._owners = GrowingArray((), np.int64, 1024)
-        units = BANDS if regularised else 1
-        self.signal = np.zeros((units, MAX_CROSSED, ray_smoothing.SIGNAL_FIELDS), np.float32)
-        self.crossed = np.zeros((units, MAX_CROSSED, 2), np.int32)
+        units = BANDS * ray_smoothing.SIGNAL if regularised else 1
+        self.signal = np.zeros(units * ray_smoothing.SIGNAL_FIELDS, np.float32)
+        self.crossed = np.zeros(units * ray_smoothing.CROSSED_FIELDS, np.int32)
         self._votes = GrowingArray((CUBE,), np.int64, 1024 if regularised else 1)
 
     @property
@@ -103,6 +102,7 @@ class RayBuffers:
             )  # fmt: skip
         else:
             height, width = keyframe.shape
+            color = keyframe.color if self.colored else None
             self._reserve_rays(
                 -(-height // rays_from_images.TILE)
                 * -(-width // rays_from_images.TILE)
@@ -110,8 +110,9 @@ class RayBuffers:
             )
             rays_from_images.rays_from_image(
                 keyframe.measurement, int(keyframe.kind == "disparity"), _depth_scale(keyframe),
-                *_optional(keyframe.color if self.colored else None, 3), *_optional(keyframe.confidence, 2),
-                _camera(keyframe, voxel_size), parameters, bundle, self._depths, self.rays, self.bands,
+                *_optional(None if color is None else color.reshape(height, -1), 2),
+                *_optional(keyframe.confidence, 2),
+                _camera(keyframe, voxel_size), parameters, bundle, self.rays, self.bands,
             )  # fmt: skip
         return int(self.bands[:, SAMPLES].sum())
 
