@@ -275,10 +275,10 @@ def vertex(values: dict[Voxel, float], colors: dict[Voxel, Any], position: Any) 
 
 
 def field(
-    raw: NDArray[np.float64], weight: NDArray[np.float64], settings: Any, quanta: int
+    raw: NDArray[np.float64], weight: NDArray[np.float64], settings: Any, quanta: int, edges: list[float]
 ) -> NDArray[np.float64]:
     """argmin Σ W (x − y)² + λ Σ ω |D2 x|² on a dense array of quanta, NaN = unseen, by sparse direct solves;
-    ω = 1, then 1 / (1 + (D2 x / ε)²) again and again. Voxels beyond reach stay as they are."""
+    ω = 1 / (1 + (D2 x / ε)²) of the last x, for each ε of `edges`. Voxels beyond reach stay as they are."""
     listed = abs(np.nan_to_num(raw, nan=np.inf)) <= settings.reach * quanta
     number = np.full(raw.shape, -1)
     number[listed] = np.arange(listed.sum())
@@ -290,11 +290,12 @@ def field(
     triples = np.concatenate(rows)
     where = (np.repeat(np.arange(len(triples)), 3), triples.ravel())
     D2 = sparse.csr_matrix((np.tile([1.0, -2.0, 1.0], len(triples)), where), (len(triples), listed.sum()))
-    y, W, omega = raw[listed], weight[listed], np.ones(len(triples))
-    for _ in range(settings.reweightings + 1):
+    x = y = raw[listed]
+    W = weight[listed]
+    for edge in edges:
+        omega = 1 / (1 + (D2 @ x / edge) ** 2)
         A = sparse.diags(W) + settings.smoothness * D2.T @ sparse.diags(omega) @ D2
         x = spsolve(A.tocsc(), W * y)
-        omega = 1 / (1 + (D2 @ x / (settings.edge * quanta)) ** 2)
     result = raw.copy()
     result[listed] = x
     return result

@@ -2,6 +2,7 @@
 """The field regulariser: what it solves, what it leaves alone, and that only the sums decide it."""
 
 import hashlib
+import math
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -63,13 +64,15 @@ def test_the_solver_equals_its_twin(monkeypatch: pytest.MonkeyPatch, seed: int) 
     distance, weight = noisy_roof(seed)
     keys, sums = map_of(distance, weight, (-2, -1, -1))
     raw = np.where(weight > 0, np.rint(distance * QUANTA), np.nan)
-    expected = kernel_twins.field(raw, weight / 16, SETTINGS, QUANTA)
+    edges = [edge for edge, _, _ in SETTINGS.rounds(0)]
+    assert edges[0] > edges[-1] > 0
+    expected = kernel_twins.field(raw, weight / 16, SETTINGS, QUANTA, edges)
     rows = solve(keys, store_of(keys, sums), 1.0, settings=SETTINGS)
     error = abs(dense(rows, distance.shape) - expected) / QUANTA
     assert (np.isnan(error) == (weight == 0)).all()
-    assert np.nanmean(error) < 0.003  # voxel
+    assert np.nanmean(error) < 0.006  # voxel
     assert np.nanmax(error) < 0.1
-    monkeypatch.setattr(field_regularizer, "ITERATIONS", 400)
+    monkeypatch.setattr(field_regularizer, "STEPS", 400)
     monkeypatch.setattr(field_regularizer, "LOWEST", 0.0005)
     rows = solve(keys, store_of(keys, sums), 1.0, settings=SETTINGS)
     assert np.nanmax(abs(dense(rows, distance.shape) - expected)) / QUANTA < 1e-3
@@ -82,9 +85,9 @@ def test_a_coarser_start_leads_to_the_same_field(monkeypatch: pytest.MonkeyPatch
     often = FieldSettings(smoothness=500.0, edge=4.0, reweightings=30)
     assert often.coarser == 1
     raw = np.where(weight > 0, np.rint(distance * QUANTA), np.nan)
-    expected = kernel_twins.field(raw, weight / 16, often, QUANTA)
-    monkeypatch.setattr(field_regularizer, "ITERATIONS", 100)
-    monkeypatch.setattr(field_regularizer, "LOWEST", 0.0005)
+    expected = kernel_twins.field(raw, weight / 16, often, QUANTA, [math.inf] + [often.edge * QUANTA] * 30)
+    monkeypatch.setattr(field_regularizer, "STRONG_STEPS", 100)
+    monkeypatch.setattr(field_regularizer, "STRONG_LOWEST", 0.0005)
     rows = solve(keys, store_of(keys, sums), 1.0, settings=often)
     error = abs(dense(rows, distance.shape) - expected) / QUANTA
     assert np.nanmax(error) < 0.05
@@ -204,7 +207,7 @@ def test_a_cube_keeps_its_edges_and_its_faces_lose_their_noise() -> None:
     keys, sums = map_of(distance, weight, (0, 0, 0))
     raw = store_of(keys, sums)
     errors = {}
-    for name, settings in (("raw", FieldSettings(0.0, 0.03, 0)), ("field", FieldSettings(30.0, 0.01, 4))):
+    for name, settings in (("raw", FieldSettings(0.0, 0.03, 0)), ("field", FieldSettings(30.0, 0.05, 3))):
         mesh = extract(keys, raw, 1.0, view=partial(solve, settings=settings))
         q = abs(mesh.vertices - 24.0) - 11.7
         error = abs(np.linalg.norm(np.maximum(q, 0), axis=1) + np.minimum(q.max(axis=1), 0))

@@ -84,8 +84,8 @@ class SensorModel(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     min_weight: NonNegative = 0.25
     surface: Surface = "field"
     field_smoothness: Smoothness = 30.0
-    field_edge: Positive = 0.02
-    field_reweightings: Annotated[int, Meta(ge=0, le=16)] = 4
+    field_edge: Positive = 0.05
+    field_reweightings: Annotated[int, Meta(ge=0, le=16)] = 3
 
 
 # Kinect v1: Nguyen, Izadi and Lovell 2012 (axial noise). Stereo: Δz = z² Δd / (b·f). Streets are seen at
@@ -107,7 +107,7 @@ SENSORS: dict[str, SensorModel] = {
         feedback=True,
         min_weight=0.5,
         field_smoothness=1000.0,
-        field_edge=0.05,
+        field_reweightings=4,
     ),
     "lidar": SensorModel(sigma_floor=0.02, min_range=1.0, max_range=100.0, min_support=4.0),
     "scanner": SensorModel(sigma_floor=0.0002, min_range=0.0, max_range=100.0),

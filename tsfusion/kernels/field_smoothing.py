@@ -8,9 +8,9 @@ y = Σ w·m / Σ w and W = Σ w are read from the map, x near a flat surface is 
 counts (Geman and McClure; the gentler 1 / √(1 + …) rounds edges by a quarter more, docs/accuracy.md).
 
 The voxels near the surface are numbered into one dense list with the numbers of their neighbours; a missing
-one has the number past the end, where all is 0. An iteration is two sweeps of the list, each writing only
-its own voxel: `bend` leaves q = ω D2 x, `relax` steps down the gradient W (x − y) + λ D2ᵀ q. Hence no order
-of threads can show.
+one has the number past the end, where all is 0. A step is two sweeps of the list, each writing only its own
+voxel: the first leaves q = ω D2 x, the second goes down the gradient W (x − y) + λ D2ᵀ q. Hence no order of
+threads can show. A launch costs as much as a step of a thousand voxels: one does several steps.
 """
 
 import taichi as ti
@@ -20,6 +20,7 @@ from tsfusion.kernels.sensor_noise import WEIGHT_ONE
 from tsfusion.kernels.voxel_traversal import RUN
 
 NONE = -1
+AT_ONCE = 3  # steps of a launch
 
 
 @ti.kernel
@@ -224,50 +225,29 @@ def refine(
 
 
 @ti.kernel
-def bend(
-    links: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    x: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    omega: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    q: ti.types.ndarray(dtype=ti.f32, ndim=2),
-):
-    """q = ω D2 x along each axis."""
-    for i in range(links.shape[0]):
-        twice = 2.0 * x[i]
-        for axis in ti.static(range(3)):
-            q[i, axis] = omega[i, axis] * (x[links[i, 2 * axis]] - twice + x[links[i, 2 * axis + 1]])
-
-
-@ti.kernel
-def reweigh(
+def weigh(
     links: ti.types.ndarray(dtype=ti.i32, ndim=2),
     x: ti.types.ndarray(dtype=ti.f32, ndim=1),
     flat: ti.i32,  # ω = 1 instead
     edge: ti.f32,
+    weight: ti.types.ndarray(dtype=ti.f32, ndim=1),
+    smoothness: ti.f32,
     omega: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    inverse: ti.types.ndarray(dtype=ti.f32, ndim=1),
 ):
-    """ω = 1 / (1 + (D2 x / ε)²); 0 where one of the three cells is missing."""
+    """ω = 1 / (1 + (D2 x / ε)²), 0 where one of the three cells is missing; and 1 / M with
+    M = W + 4 λ Σ |D2|ᵀ ω: then 0 < M⁻¹ A ≤ 1, as (1, −2, 1) has an l1 norm of 4."""
     for i in range(links.shape[0]):
         for axis in ti.static(range(3)):
             m = links[i, 2 * axis]
             p = links[i, 2 * axis + 1]
-            weight = ti.f32(0.0)
+            share = ti.f32(0.0)
             if m < links.shape[0] and p < links.shape[0]:
-                weight = 1.0
+                share = 1.0
                 if flat == 0:
                     bent = (x[m] - 2.0 * x[i] + x[p]) / edge
-                    weight = 1.0 / (1.0 + bent * bent)
-            omega[i, axis] = weight
-
-
-@ti.kernel
-def precondition(
-    links: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    weight: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    omega: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    smoothness: ti.f32,
-    inverse: ti.types.ndarray(dtype=ti.f32, ndim=1),
-):
-    """1 / M with M = W + 4 λ Σ |D2|ᵀ ω: then 0 < M⁻¹ A ≤ 1, as (1, −2, 1) has an l1 norm of 4."""
+                    share = 1.0 / (1.0 + bent * bent)
+            omega[i, axis] = share
     for i in range(links.shape[0]):
         total = ti.f32(0.0)
         for axis in ti.static(range(3)):
@@ -282,22 +262,28 @@ def relax(
     links: ti.types.ndarray(dtype=ti.i32, ndim=2),
     y: ti.types.ndarray(dtype=ti.f32, ndim=1),
     weight: ti.types.ndarray(dtype=ti.f32, ndim=1),
+    omega: ti.types.ndarray(dtype=ti.f32, ndim=2),
     inverse: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    q: ti.types.ndarray(dtype=ti.f32, ndim=2),
     smoothness: ti.f32,
-    keep: ti.f32,  # of the last step
-    gain: ti.f32,  # of the preconditioned residual
+    steps: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (AT_ONCE, 2): share of the last, gain of the residual
+    q: ti.types.ndarray(dtype=ti.f32, ndim=2),
     step: ti.types.ndarray(dtype=ti.f32, ndim=1),
     x: ti.types.ndarray(dtype=ti.f32, ndim=1),
 ):
-    """One step of the Chebyshev iteration."""
-    for i in range(links.shape[0]):
-        back = ti.f32(0.0)
-        for axis in ti.static(range(3)):
-            back += q[links[i, 2 * axis], axis] - 2.0 * q[i, axis] + q[links[i, 2 * axis + 1], axis]
-        change = keep * step[i] + gain * inverse[i] * (weight[i] * (y[i] - x[i]) - smoothness * back)
-        step[i] = change
-        x[i] = x[i] + change
+    """Some steps of the Chebyshev iteration, each after q = ω D2 x along each axis."""
+    for k in ti.static(range(AT_ONCE)):
+        for i in range(links.shape[0]):
+            twice = 2.0 * x[i]
+            for axis in ti.static(range(3)):
+                q[i, axis] = omega[i, axis] * (x[links[i, 2 * axis]] - twice + x[links[i, 2 * axis + 1]])
+        for i in range(links.shape[0]):
+            back = ti.f32(0.0)
+            for axis in ti.static(range(3)):
+                back += q[links[i, 2 * axis], axis] - 2.0 * q[i, axis] + q[links[i, 2 * axis + 1], axis]
+            residual = weight[i] * (y[i] - x[i]) - smoothness * back
+            change = steps[k, 0] * step[i] + steps[k, 1] * inverse[i] * residual
+            step[i] = change
+            x[i] = x[i] + change
 
 
 @ti.kernel

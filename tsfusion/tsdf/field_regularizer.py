@@ -5,7 +5,8 @@ A view of the map's sums: no order of keyframes or threads can show. Blocks are 
 neighbours, so that some blocks' values are nearly those of the whole map (docs/method.md says how nearly).
 """
 
-from collections.abc import Callable, Iterator
+import math
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,8 +19,9 @@ from tsfusion.tsdf.block_store import BlockStore
 from tsfusion.tsdf.surface_values import values_of
 
 BATCH = 8192  # blocks solved at once, beside their halo; some 10 kB each
-ITERATIONS = 12  # Chebyshev steps a re-weighting: the mesh is 1 % (Kinect) to 6 % (stereo) from the limit
-LOWEST = 0.02  # eigenvalue of M⁻¹A from which on the iteration damps evenly
+STEPS, LOWEST = 6, 0.015  # Chebyshev steps a round, and eigenvalue of M⁻¹A from which on they damp evenly
+STRONG_STEPS, STRONG_LOWEST = 12, 0.02  # with a coarser start: the mesh is 6 % (stereo) from the limit
+WIDEST = 1.8  # times ε, of the first round
 LEAST_REACH = 2.0  # voxels
 COARSE_FROM = 64.0  # λ that smooths over more voxels than so few iterations reach
 NORMAL_SAMPLES = 3  # voxels to each side of the surface: less would be no ray
@@ -29,10 +31,13 @@ AROUND = np.array([(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-
 SIDES = np.array([sign * step for step in _KEY_STEP for sign in (-1, 1)], np.int64)
 
 
+Round = tuple[float, float, int]  # ε in quanta, ∞: ω = 1; least eigenvalue to damp; steps
+
+
 @dataclass(frozen=True)
 class FieldSettings:
     """`smoothness` λ against data weights in full-confidence samples, `edge` ε in voxels: D2 beyond it
-    counts as an edge, `reweightings` of ω after the first solve with ω = 1."""
+    counts as an edge, `reweightings`: rounds of steps, each with ω from the x of the last."""
 
     smoothness: float
     edge: float
@@ -47,6 +52,17 @@ class FieldSettings:
     def coarser(self) -> int:
         """Levels of cells of twice the size to start from, where λ against the data is 16 times smaller."""
         return int(self.smoothness >= COARSE_FROM)
+
+    def rounds(self, depth: int) -> list[Round]:
+        """Rounds of a level; depth 0 = voxels. ε begins wider: what noise bends is no edge."""
+        edge = self.edge * QUANTA_PER_VOXEL * 4**depth
+        flat = (math.inf, STRONG_LOWEST, STRONG_STEPS)
+        if self.coarser:
+            return [flat] * (depth == self.coarser) + [(edge, *flat[1:])] * self.reweightings
+        if not self.reweightings:
+            return [flat]
+        falling = np.linspace(edge, WIDEST * edge, self.reweightings)[::-1].tolist()
+        return [(edge, LOWEST, STEPS) for edge in falling]
 
     @property
     def halo(self) -> int:
@@ -124,29 +140,27 @@ class Level:
         return cls(bits, number, starts, np.empty((total, 6), np.int32), y, weight, x)
 
     def relax(
-        self,
-        smoothness: float,
-        edge: float,
-        reweightings: int,
-        *,
-        first: bool,
-        pause: Callable[[], None],
+        self, smoothness: float, rounds: Sequence[Round], pause: Callable[[], None] = lambda: None
     ) -> None:
-        """Solve with ω = 1 if `first`, then with ω from the last solution, again and again.
+        """Go down the gradient in rounds, each with ω from the solution of the one before.
 
         Args:
-            pause: called after each step.
+            pause: called after each launch.
         """
         total = len(self.x)
         omega, bent = np.zeros((total, 3), np.float32), np.zeros((total, 3), np.float32)
         inverse, step = np.empty(total, np.float32), np.zeros(total, np.float32)
-        for flat in ([1] if first else []) + [0] * reweightings:
-            kernels.reweigh(self.links, self.x, flat, edge, omega)
-            kernels.precondition(self.links, self.weight, omega, smoothness, inverse)
-            for keep, gain in chebyshev(LOWEST, ITERATIONS):
-                kernels.bend(self.links, self.x, omega, bent)
+        for edge, lowest, count in rounds:
+            flat = edge == math.inf
+            kernels.weigh(
+                self.links, self.x, int(flat), 1.0 if flat else edge, self.weight, smoothness, omega, inverse
+            )
+            inverse[~np.isfinite(inverse)] = 0.0  # nothing draws at a cell without weight and bends: it stays
+            steps = np.zeros((-(-count // kernels.AT_ONCE), kernels.AT_ONCE, 2), np.float32)
+            steps.reshape(-1, 2)[:count] = list(chebyshev(lowest, count))
+            for some in steps:
                 kernels.relax(
-                    self.links, self.y, self.weight, inverse, bent, smoothness, keep, gain, step, self.x
+                    self.links, self.y, self.weight, omega, inverse, smoothness, some, bent, step, self.x
                 )
                 pause()
 
@@ -174,10 +188,7 @@ class _Batch:
                     level.number, level.starts, level.x,
                 )  # fmt: skip
             # between cells of twice the size a bend is 4 times as large, and there are 8 times fewer
-            level.relax(
-                s.smoothness / 2**depth, s.edge * QUANTA_PER_VOXEL * 4**depth, s.reweightings,
-                first=depth == coarsest, pause=self.pause,
-            )  # fmt: skip
+            level.relax(s.smoothness / 2**depth, s.rounds(depth), self.pause)
         finest = self.levels[0]
         rows = index_of(self.keys, self.wanted)
         kernels.write_values(rows, self.values, finest.number, finest.starts, finest.x, solved)

@@ -153,19 +153,9 @@ def _list(
 
 def _relax(level: field_regularizer.Level, voxels: int) -> None:
     """Least second differences between the seen values: as many steps as a hole of this width needs."""
-    total = len(level.x)
-    omega, bent = np.zeros((total, 3), np.float32), np.zeros((total, 3), np.float32)
-    inverse, step = np.zeros(total, np.float32), np.zeros(total, np.float32)
-    field_smoothing.reweigh(level.links, level.x, 1, 1.0, omega)
-    field_smoothing.precondition(level.links, level.weight, omega, 1.0, inverse)
-    inverse[~np.isfinite(inverse)] = 0.0  # a voxel without any second difference stays as it is
     lowest = _SOFTEST / _STIFFEST / (voxels + 2) ** 4
     steps = math.ceil(0.5 * math.log(2 / _TOLERANCE) / math.sqrt(lowest))
-    for keep, gain in field_regularizer.chebyshev(lowest, steps):
-        field_smoothing.bend(level.links, level.x, omega, bent)
-        field_smoothing.relax(
-            level.links, level.y, level.weight, inverse, bent, 1.0, keep, gain, step, level.x
-        )
+    level.relax(1.0, [(math.inf, lowest, steps)])
 
 
 def _reach(voxels: int) -> float:
