@@ -79,7 +79,7 @@ def list_voxels(
     sums: ti.types.ndarray(dtype=ti.i64, ndim=2),
     around: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (blocks, 6): −x, +x, −y, +y, −z, +z; −1 = none
     number: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    starts: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    starts: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (blocks + 1,)
     links: ti.types.ndarray(dtype=ti.i32, ndim=2),
     y: ti.types.ndarray(dtype=ti.f32, ndim=1),
     weight: ti.types.ndarray(dtype=ti.f32, ndim=1),
@@ -89,7 +89,7 @@ def list_voxels(
     for run in range(values.shape[0] * RUN):  # run loop: kernels/__init__.py
         if run % RUN == 0:
             b = run // RUN
-            for o in range(CUBE):
+            for o in range(ti.select(starts[b] < starts[b + 1], CUBE, 0)):
                 k = number[b, o]
                 if k >= 0:
                     i = starts[b] + k
@@ -228,33 +228,33 @@ def refine(
 def weigh(
     links: ti.types.ndarray(dtype=ti.i32, ndim=2),
     x: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    flat: ti.i32,  # ω = 1 instead
-    edge: ti.f32,
+    sharpness: ti.f32,  # 1 / ε; 0: ω = 1
     weight: ti.types.ndarray(dtype=ti.f32, ndim=1),
     smoothness: ti.f32,
     omega: ti.types.ndarray(dtype=ti.f32, ndim=2),
     inverse: ti.types.ndarray(dtype=ti.f32, ndim=1),
+    q: ti.types.ndarray(dtype=ti.f32, ndim=2),
 ):
-    """ω = 1 / (1 + (D2 x / ε)²), 0 where one of the three cells is missing; and 1 / M with
+    """ω = 1 / (1 + (D2 x / ε)²), 0 where one of the three cells is missing; q = ω D2 x; and 1 / M with
     M = W + 4 λ Σ |D2|ᵀ ω: then 0 < M⁻¹ A ≤ 1, as (1, −2, 1) has an l1 norm of 4."""
     for i in range(links.shape[0]):
         for axis in ti.static(range(3)):
             m = links[i, 2 * axis]
             p = links[i, 2 * axis + 1]
             share = ti.f32(0.0)
+            bent = x[m] - 2.0 * x[i] + x[p]
             if m < links.shape[0] and p < links.shape[0]:
-                share = 1.0
-                if flat == 0:
-                    bent = (x[m] - 2.0 * x[i] + x[p]) / edge
-                    share = 1.0 / (1.0 + bent * bent)
+                share = 1.0 / (1.0 + (sharpness * bent) * (sharpness * bent))
             omega[i, axis] = share
+            q[i, axis] = share * bent
     for i in range(links.shape[0]):
         total = ti.f32(0.0)
         for axis in ti.static(range(3)):
             total += (
                 2.0 * omega[i, axis] + omega[links[i, 2 * axis], axis] + omega[links[i, 2 * axis + 1], axis]
             )
-        inverse[i] = 1.0 / (weight[i] + 4.0 * smoothness * total)
+        whole = weight[i] + 4.0 * smoothness * total
+        inverse[i] = ti.select(whole > 0.0, 1.0 / whole, 0.0)  # what nothing draws at stays
 
 
 @ti.kernel
@@ -266,13 +266,14 @@ def relax(
     inverse: ti.types.ndarray(dtype=ti.f32, ndim=1),
     smoothness: ti.f32,
     steps: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (AT_ONCE, 2): share of the last, gain of the residual
+    bent: ti.i32,  # whether q is of this x
     q: ti.types.ndarray(dtype=ti.f32, ndim=2),
     step: ti.types.ndarray(dtype=ti.f32, ndim=1),
     x: ti.types.ndarray(dtype=ti.f32, ndim=1),
 ):
     """Some steps of the Chebyshev iteration, each after q = ω D2 x along each axis."""
     for k in ti.static(range(AT_ONCE)):
-        for i in range(links.shape[0]):
+        for i in range(links.shape[0] * (1 - bent if ti.static(k == 0) else 1)):
             twice = 2.0 * x[i]
             for axis in ti.static(range(3)):
                 q[i, axis] = omega[i, axis] * (x[links[i, 2 * axis]] - twice + x[links[i, 2 * axis + 1]])
@@ -288,22 +289,17 @@ def relax(
 
 @ti.kernel
 def write_values(
-    rows: ti.types.ndarray(dtype=ti.i32, ndim=1),  # of the listed blocks, which of them to write; −1 = none
-    values: ti.types.ndarray(dtype=ti.f32, ndim=2),
     number: ti.types.ndarray(dtype=ti.i32, ndim=2),
     starts: ti.types.ndarray(dtype=ti.i32, ndim=1),
     x: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    solved: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    values: ti.types.ndarray(dtype=ti.f32, ndim=2),
 ):
-    """The field where it was solved, the value as it was elsewhere."""
-    for run in range(rows.shape[0] * RUN):  # run loop: kernels/__init__.py
+    """The field where it was solved; other values stay."""
+    for run in range(number.shape[0] * RUN):  # run loop: kernels/__init__.py
         if run % RUN == 0:
-            r = run // RUN
-            b = rows[r]
-            for o in range(CUBE):
-                value = ti.math.nan
-                if b >= 0:
-                    value = values[b, o]
-                    if number[b, o] >= 0:
-                        value = x[starts[b] + number[b, o]]
-                solved[r, o] = value
+            b = run // RUN
+            if starts[b] < starts[b + 1]:
+                for o in range(CUBE):
+                    k = number[b, o]
+                    if k >= 0:
+                        values[b, o] = x[starts[b] + k]

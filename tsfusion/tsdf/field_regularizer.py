@@ -67,7 +67,7 @@ class FieldSettings:
     @property
     def halo(self) -> int:
         """Blocks around those that are solved, on each side, that are solved with them."""
-        return 2 + self.coarser
+        return 1 + 2 * self.coarser
 
 
 def solve(
@@ -83,7 +83,7 @@ def solve(
         out = np.empty((len(keys), CUBE), np.float32)
     for first in range(0, len(keys), BATCH):
         part = keys[first : first + BATCH]
-        _Batch(part, store, min_weight, settings).solve(out[first : first + len(part)])
+        _solve_batch(part, store, min_weight, settings, out[first : first + len(part)])
     return out[: len(keys)]
 
 
@@ -136,7 +136,7 @@ class Level:
     def make(cls, bits: int, number: NDArray[np.int32], counts: NDArray[np.int32]) -> "Level":
         total = int(counts.sum())
         y, weight, x = (np.zeros(total + 1, np.float32) for _ in range(3))  # the last stands for "none"
-        starts = (np.cumsum(counts) - counts).astype(np.int32)
+        starts = np.append(0, np.cumsum(counts)).astype(np.int32)
         return cls(bits, number, starts, np.empty((total, 6), np.int32), y, weight, x)
 
     def relax(
@@ -151,72 +151,71 @@ class Level:
         omega, bent = np.zeros((total, 3), np.float32), np.zeros((total, 3), np.float32)
         inverse, step = np.empty(total, np.float32), np.zeros(total, np.float32)
         for edge, lowest, count in rounds:
-            flat = edge == math.inf
-            kernels.weigh(
-                self.links, self.x, int(flat), 1.0 if flat else edge, self.weight, smoothness, omega, inverse
-            )
-            inverse[~np.isfinite(inverse)] = 0.0  # nothing draws at a cell without weight and bends: it stays
+            kernels.weigh(self.links, self.x, 1 / edge, self.weight, smoothness, omega, inverse, bent)
             steps = np.zeros((-(-count // kernels.AT_ONCE), kernels.AT_ONCE, 2), np.float32)
             steps.reshape(-1, 2)[:count] = list(chebyshev(lowest, count))
-            for some in steps:
+            for n, some in enumerate(steps):
                 kernels.relax(
-                    self.links, self.y, self.weight, omega, inverse, smoothness, some, bent, step, self.x
-                )
+                    self.links, self.y, self.weight, omega, inverse, smoothness, some, int(n == 0),
+                    bent, step, self.x,
+                )  # fmt: skip
                 pause()
 
 
-class _Batch:
-    """Blocks and their halo, as lists of cells."""
-
-    def __init__(
-        self, wanted: NDArray[np.int64], store: BlockStore, min_weight: float, settings: FieldSettings
-    ) -> None:
-        self.wanted, self.settings, self.pause = wanted, settings, store.pause
-        self.keys = keys = around(wanted, store, settings.halo)
-        self.values = values_of(keys, store, min_weight)
-        self.levels = self._list(store)
-
-    def solve(self, solved: NDArray[np.float32]) -> None:
-        """Write the values of the wanted blocks."""
-        s, coarsest = self.settings, len(self.levels) - 1
-        for depth in range(coarsest, -1, -1):
-            level = self.levels[depth]
-            if depth < coarsest:
-                coarse = self.levels[depth + 1]
-                kernels.refine(
-                    level.bits, coarse.links, coarse.number, coarse.starts, coarse.x,
-                    level.number, level.starts, level.x,
-                )  # fmt: skip
-            # between cells of twice the size a bend is 4 times as large, and there are 8 times fewer
-            level.relax(s.smoothness / 2**depth, s.rounds(depth), self.pause)
-        finest = self.levels[0]
-        rows = index_of(self.keys, self.wanted)
-        kernels.write_values(rows, self.values, finest.number, finest.starts, finest.x, solved)
-
-    def _list(self, store: BlockStore) -> list[Level]:
-        """The voxels near the surface, and their coarser cells."""
-        blocks = len(self.keys)
-        sides = index_of(self.keys, self.keys[:, None] + SIDES)
-        number, counts = np.empty((blocks, CUBE), np.int32), np.empty(blocks, np.int32)
-        kernels.number_voxels(self.values, self.settings.reach * QUANTA_PER_VOXEL, number, counts)
-        fine = Level.make(3, number, counts)
-        kernels.list_voxels(
-            self.values, store.slots_of(self.keys), store.sums, sides,
-            fine.number, fine.starts, fine.links, fine.y, fine.weight, fine.x,
-        )  # fmt: skip
-        store.keep_within_memory()
-        levels = [fine]
-        for _ in range(self.settings.coarser):
-            number = np.empty((blocks, fine.number.shape[1] // 8), np.int32)
-            kernels.number_parents(fine.bits, fine.number, number, counts)
-            coarse = Level.make(fine.bits - 1, number, counts)
-            kernels.list_parents(
-                fine.bits, sides, fine.number, fine.starts, fine.links, fine.y, fine.weight,
-                coarse.number, coarse.starts, coarse.links, coarse.y, coarse.weight, coarse.x,
+def _solve_batch(
+    wanted: NDArray[np.int64],
+    store: BlockStore,
+    min_weight: float,
+    settings: FieldSettings,
+    solved: NDArray[np.float32],
+) -> None:
+    """Write the values of the wanted blocks, solved with their halo."""
+    keys = around(wanted, store, settings.halo)
+    is_all = np.array_equal(keys, wanted)
+    values = values_of(keys, store, min_weight, solved if is_all else None)
+    levels = _list(keys, values, store, settings)
+    for depth in range(settings.coarser, -1, -1):
+        level = levels[depth]
+        if depth < settings.coarser:
+            coarse = levels[depth + 1]
+            kernels.refine(
+                level.bits, coarse.links, coarse.number, coarse.starts, coarse.x,
+                level.number, level.starts, level.x,
             )  # fmt: skip
-            levels.append(coarse)
-            fine = coarse
-        return levels
+        # between cells of twice the size a bend is 4 times as large, and there are 8 times fewer
+        level.relax(settings.smoothness / 2**depth, settings.rounds(depth), store.pause)
+    kernels.write_values(levels[0].number, levels[0].starts, levels[0].x, values)
+    if not is_all:
+        rows = index_of(keys, wanted)
+        solved[rows < 0] = np.nan
+        solved[rows >= 0] = values[rows[rows >= 0]]
+
+
+def _list(
+    keys: NDArray[np.int64], values: NDArray[np.float32], store: BlockStore, settings: FieldSettings
+) -> list[Level]:
+    """The voxels near the surface, and their coarser cells."""
+    sides = index_of(keys, keys[:, None] + SIDES)
+    number, counts = np.empty((len(keys), CUBE), np.int32), np.empty(len(keys), np.int32)
+    kernels.number_voxels(values, settings.reach * QUANTA_PER_VOXEL, number, counts)
+    fine = Level.make(3, number, counts)
+    kernels.list_voxels(
+        values, store.slots_of(keys), store.sums, sides,
+        fine.number, fine.starts, fine.links, fine.y, fine.weight, fine.x,
+    )  # fmt: skip
+    store.keep_within_memory()
+    levels = [fine]
+    for _ in range(settings.coarser):
+        number = np.empty((len(keys), fine.number.shape[1] // 8), np.int32)
+        kernels.number_parents(fine.bits, fine.number, number, counts)
+        coarse = Level.make(fine.bits - 1, number, counts)
+        kernels.list_parents(
+            fine.bits, sides, fine.number, fine.starts, fine.links, fine.y, fine.weight,
+            coarse.number, coarse.starts, coarse.links, coarse.y, coarse.weight, coarse.x,
+        )  # fmt: skip
+        levels.append(coarse)
+        fine = coarse
+    return levels
 
 
 def chebyshev(lowest: float, steps: int) -> Iterator[tuple[float, float]]:

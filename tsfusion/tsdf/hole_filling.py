@@ -122,12 +122,11 @@ def _solve(
     level, layer = _list(local, around, values, marks)
     if len(level.links):
         _relax(level, voxels)
-    filled = np.empty((len(part), CUBE), np.float32)
     level.number[marks != kernels.UNSEEN] = field_smoothing.NONE
     level.x[layer == kernels.EARLY] = np.nan
     values.fill(np.nan)  # they are not asked for
-    field_smoothing.write_values(_rows(local, part), values, level.number, level.starts, level.x, filled)
-    return filled
+    field_smoothing.write_values(level.number, level.starts, level.x, values)
+    return values[_rows(local, part)]
 
 
 def _list(
