@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from tsfusion.tsdf.map_cells import CellMeshes
     from tsfusion.tsdf.volume import Volume
 
-_REFINED_AT_ONCE = 256  # blocks: about 50 ms
-_REFINED_BETWEEN = 64  # likewise, while the next keyframe may be near
+_REFINED_AT_ONCE = 512  # blocks: some 20 ms
+_REFINED_BETWEEN = 128  # likewise, while the next keyframe may be near
 _QUIET_S = 1.0  # without a record: the next one is not near
 _REFINE_REST_FACTOR = 40.0  # else no more for so many times as long as it took: few keyframes wait for it
 _REST_FACTOR = 3  # no mesh for three times as long as the last took: a quarter of a busy fuser's time
@@ -60,10 +60,13 @@ class LiveMesh:
         self._is_behind = False
         self._next = self._quiet_from = self._next_refined = 0.0  # time.monotonic()
         self._unrefined = np.zeros((0, 3), np.int32)  # cells that viewers have with the raw surface
+        self._refined = volume.kept_values()
 
     def watch(self, wanted: bool) -> None:
         """Send the triangles, too, or no more."""
         self._watched = wanted
+        if not wanted:
+            self._refined.clear()
         if not wanted and self.refine_waits:
             self._unrefined = self._unrefined[:0]
             self.number += 1  # who comes back knows that something was missed
@@ -117,6 +120,7 @@ class LiveMesh:
         if self._volume.model.surface != "raw":
             unrefined = np.concatenate([self._unrefined, self._volume.cells_to_mesh(blocks)])
             self._unrefined = np.unique(unrefined, axis=0)
+            self._refined.forget(self._volume.values_reached(blocks))
         self._publish(meshed_ns, len(blocks), found, refined=self._volume.model.surface == "raw")
 
     @property
@@ -139,7 +143,7 @@ class LiveMesh:
         cells, self._unrefined = self._unrefined[:count], self._unrefined[count:]
         try:
             with self._sparing():
-                found = self._volume.mesh_cells(cells)
+                found = self._volume.mesh_cells(cells, values=self._refined)
                 self._publish(time.monotonic_ns(), 0, found, refined=True)
         except MemoryError:  # the raw surface stays
             self.number += 1

@@ -242,7 +242,7 @@ class AskableMap(ReadableMap):
 
         Args:
             cells: (n, 3) int32 block coordinates; of a block that the map does not have there are none.
-            values: of `whole_values`, for the very triangles of the whole map's mesh.
+            values: of `whole_values`, for the very triangles of the whole map's mesh, or of `kept_values`.
         """
         keys = np.unique(pack_keys(cells))
         return self._mesh_keys(keys, self._checked_min_weight(None), values or self._view(surface))

@@ -31,6 +31,7 @@ from tsfusion.tsdf import (
     voxel_arrays,
 )
 from tsfusion.tsdf.block_store import BlockStore, cells_of, pack_keys, unpack_keys
+from tsfusion.tsdf.kept_values import KeptValues
 from tsfusion.tsdf.map_difference import MapDifference
 from tsfusion.tsdf.mesh_extraction import MeshBuffers, extract
 from tsfusion.tsdf.mesh_tiles import WholeMapValues, tiles
@@ -123,6 +124,10 @@ class ReadableMap:
         """What `extract_mesh` of the whole map meshes, for `mesh_cells`, while the map stays as it is."""
         return WholeMapValues(np.sort(self._store.keys), self._view(surface), field_regularizer.BATCH)
 
+    def kept_values(self) -> KeptValues:
+        """Values of the map's surface for `mesh_cells`, kept from call to call while the map grows."""
+        return KeptValues(self._store, self._view(None))
+
     def mesh_parts(
         self, folder: str | os.PathLike[str], min_weight: float | None = None, *, up: Up | None = None
     ) -> MeshParts:
@@ -164,11 +169,14 @@ class ReadableMap:
 
     def _cells_reached(self, dirty: NDArray[np.int32], surface: Surface) -> NDArray[np.int32]:
         """As `cells_to_mesh`, of a surface."""
+        return cells_of(unpack_keys(self.values_reached(dirty, surface)))
+
+    def values_reached(self, dirty: NDArray[np.int32], surface: Surface | None = None) -> NDArray[np.int64]:
+        """Keys of the blocks whose values changes to these blocks (n, 3) reach: `KeptValues.forget` them."""
+        keys, surface = pack_keys(dirty), surface or self.model.surface
         if surface == "normal":
-            dirty = unpack_keys(field_regularizer.around(pack_keys(dirty), self._store, 1))
-        if surface == "field":
-            dirty = unpack_keys(field_regularizer.spread(pack_keys(dirty), self._store, self._field))
-        return cells_of(dirty)
+            return field_regularizer.around(keys, self._store, 1)
+        return field_regularizer.spread(keys, self._store, self._field) if surface == "field" else keys
 
     def diff(self, later: "ReadableMap", *, tolerance: float | None = None) -> MapDifference:
         """What is different in a later map of the same frame, in numbers and as a coloured mesh.
