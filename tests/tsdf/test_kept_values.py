@@ -7,7 +7,7 @@ import pytest
 from formula_scenes import sphere_views, volume_of, with_noise
 from numpy.typing import NDArray
 
-from tsfusion import Volume
+from tsfusion import Keyframe, Volume
 from tsfusion.tsdf import kept_values
 from tsfusion.tsdf.block_store import BlockStore
 from tsfusion.tsdf.kept_values import KeptValues
@@ -33,7 +33,7 @@ class Counted:
         return self._view(keys, store, min_weight, out)
 
 
-def noisy_sphere() -> tuple[Volume, list[object]]:
+def noisy_sphere() -> tuple[Volume, list[Keyframe]]:
     random = np.random.default_rng(0)
     views = [with_noise(view, 0.004, random) for view in sphere_views(0.5, 8)]
     return volume_of(views[:-2], sensor="kinect"), views[-2:]
@@ -47,7 +47,7 @@ def test_only_what_a_keyframe_reached_is_solved_anew() -> None:
     for view_of_now in [None, *later]:
         reached = 0
         if view_of_now is not None:
-            volume.integrate(view_of_now)  # type: ignore[arg-type]
+            volume.integrate(view_of_now)
             keys = volume.values_reached(volume.take_dirty())
             reached = len(keys)
             kept.forget(keys)

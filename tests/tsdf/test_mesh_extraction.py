@@ -132,7 +132,7 @@ def test_a_plane_is_flat_to_a_tenth_of_a_voxel(regularizer: str) -> None:
 
 def test_tiles_of_dirty_blocks_make_up_the_whole_mesh() -> None:
     views = sphere_views(0.4, 6)
-    volume = volume_of(views[:5])
+    volume = volume_of(views[:5], surface="raw")
     volume.take_dirty()
     whole = triangles_of(volume.extract_mesh(min_weight=1))
     volume.integrate(views[5])

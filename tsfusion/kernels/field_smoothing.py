@@ -36,11 +36,9 @@ def number_voxels(
             b = run // RUN
             n = 0
             for o in range(CUBE):
-                k = NONE
-                if abs(values[b, o]) <= reach:  # never true of NaN
-                    k = n
-                    n += 1
-                number[b, o] = k
+                is_near = abs(values[b, o]) <= reach  # never true of NaN
+                number[b, o] = ti.select(is_near, n, NONE)
+                n += ti.cast(is_near, ti.i32)
             counts[b] = n
 
 
@@ -52,15 +50,10 @@ def neighbour(
     shift = (2 - axis) * bits
     mask = (1 << bits) - 1
     at = ((o >> shift) & mask) + 2 * side - 1
-    block = b
-    if at < 0 or at > mask:
-        block = around[b, 2 * axis + side]
-    found = none
-    if block >= 0:
-        k = number[block, (o & ~(mask << shift)) | ((at & mask) << shift)]
-        if k >= 0:
-            found = starts[block] + k
-    return found
+    block = ti.select((at & ~mask) == 0, b, around[b, 2 * axis + side])
+    row = ti.max(block, 0)  # without branches: whether a cell is listed cannot be foretold
+    k = number[row, (o & ~(mask << shift)) | ((at & mask) << shift)]
+    return ti.select((block >= 0) & (k >= 0), starts[row] + k, none)
 
 
 @ti.func
@@ -241,10 +234,9 @@ def weigh(
         for axis in ti.static(range(3)):
             m = links[i, 2 * axis]
             p = links[i, 2 * axis + 1]
-            share = ti.f32(0.0)
             bent = x[m] - 2.0 * x[i] + x[p]
-            if m < links.shape[0] and p < links.shape[0]:
-                share = 1.0 / (1.0 + (sharpness * bent) * (sharpness * bent))
+            share = 1.0 / (1.0 + (sharpness * bent) * (sharpness * bent))
+            share = ti.select(ti.max(m, p) < links.shape[0], share, 0.0)
             omega[i, axis] = share
             q[i, axis] = share * bent
     for i in range(links.shape[0]):

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.kernels import field_smoothing as kernels
-from tsfusion.kernels import normal_smoothing
+from tsfusion.kernels import normal_smoothing, surface_cells
 from tsfusion.kernels.integrate import CUBE, QUANTA_PER_VOXEL
 from tsfusion.tsdf.block_store import BlockStore
 from tsfusion.tsdf.surface_values import values_of
@@ -152,6 +152,7 @@ class Level:
         inverse, step = np.empty(total, np.float32), np.zeros(total, np.float32)
         for edge, lowest, count in rounds:
             kernels.weigh(self.links, self.x, 1 / edge, self.weight, smoothness, omega, inverse, bent)
+            pause()
             steps = np.zeros((-(-count // kernels.AT_ONCE), kernels.AT_ONCE, 2), np.float32)
             steps.reshape(-1, 2)[:count] = list(chebyshev(lowest, count))
             for n, some in enumerate(steps):
@@ -231,8 +232,13 @@ def chebyshev(lowest: float, steps: int) -> Iterator[tuple[float, float]]:
 def around(keys: NDArray[np.int64], store: BlockStore, rings: int = 1) -> NDArray[np.int64]:
     """The blocks of the map up to so many blocks away, these among them; sorted."""
     for _ in range(rings):
-        keys = np.unique((keys[:, None] + AROUND).ravel())
-        keys = keys[store.slots_of(keys) >= 0]
+        most = min(len(AROUND) * len(keys), store.count)
+        table = np.zeros(1 << max(4, (2 * most).bit_length()), np.int64)
+        found = np.empty(most, np.int64)
+        count = surface_cells.collect_around(
+            len(keys), np.sort(keys), store.hash_keys, store.hash_slots, table, found
+        )
+        keys = np.sort(found[:count])
     return keys
 
 

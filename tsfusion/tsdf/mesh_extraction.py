@@ -11,6 +11,7 @@ from tsfusion.kernels.block_hash import insert_blocks
 from tsfusion.kernels.integrate import CUBE
 from tsfusion.kernels.voxel_values import BANDS
 from tsfusion.tsdf.block_store import BlockStore
+from tsfusion.tsdf.field_regularizer import around
 from tsfusion.tsdf.growing_array import GrowingArray
 from tsfusion.tsdf.surface_values import SurfaceView, values_of
 
@@ -30,7 +31,6 @@ class MeshBuffers:
     def _forget(self) -> None:
         self._table = np.zeros(0, np.int64)
         self._table_rows = np.zeros(0, np.int32)
-        self._found = GrowingArray((), np.int64, 0)
         self.values = GrowingArray((CUBE,), np.float32, 0)
         self.around = GrowingArray((surface_cells.AROUND,), np.int32, 0)
         self.seen = GrowingArray((8,), np.uint64, 0)
@@ -65,13 +65,7 @@ class MeshBuffers:
         """Sorted keys of the map's blocks that are, or touch, a wanted one."""
         if len(wanted) == store.count:
             return wanted
-        most = min(surface_cells.AROUND * len(wanted), store.count)
-        self._found.reserve(most)
-        table, _ = self.table(most)
-        found = surface_cells.collect_around(
-            len(wanted), wanted, store.hash_keys, store.hash_slots, table, self._found.array
-        )
-        return np.sort(self._found.array[:found])
+        return around(wanted, store)
 
     @property
     def nbytes(self) -> int:
