@@ -121,7 +121,8 @@ def test_each_surface_at_voxel_centres_is_what_is_meshed(surface: str) -> None:
     at = values[np.searchsorted(keys, pack_keys(voxels >> 3)), x << 6 | y << 3 | z]
     assert np.array_equal(np.isnan(found.distance), np.isnan(at))
     flat = np.linalg.norm(found.gradient, axis=1) < 0.999
-    np.testing.assert_allclose(found.distance[flat], at[flat] * VOXEL / 60, atol=1e-6)
+    halo = 0.01 * VOXEL if surface == "field" else 1e-6  # other blocks are solved with it
+    np.testing.assert_allclose(found.distance[flat], at[flat] * VOXEL / 60, atol=halo)
     assert np.isfinite(at[flat]).sum() > 20
 
 
