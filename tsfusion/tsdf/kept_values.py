@@ -59,10 +59,12 @@ class KeptValues:
         self._rows = np.concatenate([self._rows, np.full(max(more, 0), -1, np.int32)])
         rows = np.where(slots >= 0, self._rows[slots], -1)
         lacking = rows < 0
-        out[~lacking] = self._values.array[rows[~lacking]]
-        solved = self._view(keys[lacking], store, min_weight)
-        out[lacking] = solved
-        self._keep(slots[lacking], solved)
+        if not lacking.all():
+            np.take(self._values.array, rows, axis=0, out=out, mode="clip")
+        if lacking.any():
+            solved = self._view(keys[lacking], store, min_weight)
+            out[lacking] = solved
+            self._keep(slots[lacking], solved)
         return out
 
     def _keep(self, slots: NDArray[np.int32], solved: NDArray[np.float32]) -> None:
