@@ -7,6 +7,7 @@ there, and planes fitted there by least squares.
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import cv2
@@ -46,8 +47,15 @@ class PlaneImage:
 
     def every(self, step: int) -> NDArray[np.intp]:
         """Indices of the points on every `step`-th row and column of blocks."""
-        row, column = np.divmod(self.index, self.shape[1])
-        return np.flatnonzero((row % step == step // 2) & (column % step == step // 2))
+        return np.flatnonzero(_lattice(self.shape, step).take(self.index))
+
+
+@lru_cache(maxsize=16)
+def _lattice(shape: tuple[int, int], step: int) -> NDArray[np.bool_]:
+    """Whether blocks are on every `step`-th row and column, (rows·columns,)."""
+    row, column = np.indices(shape)
+    chosen: NDArray[np.bool_] = ((row % step == step // 2) & (column % step == step // 2)).ravel()
+    return chosen
 
 
 def deviation(depth: Any) -> Any:
@@ -76,7 +84,7 @@ def _blocks(depth: Floats, block: int) -> tuple[Floats, NDArray[np.bool_]]:
     rows, columns = depth.shape[0] // block, depth.shape[1] // block
     depth = np.ascontiguousarray(depth[: rows * block, : columns * block])
     there = (depth > _NEAREST).astype(np.float32)
-    inverse = np.divide(1, depth, out=np.zeros_like(depth), where=there > 0)
+    inverse = there / np.maximum(depth, np.float32(_NEAREST))
     size = (columns, rows)
     share, mean, square = (
         cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (there, inverse, inverse * inverse)
@@ -150,14 +158,14 @@ def match(
     scale = 1 / np.maximum(moved[2], np.float32(_NEAREST))
     u = moved[0] * scale * np.float32(K.fx) + np.float32(K.cx + 0.5)
     v = moved[1] * scale * np.float32(K.fy) + np.float32(K.cy + 0.5)
-    inside = np.flatnonzero((moved[2] > _NEAREST) & (u >= 0) & (v >= 0) & (u < columns) & (v < rows))
-    block = v[inside].astype(np.intp) * columns + u[inside].astype(np.intp)
-    there_is = there.planes[3].take(block) > 0
-    chosen, block = inside[there_is], block[there_is]
+    inside = (moved[2] > _NEAREST) & (u >= 0) & (v >= 0) & (u < columns) & (v < rows)
+    block = np.where(inside, v, 0).astype(np.intp) * columns + np.where(inside, u, 0).astype(np.intp)
+    chosen = np.flatnonzero(inside & (there.planes[3].take(block) > 0))
+    block = block.take(chosen)
     moved, planes = moved.take(chosen, axis=1), there.planes.take(block, axis=1)
     distance = planes[0] * moved[0] + planes[1] * moved[1] + planes[2] * moved[2] - planes[3]
-    which = chosen if some is None else some[chosen]
-    return Match(moved, planes[:3], distance, sigma[chosen], which, block)
+    which = chosen if some is None else some.take(chosen)
+    return Match(moved, planes[:3], distance, sigma.take(chosen), which, block)
 
 
 def correlated_blocks(found: Match, columns: int) -> float:
@@ -184,7 +192,9 @@ def equations(found: Match, weight: Floats) -> tuple[NDArray[np.float64], NDArra
     """
     x, y, z = found.moved
     nx, ny, nz = found.normals
-    J = np.stack([nx, ny, nz, y * nz - z * ny, z * nx - x * nz, x * ny - y * nx])
+    J = np.empty((6, len(x)), np.float32)
+    J[:3] = found.normals
+    J[3], J[4], J[5] = y * nz - z * ny, z * nx - x * nz, x * ny - y * nx
     weighted = J * weight
     H, g = weighted @ J.T, weighted @ found.distance
     return H.astype(np.float64), -g.astype(np.float64)

@@ -63,12 +63,14 @@ def solve(
     """
     T, trust = T_anchor_camera, FIRST_PLANE_WEIGHT
     pixel = PIXEL * columns / 640
-    planes = spurious = corners = np.zeros((6, 6))
+    planes, corners = np.zeros((6, 6)), np.zeros((6, 6))
+    last: list[tuple[se3.Matrix6, AlignmentTarget, point_to_plane.Match, point_to_plane.Floats]] = []
     for apart, iterations, gate in ROUNDS:
         some = here.every(apart) if apart > 1 else None
         reach = pixel * (4 if apart == ROUNDS[0][0] else 1)
         for iteration in range(iterations):
-            planes, spurious, corners, g = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6)
+            planes, corners, g = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6)
+            last.clear()
             for target in targets if apart == 1 else targets[:1]:
                 T_target_camera = target.T_target_anchor @ T
                 found = point_to_plane.match(target.surface, here, T_target_camera, some)
@@ -79,14 +81,14 @@ def solve(
                 A = se3.adjoint(target.T_target_anchor)
                 planes, corners = planes + A.T @ H_planes @ A, corners + A.T @ H_corners @ A
                 g = g + A.T @ (g_planes + g_corners)
-                if apart == 1:
-                    spurious = spurious + A.T @ _spurious(found, weight, target.surface) @ A
+                last.append((A, target, found, weight))
             H = planes + corners
             step = np.linalg.solve(H + (DAMPING * np.trace(H) + 1e-9) * np.eye(6), g)
             T = se3.exp(step) @ T
             if np.abs(step).max() < (FINE_STEP if apart == 1 else COARSE_STEP):
                 break
-    return PoseEstimate(se3.nearest(T), planes, spurious, corners)
+    spurious = [A.T @ _spurious(found, weight, target.surface) @ A for A, target, found, weight in last]
+    return PoseEstimate(se3.nearest(T), planes, np.sum(spurious, axis=0), corners)
 
 
 def _planes(
@@ -97,7 +99,9 @@ def _planes(
     if np.count_nonzero(near) < 12:
         return np.zeros((6, 6)), np.zeros(6), np.zeros(len(near), np.float32)
     whitened = found.distance / found.sigma
-    scale = np.float32(np.clip(1.48 * np.median(np.abs(whitened[near])), MIN_SCALE, MAX_SCALE))
+    size = np.abs(whitened.compress(near))
+    size.partition(len(size) // 2)
+    scale = np.float32(np.clip(1.48 * size[len(size) // 2], MIN_SCALE, MAX_SCALE))
     ratio = whitened / (scale * np.float32(ROBUST_WIDTH))
     weight = np.float32(trust) * near / ((1 + ratio * ratio) * scale * found.sigma) ** 2
     H, g = point_to_plane.equations(found, weight)
@@ -130,18 +134,23 @@ def _corners(
     """Normal equations of the reprojection errors of a target's corners."""
     if not len(target.points):
         return np.zeros((6, 6)), np.zeros(6)
+    X = target.points.T
     R = T_target_camera[:3, :3].T
-    q = se3.apply(se3.inverse(T_target_camera), target.points)
-    ok = q[:, 2] > 0.05
-    z = np.where(ok, q[:, 2], 1.0)
-    du = camera.fx * q[:, 0] / z + camera.cx - target.pixels[:, 0]
-    dv = camera.fy * q[:, 1] / z + camera.cy - target.pixels[:, 1]
+    x, y, z = R @ (X - T_target_camera[:3, 3:])
+    ok = z > 0.05
+    z = np.where(ok, z, 1.0)
+    fu, fv, n = camera.fx / z, camera.fy / z, len(z)
+    residual = np.empty(2 * n)
+    residual[:n] = fu * x + (camera.cx - target.pixels[:, 0])
+    residual[n:] = fv * y + (camera.cy - target.pixels[:, 1])
+    du, dv = residual[:n], residual[n:]
     weight = ok / (1 + (du * du + dv * dv) / (pixel * ROBUST_WIDTH) ** 2) ** 2 / pixel**2
-    zero = np.zeros_like(z)
-    Ju = np.stack([camera.fx / z, zero, -camera.fx * q[:, 0] / z**2], axis=1) @ R
-    Jv = np.stack([zero, camera.fy / z, -camera.fy * q[:, 1] / z**2], axis=1) @ R
-    J = np.concatenate([Ju, Jv])
-    X = np.concatenate([target.points, target.points])
-    J = -np.concatenate([J, np.cross(X, J)], axis=1)
-    w = np.concatenate([weight, weight])
-    return (J * w[:, None]).T @ J, -(J * w[:, None]).T @ np.concatenate([du, dv])
+    J = np.empty((6, 2 * n))  # of the negative residuals
+    J[:3, :n] = R[2][:, None] * (fu * x / z) - R[0][:, None] * fu
+    J[:3, n:] = R[2][:, None] * (fv * y / z) - R[1][:, None] * fv
+    for half in (J[:, :n], J[:, n:]):
+        half[3] = X[1] * half[2] - X[2] * half[1]
+        half[4] = X[2] * half[0] - X[0] * half[2]
+        half[5] = X[0] * half[1] - X[1] * half[0]
+    weighted = J * np.concatenate([weight, weight])
+    return weighted @ J.T, -(weighted @ residual)
