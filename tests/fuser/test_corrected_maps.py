@@ -593,7 +593,7 @@ class Life(RuleBasedStateMachine):
     "examples", [20, pytest.param(600, marks=pytest.mark.nightly)], ids=["short", "nightly"]
 )
 def test_a_settled_map_is_that_of_the_final_poses(examples: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Volume, "warm_up", lambda _: None)
+    monkeypatch.setattr(Volume, "warming_up", lambda _: iter(()))
     run_state_machine_as_test(
         Life, settings=given_settings(max_examples=examples, stateful_step_count=14, deadline=None)
     )

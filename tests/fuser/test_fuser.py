@@ -10,6 +10,7 @@ import struct
 import subprocess
 import sys
 import zlib
+from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
@@ -92,6 +93,28 @@ def opened(state: Path, volume: VolumeConfig = VOLUME, **settings: Any) -> tuple
     }
     begin = messages.Begin(str(state), volume, working=str(working), **{**usual, **settings})
     return Fuser(link, begin), link  # type: ignore[arg-type]
+
+
+def test_kernels_of_questions_are_compiled_while_there_is_nothing_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    compiled = []
+
+    def warming_up(_: object) -> Iterator[None]:
+        compiled.append("keyframes")
+        yield
+        compiled.append("questions")
+        yield
+        compiled.append("slices")
+
+    monkeypatch.setattr(tsfusion.Volume, "warming_up", warming_up)
+    fuser, _ = opened(tmp_path)
+    assert not fuser_main._do_some(fuser, idle=False)
+    assert compiled == ["keyframes"]
+    while fuser.warm_due:
+        assert fuser_main._do_some(fuser, idle=True)
+    assert compiled == ["keyframes", "questions", "slices"]
+    assert not fuser_main._do_some(fuser, idle=True)
 
 
 def opened_with_one(state: Path) -> tuple[Position, Fuser, Link]:

@@ -7,7 +7,7 @@ the order, and tells a keyframe that is missing or there twice.
 
 import hashlib
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -62,8 +62,9 @@ class SumMap:
         self.keyframes = 0
         self._total = 0
 
-    def warm_up(self) -> None:
+    def warming_up(self) -> Iterator[None]:
         """Compile nothing: there are no kernels."""
+        return iter(())
 
     def limit_memory(self, nbytes: int) -> None:
         """Ignore the limit: sums take next to nothing."""

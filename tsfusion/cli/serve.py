@@ -67,7 +67,7 @@ def serve(
 ) -> int:
     """Fuse what scanners send, until Ctrl-C or SIGTERM saves the maps.
 
-    A line with `ready` is printed once keyframes may come: every kernel is compiled by then.
+    A line with `ready` is printed once keyframes may come: their kernels are compiled by then.
     """
     started = time.monotonic()
     from tsfusion import server

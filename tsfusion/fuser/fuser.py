@@ -99,7 +99,8 @@ class Fuser:
             kept={"memory_bytes": begin.memory_bytes, "cache": begin.cache} if begin.cache else {},
         )
         self._volume = self._map.volume
-        self._volume.warm_up()
+        self._warming: Iterator[None] | None = self._volume.warming_up()
+        next(self._warming, None)
         self._volume.limit_memory(begin.memory_bytes)
         self._touched_by = TouchedBy()
         self._live_mesh = LiveMesh(
@@ -209,6 +210,17 @@ class Fuser:
     def mesh(self) -> None:
         """Bring the mesh up to date."""
         self._live_mesh.update()
+
+    @property
+    def warm_due(self) -> bool:
+        """Whether kernels that no keyframe needs are not compiled yet."""
+        return self._warming is not None
+
+    def warm(self) -> None:
+        """Compile some of them: a second at most. Call it only while there is nothing else to do."""
+        assert self._warming is not None
+        if next(self._warming, True):  # the steps yield None
+            self._warming = None
 
     @property
     def refine_due(self) -> bool:

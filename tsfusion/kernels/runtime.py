@@ -2,8 +2,11 @@
 """Taichi is started once, here, on the thread that will launch kernels."""
 
 import os
+import textwrap
 from contextlib import redirect_stdout, suppress
+from functools import cache
 from io import StringIO
+from types import SimpleNamespace
 
 _started_threads: int | None = None
 
@@ -37,12 +40,17 @@ def _leave_out_source_lines() -> None:
     """Keep Taichi from formatting the source position of every statement of every kernel.
 
     Only compile errors show these positions. Formatting them took a third of the time in which kernels load
-    from the cache.
+    from the cache. Nor are a function's lines looked up and wrapped anew wherever it is called: a twelfth.
     """
-    with suppress(ImportError):  # another version of Taichi: its kernels load as slowly as before
+    with suppress(
+        ImportError, AttributeError
+    ):  # another version of Taichi: it loads kernels as slowly as before
+        from taichi.lang import kernel_impl
         from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 
         ASTTransformerContext.get_pos_info = lambda _context, _node: ""
+        kernel_impl.getsourcelines = cache(kernel_impl.getsourcelines)
+        kernel_impl.textwrap = SimpleNamespace(fill=lambda line, **_: line.rstrip(), dedent=textwrap.dedent)
 
 
 def threads() -> int:

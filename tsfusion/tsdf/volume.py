@@ -9,7 +9,7 @@ the sums and never change them.
 
 import logging
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -268,16 +268,25 @@ class Volume(AskableMap):
 
     def warm_up(self) -> None:
         """Compile every kernel, so that the first keyframe is not slower than the rest."""
+        for _ in self.warming_up():
+            pass
+
+    def warming_up(self) -> Iterator[None]:
+        """Compile every kernel, in steps: after the first, those of keyframes and of their raw mesh are."""
         throwaway = Volume(override(self.config, max_blocks=1 << 14, max_blocks_per_keyframe=1 << 14))
         for keyframe in keyframes_of_every_kind(self.model, self.config.voxel_size):
             throwaway.integrate(keyframe)
             throwaway.retract(keyframe)
             throwaway.integrate(keyframe)
-        throwaway.extract_mesh(min_weight=0)
-        throwaway.extract_mesh(min_weight=0, blocks=throwaway.take_dirty()[:1])
-        for surface in {"raw", self.model.surface}:
+        blocks = throwaway.take_dirty()[:1]
+        for surface in ("raw", self.model.surface):
+            throwaway.extract_mesh(min_weight=0, surface=surface)
+            throwaway.extract_mesh(min_weight=0, surface=surface, blocks=blocks)
+            yield
             throwaway.sample(np.zeros((1, 3), np.float32), surface=surface, min_weight=0)
+            yield
         throwaway.raycast((1, 1, 0, 0), np.eye(4), (1, 1), surface="raw")
+        yield
         edge = self.config.voxel_size
         throwaway.distance_field([0.0, 0, 0, edge, edge, edge], max_distance=edge)
         current = throwaway.current_slice(0.0, edge, up="z", box=(0.0, 0, edge, edge), max_distance=edge)
