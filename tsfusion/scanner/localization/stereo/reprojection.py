@@ -80,14 +80,17 @@ def refine(
     deviation = np.zeros(len(old))
     for _ in range(MAX_ITERATIONS):
         residual, J = _linearised(T_new_old, old, disparity + offset, new, rig)
-        along = J[:, :, 6]
-        share = DISPARITY_SIGMA**2 / (PIXEL_SIGMA**2 + DISPARITY_SIGMA**2 * (along**2).sum(axis=1))
-        squared = (residual**2).sum(axis=1) - share * (along * residual).sum(axis=1) ** 2
+        along = J[6]
+        toward = (along * residual).sum(axis=0)
+        share = DISPARITY_SIGMA**2 / (PIXEL_SIGMA**2 + DISPARITY_SIGMA**2 * (along**2).sum(axis=0))
+        squared = (residual**2).sum(axis=0) - share * toward**2
         deviation = np.sqrt(np.maximum(squared, 0)) / PIXEL_SIGMA
         weight = HUBER / np.maximum(deviation, HUBER)
-        J = J[:, :, :size]
-        H, gradient = _normal_equations(J, residual, along, weight, share * weight)
-        if not np.isfinite(H).all() or np.linalg.cond(H) > 1e14:
+        H, gradient = _normal_equations(J[:size], along, residual, weight, share * weight)
+        if not np.isfinite(H).all():
+            return None
+        values = np.abs(np.linalg.eigvalsh(H))
+        if values.min() <= 1e-14 * values.max():
             return None
         step = -np.linalg.solve(H, gradient)
         T_new_old = se3.exp(step[:6]) @ T_new_old
@@ -100,35 +103,34 @@ def refine(
 
 
 def _normal_equations(
-    J: Vectors, residual: Vectors, along: Vectors, weight: Vectors, taken: Vectors
+    J: Vectors, along: Vectors, residual: Vectors, weight: Vectors, taken: Vectors
 ) -> tuple[Vectors, Vectors]:
     """Sums of weight·JᵀJ and weight·Jᵀr, reduced by the weights `taken` along each point's line."""
-    size = J.shape[2]
-    weighted = (weight[:, None, None] * J).reshape(-1, size)
-    J_along = np.einsum("nk,nki->ni", along, J)
-    taken_along = (J_along * taken[:, None]).T
-    H = weighted.T @ J.reshape(-1, size) - taken_along @ J_along
-    gradient = weighted.T @ residual.ravel() - taken_along @ (along * residual).sum(axis=1)
-    return H, gradient
+    weighted = (J * weight).reshape(len(J), -1)
+    J_along = along[0] * J[:, 0] + along[1] * J[:, 1]
+    taken_along = J_along * taken
+    H = weighted @ J.reshape(len(J), -1).T - taken_along @ J_along.T
+    return H, weighted @ residual.ravel() - taken_along @ (along * residual).sum(axis=0)
 
 
 def _linearised(
     T_new_old: se3.Transform, old: Pixels, disparity: NDArray[np.floating], new: Pixels, rig: StereoCamera
 ) -> tuple[Vectors, Vectors]:
-    """Residuals (n, 2), pixels, and their Jacobian (n, 2, 7) by a twist in the new axes and by disparity."""
-    K, X = rig.intrinsics, rig.lift(old, disparity)
-    x, y, z = se3.apply(T_new_old, X).T
+    """Residuals (2, n), pixels, and their Jacobian (7, 2, n) by a twist in the new axes and by disparity."""
+    K, X = rig.intrinsics, rig.lift(old, disparity).T
+    x, y, z = T_new_old[:3, :3] @ X + T_new_old[:3, 3:]
     behind = z < MIN_DEPTH
     inverse_z = 1 / np.where(behind, MIN_DEPTH, z)
-    residual = np.stack([K.fx * x * inverse_z + K.cx - new[:, 0], K.fy * y * inverse_z + K.cy - new[:, 1]], 1)
-    J = np.zeros((len(X), 2, 7))
-    J[:, 0, 0], J[:, 0, 2] = K.fx * inverse_z, -K.fx * x * inverse_z**2
-    J[:, 1, 1], J[:, 1, 2] = K.fy * inverse_z, -K.fy * y * inverse_z**2
-    a = J[:, :, :3]
-    J[:, :, 3] = a[:, :, 2] * y[:, None] - a[:, :, 1] * z[:, None]
-    J[:, :, 4] = a[:, :, 0] * z[:, None] - a[:, :, 2] * x[:, None]
-    J[:, :, 5] = a[:, :, 1] * x[:, None] - a[:, :, 0] * y[:, None]
-    by_disparity = (-X / disparity[:, None]) @ T_new_old[:3, :3].T
-    J[:, :, 6] = np.einsum("nij,nj->ni", a, by_disparity)
-    J[behind] = 0
+    fu, fv = K.fx * inverse_z, K.fy * inverse_z
+    u, v = fu * x, fv * y
+    residual = np.stack([u + K.cx - new[:, 0], v + K.cy - new[:, 1]])
+    J = np.zeros((7, 2, len(x)))
+    J[0, 0], J[2, 0] = fu, -u * inverse_z
+    J[1, 1], J[2, 1] = fv, -v * inverse_z
+    J[3] = J[2] * y - J[1] * z
+    J[4] = J[0] * z - J[2] * x
+    J[5] = J[1] * x - J[0] * y
+    by_disparity = T_new_old[:3, :3] @ (-X / disparity)
+    J[6] = J[0] * by_disparity[0] + J[1] * by_disparity[1] + J[2] * by_disparity[2]
+    J[:, :, behind] = 0
     return residual, J
