@@ -131,7 +131,7 @@ class StereoLocalizer(Localizer):
             return f"the image is {gray.shape[1]}×{gray.shape[0]}, unlike those before"
         elapsed = _elapsed(reference.timestamp_ns, timestamp_ns)
         expected = None if self._velocity is None else se3.exp(self._velocity * elapsed)
-        pixels, followed = _follow(reference, gray, expected)
+        pixels, followed = _follow(reference, gray, expected, thorough=self._rectification.wants_motion)
         old, disparity, new = reference.pixels[followed], reference.disparity[followed], pixels[followed]
         if len(new) < MIN_POINTS:
             return f"{len(new)} of {len(followed)} corners were found again"
@@ -201,12 +201,14 @@ def _elapsed(before_ns: int, now_ns: int) -> float:
 
 
 def _follow(
-    reference: _Reference, gray: NDArray[np.uint8], expected: se3.Transform | None
+    reference: _Reference, gray: NDArray[np.uint8], expected: se3.Transform | None, *, thorough: bool
 ) -> tuple[features.Pixels, NDArray[np.bool_]]:
     """Follow the reference's corners into the new image, first from where they are expected."""
     if expected is not None:
         guess = reference.rig.project(se3.apply(se3.inverse(expected), reference.points))
-        pixels, found = features.follow(reference.gray, gray, reference.pixels, guess=guess)
+        pixels, found = features.follow(
+            reference.gray, gray, reference.pixels, guess=guess, thorough=thorough
+        )
         if found.mean() > 0.5:
             return pixels, found
     return features.follow(reference.gray, gray, reference.pixels)
