@@ -217,7 +217,7 @@ class Fuser:
         return self._warming is not None
 
     def warm(self) -> None:
-        """Compile some of them: a second at most. Call it only while there is nothing else to do."""
+        """Compile some of them, which takes seconds at the first start. Call it only while nothing waits."""
         assert self._warming is not None
         if next(self._warming, True):  # the steps yield None
             self._warming = None

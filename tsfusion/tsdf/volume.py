@@ -278,19 +278,20 @@ class Volume(AskableMap):
             throwaway.integrate(keyframe)
             throwaway.retract(keyframe)
             throwaway.integrate(keyframe)
-        blocks = throwaway.take_dirty()[:1]
-        for surface in ("raw", self.model.surface):
-            throwaway.extract_mesh(min_weight=0, surface=surface)
-            throwaway.extract_mesh(min_weight=0, surface=surface, blocks=blocks)
-            yield
-            throwaway.sample(np.zeros((1, 3), np.float32), surface=surface, min_weight=0)
-            yield
+        throwaway.extract_mesh(min_weight=0, surface="raw")
+        throwaway.extract_mesh(min_weight=0, surface="raw", blocks=throwaway.take_dirty()[:1])
+        yield
+        throwaway.sample(np.zeros((1, 3), np.float32), surface="raw", min_weight=0)
         throwaway.raycast((1, 1, 0, 0), np.eye(4), (1, 1), surface="raw")
         yield
         edge = self.config.voxel_size
         throwaway.distance_field([0.0, 0, 0, edge, edge, edge], max_distance=edge)
         current = throwaway.current_slice(0.0, edge, up="z", box=(0.0, 0, edge, edge), max_distance=edge)
         current.update(np.zeros((1, 3), np.int32))
+        yield
+        throwaway.extract_mesh(min_weight=0)
+        throwaway.extract_mesh(min_weight=0, blocks=np.zeros((1, 3), np.int32))
+        throwaway.sample(np.zeros((1, 3), np.float32), min_weight=0)
 
     def save(self, path: str | os.PathLike[str], meta: dict[str, Any] | None = None) -> Path:
         """Write a checkpoint: complete and on disk, or not at all.

@@ -192,6 +192,19 @@ def test_places_are_found_by_their_looks_and_forgotten():
     assert 9 not in places.most_similar(views()[0])[:1]
 
 
+def test_an_index_grows_with_its_places():
+    places = PlaceIndex(capacity=1000)
+    begun = places._table.nbytes
+    for number in range(64):
+        places.add(number, views()[0])
+    assert places._table.nbytes == begun <= 1 << 20
+    places.add(64, views()[1])
+    assert places._table.nbytes == 2 * begun
+    assert places.most_similar(views()[1]) == [64]
+    places.forget(64)
+    assert places.most_similar(views()[1]) == []
+
+
 def test_memory_is_bounded_and_the_way_stays_covered():
     closing = LoopClosing(Drifting(), capacity=20)
     for frame in two_laps()[:60]:

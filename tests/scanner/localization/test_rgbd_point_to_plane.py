@@ -72,6 +72,15 @@ def test_a_moved_view_is_as_far_from_the_planes_as_it_moved():
     assert len(match(wall, wall, se3.exp(np.array([0, 0, -5.0, 0, 0, 0])), None).distance) == 0
 
 
+def test_planes_without_points_are_matched_as_before():
+    T = se3.exp(np.array([0.01, -0.02, 0.01, 0.01, 0.005, -0.01]))
+    there, here = (fit_planes(corner_of_a_room(pose), K) for pose in (np.eye(4), T))
+    kept = there.without_points()
+    assert kept.points.size == kept.sigma.size == kept.index.size == 0
+    assert kept.covered == there.covered
+    np.testing.assert_array_equal(match(kept, here, T, None).distance, match(there, here, T, None).distance)
+
+
 def test_the_step_is_the_gradient_of_the_distances():
     """Against differences: moving by -gradient/information is what brings the sum of squares down fastest."""
     T = se3.exp(np.array([0.01, -0.02, 0.01, 0.01, 0.005, -0.01]))

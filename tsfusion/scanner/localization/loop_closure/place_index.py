@@ -13,6 +13,7 @@ from tsfusion.scanner.localization.features import back_project, bilinear
 
 FEATURES = 500
 CAPACITY = 1000  # places remembered
+_LEAST = 64  # places that there is room for from the first on; a multiple of 8
 
 _MIN_SIDE = 32  # pixels of an image's shorter side
 _DEPTH_PIXELS = 4800  # of the kept depth image, about
@@ -80,14 +81,14 @@ class PlaceIndex:
     """Places by number, found by similar descriptors.
 
     Descriptors vote for places that have a similar one: locality-sensitive hashing (Gionis, Indyk and Motwani
-    1999), eight tables over 14 bits each. Memory: 16 KB a place of the capacity, beside the views.
+    1999), eight tables over 14 bits each. Memory: 16 to 33 KB a place beside its view, 1 MB at least.
     """
 
     def __init__(self, capacity: int = CAPACITY) -> None:
         rng = np.random.default_rng(7)
         self._bits = np.stack([rng.choice(256, _BITS, replace=False) for _ in range(_TABLES)])
         self._capacity = capacity
-        self._table = np.zeros((_TABLES << _BITS, -(-capacity // 8)), np.uint8)  # a bit for each place
+        self._table = np.zeros((_TABLES << _BITS, _LEAST // 8), np.uint8)  # a bit for each place
         self._votes = np.ones(capacity)  # by how many descriptors a place can get votes
         self._numbers = np.full(capacity, -1, np.int64)
         self.views: dict[int, PlaceView] = {}
@@ -101,6 +102,8 @@ class PlaceIndex:
         """Remember a place under its number; there must be room."""
         slot = int(np.flatnonzero(self._numbers < 0)[0])
         self._numbers[slot] = number
+        if slot >> 3 == self._table.shape[1]:
+            self._table = np.hstack([self._table, np.zeros_like(self._table)])
         self._table[self._keys(view), slot >> 3] |= np.uint8(128 >> (slot & 7))
         self._votes[slot] = np.sqrt(max(len(view.descriptors), 1))
         self.views[number] = view
@@ -131,5 +134,6 @@ class PlaceIndex:
         rows = np.unpackbits(self._table[self._keys(view)], axis=1)[:, : self._capacity]
         common = rows.sum(axis=1, dtype=np.int32) > max(_MAX_COMMON * len(self.views), 2)
         rows[common] = 0
-        votes: NDArray[np.float64] = rows.sum(axis=0, dtype=np.float64)
+        votes = np.zeros(self._capacity)
+        votes[: rows.shape[1]] = rows.sum(axis=0, dtype=np.float64)
         return votes

@@ -7,8 +7,9 @@ Non-Convexity for Robust Spatial Perception", 2020) finds the wrong ones from an
 """
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any
+from importlib.util import find_spec
 
 import numpy as np
 from numpy.typing import NDArray
@@ -127,7 +128,11 @@ class _Problem:
     """The edges as arrays, and the sparsity of their normal equations."""
 
     def __init__(self, nodes: Mapping[int, se3.Transform], edges: Sequence[PoseGraphEdge]) -> None:
-        self._linalg, self._sparse = require()
+        require()
+        import scipy.sparse
+        import scipy.sparse.linalg
+
+        self._linalg, self._sparse = scipy.sparse.linalg, scipy.sparse
         place = {key: index for index, key in enumerate(nodes)}
         self._start = np.array([place[edge.start] for edge in edges], dtype=np.int64)
         self._end = np.array([place[edge.end] for edge in edges], dtype=np.int64)
@@ -222,17 +227,15 @@ def _squares(error: NDArray[np.float64], information: NDArray[np.float64]) -> ND
     return result
 
 
-def require() -> tuple[Any, Any]:
-    """Import scipy's sparse linear algebra and matrices.
+def require() -> None:
+    """Check that there is scipy, which is imported when the first loop is closed: it takes 25 MB.
 
     Raises:
         MissingDependency: without scipy.
     """
-    try:
-        import scipy.sparse
-        import scipy.sparse.linalg
-    except ImportError as error:
-        raise MissingDependency(
-            "pose graphs need scipy; install it with: pip install '.[slam]' in your clone of tsfusion"
-        ) from error
-    return scipy.sparse.linalg, scipy.sparse
+    with suppress(ImportError):
+        if find_spec("scipy.sparse") is not None:
+            return
+    raise MissingDependency(
+        "pose graphs need scipy; install it with: pip install '.[slam]' in your clone of tsfusion"
+    )

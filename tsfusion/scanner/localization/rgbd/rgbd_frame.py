@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """An RGB-D frame prepared for tracking, and the tracking keyframe it may become."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
@@ -105,12 +105,13 @@ class TrackingKeyframe:
     @classmethod
     def of(cls, frame: RGBDFrame, number: int, T_world_camera: se3.Transform) -> "TrackingKeyframe":
         """Make a frame a tracking keyframe: find its corners."""
+        kept = replace(frame, surface=frame.surface.without_points())
         if frame.gray is None:
-            return cls(number, T_world_camera, frame, np.empty((0, 2), np.float32), np.empty((0, 3)))
+            return cls(number, T_world_camera, kept, np.empty((0, 2), np.float32), np.empty((0, 3)))
         corners = features.corners(frame.gray, MAX_CORNERS)
         corners = corners[features.stronger_than_noise(frame.gray, corners)]
         points, ok = frame.back_project(corners)
-        return cls(number, T_world_camera, frame, corners[ok], points[ok])
+        return cls(number, T_world_camera, kept, corners[ok], points[ok])
 
     def follow(
         self, frame: RGBDFrame, T_keyframe_camera: se3.Transform
@@ -127,7 +128,8 @@ class TrackingKeyframe:
         margin = frame.columns // 16
         ok = ahead & (expected > -margin).all(axis=1)
         ok &= (expected[:, 0] < frame.shape[1] + margin) & (expected[:, 1] < frame.shape[0] + margin)
-        moved, found = features.follow(old, new, self.corners[ok], guess=expected[ok].astype(np.float32))
+        guess = expected[ok].astype(np.float32)
+        moved, found = features.follow(old, new, self.corners[ok], guess=guess, thorough=False)
         return self.points[ok][found], moved[found]
 
     def recall(self, frame: RGBDFrame) -> tuple[NDArray[np.float64], features.Pixels]:
