@@ -163,6 +163,7 @@ def test_light_modules_reach_no_kernel() -> None:
     ("name", "heavy"),
     [
         *((name, "taichi pykitti open3d matplotlib") for name in LIGHT),
+        ("client", "cv2 mcap.writer scipy"),
         ("cli", "numpy zmq cv2 msgspec taichi trimesh"),
         ("cli.status", "numpy zmq msgspec rich.table"),
     ],

@@ -18,7 +18,6 @@ from io import BytesIO
 from typing import IO, Any, NamedTuple
 
 from mcap.opcode import Opcode
-from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 from msgspec import Struct
 
 from tsfusion.core.errors import JournalError
@@ -52,9 +51,9 @@ _LENGTH_BYTES = 9  # opcode and length, which no length counts
 _MAX_CHUNK_BYTES = 1 << 30
 
 LIBRARY = b"tsfusion"
-OPENING = MCAP0_MAGIC + struct.pack("<BQII", Opcode.HEADER, 8 + len(LIBRARY), 0, len(LIBRARY)) + LIBRARY
+MAGIC = b"\x89MCAP0\r\n"
+OPENING = MAGIC + struct.pack("<BQII", Opcode.HEADER, 8 + len(LIBRARY), 0, len(LIBRARY)) + LIBRARY
 END_OF_DATA = struct.pack("<BQI", Opcode.DATA_END, 4, 0)
-MAGIC = MCAP0_MAGIC
 HEAD_BYTES = _HEAD.size
 INDEX_BYTES = _INDEX.size
 ERASED_BYTES = _ERASED.size + _CRC.size  # that are no zeros, of an erased record
@@ -152,6 +151,8 @@ def wall_clock_ns() -> int:
 
 def begin_segment(stream: IO[bytes], identity: bytes, now_ns: int) -> Any:
     """Write the first bytes of a segment; returns the MCAP writer for `write_record`."""
+    from mcap.writer import CompressionType, Writer  # a tenth of the time in which a client is imported
+
     writer = Writer(stream, chunk_size=1, compression=CompressionType.NONE)
     writer.start(library=LIBRARY.decode())
     schema = writer.register_schema("tsfusion.keyframe", "", _LAYOUT)

@@ -9,7 +9,6 @@ planes → zstd level 1. Neighbours in a depth image are alike, so the high plan
 import math
 from typing import Any
 
-import cv2
 import numpy as np
 import zstandard
 from numpy.typing import NDArray
@@ -62,6 +61,8 @@ def unpack_mm(frame: Any, shape: tuple[int, ...]) -> NDArray[np.float32]:
 
 def pack_jpeg(image: NDArray[np.uint8], quality: int) -> bytes:
     """(H, W, 3) uint8 BGR as JPEG."""
+    import cv2  # who sends no images does without its 16 MB
+
     _, encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
     return bytes(encoded)
 
@@ -72,6 +73,8 @@ def unpack_image(frame: Any, dtype: np.dtype[Any], shape: tuple[int, ...]) -> ND
     Raises:
         Refused: `payload` unless it decodes to exactly that array, `limits` for a PNG that unfolds to more.
     """
+    import cv2
+
     image_headers.check_unfolding(frame)
     flags = cv2.IMREAD_COLOR if len(shape) == 3 else cv2.IMREAD_UNCHANGED
     try:
