@@ -66,6 +66,10 @@ class SumMap:
         """Compile nothing: there are no kernels."""
         return iter(())
 
+    def kept_values(self) -> Any:
+        """Keep nothing: there is no field."""
+        return SimpleNamespace(clear=lambda: None)
+
     def limit_memory(self, nbytes: int) -> None:
         """Ignore the limit: sums take next to nothing."""
 
