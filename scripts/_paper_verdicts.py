@@ -188,8 +188,8 @@ def _localisation(found: Findings, world: PaperWorld) -> Verdict | None:
     return Verdict(
         met=late <= LATE_SHARE and mine <= WORSE * other,
         measured={"rmse_m": mine, "traditional_rmse_m": other, "late": round(late, 4)}, wanted=wanted,
-        words=f"Up to the baseline's end the RMSE of the live trajectory is {mine:.3f} m as two processes "
-        f"({100 * late:.1f} % of the frames dropped), {other:.3f} m as one ({100 * there:.1f} % dropped).",
+        words=f"Up to the baseline's end the RMSE of the live trajectory is {mine:.3g} m as two processes "
+        f"({100 * late:.1f} % of the frames dropped), {other:.3g} m as one ({100 * there:.1f} % dropped).",
     )  # fmt: skip
 
 
@@ -301,7 +301,8 @@ def _explanation(found: Findings, world: PaperWorld) -> Verdict | None:
     fine = [run for run in unbounded if _is_good(run)]
     enough = [run for run in bounded if _is_good(run)]
     split = [run for run in beside if _is_good(run)]
-    is_needed = not fine and not enough and not split and all(_is_good(run) for run in ours)
+    same = [run for run in (*unbounded, *bounded) if run.machine == ours[0].machine]
+    is_needed = bool(same) and not fine and not enough and not split and all(_is_good(run) for run in ours)
     if fine:
         says = f"Neither is needed: on {fine[0].machine} the unbounded baseline does as well."
     elif enough:
@@ -313,6 +314,8 @@ def _explanation(found: Findings, world: PaperWorld) -> Verdict | None:
         )
     elif is_needed:
         says = "Bounding the queue is not enough: without the split keyframes, frames or time are lost."
+    elif not same and all(_is_good(run) for run in ours):
+        says = "Not shown: one process was run on a smaller machine only, which is not enough for it."
     else:
         says = "Neither reaches all of it here."
     return Verdict(

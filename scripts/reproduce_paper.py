@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Run the paper's experiments again, with the control that it lacks, and check its claims.
 
-    python scripts/reproduce_paper.py --out DIR            all of it, one run a mode (an hour on 2 cores)
+    python scripts/reproduce_paper.py --out DIR            all of it, one run a mode (75 minutes on 2 cores)
     python scripts/reproduce_paper.py --out DIR --quick    short recordings (5 minutes)
     python scripts/reproduce_paper.py --out DIR --runs 5   for tables with a spread
     python scripts/reproduce_paper.py --list               the runs, and about how long each takes

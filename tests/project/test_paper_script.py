@@ -113,14 +113,22 @@ def test_the_control_decides_what_explains_the_gain(
 ) -> None:
     made = judged(
         outcome(),
-        outcome("traditional-unbounded", machine=SMALL, **unbounded),
-        outcome("traditional-bounded", machine=SMALL, **bounded),
+        outcome("traditional-unbounded", **unbounded),
+        outcome("traditional-bounded", **bounded),
     )
     verdict = made["explanation, kitti06"]
     assert verdict.met is met
     assert says in verdict.words
     for mode in ("traditional-unbounded", "traditional-bounded", "decentralised"):
         assert _paper_runs.MODES[mode] in verdict.words
+
+
+def test_a_smaller_machine_explains_nothing() -> None:
+    bad = {"fused": 300, "machine": SMALL}
+    made = judged(outcome(), outcome("traditional-unbounded", **bad), outcome("traditional-bounded", **bad))
+    verdict = made["explanation, kitti06"]
+    assert verdict.met is False
+    assert "Not shown" in verdict.words
 
 
 def test_two_processes_may_be_all_that_is_needed() -> None:
