@@ -12,6 +12,7 @@ from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
+import pytest
 from headless_browser import Browser, browser
 from keyframes_and_servers import DEADLINE, lasting_address, pose, serving, wall
 from live_pages import address_of, ended, viewing
@@ -62,6 +63,7 @@ class Seen:
         return len(self.where(color)) > 4000  # the red axis of a scanner has up to 1700
 
 
+@pytest.mark.nightly  # a browser that draws in software beside other tests may miss the deadline
 def test_a_page_follows_its_map_whatever_happens(tmp_path: Path) -> None:
     address, state = lasting_address(), tmp_path / "state"
     with ExitStack() as stack, browser() as page:
