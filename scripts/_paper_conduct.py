@@ -53,7 +53,7 @@ Tell = Callable[[str], None]
 
 
 def fingerprint(run: Run, limits: Limits) -> str:
-    """What a run is made with: another one is another run."""
+    """A digest of a run's settings: a run with another one is another run."""
     settings = msgspec.structs.replace(run.world, cache="")
     told = msgspec.json.encode([msgspec.structs.replace(run, world=settings), limits])
     return hashlib.sha256(told).hexdigest()[:16]
@@ -171,7 +171,7 @@ def _decentralised(
 
 @contextmanager
 def _on_cores(count: int | None) -> Iterator[None]:
-    """What is started during the block may use so many cores; None = all."""
+    """Processes started during the block may use so many cores; None = all."""
     if count is None or not hasattr(os, "sched_setaffinity"):
         yield
         return

@@ -29,7 +29,7 @@ _START_S = 180.0  # a cold compilation
 
 
 class FusionBeside:
-    """What a `Scanner` takes for its client: a queue, and a thread that fuses what is in it.
+    """A stand-in for a `Scanner`'s client: a queue, and a thread that fuses what is in it.
 
     Args:
         bounded: a new keyframe replaces the one that waits; else all of them wait.

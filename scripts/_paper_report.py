@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What all runs leave together: CSV files, figures, `run.json` and the report."""
+"""Results of all runs together: CSV files, figures, `run.json` and the report."""
 
 import base64
 import csv

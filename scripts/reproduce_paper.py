@@ -97,7 +97,15 @@ def parse() -> argparse.Namespace:
                         metavar="MIB", help="of the simulated small machine")  # fmt: skip
     parser.add_argument("--robot-share", type=share, default=small.robot.share, help="of its one core's time")
     parser.add_argument("--server-share", type=share, default=small.server_share, help="of a slow server")
-    return parser.parse_args()
+    options = parser.parse_args()
+    for number in ("06", "07") if options.kitti else ():
+        if not (options.kitti / "sequences" / number / "image_0").is_dir():
+            parser.error(
+                f"--kitti: no sequences/{number}/image_0 in {options.kitti}; give the odometry's folder"
+            )
+    if options.corbs and not options.corbs.is_dir():
+        parser.error(f"--corbs: no folder {options.corbs}; give that of Desk1's recording")
+    return options
 
 
 def positive(kind: Callable[[str], Any]) -> Callable[[str], Any]:

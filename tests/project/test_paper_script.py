@@ -411,6 +411,8 @@ def test_two_modes_from_end_to_end(interrupted: tuple[str, ...], tmp_path: Path)
         (("--runs", "0"), "expected more than 0"),
         (("--server-share", "2"), "at most 1"),
         (("--only", "nowhere"), "no run has such a name"),
+        (("--kitti", "nowhere"), "no sequences/06/image_0 in nowhere"),
+        (("--corbs", "nowhere"), "no folder nowhere"),
     ],
 )
 def test_a_mistake_is_one_line(arguments: tuple[str, ...], message: str, tmp_path: Path) -> None:
