@@ -4,7 +4,8 @@
     TSFMAP1\\n | header | chunk … | digest      each but the first: uint32 length, then its bytes
 
 The header is msgpack; a chunk is one zstd frame with the keys and then each layer of up to 1024 blocks,
-blocks in key order; the digest is blake2b-128 of everything before it.
+blocks in key order (a sum of maps has shorter chunks among them); the digest is blake2b-128 of
+everything before it.
 """
 
 import hashlib
@@ -35,6 +36,8 @@ _ROWS = 128  # that are gathered at a time
 _MAX_WINDOW_BYTES = 1 << 24  # of zstd; level 1 uses less
 LAYER_DTYPES = {"sums": np.int64, "color_rgn": np.int64, "color_b": np.int32, "correction": np.float32}
 
+Rows = Iterable[tuple[str, NDArray[Any]]]  # some rows of a chunk at a time, by the name of their layer
+
 
 class CheckpointHeader(msgspec.Struct, kw_only=True):
     """First part of a checkpoint: the settings and history of the map, and what follows."""
@@ -51,12 +54,24 @@ class Chunk(NamedTuple):
     """Up to 1024 blocks of a checkpoint that is being read.
 
     `fill` reads the next bytes into an array: first the keys (blocks,) int64, then for each layer of the
-    header, in its order, rows (blocks, 512) of the layer's dtype.
+    header, in its order, rows (blocks, 512) of the layer's dtype. `frame`: all of it as it is stored.
     """
 
     first: int
     blocks: int
     fill: Callable[[NDArray[Any]], None]
+    frame: bytes
+
+
+class Piece(NamedTuple):
+    """Up to 1024 blocks of a checkpoint that is being written.
+
+    Either `rows`: the keys, then the layers of the header in its order; or the `frame` of a `Chunk`.
+    """
+
+    blocks: int
+    rows: Rows = ()
+    frame: bytes = b""
 
 
 def write(
@@ -82,18 +97,55 @@ def write(
     Raises:
         CheckpointError: when the file cannot be written.
     """
-    header.blocks = len(keys)
-    if map_digest is not None:
-        header.map_hash = "0" * 2 * map_digest.digest_size
+    with SideThread() as side:
+
+        def hashed(rows: Rows) -> Rows:
+            for name, some in rows:
+                if map_digest is not None and name in ("keys", "sums"):
+                    side.do(partial(map_digest.update, some.data))
+                yield name, some
+
+        def map_hash() -> str:
+            side.wait()
+            return "" if map_digest is None else map_digest.hexdigest()
+
+        pieces = (
+            Piece(len(chunk), hashed(_rows(keys[i : i + CHUNK], chunk, layers)))
+            for i in range(0, len(keys), CHUNK)
+            for chunk in (slots[i : i + CHUNK],)
+        )
+        if map_digest is not None:
+            header.map_hash = "0" * 2 * map_digest.digest_size
+        hash_at_end = None if map_digest is None else map_hash
+        return write_pieces(path, header, len(keys), pieces, map_hash=hash_at_end, between=between)
+
+
+def write_pieces(
+    path: Path,
+    header: CheckpointHeader,
+    blocks: int,
+    pieces: Iterable[Piece],
+    *,
+    map_hash: Callable[[], str] | None = None,
+    between: Callable[[], None] = lambda: None,
+) -> Path:
+    """As `write`, of blocks that come in pieces, so that no more than one of them is in memory.
+
+    Args:
+        blocks: number of all of them.
+        pieces: in the order of their keys.
+        map_hash: what the header says, known when all pieces were taken; until then it has one as long.
+    """
+    header.blocks = blocks
     try:
         with durable_files.replacing(path) as file:
             file.write(MAGIC)
             _write_header(file, header)
-            for payload in _payloads(keys, slots, layers, map_digest, between):
+            for payload in _payloads(header, pieces, between):
                 for part in (struct.pack("<I", sum(map(len, payload))), *payload):
                     file.write(part)
-            if map_digest is not None:
-                header.map_hash = map_digest.hexdigest()
+            if map_hash is not None:
+                header.map_hash = map_hash()
                 file.seek(len(MAGIC))
                 _write_header(file, header)
                 file.seek(0, os.SEEK_END)
@@ -139,10 +191,13 @@ def copy(source: Path, target: Path, alter: Callable[[CheckpointHeader], None]) 
 
 
 @contextmanager
-def reading(path: Path) -> Iterator[tuple[CheckpointHeader, Iterator[Chunk]]]:
+def reading(path: Path, *, is_checked: bool = False) -> Iterator[tuple[CheckpointHeader, Iterator[Chunk]]]:
     """Header and chunks of a checkpoint, for the block to put straight into their place.
 
     No more than a chunk is held beside that place. A MemoryError of the block is one of the checkpoint.
+
+    Args:
+        is_checked: the caller has read the file just now: its digest is not compared again.
 
     Raises:
         DamagedCheckpoint: when a byte differs from what was written.
@@ -151,7 +206,8 @@ def reading(path: Path) -> Iterator[tuple[CheckpointHeader, Iterator[Chunk]]]:
     try:
         with path.open("rb") as file:
             _check_magic(file, path)
-            _check_digest(file, path)
+            if not is_checked:
+                _check_digest(file, path)
             header = _read_header(file, path)
             yield header, _read_chunks(file, path, header)
     except OSError as error:
@@ -168,26 +224,21 @@ def verify(path: Path, header: CheckpointHeader, map_hash: str) -> None:
 
 
 def _payloads(
-    keys: NDArray[np.int64],
-    slots: NDArray[np.int64],
-    layers: dict[str, NDArray[Any]],
-    map_digest: "hashlib.blake2b | None",
-    between: Callable[[], None],
+    header: CheckpointHeader, pieces: Iterable[Piece], between: Callable[[], None]
 ) -> Iterator[list[bytes]]:
-    """Each chunk, in parts: the map may have left little memory. A second thread hashes meanwhile."""
-    with SideThread() as side:
-        for i in range(0, len(keys), CHUNK):
-            chunk = slots[i : i + CHUNK]
-            size = len(chunk) * _block_bytes(layers)
-            compressor = zstandard.ZstdCompressor(level=1).compressobj(size=size)
-            parts = []
-            for name, rows in _rows(keys[i : i + CHUNK], chunk, layers):
-                if map_digest is not None and name in ("keys", "sums"):
-                    side.do(partial(map_digest.update, rows.data))
-                parts.append(compressor.compress(rows.data))
-            between()
-            yield [*parts, compressor.flush()]
-        side.wait()
+    """Each piece as it is written, in parts: the map may have left little memory."""
+    left = header.blocks
+    for piece in pieces:
+        left -= piece.blocks
+        if piece.frame:
+            yield [piece.frame]
+            continue
+        size = piece.blocks * _block_bytes(header.layers)
+        compressor = zstandard.ZstdCompressor(level=1).compressobj(size=size)
+        parts = [compressor.compress(rows.data) for _, rows in piece.rows]
+        between()
+        yield [*parts, compressor.flush()]
+    assert left == 0, "the pieces are not all blocks"
 
 
 def _rows(
@@ -234,18 +285,19 @@ def _block_bytes(layers: Iterable[str]) -> int:
 
 def _read_chunks(file: BinaryIO, path: Path, header: CheckpointHeader) -> Iterator[Chunk]:
     decompressor = zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW_BYTES)
-    for first in range(0, header.blocks, CHUNK):
-        count = min(CHUNK, header.blocks - first)
-        size = count * _block_bytes(header.layers)
+    each, first, blocks = _block_bytes(header.layers), 0, header.blocks
+    while first < blocks:
         (length,) = struct.unpack("<I", _read_exactly(file, 4, path))
         frame = _read_exactly(file, length, path)
         try:
-            if zstandard.get_frame_parameters(frame).content_size != size:
-                raise DamagedCheckpoint(f"{path} is damaged: a chunk is not of the {size} bytes expected")
+            size = zstandard.get_frame_parameters(frame).content_size
+            if size % each or not 0 < size <= each * min(CHUNK, blocks - first):
+                raise DamagedCheckpoint(f"{path} is damaged: a chunk is not of the size expected")
             with decompressor.stream_reader(frame) as stream:
-                yield Chunk(first, count, partial(_fill, stream, path))
+                yield Chunk(first, size // each, partial(_fill, stream, path), frame)
         except zstandard.ZstdError as error:
             raise DamagedCheckpoint(f"{path} is damaged: {error}") from error
+        first += size // each
 
 
 def _fill(stream: zstandard.ZstdDecompressionReader, path: Path, rows: NDArray[Any]) -> None:

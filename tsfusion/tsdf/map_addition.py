@@ -93,18 +93,30 @@ def _add_rows(
 def _add_colors(
     store: BlockStore, other: BlockStore, slots: NDArray[np.int32], theirs: NDArray[np.int64]
 ) -> None:
-    here, there = store.color_rgn[slots], other.color_rgn[theirs]
-    each = here & _VOTES, there & _VOTES
+    store.color_rgn[slots], store.color_b[slots] = added_colors(
+        (store.color_rgn[slots], store.color_b[slots]), (other.color_rgn[theirs], other.color_b[theirs])
+    )
+
+
+Colors = tuple[NDArray[np.int64], NDArray[np.int32]]  # rows of `color_rgn` and `color_b`
+
+
+def added_colors(here: Colors, there: Colors) -> Colors:
+    """The colours of the same blocks in two maps, (n, 512) each, added; settled ones are averaged."""
+    rgn, blue = here[0] + there[0], here[1] + there[1]
+    if not ((here[0] | there[0] | rgn) & COLOR_LIMIT).any():  # fewer votes in both, and together
+        return rgn, blue
+    each = here[0] & _VOTES, there[0] & _VOTES
     votes = each[0] + each[1]
     full = (votes > COLOR_LIMIT) & (each[0] > 0) & (each[1] > 0)
-    blue = store.color_b[slots] + other.color_b[theirs]
-    rgn = np.where(full, 0, here) + np.where(full, 0, there)
-    if full.any():
-        share = COLOR_LIMIT / votes[full]
-        red, green = (
-            np.rint(((here[full] >> shift & _LANE) + (there[full] >> shift & _LANE)) * share).astype(np.int64)
-            for shift in (40, 16)
+    rgn = np.where(full, 0, here[0]) + np.where(full, 0, there[0])
+    share = COLOR_LIMIT / votes[full]
+    red, green = (
+        np.rint(((here[0][full] >> shift & _LANE) + (there[0][full] >> shift & _LANE)) * share).astype(
+            np.int64
         )
-        rgn[full] = (red << 40) + (green << 16) + COLOR_LIMIT
-        blue[full] = np.rint(blue[full] * share)
-    store.color_rgn[slots], store.color_b[slots] = rgn, blue
+        for shift in (40, 16)
+    )
+    rgn[full] = (red << 40) + (green << 16) + COLOR_LIMIT
+    blue[full] = np.rint(blue[full] * share)
+    return rgn, blue

@@ -38,6 +38,15 @@ from tsfusion.tsdf.mesh_tiles import WholeMapValues, tiles
 from tsfusion.tsdf.surface_values import SurfaceView, values_of
 from tsfusion.tsdf.texture_images import Keyframes
 
+HELD = "held"  # in a checkpoint's meta: how the sensors were held, as the fuser wrote it first
+
+
+def begin_hash(voxel_size: float) -> "hashlib.blake2b":
+    """A digest that is to take the keys and then the sums of a map's used blocks, 1024 at a time."""
+    digest = hashlib.blake2b(digest_size=16)
+    digest.update(struct.pack("<di", voxel_size, integrate.QUANTA_PER_VOXEL))
+    return digest
+
 
 class ReadableMap:
     """A map as one reads it: `Volume` without the ways to change it.
@@ -235,7 +244,7 @@ class ReadableMap:
 
         Colour and smoothed values are not part of it (colour may travel lossily; smoothing has an order).
         """
-        digest = self._begin_hash()
+        digest = begin_hash(self.config.voxel_size)
         for keys, sums in self._store.in_order("sums"):
             digest.update(keys.data)
             digest.update(sums.data)
@@ -251,12 +260,6 @@ class ReadableMap:
                     digest.update(sums.data)
         return digest.hexdigest()
 
-    def _begin_hash(self) -> "hashlib.blake2b":
-        """A digest that is to take the keys and then the sums of the used blocks, 1024 at a time."""
-        digest = hashlib.blake2b(digest_size=16)
-        digest.update(struct.pack("<di", self.config.voxel_size, integrate.QUANTA_PER_VOXEL))
-        return digest
-
     def _check_voxels(self, other: "ReadableMap") -> None:
         ours, theirs = self.config.voxel_size, other.config.voxel_size
         if ours != theirs:
@@ -270,6 +273,11 @@ class ReadableMap:
         if not 0 <= min_weight <= most:
             raise InvalidConfig(f"min_weight must be from 0 to {most:.0f}, got {min_weight}")
         return min_weight
+
+    @property
+    def _halo(self) -> int:
+        """Blocks around a block, on each side, that its surface depends on."""
+        return {"raw": 0, "normal": 1, "field": self._field.halo}[self.model.surface]
 
     @property
     def _field(self) -> field_regularizer.FieldSettings:

@@ -9,13 +9,14 @@ from typing import Any
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from tsfusion.core.config import LIMIT_SETTINGS, VIEW_SETTINGS, VolumeConfig, override
 from tsfusion.core.errors import CheckpointError, DamagedCheckpoint, InvalidConfig
 from tsfusion.core.side_thread import SideThread
 from tsfusion.kernels import integrate
 from tsfusion.tsdf import checkpoint
-from tsfusion.tsdf.block_store import BlockStore
+from tsfusion.tsdf.block_store import BlockStore, unpack_keys
 
 
 def fill(
@@ -33,6 +34,7 @@ def fill(
     layers = store.layers()
     if set(header.layers) != set(layers):
         raise CheckpointError(f"{path} is of another version: it has layers {header.layers}")
+    checked = 0
     with SideThread() as side:
         for chunk in chunks:
             keys = np.empty(chunk.blocks, np.int64)
@@ -41,8 +43,39 @@ def fill(
             for name in header.layers:
                 chunk.fill(layers[name][chunk.first : store.count])
             store.keep_within_memory()
-            side.do(partial(_check_in, path, store, slice(chunk.first, store.count), digest))
+            # the hash is that of runs of 1024, wherever the file's chunks end
+            while store.count - checked >= checkpoint.CHUNK or checked < store.count == header.blocks:
+                end = min(checked + checkpoint.CHUNK, store.count)
+                side.do(partial(_check_in, path, store, slice(checked, end), digest))
+                checked = end
         side.wait()
+
+
+def fill_box(
+    store: BlockStore,
+    header: checkpoint.CheckpointHeader,
+    chunks: Iterable[checkpoint.Chunk],
+    low: NDArray[np.int64],
+    high: NDArray[np.int64],
+) -> None:
+    """Put the blocks low ≤ (x, y, z) < high of a checkpoint into an empty store.
+
+    Of chunks without such a block no more than the keys are unpacked.
+    """
+    for chunk in chunks:
+        keys = np.empty(chunk.blocks, np.int64)
+        chunk.fill(keys)
+        blocks = unpack_keys(keys)
+        inside = ((blocks >= low) & (blocks < high)).all(axis=1)
+        if not inside.any():
+            continue
+        first = store.count
+        store.insert(keys[inside])
+        for name in header.layers:
+            rows = np.empty((chunk.blocks, checkpoint.CUBE), checkpoint.LAYER_DTYPES[name])
+            chunk.fill(rows)
+            store.layers()[name][first : store.count] = rows[inside]
+    store.measure_bounds()
 
 
 def _check_in(path: Path, store: BlockStore, blocks: slice, digest: "hashlib.blake2b") -> None:

@@ -32,11 +32,10 @@ from tsfusion.tsdf.askable_map import AskableMap
 from tsfusion.tsdf.block_store import MESHED, BlockStore, unpack_keys
 from tsfusion.tsdf.integrator import Integrator, KeyframeQuota
 from tsfusion.tsdf.ray_buffers import RayBuffers, keyframes_of_every_kind
+from tsfusion.tsdf.readable_map import HELD, begin_hash
 from tsfusion.tsdf.residency import checked_cache
 
 log = logging.getLogger(__name__)
-
-_HELD = "held"  # in a checkpoint's meta, as the fuser wrote it first
 
 
 class IntegrateStats(msgspec.Struct, frozen=True):
@@ -308,12 +307,12 @@ class Volume(AskableMap):
             config=self.config,
             keyframes=self.keyframes,
             map_hash="",
-            meta={**(self.meta if meta is None else meta), _HELD: self.held.numbers},
+            meta={**(self.meta if meta is None else meta), HELD: self.held.numbers},
             layers=list(layers),
         )
         used = self._store.used()
         keys, rest = self._store.keys[used], self._store.rest
-        digest = self._begin_hash()
+        digest = begin_hash(self.config.voxel_size)
         return checkpoint.write(Path(path), header, keys, used, layers, map_digest=digest, between=rest)
 
     @classmethod
@@ -343,13 +342,47 @@ class Volume(AskableMap):
             )
             store = volume._store
             opening.enter_context(store.opening(header.blocks))
-            digest = volume._begin_hash()
+            digest = begin_hash(header.config.voxel_size)
             saved_map.fill(store, Path(path), header, chunks, digest)
             volume.keyframes = header.keyframes
-            volume.held = HeldSensor(header.meta.pop(_HELD, None))
+            volume.held = HeldSensor(header.meta.pop(HELD, None))
             volume.meta = header.meta
             checkpoint.verify(Path(path), header, digest.hexdigest())
         return volume
+
+    @classmethod
+    def load_blocks(
+        cls,
+        path: str | os.PathLike[str],
+        low: Sequence[int],
+        high: Sequence[int],
+        *,
+        is_checked: bool = False,
+        **changed: Any,
+    ) -> "Volume":
+        """A part of a saved map: the blocks in a box, and those around it that its mesh depends on.
+
+        `extract_mesh(blocks=blocks_within(low, high))` of it is that of the whole map, to the last bit.
+
+        Args:
+            low, high: (3,) block coordinates, first and last + 1.
+            is_checked: the file was read as a whole just now: its digest is not compared again.
+            changed: as of `load`.
+
+        Raises:
+            InvalidConfig, CheckpointError: as `load`; the map's own hash is not compared.
+        """
+        with checkpoint.reading(Path(path), is_checked=is_checked) as (header, chunks):
+            volume = cls(saved_map.loaded_config(header, None, changed))
+            halo = 1 + volume._halo
+            saved_map.fill_box(volume._store, header, chunks, np.array(low) - halo, np.array(high) + halo)
+            volume.held = HeldSensor(header.meta.get(HELD))
+        return volume
+
+    def blocks_within(self, low: Sequence[int], high: Sequence[int]) -> NDArray[np.int32]:
+        """(n, 3) coordinates of the map's blocks low ≤ (x, y, z) < high."""
+        blocks = unpack_keys(self._store.keys)
+        return blocks[((blocks >= np.array(low)) & (blocks < np.array(high))).all(axis=1)]
 
     def limit_memory(self, nbytes: int) -> None:
         """Let a keyframe fail with MemoryError from now on if the map, with it, would take more bytes.
