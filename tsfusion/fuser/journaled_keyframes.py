@@ -81,6 +81,9 @@ class JournaledKeyframes:
         sessions: of the whole journal up to `until_ns`.
         unreadable: number of records without a readable header by reason.
         recorded: number of keyframes that are, or were until they were erased, in the journal.
+        lost: number of keyframes that damage has destroyed, at least.
+        worlds: that its keyframes name: coordinate frames of scans that found their poses themselves;
+            empty = poses were given.
     """
 
     def __init__(
@@ -93,13 +96,15 @@ class JournaledKeyframes:
         self.name = str(place.path)
         self.sessions: dict[bytes, JournaledSession] = {}
         self.unreadable = Counter[str]()
-        self.recorded = 0
+        self.recorded = self.lost = 0
+        self.worlds = set[str]()
         self._poses = KeyframePoses(None, {})
         self._places: list[KeyframePlace] = []
         for file, step in place.steps(watch):
             if isinstance(step, journal.Erased):
                 self.recorded += 1
             elif isinstance(step, journal.Damage):
+                self.lost += step.lost
                 log.log(logging.WARNING if step.torn else logging.ERROR, "%s: %s", file, step.what)
             elif step.session == SERVER_SESSION:
                 self._forget(step)
@@ -154,12 +159,14 @@ class JournaledKeyframes:
                 assert isinstance(found, Correction)
                 self._poses.correct(key, found)
                 return
-            sent = _without_measurement(unpack_keyframe(record.frames[0]))
+            header = unpack_keyframe(record.frames[0])
+            sent = _without_measurement(header)
             self._poses.add(key, seq, record.position, self._poses.placed(key, sent))
         except (DecodeError, InvalidKeyframe, IndexError) as error:
             self.unreadable[str(error)] += 1
             return
         session.keyframes += 1
+        self.worlds.add(header.world)
         self._places.append(KeyframePlace(key, seq, file, record.position.offset))
 
     def _forget(self, record: Record) -> None:

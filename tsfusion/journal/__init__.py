@@ -8,6 +8,7 @@ new segment. One chunk a keyframe, uncompressed: the arrays are compressed alrea
 from tsfusion.journal.mcap_layout import Position, Record
 from tsfusion.journal.record_scan import Damage, Erased, scan_records, segment_number
 from tsfusion.journal.segments import (
+    Reading,
     RecordEntry,
     describe,
     is_away,
@@ -28,6 +29,7 @@ __all__ = [
     "Erased",
     "Journal",
     "Position",
+    "Reading",
     "ReadingWatcher",
     "Record",
     "RecordEntry",

@@ -15,6 +15,8 @@ from typing import Literal
 from mcap.opcode import Opcode
 from msgspec import Struct
 
+from tsfusion.journal import locations
+from tsfusion.journal.locations import RemoteFile
 from tsfusion.journal.mcap_layout import END_OF_DATA, MAGIC
 
 _SECTOR_BYTES = 1 << 16
@@ -38,8 +40,13 @@ class SegmentFile:
     ) -> None:
         self.path = path
         self._on_read = on_read
-        self._file = path.open("rb", buffering=0) if descriptor is None else FileIO(descriptor, "rb")
-        self.size = os.fstat(self._file.fileno()).st_size
+        self._file: FileIO | RemoteFile
+        if descriptor is None and locations.is_url(path):
+            self._file = RemoteFile(path)
+            self.size = self._file.size
+        else:
+            self._file = path.open("rb", buffering=0) if descriptor is None else FileIO(descriptor, "rb")
+            self.size = os.fstat(self._file.fileno()).st_size
         self.failed = False  # the disk could not read some part that was asked for
         self.answered = False  # the disk has read some part
 
@@ -78,7 +85,10 @@ class SegmentFile:
             return bytes(count)
 
     def _pread(self, at: int, count: int) -> bytes:
-        content = os.pread(self._file.fileno(), count, at)
+        if isinstance(self._file, RemoteFile):
+            content = self._file.read_at(at, count)
+        else:
+            content = os.pread(self._file.fileno(), count, at)
         self.answered = True
         return content
 

@@ -6,6 +6,7 @@ import logging
 import os
 import re
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 from msgspec import Struct
@@ -40,7 +41,7 @@ def segments(folder: Path) -> list[int]:
         JournalError: when the folder cannot be listed.
     """
     try:
-        names = os.listdir(folder)
+        names = [path.name for path in folder.iterdir()]
     except OSError as error:
         raise journal_error("list", folder, error) from error
     return sorted(
@@ -105,6 +106,32 @@ def read_at(path: Path, offset: int) -> Record:
         raise journal_error("read", path, error) from error
     with source:
         return record_at(source, segment_number(path), offset)
+
+
+class Reading:
+    """Records of segments, one after the other: a segment stays open until one of another is read."""
+
+    def __init__(self) -> None:
+        self._path: Path | None = None
+        self._open = ExitStack()
+
+    def __enter__(self) -> "Reading":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._open.close()
+
+    def at(self, path: Path, offset: int) -> Record:
+        """One record of a segment file; raises JournalError as `read_at`."""
+        if path != self._path:
+            self._open.close()
+            self._path = None
+            try:
+                self._source = self._open.enter_context(SegmentFile(path))
+            except OSError as error:
+                raise journal_error("read", path, error) from error
+            self._path = path
+        return record_at(self._source, segment_number(path), offset)
 
 
 def record_at(source: SegmentFile, number: int, offset: int) -> Record:
@@ -176,8 +203,8 @@ def is_segment(path: Path) -> bool:
     if path.suffix != ".mcap":
         return False
     try:
-        with path.open("rb") as file:
-            opening = file.read(len(mcap_layout.OPENING))
+        with SegmentFile(path) as file:
+            opening = file.read(0, len(mcap_layout.OPENING))
     except OSError:  # to be reported by who reads it
         return True
     is_whole = len(opening) == len(mcap_layout.OPENING) and opening.startswith(mcap_layout.MAGIC)

@@ -26,7 +26,12 @@ PREVIOUS_FILE = "map.previous.tsf"
 
 def map_folder(state: str | Path, name: str) -> Path:
     """The folder in which a map is, or will be."""
-    return Path(state) / MAPS_FOLDER / name
+    return _maps(state) / name
+
+
+def _maps(state: str | Path) -> Path:
+    """The folder of the maps; a path may be that of a URL, which `Path` does not take."""
+    return (Path(state) if isinstance(state, str) else state) / MAPS_FOLDER
 
 
 def map_names(state: str | Path) -> list[str]:
@@ -35,9 +40,9 @@ def map_names(state: str | Path) -> list[str]:
     Raises:
         JournalError: when it cannot be listed.
     """
-    folder = Path(state) / MAPS_FOLDER
+    folder = _maps(state)
     try:
-        names = [name for name in os.listdir(folder) if re.fullmatch(MAP_NAME, name)]
+        names = [path.name for path in folder.iterdir() if re.fullmatch(MAP_NAME, path.name)]
         return sorted(name for name in names if (folder / name).is_dir())
     except FileNotFoundError:
         return []
