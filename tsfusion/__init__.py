@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from tsfusion.core.errors import TransportError as TransportError
     from tsfusion.core.errors import TsfusionError as TsfusionError
     from tsfusion.core.errors import WeightOverflow as WeightOverflow
+    from tsfusion.core.errors import WorkerLost as WorkerLost
     from tsfusion.core.errors import WorldRefused as WorldRefused
     from tsfusion.datasets import Layout as Layout
     from tsfusion.datasets import open_dataset as open_dataset
@@ -63,7 +64,7 @@ _ERRORS = (
     "InvalidKeyframe", "JournalError", "KeyframeRefused", "KeyframeTooLarge", "MapError", "MapFull",
     "MapQuota", "MissingDependency",
     "NotAllowed", "OutputError", "ServerUnreachable", "SourceError",
-    "TransportError", "TsfusionError", "WeightOverflow", "WorldRefused",
+    "TransportError", "TsfusionError", "WeightOverflow", "WorkerLost", "WorldRefused",
 )  # fmt: skip
 _HOME = {
     "Blocks": "tsdf.map_blocks",

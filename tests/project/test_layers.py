@@ -16,6 +16,7 @@ PACKAGE = ROOT / "tsfusion"
 ROWS = (
     ("__main__",),
     ("cli",),
+    ("cluster",),
     ("pipelines",),
     ("scanner", "server"),
     ("gateway", "client", "evaluation"),
@@ -28,7 +29,17 @@ ROWS = (
 
 # All others run where there is no Taichi, and answer while kernels run.
 MAY_REACH_TAICHI = (
-    *("kernels", "tsdf", "fuser", "datasets.synthetic", "evaluation", "pipelines", "cli", "__main__"),
+    *(
+        "kernels",
+        "tsdf",
+        "fuser",
+        "datasets.synthetic",
+        "evaluation",
+        "pipelines",
+        "cluster",
+        "cli",
+        "__main__",
+    ),
 )
 TAICHI_FREE = ("fuser.messages",)
 LIGHT = (

@@ -21,6 +21,7 @@ from tsfusion.cli import (
     datasets,
     doctor,
     download,
+    fuse,
     journal,
     keys,
     map,
@@ -69,6 +70,10 @@ verbs.verb(
     app, "tsfusion mesh out/latest/map.tsf room.glb", "tsfusion mesh tcp://server:5555 yard.ply --map yard",
     panel=OWN,
 )(mesh.mesh)  # fmt: skip
+verbs.verb(
+    app, "tsfusion fuse my-maps --voxel-size 0.02 --workers 4 --out fused",
+    "tsfusion fuse s3://scans/monday --ray auto --out /shared/monday", panel=OWN,
+)(fuse.fuse)  # fmt: skip
 verbs.verb(
     app, "tsfusion ask tcp://server:5555 --at 1.2 0 0.5",
     "tsfusion ask out/latest/map.tsf room.pgm --slice 0.1 1.5 --up z", panel=OWN,

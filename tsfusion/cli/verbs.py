@@ -12,8 +12,12 @@ from tsfusion.viewer import LISTEN
 
 PREFIX = "TSFUSION_"
 RENAMED = {"--max-keyframes": "--max-frames", "--poses": "--trajectory"}  # understood until version 0.3
-_VIEW = "--view"
-_PLACE = re.compile(r"(?:\[[\da-fA-F:.]+\]|localhost|\*|[\w-]+(?:\.[\w-]+)+):\d{1,5}", re.ASCII)
+LOCAL = "local"  # of --ray: a cluster of the run's own
+_HOST_PORT = r"(?:\[[\da-fA-F:.]+\]|localhost|\*|[\w-]+(?:\.[\w-]+)+):\d{1,5}"
+_PLACES = {  # flags that may go without their place: what one looks like, and the usual one
+    "--view": (re.compile(_HOST_PORT, re.ASCII), LISTEN),
+    "--ray": (re.compile(rf"auto|local|ray://\S+|{_HOST_PORT}", re.ASCII), LOCAL),
+}
 _SHORTER = {"--show-completion": "Print what that would install."}  # Typer's own takes two lines
 _ALL = "tsfusion.help_all"  # in a context's notes: --help-all was asked for
 
@@ -55,8 +59,10 @@ class Verb(_ShortHelp, TyperCommand):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         words = [new for old in args for new in _renamed(old)]
-        has_page = any(param.opts == [_VIEW] and param.nargs == 1 for param in self.params)
-        return super().parse_args(ctx, _with_places(words) if has_page else words)
+        for flag, (place, usual) in _PLACES.items():
+            if any(param.opts == [flag] and param.nargs == 1 for param in self.params):
+                words = _with_places(words, flag, place, usual)
+        return super().parse_args(ctx, words)
 
 
 def variable(flag: str) -> str:
@@ -99,18 +105,18 @@ HelpAll = Annotated[
 ]
 
 
-def _with_places(words: list[str]) -> list[str]:
-    """A command line in which each `--view` has a place: its next word, if that is one, else the usual place.
+def _with_places(words: list[str], flag: str, place: re.Pattern[str], usual: str) -> list[str]:
+    """A command line in which each such flag has a place: its next word, if that is one, else the usual one.
 
     `--view PATH` means a PATH, and `--view camera:0` a camera.
     """
     found: list[str] = []
     for word in words:
-        if found and found[-1] == _VIEW and _PLACE.fullmatch(word):
-            found[-1] = f"{_VIEW}={word}"
+        if found and found[-1] == flag and place.fullmatch(word):
+            found[-1] = f"{flag}={word}"
         else:
             found.append(word)
-    return [f"{_VIEW}={LISTEN}" if word == _VIEW else word for word in found]
+    return [f"{flag}={usual}" if word == flag else word for word in found]
 
 
 def _renamed(word: str) -> list[str]:

@@ -23,6 +23,7 @@
     │   ├── WorldRefused                   the map has keyframes of another coordinate frame
     │   ├── FlushTimeout                   keyframes were still unacknowledged at the deadline
     │   └── KeyframeRefused                the server will never take this keyframe, and said why
+    ├── WorkerLost                         one worker after the other ended at the same job
     ├── OutputError                        a result cannot be written
     ├── IncompleteRun                      a run has left its results, but missed what it was for
     └── MissingDependency                  an optional package is needed; the message names the command
@@ -144,6 +145,10 @@ class FlushTimeout(TransportError):
 
 class KeyframeRefused(TransportError):
     """The server will never take this keyframe, and said why."""
+
+
+class WorkerLost(TsfusionError):
+    """One worker after the other ended at the same job: nobody can do it."""
 
 
 class OutputError(TsfusionError):

@@ -1,0 +1,231 @@
+# SPDX-License-Identifier: MIT
+"""Many workers make the map of one: whatever is shared out, killed, interrupted or left out."""
+
+import json
+import os
+import signal
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from command_processes import Here, alive, descendants, end, eventually, read_until, started, tsfusion
+from corrected_maps import fresh_map
+from keyframes_and_servers import VOLUME, pose, wall
+from silent_display import Silent
+
+from tsfusion import Volume
+from tsfusion.cluster import fusion, job_runner, jobs, keyframe_sources
+from tsfusion.cluster.carrying_out import ATTEMPTS
+from tsfusion.cluster.fusion import FusedRun, Wishes
+from tsfusion.cluster.jobs import AnyJob, Lost, Message
+from tsfusion.core.errors import InvalidConfig, JournalError, MapError, OutputError, WorkerLost
+from tsfusion.journal import Journal
+from tsfusion.wire import codec, corrections
+
+SESSION, COUNT = b"\xab" * 16, 12
+
+
+class InThisProcess:
+    """A scheduler whose workers are this process; `lose` names jobs whose worker ends, and how often."""
+
+    name = "here"
+
+    def __init__(self, workers: int = 1, lose: dict[str, int] | None = None) -> None:
+        self.workers, self._lose = workers, dict(lose or {})
+        self._started: list[AnyJob] = []
+        self.done: list[str] = []
+
+    def start(self, job: AnyJob) -> None:
+        self._started.append(job)
+
+    def wait(self) -> Sequence[Message]:
+        job = self._started.pop()  # the last first: any order will do
+        found = list(job_runner.run(job))
+        kind = job.name.partition("-")[0]
+        if self._lose.get(kind, 0):
+            self._lose[kind] -= 1
+            jobs.done_file(Path(job.folder), job.name).unlink(missing_ok=True)
+            return [Lost(job.name, "it was killed")]
+        self.done.append(job.name)
+        return found
+
+    def close(self) -> None:
+        pass
+
+
+def write_journal(
+    folder: Path,
+    count: int = COUNT,
+    session: bytes = SESSION,
+    *,
+    step: float = 0.03,
+    far: float = 0.003,
+    **fields: Any,
+) -> Path:
+    """A journal of walls, the last one farther away. Its last record moves one, and takes one away."""
+    journal = Journal(folder / "journal", 1 << 16)
+    for seq in range(1, count + 1):
+        keyframe = wall(seq, T_world_camera=pose(step * seq), depth_scale=far if seq == count else 0.001)
+        frames = codec.encode(keyframe, jpeg_quality=90, session=session, seq=seq, **fields)
+        journal.append(frames, session=session, seq=seq)
+    change = corrections.checked({3: pose(0.5)}, removed=[4])
+    frames = corrections.encode(change, session=session, seq=count + 1)
+    journal.append(frames, session=session, seq=count + 1)
+    journal.close()
+    return folder
+
+
+@pytest.fixture
+def state(tmp_path: Path) -> Path:
+    return write_journal(tmp_path / "map")
+
+
+@pytest.fixture
+def expected(state: Path) -> Volume:
+    """The map of one process, at final poses."""
+    return fresh_map(state / "journal", VOLUME.voxel_size)
+
+
+def fuse(source: Path | str, out: Path, scheduler: Any = None, **more: Any) -> FusedRun:
+    found = keyframe_sources.listed([str(source)])
+    wishes = Wishes(**{name: more.pop(name) for name in ("worker_memory", "tile_size") if name in more})
+    made, display = scheduler or InThisProcess(3), Silent()
+    run = fusion.fuse(found, more.pop("config", VOLUME), out, lambda: made, display, wishes=wishes, **more)
+    assert display.shown[-1] == (found.count, run.keyframes_fused, found.count)
+    return run
+
+
+@pytest.mark.parametrize("workers", [1, 2, 5])
+def test_the_map_is_that_of_one_machine(state: Path, tmp_path: Path, expected: Volume, workers: int) -> None:
+    run = fuse(state, tmp_path / "out", InThisProcess(workers))
+    made = Volume.load(tmp_path / "out/map.tsf")
+    assert run.map_hash == made.map_hash() == expected.map_hash()
+    assert made.color_hash() == expected.color_hash()
+    assert (run.keyframes, run.keyframes_fused, made.held.numbers) == (11, 11, expected.held.numbers)
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
+        "map.tsf", "mesh.glb", "mesh.ply", "run.json",
+    ]  # fmt: skip
+    record = msgspec.json.decode((tmp_path / "out/run.json").read_bytes(), type=FusedRun)
+    assert record.map_hash == run.map_hash
+    whole = expected.extract_mesh()
+    assert run.mesh["vertices"] == len(whole.vertices)
+
+
+def test_a_worker_that_dies_is_replaced(state: Path, tmp_path: Path, expected: Volume) -> None:
+    run = fuse(state, tmp_path / "out", InThisProcess(9, lose={"fuse": 3, "add": 2, "mesh": 1}))
+    assert (run.map_hash, run.workers_lost) == (expected.map_hash(), 6)
+
+
+def test_a_job_that_ends_every_worker_is_told(state: Path, tmp_path: Path) -> None:
+    with pytest.raises(WorkerLost, match=f"has ended {ATTEMPTS} workers, one after the other; it was killed"):
+        fuse(state, tmp_path / "out", InThisProcess(lose={"fuse": ATTEMPTS}))
+
+
+def test_an_interrupted_run_goes_on(state: Path, tmp_path: Path, expected: Volume) -> None:
+    class Interrupted(InThisProcess):
+        def wait(self) -> Sequence[Message]:
+            if len(self.done) == 3:
+                raise KeyboardInterrupt
+            return super().wait()
+
+    with pytest.raises(KeyboardInterrupt):
+        fuse(state, tmp_path / "out", Interrupted(5))
+    assert [path.name for path in (tmp_path / "out").iterdir()] == [fusion.WORK]
+    second = InThisProcess(5)
+    run = fuse(state, tmp_path / "out", second)
+    assert (run.map_hash, run.jobs_found) == (expected.map_hash(), 3)
+    assert len(second.done) == run.jobs - 3
+    with pytest.raises(OutputError, match="holds files already"):
+        fuse(state, tmp_path / "out")
+
+
+def test_other_keyframes_or_settings_begin_anew(state: Path, tmp_path: Path) -> None:
+    with pytest.raises(WorkerLost):
+        fuse(state, tmp_path / "out", InThisProcess(lose={"mesh": ATTEMPTS}))
+    coarse = msgspec.structs.replace(VOLUME, voxel_size=0.08)
+    run = fuse(state, tmp_path / "out", config=coarse)
+    assert run.jobs_found == 0
+    assert run.map_hash == fresh_map(state / "journal", 0.08).map_hash()
+
+
+def test_a_map_larger_than_a_workers_memory_goes_out_in_parts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    street = write_journal(tmp_path / "street", step=1.0, far=0.001)
+    expected = fresh_map(street / "journal", VOLUME.voxel_size)
+    most = expected.stats().bytes // 3
+    monkeypatch.setattr(job_runner, "_budget", lambda *_: most)
+    run = fuse(street, tmp_path / "out", InThisProcess(1), worker_memory=1 << 40)
+    assert run.map_hash == expected.map_hash()
+    assert run.jobs >= 4  # a sum was made of a single job's keyframes; the mesh, and tiles
+    assert (tmp_path / "out/tiles/tileset.json").is_file()
+    assert run.mesh["triangles"] == len(expected.extract_mesh().faces)
+
+
+def test_keyframes_that_a_map_cannot_take_are_counted(state: Path, tmp_path: Path) -> None:
+    small = msgspec.structs.replace(VOLUME, max_blocks_per_keyframe=1)
+    with pytest.raises(OutputError, match="no surface to write"):
+        fuse(state, tmp_path / "out", config=small)
+    narrow = msgspec.structs.replace(VOLUME, max_blocks_per_keyframe=200)
+    run = fuse(state, tmp_path / "out", config=narrow)
+    assert (run.keyframes, run.keyframes_fused, list(run.keyframes_rejected.values())) == (11, 10, [1])
+
+
+def test_what_is_no_sum_is_refused(state: Path, tmp_path: Path) -> None:
+    smoothing = msgspec.structs.replace(VOLUME, regularizer="ray")
+    with pytest.raises(InvalidConfig, match="smoothing along rays depends on the order"):
+        fuse(state, tmp_path / "out", config=smoothing)
+
+
+def test_sources_that_do_not_add_up_are_refused(state: Path, tmp_path: Path) -> None:
+    with pytest.raises(MapError, match="both hold 11 keyframes of the same session"):
+        keyframe_sources.listed([str(state), str(state / "journal")])
+    one, other = (
+        write_journal(tmp_path / name, 5, bytes([i] * 16), world=name)
+        for i, name in enumerate(("one", "two"), 1)
+    )
+    with pytest.raises(MapError, match="coordinate frame of its own"):
+        keyframe_sources.listed([str(one), str(other)])
+    found = keyframe_sources.listed([str(one), str(other)], same_frame=True)
+    assert [len(part) for part in found.keyframes] == [4, 4]
+    assert [sum(map(len, share)) for share in found.shares(3)] == [3, 2, 3]
+    with pytest.raises(InvalidConfig, match="--option has no effect on a journal"):
+        keyframe_sources.listed([str(one)], options={"count": 3})
+    with pytest.raises(JournalError, match="does not exist"):
+        keyframe_sources.listed([str(tmp_path / "none/journal.mcap")])
+
+
+def test_the_settings_of_the_saved_map_are_taken(state: Path, here: Here, expected: Volume) -> None:
+    Volume(VOLUME).save(state / "map.tsf", meta={"done": {}})
+    done = here("fuse", state, "--workers", 2, "--out", "out", "--json")
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["map_hash"] == expected.map_hash()
+    assert here("map", "hash", "out/map.tsf").stdout.strip() == expected.map_hash()
+
+
+def test_killed_and_interrupted_commands_leave_no_worker_and_go_on(tmp_path: Path) -> None:
+    """Real processes: one worker is killed, then the command is interrupted, then it is run to its end."""
+    command = ["fuse", "synthetic:room", "--option", "count=24", "--workers", 2, "--voxel-size", 0.05]
+    out = ["--out", tmp_path / "out"]
+    process = started(*command, *out)
+    try:
+        read_until(process, "fusing 24 keyframes")
+        assert eventually(lambda: len(descendants(process.pid)) >= 2)
+        workers = descendants(process.pid)
+        os.kill(workers[0], signal.SIGKILL)
+        read_until(process, "a worker was lost, its job begins again")
+        workers += descendants(process.pid)
+    finally:
+        status = end(process, signal.SIGINT)
+    assert status == 130
+    assert eventually(lambda: not any(map(alive, workers)))
+    done = tsfusion(*command, *out, "--json")
+    assert done.returncode == 0, done.stderr
+    whole = Volume(0.05)
+    for keyframe in keyframe_sources.reading(
+        keyframe_sources.listed(["synthetic:room"], options={"count": 24}).keyframes
+    ):
+        whole.integrate(keyframe())
+    assert json.loads(done.stdout)["map_hash"] == whole.map_hash()

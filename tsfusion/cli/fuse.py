@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: MIT
+"""`tsfusion fuse`."""
+
+import os
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from tsfusion.cli import options, verbs
+
+if TYPE_CHECKING:
+    from tsfusion.cluster.fusion import FusedRun
+    from tsfusion.cluster.keyframe_sources import Listed
+    from tsfusion.cluster.schedulers import Scheduler
+    from tsfusion.core.config import VolumeConfig
+
+
+@options.takes_map_settings
+def fuse(
+    sources: Annotated[
+        list[str],
+        typer.Argument(metavar="SOURCE…", help="Journals, state folders, datasets, URLs."),
+    ],
+    *,
+    out: options.Out = None,
+    overwrite: options.Overwrite = False,
+    workers: Annotated[
+        int | None,
+        options.option("--workers", "N", "Processes; default: one a core.", min=1),
+    ] = None,
+    ray: Annotated[str | None, options.option("--ray", "[ADDRESS]", "By a Ray cluster (extra ray).")] = None,
+    worker_memory: Annotated[
+        str | None, options.option("--worker-memory", "BYTES", "Of each worker, as 2GB.")
+    ] = None,
+    tile_size: Annotated[
+        float | None, options.option("--tiles", "METRES", "Mesh in tiles, too: 3D Tiles.")
+    ] = None,
+    map_: options.Map = None,
+    same_frame: Annotated[
+        bool, options.option("--same-frame", None, "The sources' poses are in one frame.", rare=True)
+    ] = False,
+    option: options.DatasetOptions = None,
+    up: options.UpDirection = None,
+    keep_islands: options.KeepIslands = None,
+    config: options.ConfigFile = None,
+    json: options.RunJson = False,
+    **settings: Any,
+) -> None:
+    """Fuse journals and recordings with many processes, or a cluster: one map.
+
+    The map is that of one machine, to the last bit. Keyframes count at their
+    final poses. Started again, an interrupted run goes on where it was.
+    """
+    from tsfusion.cli import output, progress
+    from tsfusion.cluster import fusion, keyframe_sources
+
+    memory = options.byte_count(worker_memory)
+    wishes = fusion.Wishes(
+        up=options.up_direction(up), keep_islands=keep_islands, worker_memory=memory, tile_size=tile_size
+    )
+    with progress.shown(quiet=json) as display:
+        found = keyframe_sources.listed(
+            sources,
+            map_name=map_,
+            same_frame=same_frame,
+            options=options.dataset_options(option),
+            watch=partial(display.show_bytes, "reading the journal"),
+        )
+        result = fusion.fuse(
+            found,
+            _settings(found, config, settings),
+            out,
+            partial(_scheduler, workers or os.cpu_count() or 1, ray),
+            display,
+            wishes=wishes,
+            overwrite=overwrite,
+        )
+    if json:
+        output.as_json(result)
+    else:
+        _print(result)
+    _check(result)
+
+
+def _settings(found: "Listed", file: Path | None, flags: dict[str, Any]) -> "VolumeConfig":
+    """Those of the saved map beside the first journal, or of the file, with every flag on top."""
+    from msgspec.structs import asdict
+
+    if file is None and found.config is not None:
+        # a sensor that is chosen anew brings its own settings; None = what its preset says
+        preset = {name: value for name, value in asdict(found.config).items() if value is not None}
+    else:
+        preset = {} if found.sensor is None else {"sensor": found.sensor}
+    preset["threads"] = 1  # a worker is a process on a core
+    return options.configuration(file, preset=preset, **flags).volume
+
+
+def _scheduler(workers: int, ray: str | None) -> "Scheduler":
+    if ray is not None:
+        from tsfusion.cluster.ray_scheduler import RayCluster
+
+        return RayCluster(workers, None if ray == verbs.LOCAL else ray)
+    from tsfusion.cluster.schedulers import LocalProcesses
+
+    return LocalProcesses(workers)
+
+
+def _print(result: "FusedRun") -> None:
+    import msgspec
+
+    from tsfusion.core.counts import count_of
+    from tsfusion.geometry.mesh import summarise
+    from tsfusion.geometry.up_direction import Up
+
+    up = result.mesh.get("up")
+    figures = {**result.mesh, "up": None if up is None else msgspec.convert(up, Up)}
+    for reason, count in result.keyframes_rejected.items():
+        typer.echo(f"left out {count_of(count, 'keyframe')}: {reason}", err=True)
+    took = sum(result.seconds.values())
+    tiles = f", {count_of(result.tiles, 'tile')}" if result.tiles else ""
+    typer.echo(
+        f"{result.folder}: {result.keyframes_fused} of {result.keyframes} keyframes, "
+        f"{count_of(result.blocks, 'block')}, in {took:.1f} s by {count_of(result.workers, 'worker')}\n"
+        f"hash {result.map_hash}\nmesh: {summarise(figures)}{tiles}"
+    )
+
+
+def _check(result: "FusedRun") -> None:
+    """Raise IncompleteRun where keyframes are missing that somebody has taken."""
+    from tsfusion.core.counts import count_of
+    from tsfusion.core.errors import IncompleteRun
+
+    if result.keyframes_lost:
+        lost = count_of(result.keyframes_lost, "keyframe")
+        raise IncompleteRun(
+            f"the map lacks {lost} or more, which the journal cannot give back: `tsfusion journal verify` "
+            "says where it is damaged"
+        )

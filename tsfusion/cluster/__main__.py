@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: MIT
+"""A worker process: jobs come on stdin, messages leave on stdout; it ends with its stdin."""
+
+import os
+import signal
+import struct
+import sys
+from typing import BinaryIO
+
+import msgspec
+
+from tsfusion.cluster.jobs import AnyJob
+from tsfusion.core import process
+
+LENGTH = struct.Struct("<I")  # before each job and each message
+
+
+def main() -> None:
+    """Do jobs until there are no more."""
+    process.on_parent_end(signal.SIGKILL)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for whoever gives the jobs
+    answers = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # what libraries print is no message
+    from tsfusion.cluster import job_runner
+
+    while (job := _next(sys.stdin.buffer)) is not None:
+        for message in job_runner.run(job):
+            encoded = msgspec.msgpack.encode(message)
+            answers.write(LENGTH.pack(len(encoded)) + encoded)
+            answers.flush()
+
+
+def _next(stream: BinaryIO) -> AnyJob | None:
+    head = stream.read(LENGTH.size)
+    if len(head) < LENGTH.size:
+        return None
+    job: AnyJob = msgspec.msgpack.decode(stream.read(LENGTH.unpack(head)[0]), type=AnyJob)
+    return job
+
+
+if __name__ == "__main__":
+    main()

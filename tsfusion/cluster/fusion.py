@@ -1,0 +1,378 @@
+# SPDX-License-Identifier: MIT
+"""A map of journals and datasets, fused by many workers: shares of the keyframes, their sum, its surface."""
+
+import hashlib
+import os
+import shutil
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import msgspec
+
+from tsfusion.cluster import jobs, tiling
+from tsfusion.cluster.carrying_out import CarryingOut
+from tsfusion.cluster.jobs import Done, Progress
+from tsfusion.cluster.keyframe_sources import Listed
+from tsfusion.cluster.schedulers import Scheduler
+from tsfusion.core import folder_lock, output_folder
+from tsfusion.core.config import VIEW_SETTINGS, VolumeConfig
+from tsfusion.core.durable_files import make_folder, replacing
+from tsfusion.core.errors import InvalidConfig, OutputError
+from tsfusion.geometry.up_direction import Up
+from tsfusion.pipelines import run_files
+from tsfusion.pipelines.run_files import Circumstances
+from tsfusion.tsdf import checkpoint
+
+WORK = ".fuse"  # folder of what is half done, in that of the results
+TILES = "tiles"  # folder of a mesh in tiles
+_MOST_KEYFRAMES = 512  # a job: what a lost worker costs
+_FAN_IN = 8  # maps that are added at once: each is read once, and takes memory for one chunk
+_PLAN = "plan"
+
+
+class Display(Protocol):
+    """Shows a person how far a run is."""
+
+    def stage(self, text: str) -> None:
+        """Announce the next part of the run."""
+
+    def show_fused(self, read: int, fused: int, total: int) -> None:
+        """Show how many keyframes are read and in a map."""
+
+    def show_steps(self, text: str, done: int, total: int) -> None:
+        """Show how many steps are done, after `text`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wishes:
+    """What a person wants beside the map.
+
+    Attributes:
+        up: away from the ground; None = it is found.
+        keep_islands: as of `mesh_files.write`.
+        worker_memory: bytes that each worker may take; None = no limit.
+        tile_size: metres, edge of a tile of the mesh; None = tiles are made, of a size that suits them, only
+            where the map does not fit into a worker's memory.
+    """
+
+    up: Up | None = None
+    keep_islands: bool | None = None
+    worker_memory: int | None = None
+    tile_size: float | None = None
+
+
+class FusedRun(msgspec.Struct, frozen=True, kw_only=True):
+    """Contents of `run.json`.
+
+    Attributes:
+        keyframes: that were read, `keyframes_fused` of them in the map; `keyframes_lost`: at least so many
+            are damaged in the journals.
+        workers, scheduler: how many did it, and whose they were.
+        workers_lost: how often one ended before its job was done.
+        jobs, jobs_found: all of them, and those that an earlier run had done.
+        seconds: of the whole run by step; `worker_seconds`: CPU time that its jobs took.
+        worker_peak_rss: most memory that a worker took, bytes.
+        tiles: number of tiles of the mesh.
+    """
+
+    kind: str = "fuse"
+    sources: list[str]
+    folder: str
+    keyframes: int
+    keyframes_fused: int
+    keyframes_rejected: dict[str, int]
+    keyframes_lost: int
+    map_hash: str
+    blocks: int
+    workers: int
+    scheduler: str
+    workers_lost: int
+    jobs: int
+    jobs_found: int
+    seconds: dict[str, float]
+    worker_seconds: dict[str, float]
+    worker_peak_rss: int
+    worker_memory: int | None
+    mesh: dict[str, Any]
+    tiles: int
+    config: dict[str, Any]
+    versions: dict[str, str]
+    made: Circumstances
+
+
+@dataclass
+class _Clock:
+    """What each step takes."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+    worker_seconds: dict[str, float] = field(default_factory=dict)
+    peak_rss: int = 0
+    base_rss: int = 0
+    jobs: int = 0
+
+    @contextmanager
+    def step(self, name: str) -> Iterator[list[Done]]:
+        """Time a step; the block puts there what its jobs said in the end."""
+        begin, ended = time.monotonic(), list[Done]()
+        yield ended
+        self.seconds[name] = round(time.monotonic() - begin, 3)
+        self.worker_seconds[name] = round(sum(one.cpu_seconds for one in ended), 3)
+        self.jobs += len(ended)
+        self.peak_rss = max([self.peak_rss, *(one.peak_rss for one in ended)])
+        self.base_rss = max([self.base_rss, *(one.base_rss for one in ended)])
+
+
+def check(config: VolumeConfig) -> None:
+    """Raise InvalidConfig for settings with which a map is no sum."""
+    if config.checked_model().regularizer != "off":
+        raise InvalidConfig(
+            "smoothing along rays depends on the order of keyframes, so that parts of it do not add up: fuse "
+            "with regularizer = off (the surface `field` smooths afterwards)"
+        )
+
+
+def fuse(
+    found: Listed,
+    config: VolumeConfig,
+    out: Path | None,
+    make_scheduler: Callable[[], Scheduler],
+    display: Display,
+    *,
+    wishes: Wishes | None = None,
+    overwrite: bool = False,
+) -> FusedRun:
+    """Fuse keyframes with a scheduler's workers; what it leaves is in the folder of the result.
+
+    A run that was interrupted goes on where it was, when it is started again with the same keyframes,
+    settings and folder.
+
+    Args:
+        out: folder of `map.tsf`, `mesh.ply`, `mesh.glb`, `run.json`; None = a dated one.
+        make_scheduler: starts it; it is closed at the end.
+
+    Raises:
+        InvalidConfig: for settings with which a map is no sum.
+        OutputError: when `out` cannot be written, or holds files already; for a map without a surface.
+        MapFull, WeightOverflow: when the sum has no room.
+        WorkerLost: where one worker after the other ends at the same job.
+        TsfusionError: as whatever a job raises.
+    """
+    check(config)
+    with output_folder.results(out, overwrite=overwrite) as (results, folder):
+        place = (results if out is None else folder).absolute()  # a dated folder is not found again
+        with _workplace(place / WORK, found.fingerprint(config)) as work:
+            run = _Run(found, config, work, display, wishes or Wishes())
+            with _closing(make_scheduler()) as scheduler:
+                made = run.carry_out(scheduler, results, folder)
+            run_files.write_record(results, made)
+            if out is not None:
+                shutil.rmtree(place / TILES, ignore_errors=True)  # of an earlier run that is replaced
+        shutil.rmtree(place / WORK, ignore_errors=True)
+    return made
+
+
+@contextmanager
+def _closing(scheduler: Scheduler) -> Iterator[Scheduler]:
+    try:
+        yield scheduler
+    finally:
+        scheduler.close()
+
+
+@contextmanager
+def _workplace(work: Path, fingerprint: str) -> Iterator[Path]:
+    """The folder of what is half done: empty, or as an earlier run with the same plan left it."""
+    try:
+        make_folder(work)
+        lock = folder_lock.hold(work)
+    except BlockingIOError as error:
+        raise OutputError(
+            f"another run works in {work}: wait for its end, or choose another folder"
+        ) from error
+    except OSError as error:
+        raise OutputError(f"cannot write to {work}: {error.strerror}; choose another folder") from error
+    with lock:
+        plan = work / _PLAN
+        with suppress(OSError):
+            if plan.read_text(encoding="ascii") == fingerprint:
+                yield work
+                return
+        for path in work.iterdir():
+            path.unlink()
+        with replacing(plan) as file:
+            file.write(fingerprint.encode("ascii"))
+        yield work
+
+
+class _Run:
+    def __init__(
+        self, found: Listed, config: VolumeConfig, work: Path, display: Display, wishes: Wishes
+    ) -> None:
+        self._found, self._config, self._work = found, config, work
+        self._display, self._wishes = display, wishes
+        self._clock = _Clock()
+        self._common: dict[str, Any] = {
+            "folder": str(work),
+            "worker_memory": wishes.worker_memory,
+            "threads": config.threads or 1,
+        }
+        self._progress: dict[str, Progress] = {}
+
+    def carry_out(self, scheduler: Scheduler, results: Path, folder: Path) -> FusedRun:
+        """Do all steps; the files of the results lie in `results` then."""
+        doing = CarryingOut(scheduler, self._work, self._watch)
+        with self._clock.step("fusing") as ended:
+            ended.extend(self._fuse(doing, scheduler.workers))
+        fused = ended
+        with self._clock.step("adding") as ended:
+            file, added = self._add(doing, [name for one in fused for name in one.files])
+            ended.extend(added)
+        with checkpoint.reading(self._work / file) as (header, _):
+            map_hash, blocks = header.map_hash, header.blocks
+        with self._clock.step("meshing") as ended:
+            mesh = self._mesh(doing, file)
+            ended.append(mesh)
+            tiles = self._tiles(doing, file, mesh)
+            ended.extend(tiles)
+        self._collect(results, file, mesh, tiles)
+        left_out = Counter(self._found.left_out)
+        for one in fused:
+            left_out.update(one.left_out)
+        clock = self._clock
+        return FusedRun(
+            sources=self._found.names,
+            folder=str(folder),
+            keyframes=sum(one.read for one in fused),
+            keyframes_fused=header.keyframes,
+            keyframes_rejected=dict(left_out),
+            keyframes_lost=self._found.lost,
+            map_hash=map_hash,
+            blocks=blocks,
+            workers=scheduler.workers,
+            scheduler=scheduler.name,
+            workers_lost=doing.lost,
+            jobs=clock.jobs,
+            jobs_found=doing.found,
+            seconds=clock.seconds,
+            worker_seconds=clock.worker_seconds,
+            worker_peak_rss=clock.peak_rss,
+            worker_memory=self._wishes.worker_memory,
+            mesh={name: value for name, value in mesh.figures.items() if name != "is_whole"},
+            tiles=sum(bool(one.files) for one in tiles),
+            config=msgspec.to_builtins(self._config),
+            versions=run_files.versions(),
+            made=run_files.circumstances(),
+        )
+
+    # --- steps ---
+
+    def _fuse(self, doing: CarryingOut, workers: int) -> list[Done]:
+        count = self._found.count
+        shares = min(count, workers * -(-count // (workers * _MOST_KEYFRAMES)))
+        self._display.stage(f"fusing {count} keyframes with {workers} workers")
+        todo = [
+            jobs.Fuse(
+                name=f"fuse-{number}-of-{shares}",
+                config=self._config,
+                keyframes=keyframes,
+                **self._common,
+            )
+            for number, keyframes in enumerate(self._found.shares(shares))
+        ]
+
+        def finished(one: Done) -> None:
+            self._watch(Progress(one.name, one.read, one.fused))
+
+        return doing.do(todo, finished)
+
+    def _watch(self, said: Progress) -> None:
+        self._progress[said.name] = said
+        read, fused = (
+            sum(getattr(one, name) for one in self._progress.values()) for name in ("read", "fused")
+        )
+        self._display.show_fused(read, fused, self._found.count)
+
+    def _add(self, doing: CarryingOut, files: list[str]) -> tuple[str, list[Done]]:
+        """Add maps as a tree; the file of the whole map, and what the jobs said."""
+        ended: list[Done] = []
+        if len(files) > 1:
+            self._display.stage(f"adding {len(files)} parts of the map")
+        while len(files) > 1:
+            groups = [files[i : i + _FAN_IN] for i in range(0, len(files), _FAN_IN)]
+            todo = [jobs.Add(name=f"add-{_digest(group)}", files=group, **self._common) for group in groups]
+            done = doing.do(todo)
+            ended += done
+            files = [one.files[0] for one in done]
+        return files[0], ended
+
+    def _mesh(self, doing: CarryingOut, file: str) -> Done:
+        self._display.stage("meshing")
+        wishes = self._wishes
+        (done,) = doing.do(
+            [
+                jobs.MeshMap(
+                    name=f"mesh-{_digest([file, wishes.up, wishes.keep_islands])}",
+                    file=file,
+                    view=self._view,
+                    up=wishes.up,
+                    keep_islands=wishes.keep_islands,
+                    **self._common,
+                )
+            ]
+        )
+        if not done.files:
+            raise OutputError("the map has no surface to write: fuse more of the scene or lower --min-weight")
+        return done
+
+    def _tiles(self, doing: CarryingOut, file: str, mesh: Done) -> list[Done]:
+        wishes = self._wishes
+        if wishes.tile_size is None and mesh.figures["is_whole"]:
+            return []
+        most = tiling.most_blocks(wishes.worker_memory, self._clock.base_rss)
+        boxes = tiling.boxes(self._work / file, wishes.tile_size, most)
+        given = mesh.figures["up"]
+        up = None if given is None else msgspec.convert(given, Up)
+        todo = [
+            jobs.MeshTile(
+                name=f"tile-{_digest([file, box, up])}",
+                file=file,
+                view=self._view,
+                up=up,
+                low=box[0],
+                high=box[1],
+                **self._common,
+            )
+            for box in boxes
+        ]
+        self._display.stage(f"meshing {len(todo)} tiles")
+        finished = iter(range(1, len(todo) + 1))
+        return doing.do(todo, lambda _: self._display.show_steps("tiles", next(finished), len(todo)))
+
+    @property
+    def _view(self) -> dict[str, Any]:
+        return {name: getattr(self._config, name) for name in VIEW_SETTINGS}
+
+    def _collect(self, results: Path, file: str, mesh: Done, tiles: list[Done]) -> None:
+        """Move the files of the results out of the folder of what is half done."""
+        try:
+            os.replace(self._work / file, results / run_files.MAP)
+            for name in mesh.files:
+                os.replace(self._work / name, results / f"mesh{Path(name).suffix}")
+            made = [one for one in tiles if one.files]
+            if made:
+                (results / TILES).mkdir()
+                for number, one in enumerate(made):
+                    os.replace(self._work / one.files[0], results / TILES / f"{number:05}.glb")
+                tiling.write_tileset(results / TILES, [one.figures for one in made])
+        except OSError as error:
+            raise OutputError(f"cannot write to {results}: {error.strerror}") from error
+
+
+def _digest(what: Any) -> str:
+    """A name for a job that is told from others by this."""
+    return hashlib.blake2b(msgspec.msgpack.encode(what), digest_size=6).hexdigest()

@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: MIT
+"""Jobs that workers do, and what they say meanwhile. A job is files in, files out: it can be done twice.
+
+Whoever does a job writes its files under names that nobody has had before, and `NAME.done`, which lists them,
+last. A worker that was taken for dead and went on does no harm.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from msgspec import Struct
+from numpy.typing import NDArray
+
+from tsfusion.core.config import VolumeConfig
+from tsfusion.geometry.up_direction import Up
+
+
+class JournalKeyframes(Struct, tag="journal", frozen=True):
+    """Keyframes of a journal at their final poses.
+
+    Attributes:
+        files: segments, by path or URL.
+        file: (n,) which of them each is in; `offsets`: where its record begins.
+        poses: (n, 12) float64 as bytes, the upper three rows of T_world_camera.
+    """
+
+    files: list[str]
+    file: list[int]
+    offsets: list[int]
+    poses: bytes
+
+    def __len__(self) -> int:
+        return len(self.offsets)
+
+    def part(self, first: int, stop: int) -> "JournalKeyframes":
+        """Keyframes first … stop-1."""
+        poses = self.rows()[first:stop].tobytes()
+        return JournalKeyframes(self.files, self.file[first:stop], self.offsets[first:stop], poses)
+
+    def rows(self) -> NDArray[np.float64]:
+        """(n, 12)."""
+        return np.frombuffer(self.poses, np.float64).reshape(-1, 12)
+
+
+class DatasetKeyframes(Struct, tag="dataset", frozen=True):
+    """Keyframes first … stop-1 of a dataset that `open_dataset` opens with these options."""
+
+    path: str
+    options: dict[str, Any]
+    first: int
+    stop: int
+
+    def __len__(self) -> int:
+        return self.stop - self.first
+
+    def part(self, first: int, stop: int) -> "DatasetKeyframes":
+        """Keyframes first … stop-1 of these."""
+        return msgspec.structs.replace(self, first=self.first + first, stop=self.first + stop)
+
+
+Keyframes = JournalKeyframes | DatasetKeyframes
+
+
+class Job(Struct, frozen=True, kw_only=True):
+    """What every job has.
+
+    Attributes:
+        name: of the job, distinct in its run.
+        folder: where its files go.
+        worker_memory: bytes that the whole process may take; None = no limit.
+        threads: of the kernels.
+    """
+
+    name: str
+    folder: str
+    worker_memory: int | None = None
+    threads: int = 1
+
+
+class Fuse(Job, tag="fuse", frozen=True, kw_only=True):
+    """Make a map of keyframes; one that is larger than memory is left in several files."""
+
+    config: VolumeConfig
+    keyframes: list[Keyframes]
+
+
+class Add(Job, tag="add", frozen=True, kw_only=True):
+    """Add saved maps, in one file."""
+
+    files: list[str]
+
+
+class MeshMap(Job, tag="mesh", frozen=True, kw_only=True):
+    """Mesh the whole map.
+
+    Attributes:
+        file: the map.
+        view: settings of the surface that differ from the map's.
+        up: away from the ground; None = it is found.
+        keep_islands: as of `mesh_files.write`.
+    """
+
+    file: str
+    view: dict[str, Any]
+    up: Up | None = None
+    keep_islands: bool | None = None
+
+
+class MeshTile(Job, tag="tile", frozen=True, kw_only=True):
+    """Mesh the cells of blocks low ≤ (x, y, z) < high of a map, with what lies around them."""
+
+    file: str
+    view: dict[str, Any]
+    up: Up | None
+    low: tuple[int, int, int]
+    high: tuple[int, int, int]
+
+
+AnyJob = Fuse | Add | MeshMap | MeshTile
+
+
+class Progress(Struct, tag="progress", frozen=True):
+    """How far a job is: keyframes read, and those of them in the map."""
+
+    name: str
+    read: int
+    fused: int
+
+
+class Done(Struct, tag="done", frozen=True, kw_only=True):
+    """A job is done.
+
+    Attributes:
+        files: that it has written, in its folder.
+        left_out: reason → number of keyframes that the map could not take.
+        seconds, cpu_seconds: that it took.
+        figures: of what it made.
+        base_rss, peak_rss: memory of the process when the job began, and the most so far, bytes.
+    """
+
+    name: str
+    files: list[str]
+    seconds: float
+    cpu_seconds: float
+    base_rss: int
+    peak_rss: int
+    read: int = 0
+    fused: int = 0
+    left_out: dict[str, int] = {}
+    figures: dict[str, Any] = {}
+
+
+class Failed(Struct, tag="failed", frozen=True):
+    """A job cannot be done, by whomever: `kind` of error, and why."""
+
+    name: str
+    kind: str
+    why: str
+
+
+class Lost(Struct, tag="lost", frozen=True):
+    """Whoever did a job has ended before it was done."""
+
+    name: str
+    why: str
+
+
+Message = Progress | Done | Failed | Lost
+
+
+def done_file(folder: Path, name: str) -> Path:
+    """Where a job writes that it is done."""
+    return folder / f"{name}.done"

@@ -1,0 +1,227 @@
+# SPDX-License-Identifier: MIT
+"""What is fused: journals at their final poses, and datasets; listed by one process, read by others."""
+
+import hashlib
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from tsfusion import journal
+from tsfusion.cluster.jobs import DatasetKeyframes, JournalKeyframes, Keyframes
+from tsfusion.core.config import VolumeConfig
+from tsfusion.core.counts import count_of
+from tsfusion.core.durable_files import size_of
+from tsfusion.core.errors import CheckpointError, InvalidConfig, JournalError, MapError
+from tsfusion.datasets import open_dataset
+from tsfusion.datasets.dataset import Dataset
+from tsfusion.fuser.journaled_keyframes import JournaledKeyframes
+from tsfusion.geometry.keyframe import Keyframe
+from tsfusion.journal import locations, state_folder
+from tsfusion.tsdf import checkpoint
+from tsfusion.wire import codec
+
+SYNTHETIC = "synthetic:"
+
+
+class Listed(msgspec.Struct):
+    """Keyframes that are to be fused.
+
+    Attributes:
+        keyframes: of each source, in their order.
+        names: of the sources.
+        config: settings of the saved map beside the first journal; None = there is none.
+        sensor: of the first dataset; None = there is none.
+        left_out: reason → number of records without a readable header, or of a dataset's frames.
+        lost: number of keyframes that damage in the journals has destroyed, at least.
+    """
+
+    keyframes: list[Keyframes] = []
+    names: list[str] = []
+    config: VolumeConfig | None = None
+    sensor: str | None = None
+    left_out: dict[str, int] = {}
+    lost: int = 0
+
+    @property
+    def count(self) -> int:
+        """Of all sources together."""
+        return sum(map(len, self.keyframes))
+
+    def shares(self, count: int) -> list[list[Keyframes]]:
+        """All of them in `count` runs of about the same length; neighbours see the same blocks."""
+        ends = np.cumsum([len(one) for one in self.keyframes]).tolist()
+        borders = np.linspace(0, self.count, count + 1).round().astype(int).tolist()
+        found = []
+        for first, stop in pairwise(borders):
+            parts = []
+            for one, end in zip(self.keyframes, ends, strict=True):
+                begin = end - len(one)
+                if max(first, begin) < min(stop, end):
+                    parts.append(one.part(max(first, begin) - begin, min(stop, end) - begin))
+            found.append(parts)
+        return found
+
+    def fingerprint(self, config: VolumeConfig) -> str:
+        """Equal for the same keyframes at the same poses, with the same settings."""
+        digest = hashlib.blake2b(digest_size=16)
+        digest.update(msgspec.msgpack.encode((config, self.keyframes)))
+        for one in self.keyframes:
+            if isinstance(one, JournalKeyframes):
+                digest.update(repr([size_of(locations.location(name)) for name in one.files]).encode())
+        return digest.hexdigest()
+
+
+def listed(
+    sources: Sequence[str],
+    *,
+    map_name: str | None = None,
+    same_frame: bool = False,
+    options: dict[str, Any] | None = None,
+    watch: state_folder.Watcher = lambda _done, _all: None,
+) -> Listed:
+    """The keyframes of state folders, journals and datasets, which are in one coordinate frame.
+
+    Args:
+        map_name: which map of a state folder with several.
+        same_frame: they are in one, also where scans found their poses each for itself.
+        options: of the datasets.
+        watch: told the bytes of a journal that are read, and all of them.
+
+    Raises:
+        JournalError, DatasetError: when one cannot be read, or holds no keyframe.
+        InvalidConfig: for options without a dataset.
+        MapError: when keyframes would count twice, or the frames are not known to be one.
+    """
+    found, left_out = Listed(), Counter[str]()
+    seen = dict[tuple[bytes, int], str]()
+    worlds: set[str] | None = None
+    for source in sources:
+        if source.startswith(SYNTHETIC) or not _is_journal(source):
+            here = {""}
+            left_out.update(_add_dataset(found, source, options or {}))
+        else:
+            keyframes = _journal(found, source, map_name, watch)
+            if len(sources) > 1:
+                _check_distinct(seen, keyframes, source)
+            left_out.update(keyframes.unreadable)
+            here = keyframes.worlds or {""}
+        if worlds is not None and not same_frame and worlds.isdisjoint(here):
+            raise MapError(
+                f"{source} is of another scan that found its poses itself, in a coordinate frame of its own: "
+                "they fuse only if they are known to be in one frame (--same-frame)"
+            )
+        worlds = here | (worlds or set())
+        found.names.append(source)
+    if not found.count:
+        lost = f"; {found.lost} or more are damaged or cannot be read (see above)" if found.lost else ""
+        raise JournalError(f"no keyframes in {', '.join(sources)}{lost}")
+    if options and found.sensor is None:
+        raise InvalidConfig("--option has no effect on a journal: leave it out")
+    found.left_out = dict(left_out)
+    return found
+
+
+def _is_journal(source: str) -> bool:
+    return state_folder.is_journal(locations.location(source))
+
+
+def _journal(
+    found: Listed, source: str, map_name: str | None, watch: state_folder.Watcher
+) -> JournaledKeyframes:
+    path = locations.location(source)
+    keyframes = JournaledKeyframes(state_folder.find_journal(path, map_name), watch=watch)
+    places, poses = keyframes.places(), keyframes.poses()
+    files = sorted({str(place.file) for place in places})
+    number = {name: index for index, name in enumerate(files)}
+    found.keyframes.append(
+        JournalKeyframes(
+            [locations.absolute(name) for name in files],
+            [number[str(place.file)] for place in places],
+            [place.offset for place in places],
+            np.ascontiguousarray(poses[:, :3]).tobytes(),
+        )
+    )
+    found.lost += keyframes.lost
+    if found.config is None:
+        found.config = _saved_settings(path, map_name)
+    return keyframes
+
+
+def _saved_settings(path: Path, map_name: str | None) -> VolumeConfig | None:
+    """The settings of the saved map beside a journal; None = there is none that can be read."""
+    if locations.is_url(path):
+        return None
+    try:
+        with checkpoint.reading(state_folder.resolve_map(path, map_name) / state_folder.MAP_FILE) as opened:
+            return opened[0].config
+    except CheckpointError:
+        return None
+
+
+def _check_distinct(seen: dict[tuple[bytes, int], str], keyframes: JournaledKeyframes, source: str) -> None:
+    shared = 0
+    for place in keyframes.places():
+        before = seen.setdefault((place.session, place.seq), source)
+        shared += before != source
+        other = before if before != source else source
+    if shared:
+        raise MapError(
+            f"{source} and {other} both hold {count_of(shared, 'keyframe')} of the same session: they would "
+            "count twice"
+        )
+
+
+def _add_dataset(found: Listed, source: str, options: dict[str, Any]) -> dict[str, int]:
+    """Add a dataset; frames that it left out, by reason."""
+    dataset = open_dataset(source, **options)
+    path = source if source.startswith(SYNTHETIC) else str(Path(source).expanduser().absolute())
+    found.keyframes.append(DatasetKeyframes(path, options, 0, len(dataset)))
+    found.sensor = found.sensor or dataset.sensor
+    return dataset.skipped
+
+
+# --- reading ---
+
+
+def reading(keyframes: Sequence[Keyframes]) -> Iterator[Callable[[], Keyframe]]:
+    """What reads each keyframe, in their order.
+
+    A call raises JournalError or DatasetError when it cannot be read, DecodeError or InvalidKeyframe when it
+    is of no use, to a server neither.
+    """
+    for one in keyframes:
+        if isinstance(one, JournalKeyframes):
+            yield from _of_journal(one)
+        else:
+            dataset = open_dataset(one.path, **one.options)
+            yield from (_Frame(dataset, index) for index in range(one.first, one.stop))
+
+
+class _Frame:
+    """A keyframe of a dataset."""
+
+    def __init__(self, dataset: Dataset, index: int) -> None:
+        self._dataset, self._index = dataset, index
+
+    def __call__(self) -> Keyframe:
+        return self._dataset[self._index]
+
+
+def _of_journal(one: JournalKeyframes) -> Iterator[Callable[[], Keyframe]]:
+    rows = one.rows().reshape(-1, 3, 4)
+    with journal.Reading() as records:
+        for file, offset, pose in zip(one.file, one.offsets, rows, strict=True):
+
+            def read(file: int = file, offset: int = offset, pose: Any = pose) -> Keyframe:
+                path = locations.location(one.files[file])
+                found = codec.decode_keyframe(records.at(path, offset).frames)
+                T = np.vstack([pose, (0.0, 0.0, 0.0, 1.0)])
+                return replace(found, T_world_camera=T)
+
+            yield read

@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: MIT
+"""A map's blocks in cubes that a worker each meshes, and the index by which viewers find their files.
+
+The index is 3D Tiles 1.1 (OGC 22-025r4): a tree of boxes, whose leaves name GLB files. glTF's up is +Y, that
+of 3D Tiles +Z: viewers turn what a GLB holds, (x, y, z) → (x, −z, y).
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core.durable_files import replacing
+from tsfusion.core.errors import InvalidConfig
+from tsfusion.tsdf import checkpoint
+from tsfusion.tsdf.block_store import unpack_keys
+
+USUAL_BLOCKS = 16_384  # of a tile
+_BLOCK_BYTES = 24 << 10  # of a block that is meshed: its sums, values, the field's solution, triangles
+_WORKING_BYTES = 64 << 20  # that meshing takes, however small a tile is
+_HALO = 4  # blocks around a tile, at most
+_LEAST_SIDE, _MOST_SIDE = 4, 1 << 14  # blocks
+
+Box = tuple[tuple[int, int, int], tuple[int, int, int]]
+
+
+def most_blocks(worker_memory: int | None, base_rss: int) -> int:
+    """Blocks that a worker can mesh at once, those around a tile among them.
+
+    Args:
+        base_rss: bytes that a worker takes before.
+    """
+    if worker_memory is None:
+        return USUAL_BLOCKS
+    return max(1, min(USUAL_BLOCKS, (worker_memory - base_rss - _WORKING_BYTES) // _BLOCK_BYTES))
+
+
+def boxes(file: Path, tile_size: float | None, most: int) -> list[Box]:
+    """The cubes that hold a map's blocks: block coordinates, first and last + 1.
+
+    Args:
+        file: the map.
+        tile_size: metres, edge of a cube; None = the largest with `most` blocks at most, halo included.
+
+    Raises:
+        InvalidConfig: for a size that is none.
+    """
+    with checkpoint.reading(file) as (header, chunks):
+        keys = np.empty(header.blocks, np.int64)
+        for chunk in chunks:
+            chunk.fill(keys[chunk.first : chunk.first + chunk.blocks])
+    blocks = unpack_keys(keys).astype(np.int64)
+    side = _side(blocks, most) if tile_size is None else round(tile_size / (8 * header.config.voxel_size))
+    if side < 1:
+        raise InvalidConfig(
+            f"a tile must have an edge of {8 * header.config.voxel_size:g} m or more, got {tile_size:g} m"
+        )
+    cubes = np.unique(blocks // side, axis=0) * side
+    return [((x, y, z), (x + side, y + side, z + side)) for x, y, z in cubes.tolist()]
+
+
+def _side(blocks: NDArray[np.int64], most: int) -> int:
+    """Blocks of a cube's edge."""
+    side = _MOST_SIDE
+    while side > _LEAST_SIDE:
+        _, counts = np.unique(blocks // side, axis=0, return_counts=True)
+        around = ((side + 2 * _HALO) / side) ** 2  # a surface goes on beyond the cube on four sides
+        if counts.max() * min(around, len(blocks) / counts.max()) <= most:
+            break
+        side //= 2
+    return side
+
+
+def write_tileset(folder: Path, tiles: list[dict[str, Any]]) -> Path:
+    """Write `tileset.json` for the files 00000.glb and on of a folder.
+
+    Args:
+        tiles: `low` and `high` corners of each file's vertices, metres, as they stand in the file.
+
+    Raises:
+        OSError: when the disk refuses.
+    """
+    corners = np.array([(tile["low"], tile["high"]) for tile in tiles])  # (n, 2, 3)
+    corners = np.stack([corners[..., 0], -corners[..., 2], corners[..., 1]], axis=-1)
+    corners = np.stack([corners.min(axis=1), corners.max(axis=1)], axis=1)
+    root = _node(np.arange(len(tiles)), corners)
+    size = float(np.linalg.norm(corners[:, 1].max(axis=0) - corners[:, 0].min(axis=0)))
+    tileset = {"asset": {"version": "1.1"}, "geometricError": size, "root": {**root, "refine": "ADD"}}
+    path = folder / "tileset.json"
+    with replacing(path) as file:
+        file.write(json.dumps(tileset, indent=1).encode() + b"\n")
+    return path
+
+
+def _node(which: NDArray[np.int64], corners: NDArray[np.float64]) -> dict[str, Any]:
+    """A node of the tree: one file, or eight boxes or fewer."""
+    low, high = corners[which, 0].min(axis=0), corners[which, 1].max(axis=0)
+    node: dict[str, Any] = {"boundingVolume": {"box": _box(low, high)}}
+    if len(which) == 1:
+        return {**node, "geometricError": 0.0, "content": {"uri": f"{which[0]:05}.glb"}}
+    centers = corners[which].mean(axis=1)
+    octant = (centers > (centers.min(axis=0) + centers.max(axis=0)) / 2) @ (4, 2, 1)
+    groups = [which[octant == number] for number in np.unique(octant)]
+    if len(groups) == 1:  # all at one place
+        groups = np.array_split(which, min(8, len(which)))
+    error = float(np.linalg.norm(high - low)) / 2
+    return {**node, "geometricError": error, "children": [_node(group, corners) for group in groups]}
+
+
+def _box(low: NDArray[np.float64], high: NDArray[np.float64]) -> list[float]:
+    """Centre and three half axes."""
+    half = np.maximum((high - low) / 2, 1e-3)
+    return [*((low + high) / 2).tolist(), *np.diag(half).ravel().tolist()]
