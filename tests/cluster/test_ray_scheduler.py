@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: MIT
+"""Ray does the jobs: the same map, also where a worker of it is killed."""
+
+import os
+import signal
+import threading
+from pathlib import Path
+
+import pytest
+from command_processes import Here, descendants, eventually
+from silent_display import Silent
+
+from tsfusion import Volume
+from tsfusion.cluster import fusion, keyframe_sources
+from tsfusion.cluster.ray_scheduler import RayCluster
+from tsfusion.core.config import VolumeConfig
+from tsfusion.core.errors import TransportError
+
+pytest.importorskip("ray", reason="Ray is not installed: pip install '.[ray]'")
+# Ray's own: sockets and files of a cluster that ends with the process
+pytestmark = [pytest.mark.filterwarnings("ignore"), pytest.mark.nightly]
+
+CONFIG = VolumeConfig(voxel_size=0.03, threads=1)
+
+
+def doing() -> list[int]:
+    """The processes in which Ray does a job now."""
+    found = []
+    for pid in descendants(os.getpid()):
+        try:
+            name = Path(f"/proc/{pid}/cmdline").read_bytes()
+        except OSError:
+            continue
+        if name.startswith(b"ray::_do"):
+            found.append(pid)
+    return found
+
+
+def test_a_killed_worker_is_replaced_by_ray(tmp_path: Path) -> None:
+    found = keyframe_sources.listed(["synthetic:room"], options={"count": 24})
+    killed: list[int] = []
+
+    def kill() -> None:
+        if eventually(lambda: bool(doing()), 90.0):
+            killed.append(doing()[0])
+            os.kill(killed[0], signal.SIGKILL)
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    run = fusion.fuse(found, CONFIG, tmp_path / "out", lambda: RayCluster(2), Silent())
+    killer.join()
+    whole = Volume(CONFIG)
+    for keyframe in keyframe_sources.reading(found.keyframes):
+        whole.integrate(keyframe())
+    assert (run.scheduler, run.map_hash, run.keyframes_fused) == ("ray", whole.map_hash(), 24)
+    assert (len(killed), run.workers_lost) == (1, 1)
+    assert not doing()
+
+
+def test_a_cluster_that_is_not_there_is_told() -> None:
+    with pytest.raises(TransportError, match="there is no Ray cluster"):
+        RayCluster(1, "127.0.0.1:9")
+
+
+def test_the_command_asks_for_ray(here: Here, tmp_path: Path) -> None:
+    done = here(
+        "fuse", "synthetic:room", "--option", "count=6", "--voxel-size", 0.06, "--ray", "--workers", 2
+    )
+    assert done.returncode == 0, done.stderr
+    assert "by 2 workers" in done.stdout

@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: MIT
+"""Jobs done by Ray (extra `ray`): on a cluster, or on one that is started on this machine.
+
+Workers on other machines need tsfusion, and the folder of the results under the same path.
+"""
+
+import logging
+import os
+import socket
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import msgspec
+
+from tsfusion.cluster.jobs import AnyJob, Done, Failed, Lost, Message
+from tsfusion.core.errors import MissingDependency, TransportError
+
+_TICK_S = 1.0
+_CONNECT_S = 10.0
+_QUIET = {
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",  # it would warn of GPUs that nobody asked for
+    "RAY_USAGE_STATS_ENABLED": "0",  # it would tell its makers that and where we run
+}
+
+
+class RayCluster:
+    """A scheduler whose engine is Ray: it finds room for a worker, and another one for a worker that dies.
+
+    Args:
+        workers: jobs at the same time, at most; Ray gives each a core.
+        address: of a cluster, `auto` or `ray://HOST:PORT`; None = one is started here, and ended with this.
+
+    Raises:
+        MissingDependency: without Ray.
+        TransportError: when there is no such cluster.
+    """
+
+    name = "ray"
+
+    def __init__(self, workers: int, address: str | None = None) -> None:
+        for variable, value in _QUIET.items():
+            os.environ.setdefault(variable, value)
+        try:
+            import ray
+        except ImportError as error:
+            raise MissingDependency(
+                f"a Ray cluster needs another package ({error}): run `pip install '.[ray]'` in a clone"
+            ) from error
+        self.workers = workers
+        self._ray: Any = ray
+        own = {"num_cpus": workers, "include_dashboard": False} if address is None else {}
+        try:
+            _check_reachable(address)
+            ray.init(address=address or "local", log_to_driver=False, logging_level=logging.ERROR, **own)
+        except (OSError, ValueError, RuntimeError) as error:
+            raise TransportError(f"there is no Ray cluster at {address}: {error}") from error
+        # One attempt: whoever gives the jobs counts the lost ones, whatever the engine is.
+        self._do = ray.remote(num_cpus=1, max_retries=0, num_returns="streaming")(_do)
+        self._under_way: dict[Any, str] = {}
+
+    def start(self, job: AnyJob) -> None:
+        self._under_way[self._do.options(num_cpus=job.threads).remote(msgspec.msgpack.encode(job))] = job.name
+
+    def wait(self) -> Sequence[Message]:
+        ready: list[Any] = []
+        while not ready:
+            ready, _ = self._ray.wait(list(self._under_way), num_returns=1, timeout=_TICK_S)
+        return [self._next(one) for one in ready]
+
+    def _next(self, under_way: Any) -> Message:
+        """The next message of a job."""
+        try:
+            message: Message = msgspec.msgpack.decode(self._ray.get(next(under_way)), type=Message)
+        except StopIteration:
+            message = Lost(self._under_way[under_way], "it ended without a result")
+        except self._ray.exceptions.RayError as error:
+            message = Lost(
+                self._under_way[under_way], f"{type(error).__name__}: {str(error).splitlines()[0]}"
+            )
+        if isinstance(message, Done | Failed | Lost):
+            del self._under_way[under_way]
+        return message
+
+    def close(self) -> None:
+        for under_way in self._under_way:
+            self._ray.cancel(under_way, force=True)
+        self._under_way.clear()
+        self._ray.shutdown()
+
+
+def _check_reachable(address: str | None) -> None:
+    """Raise OSError where nobody listens at HOST:PORT: Ray itself tries for minutes."""
+    host, colon, port = (address or "").removeprefix("ray://").rpartition(":")
+    if colon and port.isdigit():
+        socket.create_connection((host.strip("[]"), int(port)), _CONNECT_S).close()
+
+
+def _do(encoded: bytes) -> Iterator[bytes]:
+    """Do an encoded job, on whatever machine this runs."""
+    from tsfusion.cluster import job_runner
+
+    for message in job_runner.run(msgspec.msgpack.decode(encoded, type=AnyJob)):
+        yield msgspec.msgpack.encode(message)
