@@ -27,3 +27,4 @@ nightly:  ## the long forms of what the tests try: about two hours
 	$(PYTHON) scripts/soak.py --keyframes 10000 --kills 12
 	$(PYTHON) scripts/faults.py
 	$(PYTHON) scripts/delivery.py
+	$(PYTHON) scripts/cluster.py --kills 20
