@@ -1,15 +1,21 @@
 # SPDX-License-Identifier: MIT
-"""The documents name only what exists, and the README's Python is run as it stands."""
+"""The documents name only what exists; their commands are understood, and their Python is run as it stands."""
 
+import ast
+import os
 import re
 import shlex
+from collections.abc import Iterator
 from pathlib import Path
 
+import doc_pages
 import msgspec
+import numpy as np
 import pytest
-from command_processes import server, tsfusion
+from command_processes import server
 from repository import ROOT
 
+import tsfusion
 from tsfusion.core.config import ClientConfig, ServerConfig
 
 ROOT_DOCUMENTS = ("README.md", "ARCHITECTURE.md", "CONTRIBUTING.md")
@@ -52,65 +58,96 @@ def test_the_commands_for_contributors_exist() -> None:
         assert (ROOT / word).exists(), word
 
 
-README = (ROOT / "README.md").read_text(encoding="utf-8")
-LIVE = "tcp://127.0.0.1:5555"
+PAGES = [pytest.param(page, id=str(page.relative_to(ROOT))) for page in doc_pages.PAGES]
+PYTHON = [page for page in PAGES if any(b.language == "python" for b in doc_pages.blocks(page.values[0]))]
+LANGUAGES = {*doc_pages.SHELL, "python", "text", "toml", "cpp", "json", "diff"}
 
 
-def blocks(language: str) -> list[str]:
-    """The fenced blocks of a language, in order."""
-    return re.findall(rf"^```{language}\n(.*?)^```$", README, re.DOTALL | re.MULTILINE)
+@pytest.mark.parametrize("page", PAGES)
+def test_every_command_shown_is_understood(page: Path) -> None:
+    """Each `tsfusion VERB …` line names a verb, flags and values that the command itself takes."""
+    for block in doc_pages.blocks(page):
+        assert block.language in LANGUAGES, f"{page.name}:{block.line}"
+        assert block.mark in ("", "background") or block.needs, f"{page.name}:{block.line}: {block.mark}"
+        if block.language in doc_pages.SHELL:
+            for words in doc_pages.commands(block):
+                assert not doc_pages.misread(words), f"{page.name}:{block.line}: {' '.join(words)}"
 
 
-@pytest.mark.parametrize(
-    "code", [pytest.param(code, id=f"block{i}") for i, code in enumerate(blocks("python"))]
-)
-def test_python_runs(code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    program = compile(code, "README.md", "exec")
-    if LIVE not in code:
-        exec(program, {"__name__": "readme"})
-        return
-    with server(tmp_path / "state") as (address, _):
-        exec(compile(code.replace(LIVE, address), "README.md", "exec"), {"__name__": "readme"})
-
-
-def test_there_is_python_to_run() -> None:
-    assert len(blocks("python")) >= 2
-
-
-def words_of(command: list[str]) -> tuple[str, ...]:
-    """The verb of a command, with its group."""
-    return tuple(command[: 2 if command[0] in ("map", "journal", "keys", "spool", "config") else 1])
-
-
-def test_every_flag_shown_exists() -> None:
-    """Each `tsfusion VERB …` line of the README names a verb and flags that its help knows."""
-    lines = [
-        re.sub(r"^\w+\$\s+", "", line)  # the prompt says on which machine
-        for block in blocks("sh")
-        for line in re.split(r"&&|>|\n", block)
+def test_commands_are_found_and_wrong_ones_seen() -> None:
+    found = [
+        words
+        for page in doc_pages.PAGES
+        for block in doc_pages.blocks(page)
+        if block.language in doc_pages.SHELL
+        for words in doc_pages.commands(block)
     ]
-    commands = [
-        shlex.split(line, comments=True)[1:]
-        for line in lines
-        if line.strip().split(" ")[0].endswith("tsfusion")
-    ]
-    assert len(commands) >= 6
-    for verb in {words_of(command) for command in commands}:
-        text = tsfusion(*verb, "--help-all").stdout or tsfusion(*verb, "--help").stdout
-        flags = {
-            word
-            for command in commands
-            if words_of(command) == verb
-            for word in command
-            if word.startswith("--")
-        }
-        assert text, verb
-        assert all(flag in text for flag in flags), (verb, flags)
+    assert len(found) > 80
+    assert "no verb" in doc_pages.misread(["scna"])
+    assert "--voxelsize" in doc_pages.misread(["replay", "room", "--voxelsize", "0.02"])
+    assert doc_pages.misread(["map", "crop", "a.tsf", "--box", "0", "0"])
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A folder with a finished run, as pages assume one, and the address of a server in `ADDRESS`."""
+    folder = tmp_path_factory.mktemp("reader")
+    volume = tsfusion.Volume(voxel_size=0.05)
+    for keyframe in tsfusion.open_dataset("synthetic:room", count=2):
+        volume.integrate(keyframe)
+    (folder / "out" / "latest").mkdir(parents=True)
+    volume.save(folder / "out" / "latest" / "map.tsf")
+    volume.save_voxels(folder / "voxels.npz")
+    with server(folder / "state", "--voxel-size", 0.05) as (address, _):
+        (folder / "ADDRESS").write_text(address)
+        yield folder
+
+
+@pytest.mark.parametrize("page", PYTHON)
+def test_python_runs(page: Path, place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A page's Python runs from its first block to its last; what never ends is compiled."""
+    monkeypatch.chdir(place)
+    given = {
+        "points": np.zeros((4, 3)),
+        "keyframes": list(tsfusion.open_dataset("synthetic:room", count=2)),
+        "__name__": "page",
+    }
+    for block in doc_pages.blocks(page):
+        if block.language != "python":
+            continue
+        code = doc_pages.addressed(block.code, (place / "ADDRESS").read_text())
+        program = compile(code, f"{page.name}:{block.line}", "exec")
+        if not block.needs and not block.title and not _goes_on(code):
+            exec(program, given)
+
+
+def _goes_on(code: str) -> bool:
+    """Whether it loops for ever."""
+    return any(
+        isinstance(node, ast.While) and isinstance(node.test, ast.Constant) for node in ast.walk(ast.parse(code))
+    )
+
+
+def test_what_is_shown_as_a_file_is_that_file() -> None:
+    """A block with the name of an example is the example, to the letter; `test_examples.py` runs it."""
+    shown = {}
+    for page in doc_pages.PAGES:
+        for block in doc_pages.blocks(page):
+            if block.title.startswith("examples/"):
+                assert block.code == (ROOT / block.title).read_text(encoding="utf-8"), block.title
+                shown[block.title] = page
+    assert set(shown) == {str(path.relative_to(ROOT)) for path in (ROOT / "examples").glob("*.py")}
 
 
 def test_links_lead_somewhere() -> None:
-    links = [link for link in re.findall(r"\]\(([^)]+)\)", README) if "://" not in link]
-    assert links
-    missing = [link for link in links if not (ROOT / link).exists()]
-    assert not missing
+    for page in doc_pages.PAGES:
+        text = re.sub(r"^```.*?^```$|`[^`\n]*`", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+        for link in re.findall(r"\]\(([^)#\s]+)[^)]*\)", text):
+            if "://" not in link and not link.startswith("reference/"):
+                assert (page.parent / link).exists() or _is_generated(page, link), f"{page.name}: {link}"
+
+
+def _is_generated(page: Path, link: str) -> bool:
+    """Whether the site alone has that page; `test_site.py` builds it."""
+    place = os.path.relpath((page.parent / link).resolve(), ROOT / "docs")
+    return place in {f"reference/{name}.md" for name in ("cli", "settings", "architecture", "changelog")}

@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: MIT
+"""The examples do what they say, against a real server: in Python, and in C++ where a compiler is."""
+
+import re
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_processes import DEADLINE, server
+from repository import ROOT
+
+from tsfusion import Keyframe, Volume, open_dataset
+from tsfusion.geometry.trajectory import quaternion
+from tsfusion.wire.queries import fetch_status
+
+COUNT = 3
+
+
+@pytest.fixture(scope="module")
+def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    with server(tmp_path_factory.mktemp("examples") / "state") as (found, _):
+        yield found
+
+
+def example(name: str, address: str, folder: Path) -> str:
+    """What an example prints; it is run in a folder of its own."""
+    from command_processes import COMMAND, environment
+
+    done = subprocess.run(
+        [COMMAND[0], ROOT / "examples" / name, address], cwd=folder, env=environment(), text=True, check=False,
+        capture_output=True, timeout=DEADLINE,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def test_poses_of_an_own_slam_and_a_planner_that_asks(address: str, tmp_path: Path) -> None:
+    assert example("own_slam.py", address, tmp_path) == "8 keyframes are in the map\n"
+    said = example("planner.py", address, tmp_path)
+    distance, x, y, z = map(float, re.findall(r"-?\d+\.\d+", said)[:4])
+    assert 0 <= distance < 0.15
+    volume = Volume(voxel_size=0.02)
+    for keyframe in open_dataset("synthetic:room", count=8):
+        volume.integrate(keyframe)
+    expected = volume.sample(np.array([[x, y, z]]), surface="raw").distance[0]
+    assert abs(distance - expected) < 0.02  # printed to a centimetre
+    assert "of a map of 8 keyframes" in said
+
+
+def test_two_robots_fill_one_map(address: str, tmp_path: Path) -> None:
+    hashes = re.findall(r"[0-9a-f]{32}", example("two_robots.py", address, tmp_path))
+    assert len(hashes) == 2
+    assert len(set(hashes)) == 1
+
+
+@pytest.fixture(scope="module")
+def sender(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The sender in C++, built as its first lines say."""
+    compiler = shutil.which("g++")
+    if compiler is None:
+        pytest.skip("no g++ is installed: apt-get install g++")
+    found = tmp_path_factory.mktemp("cpp") / "sender"
+    source = ROOT / "examples" / "cpp" / "sender.cpp"
+    line = re.search(r"^//     (g\+\+ .*)$", source.read_text(encoding="utf-8"), re.MULTILINE)
+    assert line is not None
+    words = [{"sender": str(found)}.get(word, word) for word in line[1].split()[1:]]
+    done = subprocess.run(
+        [compiler, "-Wall", "-Wextra", "-Werror", *words], cwd=ROOT, capture_output=True, text=True, check=False,
+        timeout=DEADLINE,
+    )  # fmt: skip
+    if lacking := re.search(r"fatal error: (\S+): No such file|cannot find (-l\w+)", done.stderr):
+        pytest.skip(f"{lacking[1] or lacking[2]}: apt-get install libzmq3-dev libmsgpack-cxx-dev libzstd-dev")
+    assert done.returncode == 0, done.stderr
+    return found
+
+
+def written(folder: Path, keyframes: list[Keyframe]) -> Path:
+    """Keyframes as the sender reads them: PGM files, and a list of them with their poses."""
+    lines = []
+    for number, keyframe in enumerate(keyframes):
+        height, width = keyframe.shape
+        head = f"P5\n{width} {height}\n65535\n".encode()
+        path = folder / f"{number}.pgm"
+        path.write_bytes(head + np.asarray(keyframe.measurement).astype(">u2").tobytes())
+        T = keyframe.T_world_camera
+        lines.append(" ".join([str(path), *(repr(float(x)) for x in (*T[:3, 3], *quaternion(T[:3, :3])))]))
+    (folder / "frames.txt").write_text("\n".join(lines) + "\n")
+    return folder / "frames.txt"
+
+
+def sent(sender: Path, address: str, frames: Path) -> "subprocess.CompletedProcess[str]":
+    host, port = address.removeprefix("tcp://").split(":")
+    return subprocess.run(
+        [sender, host, port, frames, "292.5", "292.5", "159.5", "119.5"], capture_output=True, text=True,
+        check=False, timeout=DEADLINE,
+    )  # fmt: skip
+
+
+def test_a_sender_in_cpp_makes_the_same_map(sender: Path, tmp_path: Path) -> None:
+    """Every keyframe once, and its integers: the hash is that of the same pixels fused in this process."""
+    keyframes = [
+        Keyframe(
+            depth=(np.asarray(one.measurement) // 10).astype(np.uint16),  # millimetres
+            intrinsics=one.intrinsics,
+            T_world_camera=one.T_world_camera,
+        )
+        for one in open_dataset("synthetic:room", count=COUNT)
+    ]
+    with server(tmp_path / "state") as (address, _):
+        done = sent(sender, address, written(tmp_path, keyframes))
+        assert (done.returncode, done.stderr) == (0, "")
+        assert done.stdout == f"{COUNT} keyframes are on the server's disk\n"
+        status = fetch_status(address, timeout=DEADLINE)
+        assert (status.keyframes_durable, status.messages_refused) == (COUNT, {})
+    expected = Volume(voxel_size=0.02)
+    for keyframe in keyframes:
+        expected.integrate(keyframe)
+    saved = Volume.load(tmp_path / "state" / "maps" / "default" / "map.tsf")
+    assert saved.map_hash() == expected.map_hash()
+
+
+def test_a_sender_in_cpp_says_what_is_wrong(sender: Path, tmp_path: Path) -> None:
+    (tmp_path / "frames.txt").write_text(f"{tmp_path}/none.pgm 0 0 0 0 0 0 1\n")
+    done = sent(sender, "tcp://127.0.0.1:1", tmp_path / "frames.txt")
+    assert done.returncode == 1
+    assert "none.pgm is no binary PGM of 16 bits" in done.stderr

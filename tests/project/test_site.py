@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: MIT
+"""The site builds without a warning, fetches nothing from elsewhere, and its reference is complete."""
+
+import re
+import subprocess
+import sys
+from html.parser import HTMLParser
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+import typer
+from repository import ROOT
+
+import tsfusion
+from tsfusion import cli
+
+pytestmark = pytest.mark.skipif(
+    find_spec("material") is None or find_spec("mkdocstrings_handlers") is None,
+    reason="the site's generator is not installed: pip install '.[docs]'",
+)
+_LOADS = {"link": "href", "script": "src", "img": "src", "iframe": "src", "source": "src"}
+
+
+class Loaded(HTMLParser):
+    """What a page makes a browser load, and the ids in it."""
+
+    def __init__(self, page: Path) -> None:
+        super().__init__()
+        self.addresses: list[str] = []
+        self.ids: set[str] = set()
+        self.feed(page.read_text(encoding="utf-8"))
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        given = dict(attrs)
+        self.ids.add(given.get("id") or "")
+        if tag in _LOADS and given.get("rel") not in ("canonical", "next", "prev"):
+            self.addresses.append(given.get(_LOADS[tag]) or "")
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("site")
+    done = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", folder], cwd=ROOT, text=True,
+        capture_output=True, check=False, timeout=240,
+    )  # fmt: skip
+    said = done.stdout + done.stderr
+    assert done.returncode == 0, said
+    assert not re.search(r"^(WARNING|ERROR)", said, re.MULTILINE), said
+    return folder
+
+
+def test_a_page_loads_nothing_from_elsewhere(site: Path) -> None:
+    pages = [page for page in site.rglob("*.html") if page.name != "404.html"]
+    assert len(pages) > 40
+    for page in pages:
+        for address in Loaded(page).addresses:
+            assert "//" not in address, f"{page.name}: {address}"
+            assert (page.parent / address.partition("#")[0].partition("?")[0]).exists(), f"{page.name}: {address}"
+
+
+def test_the_reference_has_every_verb_and_every_name(site: Path) -> None:
+    verbs = (site / "reference" / "cli.html").read_text(encoding="utf-8")
+    root = typer.main.get_command(cli.app)
+    for name, command in root.commands.items():  # type: ignore[attr-defined]
+        below = [f"{name} {word}" for word in getattr(command, "commands", {})]
+        for words in (name, *below):
+            assert f'id="tsfusion-{words.replace(" ", "-")}"' in verbs, words
+    ids = Loaded(site / "reference" / "python.html").ids
+    found = {one.rsplit(".", 1)[-1] for one in ids}
+    assert not set(tsfusion.__all__) - {"__version__"} - found
+
+
+def test_each_drawing_takes_the_colours_of_the_page(site: Path) -> None:
+    page = (site / "concepts.html").read_text(encoding="utf-8")
+    assert page.count('<div class="drawing"><svg') == 2
+    assert "prefers-color-scheme: dark) { }" in page or ":root {" not in page
