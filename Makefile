@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 PYTHON ?= $(firstword $(wildcard .venv/bin/python) python3)
 
-.PHONY: check test bench accuracy nightly
+.PHONY: check test docs docs-serve bench accuracy nightly
 
 check:  ## style and types
 	$(PYTHON) -m ruff check .
@@ -10,6 +10,12 @@ check:  ## style and types
 
 test:  ## the default suite; `make test ARGS="-m 'not slow'"` leaves out real data and long runs
 	$(PYTHON) -m pytest $(ARGS)
+
+docs:  ## the site, in out/site; open out/site/index.html
+	NO_MKDOCS_2_WARNING=1 $(PYTHON) -m mkdocs build --strict
+
+docs-serve:  ## the site at 127.0.0.1:8000, built anew when a page is saved
+	NO_MKDOCS_2_WARNING=1 $(PYTHON) -m mkdocs serve --no-strict
 
 bench:  ## one JSON line a case
 	$(PYTHON) scripts/bench.py $(ARGS)

@@ -7,7 +7,7 @@ import tsfusion
 
 
 def my_slam():
-    """Your SLAM stands here: depth (H, W) uint16, colour (H, W, 3) uint8 BGR, and the camera's pose (4, 4)."""
+    """Your SLAM stands here: depth (H, W) uint16, colour (H, W, 3) uint8 BGR, camera pose (4, 4)."""
     for frame in tsfusion.open_dataset("synthetic:room", count=8):
         yield frame.depth, frame.color, frame.T_world_camera
 

@@ -19,7 +19,9 @@ with MapClient(address, timeout=0.5) as live:
     distance = found.result.distance  # (61,) metres to the surface; NaN = beyond what the map knows there
     near = np.flatnonzero(distance < RADIUS)
     if len(near):
-        print(f"{distance[near[0]]:.2f} m from a surface at {path[near[0]].round(2).tolist()}: stop before it")
+        print(
+            f"{distance[near[0]]:.2f} m from a surface at {path[near[0]].round(2).tolist()}: stop before it"
+        )
     else:
         print("the path touches nothing that the map has seen")
     print(f"answered in {1000 * found.delay_s:.0f} ms, of a map of {found.state.keyframes} keyframes")

@@ -101,10 +101,10 @@ def commands_page() -> str:
     root: Any = typer.main.get_command(cli.app)
     parts = [
         "# The command line\n",
-        "Made from the command itself. `tsfusion VERB --help` shows the usual flags on one screen, `--help-all` "
-        "every one; here the rare ones are marked *rare*. Each flag is an environment variable, too: "
-        "`TSFUSION_VOXEL_SIZE` for `--voxel-size`. What ends well has status 0, what fails 1, a wrong flag 2, "
-        "Ctrl-C 130, SIGTERM 143; errors are one line on stderr.\n",
+        "Made from the command itself. `tsfusion VERB --help` shows the usual flags on one screen, "
+        "`--help-all` every one; here the rare ones are marked *rare*. Each flag is an environment variable, "
+        "too: `TSFUSION_VOXEL_SIZE` for `--voxel-size`. What ends well has status 0, what fails 1, a wrong "
+        "flag 2, Ctrl-C 130, SIGTERM 143; errors are one line on stderr.\n",
     ]
     for words, command in _commands(root):
         if words:
@@ -125,9 +125,7 @@ def _command(words: tuple[str, ...], command: Any) -> str:
     arguments = [param for param in command.get_params(context) if param.param_type_name == "argument"]
     usage = " ".join([name, *(_metavar(param) for param in arguments)])
     lines = [f"{'#' * (len(words) + 1)} {name}\n", _text(command.help or ""), f"\n```text\n{usage}\n```\n"]
-    rows = [
-        (f"`{_metavar(param)}`", "", getattr(param, "help", "") or "") for param in arguments
-    ]
+    rows = [(f"`{_metavar(param)}`", "", getattr(param, "help", "") or "") for param in arguments]
     rows += [(_flag(param), _default(param), _meaning(param)) for param in flags if _is_shown(param)]
     if rows:
         lines += ["| flag | default | meaning |", "|---|---|---|"]

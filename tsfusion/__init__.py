@@ -1,6 +1,14 @@
 # SPDX-License-Identifier: MIT
 """tsfusion: depth sensors in, one exact 3-D map out.
 
+    Send     Client, Keyframe, Intrinsics
+    Fuse     Volume, with the settings of VolumeConfig; Config is a whole file of settings
+    Ask      MapClient, a map on a server, and Volume, one in this process; their answers are
+             Samples, View, PointCloud, Blocks, DistanceField, DistanceSlice, OccupancySlice
+             (both with a SliceGrid) and Mesh
+    Read     open_dataset, a recording (Layout describes each kind); open_source, a sensor (a Source)
+    Errors   TsfusionError and those below it: help(tsfusion.core.errors) draws them
+
 Names are loaded on first use, so that a scanner which needs only `Client` and `Keyframe` never
 imports Taichi.
 """

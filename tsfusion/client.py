@@ -80,6 +80,19 @@ class Client:
         JournalError: when the spool cannot be used, another client uses it, or what waits in it is for
             another map or of another world.
         TransportError: when no socket can be opened.
+
+    Examples:
+        >>> with tsfusion.Client("tcp://127.0.0.1:5555") as client:
+        ...     number = client.send(
+        ...         tsfusion.Keyframe(
+        ...             depth=np.full((480, 640), 1500, np.uint16),  # millimetres
+        ...             intrinsics=tsfusion.Intrinsics(525.0, 525.0, 319.5, 239.5),
+        ...             T_world_camera=np.eye(4),
+        ...         )
+        ...     )
+        ...     client.flush(timeout=10.0)  # on the server's disk, or an error
+        >>> number
+        1
     """
 
     def __init__(

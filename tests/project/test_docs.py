@@ -1,16 +1,21 @@
 # SPDX-License-Identifier: MIT
-"""The documents name only what exists; their commands are understood, and their Python is run as it stands."""
+"""The documents name only what exists; their commands are understood, and their Python runs as it stands."""
 
 import ast
+import doctest
+import inspect
+import io
 import os
 import re
 import shlex
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import doc_pages
 import msgspec
 import numpy as np
+import own_recordings
 import pytest
 from command_processes import server
 from repository import ROOT
@@ -98,6 +103,8 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     (folder / "out" / "latest").mkdir(parents=True)
     volume.save(folder / "out" / "latest" / "map.tsf")
     volume.save_voxels(folder / "voxels.npz")
+    view = replace(keyframe, depth=keyframe.depth // 10, depth_scale=0.001)
+    own_recordings.image(folder / "incoming", "000000", view)
     with server(folder / "state", "--voxel-size", 0.05) as (address, _):
         (folder / "ADDRESS").write_text(address)
         yield folder
@@ -121,11 +128,20 @@ def test_python_runs(page: Path, place: Path, monkeypatch: pytest.MonkeyPatch) -
             exec(program, given)
 
 
+@pytest.mark.parametrize("name", sorted(set(tsfusion.__all__) - {"__version__"}))
+def test_examples_in_docstrings_run(name: str, place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(place)
+    text = doc_pages.addressed(inspect.getdoc(getattr(tsfusion, name)) or "", (place / "ADDRESS").read_text())
+    given = {"np": np, "tsfusion": tsfusion}
+    examples = doctest.DocTestParser().get_doctest(text, given, name, None, 0)
+    said = io.StringIO()
+    assert doctest.DocTestRunner().run(examples, out=said.write).failed == 0, said.getvalue()
+
+
 def _goes_on(code: str) -> bool:
     """Whether it loops for ever."""
-    return any(
-        isinstance(node, ast.While) and isinstance(node.test, ast.Constant) for node in ast.walk(ast.parse(code))
-    )
+    loops = (node for node in ast.walk(ast.parse(code)) if isinstance(node, ast.While))
+    return any(isinstance(loop.test, ast.Constant) for loop in loops)
 
 
 def test_what_is_shown_as_a_file_is_that_file() -> None:
@@ -141,7 +157,8 @@ def test_what_is_shown_as_a_file_is_that_file() -> None:
 
 def test_links_lead_somewhere() -> None:
     for page in doc_pages.PAGES:
-        text = re.sub(r"^```.*?^```$|`[^`\n]*`", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+        text = page.read_text(encoding="utf-8")
+        text = re.sub(r"^```.*?^```$|`[^`\n]*`", "", text, flags=re.DOTALL | re.MULTILINE)
         for link in re.findall(r"\]\(([^)#\s]+)[^)]*\)", text):
             if "://" not in link and not link.startswith("reference/"):
                 assert (page.parent / link).exists() or _is_generated(page, link), f"{page.name}: {link}"

@@ -4,12 +4,13 @@
 import re
 import shutil
 import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
-from command_processes import DEADLINE, server
+from command_processes import DEADLINE, environment, server
 from repository import ROOT
 
 from tsfusion import Keyframe, Volume, open_dataset
@@ -27,11 +28,9 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 def example(name: str, address: str, folder: Path) -> str:
     """What an example prints; it is run in a folder of its own."""
-    from command_processes import COMMAND, environment
-
     done = subprocess.run(
-        [COMMAND[0], ROOT / "examples" / name, address], cwd=folder, env=environment(), text=True, check=False,
-        capture_output=True, timeout=DEADLINE,
+        [sys.executable, ROOT / "examples" / name, address], cwd=folder, env=environment(), text=True,
+        check=False, capture_output=True, timeout=DEADLINE,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
@@ -68,8 +67,8 @@ def sender(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert line is not None
     words = [{"sender": str(found)}.get(word, word) for word in line[1].split()[1:]]
     done = subprocess.run(
-        [compiler, "-Wall", "-Wextra", "-Werror", *words], cwd=ROOT, capture_output=True, text=True, check=False,
-        timeout=DEADLINE,
+        [compiler, "-Wall", "-Wextra", "-Werror", *words], cwd=ROOT, capture_output=True, text=True,
+        check=False, timeout=DEADLINE,
     )  # fmt: skip
     if lacking := re.search(r"fatal error: (\S+): No such file|cannot find (-l\w+)", done.stderr):
         pytest.skip(f"{lacking[1] or lacking[2]}: apt-get install libzmq3-dev libmsgpack-cxx-dev libzstd-dev")

@@ -2,6 +2,7 @@
 """The names that `import tsfusion` offers."""
 
 import inspect
+import re
 
 import pytest
 from command_processes import python
@@ -29,6 +30,14 @@ def test_the_public_surface() -> None:
     assert tree <= set(tsfusion.__all__)
     assert all(issubclass(getattr(errors, name), tsfusion.TsfusionError) for name in tree)
     assert all(name in (errors.__doc__ or "") for name in tree)
+
+
+def test_help_names_what_is_public() -> None:
+    """The docstring names each class and function, and each has an example and says what it takes."""
+    tree = {name for name, value in vars(errors).items() if inspect.isclass(value)}
+    for name in set(tsfusion.__all__) - tree - {"__version__"}:
+        assert re.search(rf"\b{name}\b", tsfusion.__doc__ or ""), name
+        assert ">>> " in (inspect.getdoc(getattr(tsfusion, name)) or ""), name
 
 
 def test_a_scanner_imports_no_taichi() -> None:

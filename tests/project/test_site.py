@@ -57,7 +57,9 @@ def test_a_page_loads_nothing_from_elsewhere(site: Path) -> None:
     for page in pages:
         for address in Loaded(page).addresses:
             assert "//" not in address, f"{page.name}: {address}"
-            assert (page.parent / address.partition("#")[0].partition("?")[0]).exists(), f"{page.name}: {address}"
+            assert (page.parent / address.partition("#")[0].partition("?")[0]).exists(), (
+                f"{page.name}: {address}"
+            )
 
 
 def test_the_reference_has_every_verb_and_every_name(site: Path) -> None:

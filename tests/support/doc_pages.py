@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """The code blocks of a page, and a page run from its first block to its last as its reader would.
 
-A comment over a block says what a test does with it: `<!-- test: background -->` starts a command that goes on,
-`<!-- test: needs a camera -->` (or whatever it needs) leaves the block out. Nothing of it is seen on the page.
+A comment over a block says what a test does with it: `<!-- test: background -->` starts a command that goes
+on, `<!-- test: needs a camera -->` (or whatever it needs) leaves the block out. No reader sees it.
 """
 
 import os
@@ -21,13 +21,15 @@ from repository import ROOT
 from tsfusion import cli
 
 _BLOCK = re.compile(
-    r"^(?P<indent> *)(?:<!-- test: (?P<mark>[^>]+) -->\n+ *)?```(?P<language>\w*)(?P<more>[^\n]*)\n(?P<code>.*?)^ *```$",
+    r"^(?P<indent> *)(?:<!-- test: (?P<mark>[^>]+) -->\n+ *)?"
+    r"```(?P<language>\w*)(?P<more>[^\n]*)\n(?P<code>.*?)^ *```$",
     re.DOTALL | re.MULTILINE,
 )
 _COMMAND = re.compile(r"^(?:\w*\$ +)?(?:\S*/)?tsfusion(?: |$)")
 SHELL = ("", "sh", "console")
 ADDRESSES = ("tcp://127.0.0.1:5555", "tcp://server:5555", "127.0.0.1 5555")
-_GROUPS = {name for name, one in typer.main.get_command(cli.app).commands.items() if hasattr(one, "commands")}  # type: ignore[attr-defined]
+# Typer's own click or the real one, by version: both name it so.
+_UsageError: type[Exception] = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
 
 
 class Block(NamedTuple):
@@ -60,8 +62,7 @@ def blocks(page: Path) -> list[Block]:
 
 def commands(block: Block) -> Iterator[list[str]]:
     """The words of each `tsfusion` command in a shell block, as it is typed."""
-    for line in re.split(r"\n|&&", block.code.replace("\\\n", " ")):
-        line = line.strip()
+    for line in re.split(r"\s*(?:\n|&&)\s*", block.code.replace("\\\n", " ").strip()):
         if _COMMAND.match(line):
             typed = shlex.split(_COMMAND.sub("", line, count=1), comments=True)
             ends = (number for number, word in enumerate(typed) if word in ("|", ">", "&", "…"))
@@ -82,7 +83,7 @@ def misread(words: list[str]) -> str:
         command.make_context(" ".join(names), list(words), resilient_parsing="--help" in words)
     except typer.Exit:
         return ""
-    except Exception as error:
+    except _UsageError as error:
         return f"{' '.join(names)}: {error or type(error).__name__}"
     return ""
 

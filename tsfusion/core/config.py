@@ -115,7 +115,13 @@ SENSORS: dict[str, SensorModel] = {
 
 
 class VolumeConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The map and how keyframes enter it. None = what the sensor preset says."""
+    """The map and how keyframes enter it. None = what the sensor preset says.
+
+    Examples:
+        >>> config = tsfusion.VolumeConfig(voxel_size=0.05, sensor="lidar", max_range=40.0)
+        >>> tsfusion.Volume(config).config.voxel_size
+        0.05
+    """
 
     voxel_size: Positive = 0.02  # metres
     sensor: SensorName = "kinect"
@@ -289,7 +295,14 @@ class ScanConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True
 
 
 class Config(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A whole configuration file."""
+    """A whole configuration file.
+
+    Examples:
+        >>> from tsfusion.core import config
+        >>> everything = config.load(None)  # or a file; None gives the defaults
+        >>> everything.server.listen
+        'tcp://127.0.0.1:5555'
+    """
 
     volume: VolumeConfig = VolumeConfig()
     server: ServerConfig = ServerConfig()

@@ -66,6 +66,11 @@ def open_dataset(path: str | Path, /, *, unpack: bool = False, **options: Any) -
 
     Raises:
         DatasetError: the files are wrong, or the layout is unknown; the message says what was expected.
+
+    Examples:
+        >>> room = tsfusion.open_dataset("synthetic:room", count=3)
+        >>> len(room), room[0].kind, room[0].shape
+        (3, 'depth', (240, 320))
     """
     if not str(path).startswith(_SYNTHETIC):
         return find(path, unpack=unpack).open(**options)

@@ -47,6 +47,11 @@ class Layout(NamedTuple):
         description: the expected files, in one line.
         recognises: True if a folder or file is in this layout; quick, reads no images, raises nothing.
         open: `open(path, **options)` → a dataset; takes `posed` where frames may lack a pose.
+
+    Examples:
+        >>> from tsfusion.datasets import layouts
+        >>> "7-Scenes" in [layout.name for layout in layouts()]
+        True
     """
 
     name: str

@@ -30,6 +30,11 @@ class Intrinsics(msgspec.Struct, frozen=True, array_like=True):
     """Pinhole intrinsics in pixels: `u = fx·x/z + cx`, `v = fy·y/z + cy`.
 
     `fx > 0`; `fy` may be negative (an image stored bottom-up, as in ICL-NUIM).
+
+    Examples:
+        >>> camera = tsfusion.Intrinsics(fx=525.0, fy=525.0, cx=319.5, cy=239.5)
+        >>> camera.scaled(0.5)
+        Intrinsics(fx=262.5, fy=262.5, cx=159.5, cy=119.5)
     """
 
     fx: float
@@ -100,6 +105,15 @@ class Keyframe:
 
     Raises:
         InvalidKeyframe: naming the field, its value and what was expected.
+
+    Examples:
+        >>> camera = tsfusion.Intrinsics(525.0, 525.0, 319.5, 239.5)
+        >>> wall = np.full((480, 640), 1500, np.uint16)  # millimetres
+        >>> tsfusion.Keyframe(depth=wall, intrinsics=camera, T_world_camera=np.eye(4)).kind
+        'depth'
+        >>> scan = np.zeros((1000, 3), np.float32)
+        >>> tsfusion.Keyframe(points=scan, T_world_camera=np.eye(4), sensor="lidar").shape
+        (1000,)
     """
 
     T_world_camera: NDArray[np.float64]

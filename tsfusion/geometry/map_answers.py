@@ -24,6 +24,18 @@ class Samples:
         distance: (n,) float32 metres, positive in the free space in front of a surface; NaN where unseen.
         weight: (n,) float32 votes in full-confidence samples; 0 where there are none.
         gradient: (n, 3) float32, how the distance grows along x, y, z; NaN where unseen.
+
+    Examples:
+        >>> wall = tsfusion.Keyframe(
+        ...     depth=np.full((480, 640), 1500, np.uint16),
+        ...     intrinsics=tsfusion.Intrinsics(525.0, 525.0, 319.5, 239.5),
+        ...     T_world_camera=np.eye(4),
+        ... )
+        >>> volume = tsfusion.Volume(0.05)
+        >>> added = volume.integrate(wall)
+        >>> found = volume.sample([[0.0, 0.0, 1.45], [0.0, 0.0, 0.5]])
+        >>> found.distance.round(2)  # 5 cm before the wall; farther than the map knows
+        array([0.05,  nan], dtype=float32)
     """
 
     distance: NDArray[np.float32]
@@ -39,6 +51,14 @@ class View:
         depth: (H, W) float32 metres along the optical axis; 0 = nothing hit, as in a keyframe's depth.
         normals: (H, W, 3) float32 unit normals in the world's frame, towards the camera; 0 = nothing hit.
         colors: (H, W, 3) uint8 RGB (sRGB), 0 = nothing hit; None if the map holds none.
+
+    Examples:
+        >>> volume = tsfusion.Volume(0.05)
+        >>> keyframe = tsfusion.open_dataset("synthetic:room", count=1)[0]
+        >>> added = volume.integrate(keyframe)
+        >>> view = volume.raycast(keyframe.intrinsics, keyframe.T_world_camera, keyframe.shape)
+        >>> view.depth.shape, view.normals.shape
+        ((240, 320), (240, 320, 3))
     """
 
     depth: NDArray[np.float32]
@@ -55,6 +75,15 @@ class PointCloud:
         normals: (n, 3) float32, unit length, away from the surface.
         weights: (n,) float32 votes in full-confidence samples.
         colors: (n, 3) uint8 RGB (sRGB); None if the map holds none.
+
+    Examples:
+        >>> volume = tsfusion.Volume(0.05)
+        >>> added = volume.integrate(tsfusion.open_dataset("synthetic:room", count=1)[0])
+        >>> cloud = volume.point_cloud(min_weight=1.0)
+        >>> cloud.points.shape == cloud.normals.shape == cloud.colors.shape
+        True
+        >>> cloud.save("room.pcd").name
+        'room.pcd'
     """
 
     points: NDArray[np.float32]

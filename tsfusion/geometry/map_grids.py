@@ -28,6 +28,14 @@ class SliceGrid:
 
     The centre of cell (row, column) is at origin + (column + 0.5, row + 0.5) · resolution in the slice's
     frame. Its axes are the rows of `axes`: p_slice = axes @ p_map, without a shift.
+
+    Examples:
+        >>> volume = tsfusion.Volume(0.05)
+        >>> added = volume.integrate(tsfusion.open_dataset("synthetic:room", count=1)[0])
+        >>> grid = volume.occupancy_slice(0.2, 1.8, up="z").grid
+        >>> row, column = grid.cells_of(grid.centres()[3, 5][None])[0]
+        >>> int(row), int(column)
+        (3, 5)
     """
 
     origin: tuple[float, float]  # metres: the corner of cell (0, 0)
@@ -81,6 +89,13 @@ class OccupancySlice:
     """A costmap: what stands between two heights.
 
     `cells` (rows, columns) int8: 0 free, 100 occupied, −1 unseen, as in a `nav_msgs/OccupancyGrid`.
+
+    Examples:
+        >>> volume = tsfusion.Volume(0.05)
+        >>> added = volume.integrate(tsfusion.open_dataset("synthetic:room", count=1)[0])
+        >>> costmap = volume.occupancy_slice(0.2, 1.8, up="z")
+        >>> [file.name for file in costmap.save("room.yaml")]
+        ['room.yaml', 'room.pgm']
     """
 
     grid: SliceGrid
@@ -130,6 +145,13 @@ class DistanceSlice:
     `distance` (rows, columns) float32 metres, at most `max_distance`: to the nearest surface, negative where
     the map knows that a cell lies behind one. Where nothing was seen it is the distance to the nearest
     surface that was; `cells` tells which these are, as in an `OccupancySlice`.
+
+    Examples:
+        >>> volume = tsfusion.Volume(0.05)
+        >>> added = volume.integrate(tsfusion.open_dataset("synthetic:room", count=1)[0])
+        >>> around = volume.distance_slice(0.2, 1.8, up="z", max_distance=1.0)
+        >>> around.distance.shape == around.cells.shape == around.grid.shape
+        True
     """
 
     grid: SliceGrid
@@ -167,6 +189,13 @@ class DistanceField:
     lies behind the surface. Where nothing was seen it is the distance to the nearest surface that was;
     `occupancy` (X, Y, Z) int8 tells which these are: 0 free, 100 occupied, −1 unseen. The centre of voxel
     (i, j, k) is at origin + ((i, j, k) + 0.5) · voxel_size.
+
+    Examples:
+        >>> volume = tsfusion.Volume(0.05)
+        >>> added = volume.integrate(tsfusion.open_dataset("synthetic:room", count=1)[0])
+        >>> field = volume.distance_field((-0.5, -0.5, 0.5, 0.5, 0.5, 1.0), max_distance=0.5)
+        >>> field.distance.shape
+        (20, 20, 10)
     """
 
     origin: NDArray[np.float64]  # (3,) metres: the box's lower corner

@@ -43,6 +43,15 @@ class Mesh:
         held: how the sensors that saw a whole map were held; None = nobody knows.
         guessed: (m,) bool, the faces that close holes where nothing was seen; None = there are none.
         provenance: where it comes from, for whoever gets a file of it; None = not known.
+
+    Examples:
+        >>> volume = tsfusion.Volume(0.05)
+        >>> added = volume.integrate(tsfusion.open_dataset("synthetic:room", count=1)[0])
+        >>> mesh = volume.extract_mesh()
+        >>> mesh.vertices.shape == mesh.normals.shape, bool(mesh.faces.max() < len(mesh.vertices))
+        (True, True)
+        >>> mesh.cropped((-1, -1, 0, 1, 1, 1)).save("part.glb").name
+        'part.glb'
     """
 
     vertices: NDArray[np.float32]

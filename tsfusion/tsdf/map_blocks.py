@@ -29,6 +29,13 @@ class Blocks:
         color_rgn: int64, (Σ R) · 2⁴⁰ + (Σ G) · 2¹⁶ + n of n votes; None if the map holds no colour.
         color_b: int32, Σ B.
         correction: float32, what smoothing along rays adds to Σ w·m; None if the map does not smooth so.
+
+    Examples:
+        >>> volume = tsfusion.Volume(0.05)
+        >>> added = volume.integrate(tsfusion.open_dataset("synthetic:room", count=1)[0])
+        >>> blocks = volume.blocks()
+        >>> blocks.sums.shape == blocks.distance().shape == (len(blocks), 8, 8, 8)
+        True
     """
 
     def __init__(self, store: BlockStore) -> None:

@@ -75,6 +75,18 @@ class Volume(AskableMap):
 
     Raises:
         InvalidConfig: for an unknown setting or a value out of range.
+
+    Examples:
+        >>> volume = tsfusion.Volume(voxel_size=0.05, sensor="kinect")
+        >>> room = tsfusion.open_dataset("synthetic:room", count=2)
+        >>> volume.integrate(room[0]).samples
+        76800
+        >>> before = volume.map_hash()
+        >>> added, taken = volume.integrate(room[1]), volume.retract(room[1])
+        >>> volume.map_hash() == before  # to the last bit
+        True
+        >>> volume.extract_mesh().save("room.ply").name
+        'room.ply'
     """
 
     def __init__(

@@ -61,6 +61,12 @@ class MapClient:
 
     Raises:
         InvalidConfig: for an address that is none.
+
+    Examples:
+        >>> with tsfusion.MapClient("tcp://127.0.0.1:5555", timeout=5.0) as live:
+        ...     found = live.sample(np.zeros((4, 3)))
+        >>> found.result.distance.shape, found.delay_s < 5.0
+        ((4,), True)
     """
 
     def __init__(

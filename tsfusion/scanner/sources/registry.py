@@ -34,6 +34,12 @@ def open_source(spec: str, **options: object) -> Source:
         InvalidConfig: no such source, it takes no such option, or not of that type.
         SourceError: it cannot be opened.
         MissingDependency: its optional package is not installed.
+
+    Examples:
+        >>> with tsfusion.open_source("folder:incoming", idle=0.1) as source:  # or "realsense", "camera:0"
+        ...     kinds = [frame.kind for frame in source]
+        >>> kinds
+        ['depth']
     """
     name, _, place = spec.partition(":")
     others = entry_points(group=GROUP)

@@ -21,6 +21,12 @@ class Source(Protocol):
         live: whether frames are lost while nobody takes them; those of a recording or a folder wait.
         length: number of frames; None = unknown.
         skipped: number of frames left out so far, by reason.
+
+    Examples:
+        >>> with tsfusion.open_source("folder:incoming", idle=0.1) as source:
+        ...     frames = sum(1 for frame in source)
+        >>> frames, source.skipped
+        (1, {})
     """
 
     name: str
