@@ -100,13 +100,17 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     volume = tsfusion.Volume(voxel_size=0.05)
     for keyframe in tsfusion.open_dataset("synthetic:room", count=2):
         volume.integrate(keyframe)
-    (folder / "out" / "latest").mkdir(parents=True)
-    volume.save(folder / "out" / "latest" / "map.tsf")
+    for run in ("out/latest", "room-run"):
+        (folder / run).mkdir(parents=True)
+        volume.save(folder / run / "map.tsf")
     volume.save_voxels(folder / "voxels.npz")
     view = replace(keyframe, depth=keyframe.depth // 10, depth_scale=0.001)
     own_recordings.image(folder / "incoming", "000000", view)
     with server(folder / "state", "--voxel-size", 0.05) as (address, _):
         (folder / "ADDRESS").write_text(address)
+        with tsfusion.Client(address) as client:
+            client.send(keyframe)
+            client.wait_fused()
         yield folder
 
 

@@ -26,6 +26,7 @@ _BLOCK = re.compile(
     re.DOTALL | re.MULTILINE,
 )
 _COMMAND = re.compile(r"^(?:\w*\$ +)?(?:\S*/)?tsfusion(?: |$)")
+_ANY_PORT = "tcp://127.0.0.1:0"
 SHELL = ("", "sh", "console")
 ADDRESSES = ("tcp://127.0.0.1:5555", "tcp://server:5555", "127.0.0.1 5555")
 # Typer's own click or the real one, by version: both name it so.
@@ -96,10 +97,11 @@ def addressed(code: str, address: str) -> str:
     return code
 
 
-def run(page: Path, folder: Path, address: str, *, extra: dict[str, str] | None = None) -> str:
+def run(page: Path, folder: Path) -> str:
     """Run a page's blocks in a folder, in order; what they printed.
 
-    `tsfusion` and `python` are those of this process. A command that goes on ends with the page.
+    `tsfusion` and `python` are those of this process. A server that a page starts listens on a free port, and
+    ends with the page.
 
     Raises:
         AssertionError: naming the block that failed, with what it printed.
@@ -110,18 +112,19 @@ def run(page: Path, folder: Path, address: str, *, extra: dict[str, str] | None 
         program = programs / name
         program.write_text(f'#!/bin/sh\nexec "{sys.executable}" {words} "$@"\n')
         program.chmod(0o755)
-    env = {**environment(), "PATH": f"{programs}:{os.environ['PATH']}", **(extra or {})}
+    env = {**environment(), "PATH": f"{programs}:{os.environ['PATH']}", "TSFUSION_LISTEN": _ANY_PORT}
+    address = ADDRESSES[0]
     going: list[subprocess.Popen[str]] = []
     printed = []
     try:
         for block in blocks(page):
             if block.needs or block.language not in (*SHELL, "python"):
                 continue
-            code = addressed(block.code, address)
             if block.mark == "background":
-                going.append(_started(code, folder, env))
+                process, address = _started(block.code, folder, env)
+                going.append(process)
                 continue
-            (folder / ".block").write_text(code)
+            (folder / ".block").write_text(addressed(block.code, address))
             how = ["python"] if block.language == "python" else ["bash", "-euo", "pipefail"]
             done = subprocess.run(
                 [*how, ".block"], cwd=folder, env=env, text=True, check=False, stdin=subprocess.DEVNULL,
@@ -135,18 +138,19 @@ def run(page: Path, folder: Path, address: str, *, extra: dict[str, str] | None 
     return "".join(printed)
 
 
-def _started(code: str, folder: Path, env: dict[str, str]) -> "subprocess.Popen[str]":
+def _started(code: str, folder: Path, env: dict[str, str]) -> tuple["subprocess.Popen[str]", str]:
+    """A server, once it is ready, and its address."""
     words = shlex.split(code.strip(), comments=True)
     process = subprocess.Popen(
         words, cwd=folder, env=env, text=True, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT, executable=str(folder / ".programs" / words[0]),
     )  # fmt: skip
     try:
-        read_until(process, "ready")
+        line = read_until(process, "ready")
+        return process, re.findall(r"tcp://[\d.]+:\d+", line)[0]
     except BaseException:
         end(process)
         raise
-    return process
 
 
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md"), ROOT / "contrib" / "README.md"])
