@@ -172,3 +172,30 @@ def _is_generated(page: Path, link: str) -> bool:
     """Whether the site alone has that page; `test_site.py` builds it."""
     place = os.path.relpath((page.parent / link).resolve(), ROOT / "docs")
     return place in {f"reference/{name}.md" for name in ("cli", "settings", "architecture", "changelog")}
+
+
+def _said_by(path: Path) -> Iterator[str]:
+    """Every text in a module; what is put into it is left out."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.JoinedStr):
+            yield "".join(str(one.value) if isinstance(one, ast.Constant) else "…" for one in node.values)
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            yield node.value
+
+
+def test_the_messages_that_are_explained_are_said() -> None:
+    """Each message in the first column of a table of `troubleshooting.md` stands in the code."""
+    said = "\n".join(
+        " ".join(text.split()) for path in (ROOT / "tsfusion").rglob("*.py") for text in _said_by(path)
+    )
+    page = (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
+    elsewhere = ("cannot open shared object file", "Address already in use")  # the system's
+    found = 0
+    for cell in re.findall(r"^\| ([^|]*`[^|]*) \|", page, re.MULTILINE):
+        for message in re.findall(r"`([^`]+)`", cell):
+            for part in re.split(r"…|\bN\b|\b\d+(?:×\d+)?\b|\w+:// ?|(?<=\w): ", message):
+                words = part.strip(" :→")
+                if " " in words and not any(words in one for one in elsewhere):
+                    found += 1
+                    assert words in said, f"{message!r}: {words!r}"
+    assert found > 15
