@@ -77,6 +77,8 @@ def test_every_command_shown_is_understood(page: Path) -> None:
         if block.language in doc_pages.SHELL:
             for words in doc_pages.commands(block):
                 assert not doc_pages.misread(words), f"{page.name}:{block.line}: {' '.join(words)}"
+    for words in doc_pages.inline_commands(page):
+        assert not doc_pages.unknown_words(words), f"{page.name}: `tsfusion {' '.join(words)}`"
 
 
 def test_commands_are_found_and_wrong_ones_seen() -> None:
@@ -90,6 +92,8 @@ def test_commands_are_found_and_wrong_ones_seen() -> None:
     assert len(found) > 80
     assert "no verb" in doc_pages.misread(["scna"])
     assert "--voxelsize" in doc_pages.misread(["replay", "room", "--voxelsize", "0.02"])
+    assert doc_pages.unknown_words(["map", "crpo"]) == ["crpo"]
+    assert doc_pages.unknown_words(["mesh", "MAP", "--weight", "2"]) == ["--weight"]
     assert doc_pages.misread(["map", "crop", "a.tsf", "--box", "0", "0"])
 
 

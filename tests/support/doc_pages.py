@@ -33,6 +33,9 @@ ADDRESSES = ("tcp://127.0.0.1:5555", "tcp://server:5555", "127.0.0.1 5555")
 _UsageError: type[Exception] = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
 
 
+PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md"), ROOT / "contrib" / "README.md"])
+
+
 class Block(NamedTuple):
     """A fenced block."""
 
@@ -153,4 +156,24 @@ def _started(code: str, folder: Path, env: dict[str, str]) -> tuple["subprocess.
         raise
 
 
-PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md"), ROOT / "contrib" / "README.md"])
+def inline_commands(page: Path) -> Iterator[list[str]]:
+    """The words of each `tsfusion VERB …` in the sentences of a page."""
+    text = re.sub(r"^ *```.*?^ *```$", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+    for shown in re.findall(r"`tsfusion (\w[^`]*)`", text):
+        yield shown.replace("'", "").replace("…", "").split()
+
+
+def unknown_words(words: list[str]) -> list[str]:
+    """Words of a command in a sentence that is no verb, or a flag that its verb does not have."""
+    command: Any = typer.main.get_command(cli.app)
+    rest = list(words)
+    while rest and rest[0] in getattr(command, "commands", {}):
+        command = command.commands[rest.pop(0)]
+    if hasattr(command, "commands") and rest and rest[0].islower() and "|" not in rest[0]:
+        return rest[:1]
+    known = {
+        flag for param in getattr(command, "params", []) for flag in (*param.opts, *param.secondary_opts)
+    }
+    return [
+        word for word in rest if word.startswith("--") and word.partition("=")[0] not in {*known, "--help"}
+    ]
