@@ -5,8 +5,9 @@ import re
 import subprocess
 import sys
 from html.parser import HTMLParser
-from importlib.util import find_spec
+from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 
 import pytest
 import typer
@@ -78,3 +79,34 @@ def test_each_drawing_takes_the_colours_of_the_page(site: Path) -> None:
     page = (site / "concepts.html").read_text(encoding="utf-8")
     assert page.count('<div class="drawing"><svg') == 2
     assert "prefers-color-scheme: dark) { }" in page or ":root {" not in page
+
+
+def hooks() -> ModuleType:
+    """What `mkdocs.yml` names as its hooks."""
+    spec = spec_from_file_location("site_hooks", ROOT / "scripts" / "_site.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_a_page_that_the_navigation_forgot_is_listed(tmp_path: Path) -> None:
+    for name in ("listed.md", "forgotten.md"):
+        (tmp_path / name).write_text("# A page\n")
+    config = SimpleNamespace(docs_dir=str(tmp_path), nav=[{"Start": ["listed.md"]}, {"Guides": []}])
+    assert hooks().on_config(config).nav[1] == {"Guides": ["forgotten.md"]}
+
+
+def test_links_to_files_that_the_site_has_not_keep_their_names() -> None:
+    made = hooks()
+    here = SimpleNamespace(file=SimpleNamespace(src_uri="tutorials/own-slam.md"))
+    files = SimpleNamespace(get_file_from_path=lambda path: path)
+    for written, expected in {
+        "[the tree](../../ARCHITECTURE.md#files)": "[the tree](../reference/architecture.md#files)",
+        "[maps](../maps.md)": "[maps](../maps.md)",
+        "[alerts](../../tests/project/alerts.yml)": "`tests/project/alerts.yml`",
+        "[MCAP](https://mcap.dev)": "[MCAP](https://mcap.dev)",
+        "![picture](../images/soak.png)": "![picture](../images/soak.png)",
+    }.items():
+        assert made.on_page_markdown(written, here, None, files) == expected

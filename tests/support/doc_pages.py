@@ -11,6 +11,7 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -73,9 +74,14 @@ def commands(block: Block) -> Iterator[list[str]]:
             yield typed[: next(ends, len(typed))]
 
 
+@cache
+def _root() -> Any:
+    return typer.main.get_command(cli.app)
+
+
 def misread(words: list[str]) -> str:
     """Why `tsfusion WORDS` would not be understood; empty = it would."""
-    command: Any = typer.main.get_command(cli.app)
+    command: Any = _root()
     names: list[str] = []
     while words and words[0] in getattr(command, "commands", {}):
         command = command.commands[words[0]]
@@ -165,7 +171,7 @@ def inline_commands(page: Path) -> Iterator[list[str]]:
 
 def unknown_words(words: list[str]) -> list[str]:
     """Words of a command in a sentence that is no verb, or a flag that its verb does not have."""
-    command: Any = typer.main.get_command(cli.app)
+    command: Any = _root()
     rest = list(words)
     while rest and rest[0] in getattr(command, "commands", {}):
         command = command.commands[rest.pop(0)]
