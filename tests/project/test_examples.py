@@ -36,9 +36,20 @@ def example(name: str, address: str, folder: Path) -> str:
     return done.stdout
 
 
+def answered(address: str, folder: Path) -> str:
+    """What the planner prints; on a loaded machine half a second is too short now and then."""
+    for _ in range(20):
+        try:
+            return example("planner.py", address, folder)
+        except AssertionError as error:
+            if "did not answer in time" not in str(error):
+                raise
+    raise AssertionError("the map never answered in time")
+
+
 def test_poses_of_an_own_slam_and_a_planner_that_asks(address: str, tmp_path: Path) -> None:
     assert example("own_slam.py", address, tmp_path) == "8 keyframes are in the map\n"
-    said = example("planner.py", address, tmp_path)
+    said = answered(address, tmp_path)
     distance, x, y, z = map(float, re.findall(r"-?\d+\.\d+", said)[:4])
     assert 0 <= distance < 0.15
     volume = Volume(voxel_size=0.02)

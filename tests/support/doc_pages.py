@@ -20,6 +20,7 @@ from command_processes import DEADLINE, end, environment, read_until
 from repository import ROOT
 
 from tsfusion import cli
+from tsfusion.wire.questions import LONGEST_S
 
 _BLOCK = re.compile(
     r"^(?P<indent> *)(?:<!-- test: (?P<mark>[^>]+) -->\n+ *)?"
@@ -99,7 +100,8 @@ def misread(words: list[str]) -> str:
 
 
 def addressed(code: str, address: str) -> str:
-    """A block with a server's own address in place of those that pages show."""
+    """A block with a server's own address in place of those that pages show, and more time for answers."""
+    code = re.sub(r"\btimeout=[\d.]+", f"timeout={LONGEST_S}", code)
     host, port = address.removeprefix("tcp://").rsplit(":", 1)
     for shown in ADDRESSES:
         code = code.replace(shown, address if shown.startswith("tcp") else f"{host} {port}")

@@ -65,7 +65,7 @@ class MapClient:
     Examples:
         >>> with tsfusion.MapClient("tcp://127.0.0.1:5555", timeout=5.0) as live:
         ...     found = live.sample(np.zeros((4, 3)))
-        >>> found.result.distance.shape, found.delay_s < 5.0
+        >>> found.result.distance.shape, found.state.keyframes > 0
         ((4,), True)
     """
 
