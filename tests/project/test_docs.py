@@ -125,6 +125,7 @@ def test_python_runs(page: Path, place: Path, monkeypatch: pytest.MonkeyPatch) -
     given = {
         "points": np.zeros((4, 3)),
         "keyframes": list(tsfusion.open_dataset("synthetic:room", count=2)),
+        "volume": tsfusion.Volume.load("out/latest/map.tsf"),
         "__name__": "page",
     }
     for block in doc_pages.blocks(page):
