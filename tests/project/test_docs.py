@@ -101,7 +101,7 @@ def test_commands_are_found_and_wrong_ones_seen() -> None:
 def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """A folder with a finished run, as pages assume one, and the address of a server in `ADDRESS`."""
     folder = tmp_path_factory.mktemp("reader")
-    volume = tsfusion.Volume(voxel_size=0.05)
+    volume = tsfusion.Volume(voxel_size=0.02)
     for keyframe in tsfusion.open_dataset("synthetic:room", count=2):
         volume.integrate(keyframe)
     for run in ("out/latest", "room-run"):
