@@ -163,6 +163,16 @@ def test_a_token_opens_the_page_once_and_a_cookie_from_then_on(
     assert TOKEN not in caplog.text
 
 
+@pytest.mark.parametrize("path", [b"/?token=\xff\xfe", b"//[x", b"http://[::1/", b"//[x?token=open-sesame"])
+def test_an_address_that_is_none_is_judged_like_any_other(locked: PageServer, path: bytes) -> None:
+    """It is no error of the server."""
+    host, port = place(locked)
+    with socket.create_connection((host, port), timeout=DEADLINE) as link:
+        link.sendall(b"GET " + path + f" HTTP/1.1\r\nHost: {host}:{port}\r\n\r\n".encode())
+        status = int(link.makefile("rb").readline().split()[1])
+    assert status == (HTTPStatus.NOT_FOUND if TOKEN.encode() in path else HTTPStatus.FORBIDDEN)
+
+
 def test_others_than_this_machine_need_a_token() -> None:
     inside = [PageGuard(host, 80).url for host in ("127.0.0.1", "localhost", "::1", "127.3.2.1")]
     assert not any("token" in url for url in inside)

@@ -15,7 +15,7 @@ from http import HTTPStatus
 from http.cookies import CookieError, SimpleCookie
 from ipaddress import ip_address
 from typing import NamedTuple, Protocol
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qs
 
 from tsfusion.core.errors import InvalidConfig
 from tsfusion.wire.sockets import is_loopback
@@ -96,8 +96,8 @@ class PageGuard:
         """Whether a token is needed, and stands in the address that is asked for."""
         if self._token is None:
             return False
-        given = parse_qs(urlsplit(path).query).get("token", [""])[0]
-        return hmac.compare_digest(given.encode(), self._token.encode())
+        given = parse_qs(path.partition("?")[2]).get("token", [""])[0]
+        return hmac.compare_digest(given.encode(errors="surrogateescape"), self._token.encode())
 
     def answer_headers(self, path: str, headers: Headers) -> dict[str, str]:
         """Headers of the answer to a request that is not refused: nothing is loaded from elsewhere."""
