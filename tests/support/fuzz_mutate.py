@@ -16,7 +16,8 @@ Mutate = Callable[[bytes, random.Random, Sequence[bytes]], bytes]
 _INTEGERS = [0, 1, 2, 3, 7, 8, 16, 127, 128, 255, 256, 4095, 4096, 8191, 8192, 8193, 65535, 65536, 2_000_000,
              2_000_001, (1 << 31) - 1, 1 << 31, (1 << 32) - 1, 1 << 32, (1 << 63) - 1, (1 << 64) - 1,
              -1, -2, -(1 << 31), -(1 << 63)]
-_FLOATS = [0.0, -0.0, 1.0, -1.0, 1e-320, 1e-300, 1e300, float("inf"), float("-inf"), float("nan"), 1e6, 1e-3]
+_FLOATS = [0.0, -0.0, 1.0, -1.0, 1e-320, 1e-300, 1e155, 1e300, -1e300, 1e6, 1e-3,
+           float("inf"), float("-inf"), float("nan")]
 _WORDS = ["", "depth", "disparity", "points", "origins", "color", "confidence", "dzp+zstd", "mm+dzp+zstd",
           "jpeg", "png", "uint8", "uint16", "float32", "default", "kinect", "x" * 40, "../x", "a\0b", "é"]
 # fmt: on

@@ -167,7 +167,9 @@ def _questions() -> list[questions.Question]:
     return [
         questions.Sample(points=1, crc=questions.crc_of([_POINT]), min_weight=0.5, surface="raw"),
         questions.Raycast(intrinsics=(1.0, 1.0, 0.0, 0.0), pose=pose, shape=(2, 3)),
-        questions.Slice(kind="distance", low=0.0, high=1.0, up=(0.0, 0.0, 1.0), box=(0.0, 0.0, 1.0, 1.0)),
+        questions.Slice(
+            kind="distance", low=0.0, high=1.0, up=(0.0, 0.0, 1.0), box=(0.0, 0.0, 1.0, 1.0), resolution=0.1
+        ),
         questions.Field(box=(0.0, 0.0, 0.0, 1.0, 1.0, 1.0), max_distance=0.5),
         questions.Cells(first=(-1, 2, 3), since=7, surface=None),
         questions.Keyframes(session=bytes(range(16)), after=5),

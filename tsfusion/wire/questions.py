@@ -121,11 +121,11 @@ class Slice(Struct, frozen=True, tag="slice", omit_defaults=True):
         numbers = (self.low, self.high, *self.up, *(self.box or ()), self.resolution or 0, self.max_distance)
         if frames or not all(map(math.isfinite, numbers)):
             return "a slice has finite numbers and no points"
-        if np.linalg.norm(self.up) < 1e-6:
+        if not 1e-6 <= math.hypot(*self.up) <= 1e6:
             return f"up must be a direction, got {self.up}"
         if self.box is not None and self.resolution is not None:
             u0, v0, u1, v1 = self.box
-            if not (u1 - u0) * (v1 - v0) <= MOST_CELLS * self.resolution**2:
+            if not (u1 - u0) * (v1 - v0) <= MOST_CELLS * self.resolution * self.resolution:
                 return f"a slice may have {MOST_CELLS} cells: give a smaller box or a coarser resolution"
         return _problem_of_weight(self.min_weight)
 
