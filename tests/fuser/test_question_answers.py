@@ -16,13 +16,14 @@ from tsfusion import Volume
 from tsfusion.fuser import question_answers
 from tsfusion.fuser.current_keyframe import CurrentKeyframe
 from tsfusion.fuser.inbox import Inbox
+from tsfusion.fuser.kept_slices import KeptSlices
 from tsfusion.fuser.keyframe_poses import KeyframePoses
 from tsfusion.fuser.messages import NOT_WORKING, Finish, FuserAnswer, FuserQuestion, Publish, encode
 from tsfusion.fuser.question_answers import QuestionAnswers
 from tsfusion.fuser.touched_by import TouchedBy
 from tsfusion.fuser.watched_map import WatchedMap
 from tsfusion.wire import questions
-from tsfusion.wire.questions import MapState, Sample
+from tsfusion.wire.questions import MapState, Sample, Slice
 
 POINTS = np.array([[0, 0, 1.2], [0.1, 0.1, 1.25]], np.float32)
 FRAMES = questions.point_frames(POINTS)
@@ -174,3 +175,68 @@ def test_an_answer_is_not_interrupted_by_another(desk: Desk, volume: Volume) -> 
     finally:
         volume.set_pause(lambda: None)
     assert desk.numbers == [1, 2]
+
+
+def long_pass(desk: Desk, steps: int) -> Any:
+    """An answer in so many steps, behind each of which others may have their turn."""
+
+    def answer(*_: Any) -> Any:
+        for _step in range(steps):
+            began = time.process_time()
+            while time.process_time() - began < 0.003:
+                pass
+            desk.answers.give_between()
+        return {}
+
+    return answer
+
+
+def test_an_answer_that_takes_long_is_given_up_for_keyframes(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ten thousand scattered points or a view of all of a large map would take a minute."""
+    monkeypatch.setattr(question_answers, "_LONGEST_S", 0.02)
+    monkeypatch.setattr(question_answers, "answer_of", long_pass(desk, 20))
+    desk.put(asked(1))
+    desk.answers.give()
+    assert desk.numbers == [1]
+    desk.put(asked(2), Publish(True))
+    desk.answers.give()
+    assert (desk.sent[-1].number, desk.sent[-1].late) == (2, True)
+    assert "keyframes wait" in desk.sent[-1].error
+    desk.inbox.orders.clear()
+    desk.at_work.set(7)  # a keyframe is under way
+    desk.put(asked(3))
+    desk.answers.give()
+    assert (desk.sent[-1].number, desk.sent[-1].late, desk.at_work.is_set) == (3, True, True)
+
+
+def test_an_answer_that_nobody_waits_for_any_more_is_given_up(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(question_answers, "answer_of", long_pass(desk, 1 << 20))
+    desk.put(asked(1, 0.05))
+    desk.answers.give()
+    assert [(one.number, one.late, one.error) for one in desk.sent] == [(1, True, questions.LATE)]
+
+
+def test_a_slice_that_was_given_up_is_made_anew(volume: Volume) -> None:
+    """Nothing is noted for it meanwhile, and nothing left out."""
+    wanted = Slice(kind="occupancy", low=0.5, high=1.5, up=(0.0, 0.0, 1.0), box=(-0.5, -0.5, 0.5, 0.5))
+    slices = KeptSlices(volume)
+    expected = slices.get(wanted).occupancy().cells
+
+    def fail() -> None:
+        raise question_answers.AnswerGivenUp("it takes long")
+
+    volume.integrate(wall(3))
+    volume.set_pause(fail)
+    try:
+        with pytest.raises(question_answers.AnswerGivenUp):
+            slices.get(wanted)
+    finally:
+        volume.set_pause(lambda: None)
+        volume.retract(wall(3))
+    slices.note_taken(volume.take_dirty())
+    assert slices._changed == {}
+    np.testing.assert_array_equal(slices.get(wanted).occupancy().cells, expected)

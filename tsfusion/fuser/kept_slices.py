@@ -40,11 +40,11 @@ class KeptSlices:
         if question.box is None:  # around the map, which grows
             return self._made(question)
         key = msgspec.structs.replace(question, kind="distance")
-        found = self._kept.pop(key, None)
+        found, changed = self._kept.pop(key, None), self._changed.pop(key, [])
         if found is None:
             found = self._made(key)
         else:
-            blocks = np.concatenate([*self._changed[key], self._volume.changed_blocks()])
+            blocks = np.concatenate([*changed, self._volume.changed_blocks()])
             found.update(np.unique(blocks, axis=0))
         self._kept[key], self._changed[key] = found, []
         if len(self._kept) > _MOST_KEPT:

@@ -40,8 +40,15 @@ if TYPE_CHECKING:
 
 _SHARE = 0.25  # of a busy fuser's time
 _BURST_S = 0.2  # seconds of time whose share may come at once
+_LONGEST_S = (
+    1.0  # seconds of processor time that an answer takes while keyframes wait: half of it on two cores
+)
 _LOOK_S = 0.001  # seconds of a long pass until questions are looked for again
 _Arrays = dict[str, NDArray[Any]]
+
+
+class AnswerGivenUp(TsfusionError):
+    """An answer took longer than it may."""
 
 
 class QuestionAnswers:
@@ -69,6 +76,9 @@ class QuestionAnswers:
         self.slices = KeptSlices(volume)
         self._share = Bucket(_SHARE, time.monotonic(), burst=_BURST_S)
         self._is_answering = False
+        self._until_s = 0.0  # of the answer that is being made, time.monotonic()
+        self._began_s = 0.0  # likewise, time.process_time()
+        self._is_aside = False  # whether it is made in the middle of a keyframe
         self._next_look = 0.0  # time.monotonic()
 
     def give(self) -> None:
@@ -82,6 +92,7 @@ class QuestionAnswers:
                 began = time.monotonic()
                 self._share.wait(0.0, began)  # it is full again after a rest
                 question, frames = self._inbox.questions.popleft()
+                self._is_aside = self._at_work.is_set
                 with self._at_work.aside():
                     self._answer(question, [frame.buffer for frame in frames])
                 self._inbox.read()
@@ -92,9 +103,26 @@ class QuestionAnswers:
             self._next_look = time.monotonic() + _LOOK_S
 
     def give_between(self) -> None:
-        """Answer what waits, from the middle of a long pass, which calls this after each little step."""
-        if time.monotonic() >= self._next_look:
+        """Answer what waits, from the middle of a long pass, which calls this after each little step.
+
+        Raises:
+            AnswerGivenUp: when the pass is an answer itself, and has taken too long.
+        """
+        if (now := time.monotonic()) < self._next_look:
+            return
+        if self._is_answering:
+            self._next_look = now + _LOOK_S
+            self._check_time(now)
+        else:
             self.give()
+
+    def _check_time(self, now: float) -> None:
+        if now > self._until_s:
+            raise AnswerGivenUp(questions.LATE)
+        if time.process_time() - self._began_s > _LONGEST_S:
+            self._inbox.read()
+            if self._is_aside or self._inbox.orders:
+                raise AnswerGivenUp(f"keyframes wait, and it takes more than {_LONGEST_S:g} s: ask for less")
 
     @property
     def _keyframes_wait(self) -> bool:
@@ -110,12 +138,15 @@ class QuestionAnswers:
         if began_ns > asked.deadline_ns:
             self._send(FuserAnswer(asked.number, error=questions.LATE, late=True), [])
             return
+        self._began_s, self._until_s = time.process_time(), asked.deadline_ns / 1e9
         try:
             if isinstance(asked.question, Cells | Keyframes):
                 arrays = self._watched.answer(asked.question)
             else:
                 arrays = answer_of(self._volume, self.slices, asked.question, frames)
             layouts, packed = questions.pack(arrays, compress=asked.compress)
+        except AnswerGivenUp as error:
+            self._send(FuserAnswer(asked.number, error=str(error), late=True), [])
         except MemoryError as error:
             why = f"not enough memory for that: {error}; raise fuser_memory_bytes"
             self._send(FuserAnswer(asked.number, error=why), [])

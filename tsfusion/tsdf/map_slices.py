@@ -149,7 +149,7 @@ class CurrentSlice:
                 corner, along_row, along_column, along_height, store.hash_keys, store.hash_slots,
                 store.sums, store.correction, int(store.corrected), self._least, self._values, self._seen,
             )  # fmt: skip
-            store.keep_within_memory()
+            store.rest()
             # kernel: voxels; here: cells
             self._values[part] *= np.float32(size / grid.resolution)
 
