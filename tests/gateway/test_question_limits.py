@@ -16,7 +16,7 @@ from tsfusion.gateway.metrics import Metrics
 from tsfusion.gateway.question_counts import QuestionCounts
 from tsfusion.wire import messages
 from tsfusion.wire.messages import Command
-from tsfusion.wire.questions import Answer, MapState, Raycast
+from tsfusion.wire.questions import Answer, Field, MapState, Raycast
 
 LOOK = Raycast(intrinsics=(1, 1, 0, 0), pose=(1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1), shape=(1, 1))
 
@@ -49,7 +49,7 @@ class Desk:
     def ask(self, identity: bytes, client: str = "", **fields: Any) -> bool:
         """Whether the question was passed on."""
         before = len(self.passed_on)
-        command = Command(name="ask", question=LOOK, **{"number": 3, **fields})
+        command = Command(name="ask", **{"number": 3, "question": LOOK, **fields})
         self.asked.ask(identity, command, [], cast("Any", self), client)
         return len(self.passed_on) > before
 
@@ -99,6 +99,18 @@ def test_answers_that_nobody_reads_fill_no_memory() -> None:
     desk.answer(300)
     assert not desk.ask(b"third")
     assert "fill the memory" in desk.error
+
+
+def test_answers_that_come_all_at_once_fill_no_memory() -> None:
+    """The largest ones, asked for over many connections before the first of them is there."""
+    large = Field(box=(0.0, 0.0, 0.0, 1.0, 1.0, 1.0), max_distance=1.0)
+    desk = Desk(most_bytes=4 * large.most_bytes)
+    assert sum(desk.ask(b"%d" % i, question=large) for i in range(20)) == 4
+    assert "fill the memory" in desk.error
+    assert desk.replies[-1].retry
+    desk.answer(1000)
+    assert not desk.ask(b"last", question=large)
+    assert Desk(most_bytes=10).ask(b"one", question=large)
 
 
 def test_a_question_ends_with_its_time_or_with_the_fuser(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -22,6 +22,7 @@ from typing import Any
 import costly_keyframes
 import msgspec
 import numpy as np
+import odd_askers
 import odd_clients
 import zmq
 from attack_target import Access, Target
@@ -394,6 +395,7 @@ ATTACKS: dict[str, Callable[[Target], int]] = {
     "half open": half_open,
     "slow loris": slow_loris,
     **odd_clients.ATTACKS,
+    **odd_askers.ATTACKS,
     "crossings": lambda target: _push_costly(target, lambda _: costly_keyframes.crossings(), 2.0),
     "surplus idat": lambda target: _push_costly(target, lambda _: costly_keyframes.surplus_idat(), 0.5),
     "fill": lambda target: _push_costly(target, costly_keyframes.filling, 0.05),

@@ -30,7 +30,7 @@ _DEAF = 40
 _FLOOD_POINTS = 2_000_000
 
 
-def _send(link: sockets.AnySocket, frames: Frames) -> int:
+def send(link: sockets.AnySocket, frames: Frames) -> int:
     with contextlib.suppress(zmq.Again):
         link.send_multipart(frames, zmq.NOBLOCK)
         return 1
@@ -38,7 +38,7 @@ def _send(link: sockets.AnySocket, frames: Frames) -> int:
     return 0
 
 
-def _drain(link: sockets.AnySocket) -> None:
+def drain(link: sockets.AnySocket) -> None:
     while link.poll(0):
         link.recv_multipart()
 
@@ -48,8 +48,8 @@ def _control_flood(target: Target, made: Callable[[int], Any]) -> int:
     sent = 0
     with target.control_link() as link:
         while not target.over:
-            sent += _send(link, [messages.encode(made(sent))])
-            _drain(link)
+            sent += send(link, [messages.encode(made(sent))])
+            drain(link)
     return sent
 
 
@@ -59,7 +59,7 @@ def _data_flood(target: Target, made: Callable[[int], Frames], pause: float = 0.
     with target.data_link() as link:
         while not target.over or not sent:
             if link.poll(200, zmq.POLLOUT):
-                sent += _send(link, made(sent))
+                sent += send(link, made(sent))
             elif target.over:
                 break
             time.sleep(pause)
@@ -92,9 +92,9 @@ def other_worlds(target: Target) -> int:
     with target.control_link() as link, target.data_link() as push:
         while not target.over:
             hello = Hello(os.urandom(16), PROTOCOL_VERSION, world=f"w{sent}")
-            sent += _send(link, [messages.encode(hello)])
-            sent += _send(push, with_header(frames, session=hello.session, world=f"w{sent}"))
-            _drain(link)
+            sent += send(link, [messages.encode(hello)])
+            sent += send(push, with_header(frames, session=hello.session, world=f"w{sent}"))
+            drain(link)
     return sent
 
 
@@ -103,17 +103,17 @@ def deaf_askers(target: Target) -> int:
     question = messages.encode(Command(name="health"))
     sent = 0
     with ExitStack() as stack:
-        links = [stack.enter_context(_small_buffer(target, target.control)) for _ in range(_DEAF)]
+        links = [stack.enter_context(small_buffer(target, target.control)) for _ in range(_DEAF)]
         while not target.over:
             for link in links:
                 for _ in range(10):
-                    sent += _send(link, [question])
+                    sent += send(link, [question])
             time.sleep(0.01)
     return sent
 
 
 @contextlib.contextmanager
-def _small_buffer(target: Target, address: str, kind: int = zmq.DEALER) -> Iterator[sockets.AnySocket]:
+def small_buffer(target: Target, address: str, kind: int = zmq.DEALER) -> Iterator[sockets.AnySocket]:
     """A connection that takes next to nothing before its other end has to keep it."""
 
     def make(context: "zmq.Context[Any]", keys: ClientKeys | None = None) -> sockets.AnySocket:
@@ -134,11 +134,11 @@ def deaf_viewers(target: Target) -> int:
     topic = b"\x01" + sockets.mesh_topic("default")
     with ExitStack() as stack:
         while not target.over:
-            link = stack.enter_context(_small_buffer(target, target.publish, zmq.XSUB))
-            with _small_buffer(target, target.publish, zmq.XSUB) as other:
+            link = stack.enter_context(small_buffer(target, target.publish, zmq.XSUB))
+            with small_buffer(target, target.publish, zmq.XSUB) as other:
                 for one in (link, other):
                     one.poll(500, zmq.POLLOUT)
-                    count += _send(one, [topic])
+                    count += send(one, [topic])
             time.sleep(0.02)
     return count
 
@@ -258,7 +258,7 @@ def hangers(target: Target) -> int:
             return sent
         with target.control_link() as link:
             link.poll(200, zmq.POLLOUT)
-            sent += _send(link, [messages.encode(Hello(number.to_bytes(16, "big"), PROTOCOL_VERSION))])
+            sent += send(link, [messages.encode(Hello(number.to_bytes(16, "big"), PROTOCOL_VERSION))])
     raise AssertionError("unreachable")
 
 

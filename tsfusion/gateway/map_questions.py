@@ -38,6 +38,11 @@ class WaitingQuestion(Struct, frozen=True):
     deadline_ns: int
     counts: QuestionCounts  # of its map
 
+    @property
+    def most_bytes(self) -> int:
+        """Size of its answer, at the most."""
+        return self.command.question.most_bytes if self.command.question else 0
+
 
 class MapQuestions:
     """The questions under way. Call `step` again and again.
@@ -45,7 +50,7 @@ class MapQuestions:
     Args:
         refused: counts what is not passed on, under `question`.
         unread: large answers that wait to be read.
-        max_bytes: of those.
+        max_bytes: of those, and of the answers that are still to come; a single one may be larger.
         rate: questions a second of each client.
     """
 
@@ -120,10 +125,11 @@ class MapQuestions:
             return f"{MOST_OF_A_CLIENT} questions of this client are under way"
         if len(of_map) >= MOST_WAITING:
             return "too many questions at once"
-        if self._unread.nbytes > self._max_bytes:
+        assert command.question is not None
+        held = self._unread.nbytes + sum(one.most_bytes for one in self._waiting.values())
+        if held and held + command.question.most_bytes > self._max_bytes:
             return "answers that others asked for and do not read fill the memory"
         number = next(self._numbers)
-        assert command.question is not None
         message = fuser_messages.FuserQuestion(
             number, command.question, waiting.asked_ns, waiting.deadline_ns, command.compress
         )

@@ -34,6 +34,7 @@ LONGEST_S = 60.0  # that a question may wait
 LATE = "its time was over before the map came to it"
 _POINTS_A_FRAME = CONTROL_MAX_BYTES // 12
 _FARTHEST_BLOCK = 1 << 20
+_CELL_BYTES, _KEYFRAME_BYTES = 1 << 15, 1 << 8  # of an answer, roughly
 _PACKED = ("float32", "int8", "uint8", "int32")  # what `array_encoding.pack` takes
 _PACKED_FROM = 4096  # bytes: smaller arrays travel as they are
 Pose = Annotated[tuple[float, ...], Meta(min_length=16, max_length=16)]
@@ -52,6 +53,11 @@ class Sample(Struct, frozen=True, tag="sample", omit_defaults=True):
     crc: int
     min_weight: float | None = None
     surface: Surface | None = None
+
+    @property
+    def most_bytes(self) -> int:
+        """Size of its answer, at the most."""
+        return 20 * self.points
 
     def problem(self, frames: Sequence[Any]) -> str:
         """Why this is not to be asked; empty = it may be. `frames`: what came with it."""
@@ -80,6 +86,11 @@ class Raycast(Struct, frozen=True, tag="raycast", omit_defaults=True):
     shape: tuple[int, int]
     min_weight: float | None = None
     surface: Surface | None = None
+
+    @property
+    def most_bytes(self) -> int:
+        """Size of its answer, at the most."""
+        return 19 * math.prod(self.shape)
 
     def problem(self, frames: Sequence[Any]) -> str:
         """Why this is not to be asked; empty = it may be. `frames`: what came with it."""
@@ -116,6 +127,11 @@ class Slice(Struct, frozen=True, tag="slice", omit_defaults=True):
     max_distance: float = 2.0
     min_weight: float | None = None
 
+    @property
+    def most_bytes(self) -> int:
+        """Size of its answer, at the most."""
+        return 5 * MOST_CELLS
+
     def problem(self, frames: Sequence[Any]) -> str:
         """Why this is not to be asked; empty = it may be. `frames`: what came with it."""
         numbers = (self.low, self.high, *self.up, *(self.box or ()), self.resolution or 0, self.max_distance)
@@ -137,6 +153,11 @@ class Field(Struct, frozen=True, tag="field", omit_defaults=True):
     max_distance: float
     subvoxel: bool = True
     min_weight: float | None = None
+
+    @property
+    def most_bytes(self) -> int:
+        """Size of its answer, at the most."""
+        return 5 * MOST_VOXELS
 
     def problem(self, frames: Sequence[Any]) -> str:
         """Why this is not to be asked; empty = it may be. `frames`: what came with it."""
@@ -160,6 +181,11 @@ class Cells(Struct, frozen=True, tag="cells", omit_defaults=True):
     since: int | None = None
     surface: Literal["raw"] | None = "raw"
 
+    @property
+    def most_bytes(self) -> int:
+        """Size of its answer, at the most."""
+        return _CELL_BYTES * CELLS_AT_ONCE
+
     def problem(self, frames: Sequence[Any]) -> str:
         """Why this is not to be asked; empty = it may be. `frames`: what came with it."""
         if frames:
@@ -179,6 +205,11 @@ class Keyframes(Struct, frozen=True, tag="keyframes", omit_defaults=True):
 
     session: Annotated[bytes, Meta(max_length=16)] = b""
     after: int = 0
+
+    @property
+    def most_bytes(self) -> int:
+        """Size of its answer, at the most."""
+        return _KEYFRAME_BYTES * KEYFRAMES_AT_ONCE
 
     def problem(self, frames: Sequence[Any]) -> str:
         """Why this is not to be asked; empty = it may be. `frames`: what came with it."""
