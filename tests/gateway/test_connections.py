@@ -4,7 +4,7 @@
 import socket
 import sys
 from collections.abc import Iterator
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from unittest import mock
 
 import pytest
@@ -108,3 +108,21 @@ def test_other_files_are_no_crowd(stack: ExitStack) -> None:
         assert looks.call_count == 1
         _more = [port.connect("127.0.0.1") for _ in range(2)]
         assert port.limits.step() == 2
+
+
+def test_viewers_that_do_not_read_are_told_from_those_that_do(stack: ExitStack) -> None:
+    port = Port(stack, socket.AF_INET, "127.0.0.1")
+    own = port._listening.getsockname()[1]
+    port.limits.listen_at(1, 2, own)
+    (_, to_deaf), (_, to_idle) = port.connect("127.0.0.1"), port.connect("127.0.0.1")
+    to_deaf.setblocking(False)
+    with suppress(BlockingIOError):
+        while True:
+            to_deaf.send(bytes(_PIECE))
+    to_idle.send(b"x")
+    assert port.limits.cut_deaf_viewers() == 1
+    with pytest.raises(OSError, match="pipe"):
+        to_deaf.send(b"x")
+    to_idle.send(b"x")
+    port.limits.listen_at(own, 1, 2)  # on another port nobody is a viewer
+    assert port.limits.cut_deaf_viewers() == 0

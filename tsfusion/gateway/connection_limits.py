@@ -111,4 +111,14 @@ class ConnectionLimits:
                 peer,
                 nbytes / 1e6,
             )
-        return bool(hoarders)
+        if hoarders:
+            return True
+        if deaf := self._ports.connections.cut_deaf_viewers():
+            self._hoarders_cut = now
+            self._refused["memory"] += deaf
+            log.warning(
+                "the gateway holds %d MB, too near to memory_bytes: %s cut off",
+                held >> 20,
+                count_of(deaf, "viewer that does not read is", "viewers that do not read are"),
+            )
+        return deaf > 0

@@ -27,7 +27,8 @@ _VIEWER_BYTES = 64 << 10  # that a viewer may send in all: its subscriptions are
 _LONGEST_INTERVAL = 1.0
 _SHARE = 20  # of the time at most one part in so many goes into looking
 _UNREAD_BYTES = 1 << 20  # that a connection may have under way whatever happens
-_TCP_INFO = struct.Struct("=B51xI72xQ")  # linux/tcp.h: tcpi_state, tcpi_last_data_recv, tcpi_bytes_received
+# linux/tcp.h: tcpi_state, tcpi_last_data_recv, tcpi_bytes_received, tcpi_notsent_bytes
+_TCP_INFO = struct.Struct("=B51xI72xQ8xI")
 _TCP_LISTEN = 10
 _FILES = "/proc/self/fd"
 
@@ -39,6 +40,7 @@ class Connection(Struct, frozen=True):
     port: int  # of this process
     silent_ms: int
     received_bytes: int
+    unsent_bytes: int  # that the other end does not read
 
 
 class Connections:
@@ -100,6 +102,14 @@ class Connections:
         hoarders = [(fd, _peer_of(fd), nbytes) for fd, nbytes in unread if nbytes > least]
         return [(peer, nbytes) for fd, peer, nbytes in hoarders if self.cut(fd)]
 
+    def cut_deaf_viewers(self) -> int:
+        """Cut off the viewers that do not read what waits for them; how many that were.
+
+        ZeroMQ keeps some messages for each, and others for one that came later.
+        """
+        deaf = [one.fd for one in self._look() if one.port == self._viewers_port and one.unsent_bytes]
+        return sum(map(self.cut, deaf))
+
     def _look(self) -> list[Connection]:
         """The connections that stand. More than came over one was read over another of its number, before."""
         found = list(self._all())
@@ -112,11 +122,11 @@ class Connections:
                 if not stat.S_ISSOCK(os.fstat(fd).st_mode):
                     continue
                 with _shared(fd) as link:
-                    state, silent_ms, received = _TCP_INFO.unpack(
+                    state, silent_ms, received, unsent = _TCP_INFO.unpack(
                         link.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _TCP_INFO.size)
                     )
                     if state != _TCP_LISTEN and self._is_ours(link):
-                        yield Connection(fd, link.getsockname()[1], silent_ms, received)
+                        yield Connection(fd, link.getsockname()[1], silent_ms, received, unsent)
 
     def cut(self, fd: int) -> bool:
         """Cut a connection off; False when it is none (any more)."""
