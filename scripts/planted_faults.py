@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: MIT
+"""Take guarding lines away, one at a time, in a copy of the sources, and see that a test notices each.
+
+    python scripts/planted_faults.py                  all of them: a JSON line each
+    python scripts/planted_faults.py --only spool     those whose file or line matches
+    python scripts/planted_faults.py --first 10 --limit 5
+
+The guards are those of journal, checkpoints, sessions, admission, spool, questions and the map's sums
+(tests/support/planted_faults.py). Of each fault the named test files run one by one, until a test fails.
+The exit status is 1 when all pass with a guard away: it needs a test.
+"""
+
+import argparse
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
+from planted_faults import FAULTS, Fault
+
+_ROOT = Path(__file__).parents[1]
+_COPIED = ("tsfusion", "tests", "scripts", "docs", "contrib", "pyproject.toml", "README.md")
+_LONGEST_S = 300.0  # that a test file may take; a fault may make one hang, which is noticed, too
+
+
+def caught_by(root: Path, fault: Fault) -> str:
+    """The test that fails with a fault in the sources below `root`; empty = none does."""
+    path = root / "tsfusion" / fault.file
+    whole = path.read_text(encoding="utf-8")
+    if whole.count(fault.old) != 1:
+        raise SystemExit(f"{fault.file} does not have {fault.old!r} once: say anew what the fault is")
+    path.write_text(whole.replace(fault.old, fault.new), encoding="utf-8")
+    try:
+        return next((found for test in fault.tests if (found := failure(root, test))), "")
+    finally:
+        path.write_text(whole, encoding="utf-8")
+
+
+def failure(root: Path, test: str) -> str:
+    """The first test of a file that fails; empty = all pass."""
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-n0", "-p", "no:cacheprovider", f"tests/{test}"]
+    environment = {**os.environ, "PYTHONPATH": str(root), "PYTHONDONTWRITEBYTECODE": "1"}
+    try:
+        done = subprocess.run(
+            command,
+            cwd=root,
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=_LONGEST_S,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return f"{test} (hangs)"
+    if done.returncode == 0:
+        return ""
+    if done.returncode != 1:
+        raise SystemExit(f"{test} cannot be run: {done.stdout[-2000:]}{done.stderr[-2000:]}")
+    named = re.search(r"^(?:FAILED|ERROR) (\S+)", done.stdout, re.MULTILINE)
+    return named[1] if named else test
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--only", default="", help="a regular expression")
+    parser.add_argument("--first", type=int, default=1, help="number of the first fault")
+    parser.add_argument("--limit", type=int, help="how many faults")
+    options = parser.parse_args()
+    chosen = [
+        (number, one)
+        for number, one in enumerate(FAULTS, 1)
+        if re.search(options.only, f"{one.file} {one.old}")
+    ][options.first - 1 :][: options.limit]
+    missed = 0
+    with tempfile.TemporaryDirectory(prefix="tsfusion-planted-") as folder:
+        root = Path(folder)
+        for name in _COPIED:
+            source, skip = _ROOT / name, shutil.ignore_patterns("__pycache__")
+            if source.is_dir():
+                shutil.copytree(source, root / name, ignore=skip)
+            else:
+                shutil.copy(source, root / name)
+        for number, fault in chosen:
+            began = time.monotonic()
+            found = caught_by(root, fault)
+            missed += not found
+            line = {"number": number, "file": fault.file, "fault": fault.old.strip(), "caught_by": found}
+            print(json.dumps({**line, "seconds": round(time.monotonic() - began, 1)}), flush=True)
+    print(f"{len(chosen) - missed} of {len(chosen)} faults are noticed", file=sys.stderr)
+    return int(missed > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

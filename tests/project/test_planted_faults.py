@@ -1,0 +1,19 @@
+# SPDX-License-Identifier: MIT
+"""The faults of scripts/planted_faults.py are still those of the sources; the script itself takes long."""
+
+from planted_faults import FAULTS
+from repository import ROOT
+
+
+def test_each_guard_stands_once_and_its_tests_are_there() -> None:
+    assert len(FAULTS) >= 40
+    for one in FAULTS:
+        path = ROOT / "tsfusion" / one.file
+        assert path.read_text(encoding="utf-8").count(one.old) == 1, (one.file, one.old)
+        assert one.new != one.old
+        for test in one.tests:
+            assert (ROOT / "tests" / test).is_file(), test
+
+
+def test_no_fault_is_planted_twice() -> None:
+    assert len({(one.file, one.old) for one in FAULTS}) == len(FAULTS)
