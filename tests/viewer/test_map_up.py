@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""Up in a page that was opened when all keyframes had come: by how their sensors were held."""
+"""Up in a page: by how sensors were held, whatever comes first, the surface or the sensor."""
 
 import numpy as np
 import pytest
 
+from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.up_direction import HeldSensor
 from tsfusion.viewer.map_tiles import MapTiles
 from tsfusion.viewer.map_up import MapUp
-from tsfusion.wire.map_events import PathsFound, SurfaceUpdate
+from tsfusion.wire.map_events import PathsFound, ScannerSeen, SurfaceUpdate
 
 
 def floor(axis: int, height: float) -> SurfaceUpdate:
@@ -27,17 +28,32 @@ def floor(axis: int, height: float) -> SurfaceUpdate:
     )
 
 
+def upright(axis: int) -> np.ndarray:
+    """The pose of a camera that is held upright where the map's axis points up."""
+    T = np.eye(4)
+    T[:3, 1] = -np.eye(3)[axis]  # a camera's y points down
+    T[:3, 2] = np.eye(3)[(axis + 1) % 3]
+    T[:3, 0] = np.cross(T[:3, 1], T[:3, 2])
+    return T
+
+
+def test_a_scanner_that_is_seen_after_its_surface_counts() -> None:
+    tiles, up = MapTiles(), MapUp()
+    tiles.apply(floor(0, -1.5), 0.0)  # without a camera nobody takes x for up
+    up.look(tiles)
+    camera = Intrinsics(500.0, 500.0, 320.0, 240.0)
+    up.note_scanner(ScannerSeen(b"one", 0, upright(0), camera, (480, 640)))
+    up.look(tiles)
+    assert up.direction @ (1, 0, 0) > 0.99
+
+
 @pytest.mark.parametrize("axis", [1, 2])
 def test_paths_say_which_way_is_up(axis: int) -> None:
     tiles = MapTiles()
     tiles.apply(floor(axis, -1.5), 0.0)
-    T = np.eye(4)
-    T[:3, 1] = -np.eye(3)[axis]  # a camera's y points down
-    T[:3, 2] = np.eye(3)[0]
-    T[:3, 0] = np.cross(T[:3, 1], T[:3, 2])
     held = HeldSensor()
     for _ in range(3):
-        held.add(T, "kinect")
+        held.add(upright(axis), "kinect")
 
     up = MapUp()
     up.look(tiles)

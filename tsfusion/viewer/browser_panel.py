@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from tsfusion.geometry.mesh import Mesh
 
 WHOLE, BY_HAND, _FOLLOW = "Whole map", "By hand", "Follow "
-_SETTLED = 1.5  # seconds after a move of ours, in which a browser still tells older places
+_SETTLED = 10.0  # seconds after a move of ours, in which a slow browser may still tell older places
 _MOVED = 0.02  # of the distance to the target: further away, somebody moved the camera
 _RENDER = 30.0  # seconds that a browser may take for a picture
 _NARROW = 576  # pixels: up to there viser puts the panel over the lower half of the picture
@@ -71,6 +71,7 @@ class BrowserPanel:
         self._client, self._shown = client, shown
         self._commanded: View | None = None
         self._moved_at = 0.0
+        self._has_arrived = False  # whether the browser has been where we moved its camera
         self._points: list[NDArray[np.float64]] = []
         self._marks: list[Any] = []
         self._is_measuring = False
@@ -98,7 +99,7 @@ class BrowserPanel:
         view = self._wanted()
         if view is None or not self._differs(view):
             return
-        self._commanded, self._moved_at = view, time.monotonic()
+        self._commanded, self._moved_at, self._has_arrived = view, time.monotonic(), False
         with self._client.atomic():
             self._client.camera.position = view.position
             self._client.camera.look_at = view.target
@@ -129,10 +130,12 @@ class BrowserPanel:
     def _note_move(self) -> None:
         """Leave the camera to whoever has moved it."""
         view = self._commanded
-        if view is None or time.monotonic() < self._moved_at + _SETTLED or self._camera.value == BY_HAND:
+        if view is None or self._camera.value == BY_HAND:
             return
         distance = float(np.linalg.norm(view.position - view.target))
-        if float(np.linalg.norm(self._client.camera.position - view.position)) > _MOVED * distance:
+        if float(np.linalg.norm(self._client.camera.position - view.position)) <= _MOVED * distance:
+            self._has_arrived = True
+        elif self._has_arrived or time.monotonic() >= self._moved_at + _SETTLED:
             self._camera.value = BY_HAND
 
     def _toggle_measuring(self) -> None:

@@ -188,6 +188,7 @@ class LivePage:
         self._colors.up = self._up.direction
         if self._up.up != before:
             self._server.scene.set_up_direction(self._up.direction)
+            self._looked = -np.inf  # cameras follow at once: what browsers tell of them is turned, too
         if self._colors.fit_scale():
             self._nodes.changed(self._tiles.tiles)
         bounds = [tile.bounds for tile in list(self._tiles.tiles.values())]

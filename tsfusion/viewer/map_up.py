@@ -30,6 +30,8 @@ class MapUp:
 
     def note_scanner(self, event: ScannerSeen) -> None:
         """Take into account how a sensor was held."""
+        if not self._held.is_known:
+            self._looked_at = 0  # what was found before was found without
         self._held.add(event.T_world_camera, "lidar" if event.intrinsics is None else "camera")
 
     def note_paths(self, event: PathsFound) -> None:

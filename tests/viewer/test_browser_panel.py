@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: MIT
+"""Whose the camera of a browser is: the page's, until somebody moves it, however slow the browser is."""
+
+import contextlib
+from types import SimpleNamespace
+from typing import Any
+from unittest.mock import MagicMock
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tsfusion.viewer import browser_panel
+from tsfusion.viewer.browser_panel import BY_HAND, WHOLE, BrowserPanel
+from tsfusion.viewer.map_views import View
+
+UP = np.array((0.0, 0, 1))
+FIRST, SECOND = np.array((5.0, 0, 0)), np.array((9.0, 0, 0))
+
+
+class Browser:
+    """A browser that tells where its camera is when it is asked to, and the panel of it."""
+
+    def __init__(self) -> None:
+        self.whole = View(FIRST, np.zeros(3), UP)
+        camera = SimpleNamespace(position=np.zeros(3), aspect=1.6, image_width=960)
+        camera.on_update = lambda tell: setattr(self, "_tell", tell)
+        self._camera = camera
+        client = MagicMock(camera=camera, gui=MagicMock(add_dropdown=self._dropdown))
+        shown: Any = SimpleNamespace(scanners=list, whole_view=lambda aspect, covered: self.whole)
+        self.panel = BrowserPanel(client, shown, contextlib.nullcontext)
+        self.panel.update()
+
+    def _dropdown(self, label: str, options: Any, initial_value: str) -> Any:
+        self.choice = SimpleNamespace(value=initial_value, options=options, on_update=lambda call: None)
+        return self.choice
+
+    def tells(self, place: NDArray[np.float64]) -> None:
+        self._camera.position = place
+        self._tell(None)
+
+    def grows(self) -> None:
+        self.whole = View(SECOND, np.zeros(3), UP)
+        self.panel.update()
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+    now = SimpleNamespace(s=100.0)
+    monkeypatch.setattr(browser_panel.time, "monotonic", lambda: now.s)
+    return now
+
+
+def test_a_slow_browser_that_tells_an_older_place_keeps_its_camera(clock: SimpleNamespace) -> None:
+    browser = Browser()
+    browser.grows()
+    clock.s += 5
+    browser.tells(FIRST)  # where the page had it before
+    assert browser.choice.value == WHOLE
+    browser.tells(SECOND)
+    assert browser.choice.value == WHOLE
+
+
+def test_a_camera_that_leaves_its_place_is_moved_by_hand(clock: SimpleNamespace) -> None:
+    browser = Browser()
+    browser.tells(FIRST + 0.01)
+    clock.s += 0.1
+    browser.tells(FIRST + 1)
+    assert browser.choice.value == BY_HAND
+    browser.grows()
+    assert browser._camera.position is not SECOND
+
+
+def test_a_camera_that_never_comes_to_its_place_is_moved_by_hand(clock: SimpleNamespace) -> None:
+    browser = Browser()
+    clock.s += 60
+    browser.tells(SECOND)
+    assert browser.choice.value == BY_HAND
