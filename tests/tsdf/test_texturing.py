@@ -3,11 +3,13 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from gltf_validation import problems
 
 from tsfusion import Keyframe, Volume
 from tsfusion.core.errors import InvalidConfig, MapError
@@ -90,6 +92,10 @@ def test_the_same_images_give_the_same_bytes(
     ]
     assert again.texture.corners.tobytes() == textured.texture.corners.tobytes()
     assert again.encode(".glb") == textured.encode(".glb")
+
+
+def test_khronos_calls_the_glb_valid(textured: TexturedMesh, tmp_path: Path) -> None:
+    assert problems(textured.save(tmp_path / "room.glb")) == []
 
 
 def test_what_stands_in_front_is_not_painted_on_what_it_hides(

@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: MIT
 """Tiles as GLB: places to a fraction of a voxel, no cracks, and the colours that were asked for."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from drawn_scenes import decoded
+from gltf_validation import problems
 
 from tsfusion.viewer import tile_glb
 
@@ -32,6 +35,13 @@ def test_neighbours_meet_without_a_crack() -> None:
     left = decoded(encoded(shared, grey, np.zeros(3))).vertices
     right = decoded(encoded(shared, grey, np.full(3, edge - 64 * VOXEL / 2))).vertices
     assert np.abs(left - right).max() < 1e-12
+
+
+def test_khronos_finds_a_tile_too_bright_on_purpose_and_nothing_else(tmp_path: Path) -> None:
+    vertices = np.random.default_rng(2).uniform(0, 1, (300, 3))
+    (tmp_path / "tile.glb").write_bytes(encoded(vertices, np.full((300, 3), 200), np.zeros(3)))
+    found = {(one["code"], one["pointer"].rpartition("/")[0]) for one in problems(tmp_path / "tile.glb")}
+    assert found <= {("VALUE_NOT_IN_RANGE", "/materials/0/pbrMetallicRoughness/baseColorFactor")}
 
 
 def test_a_tile_with_strays_gets_a_coarser_grid() -> None:
