@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from tsfusion.tsdf.map_slices import CurrentSlice
     from tsfusion.tsdf.volume import Volume
 
-_MOST_KEPT = 2  # slices, of some 40 bytes a cell
+_MOST_KEPT = 2  # slices, of some 52 bytes a cell
 
 
 class KeptSlices:

@@ -175,6 +175,27 @@ def spread_along_lines(
 
 
 @ti.kernel
+def place_sites(
+    values: ti.types.ndarray(dtype=ti.f32, ndim=1),
+    shape: vec3i,
+    squared: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    rows: vec2i,
+    columns: vec2i,
+    offsets: ti.types.ndarray(dtype=ti.f32, ndim=2),
+):
+    """`offsets`: the way to the surface of the sites (`squared` is 0) in some `rows`, x, and `columns`, y."""
+    width = columns[1] - columns[0]
+    for n in range((rows[1] - rows[0]) * width):
+        x, y = rows[0] + n // width, columns[0] + n % width
+        for z in range(shape[2]):
+            i = (x * shape[1] + y) * shape[2] + z
+            if squared[i] == 0:
+                offset = surface_offset(values, shape, vec3i(x, y, z))
+                for a in ti.static(range(3)):
+                    offsets[i, a] = offset[a]
+
+
+@ti.kernel
 def measure(
     values: ti.types.ndarray(dtype=ti.f32, ndim=1),
     shape: vec3i,
@@ -185,6 +206,8 @@ def measure(
     rows: vec2i,
     columns: vec2i,
     subvoxel: ti.i32,
+    placed: ti.i32,
+    offsets: ti.types.ndarray(dtype=ti.f32, ndim=2),
     edge: ti.f32,
     most: ti.f32,
     distances: ti.types.ndarray(dtype=ti.f32, ndim=1),
@@ -193,7 +216,8 @@ def measure(
     end), of the box `begin`, `extent`:
     to the surface at the nearest site, or to the site's centre. Negative where a voxel lies behind it.
 
-    `edge` is a voxel's, metres.
+    `edge` is a voxel's, metres. With `placed` the surface lies at the sites' `offsets`, of `place_sites`:
+    many voxels have one site.
     """
     width = columns[1] - columns[0]
     for n in range((rows[1] - rows[0]) * width):
@@ -207,7 +231,11 @@ def measure(
                 distance = ti.min(ti.sqrt(ti.cast(squared[i], ti.f32)) * edge, most)
             elif site >= 0:
                 at = vec3i(site // (shape[1] * shape[2]), site // shape[2] % shape[1], site % shape[2])
-                foot = ti.cast(at - place, ti.f32) + surface_offset(values, shape, at)
+                foot = ti.cast(at - place, ti.f32)
+                if placed == 1:
+                    foot += vec3f(offsets[site, 0], offsets[site, 1], offsets[site, 2])
+                else:
+                    foot += surface_offset(values, shape, at)
                 distance = ti.min(foot.norm() * edge, most)
             own = value_at(values, shape, place)
             distances[i] = ti.select(own < 0.0, -distance, distance)

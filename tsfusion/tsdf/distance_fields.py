@@ -70,8 +70,8 @@ def in_box(
     squared, nearest = _nearest_sites(values, shape, low, extent, reach)
     distance = np.empty(math.prod(extent), np.float32)
     kernels.measure(
-        values, shape, low, extent, squared, nearest, (0, extent[0]), (0, extent[1]), int(subvoxel), size,
-        reach.metres, distance,
+        values, shape, low, extent, squared, nearest, (0, extent[0]), (0, extent[1]), int(subvoxel),
+        0, np.empty((1, 3), np.float32), size, reach.metres, distance,
     )  # fmt: skip
     inside = tuple(slice(a, a + n) for a, n in zip(low, extent, strict=True))
     return DistanceField(

@@ -20,7 +20,7 @@ from tsfusion.kernels.sensor_noise import WEIGHT_ONE
 from tsfusion.tsdf.block_store import BlockStore, unpack_keys
 from tsfusion.tsdf.distance_fields import Reach, spread
 
-MOST_CELLS = 1 << 24  # with the margin; some 40 bytes each
+MOST_CELLS = 1 << 24  # with the margin; some 52 bytes each
 _MOST_SAMPLES = 1 << 12  # of a cell
 _PART = 1 << 14  # cells read at a time: their blocks may have to come from a file
 _SEEN_SHARE = 0.5  # of a cell's samples, for it to be free
@@ -82,9 +82,11 @@ class CurrentSlice:
         count = rows * columns
         self._values, self._seen = np.full(count, np.nan, np.float32), np.zeros(count, np.int32)
         self._marked, self._spread, self._nearest = (
-            (np.empty(count, np.int32), np.empty(count, np.int32)) for _ in range(3)
+            (np.empty(count, np.int32), np.full(count, transform.NONE, np.int32)) for _ in range(3)
         )
-        self._distance = np.empty(count, np.float32)
+        for squared in (self._marked[0], self._spread[0], self._nearest[0]):
+            squared[:] = transform.FAR
+        self._offsets, self._distance = np.empty((count, 3), np.float32), np.empty(count, np.float32)
         self._read(np.arange(count, dtype=np.int32))
         self._count((0, 0, rows, columns))
 
@@ -176,22 +178,33 @@ class CurrentSlice:
         """Count distances again, as far as changed cells reach."""
         rows, columns = self._shape
         top, left, bottom, right = changed
-        top, bottom = max(top - 1, 0), min(bottom + 1, rows)  # cells beside them may become sites
-        # of a site beside them the surface may lie elsewhere in its cell
-        reach = self._margin + 1
-        left, right = max(left - reach, 0), min(right + reach, columns)
+        # cells beside them may become sites, or have their surface elsewhere
+        top, bottom = max(top - 1, 0), min(bottom + 1, rows)
+        left, right = max(left - 1, 0), min(right + 1, columns)
+        reach = self._margin
+        sites = self._marked[1].reshape(self._shape)[top:bottom]
+        before = sites.copy()
         transform.mark_sites(self._values, rows, columns, 1, top, bottom, *self._marked)
-        spread(
-            self._marked, self._spread, (columns, 1),
-            lines=(top, bottom), places=(0, columns), reach=self._reach,
-        )  # fmt: skip
-        spread(
-            self._spread, self._nearest, (rows, columns),
-            lines=(left, right), places=(0, rows), reach=self._reach,
-        )  # fmt: skip
+        transform.place_sites(
+            self._values, (rows, columns, 1), self._marked[0], (top, bottom), (left, right), self._offsets
+        )
+        is_other = sites != before
+        if is_other.any():  # where the same cells are sites as before, the nearest ones are the same
+            lines = top + np.flatnonzero(is_other.any(axis=1))
+            places = np.flatnonzero(is_other.any(axis=0))
+            spread(
+                self._marked, self._spread, (columns, 1),
+                lines=(int(lines[0]), int(lines[-1]) + 1), places=(0, columns), reach=self._reach,
+            )  # fmt: skip
+            reached = max(int(places[0]) - reach, 0), min(int(places[-1]) + 1 + reach, columns)
+            spread(
+                self._spread, self._nearest, (rows, columns),
+                lines=reached, places=(0, rows), reach=self._reach,
+            )  # fmt: skip
         transform.measure(
             self._values, (rows, columns, 1), (0, 0, 0), (rows, columns, 1), *self._nearest,
-            (max(top - reach, 0), min(bottom + reach, rows)), (left, right), 1,
+            (max(top - reach, 0), min(bottom + reach, rows)),
+            (max(left - reach, 0), min(right + reach, columns)), 1, 1, self._offsets,
             self.grid.resolution, self._reach.metres, self._distance,
         )  # fmt: skip
 
