@@ -203,16 +203,17 @@ class Mesh:
             known_up=self.up,
         )
 
-    def of_faces(self, kept: NDArray[np.bool_]) -> "Mesh":
-        """The faces of a (m,) bool, and the vertices that they use, in the same order."""
+    def of_faces(self, kept: NDArray[np.bool_] | NDArray[np.integer]) -> "Mesh":
+        """The faces of a (m,) bool, or of some numbers, and the vertices that they use, in the same order."""
         faces = self.faces[kept]
-        used = np.zeros(len(self.vertices), bool)
-        used[faces] = True
-        number = np.cumsum(used, dtype=np.int32) - 1
+        first, last = (int(faces.min()), int(faces.max())) if len(faces) else (0, -1)
+        is_used = np.zeros(last + 1 - first, bool)  # of a part of the mesh these are few of all vertices
+        is_used[faces - first] = True
+        used, number = first + np.flatnonzero(is_used), np.cumsum(is_used, dtype=np.int32) - np.int32(1)
         return dataclasses.replace(
             self,
             vertices=self.vertices[used],
-            faces=number[faces],
+            faces=number[faces - first],
             normals=self.normals[used],
             colors=None if self.colors is None else self.colors[used],
             guessed=None if self.guessed is None else self.guessed[kept],

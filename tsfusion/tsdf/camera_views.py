@@ -92,9 +92,9 @@ def _parts(tiles: SurfaceTiles, numbers: NDArray[np.int64]) -> Iterator[Mesh]:
     """Meshes of tiles, joined up to `MOST_TRIANGLES`."""
     part: list[Mesh] = []
     triangles = 0
-    for number in numbers.tolist():
-        part.append(tiles.mesh(number))
-        triangles += len(part[-1].faces)
+    for mesh in tiles.meshes(numbers.tolist()):
+        part.append(mesh)
+        triangles += len(mesh.faces)
         if triangles >= MOST_TRIANGLES:
             yield _joined(part)
             part, triangles = [], 0

@@ -5,6 +5,7 @@ What a cube holds depends on the map alone: not on what was asked before, nor on
 """
 
 from collections import OrderedDict
+from collections.abc import Iterator, Sequence
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
@@ -17,6 +18,7 @@ from tsfusion.tsdf.block_store import BlockStore, pack_keys, unpack_keys
 from tsfusion.tsdf.surface_values import SurfaceView, values_of
 
 SIDE = 8  # blocks
+AT_ONCE = 16  # cubes that are meshed together
 MOST_BYTES = 32 << 20  # of values that are kept, and of meshes
 
 _INSIDE = np.stack(np.meshgrid(*[np.arange(SIDE)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -89,14 +91,33 @@ class SurfaceTiles:
         )
         return new[most] if len(new) > most else len(keys)
 
-    def mesh(self, number: int) -> Mesh:
-        """The mesh of a cube's cells."""
-        piece = self._meshes.get(number)
-        if piece is None:
-            keys = self._keys(number)
-            made = mesh_extraction.extract(keys, self._store, self._min_weight, self._buffers, self.values)
-            piece = self._meshes.put(number, _Piece(made))
-        return piece.mesh
+    def meshes(self, numbers: Sequence[int]) -> Iterator[Mesh]:
+        """The meshes of the cells of some cubes; what is not kept is made several at a time."""
+        for i in range(0, len(numbers), AT_ONCE):
+            some = numbers[i : i + AT_ONCE]
+            pieces = {number: self._meshes.get(number) for number in some}
+            made = self._made([number for number, piece in pieces.items() if piece is None])
+            for number in some:
+                yield (pieces[number] or made[number]).mesh
+
+    def _made(self, numbers: list[int]) -> dict[int, "_Piece"]:
+        """Meshes of cubes, each as it would be without the others: a launch costs as much as a small one."""
+        if not numbers:
+            return {}
+        own = [self._keys(number) for number in numbers]
+        keys = np.concatenate(own)
+        order = np.argsort(keys)
+        whole, first_face = mesh_extraction.extract_cells(
+            keys[order], self._store, self._min_weight, self._buffers, self.values
+        )
+        cube_of = np.repeat(np.arange(len(own)), [len(one) for one in own])[order]
+        cube_of = np.repeat(cube_of, np.diff(first_face))
+        faces = np.argsort(cube_of, kind="stable")
+        parts = np.split(faces, np.searchsorted(cube_of[faces], np.arange(1, len(own))))
+        return {
+            number: self._meshes.put(number, _Piece(whole.of_faces(part)))
+            for number, part in zip(numbers, parts, strict=True)
+        }
 
     def _read(
         self,
