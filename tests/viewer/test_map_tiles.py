@@ -62,6 +62,33 @@ def test_a_tile_has_no_vertex_too_many_and_knows_its_cells(sphere: tuple[MapTile
         assert (tile.bounds[0] <= tile.mesh.vertices).all()
 
 
+@pytest.mark.parametrize("together", [2, 5, 100])
+def test_updates_at_once_are_the_same_as_one_after_the_other(together: int) -> None:
+    feed = GrowingMap(Volume(voxel_size=0.02, threads=2), sphere_views(RADIUS)[:4])
+    updates = []
+    while not feed.is_whole:
+        updates += [event for event in feed.grow() if isinstance(event, SurfaceUpdate)]
+    nobody = np.zeros((0, 3), np.int32)
+    nothing = Mesh(np.zeros((0, 3), np.float32), nobody, np.zeros((0, 3), np.float32))
+    updates.insert(1, SurfaceUpdate(nobody, np.zeros(1, np.int32), nothing, True))
+    ours, expected = MapTiles(4), MapTiles(4)
+    changed, each = set(), set()
+    for i in range(0, len(updates), together):
+        changed |= ours.apply_all(updates[i : i + together], 1.0)
+    for update in updates:
+        each |= expected.apply(update, 1.0)
+    assert changed == each
+    assert ours.clients == expected.clients
+    assert ours.tiles.keys() == expected.tiles.keys()
+    for key, tile in ours.tiles.items():
+        other = expected.tiles[key]
+        assert np.array_equal(triangles(tile.mesh), triangles(other.mesh))
+        assert np.array_equal(np.unique(tile.mesh.faces), np.arange(len(tile.mesh.vertices)))
+        assert np.array_equal(np.bincount(tile.cell, minlength=64), np.bincount(other.cell, minlength=64))
+        assert np.array_equal(tile.client, other.client)
+        assert np.array_equal(tile.changed_s, other.changed_s)
+
+
 def test_cells_without_triangles_take_theirs_away() -> None:
     tiles, feed = grown(count=3)
     blocks = np.array([np.array(key) * tiles.edge + cell for key, tile in tiles.tiles.items()

@@ -39,7 +39,10 @@ if TYPE_CHECKING:
     import viser
 
 MAX_BYTES_PER_SECOND = 8e6  # to each browser, as triangles
-_BUSY, _IDLE = 0.02, 0.1  # seconds that are waited for an event
+_BUSY, _IDLE = 0.05, 0.1  # seconds that are waited for an event
+_SHARE = 0.025  # of a core, for putting updates into tiles: many at once cost little more than one
+_TOGETHER = (0.1, 1.0)  # seconds of updates that are taken at once, at least and at most
+_MOST_UPDATES = 64  # that wait for that
 _BEHIND = 50  # voxels that a following camera is behind a scanner
 _SETTLED = 0.25  # seconds that a time slider rests before the map is rewound
 _OFTEN, _SELDOM = 0.3, 1.0  # seconds between two looks at cameras, and at scales and states
@@ -73,6 +76,8 @@ class LivePage:
         self._problem = ""
         self._up = MapUp()
         self._tiles = MapTiles()
+        self._updates: list[SurfaceUpdate] = []  # that have yet to be applied
+        self._next_apply = -np.inf
         self._colors = VertexColors(self._tiles, feed.weights, measures or {})
         self._nodes = TileNodes(
             server.scene,
@@ -111,10 +116,9 @@ class LivePage:
                 self._clear(event)
             case SurfaceUpdate():
                 self._up.note_given(event.mesh.known_up)
-                keys = self._tiles.apply(event, now - self._began)
-                if not self._colors.is_asked_for:
-                    self._nodes.changed(keys)
-                self._ask(keys)
+                self._updates.append(event)
+                if len(self._updates) >= _MOST_UPDATES:
+                    self._apply(now)
             case ScannerSeen():
                 self._up.note_scanner(event)
                 self._marks.note_seen(event)
@@ -127,7 +131,18 @@ class LivePage:
             case LinkSeen():
                 self._problem = event.problem
 
+    def _apply(self, now: float) -> None:
+        """Put the updates that have come into the tiles."""
+        began = time.thread_time()
+        keys = self._tiles.apply_all(self._updates, now - self._began)
+        rest = (time.thread_time() - began) / _SHARE if self._browsers else _TOGETHER[1]
+        self._updates, self._next_apply = [], now + min(max(rest, _TOGETHER[0]), _TOGETHER[1])
+        if not self._colors.is_asked_for:
+            self._nodes.changed(keys)
+        self._ask(keys)
+
     def _clear(self, event: Cleared) -> None:
+        self._updates.clear()
         self._nodes.clear()
         self._tiles.clear()
         self._marks.clear()
@@ -148,6 +163,8 @@ class LivePage:
 
     def _step(self, now: float) -> None:
         """What is to do between two looks at the feed."""
+        if self._updates and now >= self._next_apply:
+            self._apply(now)
         self._obey(now)
         self._nodes.changed(self._colors.values.take_ready())
         if now >= self._reckoned + _SELDOM:
@@ -155,8 +172,9 @@ class LivePage:
             self._reckon()
         if not self._browsers:
             return
-        self._nodes.send(now)
-        self._marks.draw(now)
+        with self._server.atomic():  # else each message wakes the web server's thread
+            self._nodes.send(now)
+            self._marks.draw(now)
         if now >= self._looked + _OFTEN:
             self._looked = now
             with self._lock:
@@ -196,7 +214,9 @@ class LivePage:
             low = np.min([one[0] for one in bounds], axis=0).astype(np.float64)
             high = np.max([one[1] for one in bounds], axis=0).astype(np.float64)
             self._panel.clipping.fit(low, high, self._up.direction)
-        if self._browsers:
+        if not self._browsers:
+            return
+        with self._server.atomic():
             facts = [f"{grouped(self._tiles.triangles)} triangles"] if bounds else ["nothing seen yet"]
             self._panel.tell(
                 map_name=self.map_name,

@@ -2,6 +2,7 @@
 """The surface of a map in cubes of some blocks: what came last for each cell, ready to be shown or saved."""
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -39,7 +40,8 @@ class Tile:
     @cached_property
     def bounds(self) -> NDArray[np.float32]:
         """(2, 3) lowest and highest coordinates, metres."""
-        return np.stack((self.mesh.vertices.min(axis=0), self.mesh.vertices.max(axis=0)))
+        axes = np.ascontiguousarray(self.mesh.vertices.T)  # along rows of three it takes three times as long
+        return np.stack((axes.min(axis=1), axes.max(axis=1)))
 
     @cached_property
     def cell_of_vertex(self) -> NDArray[np.int16]:
@@ -76,14 +78,24 @@ class MapTiles:
 
     def apply(self, update: SurfaceUpdate, now_s: float) -> set[Key]:
         """Put an update's cells in place of all earlier ones there; the tiles that it changed."""
-        self.has_colors |= update.mesh.colors is not None
+        return self.apply_all([update], now_s)
+
+    def apply_all(self, updates: Sequence[SurfaceUpdate], now_s: float) -> set[Key]:
+        """As `apply`, of several updates at once, of which the last has the newest cells.
+
+        A scanner that stands still changes the same cells with each keyframe: only the newest are looked at.
+        """
+        self.has_colors |= any(update.mesh.colors is not None for update in updates)
         self.version += 1
-        mesh = _colored(update.mesh)
-        cells = update.cells.astype(np.int64)
+        mesh, first_face, counts = _as_one(updates)
+        cells = np.concatenate([update.cells for update in updates]).astype(np.int64)
+        client = np.concatenate([self._numbered(update) for update in updates])
+        if len(updates) > 1:
+            _, last = np.unique(cells[::-1], axis=0, return_index=True)
+            newest = np.sort(len(cells) - 1 - last)
+            cells, client, first_face, counts = (one[newest] for one in (cells, client, first_face, counts))
         place = cells // self.edge
         local = ((cells - place * self.edge) @ (self.edge**2, self.edge, 1)).astype(np.int16)
-        client = self._numbered(update)
-        counts = np.diff(update.first_face)
         places, tile_of = np.unique(place, axis=0, return_inverse=True)
         tile_of = tile_of.reshape(-1)
         order = np.argsort(tile_of, kind="stable")
@@ -91,7 +103,7 @@ class MapTiles:
         changed = set()
         for number, at in enumerate(places.tolist()):
             rows = order[ends[number] : ends[number + 1]]
-            faces = _ranges(update.first_face[rows], counts[rows])
+            faces = _ranges(first_face[rows], counts[rows])
             part = _Part(local[rows], client[rows], np.repeat(local[rows], counts[rows]), mesh, faces)
             self._put((at[0], at[1], at[2]), part, now_s)
             changed.add((at[0], at[1], at[2]))
@@ -141,14 +153,27 @@ class _Part:
 
     def mesh(self) -> Mesh:
         """The faces alone, with the vertices that they use."""
-        used, faces = np.unique(self.whole.faces[self.faces], return_inverse=True)
-        colors = self.whole.colors
-        return Mesh(
-            self.whole.vertices[used],
-            faces.reshape(-1, 3).astype(np.int32),
-            self.whole.normals[used],
-            None if colors is None else colors[used],
-        )
+        return self.whole.of_faces(self.faces)
+
+
+def _as_one(
+    updates: Sequence[SurfaceUpdate],
+) -> tuple[Mesh, NDArray[np.int32], NDArray[np.int32]]:
+    """The mesh of several updates; of each cell its first face there, and how many faces it has."""
+    counts = np.concatenate([np.diff(update.first_face) for update in updates])
+    if len(updates) == 1:
+        return _colored(updates[0].mesh), updates[0].first_face[:-1], counts
+    meshes = [_colored(update.mesh) for update in updates]
+    vertices = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)], dtype=np.int32).tolist()
+    faces = np.cumsum([0, *(len(mesh.faces) for mesh in meshes)], dtype=np.int32).tolist()
+    whole = Mesh(
+        np.concatenate([mesh.vertices for mesh in meshes]),
+        np.concatenate([mesh.faces + np.int32(n) for mesh, n in zip(meshes, vertices, strict=False)]),
+        np.concatenate([mesh.normals for mesh in meshes]),
+        np.concatenate([mesh.colors for mesh in meshes if mesh.colors is not None]),
+    )
+    first = [update.first_face[:-1] + np.int32(n) for update, n in zip(updates, faces, strict=False)]
+    return whole, np.concatenate(first), counts
 
 
 def _colored(mesh: Mesh) -> Mesh:

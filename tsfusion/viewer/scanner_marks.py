@@ -34,7 +34,8 @@ class _Scanner:
     now: dict[int, NDArray[np.float64]] = field(default_factory=dict)  # position by keyframe
     first: dict[int, NDArray[np.float64]] = field(default_factory=dict)  # where it was at first
     is_found: bool = False  # in an event with all paths
-    is_drawn: bool = False
+    is_placed: bool = False  # the frustum is where it belongs
+    is_drawn: bool = False  # so is the path
     path_at: float = -math.inf
     picture_at: float = -math.inf
     picture: bytes | None = None
@@ -86,13 +87,14 @@ class ScannerMarks:
         position = event.T_world_camera[:3, 3]
         scanner.first.setdefault(event.seq, position)
         scanner.now[event.seq] = position
-        scanner.is_drawn = False
+        scanner.is_placed = scanner.is_drawn = False
 
     def note_paths(self, event: PathsFound) -> None:
         """Take the places of all keyframes into account; what came after them stays."""
         for session, scanner in self._scanners.items():
             if session not in event.paths and scanner.is_found:
-                scanner.now, scanner.newest, scanner.pose, scanner.is_drawn = {}, None, None, False
+                scanner.now, scanner.newest, scanner.pose = {}, None, None
+                scanner.is_placed = scanner.is_drawn = False
         for session, (seqs, poses) in event.paths.items():
             scanner = self._scanner(session)
             numbers = seqs.tolist()
@@ -104,14 +106,17 @@ class ScannerMarks:
                 scanner.first.setdefault(seq, place)
             if newest in numbers:
                 scanner.pose = poses[numbers.index(newest)]
-            scanner.is_found, scanner.is_drawn = True, False
+            scanner.is_found, scanner.is_placed, scanner.is_drawn = True, False, False
 
     def draw(self, now: float) -> None:
         """Bring what has changed into the scene."""
         for session, scanner in self._scanners.items():
+            if not scanner.is_placed:
+                scanner.is_placed = True
+                self._place(session, scanner)
+            self._hang_picture(scanner, now)
             if scanner.is_drawn:
                 continue
-            self._place(session, scanner, now)
             if now >= scanner.path_at + _PATH_PAUSE:
                 scanner.path_at, scanner.is_drawn = now, True
                 self._draw_paths(session, scanner)
@@ -127,7 +132,7 @@ class ScannerMarks:
     def _scanner(self, session: bytes) -> _Scanner:
         return self._scanners.setdefault(session, _Scanner(len(self._scanners)))
 
-    def _place(self, session: bytes, scanner: _Scanner, now: float) -> None:
+    def _place(self, session: bytes, scanner: _Scanner) -> None:
         if scanner.pose is None:
             if (gone := scanner.nodes.pop("scanners", None)) is not None:
                 gone.remove()
@@ -137,7 +142,12 @@ class ScannerMarks:
         if node is None:
             node = self._add(session, scanner)
         node.wxyz, node.position = wxyz, position
-        if scanner.picture is not None and now >= scanner.picture_at + _PICTURE_PAUSE and _is_frustum(node):
+
+    def _hang_picture(self, scanner: _Scanner, now: float) -> None:
+        """Show what it saw last, if that is new."""
+        node = scanner.nodes.get("scanners")
+        is_due = scanner.picture is not None and now >= scanner.picture_at + _PICTURE_PAUSE
+        if is_due and scanner.picture is not None and node is not None and _is_frustum(node):
             scanner.picture_at = now
             node.image, scanner.picture = small_picture(scanner.picture), None
 
