@@ -25,6 +25,7 @@ from typing import Any
 
 import zmq
 
+from tsfusion.wire import sockets
 from tsfusion.wire.curve import ClientKeys
 
 _EVENTS = (
@@ -90,11 +91,8 @@ class ConnectionMonitor:
     def problem(self) -> str | None:
         """The reason why there is no connection; empty = it is made; None = nothing new."""
         news: str | None = None
-        while True:
-            try:
-                head, _endpoint = self.socket.recv_multipart(zmq.NOBLOCK)
-            except zmq.Again:
-                break
+        while sockets.has_message(self.socket):
+            head, _endpoint = self.socket.recv_multipart(zmq.NOBLOCK)
             event, value = struct.unpack("=HI", head)
             problem = self._handle_event(event, value)
             news = news if problem is None else problem

@@ -126,10 +126,9 @@ class Inquiry:
 
     def _read(self, on_reply: OnReply) -> None:
         for _ in range(_MOST_AT_ONCE):
-            try:
-                head, *frames = self._connection.socket.recv_multipart(zmq.NOBLOCK, copy=False)
-            except zmq.Again:
+            if not sockets.has_message(self._connection.socket):
                 return
+            head, *frames = self._connection.socket.recv_multipart(zmq.NOBLOCK, copy=False)
             try:
                 reply = messages.decode_to_client(head.buffer)
             except DecodeError:

@@ -214,10 +214,9 @@ class MapWatcher:
     def _read_updates(self) -> None:
         mesh_topic, scan_topic = sockets.topics_of(self._map)
         for _ in range(_MOST_AT_ONCE):
-            try:
-                topic, *frames = self._updates.socket.recv_multipart(zmq.NOBLOCK, copy=False)
-            except zmq.Again:
+            if not sockets.has_message(self._updates.socket):
                 return
+            topic, *frames = self._updates.socket.recv_multipart(zmq.NOBLOCK, copy=False)
             try:
                 if topic.bytes == mesh_topic:
                     self._on_meshed(frames)

@@ -177,6 +177,11 @@ def _make(
     return made
 
 
+def has_message(made: AnySocket) -> bool:
+    """Whether a message can be read at once: asking costs a tenth of an exception."""
+    return bool(made.getsockopt(zmq.EVENTS) & zmq.POLLIN)
+
+
 def peer_address(frame: zmq.Frame) -> str:
     """Address of the machine that sent a frame; empty where ZeroMQ does not know it."""
     try:
