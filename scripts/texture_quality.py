@@ -5,13 +5,15 @@
     python scripts/texture_quality.py DATASET                      # every fifth frame is held out
     python scripts/texture_quality.py DATASET --open3d --pictures views
     python scripts/texture_quality.py synthetic:room --voxel-size 0.04
+    python scripts/texture_quality.py DATASET --choose             # settings are chosen on views of their own
 
 The frames held out are in no map and in no texture. All methods are compared on the same pixels: those where
 the mesh lies within 5 cm of the depth measured there, at least two pixels from an edge of that depth, where
 colour is registered to it. `psnr`, `ssim`: each held-out image is first moved onto what the method shows (six
 numbers), and that is made as bright as the image (three factors), for each method by itself in the same way:
 poses and exposures of single images are no property of a map. `_bright`: only brightness is fitted;
-`_as_given`: nothing is.
+`_as_given`: nothing is. With `--choose` two sets of views are held out: the settings that are best on the one
+(`choose`) are judged on the other (`judge`), beside the default ones.
 """
 
 import argparse
@@ -32,6 +34,8 @@ from tsfusion.evaluation import view_colors
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.tsdf import texturing
 from tsfusion.tsdf.texturing import TextureSettings
+
+SHARPNESS = (1.0, 1.5, 3.0, 4.0)  # among which one is chosen, beside the default
 
 
 class Chosen:
@@ -55,13 +59,16 @@ def methods(volume: Volume, keyframes: Chosen, options: argparse.Namespace) -> I
     """Each way to colour the surface."""
     plain = volume.extract_mesh()
     yield "voxel colour", plain
-    ways = {
+    ways: dict[str, dict[str, Any]] = {
         "texture": {},
         "texture, poses as given": {"align": False},
         "texture, exposures as given": {"even": False},
         "texture, both as given": {"align": False, "even": False},
     }
-    for name, changed in ways.items() if options.ablation else list(ways.items())[:1]:
+    chosen = ways if options.ablation else {"texture": {}}
+    if options.choose:
+        chosen = chosen | {f"texture, sharpness {power:g}": {"sharpness": power} for power in SHARPNESS}
+    for name, changed in chosen.items():
         settings = TextureSettings(size=options.texture_size, texel=options.texel, **changed)
         made = texturing.textured(plain, keyframes, volume.config.voxel_size, settings)
         yield name, made
@@ -191,6 +198,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=10**9, help="at most, spread over the recording")
     parser.add_argument("--texture-size", type=int, default=4096)
     parser.add_argument("--texel", type=float, help="metres; default as the images have it")
+    parser.add_argument("--choose", action="store_true", help="choose settings, judge them on other views")
     parser.add_argument("--ablation", action="store_true", help="also without alignment and even exposure")
     parser.add_argument("--open3d", action="store_true", help="beside Open3D")
     parser.add_argument("--open3d-rounds", type=int, default=100, help="of its colour map; 0 = without it")
@@ -199,8 +207,11 @@ def main() -> None:
     options = parser.parse_args()
     dataset = open_dataset(options.source)
     chosen = np.unique(np.linspace(0, len(dataset) - 1, min(options.frames, len(dataset)), dtype=np.intp))
-    out = np.arange(len(chosen)) % options.hold_out == options.hold_out // 2
-    keyframes, held_out = Chosen(dataset, chosen[~out]), Chosen(dataset, chosen[out])
+    turn, judging = np.arange(len(chosen)) % options.hold_out, options.hold_out // 2
+    sets = {"judge": turn == judging}
+    if options.choose:
+        sets = {"choose": turn == (judging + 2) % options.hold_out, **sets}
+    keyframes = Chosen(dataset, chosen[~np.logical_or.reduce(list(sets.values()))])
     volume = Volume(options.voxel_size, sensor=dataset.sensor)
     for keyframe in keyframes:
         volume.integrate(keyframe)
@@ -210,8 +221,19 @@ def main() -> None:
     for name, mesh in methods(volume, keyframes, options):
         found.append((name, mesh, time.process_time() - then))
         then = time.process_time()
-    for line in measured(found, held_out, options.pictures):
-        print(json.dumps({**line, "voxel_size": options.voxel_size, "source": options.source}), flush=True)
+    common = {"voxel_size": options.voxel_size, "source": options.source}
+    psnr: dict[str, dict[str, float]] = {}
+    for name, out in sets.items():
+        pictures = options.pictures if name == "judge" else None
+        for line in measured(found, Chosen(dataset, chosen[out]), pictures):
+            print(json.dumps({"held_out": name, **line, **common}), flush=True)
+            psnr.setdefault(name, {})[line["method"]] = line["psnr"]
+    if options.choose:
+        textures = [name for name in psnr["choose"] if name.startswith("texture")]
+        best = max(textures, key=psnr["choose"].__getitem__)
+        own, usual, voxel = (psnr["judge"][name] for name in (best, "texture", "voxel colour"))
+        gains = {"gain_db": round(own - voxel, 2), "gain_of_default_db": round(usual - voxel, 2)}
+        print(json.dumps({"chosen": best, **gains, **common}))
     print(json.dumps(surroundings(volume.config.threads or 0)))
 
 

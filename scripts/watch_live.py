@@ -3,11 +3,14 @@
 
     python scripts/watch_live.py                                keyframes at 2 cm, 8 a second, for 30 s
     python scripts/watch_live.py --watchers 3 --stalled 1 --rate 5 --voxel-size 0.05
+    python scripts/watch_live.py --watchers 0 --pages 1 --rate 10       live pages, each read by a browser
 
 The keyframes are those of `scripts/ask_live.py`. Two servers run, and a scanner turns from one to the other
 every few seconds: the one is watched, the other is not. A JSON line for each watcher (a process of its own):
-CPU seconds a second, updates, triangles and bytes a second, and whether it holds the map in the end. The last
-line has the keyframes' delay, captured → fused, with and without watchers.
+CPU seconds a second, updates, triangles and bytes a second, and whether it holds the map in the end. A line
+for each page (`tsfusion view`): CPU seconds a second of its process while the watched server gets keyframes,
+and what a browser reads of it, which draws nothing. The last line has the keyframes' delay, captured → fused,
+with and without watchers.
 """
 
 import argparse
@@ -17,7 +20,8 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -30,6 +34,8 @@ from delivery import PATIENCE, _keyframes
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
 from keyframes_and_servers import serving
+from live_pages import address_of, viewing
+from reading_browser import ReadingBrowser
 
 from tsfusion import VolumeConfig
 from tsfusion.wire.map_events import MapEvent, ScannerSeen, SurfaceUpdate
@@ -61,6 +67,37 @@ class Watched:
         found: dict[str, Any] = self._pipe.recv()
         self._process.join()
         return found
+
+
+class Page:
+    """A live page in a process of its own, and a browser that reads it."""
+
+    def __init__(self, address: str) -> None:
+        self._stack = ExitStack()
+        self._process = self._stack.enter_context(viewing(address, "--listen", "127.0.0.1:0"))
+        self._browser = ReadingBrowser(address_of(self._process))
+        self._seconds = self._cpu = 0.0
+
+    @contextmanager
+    def measured(self) -> Iterator[None]:
+        """Count what it costs meanwhile."""
+        began, cpu = time.monotonic(), self._cpu_s()
+        yield
+        self._seconds += time.monotonic() - began
+        self._cpu += self._cpu_s() - cpu
+
+    def finish(self) -> dict[str, Any]:
+        """End it; its figures."""
+        read = self._browser.close()
+        self._stack.close()
+        return {
+            "page_cpu": round(self._cpu / self._seconds, 4),
+            "mb_read": round(read / 1e6, 1),
+        }
+
+    def _cpu_s(self) -> float:
+        fields = Path(f"/proc/{self._process.pid}/stat").read_text().rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def _watch(pipe: "Connection[Any, Any]", address: str, is_stalled: bool) -> None:
@@ -115,6 +152,7 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=30.0, help="of keyframes to each server")
     parser.add_argument("--watchers", type=int, default=1)
     parser.add_argument("--stalled", type=int, default=0, help="of these, how many read nothing meanwhile")
+    parser.add_argument("--pages", type=int, default=0, help="live pages, beside the watchers")
     parser.add_argument("--voxel-size", type=float, default=0.02)
     options = parser.parse_args()
     _, source = _keyframes()
@@ -131,10 +169,18 @@ def main() -> int:
             scanner.send(server.address, FIRST, options.rate)
             scanner.wait()
         watchers = [Watched(watched.address, is_stalled=i < options.stalled) for i in range(options.watchers)]
+        pages = [Page(watched.address) for _ in range(options.pages)]
+        time.sleep(SETTLED_S if pages else 0.0)  # they show what there is
         for _ in range(0, count, TURN):
-            for server in (watched, plain):
-                scanner.send(server.address, TURN, options.rate)
+            with ExitStack() as during:
+                for page in pages:
+                    during.enter_context(page.measured())
+                scanner.send(watched.address, TURN, options.rate)
                 scanner.wait()
+            scanner.send(plain.address, TURN, options.rate)
+            scanner.wait()
+        for page in pages:
+            print(json.dumps(page.finish()), flush=True)
         lines = [one.finish() for one in watchers]
         whole = len(fetch_mesh(watched.address, timeout=PATIENCE).faces)
         health = {name: fetch_health(one.address) for name, one in (("with", watched), ("without", plain))}
