@@ -10,7 +10,7 @@ from drawn_scenes import DrawnScene, decoded
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.viewer.clipping import Clipping
 from tsfusion.viewer.map_tiles import CELL, EDGE, MapTiles
-from tsfusion.viewer.tile_nodes import PAUSE, TileNodes
+from tsfusion.viewer.tile_nodes import PAUSE, STEADY_PAUSE, TileNodes
 from tsfusion.viewer.vertex_colors import VertexColors
 from tsfusion.wire.map_events import SurfaceUpdate
 
@@ -88,6 +88,23 @@ def test_of_many_versions_the_newest_is_sent_and_the_last_stays_until_it_is_read
     (node,) = page.scene.nodes.values()
     assert np.abs(decoded(node.glb_data).colors - 130).max() < 1
     assert page.scene.bytes_drawn == 2 * len(node.glb_data)
+
+
+def test_a_tile_that_changes_all_the_time_is_sent_half_as_often() -> None:
+    page = Page(1e9)
+    sizes = []
+    for step in range(80):
+        page.apply(floor(1, color=step))
+        before = page.scene.bytes_drawn
+        page.pass_time(0.1)
+        sizes.append(page.scene.bytes_drawn - before)
+    sent = np.flatnonzero(sizes)
+    assert 4 <= len(sent) <= 6, "at once, after a pause, and then after twice as long"
+    page.pass_time(2 * STEADY_PAUSE)
+    before = page.scene.bytes_drawn
+    page.apply(floor(1, color=200))
+    page.pass_time(0.1)
+    assert page.scene.bytes_drawn > before, "after a rest it is sent at once"
 
 
 def test_what_a_plane_hides_is_not_sent_and_comes_back() -> None:

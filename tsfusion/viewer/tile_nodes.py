@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 # Seconds between two versions of a tile, at least. A browser drops a model as soon as it is given another
 # one, and shows that only once it is read: so each is a node of its own, and the last one stays meanwhile.
 PAUSE = 1.0
+STEADY_PAUSE = 2.0  # of a tile that changes all the time: half of the work for everybody, and nobody sees it
+_SOON = 0.5  # seconds after a pause within which a change is one of many
 _CUT_PAUSE = 0.25  # while somebody moves the clip plane
 _MARGIN = 1.0  # of a tile's edge that its triangles may reach beyond it
 
@@ -43,6 +45,7 @@ class TileNodes:
         self._bucket = Bucket(max_bytes_per_second, now, burst=1.0)
         self._waiting: dict[Key, None] = {}  # in the order in which they are sent
         self._sent_at: dict[Key, float] = {}
+        self._pauses: dict[Key, float] = {}  # until the next version
         self._sides: dict[Key, Side] = {}  # of what is in the scene
         self._nodes: dict[Key, viser.GlbHandle] = {}
         self._last: dict[Key, tuple[viser.GlbHandle, float]] = {}  # versions before, and when they go
@@ -70,6 +73,7 @@ class TileNodes:
             self._last,
             self._waiting,
             self._sent_at,
+            self._pauses,
             self._sides,
             self._hidden,
             self._cut,
@@ -105,16 +109,19 @@ class TileNodes:
                 del self._last[key]
                 node.remove()
         for key in list(self._waiting):
-            pause = _CUT_PAUSE if key in self._cut else PAUSE
-            if self._sent_at.get(key, -np.inf) + pause > now:
+            due = self._sent_at.get(key, -np.inf) + self._pauses.get(key, PAUSE)
+            if key in self._cut:
+                due = self._sent_at.get(key, -np.inf) + _CUT_PAUSE
+            if due > now:
                 continue
             if self._bucket.wait(1.0, now) > 0:
                 break
             del self._waiting[key]
-            size = self._send(key, now + pause)
+            size = self._send(key, now + (_CUT_PAUSE if key in self._cut else PAUSE))
             self._cut.discard(key)
             if size:
                 self._sent_at[key] = now
+                self._pauses[key] = STEADY_PAUSE if now < due + _SOON else PAUSE
                 self._bucket.spend(size)
                 self.bytes_sent += size
                 count += 1
