@@ -205,18 +205,19 @@ class Mesh:
 
     def of_faces(self, kept: NDArray[np.bool_] | NDArray[np.integer]) -> "Mesh":
         """The faces of a (m,) bool, or of some numbers, and the vertices that they use, in the same order."""
-        faces = self.faces[kept]
+        chosen = np.flatnonzero(kept) if kept.dtype == np.bool_ else kept
+        faces = np.take(self.faces, chosen, axis=0)
         first, last = (int(faces.min()), int(faces.max())) if len(faces) else (0, -1)
         is_used = np.zeros(last + 1 - first, bool)  # of a part of the mesh these are few of all vertices
         is_used[faces - first] = True
         used, number = first + np.flatnonzero(is_used), np.cumsum(is_used, dtype=np.int32) - np.int32(1)
         return dataclasses.replace(
             self,
-            vertices=self.vertices[used],
-            faces=number[faces - first],
-            normals=self.normals[used],
-            colors=None if self.colors is None else self.colors[used],
-            guessed=None if self.guessed is None else self.guessed[kept],
+            vertices=np.take(self.vertices, used, axis=0),
+            faces=np.take(number, faces - first),
+            normals=np.take(self.normals, used, axis=0),
+            colors=None if self.colors is None else np.take(self.colors, used, axis=0),
+            guessed=None if self.guessed is None else self.guessed[chosen],
         )
 
     @property

@@ -104,16 +104,14 @@ class SurfaceTiles:
         """Meshes of cubes, each as it would be without the others: a launch costs as much as a small one."""
         if not numbers:
             return {}
-        own = [self._keys(number) for number in numbers]
-        keys = np.concatenate(own)
+        keys, cube_of = self._keys(numbers)
         order = np.argsort(keys)
         whole, first_face = mesh_extraction.extract_cells(
             keys[order], self._store, self._min_weight, self._buffers, self.values
         )
-        cube_of = np.repeat(np.arange(len(own)), [len(one) for one in own])[order]
-        cube_of = np.repeat(cube_of, np.diff(first_face))
+        cube_of = np.repeat(cube_of[order], np.diff(first_face))
         faces = np.argsort(cube_of, kind="stable")
-        parts = np.split(faces, np.searchsorted(cube_of[faces], np.arange(1, len(own))))
+        parts = np.split(faces, np.searchsorted(cube_of[faces], np.arange(1, len(numbers))))
         return {
             number: self._meshes.put(number, _Piece(whole.of_faces(part)))
             for number, part in zip(numbers, parts, strict=True)
@@ -135,16 +133,17 @@ class SurfaceTiles:
             number = int(tiles[rows[0]])
             solved = self._values.get(number)
             if solved is None:
-                own = self._keys(number)
+                own, _ = self._keys([number])
                 solved = self._values.put(number, _Values(own, self._view(own, store, min_weight)))
             out[rows] = solved.of(keys[rows])
         return out[: len(keys)]
 
-    def _keys(self, number: int) -> NDArray[np.int64]:
-        """Sorted keys of the map's blocks in a cube."""
-        corner = SIDE * unpack_keys(np.array([number]))
-        keys = pack_keys(corner + _INSIDE)
-        return keys[self._store.slots_of(keys) >= 0]
+    def _keys(self, numbers: Sequence[int]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Keys of the map's blocks in some cubes, sorted in each, and which cube each lies in."""
+        corners = SIDE * unpack_keys(np.array(numbers))
+        keys = pack_keys((corners[:, None] + _INSIDE).reshape(-1, 3))
+        held = np.flatnonzero(self._store.slots_of(keys) >= 0)
+        return keys[held], held // len(_INSIDE)
 
 
 class _Sized(Protocol):

@@ -104,6 +104,7 @@ class BrowserPanel:
             self._client.camera.position = view.position
             self._client.camera.look_at = view.target
             self._client.camera.up_direction = view.up
+        self._has_arrived = False  # a callback may have read meanwhile what we have just set
 
     def _wanted(self) -> View | None:
         if self._camera.value == WHOLE:
