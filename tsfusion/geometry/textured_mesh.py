@@ -33,8 +33,8 @@ class Texture:
     page: NDArray[np.int32]
     pages: list[NDArray[np.uint8]]
 
-    def of_faces(self, kept: NDArray[np.bool_]) -> "Texture":
-        """The texture of some faces, a (m,) bool, on the same pages."""
+    def of_faces(self, kept: NDArray[np.bool_] | NDArray[np.integer]) -> "Texture":
+        """The texture of some faces, a (m,) bool or numbers, on the same pages."""
         return dataclasses.replace(self, corners=self.corners[kept], page=self.page[kept])
 
 
@@ -109,7 +109,7 @@ class TexturedMesh(Mesh):
         }
         return {**super().figures, "texture": texture}
 
-    def of_faces(self, kept: NDArray[np.bool_]) -> "TexturedMesh":
+    def of_faces(self, kept: NDArray[np.bool_] | NDArray[np.integer]) -> "TexturedMesh":
         """As `Mesh.of_faces`."""
         part = super().of_faces(kept)
         return dataclasses.replace(self, **fields_of(part), texture=self.texture.of_faces(kept))

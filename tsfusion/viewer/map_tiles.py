@@ -93,7 +93,8 @@ class MapTiles:
         if len(updates) > 1:
             _, last = np.unique(cells[::-1], axis=0, return_index=True)
             newest = np.sort(len(cells) - 1 - last)
-            cells, client, first_face, counts = (one[newest] for one in (cells, client, first_face, counts))
+            cells, client = cells[newest], client[newest]
+            first_face, counts = first_face[newest], counts[newest]
         place = cells // self.edge
         local = ((cells - place * self.edge) @ (self.edge**2, self.edge, 1)).astype(np.int16)
         places, tile_of = np.unique(place, axis=0, return_inverse=True)

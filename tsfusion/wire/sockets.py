@@ -179,7 +179,8 @@ def _make(
 
 def has_message(made: AnySocket) -> bool:
     """Whether a message can be read at once: asking costs a tenth of an exception."""
-    return bool(made.getsockopt(zmq.EVENTS) & zmq.POLLIN)
+    waiting: Any = made.getsockopt(zmq.EVENTS)
+    return bool(waiting & zmq.POLLIN)
 
 
 def peer_address(frame: zmq.Frame) -> str:
