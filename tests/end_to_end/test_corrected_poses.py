@@ -249,14 +249,14 @@ def test_corrections_count_in_the_quota(tmp_path: Path) -> None:
 _DIES = """
 import os, signal
 from tsfusion.journal import writer
-real = writer.Journal.append
-def append(self, frames, **record):
-    if bytes(frames[0][:3]) == b"TSC":
+real = writer.Journal.append_all
+def append_all(self, messages, **more):
+    if any(bytes(one.frames[0][:3]) == b"TSC" for one in messages):
         if {writes}:
-            real(self, frames, **record)
+            real(self, messages, **more)
         os.kill(os.getpid(), signal.SIGKILL)
-    return real(self, frames, **record)
-writer.Journal.append = append
+    return real(self, messages, **more)
+writer.Journal.append_all = append_all
 """
 
 

@@ -147,11 +147,11 @@ def test_a_disk_that_refuses_is_said_at_once_and_then_left_alone(
 ) -> None:
     tried = []
 
-    def append(*_: object, **__: object) -> None:
+    def append_all(*_: object, **__: object) -> None:
         tried.append(1)
         raise JournalError("the disk is full", errno.ENOSPC)
 
-    monkeypatch.setattr(Journal, "append", append)
+    monkeypatch.setattr(Journal, "append_all", append_all)
     with (
         connected(sockets.dealer, served.addresses.control) as link,
         connected(sockets.push, served.addresses.data) as push,

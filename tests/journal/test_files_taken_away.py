@@ -8,7 +8,6 @@ import shutil
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import pytest
 from failures import refuse
@@ -97,13 +96,13 @@ def test_a_record_that_was_taken_back_is_not_put_back(
     log = Journal(tmp_path, BIG, longest_wait=-1.0)
     fill(log, 1)
     with monkeypatch.context() as patched:
-        append = OpenSegment.append
+        sync = OpenSegment.sync
 
-        def too_late(segment: OpenSegment, *record: Any) -> None:
-            append(segment, *record)
+        def too_late(segment: OpenSegment) -> None:
+            sync(segment)
             segment.path.unlink()
 
-        patched.setattr(OpenSegment, "append", too_late)
+        patched.setattr(OpenSegment, "sync", too_late)
         with pytest.raises(JournalError, match="is being put back"):
             fill(log, 2)
     fill(log, 2, 3)

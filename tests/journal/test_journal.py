@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Acknowledged records are read back, after any end of the process and beside any damage."""
 
+import errno
 import os
 import signal
 import subprocess
@@ -9,13 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from failures import refuse
 from keyframes_and_servers import DEADLINE, wall
 from mcap.reader import make_reader
 
 from tsfusion import journal
 from tsfusion.core.errors import JournalError
 from tsfusion.delivery.spool import Spool
-from tsfusion.journal import Journal, Position, quarantine, segment_path
+from tsfusion.journal import Journal, Position, Unwritten, quarantine, segment_path
 from tsfusion.journal.quarantine import Quarantine
 from tsfusion.journal.recording import JournalRecording
 from tsfusion.wire import codec
@@ -45,6 +47,36 @@ def test_records_are_read_where_append_says(tmp_path: Path) -> None:
         assert [bytes(frame) for frame in record.frames] == [b"head", bytes([i]) * 1000, b""]
         assert record.nbytes == 1004
     log.close()
+
+
+def test_records_that_are_written_together_wait_for_the_disk_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = Journal(tmp_path, BIG)
+    fill(log, 1)
+    waits, real = [], os.fdatasync
+    monkeypatch.setattr(os, "fdatasync", lambda descriptor: (waits.append(1), real(descriptor)))
+    positions = log.append_all([Unwritten([b"head", bytes([i])], SESSION, 2 + i) for i in range(8)])
+    assert len(waits) == 1
+    for i, position in enumerate(positions):
+        record = journal.read(tmp_path, position)
+        assert (record.seq, [bytes(frame) for frame in record.frames]) == (2 + i, [b"head", bytes([i])])
+    log.close()
+    assert [found.seq for found in Journal(tmp_path, BIG).found] == list(range(1, 10))
+
+
+def test_of_records_that_are_written_together_all_count_or_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = Journal(tmp_path, BIG)
+    fill(log, 2)
+    together = [Unwritten([b"head", bytes(1000)], SESSION, 3 + i) for i in range(4)]
+    with monkeypatch.context() as broken, pytest.raises(JournalError, match="cannot write"):
+        broken.setattr(os, "fdatasync", refuse(errno.EIO))
+        log.append_all(together)
+    log.append_all(together[:2])
+    log.close()
+    assert [found.seq for found in Journal(tmp_path, BIG).found] == [1, 2, 3, 4]
 
 
 def test_a_new_start_finds_everything_and_begins_a_segment(tmp_path: Path) -> None:

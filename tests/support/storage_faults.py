@@ -27,7 +27,7 @@ from tsfusion.core.errors import JournalError, TsfusionError
 from tsfusion.delivery.spool import Spool, Waiting
 from tsfusion.fuser.map_checkpoints import MapCheckpoints
 from tsfusion.fuser.messages import SessionProgress
-from tsfusion.journal import Journal
+from tsfusion.journal import Journal, Unwritten
 
 SESSION = bytes(range(16))
 SEGMENT_BYTES = 1 << 16
@@ -58,12 +58,13 @@ def work(folder: Path, promises: Promises) -> None:
 
 
 def use_journal(folder: Path, promises: Promises) -> None:
-    for first in (1, 4):  # opened again behind what is there
+    for first in (1, 6):  # opened again behind what is there
         log = Journal(folder / "journal", SEGMENT_BYTES)
-        for seq in range(first, first + 3):
+        for seqs in ([first], [first + 1], [first + 2, first + 3, first + 4]):
             with suppress(JournalError):
-                log.append([RECORD], session=SESSION, seq=seq)
-                promises.note("journaled", seq)
+                log.append_all([Unwritten([RECORD], SESSION, seq) for seq in seqs])
+                for seq in seqs:
+                    promises.note("journaled", seq)
         with suppress(JournalError):
             log.close()
 

@@ -123,6 +123,7 @@ class Gateway:
                     receive_some(
                         socket, handle, partial(self._on_flood, socket), self.ports.connections.note_read
                     )
+            self._intake.finish()
         self.ports.step()
         self._limits.step()
         for hosted, message in self.maps.step():

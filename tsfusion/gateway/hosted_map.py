@@ -6,7 +6,7 @@ import logging
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import zmq
@@ -28,7 +28,7 @@ from tsfusion.gateway.keyframe_outcomes import KeyframeOutcomes
 from tsfusion.gateway.metrics import Metrics
 from tsfusion.gateway.question_counts import QuestionCounts
 from tsfusion.gateway.sessions import Sessions
-from tsfusion.journal import Journal, ReadingWatcher, state_folder
+from tsfusion.journal import Journal, Position, ReadingWatcher, Unwritten, state_folder
 from tsfusion.journal.quarantine import Quarantine
 from tsfusion.wire import corrections, keyframe_times
 from tsfusion.wire.health import MapHealth, MapState
@@ -45,8 +45,17 @@ _STALLED_AFTER = 10.0  # seconds in which keyframes wait and none is fused
 ForPeople = tuple[Meshed | fuser_messages.FuserReply | fuser_messages.FuserAnswer, Sequence[zmq.Frame]]
 
 
+class Checked(NamedTuple):
+    """A message that was found to be the next record of its session."""
+
+    header: RecordHeader
+    frames: Sequence[Any]
+    client: str  # name that its sender's key is allowed under
+    received_ns: int
+
+
 class HostedMap:
-    """An open map. Call `step` again and again, and `accept` for each keyframe.
+    """An open map. Call `step` again and again, and `accept` with the records that came.
 
     Args:
         watch: told how far the journal is read: that may take minutes, in which nothing else is done.
@@ -156,24 +165,29 @@ class HostedMap:
             seq=durable + 1,
             map_name=self.name,
         )
-        index = self.accept(unpack(frames[0]), frames, "", time.monotonic_ns())
+        (index,) = self.accept([Checked(unpack(frames[0]), frames, "", time.monotonic_ns())])
         self._leaving[index] = len(seqs)
 
-    def accept(self, header: RecordHeader, frames: Sequence[Any], client: str, received_ns: int) -> int:
-        """Write the session's next keyframe or correction to the journal, and acknowledge it; its index.
+    def accept(self, records: Sequence[Checked]) -> list[int]:
+        """Write keyframes and corrections to the journal, all or none, and acknowledge them; their indices.
 
         Raises:
             JournalError: when the disk refuses.
         """
+        unwritten = [Unwritten(one.frames, one.header.session, one.header.seq, one.client) for one in records]
         try:
-            position = self._journal.append(frames, session=header.session, seq=header.seq, client=client)
+            positions = self._journal.append_all(unwritten)
         except JournalError as error:
             self.disk.begin(error)
             raise
         self.disk.end()
+        durable_ns = time.monotonic_ns()
+        return [self._add(one, place, durable_ns) for one, place in zip(records, positions, strict=True)]
+
+    def _add(self, record: Checked, position: Position, durable_ns: int) -> int:
+        header, _, client, received_ns = record
         session = self.sessions.open(header.session, client, header.world)
         session.durable = header.seq
-        durable_ns = time.monotonic_ns()
         is_correction = isinstance(header, CorrectionHeader)
         index = self._index.add(
             position,

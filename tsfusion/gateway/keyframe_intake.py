@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Keyframes and corrections from the data socket: checked, then journaled, held off, or refused.
 
+Records that came together are journaled together: a disk takes many by one wait about as fast as one.
 The cheapest checks come first, and nothing is answered before the message is known to be from the session's
 own client: a forged message must not make a client give up a good keyframe.
 """
@@ -17,7 +18,7 @@ from tsfusion.core.config import ServerConfig
 from tsfusion.core.errors import JournalError
 from tsfusion.gateway.admission import Admission
 from tsfusion.gateway.client_routes import ClientRoutes
-from tsfusion.gateway.hosted_map import HostedMap
+from tsfusion.gateway.hosted_map import Checked, HostedMap
 from tsfusion.gateway.map_registry import MapRegistry
 from tsfusion.gateway.quotas import Quotas
 from tsfusion.wire import codec, corrections, messages, sockets
@@ -29,10 +30,11 @@ log = logging.getLogger(__name__)
 _SHORTEST_HOLD = 0.25
 _LONGEST_HOLD = 10.0
 _MOST_DAMAGED = 8  # times that a record may come damaged before it is refused for good
+_BATCH_BYTES = 4 << 20  # of records that are journaled together; one that is larger goes alone
 
 
 class KeyframeIntake:
-    """The way from the data socket into the journals.
+    """The way from the data socket into the journals. Call `finish` when some messages were handled.
 
     Args:
         on_keyframe: told of each keyframe that was journaled: its map, header, frames, and client.
@@ -55,9 +57,12 @@ class KeyframeIntake:
         self._routes = routes
         self._quotas = Quotas(server)
         self._on_keyframe = on_keyframe
+        self._batch: dict[HostedMap, list[Checked]] = {}  # not yet journaled
+        self._batch_bytes = 0
+        self._taken: dict[tuple[str, bytes], int] = {}  # map, session → the highest number among them
 
     def handle(self, frames: list[zmq.Frame]) -> None:
-        """Check one message, and journal its record or answer why not."""
+        """Check one message, and take its record to be journaled or answer why not."""
         received_ns = time.monotonic_ns()
         client = self._admission.client_of(frames[0])
         if client is None:
@@ -148,8 +153,12 @@ class KeyframeIntake:
         self, hosted: HostedMap, header: RecordHeader, buffers: list[Any], client: str, received_ns: int
     ) -> None:
         # Duplicates come first: a keyframe that is journaled must not be refused when it is sent again.
-        verdict = hosted.sessions.admit(header.session, header.seq, header.previous)
+        place = (header.map, header.session)
+        verdict = hosted.sessions.admit(
+            header.session, header.seq, header.previous, self._taken.get(place, 0)
+        )
         if verdict != "next":
+            self.finish()  # so that the answer says how far the session is
             self.duplicates += verdict == "duplicate"
             self._refused["gap"] += verdict == "gap"
             self._routes.mark_alive(header.session, client, scans=verdict == "duplicate")
@@ -158,21 +167,46 @@ class KeyframeIntake:
         try:
             codec.check(buffers, self._server.max_frame_bytes)
             self._quotas.check(header, buffers)
-            self._routes.mark_alive(header.session, client, scans=True)
-            hosted.accept(header, buffers, client, received_ns)
-            if (route := self._routes.get(header.session)) is not None:
-                route.fates.taken()
-            if isinstance(header, KeyframeHeader):
-                self._on_keyframe(header.map, header, buffers, client)
         except Refused as error:
+            self.finish()
             if isinstance(error, Damaged) and self._comes_again(header):
                 self._ask_again(error, hosted, header, client)
             else:
                 self._refuse(error, client, header)
-        except JournalError:
-            self._hold(
-                header.session, hosted.disk.seconds_left(time.monotonic()), "disk", hosted.disk.problem
-            )
+            return
+        self._routes.mark_alive(header.session, client, scans=True)
+        self._take(hosted, Checked(header, buffers, client, received_ns))
+
+    def _take(self, hosted: HostedMap, record: Checked) -> None:
+        """Put a record into the batch. What a new session may do is known when its first one is journaled."""
+        header, nbytes = record.header, sum(frame.nbytes for frame in record.frames)
+        if self._batch_bytes + nbytes > min(_BATCH_BYTES, self._server.segment_bytes):
+            self.finish()
+        self._batch.setdefault(hosted, []).append(record)
+        self._batch_bytes += nbytes
+        self._taken[header.map, header.session] = header.seq
+        if hosted.sessions.get(header.session) is None:
+            self.finish()
+
+    def finish(self) -> None:
+        """Journal the records of the batch, each map's by one wait for the disk, and answer their clients."""
+        if not self._batch:
+            return
+        batch, self._batch, self._batch_bytes = self._batch, {}, 0
+        self._taken.clear()
+        for hosted, records in batch.items():
+            try:
+                hosted.accept(records)
+            except JournalError:
+                seconds, why = hosted.disk.seconds_left(time.monotonic()), hosted.disk.problem
+                for key in dict.fromkeys(record.header.session for record in records):
+                    self._hold(key, seconds, "disk", why)
+                continue
+            for header, frames, client, _ in records:
+                if (route := self._routes.get(header.session)) is not None:
+                    route.fates.taken()
+                if isinstance(header, KeyframeHeader):
+                    self._on_keyframe(header.map, header, frames, client)
 
     def _comes_again(self, header: RecordHeader) -> bool:
         """Count that a record came damaged; whether its client, whose copy may be well, sends it again."""

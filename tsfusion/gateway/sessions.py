@@ -94,13 +94,16 @@ class Sessions:
             self._worlds.add(world)
         return session
 
-    def admit(self, key: bytes, seq: int, previous: int) -> SeqOrder:
+    def admit(self, key: bytes, seq: int, previous: int, taken: int = 0) -> SeqOrder:
         """Whether keyframe `seq` may be journaled, when the client has none between `previous` and it.
+
+        Args:
+            taken: the highest seq of the session that is about to be journaled; 0 = none is.
 
         Keyframes are taken in order only, so one number a session is enough to know every keyframe that ever
         came: exact de-duplication in constant memory.
         """
-        durable, _ = self.progress(key)
+        durable = max(self.progress(key)[0], taken)
         if seq <= durable:
             return "duplicate"
         return "next" if previous <= durable else "gap"

@@ -22,7 +22,7 @@ from tsfusion.journal.segments import (
     segment_path,
     segments,
 )
-from tsfusion.journal.writer import Journal, ReadingWatcher, write_file
+from tsfusion.journal.writer import Journal, ReadingWatcher, Unwritten, write_file
 
 __all__ = [
     "Damage",
@@ -33,6 +33,7 @@ __all__ = [
     "ReadingWatcher",
     "Record",
     "RecordEntry",
+    "Unwritten",
     "describe",
     "is_away",
     "is_closed",

@@ -63,14 +63,17 @@ class OpenSegment:
         """Bytes that were written."""
         return self._file.tell()
 
-    def append(self, frames: Sequence[Any], session: bytes, seq: int, client: str, now_ns: int) -> None:
-        """Write one record; it is on the disk when this returns.
+    def write(self, frames: Sequence[Any], session: bytes, seq: int, client: str, now_ns: int) -> None:
+        """Write one record; it is on the disk after the next `sync`.
 
         Raises:
             OSError: when the disk refuses; a part of the record may be there.
         """
         payload = mcap_layout.pack_record(frames, self._identity, session, seq, client)
         mcap_layout.write_record(self._writer, payload, seq, now_ns)
+
+    def sync(self) -> None:
+        """Wait until the disk has every record; raises OSError as `write`."""
         self._flush()
 
     def take_back(self, at: int) -> None:

@@ -10,7 +10,7 @@ import secrets
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from tsfusion.core import durable_files
 from tsfusion.core.errors import JournalError
@@ -27,6 +27,15 @@ _PARTS = r"\.[0-9]{6,9}\.mcap\.partial"  # files that a killed writer leaves
 _KEPT_OPEN = 64  # segments
 # Bytes of the journal that were read, bytes of all, and records so far
 ReadingWatcher = Callable[[int, int, int], None]
+
+
+class Unwritten(NamedTuple):
+    """A message that is to become a record."""
+
+    frames: Sequence[Any]
+    session: bytes
+    seq: int
+    client: str = ""  # name of the sender, at most 32 bytes of UTF-8
 
 
 class Journal:
@@ -144,38 +153,53 @@ class Journal:
         client: str = "",
         logged_ns: int | None = None,
     ) -> Position:
-        """Write one message; it is on the disk when this returns.
+        """Write one message; it is on the disk when this returns. See `append_all`.
 
         Args:
             client: name of the sender, at most 32 bytes of UTF-8.
             logged_ns: wall clock; None = now.
 
         Raises:
-            JournalError: when the disk refuses, or too little would stay free. Nothing of the message
+            JournalError: as `append_all`.
+        """
+        return self.append_all([Unwritten(frames, session, seq, client)], logged_ns=logged_ns)[0]
+
+    def append_all(self, messages: Sequence[Unwritten], *, logged_ns: int | None = None) -> list[Position]:
+        """Write messages into one segment; they are on the disk, by one wait for it, when this returns.
+
+        Args:
+            logged_ns: wall clock; None = now.
+
+        Raises:
+            JournalError: when the disk refuses, or too little would stay free. Nothing of any message
                 counts then.
         """
-        self._room.reserve(sum(memoryview(frame).nbytes for frame in frames))
+        self._room.reserve(sum(memoryview(frame).nbytes for one in messages for frame in one.frames))
         self._keep_place()
         now_ns = mcap_layout.wall_clock_ns() if logged_ns is None else logged_ns
-        position = Position(self._number, 0)
+        offsets = [0]
         try:
             segment = self._begin()
-            position = Position(self._number, segment.nbytes)
-            segment.append(frames, session, seq, client, now_ns)
+            offsets = []
+            for one in messages:
+                offsets.append(segment.nbytes)
+                segment.write(*one, now_ns)
+            segment.sync()
         except OSError as error:
-            self._abandon(position.offset)
+            self._abandon(offsets[0])
             raise journal_error("write", self.folder, error) from error
         except BaseException:  # interrupted in between
-            self._abandon(position.offset)
+            self._abandon(offsets[0] if offsets else None)
             raise
+        positions = [Position(self._number, offset) for offset in offsets]
         try:
             self._keep_place()  # nothing is acknowledged in a file that nobody finds
         except BaseException:
-            segment.take_back(position.offset)  # it comes again
+            segment.take_back(offsets[0])  # they come again
             raise
         if self._open is not None and segment.nbytes >= self._segment_bytes:
             self._rotate_or_abandon()
-        return position
+        return positions
 
     def _begin(self) -> OpenSegment:
         if self._open is not None and self._open.is_over:
