@@ -16,6 +16,7 @@ from tsfusion.core import process
 from tsfusion.core.config import DEFAULT_MAP, ServerConfig, VolumeConfig
 from tsfusion.core.folder_lock import lock_folder
 from tsfusion.core.service_manager import Watchdog
+from tsfusion.gateway import moved_maps
 from tsfusion.gateway.access_control import AccessControl
 from tsfusion.gateway.gateway import Gateway
 from tsfusion.gateway.metrics import Metrics
@@ -80,7 +81,7 @@ def run(
             if signals:
                 return 0
         addresses = gateway.ports.bind()
-        gateway.accept()
+        gateway.accept(_advertised(addresses, server))
         report.is_started = True
         watchdog.ready(f"listening at {addresses.data}")
         if on_ready is not None:
@@ -100,6 +101,8 @@ def _open(
     process.raise_file_limit()
     state = Path(server.state)
     stack.enter_context(lock_folder(state, "state", "server"))
+    for name in moved_maps.departed_names(state):
+        moved_maps.put_aside(state, name)
     for name in state_folder.map_names(state):
         if len(volumes) < server.max_maps and state_folder.holds_a_map(state_folder.map_folder(state, name)):
             volumes.setdefault(name, volumes[DEFAULT_MAP])
@@ -115,6 +118,7 @@ def _open(
         log.info("figures and health checks are at http://%s", metrics.serve(server.metrics))
     gateway = Gateway(context, server, ports, access, metrics, on_health=on_health)
     stack.callback(gateway.maps.close)
+    stack.callback(gateway.moves.close)
     watchdog = Watchdog()
     report = _ReadingReport(metrics, watchdog, signals)
     gateway.maps.open_at_start(volumes, report)
@@ -198,11 +202,21 @@ def _signals() -> Iterator[list[int]]:
             signal.signal(number, handler)
 
 
+def _advertised(addresses: Addresses, server: ServerConfig) -> Addresses:
+    """The addresses by which clients on other machines reach this server."""
+    if server.advertise is None:
+        return addresses
+    data = sockets.connect_address(server.advertise)
+    return Addresses(data, sockets.control_address(data), addresses.publish)
+
+
 def _check_addresses(server: ServerConfig) -> None:
     """Raise for addresses that cannot be bound now, not after the kernels are compiled."""
     for address in (server.listen, server.control):
         if address is not None:
             sockets.check_reachable(address, has_keys=server.keys is not None)
             sockets.check_free(address)
+    if server.advertise is not None:
+        sockets.control_address(sockets.connect_address(server.advertise))
     if server.control is None and sockets.parse_address(server.listen)[1]:
         sockets.check_free(sockets.control_address(server.listen))

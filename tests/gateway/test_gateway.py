@@ -34,6 +34,7 @@ from tsfusion.gateway.ports import Ports
 from tsfusion.journal import Journal, Position, state_folder
 from tsfusion.wire.health import MapHealth
 from tsfusion.wire.queries import fetch_status
+from tsfusion.wire.sockets import Addresses
 
 _FAKE = """
 import os, struct, sys, time, zmq
@@ -228,7 +229,7 @@ def test_a_fuser_that_is_stopped_is_not_the_keyframes_fault(
         """.strip()
     )
     gateway = start(body, fuser_timeout=1.5)
-    gateway.accept()
+    gateway.accept(Addresses("", "", ""))
     stepped(gateway, lambda: "is stopped from outside" in default(gateway).problem)
     assert not gateway.health().ready
     health = default(drained(gateway))

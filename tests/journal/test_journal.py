@@ -71,9 +71,10 @@ def test_of_records_that_are_written_together_all_count_or_none(
     log = Journal(tmp_path, BIG)
     fill(log, 2)
     together = [Unwritten([b"head", bytes(1000)], SESSION, 3 + i) for i in range(4)]
-    with monkeypatch.context() as broken, pytest.raises(JournalError, match="cannot write"):
+    with monkeypatch.context() as broken:
         broken.setattr(os, "fdatasync", refuse(errno.EIO))
-        log.append_all(together)
+        with pytest.raises(JournalError, match="cannot write"):
+            log.append_all(together)
     log.append_all(together[:2])
     log.close()
     assert [found.seq for found in Journal(tmp_path, BIG).found] == [1, 2, 3, 4]

@@ -29,7 +29,7 @@ class Served:
         self.gateway = gateway
         self.addresses = gateway.ports.bind()
         self.longest = 0.0  # CPU seconds of a step
-        gateway.accept()
+        gateway.accept(self.addresses)
 
     def step(self) -> None:
         began = time.thread_time()

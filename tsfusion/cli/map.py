@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tsfusion.cli import forget, map_align, map_convert, map_view, opened_maps, options, verbs
+from tsfusion.cli import forget, map_align, map_convert, map_move, map_view, opened_maps, options, verbs
 from tsfusion.core.counts import count_of
 
 if TYPE_CHECKING:
@@ -24,6 +24,7 @@ app = typer.Typer(
 )
 forget.register(app)
 map_align.register(app)
+map_move.register(app)
 
 Where = Annotated[
     Path, typer.Argument(metavar="MAP", help="A .tsf file, a state folder, or a map's folder in it.")

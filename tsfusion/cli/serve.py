@@ -46,6 +46,8 @@ SERVER_OPTIONS: dict[str, Any] = {
         "--keep-keyframes", "N", "Forget all but the newest N keyframes of a map.", rare=True)],
     "keep_radius": Annotated[float | None, options.option(
         "--keep-radius", "METRES", "Forget what was seen farther from the newest keyframe.", rare=True)],
+    "directory": _flag("--directory", "FILE", "Who of several servers has which map.", rare=True),
+    "advertise": _flag("--advertise", "ADDRESS", "By which clients reach this server.", rare=True),
     "keys": _flag("--keys", "DIR",
                   "Who may connect: `tsfusion keys`; needed beyond this machine."),
     "fuser_memory_bytes": _flag("--memory", "BYTES",

@@ -223,6 +223,8 @@ class ServerConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     state: str = "tsfusion-state"  # folder: maps/NAME/journal/, maps/NAME/map.tsf
     keys: str | None = None  # folder of `tsfusion keys`; None = no keys, reachable from this machine only
     max_maps: Annotated[int, Meta(ge=1, le=64)] = 4  # open at the same time; each has a fuser process
+    directory: str | None = None  # SQLite file in which servers write who has which map; None = one server
+    advertise: str | None = None  # address by which clients reach this server; None = `listen`'s
     metrics: str | None = None  # loopback address of Prometheus' page and health checks: 127.0.0.1:9464
     max_frame_bytes: Annotated[int, Meta(ge=1024, le=32 << 20)] = 32 << 20  # the fuser takes no larger one
     segment_bytes: Annotated[int, Meta(ge=1 << 16)] = 256 << 20

@@ -26,6 +26,8 @@ _REWIND_INTERVAL = 0.2  # one gap is reported by every keyframe behind it
 _LATEST = 1 << 62  # nanoseconds; no clock shows more than a century
 _OTHER_WORLD_INTERVAL = 5.0  # seconds; a map's frame changes when the server begins anew
 _WARNING_INTERVAL = 10.0  # seconds between two warnings of rejected records
+_MOST_HOPS = 4  # from server to server, before there is a pause between two
+_HOP_INTERVAL = 2.0  # seconds; servers that send a client to each other are put right by a person
 _HOLD = (0.05, 60.0)  # seconds: no server may hold a client for less or longer at a time
 
 
@@ -64,6 +66,8 @@ class ControlSession:
         self._warning_due = 0.0  # when rejected records may be named again
         self._unsaid = 0  # records that were rejected since they were
         self._is_lost = False  # whether it was said that the server is gone or silent
+        self._moved_to: tuple[str, str] | None = None
+        self._hops = 0  # since a server let us in
 
     @property
     def terms(self) -> messages.Welcome | None:
@@ -211,6 +215,7 @@ class ControlSession:
         elif not self._is_foreign(welcome.durable):
             self._outbox.change_link_state(self._outbox.link_state.welcomed())
             self.welcome = welcome
+            self._hops = 0
             self._ping_due = self._held_until = 0.0
             self._outbox.welcome(welcome.durable, welcome.window_keyframes)
             self._on_progress(welcome.durable, welcome.fused)
@@ -222,10 +227,39 @@ class ControlSession:
             why = f"the server is opening the map {self._hello.map}"
             self._outbox.change_link_state(self._outbox.link_state.opening(why))
             self.greet_again(_HELLO_INTERVAL[1])
+        elif denied.reason == "moved":
+            self._on_moved(denied)
         elif denied.reason == "world":
             self._on_other_world(denied)
         else:
             self._refuse(f"the server at {self._address} refuses this client: {denied.message}")
+
+    def _on_moved(self, denied: messages.Denied) -> None:
+        """Go to the server that has the map."""
+        self._hops += 1
+        self.greet_again(0.0 if self._hops <= _MOST_HOPS else _HOP_INTERVAL)
+        self._moved_to = (denied.address, denied.control)
+
+    def take_move(self) -> tuple[str, str] | None:
+        """Addresses, data and control, of the server that has the map; told once. None = go nowhere."""
+        found, self._moved_to = self._moved_to, None
+        return found
+
+    def follow(self, address: str) -> None:
+        """Begin anew with the server at another control address."""
+        why = f"map {self._hello.map} is on another server: going on at {address}"
+        self._outbox.change_link_state(self._outbox.link_state.away(why))
+        log.info("%s", why)
+        self._address = address
+        self.clock.clear()
+        self.last_heard = time.monotonic()
+        self._held_until = 0.0
+        self.greet_again(0.0 if self._hops <= _MOST_HOPS else _HOP_INTERVAL)
+        self.rewind()
+
+    def refuse_move(self, why: str) -> None:
+        """Stay, and say why this client does not go where the server sent it."""
+        self._refuse(f"the server at {self._address} sends this client elsewhere: {why}")
 
     def _on_other_world(self, denied: messages.Denied) -> None:
         """Keep everything, and stop sending. Whoever sends says so (`Client.check_world`)."""

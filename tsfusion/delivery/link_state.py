@@ -6,15 +6,17 @@
     held         the server answers, but wants nothing for now: its disk is full, or the quota is used up
     opening      the server answers, but the map is not open yet
     refused      the server does not want this client: another version, another's session, no such map
+    moved        another server has the map, and the client goes there
     other_world  the map has keyframes of another session, in another coordinate frame
     locked_out   the server does not know the client's key, or asks for one
     silent       the server answered once, and has not been heard for too long
 
 A client begins as `connecting`. A Welcome leads back there from anywhere but `connected` and `held`: the
 server has let us in, and the next Pong means `connected`. From there a Hold leads to `held`, and progress
-back again. A Denied leads to `opening`, `refused` or `other_world`, a refused handshake to `locked_out`, and
-they stay until a Welcome, another Denied or, with `locked_out`, until the handshake succeeds. Silence leads
-to `silent` from `connected`, `held` and `opening`; the others say already why nothing moves.
+back again. A Denied leads to `opening`, `moved`, `refused` or `other_world`, a refused handshake to
+`locked_out`, and they stay until a Welcome, another Denied or, with `locked_out`, until the handshake
+succeeds. Silence leads to `silent` from `connected`, `held`, `opening` and `moved`; the others say already
+why nothing moves.
 
 Nobody gives up in any state: the client asks again for ever, because a person may put it right at the other
 end. States are values without behaviour: `ControlSession` sees the events and replaces the present state by
@@ -26,7 +28,7 @@ from typing import Literal
 from msgspec import Struct
 
 LinkKind = Literal[
-    "connecting", "connected", "held", "opening", "refused", "other_world", "locked_out", "silent"
+    "connecting", "connected", "held", "opening", "moved", "refused", "other_world", "locked_out", "silent"
 ]
 
 
@@ -62,7 +64,7 @@ class LinkState(Struct, frozen=True):
 
     def silent(self, why: str = "") -> "LinkState":
         """The state when no message of the server came for too long; empty = the connection stands."""
-        is_so = self.is_connected or self.kind in ("opening", "silent")
+        is_so = self.is_connected or self.kind in ("opening", "moved", "silent")
         return LinkState("silent", why) if is_so else self
 
     # --- the server's messages ---
@@ -74,6 +76,10 @@ class LinkState(Struct, frozen=True):
     def opening(self, why: str) -> "LinkState":
         """The state after a Denied, because the map is not open yet."""
         return LinkState("opening", why)
+
+    def away(self, why: str) -> "LinkState":
+        """The state after a Denied, because another server has the map."""
+        return LinkState("moved", why)
 
     def refused(self, why: str) -> "LinkState":
         """The state when server and client cannot work together, by a Denied or by what a Welcome says."""

@@ -17,7 +17,7 @@ from typing import Any
 import zmq
 
 from tsfusion.core.config import ClientConfig
-from tsfusion.core.errors import MISSING, DecodeError, JournalError
+from tsfusion.core.errors import MISSING, DecodeError, InvalidConfig, JournalError
 from tsfusion.delivery.control_session import ControlSession
 from tsfusion.delivery.outbox import Outbox
 from tsfusion.delivery.refused_keyframes import RefusedFolder
@@ -32,6 +32,7 @@ log = logging.getLogger(__name__)
 _READ_INTERVAL = 0.5  # seconds until a record that could not be read is tried again
 _MAX_READS = 6
 _MAX_READS_AWAY = 120  # the folder may come back
+_HOME_AFTER = 10.0  # seconds without being let in, until the first server is asked where the map is
 _LEAST_SILENCE = 2.0  # seconds; a server answers each ping, two a second, and never waits
 _FAREWELL_MS = 100  # for the last message to leave
 _SOCKET_INTERVAL = 0.5  # seconds until a socket that could not be opened is tried again
@@ -50,6 +51,8 @@ class Sender:
     ) -> None:
         self._data_address = address
         self._control_address = control
+        self._home = (address, control)
+        self._followed = 0.0  # time.monotonic(), when a server sent this client to another; 0 = none has
         self._keys = keys
         self._outbox = outbox
         self._config = config
@@ -130,6 +133,8 @@ class Sender:
             except zmq.Again:
                 break
         now = time.monotonic()
+        if (place := self._control_session.take_move()) is not None:
+            self._follow_if_allowed(place, now)
         self._watch_connections(now)
         self._control_session.tick(now)
         self._watch_for_stall(now)
@@ -169,6 +174,10 @@ class Sender:
 
     def _watch_for_stall(self, now: float) -> None:
         session = self._control_session
+        if session.welcome is not None:
+            self._followed = now if self._followed else 0.0
+        elif self._followed and now - self._followed > _HOME_AFTER:
+            self._follow(self._home, now)  # the server that it was sent to does not let it in
         if now - session.last_heard > self._config.stall_timeout:
             session.on_silence(self._control.problem)
         if self._control.is_made and self._silence.has_ended(
@@ -183,6 +192,26 @@ class Sender:
         ):
             log.info("nothing moves: connecting to %s again", self._data_address)
             self._connect_again(self._data)
+
+    def _follow_if_allowed(self, place: tuple[str, str], now: float) -> None:
+        """Go to the server that has the map. Without keys only one of this machine is believed."""
+        try:
+            data = sockets.connect_address(place[0])
+            control = sockets.connect_address(sockets.control_address(data, place[1] or None))
+            if self._keys is None:
+                sockets.check_reachable(data, has_keys=False)
+                sockets.check_reachable(control, has_keys=False)
+        except InvalidConfig as error:
+            self._control_session.refuse_move(str(error))
+            return
+        self._follow((data, control), now)
+
+    def _follow(self, place: tuple[str, str], now: float) -> None:
+        self._data_address, self._control_address = place
+        self._followed = 0.0 if place == self._home else now
+        self._data.move_to(self._data_address)
+        self._control.move_to(self._control_address)
+        self._control_session.follow(self._control_address)
 
     def _connect_again(self, *connections: Connection) -> None:
         """Make connections anew, and send again what is not acknowledged as soon as the server lets us in."""

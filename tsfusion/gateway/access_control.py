@@ -21,6 +21,7 @@ log = logging.getLogger(__name__)
 
 KEPT_OUT = 60.0  # seconds; then a client that was kept out may try again
 GUEST = "(guest)"  # no client in a list can have this name
+SERVER = "(server)"  # nor this one: another server of the fleet, which has the same pair of keys
 
 
 class AccessControl:
@@ -86,6 +87,8 @@ class AccessControl:
     def _name_of(self, key: str) -> str | None:
         if key == self._guest:
             return GUEST
+        if self.keys is not None and key == self.keys.public:
+            return SERVER
         name = None if self._allowed is None else self._allowed.name_of(key)
         return None if name is not None and self._is_kept_out(name) else name
 
@@ -103,11 +106,13 @@ class AccessControl:
 
     def maps_of(self, client: str) -> AllowedMaps:
         """The maps that the client of a name may use: without keys every map."""
-        return ALL_MAPS if self._allowed is None or client == GUEST else self._allowed.maps_of(client)
+        return (
+            ALL_MAPS if self._allowed is None or client in (GUEST, SERVER) else self._allowed.maps_of(client)
+        )
 
     def may_forget_all(self, client: str) -> bool:
         """Whether a client may forget keyframes of others, too: without keys everybody may."""
-        return self._allowed is None or self._allowed.may_forget_all(client)
+        return self._allowed is None or client == SERVER or self._allowed.may_forget_all(client)
 
     def close(self) -> None:
         """Stop answering: nobody can connect any more."""

@@ -29,6 +29,7 @@ from tsfusion.gateway.forgetting import Request
 from tsfusion.gateway.fuser_queries import FuserQueries
 from tsfusion.gateway.hosted_map import ForPeople, HostedMap
 from tsfusion.gateway.keyframe_intake import KeyframeIntake
+from tsfusion.gateway.map_moves import MapMoves
 from tsfusion.gateway.map_questions import MapQuestions
 from tsfusion.gateway.map_registry import MapRegistry
 from tsfusion.gateway.memory_guard import PendingReplies
@@ -82,6 +83,16 @@ class Gateway:
         )
         unread, most_unread = PendingReplies(), server.memory_bytes // _REPLIES_SHARE
         self._queries = FuserQueries(ports, unread, most_unread)
+        self.moves = MapMoves(
+            server,
+            self.maps,
+            self._routes,
+            ports,
+            access,
+            unread=unread,
+            max_bytes=most_unread,
+            on_left=self._on_left,
+        )
         self._questions = MapQuestions(
             ports, metrics, self._refused, unread=unread, max_bytes=most_unread, rate=server.quota_questions
         )
@@ -97,10 +108,11 @@ class Gateway:
     def _new_epoch(self) -> None:
         self.epoch = f"{time.monotonic_ns():x}"  # tells clients that the messages under way are lost
 
-    def accept(self) -> None:
-        """Begin to take keyframes."""
+    def accept(self, addresses: sockets.Addresses) -> None:
+        """Begin to take keyframes, of clients that reach this server at these addresses."""
         self._accepting = True
-        self.maps.end_start()
+        self.maps.end_start((addresses.data, addresses.control))
+        self.moves.resume()
         self._next_snapshot = 0.0  # health checks are to see it at once
 
     def stop_accepting(self) -> None:
@@ -128,6 +140,7 @@ class Gateway:
         self._limits.step()
         for hosted, message in self.maps.step():
             self._pass_to_people(hosted, message)
+        self.moves.step()
         self._questions.step()
         self._scans.step()
         self._update_fusers()
@@ -178,9 +191,7 @@ class Gateway:
         """Tell each fuser whether its map has viewers; refuse the queries that a dead one will not answer."""
         for hosted in self.maps:
             if not hosted.fuser.ready:
-                self._publishing.pop(hosted.name, None)
-                self._queries.give_up(hosted.name)
-                self._questions.give_up(hosted.name)
+                self._on_left(hosted.name)
                 continue
             watched = self._subscriptions.watched(mesh_topic(hosted.name))
             changed = watched != self._publishing.get(hosted.name)
@@ -198,6 +209,12 @@ class Gateway:
             self._questions.on_answer(message, frames)
         elif frames:
             self.ports.publish(mesh_topic(hosted.name), fuser_messages.encode(message), frames)
+
+    def _on_left(self, name: str) -> None:
+        """Refuse the queries to the fuser of a map that was closed."""
+        self._publishing.pop(name, None)
+        self._queries.give_up(name)
+        self._questions.give_up(name)
 
     # --- control ---
 
@@ -249,11 +266,18 @@ class Gateway:
             return "version", f"{speaks}, this client {hello.version}"
         if forbidden := self._admission.denial_of_map(client, hello.map, sends=True):
             return "map", forbidden
+        try:
+            elsewhere = self.maps.elsewhere(hello.map)
+        except JournalError as error:
+            return "map", f"map {hello.map} cannot be opened: {error}"
+        if elsewhere is not None:
+            return "moved", f"map {hello.map} is at {elsewhere[0]} now", "", *elsewhere
         hosted = self.maps.greet(hello.map)
         if hosted is None and (why := self.maps.why_not(hello.map)):
             return "map", f"map {hello.map} cannot be opened: {why}"
         if hosted is not None and not hosted.takes_records:
-            return "opening", f"map {hello.map} is being opened"
+            what = "moves to another server" if hosted.is_frozen else "is being opened"
+            return "opening", f"map {hello.map} {what}"
         if hello.session == SERVER_SESSION:
             return "session", "the session of this spool is the server's own: use another spool folder"
         sessions = Sessions() if hosted is None else hosted.sessions
@@ -305,6 +329,8 @@ class Gateway:
             self.ports.reply(identity, messages.Reply(name=command.name, number=number, error=forbidden))
         elif command.name == "forget":
             self._on_forget(identity, command, client)
+        elif command.name in ("move", "hand_over"):
+            self.moves.on_command(identity, command, client)
         elif command.name == "ask":
             self._questions.ask(identity, command, points, self.maps.get(command.map), client)
         else:
@@ -320,6 +346,8 @@ class Gateway:
             answer("name the keyframes that are to be forgotten: nothing was named")
         elif hosted is None:
             answer(f"no map {command.map} is open")
+        elif hosted.is_leaving:
+            answer(f"map {command.map} moves to another server; ask that one")
         elif not hosted.warm:
             answer(f"map {command.map} is being opened; ask again")
         elif not self._access.may_forget_all(client) and selection.client not in (None, client):

@@ -17,6 +17,7 @@ from tsfusion.core.config import SERVER_SESSION, ServerConfig, VolumeConfig
 from tsfusion.core.counts import count_of
 from tsfusion.core.errors import JournalError
 from tsfusion.fuser import messages as fuser_messages
+from tsfusion.gateway import moved_maps
 from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.disk_pause import DiskPause
 from tsfusion.gateway.forgetting import Forgetting
@@ -72,10 +73,11 @@ class HostedMap:
         metrics: Metrics,
         watch: ReadingWatcher = lambda _done, _all, _records: None,
     ) -> None:
-        self.name = name
+        self.name, self.volume = name, volume
         self.folder = state_folder.map_folder(server.state, name)
         self.sessions = Sessions()
         self.questions = QuestionCounts()
+        self.is_leaving = self.is_frozen = False  # to another server; it takes no records any more
         self.warm = False  # the fuser has been ready once: from then on it is known what the map has
         self._metrics = metrics
         self._keeps_window = (server.keep_seconds, server.keep_keyframes, server.keep_radius) != (None,) * 3
@@ -94,6 +96,11 @@ class HostedMap:
         self._index = KeyframeIndex()
         self._index.recover(self._journal.found, self.sessions)
         self._journal.found = []
+        arrived = moved_maps.arrival_of(self.folder)
+        self._has_arrived = arrived is not None
+        for known in () if arrived is None else arrived.sessions:
+            session = self.sessions.open(known.key, known.client, known.world)
+            session.durable = max(session.durable, known.durable)
         self._backlog = FuserBacklog(self._index, self.sessions)
         self._corrections = self._backlog.corrections  # in the journal
         self.outcomes = KeyframeOutcomes(
@@ -120,8 +127,17 @@ class HostedMap:
 
     @property
     def takes_records(self) -> bool:
-        """Whether it is known what the map has: its fuser has read that, or there was nothing."""
-        return self.warm or self._is_new
+        """Whether it is known what the map has, and it stays here.
+
+        Its fuser has read that, or there was nothing, or the server from which it came said it.
+        """
+        return (self.warm or self._is_new or self._has_arrived) and not self.is_frozen
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether it is known that the map has nothing, and never had."""
+        is_known = self.warm or self._is_new
+        return is_known and not (len(self.sessions) or self.outcomes.blocks or self.outcomes.taken)
 
     @property
     def drained(self) -> bool:
@@ -158,6 +174,8 @@ class HostedMap:
 
     def _append_forgotten(self, target: bytes, seqs: NDArray[np.int64]) -> None:
         """Write the record to the journal that removes these keyframes of a session."""
+        if self.is_frozen:
+            raise JournalError(f"map {self.name} moves to another server")
         durable, _ = self.sessions.progress(SERVER_SESSION)
         frames = corrections.encode(
             corrections.forgetting(target, seqs),
@@ -210,6 +228,34 @@ class HostedMap:
         self.outcomes.acknowledge(header.session, [stamps])
         return index
 
+    # --- another server ---
+
+    def begin_to_leave(self) -> None:
+        """Delete no file of the journal any more, close the open one, and have a checkpoint written.
+
+        Raises:
+            JournalError: when the disk refuses.
+        """
+        self.is_leaving = True
+        self._close_segment()
+        if self.fuser.ready:
+            self.fuser.send(fuser_messages.Save())
+
+    def freeze(self) -> None:
+        """Take no records any more, and close the journal's last file; raises JournalError."""
+        self.is_frozen = True
+        self._close_segment()
+
+    def stay(self) -> None:
+        """Go on as before."""
+        self.is_leaving = self.is_frozen = False
+
+    def _close_segment(self) -> None:
+        try:
+            self._journal.rotate()
+        except OSError as error:
+            raise JournalError(f"cannot close a file of {self._journal.folder}: {error}") from error
+
     # --- fuser ---
 
     def step(self) -> list[ForPeople]:
@@ -254,7 +300,7 @@ class HostedMap:
                 self.fuser.restart()
         self._backlog.hand_out(self.fuser)
         self.disk.step()
-        if not self.disk.is_away:
+        if not self.disk.is_away and not self.is_leaving:
             needed = self.outcomes.moves.first_segment if self._keeps_window else None
             self._retention.step(self.fuser, self.outcomes.unmeshed, window_from=needed)
         self._save_again()

@@ -95,8 +95,22 @@ class KeyframeIntake:
             subject = logs.about(map=header.map, session=header.session, seq=header.seq, client=client)
             log.warning("a %s is refused: %s", header.kind, denied.message, extra=subject)
             self._routes.send(header.session, denied)
+        elif hosted.is_empty and (elsewhere := self._claimed_elsewhere(header)) is not None:
+            self._refused["map"] += 1
+            self._routes.send(header.session, elsewhere)
         elif not self._has_to_wait(hosted, header.session, client, nbytes, sockets.file_of(frames[0])):
             self._on_checked(hosted, header, buffers, client, received_ns)
+
+    def _claimed_elsewhere(self, header: RecordHeader) -> messages.Denied | None:
+        """The answer to the first record of a map that another server has; None = it begins here."""
+        try:
+            place = self._maps.claim(header.map)
+        except JournalError as error:
+            return messages.Denied(header.session, "map", f"map {header.map} cannot begin: {error}")
+        if place is None:
+            return None
+        why = f"map {header.map} is at {place[0]} now"
+        return messages.Denied(header.session, "moved", why, address=place[0], control=place[1])
 
     def _make_map(self, header: RecordHeader, buffers: list[Any], client: str) -> HostedMap | None:
         """The map that a client was let into, made for its first record; None = it is not, or cannot be."""
@@ -108,6 +122,9 @@ class KeyframeIntake:
             self._quotas.check(header, buffers)
         except Refused as error:
             self._refuse(error, client, header)
+            return None
+        if (elsewhere := self._claimed_elsewhere(header)) is not None:
+            self._routes.send(header.session, elsewhere)
             return None
         hosted = self._maps.open_for_client(header.map)
         if hosted is None:

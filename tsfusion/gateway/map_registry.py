@@ -15,8 +15,10 @@ from tsfusion.core import logs
 from tsfusion.core.config import DEFAULT_MAP, MAP_NAME_LENGTH, ServerConfig, VolumeConfig
 from tsfusion.core.counts import count_of
 from tsfusion.core.errors import JournalError, TsfusionError
+from tsfusion.gateway import map_arrivals, moved_maps
 from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.hosted_map import ForPeople, HostedMap
+from tsfusion.gateway.map_directory import MapDirectory, Place
 from tsfusion.gateway.metrics import Metrics
 from tsfusion.gateway.problems import Problem
 from tsfusion.gateway.sessions import Session
@@ -53,6 +55,9 @@ class MapRegistry:
         self._open: dict[str, HostedMap] = {}
         self._unopened: dict[str, tuple[str, float]] = {}  # name → why, when
         self._kept: dict[str, float] = {}  # free name that was given out → when
+        self.place = ("", "")  # data and control address by which clients reach this server
+        self.arriving: set[str] = set()  # maps that are being copied from another server
+        self._directory = MapDirectory(server.directory) if server.directory else None
         self._started = False
 
     def __iter__(self) -> Iterator[HostedMap]:
@@ -88,9 +93,96 @@ class MapRegistry:
         for name in volumes:
             self._open_map(name)
 
-    def end_start(self) -> None:
-        """Go on when a map cannot be opened, from here on; before, that is an error of the server."""
-        self._started = True
+    def end_start(self, place: Place) -> None:
+        """Go on when a map cannot be opened, from here on; before, that is an error of the server.
+
+        Args:
+            place: where clients reach this server.
+        """
+        self._started, self.place = True, place
+        for hosted in self:
+            if not hosted.is_empty:
+                self._enter(hosted.name)
+
+    # --- other servers ---
+
+    def elsewhere(self, name: str) -> Place | None:
+        """The server that has a map of which this one has nothing; None = no other has it.
+
+        Raises:
+            JournalError: when that cannot be read.
+        """
+        hosted = self.get(name)
+        if (hosted is not None and not hosted.is_empty) or name in self.arriving:
+            return None
+        entered = self._directory.place_of(name) if self._directory else None
+        if entered is not None and entered != self.place:
+            return entered
+        left = moved_maps.departed(self._server.state, name)
+        return None if left is None else (left.address, left.control)
+
+    def claim(self, name: str) -> Place | None:
+        """Enter a map that is about to begin here; the other server that has it, None = it may begin.
+
+        Raises:
+            JournalError: when the directory cannot be written.
+        """
+        if (found := self.elsewhere(name)) is not None or self._directory is None:
+            return found
+        found = self._directory.claim(name, self.place)
+        return None if found == self.place else found
+
+    def _enter(self, name: str) -> None:
+        """Enter a map that is here, whatever the directory says."""
+        if self._directory is None:
+            return
+        try:
+            self._directory.move(name, self.place)
+        except JournalError as error:
+            log.error("%s", error, extra=logs.about(map=name))
+
+    def why_not_take(self, name: str) -> str:
+        """Why a map of this name cannot come from another server; empty = it can."""
+        if name in self.arriving:
+            return f"map {name} is coming already"
+        if self._has_own(name):
+            return f"this server has a map {name} of its own"
+        return "" if self.get(name) is not None else self.why_not(name)
+
+    def _has_own(self, name: str) -> bool:
+        hosted = self.get(name)
+        return state_folder.holds_records(self._folder(name)) if hosted is None else not hosted.is_empty
+
+    def begin_to_take(self, name: str) -> None:
+        """Let nothing begin under the name of a map that is coming."""
+        self.arriving.add(name)
+        if (hosted := self.get(name)) is not None:
+            hosted.freeze()
+
+    def end_to_take(self, name: str) -> None:
+        """Note that a map has come, or will not come."""
+        self.arriving.discard(name)
+        if (hosted := self.get(name)) is not None:
+            hosted.stay()
+
+    def give_away(self, name: str) -> None:
+        """Close a map that another server has from now on, or that makes room for one that came."""
+        hosted = self._open.pop(name, None)
+        if hosted is not None:
+            hosted.close(wait=False)
+
+    def take_in(self, name: str) -> None:
+        """Open a map that has come from another server.
+
+        Raises:
+            TsfusionError: when it cannot be opened; its files are here then, and the next start tries again.
+        """
+        if self._has_own(name):
+            raise JournalError(f"this server has a map {name} of its own")
+        self.give_away(name)
+        map_arrivals.install(self._server.state, name)
+        self._enter(name)
+        self._open_map(name)
 
     def greet(self, name: str) -> HostedMap | None:
         """A map by name, opened when it is on the disk; None = there is none, or `why_not` says why.
@@ -119,6 +211,8 @@ class MapRegistry:
 
     def why_not(self, name: str) -> str:
         """Why a map that is not open cannot be opened now; empty = it can be."""
+        if name in self.arriving:
+            return "it is coming from another server"
         why, failed = self._unopened.get(name, ("", -_RETRY_INTERVAL))
         if time.monotonic() - failed < _RETRY_INTERVAL:
             return why
@@ -199,7 +293,8 @@ class MapRegistry:
         return name
 
     def _open_map(self, name: str) -> HostedMap:
-        volume = self._volumes.get(name) or self._volumes[DEFAULT_MAP]
+        own = moved_maps.volume_of(self._folder(name))
+        volume = own or self._volumes.get(name) or self._volumes[DEFAULT_MAP]
         try:
             hosted = HostedMap(
                 self._context,

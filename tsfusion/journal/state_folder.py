@@ -20,6 +20,8 @@ MAPS_FOLDER = "maps"
 JOURNAL_FOLDER = "journal"
 QUARANTINE_FOLDER = "quarantine"
 MAP_FILE = "map.tsf"
+ARRIVED_FILE = "arrived.json"  # in the folder of a map that came from another server
+MOVED_FOLDER = "moved"  # of maps that another server has
 LOCK_FILE = "fuser.lock"
 PREVIOUS_FILE = "map.previous.tsf"
 
@@ -62,6 +64,18 @@ def holds_a_map(folder: Path) -> bool:
         return False
     except OSError as error:
         raise journal_error("list", folder, error) from error
+
+
+def holds_records(folder: Path) -> bool:
+    """Whether a map's folder holds a checkpoint, or a segment of a journal that is not empty.
+
+    Raises:
+        JournalError: when it cannot be listed.
+    """
+    journal = folder / JOURNAL_FOLDER
+    numbers = segments(journal) if journal.is_dir() else []
+    paths = [segment_path(journal, number) for number in numbers]
+    return (folder / MAP_FILE).exists() or any(map(size_of, paths))
 
 
 def _fail(error: OSError) -> None:

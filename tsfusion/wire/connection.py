@@ -101,6 +101,13 @@ class Connection:
         self.close()
         self._open()
 
+    def move_to(self, address: str) -> None:
+        """Connect to another address; what the old connection held is lost."""
+        self.address, self.problem = address, ""
+        self._is_name = sockets.is_name(address)
+        self._named_ipv6 = self._tried_both = False
+        self.reopen()
+
     def check(self, now: float) -> tuple[str | None, bool]:
         """Read the events, and connect anew when that is due.
 

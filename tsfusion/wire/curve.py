@@ -46,6 +46,10 @@ class ServerKeys(Struct, frozen=True):
         socket.setsockopt(zmq.ZAP_DOMAIN, DOMAIN)
         socket.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)
 
+    def as_client(self) -> "ClientKeys":
+        """The keys with which this server is a client of another one that has the same pair."""
+        return ClientKeys(self.public, self.secret, self.public)
+
     def __repr__(self) -> str:
         return f"ServerKeys(public={self.public!r})"
 

@@ -15,6 +15,7 @@ from tsfusion.core.readable_numbers import counted
 from tsfusion.wire.forgetting import Forgotten, Selection
 from tsfusion.wire.health import Health, MeshLayout, Status
 from tsfusion.wire.keyframe_times import Seq, Stamps
+from tsfusion.wire.map_moves import HandOver, Moved, Parcel, Place
 from tsfusion.wire.questions import Answer, Question
 from tsfusion.wire.record_header import SessionId, WorldName
 from tsfusion.wire.seal import is_damaged, seal
@@ -112,14 +113,17 @@ class Denied(Struct, frozen=True, tag="denied", omit_defaults=True):
     Attributes:
         reason: `opening` (the map is being opened), `map` (there is no such map, and no room for one, or it
             cannot be opened), `session` (it is another client's), `world` (the map has keyframes of another
-            world) or `version`.
+            world), `moved` (another server has the map) or `version`.
         free_map: of `world`, the name of a map that nobody has yet.
+        address, control: of `moved`, the data and control address of that server.
     """
 
     session: SessionId
     reason: str
     message: str
     free_map: str = ""
+    address: Place = ""
+    control: Place = ""
 
 
 class Ping(Struct, frozen=True, tag="ping", omit_defaults=True):
@@ -162,12 +166,15 @@ class Pong(Struct, frozen=True, tag="pong"):
 class Command(Struct, frozen=True, tag="command", kw_only=True):
     """A request of a person or program; answered by one Reply. The points of an `ask` follow as frames."""
 
-    name: Literal["ping", "health", "status", "mesh", "new_map", "forget", "ask"]
+    name: Literal["ping", "health", "status", "mesh", "new_map", "forget", "ask", "move", "hand_over"]
     map: MapName = "default"  # of `new_map`: the name to begin with, where that is free
     min_weight: float | None = None
     selection: Selection | None = None  # of `forget`, with the two that follow
     erase: bool = False  # also delete the records' bytes
     dry_run: bool = False  # only say what would be forgotten
+    source: Place = ""  # of `move`: the data address of the server that has the map
+    source_control: Place = ""  # its control address; empty = the next port
+    hand_over: HandOver | None = None
     question: Question | None = None  # of `ask`, with what follows
     number: Annotated[int, Meta(ge=0)] = 0  # comes back with the answer
     timeout_s: float = 1.0  # then nobody waits for the answer any more
@@ -185,6 +192,8 @@ class Reply(Struct, frozen=True, tag="reply", kw_only=True):
     status: "Status | None" = None
     mesh: "MeshLayout | None" = None
     forgotten: Forgotten | None = None
+    moved: Moved | None = None
+    parcel: Parcel | None = None  # of `hand_over`
     asks: bool = False  # of a ping: whether this server's maps can be asked; an older one's cannot
     watches: bool = False  # likewise: whether its maps can be watched (`questions.Cells` and `Keyframes`)
     number: int = 0  # of the question

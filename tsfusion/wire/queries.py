@@ -18,6 +18,7 @@ from tsfusion.wire.connection import Connection
 from tsfusion.wire.curve import ClientKeys
 from tsfusion.wire.forgetting import Forgotten, Selection
 from tsfusion.wire.health import Health, MeshLayout, Status
+from tsfusion.wire.map_moves import Moved
 from tsfusion.wire.messages import Command, Reply
 from tsfusion.wire.sockets import control_address
 
@@ -154,6 +155,22 @@ def forget(
     if reply.forgotten is None:
         raise TransportError(f"the server at {address} answered without what it forgot")
     return reply.forgotten
+
+
+def move_map(
+    name: str, source: str, to: str, *, timeout: float = 3600.0, keys: ClientKeys | None = None
+) -> Moved:
+    """Tell the server at a data address, `to`, to take over a map from another one. See `fetch_health`.
+
+    Raises:
+        ServerUnreachable: when nobody is there, or it takes longer; the move may go on then.
+        TransportError: when it cannot, or this client may not; the map stays where it is.
+    """
+    command = Command(name="move", map=name, source=sockets.connect_address(source))
+    reply, _ = _request_if_present(to, None, command, timeout, keys)
+    if reply.moved is None:
+        raise TransportError(f"the server at {to} answered without how the move went")
+    return reply.moved
 
 
 def _request_if_present(

@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: MIT
+"""What a server answers to one that asks for a map: only what belongs to the map, and never its only copy."""
+
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+import zmq
+from keyframes_and_servers import connected, until
+from served_gateway import Served, record, serving_here
+
+from tsfusion.core.errors import DecodeError
+from tsfusion.gateway import map_departures
+from tsfusion.wire import messages, sockets
+from tsfusion.wire.map_moves import HandOver, Parcel
+from tsfusion.wire.messages import Command, Reply
+
+MOVE, SESSION = bytes(range(16)), bytes(16)
+
+
+class Asking:
+    """A gateway with three records, and the other server, which asks it."""
+
+    def __init__(self, served: Served, link: Any, push: Any, state: Path) -> None:
+        self.served, self.link, self.push, self.state = served, link, push, state
+        served.greet(link, "default")
+        for seq in (1, 2, 3):
+            push.send_multipart(record(seq))
+        served.until(lambda: served.durable == 3)
+
+    def ask(self, step: str, **fields: Any) -> Reply:
+        self.frames: list[bytes] = []
+        question = HandOver(move=fields.pop("move", MOVE), step=step, **fields)  # type: ignore[arg-type]
+        self.link.send(messages.encode_sealed(Command(name="hand_over", hand_over=question)))
+        while True:
+            self.served.until(lambda: self.link.poll(0))
+            head, *frames = self.link.recv_multipart()
+            message = messages.decode_to_client(head)
+            if isinstance(message, Reply):
+                self.frames = frames
+                return message
+
+    def parcel(self, step: str, **fields: Any) -> Parcel:
+        reply = self.ask(step, **fields)
+        assert reply.error is None
+        assert reply.parcel is not None
+        return reply.parcel
+
+
+@pytest.fixture
+def asking(tmp_path: Path) -> Iterator[Asking]:
+    with (
+        serving_here(tmp_path) as served,
+        connected(sockets.dealer, served.addresses.control) as link,
+        connected(sockets.push, served.addresses.data) as push,
+    ):
+        yield Asking(served, link, push, tmp_path)
+
+
+def test_a_map_is_listed_read_frozen_and_given_away(asking: Asking) -> None:
+    (file,) = (one for one in asking.parcel("list").files if one.name.startswith("journal/"))
+    parcel = asking.parcel("read", file=file.name)
+    (piece,) = asking.frames
+    assert (len(piece), zlib.crc32(piece)) == (file.nbytes, parcel.crc32)
+    assert piece == (asking.state / "maps/default" / file.name).read_bytes()
+    frozen = asking.parcel("freeze")
+    assert [(one.key, one.durable) for one in frozen.sessions] == [(SESSION, 3)]
+    asking.push.send_multipart(record(4))
+    asking.served.until(lambda: asking.served.gateway.health().refused.get("map") == 1)
+    for _ in range(2):  # an answer that was lost is asked for again
+        asking.parcel("commit", address="tcp://127.0.0.1:9", control="tcp://127.0.0.1:10")
+    assert asking.ask("list").error == "no map default is open here, or its move was given up"
+    denied = asking.served.greet(asking.link, "default")
+    assert (denied.reason, denied.address, denied.control) == (
+        "moved", "tcp://127.0.0.1:9", "tcp://127.0.0.1:10",
+    )  # fmt: skip
+    assert (asking.state / "moved/default" / file.name).stat().st_size == file.nbytes
+
+
+def test_nothing_is_given_away_that_was_not_frozen_for_this_move(asking: Asking) -> None:
+    assert "its move was given up" in str(asking.ask("commit", address="tcp://127.0.0.1:9").error)
+    asking.parcel("list")
+    assert "its move was given up" in str(asking.ask("commit", address="tcp://127.0.0.1:9").error)
+    assert "moving to another server already" in str(asking.ask("list", move=bytes(16)).error)
+    asking.parcel("freeze")
+    assert "its move was given up" in str(asking.ask("commit", move=bytes(16)).error)
+    asking.parcel("cancel")
+    asking.push.send_multipart(record(4))
+    asking.served.until(lambda: asking.served.durable == 4)
+
+
+def test_a_server_that_falls_silent_loses_its_claim(asking: Asking, monkeypatch: pytest.MonkeyPatch) -> None:
+    asking.parcel("list")
+    asking.parcel("freeze")
+    monkeypatch.setattr(map_departures, "_FROZEN_S", 0.05)
+    while not (ack := asking.served.heard(asking.link, messages.Ack)).resend:
+        pass
+    assert ack.durable == 3
+    asking.push.send_multipart(record(4))
+    asking.served.until(lambda: asking.served.durable == 4)
+    assert "its move was given up" in str(asking.ask("commit", address="tcp://127.0.0.1:9").error)
+
+
+@pytest.mark.parametrize(
+    "file", ["../../lock", "journal/../map.tsf", "/etc/passwd", "quarantine/../../x.mcap", "fuser.lock"]
+)
+def test_other_files_cannot_even_be_asked_for(file: str) -> None:
+    question = {"move": MOVE, "step": "read", "file": file}
+    content = msgspec.msgpack.encode({"type": "command", "name": "hand_over", "hand_over": question})
+    with pytest.raises(DecodeError):
+        messages.decode_to_server(content)
+
+
+def test_who_reads_no_answer_gets_no_more(asking: Asking, monkeypatch: pytest.MonkeyPatch) -> None:
+    asking.parcel("list")
+    monkeypatch.setattr(asking.served.gateway.moves, "_max_bytes", -1)
+    assert "was not read yet" in str(asking.ask("list").error)
+
+
+@pytest.mark.parametrize(
+    ("source", "error"),
+    [
+        ("tcp://192.0.2.1:5555", "without keys"),
+        ("nonsense", "an address looks like"),
+        ("", "an address looks like"),
+    ],
+)
+def test_a_map_is_not_fetched_from_anywhere(asking: Asking, source: str, error: str) -> None:
+    asking.link.send(messages.encode_sealed(Command(name="move", map="yard", source=source)))
+    reply = asking.served.heard(asking.link, Reply)
+    assert error in reply.error
+
+
+def test_a_source_that_does_not_answer_is_an_error_and_blocks_nothing(
+    asking: Asking, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tsfusion.gateway.map_arrivals._ANSWER_S", 0.1)
+    context: zmq.Context[Any] = zmq.Context()
+    silent = context.socket(zmq.ROUTER)
+    port = silent.bind_to_random_port("tcp://127.0.0.1")
+    command = Command(
+        name="move", map="yard", source="tcp://127.0.0.1:1", source_control=f"tcp://127.0.0.1:{port}"
+    )
+    asking.link.send(messages.encode_sealed(command))
+    asking.served.until(lambda: asking.served.gateway.moves._arrivals)
+    assert asking.served.greet(asking.link, "yard").reason == "map"
+    asking.served.heard(asking.link, Reply)
+    until(lambda: asking.served.step() or not asking.served.gateway.maps.arriving)
+    assert isinstance(asking.served.greet(asking.link, "yard"), messages.Welcome)
+    silent.close()
+    context.term()
+
+
+def test_a_map_comes_and_goes_on_where_it_was(asking: Asking, tmp_path: Path) -> None:
+    first = asking.served
+    with (
+        serving_here(tmp_path / "other") as second,
+        connected(sockets.dealer, second.addresses.control) as link,
+        connected(sockets.push, second.addresses.data) as push,
+    ):
+        command = Command(name="move", source=first.addresses.data, source_control=first.addresses.control)
+        link.send(messages.encode_sealed(command))
+        until(lambda: first.step() or second.step() or link.poll(0))
+        reply = messages.decode_to_client(link.recv())
+        assert isinstance(reply, Reply)
+        assert reply.error is None
+        assert reply.moved is not None
+        assert (reply.moved.address, second.durable) == (second.addresses.data, 3)
+        welcome = second.greet(link, "default")
+        assert isinstance(welcome, messages.Welcome)
+        assert welcome.durable == 3
+        for seq in (3, 4):  # one that it has, and the next
+            push.send_multipart(record(seq))
+        second.until(lambda: second.durable == 4 and second.gateway.health().duplicates == 1)
+    assert first.greet(asking.link, "default").address == second.addresses.data

@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: MIT
+"""The files that say which maps came from another server, and which ones another server has.
+
+`STATE/maps/NAME/arrived.json` belongs to the map. `STATE/moved/NAME.json` says where it is now; the files
+that it had here when it left are beside it, in `STATE/moved/NAME/`, and nothing reads them any more.
+"""
+
+import logging
+import os
+import shutil
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+from msgspec import Struct
+
+from tsfusion.core import durable_files, logs
+from tsfusion.core.config import VolumeConfig, make_settings
+from tsfusion.core.errors import JournalError
+from tsfusion.journal import state_folder
+from tsfusion.journal.record_scan import journal_error
+from tsfusion.wire.map_moves import MovedSession
+
+log = logging.getLogger(__name__)
+
+_SUFFIX = ".json"
+
+
+class Arrival(Struct, frozen=True):
+    """Where a map came from, and what was acknowledged there.
+
+    Attributes:
+        move: of this move, in hexadecimal.
+        source, source_control: addresses of the server that had it.
+        volume: the map's settings.
+    """
+
+    move: str
+    source: str
+    source_control: str
+    volume: dict[str, Any]
+    sessions: tuple[MovedSession, ...]
+
+
+class Departed(Struct, frozen=True):
+    """Where a map is now.
+
+    Attributes:
+        move: of this move, in hexadecimal.
+        before: of the move by which it had come here; empty = it began here.
+    """
+
+    move: str
+    before: str
+    address: str
+    control: str
+
+
+AnyStruct = TypeVar("AnyStruct", bound=Struct)
+
+
+def arrival_of(folder: Path) -> Arrival | None:
+    """How the map in a folder came here; None = it began here."""
+    return _read(folder / state_folder.ARRIVED_FILE, Arrival)
+
+
+def volume_of(folder: Path) -> VolumeConfig | None:
+    """The settings of a map that came from another server; None = it began here.
+
+    Raises:
+        JournalError: when the file cannot be read.
+        InvalidConfig: when they are another version's.
+    """
+    arrival = arrival_of(folder)
+    return None if arrival is None else make_settings(VolumeConfig, arrival.volume)
+
+
+def departed(state: str | Path, name: str) -> Departed | None:
+    """Where a map is that left this server; None = it did not, or it came back."""
+    found = _read(_path(state, name), Departed)
+    if found is None:
+        return None
+    here = arrival_of(state_folder.map_folder(state, name))
+    return found if here is None or here.move == found.before else None
+
+
+def write_departed(state: str | Path, name: str, where: Departed) -> None:
+    """Write down that another server has a map; raises JournalError when the disk refuses."""
+    path = _path(state, name)
+    try:
+        durable_files.make_folder(path.parent)
+        with durable_files.replacing(path) as file:
+            file.write(msgspec.json.encode(where))
+    except OSError as error:
+        with suppress(OSError):  # nobody may find what was not promised
+            path.unlink(missing_ok=True)
+        raise journal_error("write", path, error) from error
+
+
+def put_aside(state: str | Path, name: str) -> None:
+    """Move the files of a map that left out of the way. What fails is logged, and tried at a start."""
+    folder, aside = state_folder.map_folder(state, name), _path(state, name).with_suffix("")
+    if departed(state, name) is None or not folder.is_dir() or not state_folder.holds_a_map(folder):
+        return
+    try:
+        shutil.rmtree(aside, ignore_errors=True)  # of an earlier move of the same map
+        os.replace(folder, aside)
+        durable_files.sync_folder(folder.parent)
+        log.info("the map has moved; its files are kept in %s", aside, extra=logs.about(map=name))
+    except OSError as error:
+        log.error("%s", journal_error("move away", folder, error), extra=logs.about(map=name))
+
+
+def forget_departed(state: str | Path, name: str) -> None:
+    """Note that a map is back."""
+    with suppress(OSError):
+        _path(state, name).unlink(missing_ok=True)
+
+
+def departed_names(state: str | Path) -> list[str]:
+    """The maps that left this server at some time."""
+    with suppress(OSError):
+        return sorted(
+            path.stem
+            for path in (Path(state) / state_folder.MOVED_FOLDER).iterdir()
+            if path.suffix == _SUFFIX
+        )
+    return []
+
+
+def _path(state: str | Path, name: str) -> Path:
+    return Path(state) / state_folder.MOVED_FOLDER / f"{name}{_SUFFIX}"
+
+
+def _read(path: Path, kind: type[AnyStruct]) -> AnyStruct | None:
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=kind)
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise journal_error("read", path, error) from error
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise JournalError(f"{path} is damaged: {error}") from error
