@@ -129,7 +129,8 @@ class MapDepartures:
             self._on_stay(name)
 
     def _listed(self, one: _Departure) -> Parcel:
-        folder, sessions = one.hosted.folder, ()
+        folder = one.hosted.folder
+        sessions: tuple[MovedSession, ...] = ()
         try:
             files = tuple(sorted(_files(folder), key=lambda file: file.name))
         except OSError as error:
