@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: MIT
+"""A model of what servers hold, simulated with SimPy, and checked against what scripts/fleet.py measured.
+
+    python scripts/capacity.py                          the committed points, the check, a city
+    python scripts/capacity.py points.jsonl --json      other points: lines that scripts/fleet.py printed
+
+A gateway is one thread: it takes up to 16 keyframes that came, works on each, waits once for the disk, and
+answers. The wait for the disk is the floor that was measured without a server, and what the run added to it
+(`--disk-wait`). Two numbers are fitted to two runs: its work on a keyframe, and the way of an answer to the
+scanner and of the next keyframe back. All other points are predicted, and the script fails when one is off by
+more than 15 %.
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import simpy
+from msgspec import Struct
+from msgspec.structs import replace
+
+POINTS = Path(__file__).parents[1] / "docs" / "scale-points.jsonl"
+FIT, FIT_DISK_WAIT_MS = (1, 10), 5  # scanners
+TOLERANCE = 0.15
+WINDOW = 8  # keyframes under way of a scanner (`window_keyframes`)
+BATCH = 16  # keyframes that a gateway reads before the others have their turn
+SIMULATED_S = 2.0
+Row = dict[str, Any]
+
+
+class Gateway(Struct, frozen=True):
+    """Seconds of a gateway: of its work on a keyframe, of a wait for the disk, of the way there and back."""
+
+    work: float
+    wait: float
+    wait_more: float  # for each further keyframe of a batch
+    way: float
+
+
+def simulate_gateway(model: Gateway, scanners: int) -> float:
+    """Durable keyframes a second of scanners that send as many as the server's credit allows."""
+    env = simpy.Environment()
+    came: simpy.Store = simpy.Store(env)
+    written = 0
+
+    def send(delay: float) -> Iterator[Any]:
+        yield env.timeout(delay)
+        yield came.put(None)
+
+    def serve() -> Iterator[Any]:
+        nonlocal written
+        while True:
+            yield came.get()
+            count = 1
+            while came.items and count < BATCH:
+                yield came.get()
+                count += 1
+            yield env.timeout(count * (model.work + model.wait_more) + model.wait)
+            written += count
+            for _ in range(count):
+                env.process(send(model.way))
+
+    env.process(serve())
+    for _ in range(WINDOW * scanners):
+        env.process(send(0.0))
+    env.run(until=SIMULATED_S)
+    return float(written) / SIMULATED_S
+
+
+def fit_gateway(rows: list[Row]) -> Gateway:
+    """The gateway, without a disk, whose throughput is that of the fitted runs.
+
+    The run with many scanners shows its work, whatever the way is, and the one with a single scanner the way.
+    """
+    few, many = sorted((row for row in rows if _is_fitted(row)), key=lambda row: int(row["scanners"]))
+
+    def error(model: Gateway, row: Row) -> float:
+        found = simulate_gateway(_with_disk(model, row), row["scanners"])
+        return abs(found / float(row["durable_a_second"]) - 1.0)
+
+    steps = [1.05**step for step in range(60)]
+    work = min((0.0001 * step for step in steps), key=lambda one: error(Gateway(one, 0.0, 0.0, 0.001), many))
+    way = min((0.0003 * step for step in steps), key=lambda one: error(Gateway(work, 0.0, 0.0, one), few))
+    return Gateway(work, 0.0, 0.0, way)
+
+
+def _with_disk(model: Gateway, row: Row) -> Gateway:
+    """The gateway with the disk of a run: its floor, and what each wait was made longer by."""
+    one, eight = 1.0 / row["floor"]["one_a_second"], 8.0 / row["floor"]["eight_a_second"]
+    more = max((eight - one) / 7, 0.0)
+    return replace(model, wait=max(one - more, 0.0) + row["disk_wait_ms"] / 1e3, wait_more=more)
+
+
+def _is_fitted(row: Row) -> bool:
+    return row["scanners"] in FIT and row["disk_wait_ms"] == FIT_DISK_WAIT_MS
+
+
+def check(rows: list[Row]) -> tuple[Gateway, list[Row]]:
+    """The fitted gateway, and each measured point beside the prediction."""
+    gateway = fit_gateway(rows)
+    table = []
+    for row in rows:
+        predicted = simulate_gateway(_with_disk(gateway, row), row["scanners"])
+        table.append({
+            "scanners": row["scanners"], "disk_wait_ms": row["disk_wait_ms"],
+            "measured": row["durable_a_second"], "predicted": round(predicted, 1),
+            "error": round(predicted / row["durable_a_second"] - 1.0, 3), "fitted": _is_fitted(row),
+        })  # fmt: skip
+    return gateway, table
+
+
+# --- a city ---
+
+CORES = 16  # of a machine
+READ_BYTES_S = 1e9  # of its disk
+METRES, METRES_A_KEYFRAME = 1e7, 1.0  # 10,000 km of street
+# docs/memory.md, the synthetic street at 15 cm: 2,000 keyframes, 2 km, a map of 2954 MB, 15.7 CPU s, of which
+# one mesh in tiles takes 10.2 s for 458 MB
+BLOCK_BYTES = 10240
+BLOCKS_A_METRE = 2954e6 / BLOCK_BYTES / 2000
+FUSING_S, MESHING_S_A_BLOCK = 15.7 / 2000, 10.2 / (458e6 / BLOCK_BYTES)
+MOST_BLOCKS = 4_000_000  # of a map (`max_blocks`)
+
+
+def city(machines: int, keyframe_bytes: int) -> Row:
+    """Time until a city is fused and meshed anew from its journals, on machines that share the maps."""
+    maps = round(METRES * BLOCKS_A_METRE / MOST_BLOCKS + 0.5)
+    metres = METRES / maps
+    env = simpy.Environment()
+    work = simpy.Store(env)
+    work.items.extend(range(maps))
+    disks = [simpy.Resource(env, 1) for _ in range(machines)]
+    ended = []
+
+    def core(machine: int) -> Iterator[Any]:
+        while work.items:
+            yield work.get()
+            with disks[machine].request() as turn:
+                yield turn
+                yield env.timeout(metres / METRES_A_KEYFRAME * keyframe_bytes / READ_BYTES_S)
+            blocks = metres * BLOCKS_A_METRE
+            yield env.timeout(metres / METRES_A_KEYFRAME * FUSING_S + blocks * MESHING_S_A_BLOCK)
+            with disks[machine].request() as turn:
+                yield turn
+                yield env.timeout(blocks * BLOCK_BYTES / READ_BYTES_S)
+            ended.append(env.now)
+
+    for machine in range(machines):
+        for _ in range(CORES):
+            env.process(core(machine))
+    env.run()
+    return {"machines": machines, "maps": maps, "hours": round(max(ended) / 3600, 2)}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("points", nargs="?", type=Path, default=POINTS)
+    parser.add_argument("--json", action="store_true", help="one object")
+    options = parser.parse_args()
+    rows = [json.loads(line) for line in options.points.read_text(encoding="utf-8").splitlines()]
+    gateway, table = check(rows)
+    keyframe_bytes = rows[0]["keyframe_bytes"]
+    cities = [city(machines, keyframe_bytes) for machines in (1, 2, 4, 8, 16, 32, 64)]
+    worst = max(abs(row["error"]) for row in table if not row["fitted"])
+    if options.json:
+        milliseconds = {name: round(1e3 * getattr(gateway, name), 4) for name in Gateway.__struct_fields__}
+        print(json.dumps({
+            "gateway_ms": milliseconds, "points": table, "worst_error": worst, "city": cities,
+        }))  # fmt: skip
+    else:
+        for row in table:
+            print(
+                f"{row['scanners']:4} scanners, disk wait {row['disk_wait_ms']:3.0f} ms: durable a second "
+                f"{row['measured']:7.1f} measured, {row['predicted']:7.1f} predicted "
+                f"({100 * row['error']:+.1f} %{', fitted' if row['fitted'] else ''})"
+            )
+        print(f"worst of those that were not fitted: {100 * worst:.1f} %")
+        for one in cities:
+            print(f"{one['machines']:4} machines, {one['maps']} maps: {one['hours']:6.2f} h")
+    return 0 if worst <= TOLERANCE else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
