@@ -70,6 +70,8 @@ def acknowledged_more(sender: Sender) -> None:
 def journaled(state: Path) -> Counter[int]:
     """How often each number is in the journal of the default map."""
     folder = state_folder.map_folder(state, "default") / state_folder.JOURNAL_FOLDER
+    if not folder.exists():
+        return Counter()
     records = (journal.list_records(journal.segment_path(folder, one))[0] for one in journal.segments(folder))
     return Counter(record.seq for found in records for record in found)
 

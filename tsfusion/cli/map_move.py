@@ -9,7 +9,7 @@ from tsfusion.cli import options, verbs
 
 _EXAMPLES = (
     "tsfusion map move yard --from tcp://one:5555 --to tcp://two:5555",
-    "tsfusion map move default --from tcp://127.0.0.1:5555 --to tcp://127.0.0.1:6555 --json",
+    "tsfusion map move default --from tcp://one:5555 --to tcp://two:5555 --json",
 )
 
 
@@ -29,6 +29,7 @@ def move(
     key: options.Key = None,
     server_key: options.ServerKey = None,
     json: options.Json = False,
+    help_all: verbs.HelpAll = None,
 ) -> None:
     """Move a live map from one server to another, while scanners send into it.
 
