@@ -438,7 +438,7 @@ def test_a_disk_that_fails_while_a_map_is_opened_for_a_client_is_said(
 ) -> None:
     gateway = start(fusing("pass"))
     stepped(gateway, lambda: gateway.maps.warm)
-    gateway.maps.end_start()
+    gateway.maps.end_start(("", ""))
     with monkeypatch.context() as patched:
         patched.setattr(os, call, refuse(errno.EIO))
         assert gateway.maps.open_for_client("yard") is None
