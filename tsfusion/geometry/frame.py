@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tsfusion.core.errors import InvalidKeyframe
 from tsfusion.geometry.keyframe import Intrinsics, Keyframe
-from tsfusion.geometry.stereo_matching import UNITS, Matcher
+from tsfusion.geometry.stereo_matching import UNITS, Matcher, quick_disparity
 
 FrameKind = Literal["depth", "disparity", "points", "pair"]
 
@@ -90,13 +90,26 @@ class Frame:
         fields = {name: getattr(keyframe, name) for name in names}
         return cls(**{**fields, "sensor": keyframe.sensor or sensor})
 
-    def keyframe(self, T_world_camera: NDArray[np.float64]) -> Keyframe:
-        """Make a keyframe of the frame; match a stereo pair's disparity at full resolution."""
+    def keyframe(
+        self, T_world_camera: NDArray[np.float64], *, disparity: NDArray[np.uint16] | None = None
+    ) -> Keyframe:
+        """Make a keyframe of the frame; a stereo pair's is that of `match`, or is matched now."""
         if self.kind != "pair":
             return self._at(T_world_camera)
+        return self._at(T_world_camera, disparity=self.match() if disparity is None else disparity)
+
+    def match(self) -> NDArray[np.uint16]:
+        """Disparity of a stereo pair at full resolution: (H, W) uint16 in 1/16 px, 0 = uncertain."""
         assert self.left is not None
         assert self.right is not None
-        return self._at(T_world_camera, disparity=Matcher()(self.left, self.right))
+        return Matcher()(self.left, self.right)
+
+    @cached_property
+    def quick_disparity(self) -> NDArray[np.float32] | None:
+        """Disparity of a stereo pair for tracking, (H, W) float32 pixels, 0 = none; None without a pair."""
+        if self.left is None or self.right is None:
+            return None
+        return quick_disparity(self.left, self.right)
 
     @property
     def shape(self) -> tuple[int, ...]:

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from tsfusion.core.errors import InvalidKeyframe
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
-from tsfusion.geometry.stereo_matching import quick_disparity
 from tsfusion.scanner.localization import features
 from tsfusion.scanner.localization.localizer import Localizer, Lost, Pose
 from tsfusion.scanner.localization.stereo.rectification_check import RectificationCheck, RectificationMonitor
@@ -187,8 +186,8 @@ def _disparity_image(frame: Frame) -> _DisparityImage:
         )
     assert frame.intrinsics is not None
     rig = StereoCamera(frame.intrinsics, frame.baseline_fx or DEPTH_CAMERA_BASELINE_FX)
-    if frame.right is not None:
-        return _DisparityImage(gray, quick_disparity(gray, frame.right), rig)
+    if frame.quick_disparity is not None:
+        return _DisparityImage(gray, frame.quick_disparity, rig)
     assert depth is not None
     return _DisparityImage(
         gray, np.divide(rig.baseline_fx, depth, out=np.zeros_like(depth), where=depth > 0), rig
