@@ -53,6 +53,9 @@ class Scripted:
         news, self._news = self._news, None
         return news
 
+    def settle(self) -> None:
+        pass
+
     def reset(self) -> None:
         self.resets += 1
         self._anchors = {}

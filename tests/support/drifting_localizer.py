@@ -46,5 +46,8 @@ class Drifting:
     def corrections(self) -> PoseCorrections | None:
         return None
 
+    def settle(self) -> None:
+        pass
+
     def reset(self) -> None:
         self._last = None

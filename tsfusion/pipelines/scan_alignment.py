@@ -175,6 +175,9 @@ class PlacedLocalizer:
             return found
         return replace(found, T_world_camera=se3.nearest(self._T @ found.T_world_camera))
 
+    def settle(self) -> None:
+        self._localizer.settle()
+
     def corrections(self) -> PoseCorrections | None:
         found = None if self._earlier else self._localizer.corrections()
         if found is None:

@@ -131,12 +131,12 @@ class Scanner:
             self._handle_lost(found, frame)
         else:
             self._handle_pose(found, frame)
-        corrections = self._localizer.corrections()
-        if corrections is not None:
-            self._correct(corrections)
+        self._correct_if_known()
 
     def finish(self) -> None:
         """Correct the keyframes since the last loop closure too. Call it after the last frame."""
+        self._localizer.settle()
+        self._correct_if_known()
         for submap in self.submaps:
             if submap.corrections is not None and submap.located.last_seq > submap.corrected_seq:
                 submap.correct()
@@ -210,6 +210,8 @@ class Scanner:
         names = filter(None, chain([self._free_name()], map(self._name, count(2))))
         name = next(name for name in names if name not in self._taken)
         self._taken.add(name)
+        self._localizer.settle()
+        self._correct_if_known()
         log.warning("lost for %.1f s (%s): what follows goes into a new map, %s", seconds, self._why, name)
         self._localizer.reset()
         self._selector.reset()
@@ -218,6 +220,11 @@ class Scanner:
     def _name(self, number: int) -> str:
         suffix = f"-{number}"
         return self._map_name[: MAP_NAME_LENGTH - len(suffix)] + suffix
+
+    def _correct_if_known(self) -> None:
+        corrections = self._localizer.corrections()
+        if corrections is not None:
+            self._correct(corrections)
 
     def _correct(self, corrections: PoseCorrections) -> None:
         submap = self.submaps[-1]

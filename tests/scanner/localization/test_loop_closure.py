@@ -234,6 +234,23 @@ def test_a_reset_forgets_and_a_lost_frame_changes_nothing():
     assert closing.corrections() is None
 
 
+def test_a_search_beside_the_tracker_finds_the_same():
+    frames = two_laps()[:80]
+    alone, beside = LoopClosing(Drifting()), LoopClosing(Drifting(), beside=True)
+    for frame in frames:
+        there, here = alone.track(frame), beside.track(frame)
+        np.testing.assert_array_equal(here.T_world_camera, there.T_world_camera)
+    beside.settle()
+    expected, found = alone.corrections(), beside.corrections()
+    assert (found.revision, found.loops) == (expected.revision, expected.loops)
+    np.testing.assert_array_equal(list(found.anchors.values()), list(expected.anchors.values()))
+    assert beside.corrections() is None
+    assert isinstance(beside.track(replace(frames[68], T_world_camera=None)), Lost)
+    assert beside.relocalise(frames[68]) is not None
+    beside.reset()
+    assert beside.counts.keyframes == 0
+
+
 def test_a_lost_camera_finds_itself():
     frames = two_laps()
     closing = LoopClosing(Drifting())

@@ -82,5 +82,8 @@ class Localizer(Protocol):
         """Return corrections that are new since the last call; None = there are none, as in odometry."""
         return None
 
+    def settle(self) -> None:
+        """Finish what is done beside `track`; then `corrections` has what comes of it."""
+
     def reset(self) -> None:
         """Forget the world: the next pose begins a new one, unrelated to the old."""

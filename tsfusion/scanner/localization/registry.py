@@ -104,7 +104,7 @@ def _with_loops(tracker: Localizer, *, wanted: bool) -> Localizer:
     from tsfusion.scanner.localization.loop_closure.loop_closing import LoopClosing
 
     try:
-        return LoopClosing(tracker)
+        return LoopClosing(tracker, beside=True)
     except MissingDependency as error:
         log.warning("no loop closure: %s", error)
         return tracker

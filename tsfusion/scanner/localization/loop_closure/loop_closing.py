@@ -3,6 +3,8 @@
 
 import itertools
 import logging
+from collections import deque
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,9 +16,11 @@ from tsfusion.scanner.localization.localizer import Localizer, Lost, Pose, PoseC
 from tsfusion.scanner.localization.loop_closure import pose_graph, verification
 from tsfusion.scanner.localization.loop_closure.loop_consensus import Loop, LoopConsensus
 from tsfusion.scanner.localization.loop_closure.odometry_drift import OdometryChain, OdometryDrift
+from tsfusion.scanner.localization.loop_closure.ordered_work import OrderedWork
 from tsfusion.scanner.localization.loop_closure.place_index import CAPACITY, PlaceIndex, PlaceView, place_view
 
 MIN_KEYFRAMES, MIN_WAY = 10, 3.0  # keyframes, and metres plus radians of way: younger places are no loops
+MOST_WAITING = 4  # keyframes that wait for the search beside the tracker; with more the tracker waits
 MAX_CHECKS = 4  # places compared with each keyframe
 MAX_LOOPS = 2  # of one keyframe; one is enough if it changes little
 NEAR_DISTANCE, NEAR_ANGLE = 1.0, np.radians(30)  # metres, radians: places compared whatever they look like
@@ -54,17 +58,25 @@ class LoopClosing:
         localizer: the tracker; its world must stay the same between resets.
         drift: uncertainty of its poses.
         capacity: number of places remembered.
+        beside: search in a thread of its own, in the keyframes' order, while the tracker goes on; then
+            corrections come a little later, and the last ones after `settle`. They are the same.
 
     Raises:
         MissingDependency: without scipy.
     """
 
     def __init__(
-        self, localizer: Localizer, *, drift: OdometryDrift | None = None, capacity: int = CAPACITY
+        self,
+        localizer: Localizer,
+        *,
+        drift: OdometryDrift | None = None,
+        capacity: int = CAPACITY,
+        beside: bool = False,
     ) -> None:
         pose_graph.require()
         self._localizer, self._drift, self._capacity = localizer, drift or OdometryDrift(), capacity
         self.absolute = localizer.absolute
+        self._search = OrderedWork("loops", MOST_WAITING) if beside else None
         self._forget()
 
     def _forget(self) -> None:
@@ -73,7 +85,7 @@ class LoopClosing:
         self._places = PlaceIndex(self._capacity)
         self._corrected: dict[int, se3.Transform] = {}
         self.counts = LoopCounts()
-        self._is_new = False
+        self._news: deque[PoseCorrections] = deque(maxlen=1)  # those that `corrections` did not return yet
         self._optimisation_due = False
         self._optimised_at = 0  # keyframes then
         self._lost = 0  # frames, since the last that was not
@@ -89,9 +101,16 @@ class LoopClosing:
             return found
         self._lost = 0
         pose = replace(found, T_world_camera=self._T_world_tracker @ found.T_world_camera)
-        if pose.starts_anchor:
+        if pose.starts_anchor and self._search is None:
             self._keyframe(pose, frame)
+        elif pose.starts_anchor:
+            self._search.add(self._keyframe, pose, frame)
         return pose
+
+    def settle(self) -> None:
+        """Wait until every keyframe so far was compared with the places before it."""
+        if self._search is not None:
+            self._search.wait()
 
     def _relocalised(self, frame: Frame, lost: Lost) -> Pose | Lost:
         """Restart the tracker at a place that was seen before."""
@@ -106,23 +125,19 @@ class LoopClosing:
 
     def corrections(self) -> PoseCorrections | None:
         """Poses of all tracking keyframes after the last optimisation; None if they were returned before."""
-        if not self._is_new:
-            return None
-        self._is_new = False
-        return PoseCorrections(
-            revision=self.counts.optimisations,
-            anchors=dict(self._corrected),
-            T_corrected_world=self._correction(),
-            loops=self.counts.closed,
-        )
+        with suppress(IndexError):
+            return self._news.pop()
+        return None
 
     def reset(self) -> None:
         """Forget the world, its places and corrections."""
+        self.settle()
         self._localizer.reset()
         self._forget()
 
     def relocalise(self, frame: Frame) -> Pose | None:
         """Find a frame's pose by the remembered places alone; None unless the place is certain."""
+        self.settle()
         seen = _described(frame)
         if seen is None:
             return None
@@ -223,7 +238,15 @@ class LoopClosing:
                 self.counts.closed -= 1
         self._corrected = solution.nodes
         self.counts.optimisations += 1
-        self._optimised_at, self._optimisation_due, self._is_new = self.counts.keyframes, False, True
+        self._optimised_at, self._optimisation_due = self.counts.keyframes, False
+        self._news.append(
+            PoseCorrections(
+                revision=self.counts.optimisations,
+                anchors=dict(self._corrected),
+                T_corrected_world=self._correction(),
+                loops=self.counts.closed,
+            )
+        )
         log.debug("closed %d loops: χ² %.1f → %.1f", self.counts.closed, solution.before, solution.after)
 
     def _remember(self, number: int, seen: PlaceView) -> None:
@@ -245,11 +268,9 @@ def _described(frame: Frame) -> PlaceView | None:
 
 def _depth(frame: Frame) -> NDArray[np.float32] | None:
     """Depth of a frame, (H, W) metres; of a stereo pair by quick matching."""
-    if frame.left is None or frame.right is None or frame.baseline_fx is None:
+    disparity = frame.quick_disparity
+    if disparity is None or frame.baseline_fx is None:
         return frame.depth_m
-    from tsfusion.geometry.stereo_matching import quick_disparity
-
-    disparity = quick_disparity(frame.left, frame.right)
     depth = np.zeros_like(disparity)
     np.divide(np.float32(frame.baseline_fx), disparity, out=depth, where=disparity > 0)
     return depth
