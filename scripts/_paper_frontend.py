@@ -13,6 +13,7 @@ import signal
 import sys
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -82,10 +83,15 @@ class LiveRecording(LiveSource):
         return self.skipped.get("late", 0)
 
     def __iter__(self) -> Iterator[Frame]:
-        began = time.monotonic_ns()
-        self._log.note("start")
+        with ThreadPoolExecutor(1, thread_name_prefix="camera") as camera:
+            began = time.monotonic_ns()
+            self._log.note("start")
+            yield from self._played(camera, began)
+
+    def _played(self, camera: ThreadPoolExecutor, began: int) -> Iterator[Frame]:
+        """Frames by the clock; the next one's files are read before it is due, as a camera has no files."""
         offsets = ((self._stamps - self._stamps[0]) * self._pace).astype(np.int64)
-        following = 0
+        following, ahead = 0, camera.submit(frame_of, self._dataset, 0)
         while following < len(offsets) and not self._closed.is_set():
             self._closed.wait(max(0.0, (began + int(offsets[following]) - time.monotonic_ns()) / 1e9))
             newest = int(np.searchsorted(offsets, time.monotonic_ns() - began, side="right")) - 1
@@ -93,8 +99,10 @@ class LiveRecording(LiveSource):
                 self._skip("late", newest - following)
             self.index = max(newest, following)
             self.due_ns = began + int(offsets[self.index])
+            frame = ahead.result() if self.index == following else frame_of(self._dataset, self.index)
             following = self.index + 1
-            frame = frame_of(self._dataset, self.index)
+            if following < len(offsets):
+                ahead = camera.submit(frame_of, self._dataset, following)
             yield dataclasses.replace(
                 frame, timestamp_ns=int(self._stamps[self.index]), captured_ns=self.due_ns
             )
@@ -136,6 +144,9 @@ class Noted(Localizer):
 
     def corrections(self) -> PoseCorrections | None:
         return self._localizer.corrections()
+
+    def settle(self) -> None:
+        self._localizer.settle()
 
     def reset(self) -> None:
         self._localizer.reset()

@@ -121,12 +121,16 @@ def plan(
 
     Args:
         quick: the regularised map only, and no second machine.
+        runs: of each mode; with one, the plain map is made in the first world alone.
         only: those whose name holds one of these words, and those that they need; empty = all.
     """
     found: list[Run] = []
     for number in range(1, runs + 1):
         for world in worlds:
-            found += _of_world(world, limits, number, quick=quick, main=world is worlds[0])
+            main = world is worlds[0]
+            # the plain map of another world tells about its delivery and its poses what the main one's does
+            only_regularised = quick or (runs == 1 and not main)
+            found += _of_world(world, limits, number, quick=quick, main=main, plain=not only_regularised)
     chosen = [run for run in found if not only or any(word in run.name for word in only)]
     names = {run.name for run in chosen} | {source_of(run).name for run in chosen if run.mode in AGAIN}
     return [run for run in found if run.name in names]
@@ -137,9 +141,11 @@ def source_of(run: Run) -> Run:
     return msgspec.structs.replace(run, mode="decentralised")
 
 
-def _of_world(world: PaperWorld, limits: Limits, number: int, *, quick: bool, main: bool) -> list[Run]:
+def _of_world(
+    world: PaperWorld, limits: Limits, number: int, *, quick: bool, main: bool, plain: bool
+) -> list[Run]:
     whole, found = Machine(), []
-    maps: tuple[MapName, ...] = ("regularised",) if quick else ("off", "regularised")
+    maps: tuple[MapName, ...] = ("off", "regularised") if plain else ("regularised",)
     for each in maps:
         for mode in LIVE[:6] if main else LIVE[:4]:
             if (mode, each) != ("one-machine", "off"):  # the second control, once

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Run the paper's experiments again, with the control that it lacks, and check its claims.
 
-    python scripts/reproduce_paper.py --out DIR            all of it, one run a mode (75 minutes on 2 cores)
+    python scripts/reproduce_paper.py --out DIR            all of it, one run a mode (an hour on 2 cores)
     python scripts/reproduce_paper.py --out DIR --quick    short recordings (5 minutes)
     python scripts/reproduce_paper.py --out DIR --runs 5   for tables with a spread
     python scripts/reproduce_paper.py --list               the runs, and about how long each takes
@@ -26,6 +26,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +52,8 @@ from tsfusion.core.errors import TsfusionError
 
 HERE = Path(__file__).parent
 _CHILD_S = 1800.0
+_RENDERING_S = 6 * 3600.0  # on a slow machine; what is rendered is kept
+_RUNNING: "set[subprocess.Popen[bytes]]" = set()  # children under way
 Job = MapJob | SweepJob
 
 
@@ -171,7 +174,11 @@ def rendered(world: PaperWorld, cache: Path) -> PaperWorld:
         orders.write_bytes(told)
         began = time.monotonic()
         say(f"rendering {world.title} into {folder} (once; not part of any run)")
-        child([str(HERE / "_paper_render.py"), str(orders), str(folder)], folder.with_suffix(".log"))
+        child(
+            [str(HERE / "_paper_render.py"), str(orders), str(folder)],
+            folder.with_suffix(".log"),
+            _RENDERING_S,
+        )
         say(f"rendered in {time.monotonic() - began:.0f} s")
     return msgspec.structs.replace(world, cache=str(folder))
 
@@ -237,22 +244,36 @@ def measure_surfaces(
     options: argparse.Namespace, found: list[PaperWorld], runs: list[Run], failures: dict[str, str]
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """Figures of the runs' maps by the run's name, and the rows of the sweep."""
-    maps: dict[str, Any] = {}
+    mapped: dict[str, tuple[Job, str]] = {}
     for run in runs:
         folder = options.out / "runs" / run.name
         if run.mode in ("decentralised", "loops") and run.number == 1 and (folder / "map.tsf").is_file():
-            job: Job = MapJob(
+            job = MapJob(
                 world=run.world, map=str(folder / "map.tsf"), poses=str(folder / _paper_outcome.POSES),
                 pictures=str(folder / "picture"),
             )  # fmt: skip
-            maps[run.name] = answer(job, options.out, f"the map of {run.name}", failures) or {}
-    rows: list[dict[str, Any]] = []
-    if options.only:
-        return maps, rows
-    for world in sweep_worlds(found):
-        job = sweep_job(world, quick=options.quick)
-        rows += answer(job, options.out, f"λ and support on {world.title}", failures) or []
-    return maps, rows
+            mapped[run.name] = job, f"the map of {run.name}"
+    swept: list[tuple[Job, str]] = []
+    if not options.only:
+        swept = [
+            (sweep_job(world, quick=options.quick), f"λ and support on {world.title}")
+            for world in sweep_worlds(found)
+        ]
+    made = answers([*swept, *mapped.values()], options.out, failures)
+    rows = [row for each in made[: len(swept)] for row in each or []]
+    return {name: each or {} for name, each in zip(mapped, made[len(swept) :], strict=True)}, rows
+
+
+def answers(jobs: list[tuple[Job, str]], out: Path, failures: dict[str, str]) -> list[Any]:
+    """Answers of jobs with titles, as many made at a time as there are cores: none of them is timed."""
+    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        try:
+            return list(pool.map(lambda job: answer(job[0], out, job[1], failures), jobs))
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            for running in list(_RUNNING):
+                running.kill()
+            raise
 
 
 def sweep_job(world: PaperWorld, *, quick: bool) -> SweepJob:
@@ -310,19 +331,22 @@ def conclude(
     return made
 
 
-def child(command: list[str], log: Path) -> None:
-    """Run a script of ours; raise CalledProcessError when it fails. Ctrl-C ends it."""
+def child(command: list[str], log: Path, most_s: float = _CHILD_S) -> None:
+    """Run a script of ours; raise SubprocessError when it fails or takes too long. Ctrl-C ends it."""
     with (
         log.open("wb") as said,
         subprocess.Popen(
             [sys.executable, *command], stdout=said, stderr=said, **process.OWN_GROUP
         ) as running,
     ):
+        _RUNNING.add(running)
         try:
-            code = running.wait(_CHILD_S)
+            code = running.wait(most_s)
         except BaseException:
             running.kill()
             raise
+        finally:
+            _RUNNING.discard(running)
     if code:
         raise subprocess.CalledProcessError(code, command[0])
 

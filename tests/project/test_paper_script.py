@@ -15,6 +15,8 @@ import numpy as np
 import pytest
 from repository import ROOT
 
+from tsfusion.datasets import Synthetic
+from tsfusion.datasets.dataset import frame_of
 from tsfusion.evaluation.trajectory_error import TrajectoryError
 from tsfusion.wire.keyframe_times import Spread
 
@@ -27,7 +29,8 @@ import _paper_report
 import _paper_runs
 import _paper_verdicts
 import _paper_worlds
-from _paper_frontend import PlannedKeyframes
+import reproduce_paper
+from _paper_frontend import LiveRecording, PlannedKeyframes
 from _paper_outcome import Outcome
 from _paper_verdicts import Findings, Verdict
 from _paper_worlds import PaperWorld
@@ -343,6 +346,54 @@ def test_runs_have_names_of_their_own_and_come_after_what_they_need() -> None:
             assert _paper_runs.source_of(run).name in names[:place]
     only = _paper_runs.plan(worlds, _paper_runs.Limits(), quick=False, only=["two-robots"])
     assert [run.mode for run in only] == ["decentralised", "two-robots"]
+
+
+def test_with_one_run_a_mode_the_plain_map_is_made_in_one_world() -> None:
+    worlds = _paper_worlds.worlds(quick=False)
+    for runs, expected in ((1, {worlds[0].name}), (2, {world.name for world in worlds})):
+        planned = _paper_runs.plan(worlds, _paper_runs.Limits(), quick=False, runs=runs)
+        assert {run.world.name for run in planned if run.map == "off"} == expected
+        assert {run.world.name for run in planned if run.map == "regularised"} == {w.name for w in worlds}
+
+
+def test_frames_that_are_read_ahead_are_those_of_the_recording(tmp_path: Path) -> None:
+    dataset = Synthetic("room", count=6, width=64)
+    log = _paper_events.EventLog(tmp_path / "events.jsonl")
+    recording = LiveRecording(dataset, log, pace=0.1)
+    seen = []
+    for frame in recording:
+        assert frame.timestamp_ns == _paper_worlds.stamps_ns(dataset)[recording.index]
+        np.testing.assert_array_equal(frame.depth, frame_of(dataset, recording.index).depth)
+        seen.append(recording.index)
+        if recording.index == 2:
+            time.sleep(0.03)  # some are late: what was read ahead is not what comes next
+    log.close()
+    assert seen == sorted(set(seen))
+    assert len(seen) + recording.late == len(dataset)
+    assert recording.late > 0
+
+
+def test_surfaces_are_measured_side_by_side_and_end_together(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    jobs: list[Any] = [(None, str(number)) for number in range(5)]
+    monkeypatch.setattr(reproduce_paper, "answer", lambda _job, _out, title, _failures: title)
+    assert reproduce_paper.answers(jobs, tmp_path, {}) == ["0", "1", "2", "3", "4"]
+
+    def interrupted(_job: Any, _out: Path, title: str, _failures: Any) -> None:
+        if title == "1":
+            reproduce_paper.child(["-c", "import time; time.sleep(300)"], tmp_path / "log")
+        while not reproduce_paper._RUNNING:
+            time.sleep(0.01)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(reproduce_paper, "answer", interrupted)
+    began = time.monotonic()
+    with pytest.raises((KeyboardInterrupt, subprocess.SubprocessError)):
+        reproduce_paper.answers(jobs, tmp_path, {})
+    assert not reproduce_paper._RUNNING
+    assert time.monotonic() - began < 250  # the child was ended, it did not end
 
 
 def reproduce(*arguments: str | Path, data: Path) -> "subprocess.Popen[str]":
