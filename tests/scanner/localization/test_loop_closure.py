@@ -235,7 +235,7 @@ def test_a_reset_forgets_and_a_lost_frame_changes_nothing():
 
 
 def test_a_search_beside_the_tracker_finds_the_same():
-    frames = two_laps()[:80]
+    frames = two_laps()[::2][:40]
     alone, beside = LoopClosing(Drifting()), LoopClosing(Drifting(), beside=True)
     for frame in frames:
         there, here = alone.track(frame), beside.track(frame)
@@ -245,8 +245,8 @@ def test_a_search_beside_the_tracker_finds_the_same():
     assert (found.revision, found.loops) == (expected.revision, expected.loops)
     np.testing.assert_array_equal(list(found.anchors.values()), list(expected.anchors.values()))
     assert beside.corrections() is None
-    assert isinstance(beside.track(replace(frames[68], T_world_camera=None)), Lost)
-    assert beside.relocalise(frames[68]) is not None
+    assert isinstance(beside.track(replace(frames[34], T_world_camera=None)), Lost)
+    assert beside.relocalise(frames[34]) is not None
     beside.reset()
     assert beside.counts.keyframes == 0
 
