@@ -84,6 +84,7 @@ class Localizer(Protocol):
 
     def settle(self) -> None:
         """Finish what is done beside `track`; then `corrections` has what comes of it."""
+        return
 
     def reset(self) -> None:
         """Forget the world: the next pose begins a new one, unrelated to the old."""

@@ -101,10 +101,11 @@ class LoopClosing:
             return found
         self._lost = 0
         pose = replace(found, T_world_camera=self._T_world_tracker @ found.T_world_camera)
-        if pose.starts_anchor and self._search is None:
-            self._keyframe(pose, frame)
-        elif pose.starts_anchor:
-            self._search.add(self._keyframe, pose, frame)
+        if pose.starts_anchor:
+            if self._search is None:
+                self._keyframe(pose, frame)
+            else:
+                self._search.add(self._keyframe, pose, frame)
         return pose
 
     def settle(self) -> None:

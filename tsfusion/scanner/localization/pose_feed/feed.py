@@ -101,6 +101,9 @@ class PoseFeed:
         """Return the sender's corrections if there are new ones since the last call."""
         return self._deformation.new_corrections()
 
+    def settle(self) -> None:
+        """Nothing is done beside `track`."""
+
     def reset(self) -> None:
         """Forget the tracking keyframes; the world stays the sender's."""
         self._anchors.reset()
