@@ -137,9 +137,10 @@ def run(page: Path, folder: Path) -> str:
                 continue
             (folder / ".block").write_text(addressed(block.code, address))
             how = ["python"] if block.language == "python" else ["bash", "-euo", "pipefail"]
+            given = [address] if block.title else []  # an example is told where the server is
             done = subprocess.run(
-                [*how, ".block"], cwd=folder, env=env, text=True, check=False, stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=2 * DEADLINE,
+                [*how, ".block", *given], cwd=folder, env=env, text=True, check=False,
+                stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=2 * DEADLINE,
             )  # fmt: skip
             assert done.returncode == 0, f"{page.name}:{block.line} failed:\n{block.code}\n{done.stdout}"
             printed.append(done.stdout)
