@@ -140,7 +140,8 @@ def run(page: Path, folder: Path) -> str:
             given = [address] if block.title else []  # an example is told where the server is
             done = subprocess.run(
                 [*how, ".block", *given], cwd=folder, env=env, text=True, check=False,
-                stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=2 * DEADLINE,
+                stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+                timeout=2 * DEADLINE,
             )  # fmt: skip
             assert done.returncode == 0, f"{page.name}:{block.line} failed:\n{block.code}\n{done.stdout}"
             printed.append(done.stdout)

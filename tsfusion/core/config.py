@@ -302,8 +302,8 @@ class Config(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
     Examples:
         >>> from tsfusion.core import config
         >>> everything = config.load(None)  # or a file; None gives the defaults
-        >>> everything.server.listen
-        'tcp://127.0.0.1:5555'
+        >>> everything.volume.voxel_size  # metres
+        0.02
     """
 
     volume: VolumeConfig = VolumeConfig()
