@@ -42,7 +42,8 @@ TERMINATED = 128 + signal.SIGTERM
 # Typer's own click or the real one, by version: both name it so.
 _UsageError: type[Exception] = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
 
-START, OWN, SERVER, SETUP = "Start here", "Recordings and results", "Server", "This installation"
+START, OWN, SERVER = "Start here", "Recordings and results", "Server and installation"
+SETUP = SERVER  # a title of its own takes two lines of the screen
 
 app = typer.Typer(
     name="tsfusion",

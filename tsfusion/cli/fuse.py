@@ -48,9 +48,9 @@ def fuse(
     json: options.RunJson = False,
     **settings: Any,
 ) -> None:
-    """Fuse journals and recordings with many processes, or a cluster: one map.
+    """Fuse journals and recordings with many processes, or a cluster.
 
-    The map is that of one machine, to the last bit. Keyframes count at their
+    One map: that of one machine, to the last bit. Keyframes count at their
     final poses. Started again, an interrupted run goes on where it was.
     """
     from tsfusion.cli import output, progress
