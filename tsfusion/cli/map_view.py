@@ -37,13 +37,13 @@ def serve_flags(settings: dict[str, Any]) -> list[str]:
     """Flags of `serve` for settings that are not the usual ones; those without a flag in a comment."""
     from msgspec import to_builtins
 
-    from tsfusion.core.config import LIMIT_SETTINGS, VIEW_SETTINGS, VolumeConfig
+    from tsfusion.core.config import LIMIT_SETTINGS, RUN_SETTINGS, VIEW_SETTINGS, VolumeConfig
 
     usual = to_builtins(VolumeConfig())
     changed = {
         name: value
         for name, value in settings.items()
-        if value != usual[name] and name not in ("threads", *LIMIT_SETTINGS, *VIEW_SETTINGS)
+        if value != usual[name] and name not in (*RUN_SETTINGS, *LIMIT_SETTINGS, *VIEW_SETTINGS)
     }
     flags = []
     for name in [name for name in changed if name in options.MAP_OPTIONS]:

@@ -52,6 +52,9 @@ MAP_OPTIONS: dict[str, Any] = {
         rare=True)],
     "support": Annotated[str | None, _map_option(
         "--support", "LEAST:MOST", "Bounds of that half-width, such as 3:6.", rare=True)],
+    "arch": Annotated[str | None, _map_option(
+        "--arch", "NAME", "Fuse on cpu, cuda or vulkan; on the CPU where that is missing.", rare=True,
+        autocompletion=lambda: ["cpu", "cuda", "vulkan", "metal"])],
     "threads": Annotated[int | None, _map_option(
         "--threads", "N", "Threads of the kernels; default: all cores. Results do not depend on it.",
         rare=True)],

@@ -27,6 +27,7 @@ else:  # pragma: no cover
 
 Regularizer = Literal["off", "paper", "ray"]
 Surface = Literal["raw", "normal", "field"]
+Arch = Literal["cpu", "cuda", "vulkan", "metal"]
 SensorName = Literal["kinect", "tof", "realsense", "stereo", "lidar", "scanner"]
 Positive = Annotated[float, Meta(gt=0)]
 NonNegative = Annotated[float, Meta(ge=0)]
@@ -144,6 +145,7 @@ class VolumeConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     space_carving: bool = False  # rays also vote for the free space before their band
     color: bool = True
     threads: Annotated[int, Meta(ge=1, le=256)] | None = None  # None = all cores
+    arch: Arch = "cpu"  # where keyframes are fused: on a device, and on the CPU where that is not there
     max_blocks: Annotated[int, Meta(ge=1, le=4_000_000)] = 4_000_000
     max_blocks_per_keyframe: Annotated[int, Meta(ge=1, le=1 << 19)] = 1 << 17
 
@@ -203,6 +205,8 @@ VIEW_SETTINGS = (
     "field_edge",
     "field_reweightings",
 )
+# Settings of how keyframes are fused that change nothing stored: a saved map goes on with others.
+RUN_SETTINGS = ("threads", "arch")
 # Settings of a map that limit how it grows: a saved one goes on with others.
 LIMIT_SETTINGS = ("max_blocks", "max_blocks_per_keyframe")
 

@@ -23,7 +23,7 @@ SETTINGS = {
     **dict.fromkeys(("depth_max", "depth_trunc"), "max_range, in metres"),
     **dict.fromkeys(("color_type", "attr_names"), "color=True or color=False"),
     **dict.fromkeys(("block_count", "block_resolution"), "nothing: blocks are added by need"),
-    "device": "threads: it runs on the CPU",
+    "device": "arch: cpu, cuda or vulkan",
 }
 _MESH = "extract_mesh(), whose result has vertices, faces and save('room.glb')"
 VOLUME = {

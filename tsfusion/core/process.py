@@ -84,6 +84,13 @@ def limit_memory(most: int) -> None:
         resource.setrlimit(resource.RLIMIT_DATA, (most if hard < 0 else min(most, hard), hard))
 
 
+def lift_memory_limit() -> None:
+    """Take back what `limit_memory` has set in the process that started this one."""
+    _, hard = resource.getrlimit(resource.RLIMIT_DATA)
+    with suppress(OSError, ValueError):
+        resource.setrlimit(resource.RLIMIT_DATA, (hard, hard))
+
+
 def state(pid: int) -> str:
     """State of a process as the system's letter; empty where it does not tell, or there is none.
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from tsfusion.core import durable_files
-from tsfusion.core.config import LIMIT_SETTINGS, VIEW_SETTINGS, VolumeConfig
+from tsfusion.core.config import LIMIT_SETTINGS, RUN_SETTINGS, VIEW_SETTINGS, VolumeConfig
 from tsfusion.core.errors import CheckpointError, DamagedCheckpoint, InvalidConfig, TsfusionError
 from tsfusion.fuser.keyframe_poses import KeyframePoses
 from tsfusion.fuser.messages import SessionProgress
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 # Settings that may differ between a checkpoint and the server that goes on with it: none changes the sums.
-_FREE_SETTINGS = ("threads", *LIMIT_SETTINGS, *VIEW_SETTINGS)
+_FREE_SETTINGS = (*RUN_SETTINGS, *LIMIT_SETTINGS, *VIEW_SETTINGS)
 _NEW_FILE = "map.new.tsf"
 _PARTS = r"map\.new\.tsf|\.map\.new\.tsf\.partial"
 
@@ -119,7 +119,7 @@ def _resume(path: Path, wanted: VolumeConfig, kept: dict[str, Any]) -> "Volume |
     from tsfusion.tsdf.volume import Volume
 
     try:
-        changed = {name: getattr(wanted, name) for name in (*VIEW_SETTINGS, *LIMIT_SETTINGS)}
+        changed = {name: getattr(wanted, name) for name in ("arch", *VIEW_SETTINGS, *LIMIT_SETTINGS)}
         volume = Volume.load(path, wanted.threads, **kept, **changed)
     except DamagedCheckpoint as error:
         _set_aside(path, error)

@@ -93,3 +93,20 @@ def find_blocks(
     mask = map_keys.shape[0] - 1
     for i in range(keys.shape[0]):
         slots[i] = map_find(map_keys, map_slots, mask, keys[i])
+
+
+@ti.kernel
+def find_places(
+    keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
+    map_keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
+    places: ti.types.ndarray(dtype=ti.i32, ndim=1),
+):
+    """Where blocks that are in the hash stand there."""
+    mask = map_keys.shape[0] - 1
+    for n in range(keys.shape[0]):
+        i = hash_key(keys[n]) & mask
+        probes = 0
+        while map_keys[i] != keys[n] and probes <= mask:
+            i = (i + 1) & mask
+            probes += 1
+        places[n] = i

@@ -57,6 +57,16 @@ Layer = ti.types.struct(
 )
 
 
+def tiles_of(height: int, width: int) -> int:
+    """Number of tiles of an image."""
+    return -(-height // TILE) * -(-width // TILE)
+
+
+def most_rays(height: int, width: int) -> int:
+    """Number of rays that there is room for in the buffer of an image."""
+    return tiles_of(height, width) * TILE_SAMPLES
+
+
 @ti.func
 def camera_of(rows: ti.template()):
     """The (4, 3) rows of `ray_buffers._camera` as a `Camera`."""

@@ -8,6 +8,8 @@ from functools import cache
 from io import StringIO
 from types import SimpleNamespace
 
+from tsfusion.core.errors import MissingDependency
+
 _started_threads: int | None = None
 
 
@@ -34,6 +36,36 @@ def start(threads: int | None = None) -> None:
                 offline_cache=True,
                 log_level=ti.ERROR,
             )
+
+
+def start_device(arch: str) -> None:
+    """Start Taichi on a device instead, once a process: `cuda`, `vulkan` or `metal`.
+
+    Raises:
+        MissingDependency: where this machine, or Taichi's build for it, has no such device, or the device
+            lacks what the map is made of.
+    """
+    from tsfusion.kernels import taichi as ti
+
+    _leave_out_source_lines()
+    with redirect_stdout(StringIO()):
+        ti.init(arch=getattr(ti, arch), fast_math=False, offline_cache=True, log_level=ti.ERROR)
+    if ti.cfg.arch != getattr(ti, arch):
+        raise MissingDependency("Taichi finds no such device, or no driver of one")
+    from tsfusion.kernels import device_check
+
+    try:
+        is_exact = device_check.is_exact()
+    except RuntimeError as error:
+        raise MissingDependency(f"the device cannot run the kernels ({first_line(error)})") from error
+    if not is_exact:
+        raise MissingDependency("the device does not add 64-bit integers and round 64-bit floats exactly")
+
+
+def first_line(error: BaseException) -> str:
+    """What an error of Taichi says first; the rest is where in Taichi it arose."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return lines[0] if lines else type(error).__name__
 
 
 def _leave_out_source_lines() -> None:

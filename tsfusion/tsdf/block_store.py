@@ -4,7 +4,7 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,10 +12,13 @@ from numpy.typing import NDArray
 from tsfusion.core.config import CacheConfig
 from tsfusion.core.errors import MapFull
 from tsfusion.kernels import block_hash
-from tsfusion.kernels.integrate import CUBE, WEIGHT_MASK
+from tsfusion.kernels.integrate import CHANGED, CUBE, WEIGHT_MASK
 from tsfusion.tsdf.checkpoint import LAYER_DTYPES
 from tsfusion.tsdf.growing_array import MAX_ITEMS, FileArray, GrowingArray
 from tsfusion.tsdf.residency import Residency
+
+if TYPE_CHECKING:
+    from tsfusion.tsdf.device_blocks import DeviceBlocks
 
 MESHED, ASKED = 1, 2  # who follows the changes of blocks: `Volume.take_dirty`, what is kept of answers
 _FIRST_CAPACITY = 1024
@@ -36,10 +39,19 @@ class BlockStore:
 
     With a `cache` the layers lie in files, and blocks that no keyframe has changed for long leave memory:
     whoever touches rows of many blocks calls `keep_within_memory` now and then.
+
+    With a `device` keyframes are added there. Rows that are read here are brought up to date first; whoever
+    writes to rows says which (`note_written`).
     """
 
     def __init__(
-        self, *, voxel_size: float, color: bool, corrected: bool, cache: CacheConfig | None = None
+        self,
+        *,
+        voxel_size: float,
+        color: bool,
+        corrected: bool,
+        cache: CacheConfig | None = None,
+        device: "DeviceBlocks | None" = None,
     ) -> None:
         self.voxel_size = voxel_size
         self.color, self.corrected = color, corrected
@@ -57,6 +69,7 @@ class BlockStore:
         )
         present = {"sums": True, "color_rgn": color, "color_b": color, "correction": corrected}
         self._present = [name for name, there in present.items() if there]
+        self._device = device
         self._layers = {name: self._layer(name, cache) for name in present}
         self._residency: Residency | None = None
         self._memory_bytes = 0
@@ -94,6 +107,7 @@ class BlockStore:
 
     def shown(self, layer: str) -> NDArray[Any] | None:
         """(count, 512) rows of a layer, not copied (`GrowingArray.shown`); None if there is none."""
+        self._fetch()
         return self._layers[layer].shown(self.count) if layer in self._present else None
 
     @property
@@ -102,19 +116,19 @@ class BlockStore:
 
     @property
     def sums(self) -> NDArray[np.int64]:
-        return self._layers["sums"].array
+        return self._rows("sums")
 
     @property
     def color_rgn(self) -> NDArray[np.int64]:
-        return self._layers["color_rgn"].array
+        return self._rows("color_rgn")
 
     @property
     def color_b(self) -> NDArray[np.int32]:
-        return self._layers["color_b"].array
+        return self._rows("color_b")
 
     @property
     def correction(self) -> NDArray[np.float32]:
-        return self._layers["correction"].array
+        return self._rows("correction")
 
     @property
     def dirty(self) -> NDArray[np.uint8]:
@@ -134,7 +148,33 @@ class BlockStore:
 
     def layers(self) -> dict[str, NDArray[Any]]:
         """The layers the map has, by name."""
+        self._fetch()
         return {name: self._layers[name].array for name in self._present}
+
+    def _rows(self, layer: str) -> NDArray[Any]:
+        self._fetch()
+        return self._layers[layer].array
+
+    def _fetch(self) -> None:
+        if self._device is not None:
+            self._device.fetch({name: self._layers[name].array for name in self._present})
+
+    def send(self) -> None:
+        """Bring what was written to rows to the device."""
+        if self._device is not None:
+            self._device.send({name: self._layers[name].array for name in self._present}, self.count)
+
+    def note_written(self, slots: NDArray[Any]) -> None:
+        """Note that rows have been written to, from outside."""
+        if self._device is not None:
+            self._device.note_written(slots)
+
+    def note_touched(self, slots: NDArray[np.int32]) -> None:
+        """Note that the current keyframe has changed blocks on the device."""
+        assert self._device is not None
+        self._device.note_added(slots, self.count)
+        self.stamps[slots], self.dirty[slots] = self.stamp, CHANGED
+        self.places[slots] = np.arange(len(slots), dtype=np.int32)
 
     def limit(self, nbytes: int) -> None:
         """Let the map take no more than so many bytes of memory from now on; a larger one stays as it is.
@@ -198,6 +238,14 @@ class BlockStore:
         self._keys.array[first:count] = keys
         self.count = count
         self._hash(first)
+        if self._device is not None:
+            places = np.empty(len(keys), np.int32)
+            block_hash.find_places(keys, self.hash_keys, places)
+            try:
+                self._device.insert(count, places, self.hash_keys, self.hash_slots)
+            except MemoryError:
+                self.drop(first)
+                raise
 
     def drop(self, count: int) -> None:
         """Take back the newest blocks, so that `count` remain; their voxels must be zero."""
@@ -207,9 +255,12 @@ class BlockStore:
         self.drops += 1
         self.hash_keys[:] = self.hash_slots[:] = 0
         self._hash(0)
+        if self._device is not None:
+            self._device.drop(count, self.hash_keys, self.hash_slots)
 
     def release(self, slots: NDArray[np.int64]) -> None:
         """Give up blocks without votes: the last ones take their slots, and new ones the room."""
+        self._fetch()
         left = self.count - len(slots)
         is_free = np.zeros(self.count, bool)
         is_free[slots] = True
@@ -220,6 +271,7 @@ class BlockStore:
             rows[left : self.count] = 0
             self.keep_within_memory()
         self.drop(left)
+        self.note_written(to)
 
     def slots_of(self, keys: NDArray[np.int64]) -> NDArray[np.int32]:
         """(n,) slots of (n,) keys, −1 where there is no such block."""
@@ -252,7 +304,7 @@ class BlockStore:
 
     def in_order(self, layer: str) -> Iterator[tuple[NDArray[np.int64], NDArray[Any]]]:
         """Keys and rows of the used blocks in key order, up to 1024 at a time."""
-        used, rows = self.used(), self._layers[layer].array
+        used, rows = self.used(), self._rows(layer)
         for i in range(0, len(used), _CHUNK):
             chunk = used[i : i + _CHUNK]
             if (np.diff(chunk) == 1).all():  # as in a map that was just loaded: nothing has to be gathered

@@ -32,7 +32,7 @@ from tsfusion.tsdf.ray_buffers import BANDS, RayBuffers
 
 PART_WEIGHT = WEIGHT_LIMIT  # what a lane has in reserve: no part can make one overflow unnoticed
 
-_NO_LIMIT = 1 << 30  # blocks
+NO_LIMIT = 1 << 30  # blocks
 _BLOCK_COST = 1000  # of a block that is added: it takes 9 µs where memory is touched for the first time
 
 Part = tuple[int, int]  # bands first … last - 1
@@ -47,7 +47,7 @@ class KeyframeQuota(Struct, frozen=True):
     """
 
     cost: int
-    blocks: int = _NO_LIMIT
+    blocks: int = NO_LIMIT
 
 
 class Integrator:
@@ -73,7 +73,7 @@ class Integrator:
             MapFull, WeightOverflow: when adding; MapError: when taking away what is not there. The map is as
                 it was.
         """
-        self._room = self._affordable = _NO_LIMIT
+        self._room = self._affordable = NO_LIMIT
         if quota is not None and sign > 0:
             self._affordable = (quota.cost - self._check_cost(quota.cost)) // _BLOCK_COST
             self._room = quota.blocks
@@ -118,7 +118,7 @@ class Integrator:
         """Bands in runs of limited weight; nearly always all of them."""
         weights = np.cumsum(self._buffers.bands[:, WEIGHT], dtype=np.int64)  # of the bands up to each
         first = 0
-        while first < BANDS:
+        while first < len(weights):
             before = int(weights[first - 1]) if first else 0
             end = int(np.searchsorted(weights, before + PART_WEIGHT))  # first band that is too much
             yield first, max(end, first + 1)
@@ -216,7 +216,7 @@ class Integrator:
             if not len(slots) or int(bounds.max()) < WEIGHT_LIMIT:
                 store.bounds[slots] = bounds
                 return
-        integrate.largest_weights(store.sums, self._buffers.touched, store.bounds)
+        self._measure_touched()
         bad = int(np.count_nonzero(store.bounds[slots] >= WEIGHT_LIMIT))
         if sign < 0 and (bad or self._buffers.touched[TOUCHED_MISMATCH]):
             what = f"{bad} blocks disagree" if bad else "its colours are not there"
@@ -227,12 +227,23 @@ class Integrator:
                 f"({WEIGHT_LIMIT / WEIGHT_ONE:.0f} full samples); use bundle=True or a smaller voxel_size"
             )
 
+    def _measure_touched(self) -> None:
+        """Set the bounds of the touched blocks from their voxels."""
+        integrate.largest_weights(self._store.sums, self._buffers.touched, self._store.bounds)
+
     def _smooth(self, sign: int) -> None:
-        """Bring the regularised layer up to date in the blocks just touched: paper eq. 3 along each ray."""
-        s, store, model = self._buffers, self._store, self._model
+        """Bring the regularised layer up to date in the blocks just touched."""
         if sign < 0:
-            store.correction[s.touched_slots] = 0
-            return
+            self._forget_smoothed()
+        else:
+            self._smooth_touched()
+
+    def _forget_smoothed(self) -> None:
+        self._store.correction[self._buffers.touched_slots] = 0
+
+    def _smooth_touched(self) -> None:
+        """Smooth along each ray: paper eq. 3."""
+        s, store, model = self._buffers, self._store, self._model
         s.reserve_votes()
         weighted = model.regularizer == "ray"
         ray_smoothing.smooth_rays(
@@ -242,7 +253,7 @@ class Integrator:
         ray_smoothing.commit_votes(s.touched, store.sums, s.votes, store.correction)
 
     def _launch(
-        self, part: Part, sign: int, *, which: int = ALL, oldest: int = 0, most_missing: int = _NO_LIMIT
+        self, part: Part, sign: int, *, which: int = ALL, oldest: int = 0, most_missing: int = NO_LIMIT
     ) -> None:
         """Add a part's rays to the blocks of slot ≥ `oldest`."""
         store, buffers = self._store, self._buffers

@@ -85,6 +85,7 @@ def _add_rows(
     store.dirty[slots] = CHANGED
     if store.color:
         _add_colors(store, other, slots, theirs)
+    store.note_written(slots)
     if store.corrected:
         store.correction[slots[is_new]] = other.correction[theirs[is_new]]
         store.correction[slots[~is_new]] = 0

@@ -51,6 +51,7 @@ def copy(store: BlockStore, into: BlockStore, first: NDArray[np.int64], end: NDA
         into.insert(store.keys[slots])
         for name, layer in into.layers().items():
             layer[here : into.count] = np.where(inside, store.layers()[name][slots], 0)
+        into.note_written(np.arange(here, into.count))
         store.keep_within_memory()
     into.measure_bounds()
     into.dirty[: into.count] = CHANGED

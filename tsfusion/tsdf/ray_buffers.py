@@ -90,31 +90,35 @@ class RayBuffers:
         self.colored = self.color and keyframe.color is not None
         T = keyframe.T_world_camera
         if keyframe.kind == "points":
-            self._reserve_rays(len(keyframe.measurement))
             pose = np.ascontiguousarray(T[:3]) / voxel_size
             origins = keyframe.origins
             if origins is None or not len(origins):
                 origins = np.zeros(3, np.float32)
-            rays_from_points.rays_from_points(
+            self._rays_of_points(
                 keyframe.points, origins.reshape(-1, 3),
                 *_optional(keyframe.color if self.colored else None, 2), *_optional(keyframe.confidence, 1),
-                pose, parameters, bundle, self.rays, self.bands,
+                pose, parameters, bundle,
             )  # fmt: skip
         else:
-            height, width = keyframe.shape
+            height = keyframe.shape[0]
             color = keyframe.color if self.colored else None
-            self._reserve_rays(
-                -(-height // rays_from_images.TILE)
-                * -(-width // rays_from_images.TILE)
-                * rays_from_images.TILE_SAMPLES
-            )
-            rays_from_images.rays_from_image(
+            self._rays_of_image(
                 keyframe.measurement, int(keyframe.kind == "disparity"), _depth_scale(keyframe),
                 *_optional(None if color is None else color.reshape(height, -1), 2),
                 *_optional(keyframe.confidence, 2),
-                _camera(keyframe, voxel_size), parameters, bundle, self.rays, self.bands,
+                _camera(keyframe, voxel_size), parameters, bundle,
             )  # fmt: skip
         return int(self.bands[:, SAMPLES].sum())
+
+    def _rays_of_points(self, points: Any, *rest: Any) -> None:
+        """Run `rays_from_points`, which takes these arguments and then the buffers."""
+        self._reserve_rays(len(points))
+        rays_from_points.rays_from_points(points, *rest, self.rays, self.bands)
+
+    def _rays_of_image(self, image: NDArray[Any], *rest: Any) -> None:
+        """Likewise `rays_from_image`."""
+        self._reserve_rays(rays_from_images.most_rays(*image.shape))
+        rays_from_images.rays_from_image(image, *rest, self.rays, self.bands)
 
     @property
     def most_missing(self) -> int:

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core.config import LIMIT_SETTINGS, VIEW_SETTINGS, VolumeConfig, override
+from tsfusion.core.config import LIMIT_SETTINGS, RUN_SETTINGS, VIEW_SETTINGS, VolumeConfig, override
 from tsfusion.core.errors import CheckpointError, DamagedCheckpoint, InvalidConfig
 from tsfusion.core.side_thread import SideThread
 from tsfusion.kernels import integrate
@@ -42,6 +42,7 @@ def fill(
             store.insert(keys)
             for name in header.layers:
                 chunk.fill(layers[name][chunk.first : store.count])
+            store.note_written(np.arange(chunk.first, store.count))
             store.keep_within_memory()
             # the hash is that of runs of 1024, wherever the file's chunks end
             while store.count - checked >= checkpoint.CHUNK or checked < store.count == header.blocks:
@@ -94,10 +95,10 @@ def loaded_config(
 ) -> VolumeConfig:
     """The settings of a saved map, with those that may be others."""
     saved = header.config
-    fixed = {name for name in changed if name not in (*VIEW_SETTINGS, *LIMIT_SETTINGS)}
+    fixed = {name for name in changed if name not in (*VIEW_SETTINGS, *LIMIT_SETTINGS, *RUN_SETTINGS)}
     if saved.model().regularizer != "off" and changed.get("smoothness") not in (None, saved.smoothness):
         fixed.add("smoothness")  # it has smoothed along rays already
     if fixed:
         raise InvalidConfig(f"a saved map cannot change {', '.join(sorted(fixed))}; fuse it anew")
-    config = override(msgspec.structs.replace(saved, threads=threads), **changed)
+    config = override(msgspec.structs.replace(saved, threads=threads, arch="cpu"), **changed)
     return override(config, max_blocks=max(config.max_blocks, header.blocks))

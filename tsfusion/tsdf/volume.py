@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core import other_names, process
-from tsfusion.core.config import CacheConfig, VolumeConfig, make_settings, override
+from tsfusion.core.config import Arch, CacheConfig, VolumeConfig, make_settings, override
 from tsfusion.core.errors import InvalidConfig, MapError
 from tsfusion.geometry.keyframe import Keyframe, keyframe_of
 from tsfusion.geometry.sample_ranges import why_no_samples
@@ -30,6 +30,8 @@ from tsfusion.kernels.voxel_traversal import COUNT
 from tsfusion.tsdf import checkpoint, map_addition, map_crop, map_history, saved_map
 from tsfusion.tsdf.askable_map import AskableMap
 from tsfusion.tsdf.block_store import MESHED, BlockStore, unpack_keys
+from tsfusion.tsdf.device_blocks import DeviceBlocks, device_for
+from tsfusion.tsdf.device_integrator import DeviceIntegrator, DeviceRayBuffers
 from tsfusion.tsdf.integrator import Integrator, KeyframeQuota
 from tsfusion.tsdf.ray_buffers import RayBuffers, keyframes_of_every_kind
 from tsfusion.tsdf.readable_map import HELD, begin_hash
@@ -67,6 +69,8 @@ class Volume(AskableMap):
     Give a `VolumeConfig`, or the edge of a voxel in metres and other fields by name:
     `Volume(0.02, sensor="kinect", regularizer="ray")`.
     Use it from one thread (Taichi's). `threads` counts for the first volume of a process: Taichi starts once.
+    With `arch="cuda"` or another device, keyframes are fused there, in a process that all volumes of this one
+    share; where the device is missing, a warning says why, and they are fused on the CPU.
 
     Args:
         memory_bytes: that the blocks may take of memory; those that no keyframe has changed for longest wait
@@ -109,11 +113,13 @@ class Volume(AskableMap):
             config = override(config, **settings)
         runtime.start(config.threads)
         smooths = config.checked_model().regularizer != "off"
+        device = device_for(config.arch, color=config.color, smooths=smooths)
         store = BlockStore(
             voxel_size=config.voxel_size,
             color=config.color,
             corrected=smooths,
             cache=None if memory_bytes is None else checked_cache(memory_bytes, cache),
+            device=device,
         )
         super().__init__(config, store)
         self.quota: KeyframeQuota | None = None  # of the keyframes that are integrated from here on
@@ -122,8 +128,8 @@ class Volume(AskableMap):
         self._released: list[NDArray[np.int64]] = []  # keys of released blocks whose mesh has to go
         if memory_bytes is not None:
             self.limit_memory(memory_bytes)
-        self._ray_buffers = RayBuffers(color=config.color, regularised=smooths)
-        self._integrator = Integrator(self._store, self._ray_buffers, config)
+        self._device = device
+        self._ray_buffers, self._integrator = _writers(store, device, config)
 
     if not TYPE_CHECKING:
 
@@ -316,7 +322,7 @@ class Volume(AskableMap):
         """
         layers = self._store.layers()
         header = checkpoint.CheckpointHeader(
-            config=self.config,
+            config=msgspec.structs.replace(self.config, arch="cpu"),  # of where it is, not of what it holds
             keyframes=self.keyframes,
             map_hash="",
             meta={**(self.meta if meta is None else meta), HELD: self.held.numbers},
@@ -413,6 +419,11 @@ class Volume(AskableMap):
         self._store.pause = pause
 
     @property
+    def arch(self) -> Arch:
+        """Where keyframes are fused: as the settings say, or `cpu` where that device is missing."""
+        return "cpu" if self._device is None else self._device.arch
+
+    @property
     def most_blocks(self) -> int:
         """Number of blocks that the map may have, by its settings and by `limit_memory`."""
         return min(self.config.max_blocks, self._store.most_blocks)
@@ -443,6 +454,17 @@ class Volume(AskableMap):
         sensor = keyframe.sensor or self.config.sensor
         if keyframe.points is None or sensor == "lidar":  # of other points nobody knows the sensor's axes
             self.held.add(keyframe.T_world_camera, sensor, times=sign)
+
+
+def _writers(
+    store: BlockStore, device: DeviceBlocks | None, config: VolumeConfig
+) -> tuple[RayBuffers, Integrator]:
+    """What makes rays of keyframes and adds them to a map."""
+    if device is None:
+        buffers = RayBuffers(color=config.color, regularised=store.corrected)
+        return buffers, Integrator(store, buffers, config)
+    on_device = DeviceRayBuffers(device, color=config.color)
+    return on_device, DeviceIntegrator(store, device, on_device, config)
 
 
 def _keyframe(keyframe: Any, others: tuple[object, ...], fields: dict[str, Any]) -> Keyframe:

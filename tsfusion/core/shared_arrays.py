@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: MIT
+"""Arrays that one process writes and another reads, in memory that both have mapped."""
+
+import mmap
+import os
+import tempfile
+from collections.abc import Iterable
+from contextlib import suppress
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+_ALIGNMENT = 64  # bytes
+_STEP = 1 << 20
+
+
+class Place(NamedTuple):
+    """Where an array lies in shared memory."""
+
+    offset: int
+    shape: tuple[int, ...]
+    dtype: str
+
+    @property
+    def end(self) -> int:
+        return self.offset + int(np.prod(self.shape, dtype=np.int64)) * np.dtype(self.dtype).itemsize
+
+
+def make_file() -> int:
+    """A descriptor of a file without a name, in memory where the system has such files (Linux)."""
+    with suppress(AttributeError):
+        return os.memfd_create("tsfusion")
+    with tempfile.TemporaryFile() as file:
+        return os.dup(file.fileno())
+
+
+class SharedArrays:
+    """One process's side of the memory. Arrays stay valid; their content until the writer begins anew.
+
+    Args:
+        descriptor: of the file; it is closed with this object.
+    """
+
+    def __init__(self, descriptor: int) -> None:
+        self._descriptor = descriptor
+        self._map: mmap.mmap | None = None
+        self._size = 0
+        self._end = 0
+
+    def begin(self) -> None:
+        """Write over what was written before."""
+        self._end = 0
+
+    def empty(self, shape: tuple[int, ...], dtype: DTypeLike) -> tuple[NDArray[Any], Place]:
+        """An array to be filled, and where it is."""
+        place = Place(-(-self._end // _ALIGNMENT) * _ALIGNMENT, shape, np.dtype(dtype).str)
+        self._end = place.end
+        if place.end > self._size:
+            os.ftruncate(self._descriptor, -(-max(place.end, 2 * self._size) // _STEP) * _STEP)
+        return self.read(place), place
+
+    def write(self, arrays: Iterable[NDArray[Any]]) -> list[Place]:
+        """Copy arrays into the memory."""
+        places = []
+        for array in arrays:
+            shared, place = self.empty(array.shape, array.dtype)
+            shared[...] = array
+            places.append(place)
+        return places
+
+    def read(self, place: Place) -> NDArray[Any]:
+        """The array at a place, not copied."""
+        if self._map is None or place.end > self._size:
+            # Arrays of the earlier mapping keep it.
+            self._size = os.fstat(self._descriptor).st_size
+            self._map = mmap.mmap(self._descriptor, max(self._size, 1)) if self._size else None
+        if self._map is None or not np.prod(place.shape):
+            return np.zeros(place.shape, place.dtype)
+        found: NDArray[Any] = np.ndarray(place.shape, place.dtype, self._map, place.offset)
+        return found
+
+    def close(self) -> None:
+        """Close the descriptor; arrays that were read stay."""
+        if self._descriptor >= 0:
+            os.close(self._descriptor)
+            self._descriptor = -1

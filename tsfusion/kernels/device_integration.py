@@ -1,0 +1,310 @@
+# SPDX-License-Identifier: MIT
+"""Additive integration on a device of many threads: a thread a ray, additions by atomics.
+
+Every voxel gets what `integrate.add_rays` gives it: the additions are the same integers, and their order
+shows nowhere. Arrays are a device's (`ti.ndarray`); those of the map have a row of 512 voxels a slot.
+"""
+
+import taichi as ti
+
+from tsfusion.kernels.block_hash import map_find
+from tsfusion.kernels.integrate import (
+    ALL,
+    COLOR_LIMIT,
+    CUBE,
+    FREE_SHIFT,
+    MAX_DISTANCE,
+    ONLY_DEFERRED,
+    TOUCHED_COUNT,
+    TOUCHED_HEADER,
+    TOUCHED_MISMATCH,
+    WEIGHT_BITS,
+    quantize,
+)
+from tsfusion.kernels.voxel_traversal import (
+    ADDED,
+    COUNT,
+    CROSSING,
+    DEFERRED,
+    END,
+    INTERVAL,
+    LENGTH,
+    START,
+    UPDATES,
+    WEIGHT_COLOR,
+    advance,
+    begin_walk,
+    hash_key,
+    next_step,
+    offset_in_block,
+    pack,
+    ray_weight,
+    vec3i,
+)
+
+# A listed update: place of the voxel in the layers, w·m and w; of a missing block: its coordinates. A vote
+# for a colour: place and 0xRRGGBB.
+LISTED_FIELDS, VOTE_FIELDS = 4, 2
+PLACE, PRODUCT, VOTE, LAST = 0, 1, 2, 3
+BLOCK, COLOR = 1, 1
+LISTED, FOUND, COUNTS = 0, 1, 2  # how many of them, how many missing blocks
+WINNERS = 1 << 16
+MISSING, SKIPPED = -1, -2  # instead of a place: what is listed is a missing block, or nothing
+
+
+@ti.func
+def band_of(bands: ti.template(), r):
+    """The last band that begins at ray `r` or before it; those without rays begin where the next one does."""
+    low, high = 0, bands.shape[0]
+    while high - low > 1:
+        middle = (low + high) >> 1
+        if bands[middle, START] <= r:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+@ti.func
+def list_block(slot, stamp, stamps: ti.template(), touched: ti.template()):
+    """List a block among those that the keyframe touches, once."""
+    if stamps[slot] != stamp:
+        if ti.atomic_max(stamps[slot], stamp) != stamp:
+            place = ti.atomic_add(touched[TOUCHED_COUNT], 1)
+            touched[TOUCHED_HEADER + place] = slot
+
+
+@ti.func
+def missing_key(listed: ti.template(), i):
+    """Key of the missing block that is listed at place i."""
+    return pack(listed[i, BLOCK], listed[i, BLOCK + 1], listed[i, BLOCK + 2])
+
+
+@ti.func
+def missing_place(listed: ti.template(), i):
+    """Where it is in the table of `WINNERS` places."""
+    return hash_key(missing_key(listed, i)) & (WINNERS - 1)
+
+
+@ti.func
+def crossed(rays: ti.template(), r):
+    """How many voxels ray `r` crosses."""
+    n, length = 1, rays[r, LENGTH]
+    for a in ti.static(range(3)):
+        if rays[r, CROSSING + a] < length:
+            n += 1 + (length - 1 - rays[r, CROSSING + a]) // rays[r, INTERVAL + a]
+    return n
+
+
+@ti.func
+def list_updates(
+    rays: ti.template(), r, base, most, sign_, oldest, hash_keys: ti.template(), hash_slots: ti.template(),
+    listed: ti.template(),
+):  # fmt: skip
+    """List the update of every voxel that ray `r` crosses in blocks of slot ≥ `oldest`, and missing blocks,
+    from place `base` on, `most` in all; returns the number of updates, whether a block is missing, and the
+    place of the voxel that takes the colour, or −1."""
+    walk, weight = begin_walk(rays, r), ray_weight(rays, r)
+    ends, length = rays[r, END], rays[r, LENGTH]
+    end = ends & ~7
+    band_begins = end - (length - end)  # before it is free space
+    free_weight, free_distance = ti.max(weight >> FREE_SHIFT, 1), quantize(length - end)
+    last, slot = vec3i(2147483647), -1
+    added, lacks, colored, n = 0, 0, SKIPPED, 0
+    is_colored = ti.select(end + 1 == length, 1, 0)  # or is to have none
+    while n < most:
+        block = walk.voxel >> 3
+        is_new = (block[0] != last[0]) | (block[1] != last[1]) | (block[2] != last[2])
+        at = SKIPPED
+        if is_new:
+            last = block
+            key = pack(block[0], block[1], block[2])
+            slot = map_find(hash_keys, hash_slots, hash_keys.shape[0] - 1, key)
+            lacks |= ti.select(slot < 0, 1, 0)
+            at = ti.select(slot < 0, MISSING, SKIPPED)
+            slot = ti.select(slot < oldest, -1, slot)
+        step, leaves = next_step(walk.crossing)
+        is_free = leaves < band_begins
+        w = ti.select(is_free, free_weight, weight)
+        m = ti.select(is_free, free_distance, ti.max(quantize(walk.distance), -MAX_DISTANCE))
+        at = ti.select(slot >= 0, slot * CUBE + offset_in_block(walk.voxel), at)
+        listed[base + n, PLACE] = at
+        listed[base + n, PRODUCT] = ti.select(at == MISSING, block[0], sign_ * w * m)
+        listed[base + n, VOTE] = ti.select(at == MISSING, block[1], sign_ * w)
+        listed[base + n, LAST] = block[2]
+        added += ti.select(at >= 0, 1, 0)
+        takes_color = (is_colored == 0) & (leaves > end)
+        colored = ti.select(takes_color, at, colored)
+        is_colored = ti.select(takes_color, 1, is_colored)
+        advance(walk, step)
+        n += 1
+    return added, lacks, colored
+
+
+@ti.kernel
+def add_rays(
+    rays: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    bands: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    deferred: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    first_ray: ti.i32,
+    end_ray: ti.i32,
+    which: ti.i32,
+    first_band: ti.i32,
+    end_band: ti.i32,
+    sign_: ti.i32,
+    oldest: ti.i32,
+    stamp: ti.i32,
+    has_color: ti.i32,
+    hash_keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
+    hash_slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    winners: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    missing: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    stamps: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    touched: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    count: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    listed: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    votes: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    sums: ti.types.ndarray(dtype=ti.i64, ndim=2),
+    color_rgn: ti.types.ndarray(dtype=ti.i64, ndim=2),
+    color_b: ti.types.ndarray(dtype=ti.i32, ndim=2),
+):
+    """As `integrate.add_rays`, a thread a ray; `first_ray` … `end_ray` − 1 are the places of the bands' rays.
+
+    Updates are listed, then added, a thread each: so those of one ray do not wait for each other. Nothing is
+    added inside a loop within a thread: after that, Mesa's software device (22.3) forgets which threads run.
+    Rays that cross missing blocks are marked in `deferred` instead of listed, and the blocks' coordinates are
+    in `missing`, some of them twice: of those that share a place in `winners`, one is
+    left out for every other one that is the same block. No band ends early: what was
+    added is all of its rays. A settled colour stays, as in `integrate.vote_color`.
+    """
+    for band in range(first_band, end_band):
+        if which == ALL:
+            bands[band, DEFERRED], bands[band, UPDATES] = 0, 0
+            bands[band, ADDED] = bands[band, COUNT]
+    for i in range(COUNTS):
+        count[i] = 0
+    for r in range(first_ray, end_ray):
+        band = band_of(bands, r)
+        place = r - bands[band, START]
+        is_wanted = ti.cast(place >= 0 and place < bands[band, COUNT], ti.i32)
+        if is_wanted == 1 and which == ONLY_DEFERRED:
+            is_wanted = deferred[r]
+        votes[r - first_ray, PLACE] = SKIPPED
+        if is_wanted == 1 and ray_weight(rays, r) > 0:
+            most = crossed(rays, r)
+            base = ti.atomic_add(count[LISTED], most)
+            added, lacks, colored = list_updates(
+                rays, r, base, most, sign_, oldest, hash_keys, hash_slots, listed
+            )
+            votes[r - first_ray, PLACE] = colored
+            votes[r - first_ray, COLOR] = rays[r, WEIGHT_COLOR] & 0xFFFFFF
+            ti.atomic_add(bands[band, UPDATES], added)
+            if which == ALL:
+                deferred[r] = lacks
+                ti.atomic_add(bands[band, DEFERRED], lacks)
+    for i in range(count[LISTED]):
+        at = listed[i, PLACE]
+        if at >= 0:
+            # both sums in one addition; their quotient minimises Σ w (x − m)²: paper eq. 2
+            product = ti.cast(listed[i, PRODUCT], ti.i64)
+            ti.atomic_add(sums[at // CUBE, at % CUBE], (product << WEIGHT_BITS) + listed[i, VOTE])
+    for i in range(count[LISTED]):
+        at = listed[i, PLACE]
+        if at >= 0:
+            list_block(at // CUBE, stamp, stamps, touched)
+    for i in range(ti.select(which == ALL, count[LISTED], 0)):
+        if listed[i, PLACE] == MISSING:
+            winners[missing_place(listed, i)] = i
+    for i in range(ti.select(which == ALL, count[LISTED], 0)):
+        if listed[i, PLACE] == MISSING:
+            winner = winners[missing_place(listed, i)]
+            is_another = ti.cast(missing_key(listed, winner) != missing_key(listed, i), ti.i32)
+            if winner == i or is_another == 1:
+                n = ti.atomic_add(count[FOUND], 1)
+                if n < missing.shape[0]:
+                    for a in ti.static(range(3)):
+                        missing[n, a] = listed[i, BLOCK + a]
+    for i in range(ti.select(has_color == 1, end_ray - first_ray, 0)):
+        at, packed = votes[i, PLACE], votes[i, COLOR]
+        if at >= 0:
+            slot, o = at // CUBE, at % CUBE
+            taken = ti.cast(color_rgn[slot, o] & 65535, ti.i32)
+            if taken < COLOR_LIMIT or taken >= COLOR_LIMIT + (COLOR_LIMIT >> 1):
+                red, green = ti.cast((packed >> 16) & 255, ti.i64), ti.cast((packed >> 8) & 255, ti.i64)
+                before = ti.atomic_add(color_rgn[slot, o], sign_ * ((red << 40) + (green << 16) + 1))
+                ti.atomic_add(color_b[slot, o], sign_ * (packed & 255))
+                if sign_ < 0 and (before & 65535) == 0:
+                    touched[TOUCHED_MISMATCH] = 1
+
+
+@ti.kernel
+def write_hash(
+    places: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
+    slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    hash_keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
+    hash_slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
+):
+    """Write keys and slots to places of the hash from block to slot."""
+    for i in range(places.shape[0]):
+        hash_keys[places[i]] = keys[i]
+        hash_slots[places[i]] = slots[i]
+
+
+@ti.kernel
+def read_list(
+    listed: ti.types.ndarray(dtype=ti.i32, ndim=1), count: ti.i32, out: ti.types.ndarray(dtype=ti.i32, ndim=1)
+):
+    """Copy the first `count` numbers of a list."""
+    for i in range(count):
+        out[i] = listed[i]
+
+
+@ti.kernel
+def read_rows(
+    layer: ti.types.ndarray(ndim=2),
+    slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    rows: ti.types.ndarray(ndim=2),
+):
+    """`rows[i]` = row `slots[i]` of a layer."""
+    for i in range(slots.shape[0] * CUBE):
+        rows[i // CUBE, i % CUBE] = layer[slots[i // CUBE], i % CUBE]
+
+
+@ti.kernel
+def write_rows(
+    layer: ti.types.ndarray(ndim=2),
+    slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    rows: ti.types.ndarray(ndim=2),
+):
+    """Row `slots[i]` of a layer = `rows[i]`."""
+    for i in range(slots.shape[0] * CUBE):
+        layer[slots[i // CUBE], i % CUBE] = rows[i // CUBE, i % CUBE]
+
+
+@ti.kernel
+def move_rows(layer: ti.types.ndarray(ndim=2), count: ti.i32, larger: ti.types.ndarray(ndim=2)):
+    """Copy the first `count` rows of a layer into a larger one."""
+    for i in range(count * CUBE):
+        larger[i // CUBE, i % CUBE] = layer[i // CUBE, i % CUBE]
+
+
+@ti.kernel
+def write_list(new: ti.types.ndarray(dtype=ti.i32, ndim=1), listed: ti.types.ndarray(dtype=ti.i32, ndim=1)):
+    """Set the first numbers of a list."""
+    for i in range(new.shape[0]):
+        listed[i] = new[i]
+
+
+@ti.kernel
+def move_list(listed: ti.types.ndarray(ndim=1), larger: ti.types.ndarray(ndim=1)):
+    """Copy a list into a larger one."""
+    for i in range(listed.shape[0]):
+        larger[i] = listed[i]
+
+
+@ti.kernel
+def read_table(table: ti.types.ndarray(dtype=ti.i32, ndim=2), out: ti.types.ndarray(dtype=ti.i32, ndim=2)):
+    """Copy the first rows of a table."""
+    for i, a in ti.ndrange(out.shape[0], 3):
+        out[i, a] = table[i, a]

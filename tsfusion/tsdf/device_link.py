@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: MIT
+"""This process's end of the connection to the process that has a device (`device_process`)."""
+
+import atexit
+import logging
+import socket
+import subprocess
+import sys
+import threading
+from contextlib import suppress
+from multiprocessing.connection import Connection
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core import process
+from tsfusion.core.config import Arch
+from tsfusion.core.shared_arrays import Place, SharedArrays, make_file
+
+log = logging.getLogger(__name__)
+
+_COMMAND = (sys.executable, "-m", "tsfusion.tsdf.device_process")
+_START_S = 120.0  # a device's first start compiles its driver's own kernels, too
+_END_S = 3.0
+
+
+class DeviceLost(RuntimeError):
+    """The process with the device has ended, or a kernel failed on it: what it had added since the map was
+    last read is lost.
+
+    This is no TsfusionError on purpose: no keyframe is to blame, and nothing may go on with the map. A fuser
+    that ends with it is started again, and fuses what its journal has beyond the last checkpoint.
+    """
+
+
+class DeviceLink:
+    """Calls to a device, one after the other, from the thread that uses maps."""
+
+    def __init__(self, arch: Arch) -> None:
+        """Start the process.
+
+        Raises:
+            DeviceLost: when there is no such device; the message says why.
+        """
+        self.arch = arch
+        self.is_trusted = False  # whether it was tried
+        self._has_ended = False
+        self._maps = 0
+        self._forgotten: list[int] = []
+        descriptors = make_file(), make_file()
+        self._requests, self._replies = (SharedArrays(one) for one in descriptors)
+        ours, theirs = socket.socketpair()
+        with theirs:
+            passed = [theirs.fileno(), *descriptors]
+            ends_with_thread = threading.current_thread() is threading.main_thread()
+            self._process = subprocess.Popen(
+                [*_COMMAND, *map(str, passed), arch, str(int(ends_with_thread))],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                pass_fds=passed,
+                **process.OWN_GROUP,
+            )
+        self._link: Connection[Any, Any] = Connection(ours.detach())
+        atexit.register(self.close)
+        self._receive(_START_S)
+
+    @property
+    def has_ended(self) -> bool:
+        return self._has_ended
+
+    def new_map(self, layers: tuple[str, ...]) -> int:
+        """Make an empty map on the device; returns its number.
+
+        Raises:
+            MemoryError, DeviceLost: as `call`.
+        """
+        self._maps += 1
+        self.call(self._maps, "make", layers)
+        return self._maps
+
+    def forget_later(self, number: int) -> None:
+        """Let a map go before the next call: this may be called at any time, also during one."""
+        self._forgotten.append(number)
+
+    def call(self, number: int, verb: str, *arguments: Any) -> Any:
+        """Call a method of a map (`DeviceMap`); arrays in the result are valid until the next call.
+
+        Raises:
+            MemoryError: the device has no memory for more; the map is as it was.
+            DeviceLost: the device is gone.
+        """
+        with process.uninterrupted():  # an answer that nobody took would be the next call's
+            while self._forgotten:
+                self._ask(self._forgotten.pop(), "forget", ())
+            return self._ask(number, verb, arguments)
+
+    def _ask(self, number: int, verb: str, arguments: tuple[Any, ...]) -> Any:
+        if self._has_ended:
+            raise DeviceLost(f"the process with the device {self.arch} has ended")
+        self._requests.begin()
+        packed = [self._requests.write([one])[0] if isinstance(one, np.ndarray) else one for one in arguments]
+        try:
+            self._link.send((number, verb, packed))
+        except OSError as error:
+            self.close()
+            raise DeviceLost(f"the process with the device {self.arch} has ended") from error
+        return self._receive(None)
+
+    def _receive(self, timeout: float | None) -> Any:
+        how: str = "failed"
+        found: Any = "its process has ended"
+        with suppress(EOFError, OSError):
+            how, found = self._link.recv() if self._link.poll(timeout) else (how, "it does not start")
+        if how == "memory":
+            raise MemoryError(f"the device {self.arch} has no memory for more of the map ({found})")
+        if how == "failed":
+            self.close()
+            raise DeviceLost(f"the device {self.arch} cannot be used: {found}")
+        if isinstance(found, list):
+            arrays: list[NDArray[Any]] = [self._replies.read(Place(*place)) for place in found]
+            return arrays
+        return found
+
+    def close(self) -> None:
+        """End the process, and with it its maps."""
+        if self._has_ended:
+            return
+        self._has_ended = True
+        atexit.unregister(self.close)
+        self._link.close()
+        try:
+            self._process.wait(_END_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._requests.close()
+        self._replies.close()
+
+
+_links: dict[Arch, DeviceLink] = {}  # process-wide, as Taichi's own state is: a process a device
+_missing = set[Arch]()
+
+
+def link_to(arch: Arch) -> DeviceLink | None:
+    """The process with a device, which all maps of this process share; None = there is none, which is logged
+    once."""
+    if arch == "cpu" or arch in _missing:
+        return None
+    link = _links.get(arch)
+    if link is None or link.has_ended:
+        try:
+            link = _links[arch] = DeviceLink(arch)
+        except DeviceLost as error:
+            _missing.add(arch)
+            log.warning("%s; keyframes are fused on the CPU", error)
+            return None
+    return link
+
+
+def refuse(link: DeviceLink, why: str) -> None:
+    """Let all maps of this process be on the CPU, and say why."""
+    link.close()
+    _missing.add(link.arch)
+    log.warning("the device %s cannot be used: %s; keyframes are fused on the CPU", link.arch, why)

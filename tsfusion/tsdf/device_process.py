@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: MIT
+"""The process that has a device, `python -m tsfusion.tsdf.device_process`: Taichi runs on that device here.
+
+Taichi has one device a process. Whoever reads maps (meshes, the field, questions) does that on the CPU;
+`device_link` starts this process for it, and is at the other end of its connection.
+"""
+
+import signal
+import sys
+from multiprocessing.connection import Connection
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tsfusion.core import process
+from tsfusion.core.errors import MissingDependency
+from tsfusion.core.shared_arrays import Place, SharedArrays
+from tsfusion.kernels import runtime
+from tsfusion.kernels.integrate import CUBE
+from tsfusion.tsdf.checkpoint import LAYER_DTYPES
+
+if TYPE_CHECKING:
+    from tsfusion.tsdf.device_map import DeviceMap
+
+GROWS = ("make", "insert")  # what may fail for lack of memory, and then changes nothing
+
+
+class _Device:
+    """What the process does: answers calls of maps by their numbers."""
+
+    def __init__(self, link: "Connection[Any, Any]", requests: SharedArrays, replies: SharedArrays) -> None:
+        self._link, self._requests, self._replies = link, requests, replies
+        self._maps: dict[int, DeviceMap] = {}
+
+    def run(self) -> None:
+        """Answer until the other end is closed."""
+        try:
+            while True:
+                number, verb, arguments = self._link.recv()
+                self._link.send(self._answer(number, verb, arguments))
+        except (EOFError, OSError):
+            pass
+
+    def _answer(self, number: int, verb: str, arguments: tuple[Any, ...]) -> tuple[str, Any]:
+        self._replies.begin()
+        given = [self._requests.read(one) if isinstance(one, Place) else one for one in arguments]
+        try:
+            return "done", self._do(number, verb, given)
+        except (RuntimeError, MemoryError) as error:
+            return "memory" if verb in GROWS else "failed", runtime.first_line(error)
+
+    def _do(self, number: int, verb: str, given: list[Any]) -> Any:
+        if verb == "make":
+            from tsfusion.tsdf.device_map import DeviceMap
+
+            self._maps[number] = DeviceMap(*given)
+            return None
+        if verb == "forget":
+            self._maps.pop(number, None)
+            return None
+        if verb == "read":
+            return self._read(self._maps[number], *given)
+        found = getattr(self._maps[number], verb)(*given)
+        if isinstance(found, np.ndarray):
+            return self._replies.write([found])
+        return self._replies.write(found) if isinstance(found, tuple) else found
+
+    def _read(self, one: "DeviceMap", names: tuple[str, ...], slots: Any) -> list[Place]:
+        """Rows of layers, copied from the device to where the other process reads them."""
+        places = []
+        for name in names:
+            rows, place = self._replies.empty((len(slots), CUBE), LAYER_DTYPES[name])
+            one.read(name, slots, rows)
+            places.append(place)
+        return places
+
+
+def main() -> None:
+    """Serve a connection: its descriptor, those of the shared memory, the device, and whether to end at once
+    with the thread that started this process."""
+    link, requests, replies = (int(argument) for argument in sys.argv[1:4])
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)  # who started it decides
+    if sys.argv[5] == "1":
+        process.on_parent_end(signal.SIGKILL)
+    process.end_first()
+    process.lift_memory_limit()  # which counts what a driver maps, too
+    connection: Connection[Any, Any] = Connection(link)
+    try:
+        runtime.start_device(sys.argv[4])
+    except MissingDependency as error:
+        connection.send(("failed", str(error)))
+        return
+    connection.send(("done", None))
+    _Device(connection, SharedArrays(requests), SharedArrays(replies)).run()
+
+
+if __name__ == "__main__":
+    main()

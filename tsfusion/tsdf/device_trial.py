@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: MIT
+"""Whether a device fuses as the CPU does: tried before a map trusts it, because drivers have errors."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core.config import VolumeConfig
+from tsfusion.geometry.keyframe import Intrinsics, Keyframe
+from tsfusion.kernels import runtime
+from tsfusion.tsdf.block_store import BlockStore
+from tsfusion.tsdf.device_blocks import DeviceBlocks
+from tsfusion.tsdf.device_integrator import DeviceIntegrator, DeviceRayBuffers
+from tsfusion.tsdf.device_link import DeviceLink
+from tsfusion.tsdf.integrator import Integrator
+from tsfusion.tsdf.ray_buffers import RayBuffers
+
+_CONFIG = VolumeConfig(voxel_size=0.05, regularizer="off")
+_LAYERS = ("sums", "color_rgn", "color_b")
+
+
+def agrees(link: DeviceLink) -> bool:
+    """Whether two keyframes, one of them taken away again, make the same map there and on the CPU."""
+    runtime.start(None)
+    on_cpu = _store(None)
+    buffers = RayBuffers(color=True, regularised=False)
+    expected = _fused(on_cpu, buffers, Integrator(on_cpu, buffers, _CONFIG))
+    device = DeviceBlocks(link, _LAYERS)
+    on_device = _store(device)
+    rays = DeviceRayBuffers(device, color=True)
+    found = _fused(on_device, rays, DeviceIntegrator(on_device, device, rays, _CONFIG))
+    return all((here == there).all() for here, there in zip(found, expected, strict=True))
+
+
+def _store(device: DeviceBlocks | None) -> BlockStore:
+    return BlockStore(voxel_size=_CONFIG.voxel_size, color=True, corrected=False, device=device)
+
+
+def _fused(store: BlockStore, buffers: RayBuffers, integrator: Integrator) -> list[NDArray[Any]]:
+    """The keys of a map of two keyframes and its layers, in order; the second one was there twice."""
+    for keyframe, sign in zip(_keyframes(), (1, 1, 1, -1), strict=True):
+        buffers.make_rays(keyframe, _CONFIG)
+        integrator.apply(sign)
+    order = np.argsort(store.keys)
+    return [
+        store.keys[order],
+        store.bounds[order],
+        *(layer[: store.count][order] for layer in store.layers().values()),
+    ]
+
+
+def _keyframes() -> list[Keyframe]:
+    """Noisy surfaces, seen askew: no coordinate lies on the border between two voxels."""
+    random = np.random.default_rng(0)
+    turn, _ = np.linalg.qr(random.normal(size=(3, 3)))
+    pose = np.eye(4)
+    pose[:3, :3] = turn * np.sign(np.linalg.det(turn))
+    pose[:3, 3] = random.normal(size=3)
+    depth = 1.5 + 0.3 * random.random((48, 64)).astype(np.float32)
+    color = random.integers(0, 256, (48, 64, 3), np.uint8)
+    image = Keyframe(
+        depth=depth, intrinsics=Intrinsics(60.0, 60.0, 31.5, 23.5), T_world_camera=pose, color=color
+    )
+    points = Keyframe(points=random.normal(size=(400, 3)).astype(np.float32), T_world_camera=pose)
+    return [image, points, image, image]
