@@ -5,12 +5,15 @@
     python scripts/bench.py --list               the cases
     python scripts/bench.py --only 7scenes       those whose name holds a word
     python scripts/bench.py --repeat 5           so often, and a line with least and median ratio at the end
+    python scripts/bench.py --arch cuda          also fused on a device beside, where there is one
 
 Open3D's VoxelBlockGrid runs beside, where `open3d` is installed (`pip install '.[bench]'`): in the same
 process, the same keyframes in turn, with the same range and truncation; its mesh is of voxels of weight 1 and
 of weight 2 on. `1thread` is one thread on one pinned core. Machines differ and are noisy: only `ratio` says
 who is faster. `field` meshes the default surface, `off` the raw one; `remesh` is the mesh of what a keyframe
 changed; `floor` the least time that memory traffic takes.
+With `--arch` the same keyframes go in turn to a map on that device; `ratio` has its wall time against the
+CPU's, and `device` says whether both maps are the same.
 Recorded cases need TSFUSION_DATA (default ../shared/data) and are left out, with a word, where it is missing.
 """
 
@@ -184,7 +187,7 @@ class Stages:
         return timed
 
 
-def run_case(case: Case, threads: int, keyframes: int) -> dict[str, Any]:
+def run_case(case: Case, threads: int, keyframes: int, arch: str) -> dict[str, Any]:
     """Measure one case in this process, with Open3D in turn where it can do the same."""
     threads = case.threads or threads
     os.environ["OMP_NUM_THREADS"] = str(threads)
@@ -195,12 +198,15 @@ def run_case(case: Case, threads: int, keyframes: int) -> dict[str, Any]:
     if source.sensor == "kinect" and not unimportable("open3d"):
         color = bool(case.settings.get("color"))
         peer = Open3D(case.voxel_size, max_range=MAX_RANGE, truncation=TRUNCATION, color=color)
-    ours = run(case, source, threads, peer)
-    row = {"case": case.name, "voxel_size": case.voxel_size, "settings": case.settings, **ours}
+    ours = run(case, source, threads, peer, arch)
+    row = {"case": case.name, "voxel_size": case.voxel_size, "settings": case.settings, "ratio": {}, **ours}
+    if device := row.get("device"):
+        spent = device["keyframe"]["wall_ms_median"] / row["keyframe"]["wall_ms_median"]
+        row["ratio"]["device_wall"] = round(spent, 4)
     if peer is not None:
         beside = row["open3d"]
         spent = row["keyframe"]["cpu_ms_median"] / beside["keyframe"]["cpu_ms_median"]
-        row["ratio"] = {"keyframe": round(spent, 3)}
+        row["ratio"]["keyframe"] = round(spent, 3)
         for weight in (1, 2):
             peer.mesh_weight = float(weight)
             mesh, cpu_ms = timed_mesh(peer.extract_mesh)
@@ -212,7 +218,7 @@ def run_case(case: Case, threads: int, keyframes: int) -> dict[str, Any]:
     return {**row, **surroundings(threads)}
 
 
-def run(case: Case, source: Source, threads: int, peer: Open3D | None) -> dict[str, Any]:
+def run(case: Case, source: Source, threads: int, peer: Open3D | None, arch: str) -> dict[str, Any]:
     started = time.perf_counter()
     from tsfusion import Volume
 
@@ -234,6 +240,9 @@ def run(case: Case, source: Source, threads: int, peer: Open3D | None) -> dict[s
     steps: list[Callable[[Any], Any]] = [volume.integrate, remesh]
     if peer:
         steps.append(peer.integrate)
+    device = Volume(**settings, arch=arch) if arch != "cpu" else None
+    if device is not None:
+        steps.append(device.integrate)
     with stages.watch():
         spent = timed_keyframes(source.fused, *steps, after_warm_up=stages.times.clear)
         stages.keyframes = spent.shape[2]
@@ -249,6 +258,9 @@ def run(case: Case, source: Source, threads: int, peer: Open3D | None) -> dict[s
     }  # fmt: skip
     if peer:
         row["open3d"] = {"keyframe": figures(spent[2])}
+    if device is not None:
+        same = device.map_hash() == row["map_hash"]
+        row["device"] = {"arch": device.arch, "keyframe": figures(spent[-1]), "same_map": same}
     return row
 
 
@@ -280,14 +292,23 @@ def figures(seconds: NDArray[np.float64]) -> dict[str, float]:
     }  # fmt: skip
 
 
-def missing(case: Case) -> str | None:
+def missing(case: Case, arch: str) -> str | None:
     """Why a case cannot run here, if it cannot."""
+    if arch != "cpu" and (case.settings.get("regularizer", "off") != "off" or case.copies):
+        return "a device fuses without smoothing along rays, and copies of a scene are for the CPU"
     folder = {"7scenes": "7scenes/redkitchen", "kitti00": "kitti_odometry"}.get(case.source)
     if folder and not (DATA / folder).exists():
         return f"no {folder} in {DATA} (set TSFUSION_DATA)"
     if case.source == "7scenes" and importlib.util.find_spec("scipy") is None:
         return "scipy is not installed (pip install '.[bench]')"
     return None
+
+
+def has_device(arch: str) -> bool:
+    """Whether a map can be on such a device."""
+    from tsfusion import Volume
+
+    return bool(Volume(arch=arch).arch == arch)
 
 
 def main() -> int:
@@ -300,6 +321,7 @@ def main() -> int:
     parser.add_argument("--threads", type=int, default=os.cpu_count(), help="threads a system may use")
     parser.add_argument("--repeat", type=int, default=1, help="run every case so often")
     parser.add_argument("--keyframes", type=int, default=100, help="at most so many a case")
+    parser.add_argument("--arch", default="cpu", help="a device to fuse on beside: cuda, vulkan")
     parser.add_argument("--case", metavar="NAME", help="run this one here, in this process")
     options = parser.parse_args()
     chosen = [c for c in cases() if options.only in c.name and options.case in (None, c.name)]
@@ -309,17 +331,20 @@ def main() -> int:
         print("\n".join(c.name for c in chosen))
         return 0
     if options.case:
-        print(json.dumps(run_case(chosen[0], options.threads, options.keyframes)))
+        print(json.dumps(run_case(chosen[0], options.threads, options.keyframes, options.arch)))
+        return 0
+    if options.arch != "cpu" and not has_device(options.arch):
+        print(f"left out, there is no {options.arch} device that fuses as the CPU does", file=sys.stderr)
         return 0
     if reason := unimportable("open3d"):
         print(f"without Open3D beside: {reason}", file=sys.stderr)
     status = 0
     for case in chosen:
-        if reason := missing(case):
+        if reason := missing(case, options.arch):
             print(f"{case.name}: left out, {reason}", file=sys.stderr)
             continue
         command = [sys.executable, __file__, "--case", case.name, "--threads", str(options.threads)]
-        command += ["--keyframes", str(options.keyframes)]
+        command += ["--keyframes", str(options.keyframes), "--arch", options.arch]
         rows: list[dict[str, Any]] = []
         for _ in range(options.repeat):
             done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
