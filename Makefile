@@ -32,6 +32,6 @@ nightly:  ## the long forms of what the tests try: about two hours
 	$(PYTHON) scripts/fuzz.py --cases 1000000
 	$(PYTHON) scripts/soak.py --keyframes 10000 --kills 12
 	$(PYTHON) scripts/faults.py
-	$(PYTHON) scripts/planted_faults.py
+	$(PYTHON) scripts/plant_faults.py
 	$(PYTHON) scripts/delivery.py
 	$(PYTHON) scripts/cluster.py --kills 20

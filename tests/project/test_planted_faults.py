@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The faults of scripts/planted_faults.py are still those of the sources; the script itself takes long."""
+"""The faults of scripts/plant_faults.py are still those of the sources; the script itself takes long."""
 
 from planted_faults import FAULTS
 from repository import ROOT

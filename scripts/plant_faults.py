@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Take guarding lines away, one at a time, in a copy of the sources, and see that a test notices each.
 
-    python scripts/planted_faults.py                  all of them: a JSON line each
-    python scripts/planted_faults.py --only spool     those whose file or line matches
-    python scripts/planted_faults.py --first 10 --limit 5
+    python scripts/plant_faults.py                  all of them: a JSON line each
+    python scripts/plant_faults.py --only spool     those whose file or line matches
+    python scripts/plant_faults.py --first 10 --limit 5
 
 The guards are those of journal, checkpoints, sessions, admission, spool, questions and the map's sums
 (tests/support/planted_faults.py). Of each fault the named test files run one by one, until a test fails.
