@@ -36,8 +36,8 @@ class Matcher:
         search = self.search or _usual_search(left)
         found = self._match(left, right, search)
         # Mirrored, the right image is a left one.
-        mirrored = [_halved(np.ascontiguousarray(image[:, ::-1])) for image in (right, left)]
-        other = self._match(*mirrored, _multiple_of_16(search / 2))[:, ::-1]
+        one, two = (_halved(np.ascontiguousarray(image[:, ::-1])) for image in (right, left))
+        other = self._match(one, two, _multiple_of_16(search / 2))[:, ::-1]
         whole = cv2.resize(2 * other, left.shape[::-1], interpolation=cv2.INTER_NEAREST)
         found[~_agree(found, whole, self.agreement * UNITS)] = -UNITS
         cv2.filterSpeckles(found, -UNITS, self.speckle, UNITS)
