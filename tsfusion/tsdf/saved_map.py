@@ -76,6 +76,7 @@ def fill_box(
             rows = np.empty((chunk.blocks, checkpoint.CUBE), checkpoint.LAYER_DTYPES[name])
             chunk.fill(rows)
             store.layers()[name][first : store.count] = rows[inside]
+        store.note_written(np.arange(first, store.count))
     store.measure_bounds()
 
 
