@@ -40,6 +40,7 @@ from tsfusion.wire.queries import fetch_health, fetch_mesh, fetch_new_map, fetch
 START_DEADLINE = 180.0  # seconds; a cold kernel compilation on a slow machine
 STOP_DEADLINE = 60.0  # seconds; draining and the checkpoint
 _ROUTINE = re.compile("tsfusion: (DEBUG|INFO|WARNING): ")  # lines of a server's log that are no error
+_WARNING = re.compile("tsfusion(?: fuser)?: WARNING: (.*)")
 _NAME_TIMEOUT = 1.0  # seconds for a server to name a free map: a sensor waits
 NEW_MAP = "auto"  # as the name of a map: the next one that nobody has
 log = logging.getLogger(__name__)
@@ -62,7 +63,11 @@ class ServerChild:
         return self._process.pid
 
     def wait_ready(self) -> None:
-        """Read the line that says the server is ready; raise TransportError when it ends or stays silent."""
+        """Read the line that says the server is ready, and repeat its warnings.
+
+        Raises:
+            TransportError: when it ends or stays silent.
+        """
         started = time.monotonic()
         stdout = self._process.stdout
         assert stdout is not None
@@ -77,6 +82,9 @@ class ServerChild:
         ready = json.loads(line)
         self.listen, self.control = ready["listen"], ready["control"]
         self.start_seconds = time.monotonic() - started
+        for line in self._log.read_text(encoding="utf-8", errors="replace").splitlines():
+            if found := _WARNING.match(line):
+                log.warning("%s", found[1])  # a missing device, a damaged journal
 
     def check(self) -> None:
         """Raise TransportError, with the server's own error message, unless it is running."""
