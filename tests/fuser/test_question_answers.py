@@ -196,6 +196,7 @@ def test_an_answer_that_takes_long_is_given_up_for_keyframes(
 ) -> None:
     """Ten thousand scattered points or a view of all of a large map would take a minute."""
     monkeypatch.setattr(question_answers, "_LONGEST_S", 0.02)
+    monkeypatch.setattr(question_answers, "_SHORTEST_S", 0.01)
     monkeypatch.setattr(question_answers, "answer_of", long_pass(desk, 20))
     desk.put(asked(1))
     desk.answers.give()
@@ -209,6 +210,28 @@ def test_an_answer_that_takes_long_is_given_up_for_keyframes(
     desk.put(asked(3))
     desk.answers.give()
     assert (desk.sent[-1].number, desk.sent[-1].late, desk.at_work.is_set) == (3, True, True)
+
+
+def test_an_answer_is_given_up_sooner_where_the_share_is_used_up(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Between two keyframes nothing waits, and each would find a long answer that has just begun."""
+    monkeypatch.setattr(question_answers, "_SHORTEST_S", 0.01)
+    monkeypatch.setattr(question_answers, "answer_of", long_pass(desk, 20))
+    desk.answers._share.spend(100.0)
+    desk.put(asked(1))
+    desk.answers.give()
+    assert desk.numbers == [1]
+
+    def answer(*_: Any) -> Any:
+        desk.put(Publish(True))  # it comes meanwhile
+        return long_pass(desk, 20)()
+
+    monkeypatch.setattr(question_answers, "answer_of", answer)
+    desk.answers._share.spend(100.0)
+    desk.put(asked(2))
+    desk.answers.give()
+    assert (desk.sent[-1].number, desk.sent[-1].late) == (2, True)
 
 
 def test_an_answer_that_nobody_waits_for_any_more_is_given_up(

@@ -40,9 +40,8 @@ if TYPE_CHECKING:
 
 _SHARE = 0.25  # of a busy fuser's time
 _BURST_S = 0.2  # seconds of time whose share may come at once
-_LONGEST_S = (
-    1.0  # seconds of processor time that an answer takes while keyframes wait: half of it on two cores
-)
+# Seconds of processor time of an answer while keyframes wait; and where the share is used up already
+_LONGEST_S, _SHORTEST_S = 0.7, 0.1
 _LOOK_S = 0.001  # seconds of a long pass until questions are looked for again
 _Arrays = dict[str, NDArray[Any]]
 
@@ -119,10 +118,15 @@ class QuestionAnswers:
     def _check_time(self, now: float) -> None:
         if now > self._until_s:
             raise AnswerGivenUp(questions.LATE)
-        if time.process_time() - self._began_s > _LONGEST_S:
-            self._inbox.read()
-            if self._is_aside or self._inbox.orders:
-                raise AnswerGivenUp(f"keyframes wait, and it takes more than {_LONGEST_S:g} s: ask for less")
+        took = time.process_time() - self._began_s
+        if took < _SHORTEST_S:
+            return
+        self._inbox.read()
+        is_over = took > _LONGEST_S or self._share.wait(1e-6, now) > 0
+        if is_over and (self._is_aside or self._inbox.orders):
+            raise AnswerGivenUp(
+                f"keyframes wait, and it takes more than {took:.1f} s: ask for less, or again"
+            )
 
     @property
     def _keyframes_wait(self) -> bool:
