@@ -123,7 +123,7 @@ def test_what_is_meant(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ],
 )
 def test_the_place_of_a_page_may_be_left_out(typed: str, meant: str) -> None:
-    assert verbs._with_places(typed.split()) == meant.split()
+    assert verbs._with_places(typed.split(), "--view", *verbs._PLACES["--view"]) == meant.split()
 
 
 def serve(state: Path, *flags: object) -> Any:

@@ -173,7 +173,7 @@ def test_the_number_of_a_connection_that_ended_may_be_another_files() -> None:
         assert not connections.cut(here.fileno())
         there.sendall(b"x")
         assert here.recv(1) == b"x"
-    new = Connection(7, 1, 0, 5 << 20)
+    new = Connection(7, 1, 0, 5 << 20, 0)
     connections._all = lambda: iter([new])  # type: ignore[method-assign]
     for before, kept in ((1 << 30, 5 << 20), (3 << 20, 3 << 20)):
         connections._read.clear()

@@ -55,7 +55,7 @@ def test_the_commands_for_contributors_exist() -> None:
     assert set(re.findall(r"make (\w+)", text)) <= set(targets)
     assert set(re.findall(r"marked `(\w+)`", text)) == set(markers) == {"slow", "nightly"}
     for path in re.findall(r"`([\w.]*/[\w./]+)`|\]\(([\w./]+)\)", text):
-        assert (ROOT / "".join(path)).exists() or path[0] == "dist/", path
+        assert (ROOT / "".join(path)).exists() or path[0].startswith(("dist/", "out/")), path
     blocks = re.findall(r"^```sh\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
     commands = [shlex.split(line, comments=True) for line in "".join(blocks).splitlines()]
     assert len(commands) >= 8

@@ -58,10 +58,10 @@ FAULTS = (
     Fault(
         _WRITER, "            self._keep_place()  # nothing is", "            pass  # nothing is", _JOURNAL
     ),
-    Fault(_WRITER, "            segment.take_back(position.offset)  # it comes again\n", "", _JOURNAL),
+    Fault(_WRITER, "            segment.take_back(offsets[0])  # they come again\n", "", _JOURNAL),
     Fault(
         _WRITER,
-        "            self._abandon(position.offset)\n            raise journal_error",
+        "            self._abandon(offsets[0])\n            raise journal_error",
         "            raise journal_error",
         _JOURNAL,
     ),
@@ -117,7 +117,7 @@ FAULTS = (
     Fault(_CHECKPOINT, "    if map_hash != header.map_hash:", "    if False:", _MAP),
     Fault(
         _CHECKPOINT,
-        "            if zstandard.get_frame_parameters(frame).content_size != size:",
+        "            if size % each or not 0 < size <= each * min(CHUNK, blocks - first):",
         "            if False:",
         _MAP,
     ),
@@ -136,8 +136,8 @@ FAULTS = (
     Fault(_SESSIONS, "return key in self._by_key or len(self) < _MAX_SESSIONS", "return True", _DOOR),
     Fault(
         _INTAKE,
-        "            codec.check(buffers, self._server.max_frame_bytes)\n            self._quotas.check(header, buffers)\n            self._routes",
-        "            self._routes",
+        "            codec.check(buffers, self._server.max_frame_bytes)\n            self._quotas.check(header, buffers)\n        except Refused as error:\n            self.finish()",
+        "            pass\n        except Refused as error:\n            self.finish()",
         _DOOR,
     ),
     Fault(

@@ -238,9 +238,18 @@ def arriving_folder(state: str | Path, name: str) -> Path:
 
 
 def unfinished(state: str | Path) -> list[tuple[str, Arrival]]:
-    """Maps that an earlier process had copied whole. Parts of others are deleted."""
+    """Maps that an earlier process had copied whole. Parts of others are deleted.
+
+    Raises:
+        JournalError: when the folder of the maps cannot be listed.
+    """
+    maps = Path(state) / state_folder.MAPS_FOLDER
+    try:
+        folders = sorted(maps.glob(f"{_PREFIX}*{_SUFFIX}"))
+    except OSError as error:
+        raise JournalError(f"cannot list {maps}: {error}", error.errno) from error
     found = []
-    for folder in sorted((Path(state) / state_folder.MAPS_FOLDER).glob(f"{_PREFIX}*{_SUFFIX}")):
+    for folder in folders:
         name = folder.name[len(_PREFIX) : -len(_SUFFIX)]
         arrival = moved_maps.arrival_of(folder)
         if arrival is None:
