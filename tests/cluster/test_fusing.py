@@ -180,6 +180,9 @@ def test_what_is_no_sum_is_refused(state: Path, tmp_path: Path) -> None:
 
 
 def test_sources_that_do_not_add_up_are_refused(state: Path, tmp_path: Path) -> None:
+    for twice in (str(state), f"{state}/."), ("synthetic:room", "synthetic:room"):
+        with pytest.raises(MapError, match="is given 2 times"):
+            keyframe_sources.listed(twice)
     with pytest.raises(MapError, match="both hold 11 keyframes of the same session"):
         keyframe_sources.listed([str(state), str(state / "journal")])
     one, other = (

@@ -2,6 +2,7 @@
 """What is fused: journals at their final poses, and datasets; listed by one process, read by others."""
 
 import hashlib
+import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -101,6 +102,7 @@ def listed(
     found, left_out = Listed(), Counter[str]()
     seen = dict[tuple[bytes, int], str]()
     worlds: set[str] | None = None
+    _check_once(sources)
     for source in sources:
         if source.startswith(SYNTHETIC) or not _is_journal(source):
             here = {""}
@@ -162,6 +164,15 @@ def _saved_settings(path: Path, map_name: str | None) -> VolumeConfig | None:
             return opened[0].config
     except CheckpointError:
         return None
+
+
+def _check_once(sources: Sequence[str]) -> None:
+    places = Counter(
+        one if "://" in one or one.startswith(SYNTHETIC) else os.path.realpath(one) for one in sources
+    )
+    for place, times in places.items():
+        if times > 1:
+            raise MapError(f"{place} is given {times} times: its keyframes would count as often")
 
 
 def _check_distinct(seen: dict[tuple[bytes, int], str], keyframes: JournaledKeyframes, source: str) -> None:
