@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What mkdocs calls while it builds the site: pages that are generated, and links that leave `docs/`.
+"""Hooks of mkdocs while it builds the site: pages that are generated, and links that leave `docs/`.
 
 `mkdocs.yml` names this file as its hooks. Nothing that is generated here is kept in the repository.
 """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What one server holds: simulated scanners on loopback, a JSON line a case.
+"""Load on one server: simulated scanners on loopback, a JSON line a case.
 
     python scripts/fleet.py                                  1, 10, 50 and 200 scanners at 0.5 keyframes/s
     python scripts/fleet.py --scanners 50 --maps 4           four maps, each with a fuser of its own

@@ -27,7 +27,7 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 
 def example(name: str, address: str, folder: Path) -> str:
-    """What an example prints; it is run in a folder of its own."""
+    """Output of an example; it is run in a folder of its own."""
     done = subprocess.run(
         [sys.executable, ROOT / "examples" / name, address], cwd=folder, env=environment(), text=True,
         check=False, capture_output=True, timeout=DEADLINE,
@@ -37,7 +37,7 @@ def example(name: str, address: str, folder: Path) -> str:
 
 
 def answered(address: str, folder: Path) -> str:
-    """What the planner prints; on a loaded machine half a second is too short now and then."""
+    """Output of the planner; on a loaded machine half a second is too short now and then."""
     for _ in range(20):
         try:
             return example("planner.py", address, folder)
