@@ -150,6 +150,19 @@ def test_credit_is_bytes_as_well_as_keyframes(outbox: Outbox) -> None:
     assert outbox.claim(0, 0) is not None  # one is always allowed
 
 
+def test_what_is_acknowledged_is_on_its_way_no_more(outbox: Outbox) -> None:
+    for _ in range(2):
+        send(outbox)
+    outbox.acknowledge(1, 0)
+    assert outbox.outstanding == 1
+    claimed = outbox.claim(2, 1 << 20)  # its credit is free again, for the one behind those on their way
+    assert claimed is not None
+    assert (claimed[0].seq, claimed[1]) == (3, 2)
+    outbox.sent(claimed[0], 1)
+    outbox.acknowledge(3, 0)
+    assert outbox.outstanding == 0
+
+
 def test_an_interrupt_leaves_it_free_for_others(outbox: Outbox) -> None:
     """Ctrl-C may come when the lock is just taken: the sending thread must not wait for it for ever."""
     assert is_free_after_interrupts(lambda: outbox.keyframes_waiting)

@@ -79,10 +79,12 @@ def test_a_disk_that_refuses_holds_every_client_and_loses_nothing(
             broken.setattr(os, "fdatasync", refuse(errno.EIO))
             for session in SESSIONS:
                 push.send_multipart(record(2, session=session))
-            held = {served.heard(link, messages.Hold).session for _ in SESSIONS}
-        assert held == set(SESSIONS)
-        assert served.durable == len(SESSIONS)
+            holds = [served.heard(link, messages.Hold) for _ in SESSIONS]
         (hosted,) = served.gateway.maps
+        assert {one.session for one in holds} == set(SESSIONS)
+        assert {(one.reason, one.message) for one in holds} == {("disk", hosted.disk.problem)}
+        assert os.strerror(errno.EIO) in hosted.disk.problem
+        assert served.durable == len(SESSIONS)
         hosted.disk._until = 0.0
         for route in served.gateway._routes:
             route.held_until = 0.0

@@ -105,7 +105,7 @@ FAULTS = (
         "journal/quarantine.py",
         "                durable_files.sync_folder(self.folder.parent)\n",
         "",
-        ("journal/test_storage_faults.py", "journal/test_bad_disks.py", "gateway/test_gateway.py"),
+        ("journal/test_files_taken_away.py",),
     ),
     # checkpoint: whole or not at all, never believed when damaged
     Fault(
@@ -133,12 +133,17 @@ FAULTS = (
     Fault(_SESSIONS, '        if seq <= durable:\n            return "duplicate"\n', "", _DOOR),
     Fault(_SESSIONS, 'return "next" if previous <= durable else "gap"', 'return "next"', _DOOR),
     Fault(_SESSIONS, "return not self.client or not client or self.client == client", "return True", _DOOR),
-    Fault(_SESSIONS, "return key in self._by_key or len(self) < _MAX_SESSIONS", "return True", _DOOR),
+    Fault(
+        _SESSIONS,
+        "return key in self._by_key or len(self) < _MAX_SESSIONS",
+        "return True",
+        ("gateway/test_keyframe_index.py",),
+    ),
     Fault(
         _INTAKE,
         "            codec.check(buffers, self._server.max_frame_bytes)\n            self._quotas.check(header, buffers)\n        except Refused as error:\n            self.finish()",
         "            pass\n        except Refused as error:\n            self.finish()",
-        _DOOR,
+        ("gateway/test_map_registry.py",),
     ),
     Fault(
         _INTAKE,
@@ -162,7 +167,7 @@ FAULTS = (
         _HOSTED,
         "            self.disk.begin(error)\n            raise\n",
         "            raise\n",
-        ("gateway/test_disk_pause.py", "gateway/test_gateway.py", "end_to_end/test_state_taken_away.py"),
+        ("gateway/test_journaled_together.py",),
     ),
     Fault(
         "gateway/journal_retention.py",
@@ -174,7 +179,7 @@ FAULTS = (
         "gateway/access_control.py",
         "        self._revoked |= self._allowed.refresh()  # the file may have changed since the last step\n",
         "",
-        ("gateway/test_connections.py", "end_to_end/test_security.py"),
+        ("gateway/test_ports.py", "end_to_end/test_security.py"),
     ),
     Fault(
         "gateway/ports.py",
