@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 _SHARE = 0.25  # of a busy fuser's time
 _BURST_S = 0.2  # seconds of time whose share may come at once
 # Seconds of processor time of an answer while keyframes wait; and where the share is used up already
-_LONGEST_S, _SHORTEST_S = 0.7, 0.1
+_LONGEST_S, _SHORTEST_S = 0.4, 0.1
 _LOOK_S = 0.001  # seconds of a long pass until questions are looked for again
 _Arrays = dict[str, NDArray[Any]]
 
