@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Faults to plant into a copy of the sources, a guarding line each, and the tests that are to notice."""
+"""Faults to plant into a copy of the sources, a guarding line each, and the test that is to notice."""
 
 # ruff: noqa: E501  the lines that are taken away stand as they are
 
@@ -13,252 +13,381 @@ class Fault(Struct, frozen=True):
         file: below `tsfusion/`.
         old: text that stands there once.
         new: what it becomes.
-        tests: files below `tests/`, the likeliest first.
+        test: the one that fails then, `FILE::NAME` below `tests/`.
     """
 
     file: str
     old: str
     new: str
-    tests: tuple[str, ...]
+    test: str
 
-
-_JOURNAL = (
-    "journal/test_journal.py", "journal/test_bad_disks.py", "journal/test_storage_faults.py",
-    "journal/test_files_taken_away.py", "journal/test_torn_and_flipped.py",
-)  # fmt: skip
-_DOOR = (
-    "gateway/test_gateway.py", "gateway/test_returning_clients.py", "gateway/test_client_routes.py",
-    "gateway/test_hostile_peers.py", "end_to_end/test_security.py",
-)  # fmt: skip
-_SPOOL = (
-    "delivery/test_outbox.py", "delivery/test_delivery_model.py", "delivery/test_spool_full_disk.py",
-    "delivery/test_spool_taken_away.py", "delivery/test_refusals.py", "delivery/test_control_session.py",
-)  # fmt: skip
-_MAP = ("tsdf/test_checkpoint.py", "fuser/test_fuser.py", "journal/test_storage_faults.py")
-_ASKED = ("gateway/test_question_limits.py", "wire/test_questions.py", "fuser/test_question_answers.py")
-_SUMS = ("kernels/test_integrate.py", "tsdf/test_volume.py")
-
-_WRITER, _SEGMENT, _SCAN = "journal/writer.py", "journal/open_segment.py", "journal/record_scan.py"
-_DURABLE, _CHECKPOINT = "core/durable_files.py", "tsdf/checkpoint.py"
-_INTAKE, _SESSIONS, _HOSTED = "gateway/keyframe_intake.py", "gateway/sessions.py", "gateway/hosted_map.py"
-_SPOOL_FILE, _OUTBOX = "delivery/spool.py", "delivery/outbox.py"
 
 FAULTS = (
     # journal: what is acknowledged is on the disk, and found again
-    Fault(_SEGMENT, "            os.fdatasync(self._descriptor)\n", "            pass\n", _JOURNAL),
     Fault(
-        _SEGMENT, "            durable_files.sync_folder(self.path.parent)\n", "            pass\n", _JOURNAL
+        "journal/open_segment.py",
+        "            os.fdatasync(self._descriptor)\n",
+        "            pass\n",
+        "journal/test_bad_disks.py::test_everything_is_on_the_disk_in_the_order_that_recovery_needs",
     ),
-    Fault(_SEGMENT, "os.ftruncate(self._descriptor, cut)", "pass", _JOURNAL),
-    Fault(_SEGMENT, "os.ftruncate(self._descriptor, at)", "pass", _JOURNAL),
-    Fault(_SEGMENT, "        self.is_over = True\n", "", _JOURNAL),
-    Fault(_SEGMENT, "os.O_RDWR | os.O_CREAT | os.O_EXCL", "os.O_RDWR | os.O_CREAT", _JOURNAL),
-    Fault(_SEGMENT, "copy.truncate(os.fstat(self._descriptor).st_size)", "pass", _JOURNAL),
-    Fault(_SEGMENT, "return os.fstat(self._descriptor).st_nlink == 0", "return False", _JOURNAL),
     Fault(
-        _WRITER, "            self._keep_place()  # nothing is", "            pass  # nothing is", _JOURNAL
+        "journal/open_segment.py",
+        "            durable_files.sync_folder(self.path.parent)\n",
+        "            pass\n",
+        "journal/test_bad_disks.py::test_everything_is_on_the_disk_in_the_order_that_recovery_needs",
     ),
-    Fault(_WRITER, "            segment.take_back(offsets[0])  # they come again\n", "", _JOURNAL),
     Fault(
-        _WRITER,
+        "journal/open_segment.py",
+        "os.ftruncate(self._descriptor, cut)",
+        "pass",
+        "journal/test_bad_disks.py::test_what_was_refused_is_cut_off_on_the_disk_as_well",
+    ),
+    Fault(
+        "journal/open_segment.py",
+        "os.ftruncate(self._descriptor, at)",
+        "pass",
+        "journal/test_bad_disks.py::test_what_was_refused_is_cut_off_on_the_disk_as_well",
+    ),
+    Fault(
+        "journal/open_segment.py",
+        "        self.is_over = True\n",
+        "",
+        "journal/test_files_taken_away.py::test_a_record_of_a_file_whose_place_is_not_known_is_taken_back",
+    ),
+    Fault(
+        "journal/open_segment.py",
+        "os.O_RDWR | os.O_CREAT | os.O_EXCL",
+        "os.O_RDWR | os.O_CREAT",
+        "journal/test_files_taken_away.py::test_a_file_with_the_next_number_is_stepped_over",
+    ),
+    Fault(
+        "journal/open_segment.py",
+        "copy.truncate(os.fstat(self._descriptor).st_size)",
+        "pass",
+        "journal/test_files_taken_away.py::test_a_record_that_was_taken_back_is_not_put_back",
+    ),
+    Fault(
+        "journal/open_segment.py",
+        "return os.fstat(self._descriptor).st_nlink == 0",
+        "return False",
+        "journal/test_files_taken_away.py::test_an_open_segment_that_is_taken_away_is_put_back_with_every_record",
+    ),
+    Fault(
+        "journal/writer.py",
+        "            self._keep_place()  # nothing is",
+        "            pass  # nothing is",
+        "journal/test_files_taken_away.py::test_a_record_is_not_acknowledged_in_a_file_that_vanished_meanwhile",
+    ),
+    Fault(
+        "journal/writer.py",
+        "            segment.take_back(offsets[0])  # they come again\n",
+        "",
+        "journal/test_files_taken_away.py::test_a_record_of_a_file_whose_place_is_not_known_is_taken_back",
+    ),
+    Fault(
+        "journal/writer.py",
         "            self._abandon(offsets[0])\n            raise journal_error",
         "            raise journal_error",
-        _JOURNAL,
+        "journal/test_bad_disks.py::test_what_was_refused_is_cut_off_on_the_disk_as_well",
     ),
     Fault(
-        _WRITER, "            if end is not None and end <= segment.first:", "            if False:", _JOURNAL
+        "journal/writer.py",
+        "            if end is not None and end <= segment.first:",
+        "            if False:",
+        "journal/test_bad_disks.py::test_a_disk_that_refuses_is_an_error_and_not_the_end",
     ),
-    Fault(_WRITER, "        if missing and self.is_away:", "        if False:", _JOURNAL),
     Fault(
-        _WRITER, "            if not segment.is_deleted and self.is_away:", "            if False:", _JOURNAL
+        "journal/writer.py",
+        "        if missing and self.is_away:",
+        "        if False:",
+        "journal/test_files_taken_away.py::test_nothing_is_written_into_an_empty_folder_in_the_place_of_the_journal",
     ),
     Fault(
-        _WRITER,
+        "journal/writer.py",
+        "            if not segment.is_deleted and self.is_away:",
+        "            if False:",
+        "journal/test_files_taken_away.py::test_nothing_is_written_into_an_empty_folder_in_the_place_of_the_journal",
+    ),
+    Fault(
+        "journal/writer.py",
         "            if number >= below or self.nbytes <= limit:",
         "            if self.nbytes <= limit:",
-        ("journal/test_journal.py", "gateway/test_journal_retention.py"),
+        "journal/test_bad_disks.py::test_the_oldest_segments_go_and_no_other",
     ),
-    Fault("journal/free_space.py", "            if nbytes > spare:", "            if False:", _JOURNAL),
     Fault(
-        _SCAN,
+        "journal/free_space.py",
+        "            if nbytes > spare:",
+        "            if False:",
+        "journal/test_bad_disks.py::test_append_stops_before_the_disk_is_full",
+    ),
+    Fault(
+        "journal/record_scan.py",
         "        if self._identity is not None and head.segment != self._identity:",
         "        if False:",
-        _JOURNAL,
+        "journal/test_torn_and_flipped.py::test_a_keyframe_cannot_pass_off_its_own_bytes_as_records",
     ),
     Fault(
-        _SCAN,
+        "journal/record_scan.py",
         "            raise OSError(errno.EIO, os.strerror(errno.EIO))  # the disk is away",
         "            pass  #",
-        _JOURNAL,
+        "journal/test_bad_disks.py::test_only_bad_sectors_are_read_as_damage",
     ),
-    Fault("journal/mcap_layout.py", "or zlib.crc32(raw[inner:end]) != crc32:", "or False:", _JOURNAL),
-    # files that are replaced: checkpoints, quarantine, keys
-    Fault(_DURABLE, "            os.fsync(file.fileno())\n", "", _MAP),
     Fault(
-        _DURABLE,
+        "journal/mcap_layout.py",
+        "or zlib.crc32(raw[inner:end]) != crc32:",
+        "or False:",
+        "journal/test_torn_and_flipped.py::test_neighbours_that_are_damaged_each_count",
+    ),
+    # files that are replaced: checkpoints, quarantine, keys
+    Fault(
+        "core/durable_files.py",
+        "            os.fsync(file.fileno())\n",
+        "",
+        "journal/test_files_taken_away.py::test_what_is_put_aside_is_on_the_disk",
+    ),
+    Fault(
+        "core/durable_files.py",
         "        os.replace(partial, path)\n        sync_folder(path.parent)\n    except",
         "        os.replace(partial, path)\n    except",
-        _MAP,
+        "fuser/test_fuser.py::test_a_checkpoint_is_on_the_disk_before_it_has_its_name_and_then_the_name",
     ),
-    Fault(_DURABLE, "    for made in reversed(missing):\n        sync_folder(made.parent)\n", "", _JOURNAL),
+    Fault(
+        "core/durable_files.py",
+        "    for made in reversed(missing):\n        sync_folder(made.parent)\n",
+        "",
+        "journal/test_bad_disks.py::test_everything_is_on_the_disk_in_the_order_that_recovery_needs",
+    ),
     Fault(
         "journal/quarantine.py",
         "                durable_files.sync_folder(self.folder.parent)\n",
         "",
-        ("journal/test_files_taken_away.py",),
+        "journal/test_files_taken_away.py::test_what_is_put_aside_is_on_the_disk",
     ),
     # checkpoint: whole or not at all, never believed when damaged
     Fault(
-        _CHECKPOINT,
+        "tsdf/checkpoint.py",
         "            _check_digest(file, path)\n            header = _read_header(file, path)\n            yield",
         "            header = _read_header(file, path)\n            yield",
-        _MAP,
+        "tsdf/test_checkpoint.py::test_a_file_with_a_flipped_bit_is_refused",
     ),
-    Fault(_CHECKPOINT, "    if map_hash != header.map_hash:", "    if False:", _MAP),
     Fault(
-        _CHECKPOINT,
+        "tsdf/checkpoint.py",
+        "    if map_hash != header.map_hash:",
+        "    if False:",
+        "tsdf/test_checkpoint.py::test_each_part_of_a_forged_file_is_checked",
+    ),
+    Fault(
+        "tsdf/checkpoint.py",
         "            if size % each or not 0 < size <= each * min(CHUNK, blocks - first):",
         "            if False:",
-        _MAP,
+        "tsdf/test_checkpoint.py::test_each_part_of_a_forged_file_is_checked",
     ),
-    Fault(_CHECKPOINT, "    if read != rows.nbytes:", "    if False:", _MAP),
-    Fault(_CHECKPOINT, "    if not 0 <= header.blocks <= header.config.max_blocks:", "    if False:", _MAP),
     Fault(
-        _CHECKPOINT,
+        "tsdf/checkpoint.py",
+        "    if read != rows.nbytes:",
+        "    if False:",
+        "tsdf/test_checkpoint.py::test_each_part_of_a_forged_file_is_checked",
+    ),
+    Fault(
+        "tsdf/checkpoint.py",
+        "    if not 0 <= header.blocks <= header.config.max_blocks:",
+        "    if False:",
+        "tsdf/test_checkpoint.py::test_a_forged_file_is_refused_before_it_asks_for_memory",
+    ),
+    Fault(
+        "tsdf/checkpoint.py",
         "    kind = CheckpointError if is_of_another_version else DamagedCheckpoint",
         "    kind = DamagedCheckpoint",
-        _MAP,
+        "tsdf/test_checkpoint.py::test_a_map_of_another_version_or_that_cannot_be_read_now_is_not_damaged",
     ),
     # sessions and admission
-    Fault(_SESSIONS, '        if seq <= durable:\n            return "duplicate"\n', "", _DOOR),
-    Fault(_SESSIONS, 'return "next" if previous <= durable else "gap"', 'return "next"', _DOOR),
-    Fault(_SESSIONS, "return not self.client or not client or self.client == client", "return True", _DOOR),
     Fault(
-        _SESSIONS,
+        "gateway/sessions.py",
+        '        if seq <= durable:\n            return "duplicate"\n',
+        "",
+        "gateway/test_keyframe_index.py::test_each_keyframe_is_admitted_once_and_in_order",
+    ),
+    Fault(
+        "gateway/sessions.py",
+        'return "next" if previous <= durable else "gap"',
+        'return "next"',
+        "gateway/test_keyframe_index.py::test_each_keyframe_is_admitted_once_and_in_order",
+    ),
+    Fault(
+        "gateway/sessions.py",
+        "return not self.client or not client or self.client == client",
+        "return True",
+        "gateway/test_client_routes.py::test_a_session_is_its_clients_in_the_journal_and_before",
+    ),
+    Fault(
+        "gateway/sessions.py",
         "return key in self._by_key or len(self) < _MAX_SESSIONS",
         "return True",
-        ("gateway/test_keyframe_index.py",),
+        "gateway/test_keyframe_index.py::test_sessions_are_bounded",
     ),
     Fault(
-        _INTAKE,
+        "gateway/keyframe_intake.py",
         "            codec.check(buffers, self._server.max_frame_bytes)\n            self._quotas.check(header, buffers)\n        except Refused as error:\n            self.finish()",
         "            pass\n        except Refused as error:\n            self.finish()",
-        ("gateway/test_map_registry.py",),
+        "gateway/test_map_registry.py::test_a_record_whose_frames_are_too_large_together_is_refused",
     ),
     Fault(
-        _INTAKE,
+        "gateway/keyframe_intake.py",
         "            if corrections.is_servers_own(header):",
         "            if False:",
-        ("gateway/test_forget_requests.py", "end_to_end/test_forgetting.py", "wire/test_corrections.py"),
+        "end_to_end/test_forgetting.py::test_nothing_but_the_server_writes_what_is_forgotten",
     ),
     Fault(
-        _INTAKE,
+        "gateway/keyframe_intake.py",
         "        return route.damaged[1] < _MOST_DAMAGED",
         "        return True",
-        ("end_to_end/test_damaged_links.py", "gateway/test_gateway.py"),
+        "end_to_end/test_damaged_links.py::test_a_record_that_always_comes_damaged_is_given_up",
     ),
     Fault(
-        _INTAKE,
+        "gateway/keyframe_intake.py",
         "            if isinstance(error, Damaged) and self._comes_again(header):",
         "            if False:",
-        ("end_to_end/test_damaged_links.py", "gateway/test_gateway.py"),
+        "end_to_end/test_damaged_links.py::test_what_is_damaged_on_the_way_is_sent_again",
     ),
     Fault(
-        _HOSTED,
+        "gateway/hosted_map.py",
         "            self.disk.begin(error)\n            raise\n",
         "            raise\n",
-        ("gateway/test_journaled_together.py",),
+        "gateway/test_journaled_together.py::test_a_disk_that_refuses_holds_every_client_and_loses_nothing",
     ),
     Fault(
         "gateway/journal_retention.py",
         "            below = self._in_previous\n",
         "            below = self._in_last\n",
-        ("gateway/test_journal_retention.py", "journal/test_journal.py"),
+        "gateway/test_journal_retention.py::test_what_two_checkpoints_hold_may_go",
     ),
     Fault(
         "gateway/access_control.py",
         "        self._revoked |= self._allowed.refresh()  # the file may have changed since the last step\n",
         "",
-        ("gateway/test_ports.py", "end_to_end/test_security.py"),
+        "gateway/test_ports.py::test_who_may_not_connect_any_more_is_heard_and_served_no_more",
     ),
     Fault(
         "gateway/ports.py",
         "while frames[-1].more and len(frames) <= MAX_FRAMES:",
         "while frames[-1].more:",
-        ("gateway/test_ports.py", "gateway/test_hostile_peers.py"),
+        "gateway/test_ports.py::test_a_message_of_frames_without_end_is_not_read_to_its_end",
     ),
     Fault(
         "gateway/memory_guard.py",
         "        exceeded = held > self._bound\n",
         "        exceeded = False\n",
-        ("end_to_end/test_hostile_load.py",),
+        "gateway/test_ports.py::test_who_fills_the_memory_is_cut_off_alone",
     ),
     # spool and outbox: nothing goes that is not acknowledged, no number comes twice
     Fault(
-        _SPOOL_FILE, "while self.waiting and self.waiting[0].seq <= durable:", "while self.waiting:", _SPOOL
+        "delivery/spool.py",
+        "while self.waiting and self.waiting[0].seq <= durable:",
+        "while self.waiting:",
+        "delivery/test_outbox.py::test_what_is_acknowledged_is_on_its_way_no_more",
     ),
     Fault(
-        _SPOOL_FILE,
+        "delivery/spool.py",
         "            self._tombstones.add(seq)\n            raise\n",
         "            raise\n",
-        _SPOOL,
+        "delivery/test_spool_full_disk.py::test_a_record_that_cannot_be_taken_back_does_not_pass_for_another",
     ),
-    Fault(_SPOOL_FILE, "        self._tombstones.add(entry.seq)\n", "", _SPOOL),
     Fault(
-        _SPOOL_FILE,
+        "delivery/spool.py",
+        "        self._tombstones.add(entry.seq)\n",
+        "",
+        "journal/test_journal.py::test_an_entry_in_the_middle_can_be_removed",
+    ),
+    Fault(
+        "delivery/spool.py",
         "last + _RESTART_GAP + secrets.randbelow(_RESTART_SPREAD) if last else 1",
         "last + 1",
-        _SPOOL,
+        "delivery/test_outbox.py::test_only_what_was_sent_can_be_corrected",
     ),
     Fault(
-        _SPOOL_FILE,
+        "delivery/spool.py",
         '                    log.warning("%s", error)\n                    return False\n',
         "",
-        _SPOOL,
+        "delivery/test_spool_taken_away.py::test_no_newer_file_is_deleted_before_an_older_one",
     ),
-    Fault(_SPOOL_FILE, "(newest if below is None else below)", "1 << 60", _SPOOL),
     Fault(
-        _OUTBOX,
+        "delivery/spool.py",
+        "(newest if below is None else below)",
+        "1 << 60",
+        "delivery/test_spool_taken_away.py::test_no_newer_file_is_deleted_before_an_older_one",
+    ),
+    Fault(
+        "delivery/outbox.py",
         "                if entry.seq > sent and not entry.is_correction:",
         "                if not entry.is_correction:",
-        _SPOOL,
+        "delivery/test_outbox.py::test_of_what_a_dead_scanner_left_a_windows_worth_may_be_journaled",
     ),
-    Fault(_OUTBOX, "            self._outstanding = min(self._outstanding, place)\n", "", _SPOOL),
-    Fault(_OUTBOX, "            self._outstanding = max(self._outstanding - len(dropped), 0)\n", "", _SPOOL),
+    Fault(
+        "delivery/outbox.py",
+        "            self._outstanding = min(self._outstanding, place)\n",
+        "",
+        "delivery/test_control_session.py::test_only_what_was_sent_can_be_refused",
+    ),
+    Fault(
+        "delivery/outbox.py",
+        "            self._outstanding = max(self._outstanding - len(dropped), 0)\n",
+        "",
+        "delivery/test_outbox.py::test_what_is_acknowledged_is_on_its_way_no_more",
+    ),
     # questions
-    Fault("gateway/map_questions.py", ">= MOST_OF_A_CLIENT:", ">= 1 << 30:", _ASKED),
+    Fault(
+        "gateway/map_questions.py",
+        ">= MOST_OF_A_CLIENT:",
+        ">= 1 << 30:",
+        "gateway/test_question_limits.py::test_a_client_has_a_few_under_way_over_all_its_connections",
+    ),
     Fault(
         "gateway/map_questions.py",
         "        if held and held + command.question.most_bytes > self._max_bytes:",
         "        if False:",
-        _ASKED,
+        "gateway/test_question_limits.py::test_answers_that_nobody_reads_fill_no_memory",
     ),
     Fault(
         "gateway/connection_limits.py",
         "        if deaf := self._ports.connections.cut_deaf_viewers():",
         "        if deaf := 0:",
-        ("gateway/test_connection_limits.py",),
+        "gateway/test_connection_limits.py::test_viewers_that_do_not_read_go_before_everybody_goes",
     ),
-    Fault("fuser/question_answers.py", "        if now > self._until_s:", "        if False:", _ASKED),
+    Fault(
+        "fuser/question_answers.py",
+        "        if now > self._until_s:",
+        "        if False:",
+        "fuser/test_question_answers.py::test_an_answer_that_nobody_waits_for_any_more_is_given_up",
+    ),
     # the map's sums
     Fault(
         "kernels/integrate.py",
         "        if ti.atomic_max(stamps[slot], stamp) != stamp:",
         "        if True:",
-        _SUMS,
+        "kernels/test_integrate.py::test_the_maps_blocks_are_those_of_the_crossed_voxels",
     ),
     Fault(
         "kernels/integrate.py",
         "first = ti.select(owners[slot] == mark, LEFT_OUT, slot * CUBE)",
         "first = slot * CUBE",
-        _SUMS,
+        "kernels/test_integrate.py::test_integration_equals_the_twin_to_the_bit",
     ),
-    Fault("kernels/integrate.py", "    elif slot < oldest:", "    elif slot < 0:", _SUMS),
-    Fault("tsdf/integrator.py", "            self._take_back(added, sign, before)\n", "", _SUMS),
+    Fault(
+        "kernels/integrate.py",
+        "    elif slot < oldest:",
+        "    elif slot < 0:",
+        "kernels/test_integrate.py::test_windows_that_take_the_place_of_others_are_read_anew",
+    ),
+    Fault(
+        "tsdf/integrator.py",
+        "            self._take_back(added, sign, before)\n",
+        "",
+        "tsdf/test_volume.py::test_whatever_fails_leaves_the_map_as_it_was",
+    ),
     Fault(
         "tsdf/kept_values.py",
         "        if self._drops != self._store.drops:",
         "        if False:",
-        ("tsdf/test_kept_values.py",),
+        "tsdf/test_kept_values.py::test_blocks_that_have_gone_are_forgotten",
     ),
 )
