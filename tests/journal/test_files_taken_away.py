@@ -184,7 +184,9 @@ def test_a_record_of_a_file_whose_place_is_not_known_is_taken_back(
             fill(log, 2)
     fill(log, 2, 3)
     log.close()
-    assert seqs(tmp_path) == [1, 2, 3]
+    again = Journal(tmp_path, BIG)
+    assert ([found.seq for found in again.found], again.damaged) == ([1, 2, 3], 0)
+    assert journal.segments(tmp_path) == [1, 2]  # nothing is written behind the place of what was taken back
 
 
 def test_a_disk_that_cannot_take_it_back_now_loses_nothing(

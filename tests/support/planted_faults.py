@@ -130,13 +130,13 @@ FAULTS = (
         "journal/record_scan.py",
         "            raise OSError(errno.EIO, os.strerror(errno.EIO))  # the disk is away",
         "            pass  #",
-        "journal/test_bad_disks.py::test_only_bad_sectors_are_read_as_damage",
+        "journal/test_bad_disks.py::test_a_segment_that_cannot_be_read_is_not_passed_over",
     ),
     Fault(
         "journal/mcap_layout.py",
         "or zlib.crc32(raw[inner:end]) != crc32:",
         "or False:",
-        "journal/test_torn_and_flipped.py::test_neighbours_that_are_damaged_each_count",
+        "journal/test_torn_and_flipped.py::test_a_flipped_bit_at_any_byte_costs_at_most_the_record_it_hit",
     ),
     # files that are replaced: checkpoints, quarantine, keys
     Fault(
