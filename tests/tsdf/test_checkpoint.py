@@ -198,6 +198,7 @@ def test_blocks_that_are_empty_or_out_of_order_are_refused(tmp_path: Path) -> No
         ("cut chunk", "a chunk ends .* bytes early"),
         ("length", "is cut short"),
         ("window", "is damaged: .*memory"),
+        ("hash", "says its map hash is 0+, but it loads as"),
     ],
 )
 def test_each_part_of_a_forged_file_is_checked(saved: Path, tmp_path: Path, part: str, message: str) -> None:
@@ -218,6 +219,8 @@ def test_each_part_of_a_forged_file_is_checked(saved: Path, tmp_path: Path, part
         length = len(frame)
     elif part == "length":
         length = 2**32 - 1
+    elif part == "hash":
+        header.map_hash = "0" * len(header.map_hash)
     else:
         frame[5] = 27 - 10 << 3  # 128 MB
     altered = msgspec.msgpack.encode(header)
