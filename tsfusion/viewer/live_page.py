@@ -39,9 +39,9 @@ if TYPE_CHECKING:
     import viser
 
 MAX_BYTES_PER_SECOND = 8e6  # to each browser, as triangles
-_BUSY, _IDLE = 0.05, 0.1  # seconds that are waited for an event
-_SHARE = 0.025  # of a core, for putting updates into tiles: many at once cost little more than one
-_TOGETHER = (0.1, 1.0)  # seconds of updates that are taken at once, at least and at most
+_WAIT = 0.1  # seconds that are waited for an event
+_SHARE = 0.012  # of a core, for putting updates into tiles: many at once cost little more than one
+_TOGETHER = (0.2, 1.0)  # seconds of updates that are taken at once, at least and at most
 _MOST_UPDATES = 64  # that wait for that
 _BEHIND = 50  # voxels that a following camera is behind a scanner
 _SETTLED = 0.25  # seconds that a time slider rests before the map is rewound
@@ -88,7 +88,7 @@ class LivePage:
         )
         self._marks = ScannerMarks(server.scene)
         self._colors.name_clients(self._marks.name)
-        self._sample: tuple[int, map_views.Sample] | None = None
+        self._whole_views = map_views.WholeViews(self._tiles)
         self._browsers: dict[int, BrowserPanel] = {}
         self._looked, self._reckoned = -np.inf, -np.inf
         self._lock = threading.Lock()  # of `_browsers`
@@ -102,8 +102,7 @@ class LivePage:
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")  # a browser that left
         try:
             while not stop.is_set():
-                wait = _BUSY if self._nodes.are_waiting and self._browsers else _IDLE
-                for event in self._feed.events(wait):
+                for event in self._feed.events(_WAIT):
                     self._take(event)
                 self._step(time.monotonic())
         finally:
@@ -145,6 +144,7 @@ class LivePage:
         self._updates.clear()
         self._nodes.clear()
         self._tiles.clear()
+        self._whole_views.forget()
         self._marks.clear()
         self._colors.choose(self._colors.mode)
         if event.map != self.map_name:
@@ -172,9 +172,10 @@ class LivePage:
             self._reckon()
         if not self._browsers:
             return
-        with self._server.atomic():  # else each message wakes the web server's thread
-            self._nodes.send(now)
-            self._marks.draw(now)
+        if self._nodes.is_due(now) or self._marks.is_due(now):
+            with self._server.atomic():  # else each message wakes the web server's thread
+                self._nodes.send(now)
+                self._marks.draw(now)
         if now >= self._looked + _OFTEN:
             self._looked = now
             with self._lock:
@@ -207,6 +208,7 @@ class LivePage:
         if self._up.up != before:
             self._server.scene.set_up_direction(self._up.direction)
             self._looked = -np.inf  # cameras follow at once: what browsers tell of them is turned, too
+        self._whole_views.refresh(self._up.direction)
         if self._colors.fit_scale():
             self._nodes.changed(self._tiles.tiles)
         bounds = [tile.bounds for tile in list(self._tiles.tiles.values())]
@@ -240,10 +242,7 @@ class LivePage:
 
     def whole_view(self, aspect: float, covered: float) -> View | None:
         """See `browser_panel.Shown`, with what follows."""
-        version = self._tiles.version
-        if self._sample is None or self._sample[0] != version:
-            self._sample = (version, map_views.sample(self._tiles))
-        return map_views.whole(self._sample[1], self._up.direction, aspect, covered=covered)
+        return self._whole_views.of(aspect, covered)
 
     def scanner_view(self, session: bytes) -> View | None:
         pose = self._marks.pose(session)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.up_direction import Up
+from tsfusion.wire.held_cells import keys_of
 from tsfusion.wire.map_events import SurfaceUpdate
 
 CELL = 8  # voxels along a cell's edge
@@ -87,18 +88,15 @@ class MapTiles:
         """
         self.has_colors |= any(update.mesh.colors is not None for update in updates)
         self.version += 1
-        mesh, first_face, counts = _as_one(updates)
-        cells = np.concatenate([update.cells for update in updates]).astype(np.int64)
-        client = np.concatenate([self._numbered(update) for update in updates])
-        if len(updates) > 1:
-            _, last = np.unique(cells[::-1], axis=0, return_index=True)
-            newest = np.sort(len(cells) - 1 - last)
-            cells, client = cells[newest], client[newest]
-            first_face, counts = first_face[newest], counts[newest]
+        clients = [self._numbered(update) for update in updates]
+        rows_of = _newest_rows(updates)
+        mesh, first_face, counts = _as_one(updates, rows_of)
+        cells = np.concatenate([update.cells[rows] for update, rows in zip(updates, rows_of, strict=True)])
+        client = np.concatenate([one[rows] for one, rows in zip(clients, rows_of, strict=True)])
         place = cells // self.edge
         local = ((cells - place * self.edge) @ (self.edge**2, self.edge, 1)).astype(np.int16)
-        places, tile_of = np.unique(place, axis=0, return_inverse=True)
-        tile_of = tile_of.reshape(-1)
+        _, first_of, tile_of = np.unique(keys_of(place), return_index=True, return_inverse=True)
+        places = place[first_of]
         order = np.argsort(tile_of, kind="stable")
         ends = np.searchsorted(tile_of[order], np.arange(len(places) + 1))
         changed = set()
@@ -124,7 +122,7 @@ class MapTiles:
             replaced[part.cells] = True
             kept = ~replaced[old.cell]
             if kept.any():
-                mesh = _joined(old.mesh if kept.all() else old.mesh.of_faces(kept), mesh)
+                mesh = _joined((old.mesh if kept.all() else old.mesh.of_faces(kept), mesh))
                 cell = np.concatenate((old.cell[kept], cell))
         if len(cell):
             self.tiles[key] = Tile(mesh, cell, changed_s, client)
@@ -157,24 +155,36 @@ class _Part:
         return self.whole.of_faces(self.faces)
 
 
-def _as_one(
-    updates: Sequence[SurfaceUpdate],
-) -> tuple[Mesh, NDArray[np.int32], NDArray[np.int32]]:
-    """The mesh of several updates; of each cell its first face there, and how many faces it has."""
-    counts = np.concatenate([np.diff(update.first_face) for update in updates])
+def _newest_rows(updates: Sequence[SurfaceUpdate]) -> list[NDArray[np.int64]]:
+    """The rows of each update's cells that no later update has again."""
+    keys = np.concatenate([keys_of(update.cells) for update in updates])
     if len(updates) == 1:
-        return _colored(updates[0].mesh), updates[0].first_face[:-1], counts
-    meshes = [_colored(update.mesh) for update in updates]
-    vertices = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)], dtype=np.int32).tolist()
-    faces = np.cumsum([0, *(len(mesh.faces) for mesh in meshes)], dtype=np.int32).tolist()
-    whole = Mesh(
-        np.concatenate([mesh.vertices for mesh in meshes]),
-        np.concatenate([mesh.faces + np.int32(n) for mesh, n in zip(meshes, vertices, strict=False)]),
-        np.concatenate([mesh.normals for mesh in meshes]),
-        np.concatenate([mesh.colors for mesh in meshes if mesh.colors is not None]),
-    )
-    first = [update.first_face[:-1] + np.int32(n) for update, n in zip(updates, faces, strict=False)]
-    return whole, np.concatenate(first), counts
+        return [np.arange(len(keys))]
+    _, last = np.unique(keys[::-1], return_index=True)
+    newest = np.sort(len(keys) - 1 - last)
+    begins = np.cumsum([0, *(len(update.cells) for update in updates)])
+    ends = np.searchsorted(newest, begins)
+    return [newest[ends[i] : ends[i + 1]] - begins[i] for i in range(len(updates))]
+
+
+def _as_one(
+    updates: Sequence[SurfaceUpdate], rows_of: Sequence[NDArray[np.int64]]
+) -> tuple[Mesh, NDArray[np.int64], NDArray[np.int64]]:
+    """The mesh of some cells of several updates; of each cell its first face there, and how many faces it has.
+
+    Args:
+        rows_of: the rows of those cells, ascending, of each update.
+    """
+    meshes, counts = [], []
+    for update, rows in zip(updates, rows_of, strict=True):
+        each = np.diff(update.first_face)[rows]
+        counts.append(each)
+        if len(rows) == len(update.cells):
+            meshes.append(_colored(update.mesh))
+        elif len(rows):
+            meshes.append(_colored(update.mesh.of_faces(_ranges(update.first_face[rows], each))))
+    count = np.concatenate(counts)
+    return _joined(meshes), np.cumsum(count) - count, count
 
 
 def _colored(mesh: Mesh) -> Mesh:
@@ -183,15 +193,16 @@ def _colored(mesh: Mesh) -> Mesh:
     return dataclasses.replace(mesh, colors=np.full(mesh.vertices.shape, GREY, np.uint8))
 
 
-def _joined(first: Mesh, second: Mesh) -> Mesh:
-    """Two meshes as one."""
-    assert first.colors is not None
-    assert second.colors is not None
+def _joined(meshes: Sequence[Mesh]) -> Mesh:
+    """Meshes with colours as one."""
+    if len(meshes) == 1:
+        return meshes[0]
+    offsets = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)], dtype=np.int32).tolist()
     return Mesh(
-        np.concatenate((first.vertices, second.vertices)),
-        np.concatenate((first.faces, second.faces + np.int32(len(first.vertices)))),
-        np.concatenate((first.normals, second.normals)),
-        np.concatenate((first.colors, second.colors)),
+        np.concatenate([mesh.vertices for mesh in meshes]),
+        np.concatenate([mesh.faces + np.int32(n) for mesh, n in zip(meshes, offsets, strict=False)]),
+        np.concatenate([mesh.normals for mesh in meshes]),
+        np.concatenate([mesh.colors for mesh in meshes if mesh.colors is not None]),
     )
 
 
@@ -211,7 +222,7 @@ def whole(meshes: list[Mesh], up: Up | None) -> Mesh:
     return Mesh(vertices[first], faces, normals[first], colors[first], known_up=up)
 
 
-def _ranges(starts: NDArray[np.int32], counts: NDArray[np.int32]) -> NDArray[np.int64]:
+def _ranges(starts: NDArray[np.integer], counts: NDArray[np.integer]) -> NDArray[np.int64]:
     """The numbers from each start on, so many of each."""
     before = np.cumsum(counts) - counts
     found: NDArray[np.int64] = np.arange(int(counts.sum())) + np.repeat(starts - before, counts)

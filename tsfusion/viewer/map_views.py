@@ -62,6 +62,39 @@ def whole(surface: Sample, up: NDArray[np.float64], aspect: float, *, covered: f
     return _fitted(surface.points, (toward[best], up), aspect, covered)
 
 
+class WholeViews:
+    """Views of all of a map, each found once until `refresh` notes that the map has changed."""
+
+    def __init__(self, tiles: MapTiles) -> None:
+        self._tiles = tiles
+        self._up: NDArray[np.float64] = np.array((0.0, 0.0, 1.0))
+        self._version = -1
+        self._sample: Sample | None = None
+        self._views: dict[tuple[float, float], View] = {}
+
+    def forget(self) -> None:
+        """Find every view anew."""
+        self._sample = None
+        self._views.clear()
+
+    def refresh(self, up: NDArray[np.float64]) -> None:
+        """Find views anew where the tiles, or the direction up, are others than before."""
+        if self._version != self._tiles.version or not np.array_equal(up, self._up):
+            self._up, self._version = up, self._tiles.version
+            self.forget()
+
+    def of(self, aspect: float, covered: float) -> View | None:
+        """See `whole`; None is not kept: what comes first is seen at once."""
+        view = self._views.get((aspect, covered))
+        if view is None:
+            if self._sample is None or not len(self._sample.points):
+                self._sample = sample(self._tiles)
+            view = whole(self._sample, self._up, aspect, covered=covered)
+            if view is not None:
+                self._views[aspect, covered] = view
+        return view
+
+
 def _fitted(
     points: NDArray[np.float64],
     directions: tuple[NDArray[np.float64], NDArray[np.float64]],

@@ -16,7 +16,7 @@ from tsfusion.wire.map_events import PathsFound, ScannerSeen
 if TYPE_CHECKING:
     import viser
 
-_PICTURE_PAUSE = 0.5  # seconds between two pictures of a scanner, at least
+_PICTURE_PAUSE = 1.0  # seconds between two pictures of a scanner, at least
 _PATH_PAUSE = 1.0  # seconds between two versions of a path
 _MOST_POINTS = 3000  # of a drawn path
 _WIDTHS = {"paths": 4.0, "first paths": 1.5}  # pixels
@@ -107,6 +107,15 @@ class ScannerMarks:
             if newest in numbers:
                 scanner.pose = poses[numbers.index(newest)]
             scanner.is_found, scanner.is_placed, scanner.is_drawn = True, False, False
+
+    def is_due(self, now: float) -> bool:
+        """Whether `draw` has something to do."""
+        return any(
+            not one.is_placed
+            or (not one.is_drawn and now >= one.path_at + _PATH_PAUSE)
+            or (one.picture is not None and now >= one.picture_at + _PICTURE_PAUSE)
+            for one in self._scanners.values()
+        )
 
     def draw(self, now: float) -> None:
         """Bring what has changed into the scene."""

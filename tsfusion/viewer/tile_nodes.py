@@ -55,10 +55,11 @@ class TileNodes:
         self.voxel_size = 1.0
         self.bytes_sent = 0
 
-    @property
-    def are_waiting(self) -> bool:
-        """Whether tiles have yet to be sent."""
-        return bool(self._waiting)
+    def is_due(self, now: float) -> bool:
+        """Whether `send` has something to do."""
+        return any(now >= end for _, end in self._last.values()) or any(
+            now >= self._due(key) for key in self._waiting
+        )
 
     def has(self, key: Key) -> bool:
         """Whether the scene has a version of a tile."""
@@ -109,9 +110,7 @@ class TileNodes:
                 del self._last[key]
                 node.remove()
         for key in list(self._waiting):
-            due = self._sent_at.get(key, -np.inf) + self._pauses.get(key, PAUSE)
-            if key in self._cut:
-                due = self._sent_at.get(key, -np.inf) + _CUT_PAUSE
+            due = self._due(key)
             if due > now:
                 continue
             if self._bucket.wait(1.0, now) > 0:
@@ -126,6 +125,11 @@ class TileNodes:
                 self.bytes_sent += size
                 count += 1
         return count
+
+    def _due(self, key: Key) -> float:
+        """When a tile may be sent."""
+        pause = _CUT_PAUSE if key in self._cut else self._pauses.get(key, PAUSE)
+        return self._sent_at.get(key, -np.inf) + pause
 
     def shown_mesh(self, key: Key, tile: Tile) -> Mesh:
         """What is shown of a tile, in the colours that are shown."""

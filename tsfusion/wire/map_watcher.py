@@ -25,6 +25,7 @@ from tsfusion.wire.messages import Reply
 from tsfusion.wire.questions import MOST_POINTS, Answer, Cells, Keyframes
 
 _MOST_AT_ONCE = 16  # updates of one call
+_TOGETHER_S = 0.1  # from one reading of updates to the next: each awakening costs, and nobody sees the difference
 _PAUSE_S, _BUSY_PAUSE_S = 0.02, 0.05  # between two questions; while the map has keyframes to fuse
 _RETRY_S = 0.5  # after a question that was refused or not answered
 _WEIGHTS_S = 2.0  # that a question for weights may take
@@ -75,7 +76,7 @@ class MapWatcher:
             raise TransportError(f"cannot open a socket: {error.strerror}") from error
         self._health: Health | None = None
         self._asked: Cells | Keyframes | None = None
-        self._next_question = 0.0  # time.monotonic()
+        self._next_question = self._next_read = 0.0  # time.monotonic()
         self._refusal = ""  # why a question was refused that no patience answers
         self._said: str | None = None  # the problem of the link
         self._events: list[MapEvent] = []
@@ -141,12 +142,16 @@ class MapWatcher:
                 found, self._events = self._events, []
                 return found
             until = max(min(deadline, self._due()) - time.monotonic(), 0.0)
-            updates = [(self._updates.socket, zmq.POLLIN), (self._updates.events, zmq.POLLIN)]
-            zmq.zmq_poll([*self._inquiry.polled, *updates], int(1000 * min(until, 1.0)) + 1)
+            polled = [*self._inquiry.polled, (self._updates.events, zmq.POLLIN)]
+            if time.monotonic() >= self._next_read:
+                polled.append((self._updates.socket, zmq.POLLIN))
+            zmq.zmq_poll(polled, int(1000 * min(until, 1.0)) + 1)
 
     def _due(self) -> float:
         """When there is something to do although nothing comes."""
         waits = [self._inquiry.due]
+        if self._next_read > time.monotonic():
+            waits.append(self._next_read)
         if self._updates.due:
             waits.append(self._updates.due)
         if self._inquiry.may_ask:
@@ -212,9 +217,12 @@ class MapWatcher:
             self._events += cleared
 
     def _read_updates(self) -> None:
+        if time.monotonic() < self._next_read:
+            return
         mesh_topic, scan_topic = sockets.topics_of(self._map)
-        for _ in range(_MOST_AT_ONCE):
+        for count in range(_MOST_AT_ONCE):
             if not sockets.has_message(self._updates.socket):
+                self._next_read = time.monotonic() + (_TOGETHER_S if count else 0.0)
                 return
             topic, *frames = self._updates.socket.recv_multipart(zmq.NOBLOCK, copy=False)
             try:
