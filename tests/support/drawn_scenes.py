@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tsfusion.viewer import tile_glb
+
 # three.js, `ACESFilmicToneMapping`
 _IN = np.array(((0.59719, 0.35458, 0.04823), (0.07600, 0.90834, 0.01566), (0.02840, 0.13383, 0.83777)))
 _OUT = np.array(((1.60475, -0.53108, -0.07367), (-0.10208, 1.10813, -0.00605), (-0.00327, -0.07276, 1.07602)))
@@ -21,20 +23,30 @@ class Node:
         self._scene, self.name, self.visible = scene, name, True
         self.__dict__.update(fields)
 
+    def __setattr__(self, name: str, value: Any) -> None:
+        self.__dict__[name] = value
+        if name == "glb_data" and value != tile_glb.EMPTY:
+            self._scene.bytes_drawn += len(value)
+
     def remove(self) -> None:
         assert self._scene.nodes.pop(self.name) is self
 
 
 @dataclass
 class DrawnScene:
-    """Takes the place of `viser.SceneApi`."""
+    """Takes the place of `viser.SceneApi`.
+
+    Attributes:
+        bytes_drawn: of all models that were given to nodes; what is empty does not count.
+    """
 
     nodes: dict[str, Node] = field(default_factory=dict)
     bytes_drawn: int = 0
 
     def add_glb(self, name: str, glb_data: bytes, **fields: Any) -> Node:
-        self.bytes_drawn += len(glb_data)
-        return self._add(name, {"glb_data": glb_data, **fields})
+        node = self._add(name, fields)
+        node.glb_data = glb_data
+        return node
 
     def add_line_segments(self, name: str, points: Any, colors: Any, **fields: Any) -> Node:
         return self._add(name, {"points": points, "colors": colors, **fields})
@@ -44,6 +56,12 @@ class DrawnScene:
 
     def add_frame(self, name: str, **fields: Any) -> Node:
         return self._add(name, fields)
+
+    @property
+    def models(self) -> list[Any]:
+        """Nodes with a model that is not empty."""
+        nodes = [node for node in self.nodes.values() if "glb_data" in node.__dict__]
+        return [node for node in nodes if node.__dict__["glb_data"] != tile_glb.EMPTY]
 
     def shown(self, prefix: str = "") -> set[str]:
         """Names of the nodes that can be seen."""

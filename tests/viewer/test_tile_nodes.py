@@ -66,7 +66,7 @@ def test_bytes_a_second_are_bounded_and_everyone_has_a_turn() -> None:
         page.apply(floor(20, color=100 + len(sent) % 50))
         page.pass_time(0.05)
         sent.update(
-            name.rstrip("b") for name, node in page.scene.nodes.items() if before.get(name) != node.glb_data
+            node.name.rstrip("b") for node in page.scene.models if before.get(node.name) != node.glb_data
         )
     assert page.scene.bytes_drawn == page.nodes.bytes_sent
     assert rate * page.now / 2 < page.nodes.bytes_sent <= rate * (page.now + 1) + size
@@ -81,13 +81,30 @@ def test_of_many_versions_the_newest_is_sent_and_the_last_stays_until_it_is_read
     for color in (50, 90, 130):
         page.apply(floor(1, color=color))
     page.pass_time(PAUSE - 0.1)
-    assert len(page.scene.nodes) == 1, "a tile is not sent again at once"
+    assert len(page.scene.models) == 1, "a tile is not sent again at once"
     page.pass_time(0.1)
-    assert len(page.scene.nodes) == 2
+    assert len(page.scene.shown()) == len(page.scene.models) == 2
     page.pass_time(PAUSE)
-    (node,) = page.scene.nodes.values()
+    (node,) = page.scene.models
+    assert page.scene.shown() == {node.name}
     assert np.abs(decoded(node.glb_data).colors - 130).max() < 1
     assert page.scene.bytes_drawn == 2 * len(node.glb_data)
+    assert len(page.scene.nodes) == 2, "the other node is kept for the next version"
+    page.pass_time(6.0)
+    assert list(page.scene.nodes.values()) == [node], "but not for ever"
+
+
+def test_versions_change_between_two_nodes() -> None:
+    page = Page(1e9)
+    made = Counter[str]()
+    add = page.scene.add_glb
+    page.scene.add_glb = lambda name, *args, **fields: (made.update([name]), add(name, *args, **fields))[1]
+    for step in range(12):
+        page.apply(floor(1, color=10 * step))
+        page.pass_time(STEADY_PAUSE)
+        newest = [node for node in page.scene.models if node.visible]
+        assert any(np.abs(decoded(node.glb_data).colors - 10 * step).max() < 1 for node in newest)
+    assert made == {"/map/0_0_0": 1, "/map/0_0_0b": 1}
 
 
 def test_a_tile_that_changes_all_the_time_is_sent_half_as_often() -> None:
@@ -123,8 +140,9 @@ def test_what_a_plane_hides_is_not_sent_and_comes_back() -> None:
     assert not any(name.startswith("/map/2_0_0") for name in page.scene.shown())
     page.nodes.clip(Clipping())
     page.pass_time(4.0)
-    assert len(page.scene.shown()) == len(page.scene.nodes) == 3
-    for node in page.scene.nodes.values():
+    assert page.scene.shown() == {node.name for node in page.scene.models}
+    assert len(page.scene.models) == 3
+    for node in page.scene.models:
         model = decoded(node.glb_data)
         assert len(model.faces) == 2 * 39 * 39
         assert np.abs(model.colors - 60).max() < 1

@@ -112,7 +112,7 @@ def _tree(
 def _packed(tree: dict[str, Any], binary: bytes) -> bytes:
     text = json.dumps(tree, separators=(",", ":")).encode()
     chunks = b""
-    for kind, content, filler in ((b"JSON", text, b" "), (b"BIN\0", binary, b"\0")):
+    for kind, content, filler in ((b"JSON", text, b" "), (b"BIN\0", binary, b"\0"))[: 2 if binary else 1]:
         length = len(content) + -len(content) % 4
         chunks += struct.pack("<I4s", length, kind) + content.ljust(length, filler)
     return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
@@ -125,3 +125,4 @@ def _linear() -> NDArray[np.float32]:
 
 
 _LINEAR = _linear()
+EMPTY = _packed({"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": []}]}, b"")  # of nothing

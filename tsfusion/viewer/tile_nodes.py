@@ -17,9 +17,11 @@ if TYPE_CHECKING:
     import viser
 
 # Seconds between two versions of a tile, at least. A browser drops a model as soon as it is given another
-# one, and shows that only once it is read: so each is a node of its own, and the last one stays meanwhile.
+# one, and shows that only once it is read: so a tile has two nodes in turn, and the last one stays meanwhile.
+# A node costs viser ten times as much to make as to change: the other is kept, empty, while it may be needed.
 PAUSE = 1.0
 STEADY_PAUSE = 2.0  # of a tile that changes all the time: half of the work for everybody, and nobody sees it
+_SPARED = 5.0  # seconds that an empty node is kept after its last version
 _SOON = 0.5  # seconds after a pause within which a change is one of many
 _CUT_PAUSE = 0.25  # while somebody moves the clip plane
 _MARGIN = 1.0  # of a tile's edge that its triangles may reach beyond it
@@ -49,6 +51,7 @@ class TileNodes:
         self._sides: dict[Key, Side] = {}  # of what is in the scene
         self._nodes: dict[Key, viser.GlbHandle] = {}
         self._last: dict[Key, tuple[viser.GlbHandle, float]] = {}  # versions before, and when they go
+        self._spare: dict[Key, tuple[viser.GlbHandle, float]] = {}  # empty nodes, and when they go
         self._cut: set[Key] = set()  # wait because of the clipping
         self._hidden: set[Key] = set()  # have changed while they were not to be seen
         self.clipping = Clipping()
@@ -57,9 +60,8 @@ class TileNodes:
 
     def is_due(self, now: float) -> bool:
         """Whether `send` has something to do."""
-        return any(now >= end for _, end in self._last.values()) or any(
-            now >= self._due(key) for key in self._waiting
-        )
+        ends = (end for nodes in (self._last, self._spare) for _, end in nodes.values())
+        return any(now >= end for end in ends) or any(now >= self._due(key) for key in self._waiting)
 
     def has(self, key: Key) -> bool:
         """Whether the scene has a version of a tile."""
@@ -67,11 +69,13 @@ class TileNodes:
 
     def clear(self) -> None:
         """Take everything out of the scene."""
-        for node in (*self._nodes.values(), *(node for node, _ in self._last.values())):
+        older = (node for nodes in (self._last, self._spare) for node, _ in nodes.values())
+        for node in (*self._nodes.values(), *older):
             node.remove()
         for kept in (
             self._nodes,
             self._last,
+            self._spare,
             self._waiting,
             self._sent_at,
             self._pauses,
@@ -105,9 +109,12 @@ class TileNodes:
     def send(self, now: float) -> int:
         """Send what is due; the number of tiles that were."""
         count = 0
-        for key, (node, end) in list(self._last.items()):
+        for key, (_, end) in list(self._last.items()):
             if now >= end:
-                del self._last[key]
+                self._empty_last(key, now)
+        for key, (node, end) in list(self._spare.items()):
+            if now >= end:
+                del self._spare[key]
                 node.remove()
         for key in list(self._waiting):
             due = self._due(key)
@@ -116,7 +123,7 @@ class TileNodes:
             if self._bucket.wait(1.0, now) > 0:
                 break
             del self._waiting[key]
-            size = self._send(key, now + (_CUT_PAUSE if key in self._cut else PAUSE))
+            size = self._send(key, now)
             self._cut.discard(key)
             if size:
                 self._sent_at[key] = now
@@ -136,17 +143,15 @@ class TileNodes:
         mesh = Mesh(tile.mesh.vertices, tile.mesh.faces, tile.mesh.normals, self._colors.colors(key, tile))
         return mesh if self.clipping.side(tile.bounds) == "whole" else self.clipping.cut(mesh)
 
-    def _send(self, key: Key, end: float) -> int:
-        """Bring a tile into the scene as it is now; the bytes that takes.
-
-        Args:
-            end: when the version before goes.
-        """
+    def _send(self, key: Key, now: float) -> int:
+        """Bring a tile into the scene as it is now; the bytes that takes."""
         tile, node = self._tiles.tiles.get(key), self._nodes.get(key)
         if tile is None:
             if node is not None:
                 self._hide(key, node)
                 self._nodes.pop(key).remove()
+            if key in self._spare:
+                self._spare.pop(key)[0].remove()
             self._sides.pop(key, None)
             return 0
         side = self.clipping.side(tile.bounds)
@@ -157,24 +162,42 @@ class TileNodes:
                 self._hide(key, node)
             return 0
         self._sides[key] = side
-        return self._put(key, mesh, end)
+        return self._put(key, mesh, now)
 
     def _hide(self, key: Key, node: "viser.GlbHandle") -> None:
         node.visible = False
         if key in self._last:
             self._last.pop(key)[0].remove()
 
-    def _put(self, key: Key, mesh: Mesh, end: float) -> int:
+    def _put(self, key: Key, mesh: Mesh, now: float) -> int:
         edge = self._tiles.edge * CELL * self.voxel_size
         corner = edge * (np.array(key, np.float64) - _MARGIN)
         assert mesh.colors is not None
         content = tile_glb.encode(mesh.vertices, mesh.faces, mesh.colors, corner, self.voxel_size)
-        names = ["/map/" + "_".join(map(str, key)) + version for version in ("", "b")]
-        node = self._nodes.get(key)
         if key in self._last:
-            self._last.pop(key)[0].remove()
+            self._empty_last(key, now)
+        node = self._nodes.get(key)
         if node is not None:
-            self._last[key] = (node, end)
-            names.remove(node.name)
-        self._nodes[key] = self._scene.add_glb(names[0], content, cast_shadow=False, receive_shadow=False)
+            self._last[key] = (node, now + (_CUT_PAUSE if key in self._cut else PAUSE))
+        if key in self._spare:
+            other, _ = self._spare.pop(key)
+        else:
+            other = self._add(key, node)
+        other.glb_data = content
+        other.visible = True
+        self._nodes[key] = other
         return len(content)
+
+    def _add(self, key: Key, node: "viser.GlbHandle | None") -> "viser.GlbHandle":
+        """An empty node beside another one. What it is made with stays in viser's memory as long as it lives."""
+        names = ["/map/" + "_".join(map(str, key)) + version for version in ("", "b")]
+        if node is not None:
+            names.remove(node.name)
+        return self._scene.add_glb(names[0], tile_glb.EMPTY, cast_shadow=False, receive_shadow=False)
+
+    def _empty_last(self, key: Key, now: float) -> None:
+        """Take the version before out of the scene, and keep its node."""
+        node, _ = self._last.pop(key)
+        node.visible = False
+        node.glb_data = tile_glb.EMPTY
+        self._spare[key] = (node, now + _SPARED)
