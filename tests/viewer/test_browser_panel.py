@@ -61,6 +61,24 @@ def test_a_slow_browser_that_tells_an_older_place_keeps_its_camera(clock: Simple
     assert browser.choice.value == WHOLE
 
 
+def test_a_camera_that_is_turned_away_is_moved_there_again(clock: SimpleNamespace) -> None:
+    """The up direction and the camera's place reach a browser in either order: the one turns the other."""
+    browser = Browser()
+    browser.tells(np.array((0.0, -5, 0)))
+    clock.s += 0.3
+    browser.panel.update()
+    assert browser._camera.position is not FIRST, "it may be on its way"
+    clock.s += 1
+    browser.panel.update()
+    assert browser._camera.position is FIRST
+    browser.tells(FIRST)
+    browser._camera.position = SECOND
+    clock.s += 5
+    browser.panel.update()
+    assert browser._camera.position is SECOND, "it has been there"
+    assert browser.choice.value == WHOLE
+
+
 def test_a_camera_that_leaves_its_place_is_moved_by_hand(clock: SimpleNamespace) -> None:
     browser = Browser()
     browser.tells(FIRST + 0.01)

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 WHOLE, BY_HAND, _FOLLOW = "Whole map", "By hand", "Follow "
 _SETTLED = 10.0  # seconds after a move of ours, in which a slow browser may still tell older places
+_AGAIN = 1.0  # seconds after which a camera that is elsewhere is moved once more: the up direction may turn it
 _MOVED = 0.02  # of the distance to the target: further away, somebody moved the camera
 _RENDER = 30.0  # seconds that a browser may take for a picture
 _NARROW = 576  # pixels: up to there viser puts the panel over the lower half of the picture
@@ -70,7 +71,8 @@ class BrowserPanel:
     ) -> None:
         self._client, self._shown = client, shown
         self._commanded: View | None = None
-        self._moved_at = 0.0
+        self._moved_at = self._sent_at = 0.0
+        self._is_elsewhere = False  # than where we moved it, as the browser tells
         self._has_arrived = False  # whether the browser has been where we moved its camera
         self._points: list[NDArray[np.float64]] = []
         self._marks: list[Any] = []
@@ -96,10 +98,16 @@ class BrowserPanel:
         names = (WHOLE, BY_HAND, *dict.fromkeys(_FOLLOW + name for _, name in self._shown.scanners()))
         if tuple(self._camera.options) != names:
             self._camera.options = names
-        view = self._wanted()
-        if view is None or not self._differs(view):
+        view, now = self._wanted(), time.monotonic()
+        if view is None:
             return
-        self._commanded, self._moved_at, self._has_arrived = view, time.monotonic(), False
+        if self._differs(view):
+            self._commanded, self._moved_at = view, now
+        elif not self._is_elsewhere or now < self._sent_at + _AGAIN:
+            return
+        view = self._commanded
+        assert view is not None
+        self._sent_at, self._has_arrived, self._is_elsewhere = now, False, False
         with self._client.atomic():
             self._client.camera.position = view.position
             self._client.camera.look_at = view.target
@@ -135,9 +143,11 @@ class BrowserPanel:
             return
         distance = float(np.linalg.norm(view.position - view.target))
         if float(np.linalg.norm(self._client.camera.position - view.position)) <= _MOVED * distance:
-            self._has_arrived = True
+            self._has_arrived, self._is_elsewhere = True, False
         elif self._has_arrived or time.monotonic() >= self._moved_at + _SETTLED:
-            self._camera.value = BY_HAND
+            self._camera.value, self._is_elsewhere = BY_HAND, False
+        else:
+            self._is_elsewhere = True
 
     def _toggle_measuring(self) -> None:
         self._is_measuring = not self._is_measuring
