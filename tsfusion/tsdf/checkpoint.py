@@ -66,11 +66,13 @@ class Chunk(NamedTuple):
 class Piece(NamedTuple):
     """Up to 1024 blocks of a checkpoint that is being written.
 
-    Either `rows`: the keys, then the layers of the header in its order; or the `frame` of a `Chunk`.
+    Either `rows`: the keys, then the layers of the header in its order; or all of that in one array,
+    `content`; or the `frame` of a `Chunk`.
     """
 
     blocks: int
     rows: Rows = ()
+    content: NDArray[np.uint8] | None = None
     frame: bytes = b""
 
 
@@ -190,6 +192,27 @@ def copy(source: Path, target: Path, alter: Callable[[CheckpointHeader], None]) 
     return target
 
 
+def split(content: NDArray[np.uint8], layers: Iterable[str]) -> tuple[NDArray[np.int64], dict[str, Any]]:
+    """The keys (n,) and the rows (n, 512) of each layer that lie in a chunk's bytes one after the other.
+
+    Args:
+        content: as `array_for` makes it, or a whole chunk; the arrays are views of it.
+    """
+    layers = list(layers)
+    blocks = len(content) // _block_bytes(layers)
+    rows, at = dict[str, Any](), 8 * blocks
+    for name in layers:
+        end = at + blocks * CUBE * np.dtype(LAYER_DTYPES[name]).itemsize
+        rows[name] = content[at:end].view(LAYER_DTYPES[name]).reshape(blocks, CUBE)
+        at = end
+    return content[: 8 * blocks].view(np.int64), rows
+
+
+def array_for(blocks: int, layers: Iterable[str]) -> NDArray[np.uint8]:
+    """Room for the bytes of a chunk of some blocks."""
+    return np.empty(blocks * _block_bytes(layers), np.uint8)
+
+
 @contextmanager
 def reading(path: Path, *, is_checked: bool = False) -> Iterator[tuple[CheckpointHeader, Iterator[Chunk]]]:
     """Header and chunks of a checkpoint, for the block to put straight into their place.
@@ -232,6 +255,9 @@ def _payloads(
         left -= piece.blocks
         if piece.frame:
             yield [piece.frame]
+            continue
+        if piece.content is not None:  # at once is a quarter faster than bit by bit
+            yield [zstandard.ZstdCompressor(level=1).compress(piece.content.data)]
             continue
         size = piece.blocks * _block_bytes(header.layers)
         compressor = zstandard.ZstdCompressor(level=1).compressobj(size=size)

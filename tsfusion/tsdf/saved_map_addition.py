@@ -21,7 +21,7 @@ from tsfusion.geometry.up_direction import HeldSensor
 from tsfusion.kernels.integrate import WEIGHT_LIMIT
 from tsfusion.kernels.sensor_noise import WEIGHT_ONE
 from tsfusion.tsdf import checkpoint, map_history
-from tsfusion.tsdf.checkpoint import CHUNK, CUBE, LAYER_DTYPES, CheckpointHeader, Chunk, Piece
+from tsfusion.tsdf.checkpoint import CHUNK, CUBE, CheckpointHeader, Chunk, Piece
 from tsfusion.tsdf.map_addition import added_colors
 from tsfusion.tsdf.readable_map import HELD, begin_hash
 
@@ -191,10 +191,9 @@ class _Stream:
             yield keys, {name: rows[first : first + now] for name, rows in self._rows.items()}
 
     def _read(self, chunk: Chunk) -> None:
-        chunk.fill(np.empty(chunk.blocks, np.int64))
-        self._rows = {name: np.empty((chunk.blocks, CUBE), LAYER_DTYPES[name]) for name in self._layers}
-        for rows in self._rows.values():
-            chunk.fill(rows)
+        content = checkpoint.array_for(chunk.blocks, self._layers)
+        chunk.fill(content)
+        _, self._rows = checkpoint.split(content, self._layers)
 
 
 def _pieces(streams: Sequence[_Stream], layers: Sequence[str], digest: _Digest) -> Iterator[Piece]:
@@ -213,25 +212,38 @@ def _sum(
     keys: NDArray[np.int64], streams: Sequence[_Stream], layers: Sequence[str], digest: _Digest
 ) -> Piece:
     """The sums of some blocks, whose keys are all that the streams have next."""
-    sums: Rows = {name: np.zeros((len(keys), CUBE), LAYER_DTYPES[name]) for name in layers}
+    content = checkpoint.array_for(len(keys), layers)
+    own, sums = checkpoint.split(content, layers)
+    own[:] = keys
     is_there = np.zeros(len(keys), bool)
     for stream in streams:
         for theirs, rows in stream.take(int(keys[-1])):
             at = np.searchsorted(keys, theirs)
-            _add(sums, rows, at, is_there[at])
+            again = is_there[at]
+            if again.any():
+                _add(sums, {name: one[again] for name, one in rows.items()}, at[again])
+                _put(sums, {name: one[~again] for name, one in rows.items()}, at[~again])
+            else:
+                _put(sums, rows, at)
             is_there[at] = True
     digest.add(keys, sums["sums"])
-    return Piece(len(keys), [("keys", keys), *sums.items()])
+    return Piece(len(keys), content=content)
 
 
-def _add(sums: Rows, piece: Rows, at: NDArray[np.int64], is_there: NDArray[np.bool_]) -> None:
-    """Add rows to the rows `at`, of which some are there already."""
-    if not is_there.any():
-        for name, rows in piece.items():
-            sums[name][at] = rows
+def _put(sums: Rows, rows: Rows, at: NDArray[np.int64]) -> None:
+    """Write the rows `at` of blocks that nothing was written for."""
+    if not len(at):
         return
+    run = slice(int(at[0]), int(at[-1]) + 1)  # mostly they lie side by side
+    where: Any = run if run.stop - run.start == len(at) else at
+    for name, one in rows.items():
+        sums[name][where] = one
+
+
+def _add(sums: Rows, rows: Rows, at: NDArray[np.int64]) -> None:
+    """Add to the rows `at`."""
     both = sums["sums"][at]
-    both += piece["sums"]  # to zeros, where there is nothing yet
+    both += rows["sums"]
     if (is_full := both & WEIGHT_LIMIT).any():  # the limit is a bit, and twice as much the lane's end
         full = int(is_full.any(axis=1).sum())
         raise WeightOverflow(
@@ -241,7 +253,7 @@ def _add(sums: Rows, piece: Rows, at: NDArray[np.int64], is_there: NDArray[np.bo
     sums["sums"][at] = both
     if "color_rgn" in sums:
         here = sums["color_rgn"][at], sums["color_b"][at]
-        there = piece["color_rgn"], piece["color_b"]
+        there = rows["color_rgn"], rows["color_b"]
         sums["color_rgn"][at], sums["color_b"][at] = added_colors(here, there)
     if "correction" in sums:  # smoothed values are no sums
-        sums["correction"][at] = np.where(is_there[:, None], 0, piece["correction"])
+        sums["correction"][at] = 0
