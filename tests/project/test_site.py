@@ -11,6 +11,7 @@ from types import ModuleType, SimpleNamespace
 
 import pytest
 import typer
+from headless_browser import browser
 from repository import ROOT
 
 import tsfusion
@@ -79,6 +80,36 @@ def test_each_drawing_takes_the_colours_of_the_page(site: Path) -> None:
     page = (site / "concepts.html").read_text(encoding="utf-8")
     assert page.count('<div class="drawing"><svg') == 2
     assert "prefers-color-scheme: dark) { }" in page or ":root {" not in page
+
+
+def test_search_finds_a_page_in_a_folder_without_a_server(site: Path) -> None:
+    for opened in ("index.html", "reference/wire.html"):
+        with browser() as chromium:
+            chromium.open(site / opened)
+            chromium.wait(
+                "(() => { const field = document.querySelector('[data-md-component=search-query]');"
+                "field.focus(); field.value = 'quarantine'; field.dispatchEvent(new Event('keyup'));"
+                "return document.querySelector('.md-search-result__item a') !== null; })()"
+            )
+            found = chromium.evaluate(
+                "[...document.querySelectorAll('.md-search-result__item a')].map((link) => link.href)"
+            )
+            assert any(link.partition("?")[0] == (site / "glossary.html").as_uri() for link in found), found
+            assert not chromium.errors
+            assert all(address.startswith(("file:", "data:", "about:")) for address in chromium.requests)
+
+
+@pytest.mark.slow
+def test_each_page_fits_a_phone_and_shows_its_pictures(site: Path) -> None:
+    with browser() as chromium:
+        for page in sorted(site.rglob("*.html")):
+            if page.name == "404.html":  # its addresses are those of a server
+                continue
+            chromium.open(page, width=390, height=844)
+            place = page.relative_to(site)
+            assert chromium.evaluate("document.documentElement.scrollWidth") <= 390, f"{place}: too wide"
+            lazy = "[...document.images].filter((image) => !image.complete || !image.naturalWidth)"
+            assert chromium.evaluate(f"{lazy}.map((image) => image.src)") == [], f"{place}: no such picture"
 
 
 def hooks() -> ModuleType:
