@@ -277,7 +277,7 @@ FAULTS = (
         "gateway/memory_guard.py",
         "        exceeded = held > self._bound\n",
         "        exceeded = False\n",
-        "gateway/test_ports.py::test_who_fills_the_memory_is_cut_off_alone",
+        "end_to_end/test_hostile_load.py::test_memory_that_does_not_come_back_is_reported_once",
     ),
     # spool and outbox: nothing goes that is not acknowledged, no number comes twice
     Fault(
