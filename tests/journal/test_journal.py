@@ -267,6 +267,23 @@ def test_an_entry_in_the_middle_can_be_removed(tmp_path: Path) -> None:
     spool.remove(1)
     assert [entry.seq for entry in spool.waiting] == [1, 3]
     spool.close()
+    again = Spool(tmp_path, 100_000)
+    assert [entry.seq for entry in again.waiting] == [1, 3]  # nor does the next scanner send it
+    again.close()
+
+
+def test_what_was_written_and_is_not_queued_yet_stays(tmp_path: Path) -> None:
+    """One thread writes; what came before may be acknowledged to another one meanwhile."""
+    spool = Spool(tmp_path, 100_000)
+    put(spool, 1)
+    entry = spool.write([b"head", b""])
+    spool.drop(1)
+    spool.add(entry)
+    assert segment_path(tmp_path, 1).exists()
+    spool.close()
+    again = Spool(tmp_path, 100_000)
+    assert [one.seq for one in again.waiting] == [2]
+    again.close()
 
 
 def test_the_quarantine_keeps_to_its_limits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
