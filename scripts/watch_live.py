@@ -9,8 +9,8 @@ The keyframes are those of `scripts/ask_live.py`. Two servers run, and a scanner
 every few seconds: the one is watched, the other is not. A JSON line for each watcher (a process of its own):
 CPU seconds a second, updates, triangles and bytes a second, and whether it holds the map in the end. A line
 for each page (`tsfusion view`): CPU seconds a second of its process while the watched server gets keyframes,
-and what a browser reads of it, which draws nothing. The last line has the keyframes' delay, captured → fused,
-with and without watchers.
+and what a browser reads of it, which draws nothing (`--browser real` for one that does). The last line has
+the keyframes' delay, captured → fused, with and without watchers.
 """
 
 import argparse
@@ -33,6 +33,7 @@ from ask_live import FIRST, TURN, Scanner
 from delivery import PATIENCE, _keyframes
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
+from headless_browser import browser
 from keyframes_and_servers import serving
 from live_pages import address_of, viewing
 from reading_browser import ReadingBrowser
@@ -43,6 +44,7 @@ from tsfusion.wire.map_watcher import MapWatcher
 from tsfusion.wire.queries import fetch_health, fetch_mesh
 
 TARGET = 1.10  # the keyframes' delay, p95, with watchers : without
+BROWSERS = ("reading", "real", "none")
 SETTLED_S = 5.0  # without an event: the watcher has all
 
 
@@ -70,12 +72,19 @@ class Watched:
 
 
 class Page:
-    """A live page in a process of its own, and a browser that reads it."""
+    """A live page in a process of its own, and a browser that has it open.
 
-    def __init__(self, address: str) -> None:
-        self._stack = ExitStack()
+    Args:
+        kind: of the browser: one of `BROWSERS`.
+    """
+
+    def __init__(self, address: str, kind: str) -> None:
+        self._kind, self._stack = kind, ExitStack()
         self._process = self._stack.enter_context(viewing(address, "--listen", "127.0.0.1:0"))
-        self._browser = ReadingBrowser(address_of(self._process))
+        url = address_of(self._process)
+        self._reading = ReadingBrowser(url) if kind == "reading" else None
+        if kind == "real":
+            self._stack.enter_context(browser()).open(url, width=960, height=540)
         self._seconds = self._cpu = 0.0
 
     @contextmanager
@@ -88,12 +97,9 @@ class Page:
 
     def finish(self) -> dict[str, Any]:
         """End it; its figures."""
-        read = self._browser.close()
+        read = {} if self._reading is None else {"mb_read": round(self._reading.close() / 1e6, 1)}
         self._stack.close()
-        return {
-            "page_cpu": round(self._cpu / self._seconds, 4),
-            "mb_read": round(read / 1e6, 1),
-        }
+        return {"browser": self._kind, "page_cpu": round(self._cpu / self._seconds, 4), **read}
 
     def _cpu_s(self) -> float:
         fields = Path(f"/proc/{self._process.pid}/stat").read_text().rpartition(")")[2].split()
@@ -153,6 +159,9 @@ def main() -> int:
     parser.add_argument("--watchers", type=int, default=1)
     parser.add_argument("--stalled", type=int, default=0, help="of these, how many read nothing meanwhile")
     parser.add_argument("--pages", type=int, default=0, help="live pages, beside the watchers")
+    parser.add_argument(
+        "--browser", choices=BROWSERS, default="reading", help="real: Chromium, which draws on the same cores"
+    )
     parser.add_argument("--voxel-size", type=float, default=0.02)
     options = parser.parse_args()
     _, source = _keyframes()
@@ -169,7 +178,7 @@ def main() -> int:
             scanner.send(server.address, FIRST, options.rate)
             scanner.wait()
         watchers = [Watched(watched.address, is_stalled=i < options.stalled) for i in range(options.watchers)]
-        pages = [Page(watched.address) for _ in range(options.pages)]
+        pages = [Page(watched.address, options.browser) for _ in range(options.pages)]
         time.sleep(SETTLED_S if pages else 0.0)  # they show what there is
         for _ in range(0, count, TURN):
             with ExitStack() as during:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 WHOLE, BY_HAND, _FOLLOW = "Whole map", "By hand", "Follow "
 _SETTLED = 10.0  # seconds after a move of ours, in which a slow browser may still tell older places
-_AGAIN = 1.0  # seconds after which a camera that is elsewhere is moved once more: the up direction may turn it
+_AGAIN = 1.0  # seconds after which a camera is moved once more that a new up direction has turned
 _MOVED = 0.02  # of the distance to the target: further away, somebody moved the camera
 _RENDER = 30.0  # seconds that a browser may take for a picture
 _NARROW = 576  # pixels: up to there viser puts the panel over the lower half of the picture

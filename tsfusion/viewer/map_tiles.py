@@ -170,7 +170,7 @@ def _newest_rows(updates: Sequence[SurfaceUpdate]) -> list[NDArray[np.int64]]:
 def _as_one(
     updates: Sequence[SurfaceUpdate], rows_of: Sequence[NDArray[np.int64]]
 ) -> tuple[Mesh, NDArray[np.int64], NDArray[np.int64]]:
-    """The mesh of some cells of several updates; of each cell its first face there, and how many faces it has.
+    """The mesh of some cells of several updates; of each cell its first face there, and the number of faces.
 
     Args:
         rows_of: the rows of those cells, ascending, of each update.

@@ -189,7 +189,7 @@ class TileNodes:
         return len(content)
 
     def _add(self, key: Key, node: "viser.GlbHandle | None") -> "viser.GlbHandle":
-        """An empty node beside another one. What it is made with stays in viser's memory as long as it lives."""
+        """An empty node beside another one: what it is made with stays in viser's memory as long as it."""
         names = ["/map/" + "_".join(map(str, key)) + version for version in ("", "b")]
         if node is not None:
             names.remove(node.name)
