@@ -40,11 +40,14 @@ if TYPE_CHECKING:
 
 MAX_BYTES_PER_SECOND = 8e6  # to each browser, as triangles
 _WAIT = 0.1  # seconds that are waited for an event
-_SHARE = 0.012  # of a core, for putting updates into tiles: many at once cost little more than one
-_TOGETHER = (0.2, 1.0)  # seconds of updates that are taken at once, at least and at most
+_SHARE = 0.008  # of a core, for putting updates into tiles: many at once cost little more than one
+_TOGETHER = (0.25, 1.0)  # seconds of updates that are taken at once, at least and at most
 _MOST_UPDATES = 64  # that wait for that
 _BEHIND = 50  # voxels that a following camera is behind a scanner
 _SETTLED = 0.25  # seconds that a time slider rests before the map is rewound
+_DRAW = (
+    0.25  # seconds between two sendings to browsers: each wakes the web server
+)
 _OFTEN, _SELDOM = 0.3, 1.0  # seconds between two looks at cameras, and at scales and states
 
 log = logging.getLogger(__name__)
@@ -90,7 +93,7 @@ class LivePage:
         self._colors.name_clients(self._marks.name)
         self._whole_views = map_views.WholeViews(self._tiles)
         self._browsers: dict[int, BrowserPanel] = {}
-        self._looked, self._reckoned = -np.inf, -np.inf
+        self._drawn = self._looked = self._reckoned = -np.inf
         self._lock = threading.Lock()  # of `_browsers`
         set_theme(server.gui, dark=False)
         self._panel = SharedPanel(server.gui, feed, self._colors.names, self._marks.show)
@@ -172,7 +175,8 @@ class LivePage:
             self._reckon()
         if not self._browsers:
             return
-        if self._nodes.is_due(now) or self._marks.is_due(now):
+        if now >= self._drawn + _DRAW and (self._nodes.is_due(now) or self._marks.is_due(now)):
+            self._drawn = now
             with self._server.atomic():  # else each message wakes the web server's thread
                 self._nodes.send(now)
                 self._marks.draw(now)

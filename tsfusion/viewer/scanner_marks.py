@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
 _PICTURE_PAUSE = 1.0  # seconds between two pictures of a scanner, at least
 _PATH_PAUSE = 1.0  # seconds between two versions of a path
-_PLACE_PAUSE = 0.2  # seconds between two places of a scanner
 _MOST_POINTS = 3000  # of a drawn path
 _WIDTHS = {"paths": 4.0, "first paths": 1.5}  # pixels
 _FADED = 0.6  # of the way to grey
@@ -37,7 +36,6 @@ class _Scanner:
     is_found: bool = False  # in an event with all paths
     is_placed: bool = False  # the frustum is where it belongs
     is_drawn: bool = False  # so is the path
-    placed_at: float = -math.inf
     path_at: float = -math.inf
     picture_at: float = -math.inf
     picture: bytes | None = None
@@ -113,7 +111,7 @@ class ScannerMarks:
     def is_due(self, now: float) -> bool:
         """Whether `draw` has something to do."""
         return any(
-            (not one.is_placed and now >= one.placed_at + _PLACE_PAUSE)
+            not one.is_placed
             or (not one.is_drawn and now >= one.path_at + _PATH_PAUSE)
             or (one.picture is not None and now >= one.picture_at + _PICTURE_PAUSE)
             for one in self._scanners.values()
@@ -122,8 +120,8 @@ class ScannerMarks:
     def draw(self, now: float) -> None:
         """Bring what has changed into the scene."""
         for session, scanner in self._scanners.items():
-            if not scanner.is_placed and now >= scanner.placed_at + _PLACE_PAUSE:
-                scanner.placed_at, scanner.is_placed = now, True
+            if not scanner.is_placed:
+                scanner.is_placed = True
                 self._place(session, scanner)
             self._hang_picture(scanner, now)
             if scanner.is_drawn:

@@ -25,7 +25,7 @@ from tsfusion.wire.messages import Reply
 from tsfusion.wire.questions import MOST_POINTS, Answer, Cells, Keyframes
 
 _MOST_AT_ONCE = 16  # updates of one call
-_TOGETHER_S = 0.1  # from one reading of updates to the next: each awakening costs
+_TOGETHER_S = 0.2  # from one reading of updates to the next: each awakening costs
 _PAUSE_S, _BUSY_PAUSE_S = 0.02, 0.05  # between two questions; while the map has keyframes to fuse
 _RETRY_S = 0.5  # after a question that was refused or not answered
 _WEIGHTS_S = 2.0  # that a question for weights may take
