@@ -3,6 +3,7 @@
 
 import json
 import os
+import shutil
 import signal
 from collections.abc import Sequence
 from pathlib import Path
@@ -183,8 +184,19 @@ def test_sources_that_do_not_add_up_are_refused(state: Path, tmp_path: Path) -> 
     for twice in (str(state), f"{state}/."), ("synthetic:room", "synthetic:room"):
         with pytest.raises(MapError, match="is given 2 times"):
             keyframe_sources.listed(twice)
-    with pytest.raises(MapError, match="both hold 11 keyframes of the same session"):
-        keyframe_sources.listed([str(state), str(state / "journal")])
+    (tmp_path / "again").symlink_to(state)
+    for again in (str(tmp_path / "again"), f"file://{state}"):
+        with pytest.raises(MapError, match="is given 2 times"):
+            keyframe_sources.listed([str(state), again])
+    whole = tmp_path / "recording"
+    (whole / "first").mkdir(parents=True)
+    (tmp_path / "part").symlink_to(whole / "first")
+    with pytest.raises(MapError, match=f"part lies in {whole}: its keyframes would count twice"):
+        keyframe_sources.listed([str(tmp_path / "part"), str(whole)])
+    copy = shutil.copytree(state / "journal", tmp_path / "copy")
+    for other in (state / "journal", tmp_path / "again" / "journal", copy):
+        with pytest.raises(MapError, match="both hold 11 keyframes of the same session"):
+            keyframe_sources.listed([str(state), str(other)])
     one, other = (
         write_journal(tmp_path / name, 5, bytes([i] * 16), world=name)
         for i, name in enumerate(("one", "two"), 1)

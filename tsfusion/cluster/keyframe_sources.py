@@ -167,12 +167,36 @@ def _saved_settings(path: Path, map_name: str | None) -> VolumeConfig | None:
 
 
 def _check_once(sources: Sequence[str]) -> None:
-    places = Counter(
-        one if "://" in one or one.startswith(SYNTHETIC) else os.path.realpath(one) for one in sources
-    )
-    for place, times in places.items():
+    """Refuse a source that is given twice: by links, as a URL of this machine, or a dataset's part beside it.
+
+    Of journals `_check_distinct` asks the records, wherever they lie.
+    """
+    places = [_place(one) for one in sources]
+    for place, times in Counter(places).items():
         if times > 1:
             raise MapError(f"{place} is given {times} times: its keyframes would count as often")
+    folders = {
+        place: source
+        for place, source in zip(places, sources, strict=True)
+        if os.path.isabs(place) and len(sources) > 1 and not _is_journal(source)
+    }
+    for place, source in folders.items():
+        whole = next((str(one) for one in Path(place).parents if str(one) in folders), None)
+        if whole is not None:
+            raise MapError(
+                f"{source} lies in {folders[whole]}: its keyframes would count twice; give one of them, or "
+                "move what is no part of the other elsewhere"
+            )
+
+
+def _place(source: str) -> str:
+    """What a source is told from others by: of this machine an absolute path without links."""
+    if source.startswith(SYNTHETIC):
+        return source
+    path = source.removeprefix("file://")
+    if "://" in path:
+        return path.rstrip("/")
+    return os.path.realpath(os.path.expanduser(path))
 
 
 def _check_distinct(seen: dict[tuple[bytes, int], str], keyframes: JournaledKeyframes, source: str) -> None:
