@@ -11,8 +11,10 @@ import trimesh
 from keyframes_and_servers import pose, wall
 
 from tsfusion import Volume, VolumeConfig
-from tsfusion.cluster import tiling
+from tsfusion.cluster import mesh_runs, tiling
 from tsfusion.core.errors import InvalidConfig
+from tsfusion.geometry.mesh_parts import joined
+from tsfusion.tsdf import field_regularizer, mesh_tiles
 
 CONFIG = VolumeConfig(voxel_size=0.02, threads=1)
 
@@ -58,6 +60,28 @@ def test_tiles_are_the_whole_mesh(volume: Volume, tmp_path: Path, surface: Any) 
 
         apart, _ = cKDTree(whole.vertices).query(np.concatenate([tile.vertices for tile in tiles]))
         assert apart.max() < 0.01 * CONFIG.voxel_size
+
+
+@pytest.mark.parametrize("surface", ["raw", "field", "normal"])
+def test_runs_of_a_mesh_are_the_whole_one_bit_for_bit(
+    volume: Volume, tmp_path: Path, surface: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(field_regularizer, "BATCH", 64)  # blocks a tile
+    file = volume.save(tmp_path / "map.tsf")
+    whole = volume.extract_mesh(surface=surface)
+    blocks = volume.stats().blocks
+    assert mesh_runs.shares(64, 8) == []
+    for workers in (2, 5, 1000):
+        shares = mesh_runs.shares(blocks, workers)
+        assert [one for share in shares for one in share] == list(range(-(-blocks // 64)))
+        files = [tmp_path / f"{workers}-{number}.npz" for number in range(len(shares))]
+        for path, share in zip(files, shares, strict=True):
+            mesh_runs.write(path, mesh_runs.make(file, share, {"surface": surface}))
+        runs = [mesh_runs.read(path) for path in files]
+        assert sum(len(one.open_at) for one in runs) > 0
+        made = joined(list(mesh_tiles.together(reversed(runs))))
+        for name in ("vertices", "faces", "normals", "colors"):
+            np.testing.assert_array_equal(getattr(made, name), getattr(whole, name))
 
 
 def test_tiles_are_as_large_as_a_worker_can_hold(volume: Volume, tmp_path: Path) -> None:

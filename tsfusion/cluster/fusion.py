@@ -14,7 +14,7 @@ from typing import Any, Protocol
 
 import msgspec
 
-from tsfusion.cluster import jobs, tiling
+from tsfusion.cluster import jobs, mesh_runs, tiling
 from tsfusion.cluster.carrying_out import CarryingOut
 from tsfusion.cluster.jobs import Done, Progress
 from tsfusion.cluster.keyframe_sources import Listed
@@ -235,7 +235,9 @@ class _Run:
         with checkpoint.reading(self._work / file) as (header, _):
             map_hash, blocks = header.map_hash, header.blocks
         with self._clock.step("meshing") as ended:
-            mesh = self._mesh(doing, file)
+            runs = self._mesh_runs(doing, file, blocks, scheduler.workers)
+            ended.extend(runs)
+            mesh = self._mesh(doing, file, runs)
             ended.append(mesh)
             tiles = self._tiles(doing, file, mesh)
             ended.extend(tiles)
@@ -310,8 +312,24 @@ class _Run:
             files = [one.files[0] for one in done]
         return files[0], ended
 
-    def _mesh(self, doing: CarryingOut, file: str) -> Done:
+    def _mesh_runs(self, doing: CarryingOut, file: str, blocks: int, workers: int) -> list[Done]:
+        """Parts of the whole mesh by all workers, where the map fits into the memory of one."""
         self._display.stage("meshing")
+        if self._wishes.worker_memory is not None:
+            return []
+        return doing.do(
+            jobs.MeshRun(
+                name=f"run-{_digest([file, one.start, one.stop])}",
+                file=file,
+                view=self._view,
+                first=one.start,
+                stop=one.stop,
+                **self._common,
+            )
+            for one in mesh_runs.shares(blocks, workers)
+        )
+
+    def _mesh(self, doing: CarryingOut, file: str, runs: list[Done]) -> Done:
         wishes = self._wishes
         (done,) = doing.do(
             [
@@ -319,6 +337,7 @@ class _Run:
                     name=f"mesh-{_digest([file, wishes.up, wishes.keep_islands])}",
                     file=file,
                     view=self._view,
+                    runs=[one.files[0] for one in runs],
                     up=wishes.up,
                     keep_islands=wishes.keep_islands,
                     **self._common,

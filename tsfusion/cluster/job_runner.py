@@ -13,7 +13,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from tsfusion.cluster import jobs, keyframe_sources
+from tsfusion.cluster import jobs, keyframe_sources, mesh_runs
 from tsfusion.cluster.jobs import AnyJob, Done, Failed, Message, Progress
 from tsfusion.core import process
 from tsfusion.core.config import VolumeConfig
@@ -30,8 +30,13 @@ from tsfusion.core.errors import (
 )
 from tsfusion.geometry import up_direction
 from tsfusion.geometry.mesh import Mesh
+from tsfusion.geometry.mesh_parts import joined
+from tsfusion.geometry.provenance import Provenance
+from tsfusion.geometry.up_direction import HeldSensor
 from tsfusion.kernels import runtime
 from tsfusion.pipelines import mesh_files
+from tsfusion.tsdf import checkpoint, mesh_tiles
+from tsfusion.tsdf.readable_map import HELD, map_provenance
 from tsfusion.tsdf.saved_map_addition import add_files
 from tsfusion.tsdf.volume import Volume
 
@@ -175,7 +180,15 @@ def _add(job: jobs.Add, folder: Path) -> dict[str, Any]:
 # --- meshing ---
 
 
+def _run(job: jobs.MeshRun, folder: Path) -> dict[str, Any]:
+    path = _new(folder, job.name, ".npz")
+    mesh_runs.write(path, mesh_runs.make(folder / job.file, range(job.first, job.stop), job.view))
+    return {"files": [path.name]}
+
+
 def _mesh(job: jobs.MeshMap, folder: Path) -> dict[str, Any]:
+    if job.runs:
+        return _put_together(job, folder)
     budget = None if job.worker_memory is None else _budget(job.worker_memory, _MESHING_BYTES)
     volume = Volume.load(folder / job.file, memory_bytes=budget, cache=job.folder, **job.view)
     prefix = _new(folder, job.name, "")
@@ -187,11 +200,24 @@ def _mesh(job: jobs.MeshMap, folder: Path) -> dict[str, Any]:
         parts.provenance = origin
         files = parts.save(prefix.with_suffix(".ply"))
         return {"files": [file.name for file in files], "figures": _plain(parts.figures, is_whole=False)}
-    mesh = volume.extract_mesh()
+    return _written(job, folder, volume.extract_mesh(), origin)
+
+
+def _put_together(job: jobs.MeshMap, folder: Path) -> dict[str, Any]:
+    with checkpoint.reading(folder / job.file, is_checked=True) as (header, _):
+        origin = map_provenance(header)
+    runs = [mesh_runs.read(folder / name) for name in reversed(job.runs)]
+    mesh = joined(list(mesh_tiles.together(runs)))
+    return _written(job, folder, replace(mesh, held=HeldSensor(header.meta.get(HELD))), origin)
+
+
+def _written(job: jobs.MeshMap, folder: Path, mesh: Mesh, origin: Provenance) -> dict[str, Any]:
+    """Write the whole mesh; what the job says in the end."""
     if not len(mesh.faces):
         return {"files": [], "figures": _plain(mesh.figures, is_whole=True)}
-    up = up_direction.find(mesh, volume.held, given=job.up)
+    up = up_direction.find(mesh, mesh.held or HeldSensor(), given=job.up)
     mesh = replace(mesh, known_up=up, provenance=origin)
+    prefix = _new(folder, job.name, "")
     made = [prefix.with_suffix(suffix) for suffix in (".ply", ".glb")]
     left_out = mesh_files.write(mesh, made, keep_islands=job.keep_islands)
     left_out["files"] = [Path(name).suffix for name in left_out["files"]]
@@ -238,6 +264,7 @@ def _at_once(do: Callable[[Any, Path], dict[str, Any]]) -> Callable[[Any, Path],
 _DOERS: dict[type, Callable[[Any, Path], Doing]] = {
     jobs.Fuse: _fuse,
     jobs.Add: _at_once(_add),
+    jobs.MeshRun: _at_once(_run),
     jobs.MeshMap: _at_once(_mesh),
     jobs.MeshTile: _at_once(_tile),
 }

@@ -92,11 +92,21 @@ class Add(Job, tag="add", frozen=True, kw_only=True):
     files: list[str]
 
 
+class MeshRun(Job, tag="run", frozen=True, kw_only=True):
+    """Mesh some tiles of a map for `MeshMap` (`tsdf.mesh_tiles`): first ≤ number < stop."""
+
+    file: str
+    view: dict[str, Any]
+    first: int
+    stop: int
+
+
 class MeshMap(Job, tag="mesh", frozen=True, kw_only=True):
     """Mesh the whole map.
 
     Attributes:
         file: the map.
+        runs: files of its `MeshRun` jobs, in their order; none = they are not made.
         view: settings of the surface that differ from the map's.
         up: away from the ground; None = it is found.
         keep_islands: as of `mesh_files.write`.
@@ -104,6 +114,7 @@ class MeshMap(Job, tag="mesh", frozen=True, kw_only=True):
 
     file: str
     view: dict[str, Any]
+    runs: list[str] = []
     up: Up | None = None
     keep_islands: bool | None = None
 
@@ -118,7 +129,7 @@ class MeshTile(Job, tag="tile", frozen=True, kw_only=True):
     high: tuple[int, int, int]
 
 
-AnyJob = Fuse | Add | MeshMap | MeshTile
+AnyJob = Fuse | Add | MeshRun | MeshMap | MeshTile
 
 
 class Progress(Struct, tag="progress", frozen=True):

@@ -47,10 +47,7 @@ def boxes(file: Path, tile_size: float | None, most: int) -> list[Box]:
     Raises:
         InvalidConfig: for a size that is none.
     """
-    with checkpoint.reading(file) as (header, chunks):
-        keys = np.empty(header.blocks, np.int64)
-        for chunk in chunks:
-            chunk.fill(keys[chunk.first : chunk.first + chunk.blocks])
+    header, keys = checkpoint.keys_of(file)
     blocks = unpack_keys(keys).astype(np.int64)
     side = _side(blocks, most) if tile_size is None else round(tile_size / (8 * header.config.voxel_size))
     if side < 1:

@@ -240,6 +240,15 @@ def reading(path: Path, *, is_checked: bool = False) -> Iterator[tuple[Checkpoin
         raise CheckpointError(f"the map {path} does not fit into this machine's memory") from error
 
 
+def keys_of(path: Path, *, is_checked: bool = False) -> tuple[CheckpointHeader, NDArray[np.int64]]:
+    """The header of a checkpoint and the keys of its blocks, sorted. Arguments and errors as of `reading`."""
+    with reading(path, is_checked=is_checked) as (header, chunks):
+        keys = np.empty(header.blocks, np.int64)
+        for chunk in chunks:
+            chunk.fill(keys[chunk.first : chunk.first + chunk.blocks])
+    return header, keys
+
+
 def verify(path: Path, header: CheckpointHeader, map_hash: str) -> None:
     """Raise DamagedCheckpoint unless the loaded map has the hash that was saved."""
     if map_hash != header.map_hash:

@@ -6,7 +6,7 @@ triangles of their cells. Tiles come last first: a cell's other vertices lie tow
 are known by then. Vertices are counted from the end of the whole mesh, whose length shows with the last tile.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +20,7 @@ from tsfusion.tsdf.surface_values import SurfaceView
 _FARTHEST = int(CELL_STEPS.max())  # what the keys of blocks that share a cell differ by at most
 
 
-class _Numbered(NamedTuple):
+class Numbered(NamedTuple):
     """Blocks whose vertices have numbers: (n,) sorted keys, (n, 24) edges with a vertex, and (n,) the number
     of the first vertex, from the end."""
 
@@ -28,14 +28,53 @@ class _Numbered(NamedTuple):
     edges: NDArray[np.uint64]
     first: NDArray[np.int64]
 
-    def before(self, later: "_Numbered", last: np.int64) -> "_Numbered":
+    def before(self, later: "Numbered", last: np.int64) -> "Numbered":
         """These and the later ones, up to a key."""
         n = int(np.searchsorted(later.keys, last, side="right"))
-        return _Numbered(
+        return Numbered(
             np.concatenate([self.keys, later.keys[:n]]),
             np.concatenate([self.edges, later.edges[:n]]),
             np.concatenate([self.first, later.first[:n]]),
         )
+
+    def numbers(self, vertices: "_Vertices") -> NDArray[np.int64]:
+        """(n,) numbers from the end of vertices on edges of these blocks."""
+        at, of = np.unique(np.searchsorted(self.keys, vertices.keys), return_inverse=True)
+        rank = np.cumsum(_bits(self.edges[at]), axis=1, dtype=np.int16) - 1
+        numbers: NDArray[np.int64] = self.first[at][of] - rank[of, vertices.edges]
+        return numbers
+
+
+class _Vertices(NamedTuple):
+    """Vertices of other tiles, (n,) each: the key of the block, and which of its edges they are on."""
+
+    keys: NDArray[np.int64]
+    edges: NDArray[np.int64]
+
+    def of(self, chosen: NDArray[np.bool_]) -> "_Vertices":
+        return _Vertices(self.keys[chosen], self.edges[chosen])
+
+
+_NOBODY = Numbered(np.zeros(0, np.int64), np.zeros((0, 24), np.uint64), np.zeros(0, np.int64))
+
+
+class MeshRun(NamedTuple):
+    """The mesh of some tiles, one after the other, that is made without the others.
+
+    Attributes:
+        part: its numbers are from the end of these tiles; 0 stands for vertices behind them.
+        open_at: (n,) where these zeros are, in the corners of all faces.
+        open_keys, open_edges: (n,) which vertices they are: the key of the block, and the edge of it.
+        border: the first blocks, whose vertices those before may need.
+        first: key of the first block.
+    """
+
+    part: MeshPart
+    open_at: NDArray[np.int64]
+    open_keys: NDArray[np.int64]
+    open_edges: NDArray[np.int64]
+    border: Numbered
+    first: np.int64
 
 
 def tiles(store: BlockStore, min_weight: float, view: SurfaceView) -> Iterator[MeshPart]:
@@ -43,13 +82,74 @@ def tiles(store: BlockStore, min_weight: float, view: SurfaceView) -> Iterator[M
 
     Beside a tile and its neighbours, memory holds the values of up to three layers of blocks, across x.
     """
-    size = field_regularizer.BATCH
     keys = np.sort(store.keys)
+    for made in _tiles(keys, range(tile_count(len(keys))), store, min_weight, view):
+        yield made.part
+
+
+def tile_count(blocks: int) -> int:
+    """Number of tiles of a map."""
+    return -(-blocks // field_regularizer.BATCH)
+
+
+def run(
+    keys: NDArray[np.int64], which: range, store: BlockStore, min_weight: float, view: SurfaceView
+) -> MeshRun:
+    """Some tiles of a map, of which the store holds what they depend on: `blocks_of_run`, and around them.
+
+    Args:
+        keys: of all of its blocks, sorted.
+    """
+    made = list(_tiles(keys, which, store, min_weight, view))[::-1]
+    corners = np.array([one.part.faces.size for one in made])
+    begin = np.cumsum(corners) - corners
+    colors = [one.part.colors for one in made if one.part.colors is not None]
+    part = MeshPart(
+        np.concatenate([one.part.vertices for one in made]),
+        np.concatenate([one.part.faces for one in made]),
+        np.concatenate([one.part.normals for one in made]),
+        np.concatenate(colors) if colors else None,
+    )
+    open_at = np.concatenate([at + one.open_at for at, one in zip(begin, made, strict=True)])
+    open_keys = np.concatenate([one.open_keys for one in made])
+    open_edges = np.concatenate([one.open_edges for one in made])
+    return MeshRun(part, open_at, open_keys, open_edges, made[0].border, made[0].first)
+
+
+def blocks_of_run(keys: NDArray[np.int64], which: range) -> NDArray[np.int64]:
+    """Keys of the blocks whose values a run of tiles needs: all that are solved with those at its cells."""
+    size = field_regularizer.BATCH
+    own = keys[which.start * size : which.stop * size]
+    low, high = int(own[0]) - 2 * _FARTHEST, int(own[-1]) + _FARTHEST
+    begin = int(np.searchsorted(keys, low)) // size * size
+    end = -(-int(np.searchsorted(keys, high, side="right")) // size) * size
+    return keys[begin:end]
+
+
+def together(runs: Iterable[MeshRun]) -> Iterator[MeshPart]:
+    """The parts of the whole mesh, as of `tiles`, of its runs, the last first."""
+    done, known = 0, _NOBODY
+    for one in runs:
+        faces = one.part.faces.astype(np.int64) + done
+        vertices = _Vertices(one.open_keys, one.open_edges)
+        faces.reshape(-1)[one.open_at] = known.numbers(vertices)
+        yield one.part._replace(faces=faces.astype(np.int32))
+        border = one.border._replace(first=one.border.first + done)
+        known = border.before(known, one.first + _FARTHEST)
+        done += len(one.part.vertices)
+
+
+def _tiles(
+    keys: NDArray[np.int64], which: range, store: BlockStore, min_weight: float, view: SurfaceView
+) -> Iterator[MeshRun]:
+    """Single tiles, the last first; their numbers are from the end of the last one."""
+    size = field_regularizer.BATCH
     values = WholeMapValues(keys, view, size)
     buffers = mesh_extraction.MeshBuffers()
-    beyond = _Numbered(keys[:0], np.zeros((0, 24), np.uint64), keys[:0])
-    done = 0
-    for begin in range((len(keys) - 1) // size * size, -1, -size):
+    beyond, done = _NOBODY, 0
+    last_key = keys[min(which.stop * size, len(keys)) - 1] if len(keys) else np.int64(0)
+    for number in reversed(which):
+        begin = number * size
         own = keys[begin : begin + size]
         wanted = np.unique((own[:, None] - CELL_STEPS).ravel())  # they share the edges of these blocks
         wanted = wanted[store.slots_of(wanted) >= 0]
@@ -58,35 +158,34 @@ def tiles(store: BlockStore, min_weight: float, view: SurfaceView) -> Iterator[M
         b = a + len(own)
         first, edges = buffers.first.array, buffers.edges.array
         (start, face), (end, last_face) = first[a], first[b]
-        faces = done + int(end) - mesh.faces[face:last_face].astype(np.int64)
-        outside = faces <= done
+        faces = (done + int(end) - mesh.faces[face:last_face].astype(np.int64)).reshape(-1)
+        outside = np.flatnonzero(faces <= done)
         local = done + int(end) - faces[outside]
-        faces[outside] = _numbers(local, rows, first[: len(rows), 0], edges, beyond)
-        yield MeshPart(
+        vertices = _vertices(local, rows, first[: len(rows), 0], edges)
+        is_open = vertices.keys > last_key
+        faces[outside[~is_open]] = beyond.numbers(vertices.of(~is_open))
+        faces[outside[is_open]] = 0
+        part = MeshPart(
             mesh.vertices[start:end],
-            faces.astype(np.int32),
+            faces.astype(np.int32).reshape(-1, 3),
             mesh.normals[start:end],
             None if mesh.colors is None else mesh.colors[start:end],
         )
-        numbered = _Numbered(own, edges[a:b].copy(), done + int(end) - first[a:b, 0].astype(np.int64))
+        numbered = Numbered(own, edges[a:b].copy(), done + int(end) - first[a:b, 0].astype(np.int64))
         beyond = numbered.before(beyond, own[0] + _FARTHEST)
+        yield MeshRun(part, outside[is_open], *vertices.of(is_open), beyond, own[0])
         values.forget_beyond(int(own[0]) + _FARTHEST)
         done += int(end - start)
 
 
-def _numbers(
-    local: NDArray[np.int64],
-    rows: NDArray[np.int64],
-    first: NDArray[np.int32],
-    edges: NDArray[np.uint64],
-    known: _Numbered,
-) -> NDArray[np.int64]:
-    """Numbers from the end of vertices on other tiles' edges, of which a tile knows but its own numbers.
+def _vertices(
+    local: NDArray[np.int64], rows: NDArray[np.int64], first: NDArray[np.int32], edges: NDArray[np.uint64]
+) -> _Vertices:
+    """Vertices on other tiles' edges, of which a tile knows but its own numbers.
 
     Args:
         local: (n,) the tile's numbers.
         rows, first, edges: the tile's blocks, their first vertices, and their edges that its cells use.
-        known: those blocks with all their edges.
     """
     ids, back = np.unique(local, return_inverse=True)
     row = np.searchsorted(first, ids, side="right") - 1
@@ -94,10 +193,8 @@ def _numbers(
     used = _bits(edges[blocks])
     counts = used.sum(axis=1, dtype=np.int64)
     edge = np.nonzero(used)[1][np.cumsum(counts)[of] - counts[of] + ids - first[row]]
-    at = np.searchsorted(known.keys, rows[blocks])
-    rank = np.cumsum(_bits(known.edges[at]), axis=1, dtype=np.int16) - 1
-    numbers: NDArray[np.int64] = known.first[at][of] - rank[of, edge]
-    return numbers[back.reshape(-1)]
+    back = back.reshape(-1)
+    return _Vertices(rows[row][back], edge[back])
 
 
 def _bits(planes: NDArray[np.uint64]) -> NDArray[np.uint8]:

@@ -28,9 +28,11 @@ from tsfusion.tsdf import (
     hole_filling,
     map_difference,
     map_history,
+    mesh_tiles,
     voxel_arrays,
 )
 from tsfusion.tsdf.block_store import BlockStore, cells_of, pack_keys, unpack_keys
+from tsfusion.tsdf.checkpoint import CheckpointHeader
 from tsfusion.tsdf.kept_values import KeptValues
 from tsfusion.tsdf.map_difference import MapDifference
 from tsfusion.tsdf.mesh_extraction import MeshBuffers, extract
@@ -153,20 +155,23 @@ class ReadableMap:
         parts = tiles(self._store, least, self._view(None))
         return MeshParts(parts, Path(folder), held=self.held, known_up=up)
 
+    def mesh_run(self, keys: NDArray[np.int64], which: range) -> mesh_tiles.MeshRun:
+        """Some tiles of a larger map's mesh, of which this one holds `mesh_tiles.blocks_of_run` and around.
+
+        Args:
+            keys: of all of its blocks, sorted.
+            which: of its `mesh_tiles.tile_count` tiles.
+        """
+        least = self._checked_min_weight(None)
+        return mesh_tiles.run(keys, which, self._store, least, self._view(None))
+
     def provenance(self, source: str | None = None) -> Provenance:
         """What a file of its surface says about the map; its hash is taken anew.
 
         Args:
             source: file or folder that the map came from; its name is told, not where it lies.
         """
-        worlds = {one.world for one in map_history.of_clients(map_history.sessions(self.meta)) if one.world}
-        return Provenance(
-            source=None if source is None else Path(source).resolve().name,
-            keyframes=self.keyframes,
-            map_hash=self.map_hash(),
-            world=" ".join(sorted(worlds)),
-            voxel_size=self.config.voxel_size,
-        )
+        return _provenance(self.meta, self.keyframes, self.map_hash(), self.config, source)
 
     def cells_to_mesh(self, dirty: NDArray[np.int32]) -> NDArray[np.int32]:
         """The blocks whose mesh the changes to these blocks reach: (m, 3) int32.
@@ -296,3 +301,25 @@ class ReadableMap:
         if surface == "normal":
             return partial(field_regularizer.along_normals, smoothness=self.model.smoothness)
         return values_of
+
+
+def map_provenance(header: CheckpointHeader) -> Provenance:
+    """What a file of a saved map's surface says about it, as `ReadableMap.provenance`, by its header."""
+    return _provenance(header.meta, header.keyframes, header.map_hash, header.config, None)
+
+
+def _provenance(
+    meta: dict[str, Any],
+    keyframes: int,
+    map_hash: str,
+    config: VolumeConfig,
+    source: str | None,
+) -> Provenance:
+    worlds = {one.world for one in map_history.of_clients(map_history.sessions(meta)) if one.world}
+    return Provenance(
+        source=None if source is None else Path(source).resolve().name,
+        keyframes=keyframes,
+        map_hash=map_hash,
+        world=" ".join(sorted(worlds)),
+        voxel_size=config.voxel_size,
+    )

@@ -40,7 +40,7 @@ def add_files(paths: Sequence[Path], target: Path) -> CheckpointHeader:
         MapFull, WeightOverflow: as `Volume.merge`; nothing is written.
         CheckpointError: when one cannot be read, or the sum cannot be written.
     """
-    headers, keys = zip(*(_keys_of(path) for path in paths), strict=True)
+    headers, keys = zip(*(checkpoint.keys_of(path) for path in paths), strict=True)
     blocks = len(np.unique(np.concatenate(keys)))
     header = _header(headers, blocks)
     with ExitStack() as opened:
@@ -52,15 +52,6 @@ def add_files(paths: Sequence[Path], target: Path) -> CheckpointHeader:
         pieces = _pieces(streams, header.layers, digest)
         checkpoint.write_pieces(target, header, blocks, pieces, map_hash=digest.hexdigest)
     return header
-
-
-def _keys_of(path: Path) -> tuple[CheckpointHeader, NDArray[np.int64]]:
-    """The header of a saved map and the keys of its blocks; its digest is compared."""
-    with checkpoint.reading(path) as (header, chunks):
-        keys = np.empty(header.blocks, np.int64)
-        for chunk in chunks:
-            chunk.fill(keys[chunk.first : chunk.first + chunk.blocks])
-    return header, keys
 
 
 def _header(headers: Sequence[CheckpointHeader], blocks: int) -> CheckpointHeader:
