@@ -11,6 +11,7 @@ heavy (a band of rays, a block), a kernel gives each unit a whole run and works 
 """
 
 import os
+from contextlib import suppress
 
 from tsfusion.core.errors import MissingDependency
 
@@ -29,3 +30,10 @@ except ImportError as error:  # a library of the system, which small containers 
         f"taichi does not load ({error}); where there is no desktop, install libx11-6 (Debian, Ubuntu) or "
         "libX11 (Fedora)"
     ) from error
+
+with suppress(ImportError, AttributeError):  # another version of Taichi: kernels load as slowly as before
+    # At each decorator Taichi reads the source around it, and goes through all modules for that, to see if it
+    # stands in a class. Ours stand in none.
+    from taichi.lang import kernel_impl
+
+    kernel_impl._inside_class = lambda level_of_class_stackframe: False
