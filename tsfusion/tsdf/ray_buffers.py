@@ -103,7 +103,9 @@ class RayBuffers:
             height = keyframe.shape[0]
             color = keyframe.color if self.colored else None
             self._rays_of_image(
-                keyframe.measurement, int(keyframe.kind == "disparity"), _depth_scale(keyframe),
+                # The kernel reads float32; of two types it would be compiled twice, a second at each start.
+                keyframe.measurement.astype(np.float32, copy=False),
+                int(keyframe.kind == "disparity"), _depth_scale(keyframe),
                 *_optional(None if color is None else color.reshape(height, -1), 2),
                 *_optional(keyframe.confidence, 2),
                 _camera(keyframe, voxel_size), parameters, bundle,
