@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: MIT
 """Fixtures of all tests; which tests are collected, and how they start."""
 
+import atexit
 import faulthandler
 import logging
 import os
+import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -20,6 +23,10 @@ from tsfusion.core import logs
 from tsfusion.core.errors import MissingDependency
 
 os.environ["PYTHONPATH"] = os.pathsep.join(sys.path)  # programs that tests start find what tests find
+if os.environ.pop("PYTHONDONTWRITEBYTECODE", None):
+    # Not in the tree, then, but somewhere: each of hundreds of commands would compile its modules anew.
+    os.environ["PYTHONPYCACHEPREFIX"] = tempfile.mkdtemp(prefix="tsfusion-pycache-")
+    atexit.register(shutil.rmtree, os.environ["PYTHONPYCACHEPREFIX"], ignore_errors=True)
 OPTIONAL = ("kiss_icp", "open3d", "pooch", "pyrealsense2", "rosbags", "scipy", "xatlas")
 STDERR = pytest.StashKey[Any]()
 DATA = Path(os.environ.get("TSFUSION_DATA", Path(__file__).parents[2] / "shared" / "data"))
