@@ -10,14 +10,18 @@ heavy (a band of rays, a block), a kernel gives each unit a whole run and works 
             unit = run // RUN
 """
 
+import inspect
 import os
-from contextlib import suppress
 
 from tsfusion.core.errors import MissingDependency
 
 os.environ.setdefault("HOME", os.path.expanduser("~"))  # without it (a daemon's environment) taichi aborts
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # the banner goes to stdout
 os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")  # it would tell its makers that and where we run
+# At each decorator Taichi asks `inspect` who imports the module, to see if that is a class; `inspect` finds no
+# file of that name and goes through all modules, each time. Here is its answer.
+_FROM_FILE = getattr(inspect, "modulesbyfile", {})
+_FROM_FILE["<frozen importlib._bootstrap>"] = "importlib._bootstrap"
 try:
     import taichi as taichi
 except ModuleNotFoundError as error:
@@ -30,10 +34,3 @@ except ImportError as error:  # a library of the system, which small containers 
         f"taichi does not load ({error}); where there is no desktop, install libx11-6 (Debian, Ubuntu) or "
         "libX11 (Fedora)"
     ) from error
-
-with suppress(ImportError, AttributeError):  # another version of Taichi: kernels load as slowly as before
-    # At each decorator Taichi reads the source around it, and goes through all modules for that, to see if it
-    # stands in a class. Ours stand in none.
-    from taichi.lang import kernel_impl
-
-    kernel_impl._inside_class = lambda level_of_class_stackframe: False
