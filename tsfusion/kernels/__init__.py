@@ -18,8 +18,8 @@ from tsfusion.core.errors import MissingDependency
 os.environ.setdefault("HOME", os.path.expanduser("~"))  # without it (a daemon's environment) taichi aborts
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # the banner goes to stdout
 os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")  # it would tell its makers that and where we run
-# At each decorator Taichi asks `inspect` who imports the module: a class? `inspect` knows no file of that name
-# and goes through all modules for it, each time. Here is its answer.
+# At each decorator Taichi asks `inspect` who imports the module: a class? `inspect` knows no such file and
+# looks through all modules for it, each time. Here is its answer.
 getattr(inspect, "modulesbyfile", {})["<frozen importlib._bootstrap>"] = "importlib._bootstrap"
 try:
     import taichi as taichi
