@@ -163,6 +163,18 @@ def test_what_is_acknowledged_is_on_its_way_no_more(outbox: Outbox) -> None:
     assert outbox.outstanding == 0
 
 
+def test_what_was_sent_behind_a_refused_record_is_sent_again(outbox: Outbox) -> None:
+    for _ in range(3):
+        send(outbox)
+    entry = outbox.find_sent(2)
+    assert entry is not None
+    outbox.refuse(entry, "values", "a three")
+    assert outbox.outstanding == 1
+    claimed = outbox.claim(8, 1 << 20)
+    assert claimed is not None
+    assert (claimed[0].seq, claimed[1]) == (3, 1)  # the server saw a gap there
+
+
 def test_an_interrupt_leaves_it_free_for_others(outbox: Outbox) -> None:
     """Ctrl-C may come when the lock is just taken: the sending thread must not wait for it for ever."""
     assert is_free_after_interrupts(lambda: outbox.keyframes_waiting)

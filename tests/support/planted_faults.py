@@ -326,7 +326,7 @@ FAULTS = (
         "delivery/outbox.py",
         "            self._outstanding = min(self._outstanding, place)\n",
         "",
-        "delivery/test_control_session.py::test_only_what_was_sent_can_be_refused",
+        "delivery/test_outbox.py::test_what_was_sent_behind_a_refused_record_is_sent_again",
     ),
     Fault(
         "delivery/outbox.py",
