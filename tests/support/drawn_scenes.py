@@ -28,6 +28,10 @@ class Node:
         if name == "glb_data" and value != tile_glb.EMPTY:
             self._scene.bytes_drawn += len(value)
 
+    @property
+    def is_empty(self) -> bool:
+        return bool(self.__dict__.get("glb_data") == tile_glb.EMPTY)
+
     def remove(self) -> None:
         assert self._scene.nodes.pop(self.name) is self
 
@@ -60,12 +64,13 @@ class DrawnScene:
     @property
     def models(self) -> list[Any]:
         """Nodes with a model that is not empty."""
-        nodes = [node for node in self.nodes.values() if "glb_data" in node.__dict__]
-        return [node for node in nodes if node.__dict__["glb_data"] != tile_glb.EMPTY]
+        nodes = self.nodes.values()
+        return [node for node in nodes if "glb_data" in node.__dict__ and not node.is_empty]
 
     def shown(self, prefix: str = "") -> set[str]:
         """Names of the nodes that can be seen."""
-        return {name for name, node in self.nodes.items() if node.visible and name.startswith(prefix)}
+        found = {name for name, node in self.nodes.items() if node.visible and not node.is_empty}
+        return {name for name in found if name.startswith(prefix)}
 
     def _add(self, name: str, fields: dict[str, Any]) -> Node:
         assert name not in self.nodes, f"{name} is there already"

@@ -41,13 +41,12 @@ if TYPE_CHECKING:
 MAX_BYTES_PER_SECOND = 8e6  # to each browser, as triangles
 _WAIT = 0.1  # seconds that are waited for an event
 _SHARE = 0.008  # of a core, for putting updates into tiles: many at once cost little more than one
-_TOGETHER = (0.25, 1.0)  # seconds of updates that are taken at once, at least and at most
+_TOGETHER = (0.25, 1.5)  # seconds of updates that are taken at once, at least and at most
 _MOST_UPDATES = 64  # that wait for that
 _BEHIND = 50  # voxels that a following camera is behind a scanner
 _SETTLED = 0.25  # seconds that a time slider rests before the map is rewound
-_DRAW = (
-    0.25  # seconds between two sendings to browsers: each wakes the web server
-)
+_DRAW_SHARE = 0.01  # of a core, for sending tiles and marks: what changes meanwhile is sent once
+_DRAW = (0.25, 1.0)  # seconds between two sendings to browsers, at least and at most
 _OFTEN, _SELDOM = 0.3, 1.0  # seconds between two looks at cameras, and at scales and states
 
 log = logging.getLogger(__name__)
@@ -93,7 +92,7 @@ class LivePage:
         self._colors.name_clients(self._marks.name)
         self._whole_views = map_views.WholeViews(self._tiles)
         self._browsers: dict[int, BrowserPanel] = {}
-        self._drawn = self._looked = self._reckoned = -np.inf
+        self._next_draw = self._looked = self._reckoned = -np.inf
         self._lock = threading.Lock()  # of `_browsers`
         set_theme(server.gui, dark=False)
         self._panel = SharedPanel(server.gui, feed, self._colors.names, self._marks.show)
@@ -137,8 +136,8 @@ class LivePage:
         """Put the updates that have come into the tiles."""
         began = time.thread_time()
         keys = self._tiles.apply_all(self._updates, now - self._began)
-        rest = (time.thread_time() - began) / _SHARE if self._browsers else _TOGETHER[1]
-        self._updates, self._next_apply = [], now + min(max(rest, _TOGETHER[0]), _TOGETHER[1])
+        rest = _rest(began, _SHARE, _TOGETHER) if self._browsers else _TOGETHER[1]
+        self._updates, self._next_apply = [], now + rest
         if not self._colors.is_asked_for:
             self._nodes.changed(keys)
         self._ask(keys)
@@ -175,11 +174,12 @@ class LivePage:
             self._reckon()
         if not self._browsers:
             return
-        if now >= self._drawn + _DRAW and (self._nodes.is_due(now) or self._marks.is_due(now)):
-            self._drawn = now
+        if now >= self._next_draw and (self._nodes.is_due(now) or self._marks.is_due(now)):
+            began = time.thread_time()
             with self._server.atomic():  # else each message wakes the web server's thread
                 self._nodes.send(now)
                 self._marks.draw(now)
+            self._next_draw = now + _rest(began, _DRAW_SHARE, _DRAW)
         if now >= self._looked + _OFTEN:
             self._looked = now
             with self._lock:
@@ -202,6 +202,7 @@ class LivePage:
                 self._nodes.changed(self._tiles.tiles)
             self._ask(set(self._tiles.tiles))
         if orders.is_clipping:
+            self._next_draw = now
             self._nodes.clip(self._panel.clipping.clipping)
 
     def _reckon(self) -> None:
@@ -265,3 +266,8 @@ class LivePage:
     def shown_mesh(self) -> Mesh:
         parts = [self._nodes.shown_mesh(key, tile) for key, tile in list(self._tiles.tiles.items())]
         return map_tiles.whole(parts, self._up.up)
+
+
+def _rest(began: float, share: float, bounds: tuple[float, float]) -> float:
+    """Seconds after which work that began at `began` (`time.thread_time`) has had its share of a core."""
+    return min(max((time.thread_time() - began) / share, bounds[0]), bounds[1])

@@ -184,7 +184,8 @@ class TileNodes:
         else:
             other = self._add(key, node)
         other.glb_data = content
-        other.visible = True
+        if not other.visible:
+            other.visible = True
         self._nodes[key] = other
         return len(content)
 
@@ -198,6 +199,5 @@ class TileNodes:
     def _empty_last(self, key: Key, now: float) -> None:
         """Take the version before out of the scene, and keep its node."""
         node, _ = self._last.pop(key)
-        node.visible = False
         node.glb_data = tile_glb.EMPTY
         self._spare[key] = (node, now + _SPARED)
