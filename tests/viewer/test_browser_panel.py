@@ -23,13 +23,16 @@ class Browser:
 
     def __init__(self) -> None:
         self.whole = View(FIRST, np.zeros(3), UP)
-        camera = SimpleNamespace(position=np.zeros(3), aspect=1.6, image_width=960)
+        self._camera = camera = SimpleNamespace(position=np.zeros(3), aspect=1.6)
         camera.on_update = lambda tell: setattr(self, "_tell", tell)
-        self._camera = camera
         client = MagicMock(camera=camera, gui=MagicMock(add_dropdown=self._dropdown))
-        shown: Any = SimpleNamespace(scanners=list, whole_view=lambda aspect, covered: self.whole)
+        shown: Any = SimpleNamespace(scanners=list, whole_view=self._whole_view)
         self.panel = BrowserPanel(client, shown, contextlib.nullcontext)
         self.panel.update()
+
+    def _whole_view(self, aspect: float, covered: float) -> View:
+        self.covered = covered
+        return self.whole
 
     def _dropdown(self, label: str, options: Any, initial_value: str) -> Any:
         self.choice = SimpleNamespace(value=initial_value, options=options, on_update=lambda call: None)
@@ -94,3 +97,12 @@ def test_a_camera_that_never_comes_to_its_place_is_moved_by_hand(clock: SimpleNa
     clock.s += 60
     browser.tells(SECOND)
     assert browser.choice.value == BY_HAND
+
+
+@pytest.mark.parametrize(("width", "height", "covered"), [(390, 844, 0.5), (640, 540, 0.0), (844, 390, 0.0)])
+def test_only_a_phone_s_panel_covers_the_map(width: int, height: int, covered: float) -> None:
+    """However many pixels a browser draws: three for a point, or fewer where it is slow."""
+    browser = Browser()
+    browser._camera.aspect = width / height
+    browser.panel.update()
+    assert browser.covered == covered

@@ -24,7 +24,9 @@ _SETTLED = 10.0  # seconds after a move of ours, in which a slow browser may sti
 _AGAIN = 1.0  # seconds after which a camera is moved once more that a new up direction has turned
 _MOVED = 0.02  # of the distance to the target: further away, somebody moved the camera
 _RENDER = 30.0  # seconds that a browser may take for a picture
-_NARROW = 576  # pixels: up to there viser puts the panel over the lower half of the picture
+# Width / height of a phone's picture. Up to 576 points of width viser puts the panel over its lower half; but a
+# browser tells pixels, of which a phone has two or three a point, and one that draws slowly three quarters.
+_UPRIGHT = 0.6
 _COVERED = 0.5
 _MARK = (213, 94, 0)
 
@@ -117,7 +119,7 @@ class BrowserPanel:
     def _wanted(self) -> View | None:
         if self._camera.value == WHOLE:
             camera = self._client.camera
-            covered = _COVERED if camera.image_width <= _NARROW else 0.0
+            covered = _COVERED if camera.aspect < _UPRIGHT else 0.0
             return self._shown.whole_view(camera.aspect, covered)
         for session, name in self._shown.scanners():
             if self._camera.value == _FOLLOW + name:
