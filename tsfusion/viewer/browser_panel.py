@@ -24,8 +24,8 @@ _SETTLED = 10.0  # seconds after a move of ours, in which a slow browser may sti
 _AGAIN = 1.0  # seconds after which a camera is moved once more that a new up direction has turned
 _MOVED = 0.02  # of the distance to the target: further away, somebody moved the camera
 _RENDER = 30.0  # seconds that a browser may take for a picture
-# Width / height of a phone's picture. Up to 576 points of width viser puts the panel over its lower half; but a
-# browser tells pixels, of which a phone has two or three a point, and one that draws slowly three quarters.
+# Width / height of a phone. Up to 576 points of width viser puts the panel over the lower half of the
+# picture; but a browser tells pixels: a phone has two or three a point, one that draws slowly three quarters.
 _UPRIGHT = 0.6
 _COVERED = 0.5
 _MARK = (213, 94, 0)
