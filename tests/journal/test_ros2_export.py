@@ -247,6 +247,7 @@ def test_foxglove_s_layout_names_what_an_export_holds(tmp_path: Path) -> None:
 
     panels = layout["configById"]
     assert sorted(leaves(layout["layout"])) == sorted(panels)
+    assert {one.partition("!")[0] for one in panels} == {"3D", "Image", "Plot"}, "kinds that Foxglove has"
     named = [one for one in words(panels) if one.startswith("/")]
     assert set(messages) == {one.split(".")[0] for one in named} | {"/tf", "/scanner/depth/camera_info"}
     for path in (one for one in named if "." in one):
