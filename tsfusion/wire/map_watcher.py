@@ -26,6 +26,7 @@ from tsfusion.wire.questions import MOST_POINTS, Answer, Cells, Keyframes
 
 _MOST_AT_ONCE = 16  # updates of one call
 _TOGETHER_S = 0.2  # from one reading of updates to the next: each awakening costs
+_FEW = 6  # updates that may have come meanwhile: of more, the socket's queue could not hold the next
 _PAUSE_S, _BUSY_PAUSE_S = 0.02, 0.05  # between two questions; while the map has keyframes to fuse
 _RETRY_S = 0.5  # after a question that was refused or not answered
 _WEIGHTS_S = 2.0  # that a question for weights may take
@@ -222,7 +223,7 @@ class MapWatcher:
         mesh_topic, scan_topic = sockets.topics_of(self._map)
         for count in range(_MOST_AT_ONCE):
             if not sockets.has_message(self._updates.socket):
-                self._next_read = time.monotonic() + (_TOGETHER_S if count else 0.0)
+                self._next_read = time.monotonic() + (_TOGETHER_S if 0 < count <= _FEW else 0.0)
                 return
             topic, *frames = self._updates.socket.recv_multipart(zmq.NOBLOCK, copy=False)
             try:
