@@ -136,7 +136,8 @@ class ServerWatcher:
         return time.monotonic() - self._well >= self._stall_after
 
     def _health(self) -> Health:
-        return fetch_health(self._address, timeout=self._timeout, **self._connection)
+        wanted = self._only or None  # a map that moved is followed
+        return fetch_health(self._address, map_name=wanted, timeout=self._timeout, **self._connection)
 
     def _selected(self, health: Health) -> dict[str, MapHealth]:
         return {name: one for name, one in health.maps.items() if self._only in ("", name)}

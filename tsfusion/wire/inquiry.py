@@ -28,12 +28,15 @@ class Inquiry:
     """Asks a server for its health once a second, and one question at a time.
 
     Attributes:
+        map: whose other server is asked about with the health, where it has one.
         watches: whether the server's maps can be watched; None = not known yet.
     """
 
-    def __init__(self, context: "zmq.Context[Any]", address: str, keys: ClientKeys | None) -> None:
+    def __init__(
+        self, context: "zmq.Context[Any]", address: str, keys: ClientKeys | None, map_name: str
+    ) -> None:
         self._connection: Connection = open_connection(context, sockets.connect_address(address), keys)
-        self.address = address
+        self.address, self.map = address, map_name
         self.watches: bool | None = None
         self._greeted = 0  # on which connection
         self._seen = time.monotonic()  # when there was a connection, or none could be yet
@@ -88,6 +91,13 @@ class Inquiry:
             )
         )
 
+    def move_to(self, address: str) -> None:
+        """Ask another server from now on."""
+        self.drop_question()
+        self.address, self.watches, self._health_asked = address, None, None
+        self._seen = time.monotonic()
+        self._connection.move_to(address)
+
     def drop_question(self) -> None:
         """Take no answer to the question that is under way."""
         self._number += 1
@@ -118,7 +128,7 @@ class Inquiry:
             connection.reopen()  # what stands may lead nowhere, and nobody would notice
         elif self._health_asked is None and now >= self._health_due:
             self._health_due, self._health_asked = now + _HEALTH_INTERVAL, now
-            self._send(Command(name="health"))
+            self._send(Command(name="health", map=self.map))
 
     def _send(self, command: Command) -> None:
         with suppress(zmq.Again):  # the connection has ended: all is asked again on the next one
@@ -135,6 +145,8 @@ class Inquiry:
                 continue  # damaged on its way: it is asked again
             if isinstance(reply, Reply) and self._is_expected(reply):
                 on_reply(reply, _buffers(frames))
+                if reply.elsewhere is not None:
+                    return  # the connection may be another one now
 
     def _is_expected(self, reply: Reply) -> bool:
         if reply.name == "ping":

@@ -20,10 +20,11 @@ from tsfusion.geometry.up_direction import Up
 from tsfusion.wire import messages, questions, sockets
 from tsfusion.wire.curve import ClientKeys
 from tsfusion.wire.messages import Command, Reply
-from tsfusion.wire.queries import CommandRefused, Exchange, open_connection
+from tsfusion.wire.queries import CommandRefused, Exchange, open_connection, place_of
 from tsfusion.wire.questions import Answer, Field, MapState, Question, Raycast, Sample, Slice
 
 Result = TypeVar("Result")
+_MOST_HOPS = 4  # from server to server, after a map
 _GRID = ("origin", "resolution", "heights", "axes")
 
 
@@ -47,7 +48,8 @@ class Answered(Struct, Generic[Result], frozen=True, kw_only=True, eq=False):
 class MapClient:
     """A map on a server, asked by the methods of `Volume`: each returns an `Answered` of what that returns.
 
-    The map answers between two keyframes, within milliseconds; a question that is not answered in its time
+    The map answers between two keyframes, within milliseconds; one that has moved to another server is asked
+    there (without keys, on this machine alone). A question that is not answered in its time
     raises, and never hangs. By custom the surface is the raw one here, as it was fused: smoothing it takes
     the server longer. Use it from one thread.
 
@@ -86,6 +88,7 @@ class MapClient:
         self._context = sockets.open_context()
         place = sockets.control_address(self.address, control)
         self._connection = open_connection(self._context, sockets.connect_address(place), keys)
+        self._keys = keys
         self._number = 0
 
     def close(self) -> None:
@@ -249,6 +252,12 @@ class MapClient:
         )
         sent = [messages.encode_sealed(Command(name="ping"))], [messages.encode_sealed(command), *frames]
         reply, arrays = self._exchange(sent, began + seconds, seconds)
+        for _ in range(_MOST_HOPS):
+            if reply.elsewhere is None:
+                break
+            self.address, place = place_of(reply.elsewhere, self._keys)
+            self._connection.move_to(place)
+            reply, arrays = self._exchange(sent, began + seconds, seconds)
         delay = time.monotonic() - began
         if reply.late:
             raise AnswerLate(f"the map {self.map} at {self.address}: {reply.error}")

@@ -21,7 +21,8 @@ from tsfusion.wire.health import Health
 from tsfusion.wire.inquiry import Inquiry
 from tsfusion.wire.map_client import MapClient
 from tsfusion.wire.map_events import HealthSeen, LinkSeen, MapEvent
-from tsfusion.wire.messages import Reply
+from tsfusion.wire.messages import Elsewhere, Reply
+from tsfusion.wire.queries import place_of
 from tsfusion.wire.questions import MOST_POINTS, Answer, Cells, Keyframes
 
 _MOST_AT_ONCE = 16  # updates of one call
@@ -35,8 +36,9 @@ _WEIGHTS_S = 2.0  # that a question for weights may take
 class MapWatcher:
     """What happens to a map of a running server (a `viewer.map_feed.MapFeed`).
 
-    It never ends by itself: while the server is away, `LinkSeen` says so, and all comes again afterwards. Use
-    it from one thread, but for `weights`.
+    It never ends by itself: while the server is away, `LinkSeen` says so, and all comes again afterwards. A
+    map that moves to another server is followed there (without keys, on this machine alone). Use it from one
+    thread, but for `weights`.
 
     Args:
         address: of the server: tcp://HOST:PORT.
@@ -68,7 +70,7 @@ class MapWatcher:
         self._weights: MapClient | None = None
         self._map = map_name
         self._context = sockets.open_context()
-        self._inquiry = Inquiry(self._context, self._control, keys)
+        self._inquiry = Inquiry(self._context, self._control, keys, map_name)
         try:
             self._updates = Connection(self._context, self._subscriber, self._publish, keys)
         except zmq.ZMQError as error:
@@ -84,7 +86,8 @@ class MapWatcher:
         self._follow(map_name)
 
     def _follow(self, map_name: str) -> None:
-        self._map, self._followed, self._paths = map_name, FollowedMap(map_name), FollowedPaths()
+        self._map = self._inquiry.map = map_name
+        self._followed, self._paths = FollowedMap(map_name), FollowedPaths()
         self._asked, self._refusal, self._said = None, "", None
 
     def _subscriber(self, context: "zmq.Context[Any]", keys: ClientKeys | None) -> sockets.AnySocket:
@@ -187,7 +190,9 @@ class MapWatcher:
         return self._health is not None and self._map in self._health.maps
 
     def _on_reply(self, reply: Reply, frames: list[memoryview]) -> None:
-        if reply.health is not None:
+        if reply.elsewhere is not None:
+            self._go_to(reply.elsewhere)
+        elif reply.health is not None:
             self._on_health(reply.health)
         elif reply.answer is None:
             self._refusal = "" if reply.retry or reply.late else reply.error or ""
@@ -199,6 +204,25 @@ class MapWatcher:
             except DecodeError as error:
                 self._refusal = f"an answer of the server makes no sense: {error}"
                 self._next_question = time.monotonic() + _RETRY_S
+
+    def _go_to(self, elsewhere: Elsewhere) -> None:
+        """Watch the map at the server that has it by now."""
+        try:
+            data, control = place_of(elsewhere, self._keys)
+        except InvalidConfig as error:
+            self._refusal = f"the map {self._map} is said to be at {elsewhere.address}: {error}"
+            return
+        self.address, self._control = data, control
+        self._publish = sockets.connect_address(sockets.publish_address(data, control, None))
+        self._inquiry.move_to(control)
+        self._updates.move_to(self._publish)
+        self._health = None
+        with self._weights_lock:
+            if self._weights is not None:
+                self._weights.close()
+                self._weights = None
+        self._events += self._followed.forget()
+        self._follow(self._map)
 
     def _taken(self, answer: Answer, frames: list[memoryview]) -> list[MapEvent]:
         arrays = questions.unpack(answer, frames)

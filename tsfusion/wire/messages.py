@@ -181,6 +181,13 @@ class Command(Struct, frozen=True, tag="command", kw_only=True):
     compress: bool = False  # large arrays of the answer
 
 
+class Elsewhere(Struct, frozen=True):
+    """Data and control address of the server that a map is at; an empty one is the port after the other."""
+
+    address: str
+    control: str = ""
+
+
 class Reply(Struct, frozen=True, tag="reply", kw_only=True):
     """The answer to a Command; arrays of a mesh follow as raw frames."""
 
@@ -193,6 +200,7 @@ class Reply(Struct, frozen=True, tag="reply", kw_only=True):
     mesh: "MeshLayout | None" = None
     forgotten: Forgotten | None = None
     moved: Moved | None = None
+    elsewhere: Elsewhere | None = None  # where the command's map is, if another server has it
     parcel: Parcel | None = None  # of `hand_over`
     asks: bool = False  # of a ping: whether this server's maps can be asked; an older one's cannot
     watches: bool = False  # likewise: whether its maps can be watched (`questions.Cells` and `Keyframes`)

@@ -19,35 +19,46 @@ from tsfusion.wire.curve import ClientKeys
 from tsfusion.wire.forgetting import Forgotten, Selection
 from tsfusion.wire.health import Health, MeshLayout, Status
 from tsfusion.wire.map_moves import Moved
-from tsfusion.wire.messages import Command, Reply
+from tsfusion.wire.messages import Command, Elsewhere, Reply
 from tsfusion.wire.sockets import control_address
 
 _AGAIN_INTERVAL = 0.25  # seconds
+_MOST_HOPS = 4  # from server to server, after a map
 _PING_TIMEOUT = 5.0  # seconds; the gateway is never busy: without an answer for so long there is none
 
 
 class CommandRefused(TransportError):
     """The server answered that it cannot do what a command asks."""
 
-    def __init__(self, address: str, reason: str, *, retry: bool = False) -> None:
+    def __init__(
+        self, address: str, reason: str, *, retry: bool = False, elsewhere: Elsewhere | None = None
+    ) -> None:
         super().__init__(f"the server at {address}: {reason}")
         self.reason = reason  # the server's words, without its address
         self.retry = retry  # whether the same command may succeed soon
+        self.elsewhere = elsewhere  # the server that has the map; None = no other is known
 
 
 def fetch_health(
-    address: str, *, control: str | None = None, timeout: float = 10.0, keys: ClientKeys | None = None
+    address: str,
+    *,
+    control: str | None = None,
+    map_name: str | None = None,
+    timeout: float = 10.0,
+    keys: ClientKeys | None = None,
 ) -> Health:
     """Ask the server at a data address for its health; it answers at once, whatever its fusers do.
 
     Args:
+        map_name: where that map is at another server by now, that one is asked.
         keys: of `curve.client_keys`, for a server with keys.
 
     Raises:
         NotAllowed: when the server turns the connection away.
         ServerUnreachable: when nobody answers in `timeout` seconds.
     """
-    reply, _ = _request_if_present(address, control, Command(name="health"), timeout, keys)
+    command = Command(name="health", map=map_name or DEFAULT_MAP)
+    reply, _ = _request_if_present(address, control, command, timeout, keys, follow=map_name is not None)
     if reply.health is None:
         raise TransportError(f"the server at {address} answered without its health")
     return reply.health
@@ -174,13 +185,52 @@ def move_map(
 
 
 def _request_if_present(
-    address: str, control: str | None, command: Command, timeout: float, keys: ClientKeys | None
+    address: str,
+    control: str | None,
+    command: Command,
+    timeout: float,
+    keys: ClientKeys | None,
+    *,
+    follow: bool = True,
 ) -> tuple[Reply, list[memoryview]]:
-    """Send a command that may take long to answer, after a ping has shown that the server is there."""
-    address = control_address(sockets.connect_address(address), control)
-    if timeout > _PING_TIMEOUT:
-        request(address, Command(name="ping"), timeout=_PING_TIMEOUT, keys=keys)
-    return request(address, command, timeout=timeout, keys=keys)
+    """Send a command that may take long to answer, after a ping has shown that the server is there.
+
+    Args:
+        follow: ask the server that the map is at, where the first one says so.
+    """
+    address = sockets.connect_address(address)
+    for hops_left in reversed(range(_MOST_HOPS + 1)):
+        place = control_address(address, control)
+        name = f"{address} (control {place})"
+        if timeout > _PING_TIMEOUT:
+            request(place, Command(name="ping"), timeout=_PING_TIMEOUT, keys=keys, name=name)
+        try:
+            reply, frames = request(place, command, timeout=timeout, keys=keys, name=name)
+        except CommandRefused as error:
+            if error.elsewhere is None or not follow or not hops_left:
+                raise
+            elsewhere = error.elsewhere
+        else:
+            if reply.elsewhere is None or not follow or not hops_left:
+                return reply, frames
+            elsewhere = reply.elsewhere
+        address, control = place_of(elsewhere, keys)
+    raise AssertionError("the last hop returns or raises")
+
+
+def place_of(elsewhere: Elsewhere, keys: ClientKeys | None) -> tuple[str, str]:
+    """Data and control address of a server that a map is said to be at.
+
+    Raises:
+        InvalidConfig: for addresses that are none, and without keys for those of other machines: anybody may
+            have said so.
+    """
+    data = sockets.connect_address(elsewhere.address)
+    control = sockets.connect_address(control_address(data, elsewhere.control or None))
+    if keys is None:
+        sockets.check_reachable(data, has_keys=False)
+        sockets.check_reachable(control, has_keys=False)
+    return data, control
 
 
 def mesh_of(layout: MeshLayout, frames: list[memoryview]) -> Mesh:
@@ -207,13 +257,19 @@ _MAX_TIMEOUT_S = 1e6  # seconds; a poll takes no more than 2³¹ ms
 
 
 def request(
-    address: str, command: messages.Command, *, timeout: float, keys: ClientKeys | None = None
+    address: str,
+    command: messages.Command,
+    *,
+    timeout: float,
+    keys: ClientKeys | None = None,
+    name: str = "",
 ) -> tuple[messages.Reply, list[memoryview]]:
     """Send a command to a server's control address; its reply and the raw frames that came with it.
 
     Args:
         timeout: seconds.
         keys: of `curve.client_keys`; None = a connection without.
+        name: of the server, in errors; empty = the address.
 
     Raises:
         InvalidConfig: for a malformed address.
@@ -224,10 +280,10 @@ def request(
     """
     address = sockets.connect_address(address)
     with sockets.open_context() as context, closing(open_connection(context, address, keys)) as connection:
-        exchange = Exchange(connection, [[messages.encode_sealed(command)]])
+        exchange = Exchange(connection, [[messages.encode_sealed(command)]], name)
         reply, frames = exchange.reply(timeout)
     if reply.error is not None:
-        raise CommandRefused(address, reply.error, retry=reply.retry)
+        raise CommandRefused(name or address, reply.error, retry=reply.retry, elsewhere=reply.elsewhere)
     return reply, frames
 
 
@@ -242,8 +298,9 @@ def open_connection(context: "zmq.Context[Any]", address: str, keys: ClientKeys 
 class Exchange:
     """Messages sent on each connection that is made, until the replies to them have come."""
 
-    def __init__(self, connection: Connection, sent: Sequence[list[Any]]) -> None:
+    def __init__(self, connection: Connection, sent: Sequence[list[Any]], name: str = "") -> None:
         self._connection, self._sent = connection, sent
+        self._name = name or connection.address  # of the server, in errors
         self._asked = 0  # on which connection
         self._why = ""  # there is none
 
@@ -260,7 +317,7 @@ class Exchange:
             ServerUnreachable: when nobody answered within `timeout` seconds.
             TransportError: when what answers is no tsfusion server.
         """
-        address = self._connection.address
+        address = self._name
         try:
             head, *frames = self._receive(min(timeout, _MAX_TIMEOUT_S))
             reply = messages.decode_to_client(head.buffer)
@@ -290,6 +347,6 @@ class Exchange:
                 raise (NotAllowed if connection.refused else TransportError)(self._why)
         reason = f": {self._why}" if self._why else ""
         raise ServerUnreachable(
-            f"no server answered at {connection.address} within {timeout:.3g} s{reason}; is `tsfusion serve` "
+            f"no server answered at {self._name} within {timeout:.3g} s{reason}; is `tsfusion serve` "
             "running there, and is the port right?"
         )
