@@ -5,19 +5,21 @@ import os
 import signal
 import threading
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import closing, suppress
 from pathlib import Path
 
 import pytest
 from command_processes import tsfusion
 from keyframes_and_servers import DEADLINE, Server, lasting_address, map_hash, pose, serving, until, wall
 
-from tsfusion import Client, journal
+from tsfusion import Client, MapClient, journal
 from tsfusion.core.config import ClientConfig
 from tsfusion.core.errors import TransportError
 from tsfusion.journal import state_folder
 from tsfusion.wire import queries
+from tsfusion.wire.map_events import MapEvent, SurfaceUpdate
+from tsfusion.wire.map_watcher import MapWatcher
 
 QUICK = ClientConfig(stall_timeout=0.5)
 FEW = 12
@@ -67,6 +69,17 @@ def acknowledged_more(sender: Sender) -> None:
     until(lambda: sender.client.stats.durable >= before + FEW)
 
 
+def see(watcher: MapWatcher, reached: Callable[[], bool]) -> None:
+    """Wait until the watcher is somewhere, and has the map's surface from there."""
+    seen: list[MapEvent] = []
+
+    def has_surface() -> bool:
+        seen.extend(watcher.events(0.1))
+        return reached() and any(isinstance(event, SurfaceUpdate) for event in seen)
+
+    until(has_surface)
+
+
 def journaled(state: Path) -> Counter[int]:
     """How often each number is in the journal of the default map."""
     folder = state_folder.map_folder(state, "default") / state_folder.JOURNAL_FOLDER
@@ -86,10 +99,19 @@ def test_a_live_map_moves_and_every_keyframe_is_in_it_once(
     tmp_path: Path, sending: tuple[Server, Server, Sender]
 ) -> None:
     one, two, sender = sending
-    moved = tsfusion("map", "move", "default", "--from", one.address, "--to", two.address)
-    assert moved.returncode == 0, moved.stderr
-    assert f"map default is at {two.address}" in moved.stdout
+    with closing(MapWatcher(one.address)) as watcher:
+        see(watcher, lambda: watcher.address == one.address)
+        moved = tsfusion("map", "move", "default", "--from", one.address, "--to", two.address)
+        assert moved.returncode == 0, moved.stderr
+        assert f"map default is at {two.address}" in moved.stdout
+        see(watcher, lambda: watcher.address == two.address)
     acknowledged_more(sender)
+    status = tsfusion("status", "--connect", one.address, "--map", "default")
+    assert status.returncode == 0, status.stdout + status.stderr
+    with MapClient(one.address, timeout=DEADLINE) as live:
+        assert live.sample([[0.0, 0.0, 1.0]]).state.keyframes >= FEW
+        assert live.address == two.address
+    assert len(queries.fetch_mesh(one.address).faces)
     with Client(one.address, spool=tmp_path / "late", config=QUICK) as late:  # knows only the first server
         late.send(wall(41, T_world_camera=pose(5.0)))
         late.flush(DEADLINE)

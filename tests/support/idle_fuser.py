@@ -26,6 +26,10 @@ while True:
         link.send(fuser_messages.encode(fuser_messages.Ready({})))
     elif isinstance(message, fuser_messages.Fuse):
         link.send(fuser_messages.encode(fuser_messages.Done(message.index, 1, 2, message.skip)))
+    elif isinstance(message, fuser_messages.Save):
+        link.send(fuser_messages.encode(fuser_messages.Saved(False)))
+    elif isinstance(message, fuser_messages.Warm | fuser_messages.Open):
+        link.send(fuser_messages.encode(fuser_messages.Prepared()))
     elif isinstance(message, fuser_messages.Finish):
         sys.exit(0)
 """

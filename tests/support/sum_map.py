@@ -56,7 +56,7 @@ class SumMap:
     quota = None  # nothing of it is used up
     stamp = drops = 0  # it has no blocks that change
 
-    def __init__(self, config: VolumeConfig) -> None:
+    def __init__(self, config: VolumeConfig, **_: object) -> None:
         self.config = config
         self.meta: dict[str, Any] = {}
         self.keyframes = 0
@@ -65,6 +65,9 @@ class SumMap:
     def warming_up(self) -> Iterator[None]:
         """Compile nothing: there are no kernels."""
         return iter(())
+
+    def warm_up(self) -> None:
+        """Compile nothing, either."""
 
     def kept_values(self) -> Any:
         """Keep nothing: there is no field."""

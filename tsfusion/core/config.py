@@ -227,6 +227,9 @@ class ServerConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     state: str = "tsfusion-state"  # folder: maps/NAME/journal/, maps/NAME/map.tsf
     keys: str | None = None  # folder of `tsfusion keys`; None = no keys, reachable from this machine only
     max_maps: Annotated[int, Meta(ge=1, le=64)] = 4  # open at the same time; each has a fuser process
+    spare_fusers: Annotated[int, Meta(ge=0, le=16)] = (
+        0  # that wait for maps, some 200 MB each; they open at once
+    )
     directory: str | None = None  # SQLite file in which servers write who has which map; None = one server
     advertise: str | None = None  # address by which clients reach this server; None = `listen`'s
     metrics: str | None = None  # loopback address of Prometheus' page and health checks: 127.0.0.1:9464

@@ -47,6 +47,13 @@ def configure(format: LogFormat, level: LogLevel, process: str = "server", *, ma
     sys.excepthook = _log_unexpected if format == "json" else sys.__excepthook__
 
 
+def name_map(map: str) -> None:
+    """Make a map the subject of every line that names no other one, from now on."""
+    for handler in logging.root.handlers:
+        if isinstance(handler.formatter, TextFormatter | JsonFormatter):
+            handler.formatter.map = map
+
+
 def about(
     *,
     map: str | None = None,
@@ -84,12 +91,12 @@ class TextFormatter(logging.Formatter):
 
     def __init__(self, process: str, map: str | None = None) -> None:
         super().__init__()
-        self._map = map
+        self.map = map
         self._name = "tsfusion" if process == "server" else f"tsfusion {process}"
 
     def format(self, record: logging.LogRecord) -> str:
         """One line; a traceback follows on lines of its own."""
-        subject = ", ".join(f"{key} {value}" for key, value in _about(record, self._map).items())
+        subject = ", ".join(f"{key} {value}" for key, value in _about(record, self.map).items())
         line = f"{self._name}: {record.levelname}: {printable(record.getMessage())}"
         trace = _trace(record)
         return line + (f" ({subject})" if subject else "") + (f"\n{trace}" if trace else "")
@@ -100,7 +107,7 @@ class JsonFormatter(logging.Formatter):
 
     def __init__(self, process: str, map: str | None = None) -> None:
         super().__init__()
-        self._map = map
+        self.map = map
         self._process = process
 
     def format(self, record: logging.LogRecord) -> str:
@@ -112,7 +119,7 @@ class JsonFormatter(logging.Formatter):
             "process": self._process,
             "logger": record.name,
             "message": printable(record.getMessage()),
-            **_about(record, self._map),
+            **_about(record, self.map),
         }
         if trace := _trace(record):
             fields["exception"] = trace

@@ -16,8 +16,10 @@ from tsfusion.core.config import LogFormat, LogLevel
 from tsfusion.core.errors import MapError, TsfusionError
 from tsfusion.core.folder_lock import lock_folder
 from tsfusion.fuser import messages as fuser_messages
+from tsfusion.fuser import opened_map
 from tsfusion.fuser.fuser import LOCK, Fuser
 from tsfusion.fuser.inbox import Inbox
+from tsfusion.fuser.opened_map import OpenedMap
 from tsfusion.wire import sockets
 
 _LOCK_WAIT_S = 60.0  # for another fuser to end: it may be reading a large map
@@ -55,7 +57,7 @@ def _serve(link: sockets.AnySocket) -> int:
     poller.register(link, zmq.POLLIN)
     poller.register(sys.stdin.fileno(), zmq.POLLIN)
     fuser: Fuser | None = None
-    inbox = Inbox(link)
+    inbox, ahead = Inbox(link), _Ahead(link)
     while fuser is None or fuser.exit_status is None:
         if fuser is not None:
             fuser.answer()
@@ -75,8 +77,12 @@ def _serve(link: sockets.AnySocket) -> int:
         if not inbox.orders:
             continue
         message = inbox.orders.popleft()
-        if isinstance(message, fuser_messages.Begin):
-            fuser = _open_map(link, message, inbox)
+        if isinstance(message, fuser_messages.Warm | fuser_messages.Open):
+            if not ahead.do(message):
+                return 1
+        elif isinstance(message, fuser_messages.Begin):
+            logs.name_map(Path(message.folder).name)
+            fuser = _open_map(link, message, inbox, ahead.opened)
             if fuser is None:
                 return 1
         elif fuser is not None:
@@ -102,35 +108,71 @@ def _do_some(fuser: Fuser, *, idle: bool) -> bool:
     return True
 
 
+class _Ahead:
+    """What is done before there is a map to work at."""
+
+    def __init__(self, link: sockets.AnySocket) -> None:
+        self._link = link
+        self.opened: OpenedMap | None = None
+
+    def do(self, message: fuser_messages.Warm | fuser_messages.Open) -> bool:
+        """Do it and say so; False where a map cannot be opened, and that is said."""
+        try:
+            if isinstance(message, fuser_messages.Warm):
+                opened_map.warm(message.volume)
+            else:
+                _lock(message.begin)
+                self.opened = OpenedMap(message.begin)
+                for _ in self.opened.warming:
+                    pass
+        except (TsfusionError, OSError, MemoryError) as error:
+            _say_failed(self._link, error)
+            return False
+        self._link.send(fuser_messages.encode(fuser_messages.Prepared()))
+        return True
+
+
 def _open_map(
-    link: sockets.AnySocket, message: fuser_messages.Begin, inbox: Inbox | None = None
+    link: sockets.AnySocket,
+    message: fuser_messages.Begin,
+    inbox: Inbox | None = None,
+    opened: OpenedMap | None = None,
 ) -> Fuser | None:
     """Open the map and report that, or why it cannot be opened; None = it cannot."""
     try:
-        process.end_first()
-        # held until this process ends
-        lock_folder(
-            Path(message.folder), "map", "fuser", name=LOCK, wait=_LOCK_WAIT_S, error_type=MapError,
-            make=False,  # one that is away must not be made in its place
-        )  # fmt: skip
-        fuser = Fuser(link, message, inbox)
+        if opened is None:
+            _lock(message)
+        fuser = Fuser(link, message, inbox, opened)
     except (TsfusionError, OSError, MemoryError) as error:
-        if isinstance(error, MemoryError):
-            known: TsfusionError = MapError(f"no memory to open the map: {error}; raise fuser_memory_bytes")
-        elif isinstance(error, OSError):
-            known = MapError(f"the map cannot be opened: {error}")
-        else:
-            known = error
-        link.send(fuser_messages.encode(fuser_messages.Failed.of(known)))
+        _say_failed(link, error)
         return None
     link.send(fuser_messages.encode(fuser.ready()))
     return fuser
 
 
+def _lock(begin: fuser_messages.Begin) -> None:
+    """Hold the map's folder until this process ends."""
+    process.end_first()
+    lock_folder(
+        Path(begin.folder), "map", "fuser", name=LOCK, wait=_LOCK_WAIT_S, error_type=MapError,
+        make=False,  # one that is away must not be made in its place
+    )  # fmt: skip
+
+
+def _say_failed(link: sockets.AnySocket, error: Exception) -> None:
+    if isinstance(error, MemoryError):
+        known: TsfusionError = MapError(f"no memory to open the map: {error}; raise fuser_memory_bytes")
+    elif isinstance(error, TsfusionError):
+        known = error
+    else:
+        known = MapError(f"the map cannot be opened: {error}")
+    link.send(fuser_messages.encode(fuser_messages.Failed.of(known)))
+
+
 def main() -> int:
     """Run the fuser process with the arguments that the gateway gives it: ENDPOINT FORMAT LEVEL MAP."""
     endpoint, format_, level, map_name = sys.argv[1:]
-    logs.configure(cast("LogFormat", format_), cast("LogLevel", level), "fuser", map=map_name)
+    logs.configure(cast("LogFormat", format_), cast("LogLevel", level), "fuser", map=map_name or None)
     logging.getLogger("tsfusion.tsdf.volume").disabled = True  # the gateway warns, and names the client
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)  # a terminal or supervisor signals all; the gateway decides

@@ -28,7 +28,7 @@ from tsfusion.fuser.current_keyframe import CurrentKeyframe
 from tsfusion.fuser.departures import Departures
 from tsfusion.fuser.inbox import Inbox
 from tsfusion.fuser.live_mesh import LiveMesh, mesh_frames
-from tsfusion.fuser.map_checkpoints import MapCheckpoints
+from tsfusion.fuser.opened_map import OpenedMap
 from tsfusion.fuser.pose_mover import REST_FACTOR, PoseMover
 from tsfusion.fuser.question_answers import QuestionAnswers
 from tsfusion.fuser.touched_by import TouchedBy
@@ -46,8 +46,7 @@ if TYPE_CHECKING:
 
     from tsfusion.tsdf.volume import IntegrateStats
 
-_WORKING_MEMORY = 768 << 20  # bytes for keyframes and meshes, beyond those of the map
-_FOR_KEYFRAMES = 256 << 20  # bytes of it that meshes leave free
+_FOR_KEYFRAMES = 256 << 20  # bytes of working memory that meshes leave free
 _FOR_A_CHECKPOINT = 64 << 20  # bytes beyond both
 LOCK = "fuser.lock"  # in the map's folder
 _PATIENCE_S = 10.0  # for a record that the system refuses to read, or whose segment is not there
@@ -65,13 +64,16 @@ class Fuser:
 
     Args:
         inbox: where questions to the map come in; None = nobody asks any.
+        opened: the map, where it was read before its folder had this name.
     """
 
     def __init__(
-        self, link: sockets.AnySocket, begin: fuser_messages.Begin, inbox: Inbox | None = None
+        self,
+        link: sockets.AnySocket,
+        begin: fuser_messages.Begin,
+        inbox: Inbox | None = None,
+        opened: OpenedMap | None = None,
     ) -> None:
-        from tsfusion.kernels import runtime
-
         self._link = link
         self._begin = begin
         self._folder = Path(begin.folder)
@@ -84,24 +86,15 @@ class Fuser:
         self._newest = Position(0, 0)  # of the records that were answered
         self._hashes: tuple[int, str, str] | None = None  # changes, map hash, colour hash
         self._current = CurrentKeyframe(begin.working)
-        runtime.start(begin.volume.threads)  # it reserves a GB, and more for each thread, and hardly uses it
-        self._memory_limit = process.data_bytes() + _WORKING_MEMORY + begin.memory_bytes
-        process.limit_memory(self._memory_limit)
         self.exit_status: int | None = None  # of the process, which has to end; None = it goes on
         self._home, self._journal_home = os.stat(self._folder), None
         with suppress(OSError):
             self._journal_home = os.stat(self._folder / state_folder.JOURNAL_FOLDER)
-        # A map of any size opens, as long as there is memory; from then on it may not outgrow its own.
-        self._map = MapCheckpoints(
-            self._folder,
-            begin.volume,
-            keep_previous=begin.keep_previous,
-            kept={"memory_bytes": begin.memory_bytes, "cache": begin.cache} if begin.cache else {},
-        )
+        opened = opened or OpenedMap(begin)
+        self._memory_limit, self._map = opened.memory_limit, opened.checkpoints
+        self._map.move_to(self._folder)
         self._volume = self._map.volume
-        self._warming: Iterator[None] | None = self._volume.warming_up()
-        next(self._warming, None)
-        self._volume.limit_memory(begin.memory_bytes)
+        self._warming: Iterator[None] | None = opened.warming
         self._touched_by = TouchedBy()
         self._live_mesh = LiveMesh(
             self._volume,

@@ -25,7 +25,7 @@ EXPIRED = -1  # instead of the number of a `Find`
 
 
 class Begin(Struct, frozen=True, tag="begin"):
-    """Open the map in `folder` and compile the kernels.
+    """Open the map in `folder` and compile the kernels, unless `Open` or `Warm` did, and work at it.
 
     Attributes:
         mesh_interval: seconds between two meshes, at least.
@@ -54,6 +54,19 @@ class Begin(Struct, frozen=True, tag="begin"):
     keep_keyframes: int | None = None
     keep_radius: float | None = None
     cache: CacheConfig | None = None
+
+
+class Warm(Struct, frozen=True, tag="warm"):
+    """Compile the kernels of maps with these settings; answered with `Prepared`."""
+
+    volume: VolumeConfig
+
+
+class Open(Struct, frozen=True, tag="open"):
+    """Read the map of a `Begin` that comes later, when its folder may have another name; answered with
+    `Prepared`."""
+
+    begin: Begin
 
 
 class SessionProgress(Struct, frozen=True, array_like=True):
@@ -138,6 +151,10 @@ class Finish(Struct, frozen=True, tag="finish"):
 
 class Started(Struct, frozen=True, tag="started"):
     """The process runs and waits for `Begin`."""
+
+
+class Prepared(Struct, frozen=True, tag="prepared"):
+    """What `Warm` or `Open` asked for is done."""
 
 
 class Ready(Struct, frozen=True, tag="ready"):
@@ -293,10 +310,10 @@ class FuserAnswer(Struct, frozen=True, tag="answered"):
     late: bool = False
 
 
-ToFuser = Begin | Fuse | FuserQuery | FuserQuestion | Find | Expire | Publish | Save | Finish
+ToFuser = Warm | Open | Begin | Fuse | FuserQuery | FuserQuestion | Find | Expire | Publish | Save | Finish
 ToGateway = (
-    Started | Ready | Failed | Done | CorrectionProgress | Saved | Found | Held | Meshed | FuserReply
-    | FuserAnswer
+    Started | Prepared | Ready | Failed | Done | CorrectionProgress | Saved | Found | Held | Meshed
+    | FuserReply | FuserAnswer
 )  # fmt: skip
 to_fuser: "msgspec.msgpack.Decoder[ToFuser]" = msgspec.msgpack.Decoder(ToFuser)
 to_gateway: "msgspec.msgpack.Decoder[ToGateway]" = msgspec.msgpack.Decoder(ToGateway)

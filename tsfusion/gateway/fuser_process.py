@@ -27,7 +27,10 @@ class FuserProcess:
     """A process that is started at once. Call `close` when it has ended, or to end it.
 
     Args:
-        name: of the map, for the log lines.
+        name: of the map, for the log lines; empty = that of a `Begin` that comes later.
+
+    Attributes:
+        has_started: whether it has said so, and takes messages.
 
     Raises:
         OSError, zmq.ZMQError: when the system cannot start it.
@@ -36,6 +39,7 @@ class FuserProcess:
     def __init__(
         self, context: "zmq.Context[Any]", name: str, log_format: LogFormat, log_level: LogLevel
     ) -> None:
+        self.has_started = False
         self._working = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115  nameless, held as long as this
         self._scratch = Path(tempfile.mkdtemp(prefix="tsfusion-"))  # a socket's path has to be short
         self.socket = sockets.pair(context)  # the gateway's end
@@ -82,8 +86,13 @@ class FuserProcess:
         """Write that it is at no keyframe."""
         os.pwrite(self._working.fileno(), struct.pack("<q", fuser_messages.NOT_WORKING), 0)
 
+    def note_start(self) -> None:
+        """Note that it has connected: the file by which it did must not stay behind a killed gateway."""
+        self.has_started = True
+        self.remove_socket_file()
+
     def remove_socket_file(self) -> None:
-        """Remove the file by which the process has connected: none stays behind a killed gateway."""
+        """Remove the file by which the process has connected."""
         shutil.rmtree(self._scratch, ignore_errors=True)
 
     def kill(self) -> None:

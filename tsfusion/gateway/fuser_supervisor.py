@@ -17,8 +17,8 @@ from tsfusion.core import logs, process
 from tsfusion.core.config import CacheConfig, ServerConfig, VolumeConfig
 from tsfusion.core.errors import MapError
 from tsfusion.fuser import messages as fuser_messages
-from tsfusion.gateway.fuser_process import FuserProcess
 from tsfusion.gateway.fuser_silence import FuserSilence
+from tsfusion.gateway.spare_fusers import SpareFusers
 from tsfusion.wire import sockets
 
 log = logging.getLogger(__name__)
@@ -38,14 +38,29 @@ STANDS_STILL_AFTER = 5.0  # seconds at one keyframe, stopped, or waiting for a d
 
 
 class FuserSupervisor:
-    """One fuser process after another, all at work on the same map."""
+    """One fuser process after another, all at work on the same map.
+
+    Args:
+        ahead: another folder, in which the map is read until `begin_work` says that it lies in its own.
+        spares: processes that have all but the map.
+
+    Attributes:
+        is_prepared: whether the map was read ahead.
+    """
 
     def __init__(
-        self, context: "zmq.Context[Any]", folder: Path, server: ServerConfig, volume: VolumeConfig
+        self,
+        context: "zmq.Context[Any]",
+        folder: Path,
+        server: ServerConfig,
+        volume: VolumeConfig,
+        *,
+        ahead: Path | None = None,
+        spares: SpareFusers | None = None,
     ) -> None:
-        self._context = context
         self._map = folder.name
-        self._server = server
+        self._server, self._ahead = server, ahead
+        self._spares = spares or SpareFusers(context, server)
         self._begin = fuser_messages.Begin(
             str(folder),
             volume,
@@ -59,8 +74,9 @@ class FuserSupervisor:
             keep_seconds=server.keep_seconds,
             keep_keyframes=server.keep_keyframes,
             keep_radius=server.keep_radius,
-            cache=_cache(server, folder),
+            cache=_cache(server, folder if ahead is None else folder.parent),  # on the same disk
         )
+        self.is_prepared = False
         self._early_deaths = 0  # in a row, of processes that were not at work on a keyframe
         self._blame: dict[int, int] = {}  # index of a keyframe → weight of the deaths at it
         self.finishing = self._finish_sent = False
@@ -74,9 +90,8 @@ class FuserSupervisor:
             raise MapError(f"the fuser process of map {self._map} cannot be started: {error}") from error
 
     def _start(self) -> None:
-        self._process = FuserProcess(
-            self._context, self._map, self._server.log_format, self._server.log_level
-        )
+        self._process = self._spares.take(self._map, self._begin.volume)
+        self.is_prepared = False
         self.ready = False  # it has opened the map and compiled the kernels
         self.held = ""
         self._restart_at = 0.0
@@ -84,6 +99,21 @@ class FuserSupervisor:
         self._last_message = self._ready_since = time.monotonic()
         self._oom_kills = process.oom_kills()
         self.in_flight: deque[int] = deque()  # indices that it has not answered, oldest first
+        if self._process.has_started:
+            self._send_begin()
+
+    def _send_begin(self) -> None:
+        """Give the process its map. It takes messages, and none was sent: there is room for this one."""
+        if self._ahead is None:
+            self.send(msgspec.structs.replace(self._begin, working=self._process.working_file))
+        else:
+            self.send(fuser_messages.Open(msgspec.structs.replace(self._begin, folder=str(self._ahead))))
+
+    def begin_work(self) -> None:
+        """Have the map, which lies in its own folder now, worked at."""
+        self._ahead = None
+        if self._process.has_started:
+            self._send_begin()
 
     @property
     def socket(self) -> sockets.AnySocket:
@@ -173,8 +203,10 @@ class FuserSupervisor:
         elif isinstance(message, fuser_messages.Failed):
             raise message.error()
         if isinstance(message, fuser_messages.Started):
-            self._process.remove_socket_file()
-            self.send(msgspec.structs.replace(self._begin, working=self._process.working_file))
+            self._process.note_start()
+            self._send_begin()
+        elif isinstance(message, fuser_messages.Prepared):
+            self.is_prepared = True
         elif isinstance(message, fuser_messages.Ready):
             self.ready = self._was_ready = True
             self._ready_since = self._last_message

@@ -15,7 +15,7 @@ import msgspec
 import zmq
 
 from tsfusion.core import logs, process
-from tsfusion.core.config import SERVER_SESSION, ServerConfig
+from tsfusion.core.config import ServerConfig
 from tsfusion.core.counts import count_of
 from tsfusion.core.errors import DecodeError, JournalError
 from tsfusion.fuser import messages as fuser_messages
@@ -27,6 +27,7 @@ from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.connection_limits import ConnectionLimits
 from tsfusion.gateway.forgetting import Request
 from tsfusion.gateway.fuser_queries import FuserQueries
+from tsfusion.gateway.greetings import Greetings
 from tsfusion.gateway.hosted_map import ForPeople, HostedMap
 from tsfusion.gateway.keyframe_intake import KeyframeIntake
 from tsfusion.gateway.map_moves import MapMoves
@@ -37,7 +38,6 @@ from tsfusion.gateway.metrics import Metrics
 from tsfusion.gateway.ports import Flood, Ports, Subscriptions, receive_some
 from tsfusion.gateway.problems import Problem, ProblemTimes
 from tsfusion.gateway.scan_updates import ScanUpdates
-from tsfusion.gateway.sessions import Sessions
 from tsfusion.wire import messages, sockets
 from tsfusion.wire.allowed_maps import ALL_MAPS, AllowedMaps
 from tsfusion.wire.forgetting import Forgotten
@@ -51,6 +51,7 @@ _RENEW_TICK_MS = 10  # while the sockets are made anew
 _SNAPSHOT_INTERVAL = 1.0  # seconds
 _CLIENT_PROBLEMS = 10  # lines about single clients
 _REPLIES_SHARE = 4  # one fourth of the memory is for meshes and answers that wait to be read
+_OF_AN_OPEN_MAP = frozenset({"forget", "ask", "status", "mesh"})
 Handlers = dict[sockets.AnySocket, Callable[[list[zmq.Frame]], None]]
 
 
@@ -76,6 +77,7 @@ class Gateway:
         self._admission = Admission(access, self._routes)
         self._refused = self._admission.refused
         self.maps = MapRegistry(context, server, self._routes, metrics)
+        self._greetings = Greetings(server, self.maps, self._admission, self._routes, ports)
         self._subscriptions = Subscriptions()
         self._scans = ScanUpdates(ports, self._subscriptions)
         self._intake = KeyframeIntake(
@@ -234,80 +236,9 @@ class Gateway:
         if isinstance(message, messages.Command):
             self._on_command(identity.bytes, message, points, client)
         elif isinstance(message, messages.Hello):
-            self._on_hello(identity, message, client)
+            self._greetings.on_hello(identity, message, client, self.epoch)
         else:
-            self._on_ping(identity.bytes, message, client)
-
-    def _on_hello(self, frame: zmq.Frame, hello: messages.Hello, client: str) -> None:
-        identity = frame.bytes
-        if denied := self._denial(identity, hello, client):
-            self.ports.reply(identity, messages.Denied(hello.session, *denied))
-            return
-        if (route := self._routes.get(hello.session)) is not None:
-            route.address = sockets.peer_address(frame)
-        durable, fused = self.maps.progress(hello.map, hello.session)
-        welcome = messages.Welcome(
-            epoch=self.epoch,
-            version=messages.PROTOCOL_VERSION,
-            durable=durable,
-            fused=fused,
-            window_keyframes=self._server.window_keyframes,
-            window_bytes=self._server.window_bytes,
-            max_frame_bytes=self._server.max_frame_bytes,
-        )
-        if (hosted := self.maps.get(hello.map)) is not None:
-            hosted.outcomes.tell_untold(hello.session)  # before it is told that these are answered
-        self.ports.reply(identity, welcome)
-
-    def _denial(self, identity: bytes, hello: messages.Hello, client: str) -> tuple[str, ...] | None:
-        """The fields of the answer to a session that is not opened; None = it is, and its route is made."""
-        if hello.version != messages.PROTOCOL_VERSION:
-            speaks = f"the server speaks version {messages.PROTOCOL_VERSION} of the wire format"
-            return "version", f"{speaks}, this client {hello.version}"
-        if forbidden := self._admission.denial_of_map(client, hello.map, sends=True):
-            return "map", forbidden
-        try:
-            elsewhere = self.maps.elsewhere(hello.map)
-        except JournalError as error:
-            return "map", f"map {hello.map} cannot be opened: {error}"
-        if elsewhere is not None:
-            return "moved", f"map {hello.map} is at {elsewhere[0]} now", "", *elsewhere
-        hosted = self.maps.greet(hello.map)
-        if hosted is None and (why := self.maps.why_not(hello.map)):
-            return "map", f"map {hello.map} cannot be opened: {why}"
-        if hosted is not None and not hosted.takes_records:
-            what = "moves to another server" if hosted.is_frozen else "is being opened"
-            return "opening", f"map {hello.map} {what}"
-        if hello.session == SERVER_SESSION:
-            return "session", "the session of this spool is the server's own: use another spool folder"
-        sessions = Sessions() if hosted is None else hosted.sessions
-        if not self._admission.owns(sessions, hello.session, client):
-            return "session", "the session of this spool is another client's: use another spool folder"
-        if not sessions.room_for(hello.session):
-            return "session", f"map {hello.map} has {len(sessions)} sessions and takes no new one"
-        may_use = self._admission.maps_of(client)
-        if hosted is not None and (other := self.maps.denial_of_world(hosted, hello, may_use)):
-            self._refused["world"] += 1
-            log.warning("%s", other.message, extra=logs.about(session=hello.session, client=client))
-            return other.reason, other.message, other.free_map
-        scans = sessions.get(hello.session) is not None
-        self._routes.connect(hello.session, hello.map, identity, client, scans=scans)
-        return None
-
-    def _on_ping(self, identity: bytes, ping: messages.Ping, client: str) -> None:
-        received_ns = time.monotonic_ns()
-        progress: tuple[int, int] = (0, 0)
-        waiting = None
-        route = self._routes.mark_alive(ping.session, client)
-        if route is not None:
-            route.identity = identity  # of several connections the one that is heard is the one that stands
-            route.update(ping)
-            progress = self.maps.progress(route.map, ping.session)
-            if (hosted := self.maps.get(route.map)) is not None:
-                hosted.outcomes.tell_untold(ping.session)
-                waiting = hosted.corrections_waiting
-        pong = messages.Pong(self.epoch, ping.sent_ns, received_ns, time.monotonic_ns(), *progress, waiting)
-        self.ports.reply(identity, pong)
+            self._greetings.on_ping(identity.bytes, message, client, self.epoch)
 
     def _on_command(
         self, identity: bytes, command: messages.Command, points: list[zmq.Frame], client: str
@@ -316,7 +247,9 @@ class Gateway:
         if command.name == "ping":
             self.ports.reply(identity, messages.Reply(name="ping", asks=True, watches=True))
         elif command.name == "health":
-            self.ports.reply(identity, messages.Reply(name="health", health=self.health(maps)))
+            elsewhere = self._elsewhere(command.map) if command.map in maps else None
+            reply = messages.Reply(name="health", health=self.health(maps), elsewhere=elsewhere)
+            self.ports.reply(identity, reply)
         elif command.name == "new_map":
             try:
                 name = self.maps.keep_free_name(command.map, maps)
@@ -327,6 +260,10 @@ class Gateway:
         elif forbidden := self._admission.denial_of_map(client, command.map):
             number = command.number
             self.ports.reply(identity, messages.Reply(name=command.name, number=number, error=forbidden))
+        elif command.name in _OF_AN_OPEN_MAP and (place := self._elsewhere(command.map)) is not None:
+            why = f"map {command.map} is at {place.address} now"
+            reply = messages.Reply(name=command.name, number=command.number, error=why, elsewhere=place)
+            self.ports.reply(identity, reply)
         elif command.name == "forget":
             self._on_forget(identity, command, client)
         elif command.name in ("move", "hand_over"):
@@ -335,6 +272,15 @@ class Gateway:
             self._questions.ask(identity, command, points, self.maps.get(command.map), client)
         else:
             self._queries.submit(identity, command, self.maps.get(command.map), client)
+
+    def _elsewhere(self, name: str) -> messages.Elsewhere | None:
+        """The other server that has a map; None = none is known, or the map is open here."""
+        try:
+            place = None if self.maps.has(name) else self.maps.elsewhere(name)
+        except JournalError as error:
+            log.error("%s", error, extra=logs.about(map=name))
+            return None
+        return None if place is None else messages.Elsewhere(*place)
 
     def _on_forget(self, identity: bytes, command: messages.Command, client: str) -> None:
         def answer(found: Forgotten | str) -> None:

@@ -1,11 +1,9 @@
 # SPDX-License-Identifier: MIT
 """One map of a server: its journal, its sessions, and the fuser that works through the journal."""
 
-import glob
 import logging
 import time
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,10 +12,10 @@ from numpy.typing import NDArray
 
 from tsfusion.core import logs
 from tsfusion.core.config import SERVER_SESSION, ServerConfig, VolumeConfig
-from tsfusion.core.counts import count_of
 from tsfusion.core.errors import JournalError
 from tsfusion.fuser import messages as fuser_messages
-from tsfusion.gateway import moved_maps
+from tsfusion.gateway import map_opening, moved_maps
+from tsfusion.gateway.checkpoint_orders import CheckpointOrders
 from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.disk_pause import DiskPause
 from tsfusion.gateway.forgetting import Forgetting
@@ -26,23 +24,20 @@ from tsfusion.gateway.fuser_supervisor import FuserSupervisor
 from tsfusion.gateway.journal_retention import JournalRetention
 from tsfusion.gateway.keyframe_index import KeyframeIndex
 from tsfusion.gateway.keyframe_outcomes import KeyframeOutcomes
+from tsfusion.gateway.map_condition import MapCondition
 from tsfusion.gateway.metrics import Metrics
 from tsfusion.gateway.question_counts import QuestionCounts
 from tsfusion.gateway.sessions import Sessions
-from tsfusion.journal import Journal, Position, ReadingWatcher, Unwritten, state_folder
+from tsfusion.gateway.spare_fusers import SpareFusers
+from tsfusion.journal import Position, ReadingWatcher, Unwritten, state_folder
 from tsfusion.journal.quarantine import Quarantine
 from tsfusion.wire import corrections, keyframe_times
-from tsfusion.wire.health import MapHealth, MapState
-from tsfusion.wire.mesh_updates import Meshed, MeshUpdate
+from tsfusion.wire.health import MapHealth
+from tsfusion.wire.mesh_updates import Meshed
 from tsfusion.wire.record_header import CorrectionHeader, RecordHeader, unpack
 
 log = logging.getLogger(__name__)
 
-_SEGMENTS_KEPT = 4  # a journal with a limit is deleted in quarters of that limit
-_FOR_GONE = "what no checkpoint holds of them is lost, unless they are put back"
-_SAVE_PAUSE = 10.0  # seconds until a checkpoint is tried again that could not be written
-_LONGEST_WAIT = 0.2  # seconds of a step, for a segment of the journal that is put back
-_STALLED_AFTER = 10.0  # seconds in which keyframes wait and none is fused
 ForPeople = tuple[Meshed | fuser_messages.FuserReply | fuser_messages.FuserAnswer, Sequence[zmq.Frame]]
 
 
@@ -60,6 +55,8 @@ class HostedMap:
 
     Args:
         watch: told how far the journal is read: that may take minutes, in which nothing else is done.
+        fuser: that read the map ahead; None = one begins now.
+        spares: processes that it may take.
     """
 
     def __init__(
@@ -72,25 +69,18 @@ class HostedMap:
         routes: ClientRoutes,
         metrics: Metrics,
         watch: ReadingWatcher = lambda _done, _all, _records: None,
+        fuser: FuserSupervisor | None = None,
+        spares: SpareFusers | None = None,
     ) -> None:
         self.name, self.volume = name, volume
         self.folder = state_folder.map_folder(server.state, name)
         self.sessions = Sessions()
         self.questions = QuestionCounts()
         self.is_leaving = self.is_frozen = False  # to another server; it takes no records any more
-        self.warm = False  # the fuser has been ready once: from then on it is known what the map has
         self._metrics = metrics
         self._keeps_window = (server.keep_seconds, server.keep_keyframes, server.keep_radius) != (None,) * 3
-        self._last_keyframe: float | None = None  # time.monotonic()
-        self._moved = 0.0  # time.monotonic(): the fuser answered, or had nothing to answer
-        self._loss = ""
-        self._newest_mesh: MeshUpdate | None = None
-        self._checkpoints = 0  # written since the map was opened
-        self._unsaved = ""  # why no checkpoint can be written; empty = it can
-        self._save_at = 0.0  # time.monotonic()
-        self._missing = 0  # segments of the journal that were missing when a checkpoint was asked for
         self._is_new = not state_folder.holds_a_map(self.folder)
-        self._journal = _open_journal(self.folder, server, watch)
+        self._journal = map_opening.open_journal(self.folder, server, watch)
         self.disk = DiskPause(self._journal, name)
         self._quarantine = Quarantine(self.folder / state_folder.QUARANTINE_FOLDER, server.quarantine_bytes)
         self._index = KeyframeIndex()
@@ -113,8 +103,22 @@ class HostedMap:
             quarantine=self._quarantine,
         )
         self._retention = JournalRetention(self._journal, self._index, self.sessions, server.journal_bytes)
-        _warn_of_old_corrections(self.folder)
-        self.fuser = FuserSupervisor(context, self.folder, server, volume)
+        map_opening.warn_of_old_corrections(self.folder)
+        self.fuser = fuser or FuserSupervisor(context, self.folder, server, volume, spares=spares)
+        if fuser is not None:
+            fuser.begin_work()
+        self._checkpoints = CheckpointOrders(self.fuser, self._journal)
+        self._condition = MapCondition(
+            self.fuser,
+            self._journal,
+            self._quarantine,
+            disk=self.disk,
+            sessions=self.sessions,
+            backlog=self._backlog,
+            outcomes=self.outcomes,
+            checkpoints=self._checkpoints,
+            questions=self.questions,
+        )
         self._leaving: dict[int, int] = {}  # index of a record that forgets keyframes → how many
         self.forgetting = Forgetting(
             name,
@@ -124,6 +128,16 @@ class HostedMap:
             append=self._append_forgotten,
             send=self.fuser.send,
         )
+
+    @property
+    def warm(self) -> bool:
+        """Whether the fuser has been ready once: from then on it is known what the map has."""
+        return self._condition.warm
+
+    @property
+    def is_saved(self) -> bool:
+        """Whether the checkpoint that it was to leave with is written, or cannot be."""
+        return self._checkpoints.is_answered
 
     @property
     def takes_records(self) -> bool:
@@ -142,7 +156,7 @@ class HostedMap:
     @property
     def drained(self) -> bool:
         """Whether the map has every keyframe of the journal, where the newest correction of it says."""
-        return self.fuser.idle and self._backlog.is_empty and not self.outcomes.moves.waiting
+        return self._condition.drained
 
     @property
     def corrections_waiting(self) -> int:
@@ -156,7 +170,9 @@ class HostedMap:
 
     def idle_since(self, since: float) -> bool:
         """Whether no keyframe waits, nor came since then (`time.monotonic()`)."""
-        return self.drained and (self._last_keyframe is None or self._last_keyframe < since)
+        return self.drained and (
+            self._condition.last_keyframe is None or self._condition.last_keyframe < since
+        )
 
     def close(self, *, wait: bool = True) -> None:
         """End the fuser and finish the journal. A journal that cannot be finished is logged.
@@ -217,12 +233,12 @@ class HostedMap:
             is_correction=is_correction,
         )
         if self._backlog.is_empty:
-            self._moved = time.monotonic()
+            self._condition.moved = time.monotonic()
         self._backlog.add(session, is_correction=is_correction)
         if is_correction:
             self._corrections += 1
         else:
-            self._last_keyframe = durable_ns / 1e9
+            self._condition.last_keyframe = durable_ns / 1e9
             self._metrics.observe(self.name, "journal", (durable_ns - received_ns) / 1e9)
         stamps = keyframe_times.Stamps(header.seq, received_ns, durable_ns)
         self.outcomes.acknowledge(header.session, [stamps])
@@ -238,8 +254,7 @@ class HostedMap:
         """
         self.is_leaving = True
         self._close_segment()
-        if self.fuser.ready:
-            self.fuser.send(fuser_messages.Save())
+        self._checkpoints.ask()
 
     def freeze(self) -> None:
         """Take no records any more, and close the journal's last file; raises JournalError."""
@@ -272,7 +287,7 @@ class HostedMap:
         while (received := self.fuser.receive()) is not None:
             message, frames = received
             if isinstance(message, fuser_messages.Done):
-                self._moved = time.monotonic()
+                self._condition.moved = time.monotonic()
                 self._backlog.on_done(message.index, (message.fused_ns - message.fuse_start_ns) / 1e9)
                 self._leaving.pop(message.index, None)
                 self.outcomes.on_done(message)
@@ -286,7 +301,7 @@ class HostedMap:
                 self.forgetting.on_found(message)
             elif isinstance(message, Meshed):
                 self.outcomes.on_meshed(message)
-                self._newest_mesh = message.update or self._newest_mesh
+                self._condition.newest_mesh = message.update or self._condition.newest_mesh
                 for_people.append((message, frames))
             elif isinstance(message, fuser_messages.FuserAnswer):
                 for_people.append((message, frames))
@@ -303,7 +318,7 @@ class HostedMap:
         if not self.disk.is_away and not self.is_leaving:
             needed = self.outcomes.moves.first_segment if self._keeps_window else None
             self._retention.step(self.fuser, self.outcomes.unmeshed, window_from=needed)
-        self._save_again()
+        self._checkpoints.step()
         self._forget()
         return for_people
 
@@ -320,30 +335,15 @@ class HostedMap:
             )
 
     def _on_saved(self, saved: fuser_messages.Saved) -> None:
-        self._checkpoints += saved.written
         if saved.written:
             self.outcomes.on_checkpoint()
-        self._unsaved = saved.problem
-        self._save_at = time.monotonic() + _SAVE_PAUSE
+        self._checkpoints.on_saved(saved)
         self._retention.on_saved(saved)
         self.forgetting.on_saved(saved)
 
-    def _save_again(self) -> None:
-        """Ask for a checkpoint where the last one failed, or segments of the journal have gone since."""
-        now, missing = time.monotonic(), len(self._journal.missing)
-        is_due = self._unsaved and now >= self._save_at
-        if (
-            self.fuser.ready
-            and (is_due or missing > self._missing)
-            and self.fuser.send(fuser_messages.Save())
-        ):
-            self._save_at = now + _SAVE_PAUSE
-            self._missing = missing
-        self._missing = min(self._missing, missing)
-
     def _on_ready(self, ready: fuser_messages.Ready) -> None:
         if not self.warm:
-            self._compare(ready)
+            map_opening.compare(self.name, self._journal, self.sessions, ready)
         for key, progress in ready.done.items():
             session = self.sessions.open(key, progress.client, progress.world)
             session.durable = max(session.durable, progress.seq)
@@ -355,143 +355,24 @@ class HostedMap:
         self._retention.on_ready()
         self.forgetting.on_ready()
         if not self.warm:
-            self.warm = True
-            self._moved = time.monotonic()
-            log.info("%s", self._contents(ready), extra=logs.about(map=self.name))
-        self._check_checkpoint(ready)
-
-    def _compare(self, ready: fuser_messages.Ready) -> None:
-        """Say that the journal, of which nothing was deleted on purpose, ends before the checkpoint does."""
-        shorter = [key for key, done in ready.done.items() if self.sessions.progress(key)[0] < done.seq]
-        if shorter and self._journal.first == 1:
-            log.warning(
-                "its checkpoint holds keyframes of %s that its journal %s lacks: was the journal "
-                "deleted, or is its disk not mounted? The map cannot be built again from it",
-                count_of(len(shorter), "session"),
-                self._journal.folder,
-                extra=logs.about(map=self.name),
-            )
-
-    def _contents(self, ready: fuser_messages.Ready) -> str:
-        """What there is of a map when it is opened, for the log."""
-        waiting = self._backlog.keyframes
-        if not ready.done and not waiting:
-            return "a new map is open"
-        rest = f"; {waiting} more are fused from its journal" if waiting else ""
-        return f"the map is open, with {count_of(ready.keyframes, 'keyframe')}{rest}"
-
-    def _check_checkpoint(self, ready: fuser_messages.Ready) -> None:
-        """Report keyframes that are neither in a checkpoint nor in the journal."""
-        self._loss = ""
-        if not ready.done and self._journal.first > 1:
-            first = self._journal.first
-            self._loss = f"its checkpoints are lost, and with them what was journaled before segment {first}"
-            log.error("%s", self._loss, extra=logs.about(map=self.name))
+            self._condition.warm = True
+            self._condition.moved = time.monotonic()
+            found = map_opening.contents(ready, self._backlog.keyframes)
+            log.info("%s", found, extra=logs.about(map=self.name))
+        self._condition.loss = map_opening.loss(self.name, self._journal, ready)
 
     # --- health ---
 
     @property
-    def state(self) -> MapState:
-        """The state in a word."""
-        if self.fuser.failed:
-            return "failed"
-        if not self.warm:
-            return "opening"
-        if not self.fuser.ready:
-            return "restarting"
-        return "idle" if self.drained else "busy"
-
-    @property
     def problem(self) -> str:
         """Why keyframes are not accepted or not fused, and what to do; empty = they are."""
-        if problem := self.disk.problem or self.fuser.problem:
-            return problem
-        stalled = self.warm and not self._backlog.is_empty and time.monotonic() - self._moved > _STALLED_AFTER
-        if stalled and self.fuser.ready:
-            return "keyframes wait and none is fused: its fuser makes a mesh or a checkpoint, or it hangs"
-        return "keyframes wait, and its fuser is still starting again: read the log" if stalled else ""
+        return self._condition.problem
 
     @property
     def notices(self) -> list[str]:
         """What a person should know of, though keyframes are taken and will be fused."""
-        damaged, put_back = self._journal.damaged, self._journal.put_back
-        lost = count_of(damaged, "keyframe of its journal is", "keyframes of its journal are")
-        notices = [f"{lost} damaged and lost"] if damaged else []
-        if absent := self._journal.absent:
-            gone = count_of(absent, "segment of its journal was", "segments of its journal were")
-            notices.append(f"{gone} not there at the start: {_FOR_GONE}")
-        if missing := self._journal.missing:
-            first = f"{missing[0]:06d}.mcap"
-            gone = count_of(len(missing), "segment of its journal is", "segments of its journal are")
-            notices.append(f"{gone} gone, first {first}: {_FOR_GONE}")
-        if put_back:
-            notices.append(
-                f"its journal was taken away while it was written to, {count_of(put_back, 'time')}, and was "
-                "put back with every keyframe: find out who deletes or moves files there"
-            )
-        if self._unsaved:
-            notices.append(f"no checkpoint can be written: {self._unsaved}")
-        if self.state == "restarting" and not self.problem:
-            notices.append("its fuser ended, and another one takes over: the log says why")
-        notices += filter(None, (self._quarantine.problem, self._loss))
-        return [*notices, *self.outcomes.notices.values()]
+        return self._condition.notices
 
     def health(self) -> MapHealth:
         """How the map is doing, as far as it is known without asking the fuser."""
-        now, outcomes = time.monotonic(), self.outcomes
-        return MapHealth(
-            state=self.state,
-            problem=self.problem,
-            keyframes_durable=outcomes.taken + outcomes.rejected.total() + self._backlog.keyframes,
-            keyframes_fused=outcomes.fused,
-            waiting=self._backlog.keyframes,
-            rejected=dict(outcomes.rejected),
-            quarantined=len(self._quarantine),
-            sessions=self.sessions.of_clients,
-            journal_bytes=self._journal.nbytes,
-            journal_damaged=self._journal.damaged,
-            fuser_restarts=self.fuser.restarts,
-            blocks=outcomes.blocks,
-            map_bytes=outcomes.map_bytes,
-            last_keyframe_s=None if self._last_keyframe is None else max(now - self._last_keyframe, 0.0),
-            delay_ms=outcomes.delays.summary(),
-            delay_bound_ms=outcomes.delays.bound_ms,
-            corrections=self._corrections,
-            corrections_waiting=self.corrections_waiting,
-            corrections_unavailable=outcomes.moves.unavailable,
-            keyframes_moved=outcomes.moves.moved,
-            moving_s=outcomes.moves.seconds,
-            keyframes_forgotten=outcomes.moves.forgotten,
-            checkpoints=self._checkpoints,
-            journal_missing=self._journal.absent + len(self._journal.missing),
-            journal_put_back=self._journal.put_back,
-            fusing_s=self.fuser.seconds_at_work,
-            questions=dict(self.questions.by_outcome),
-            question_ms=self.questions.delay_ms,
-            mesh_epoch=self._newest_mesh.epoch if self._newest_mesh else "",
-            mesh_number=self._newest_mesh.number if self._newest_mesh else 0,
-        )
-
-
-def _open_journal(folder: Path, server: ServerConfig, watch: ReadingWatcher) -> Journal:
-    """The map's journal, in segments small enough to keep it to its limit."""
-    segment_bytes = server.segment_bytes
-    if server.journal_bytes is not None:
-        segment_bytes = min(segment_bytes, server.journal_bytes // _SEGMENTS_KEPT)
-    return Journal(
-        folder / state_folder.JOURNAL_FOLDER,
-        segment_bytes,
-        min_free_bytes=server.min_free_bytes,
-        longest_wait=_LONGEST_WAIT,
-        watch=watch,
-    )
-
-
-def _warn_of_old_corrections(folder: Path) -> None:
-    old = folder / "corrections"
-    if glob.glob("*.tsc", root_dir=old):  # nothing where the disk does not say
-        log.warning(
-            "%s holds corrected poses as an earlier development version kept them: they are not read; "
-            "delete the folder to silence this",
-            old,
-        )
+        return self._condition.health(self._corrections, self.corrections_waiting)

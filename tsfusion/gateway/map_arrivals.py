@@ -15,6 +15,7 @@ import zlib
 from collections.abc import Callable
 from contextlib import closing, suppress
 from pathlib import Path
+from typing import Any
 
 import msgspec
 from msgspec import Struct
@@ -40,6 +41,8 @@ log = logging.getLogger(__name__)
 _ANSWER_S = 10.0  # for one answer of the other server
 _LITTLE = 4 << 20  # bytes that were new in a round: the rest is copied while the map stands still
 _MOST_ROUNDS = 30
+_ROUND_S = 0.1  # between two looks while there is little to copy
+_SAVING_S = 60.0  # for the other server to write a checkpoint, without which more is fused anew here
 _RETRY_S = 1.0  # until a question is asked again that was not answered, or too early
 _OPENING_S = 120.0  # for the other server to open the map
 _PREFIX, _SUFFIX = ".", ".arriving"
@@ -56,6 +59,9 @@ class Request(Struct, frozen=True):
 
 class MapArrival:
     """One map that comes. `outcome` is set when the thread has ended.
+
+    Before that, `wants_fuser` says that its files can be read; `prepared` is to be set when that was done, or
+    cannot be: only then the map is frozen.
 
     Args:
         own: data and control address of this server, for clients.
@@ -81,6 +87,8 @@ class MapArrival:
         self._move = secrets.token_bytes(16) if resumed is None else bytes.fromhex(resumed.move)
         self._have: dict[str, tuple[int, str]] = {}  # bytes and version, by file
         self._copied = self._number = 0
+        self.volume: dict[str, Any] = {}  # its settings, once they are known
+        self.wants_fuser, self.prepared = threading.Event(), threading.Event()
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"arrival-{self.name}", daemon=True)
         self._thread.start()
@@ -119,15 +127,10 @@ class MapArrival:
     def _copy(self, link: Connection) -> float:
         """Copy the map while it lives, then freeze it and copy the rest; when it was frozen."""
         self._wait_until_it_can_leave(link)
-        for _ in range(_MOST_ROUNDS):
-            before = self._copied
-            self._take_files(link, self._ask(link, "list")[0].files)
-            if self._copied - before < _LITTLE:
-                break
+        self._copy_what_is_there(link)
         frozen_at = time.monotonic()
         last, _ = self._ask(link, "freeze")
-        journal = tuple(one for one in last.files if one.name != state_folder.MAP_FILE)
-        self._take_files(link, journal)
+        self._take_files(link, _without_map(last))
         for folder in (self.folder, *(path for path in self.folder.iterdir() if path.is_dir())):
             durable_files.sync_folder(folder)
         arrival = Arrival(
@@ -136,6 +139,24 @@ class MapArrival:
         with durable_files.replacing(self.folder / state_folder.ARRIVED_FILE) as file:
             file.write(msgspec.json.encode(arrival))
         return frozen_at
+
+    def _copy_what_is_there(self, link: Connection) -> None:
+        """Copy until little is new, and the map was read here: what it takes then is short."""
+        began, rounds = time.monotonic(), 0
+        while rounds < _MOST_ROUNDS:
+            parcel, before = self._ask(link, "list")[0], self._copied
+            # One file is read while others come: from then on the map's stays as it is.
+            self._take_files(link, _without_map(parcel) if self.wants_fuser.is_set() else parcel.files)
+            rounds += self._copied - before >= _LITTLE
+            waited = time.monotonic() - began
+            if not self.wants_fuser.is_set() and (parcel.is_saved or waited > _SAVING_S):
+                self.volume = parcel.volume
+                self.wants_fuser.set()
+            is_little = self._copied - before < _LITTLE
+            if is_little and (self.prepared.is_set() or waited > _SAVING_S + _OPENING_S):
+                return
+            if is_little and self._stopping.wait(_ROUND_S):
+                raise JournalError("this server is ending")
 
     def _wait_until_it_can_leave(self, link: Connection) -> None:
         until = time.monotonic() + _OPENING_S
@@ -222,14 +243,19 @@ class MapArrival:
         )
         self._number += 1
         command = messages.Command(name="hand_over", map=self.name, hand_over=question, number=self._number)
-        exchange = Exchange(link, [[messages.encode_sealed(command)]])
+        name = f"{self._request.source} (control {link.address})"
+        exchange = Exchange(link, [[messages.encode_sealed(command)]], name)
         while True:
             reply, frames = exchange.reply(_ANSWER_S)
             if reply.number == self._number:  # else it is late, of a question that was asked twice
                 break
         if reply.error is not None:
-            raise CommandRefused(link.address, reply.error, retry=reply.retry)
+            raise CommandRefused(self._request.source, reply.error, retry=reply.retry)
         return reply.parcel or Parcel(), frames
+
+
+def _without_map(parcel: Parcel) -> tuple[MapFile, ...]:
+    return tuple(one for one in parcel.files if one.name != state_folder.MAP_FILE)
 
 
 def arriving_folder(state: str | Path, name: str) -> Path:

@@ -140,7 +140,7 @@ class MapDepartures:
                 MovedSession(each.key, each.client, each.world, each.durable) for each in one.hosted.sessions
             )
         volume = msgspec.to_builtins(one.hosted.volume)
-        return Parcel(files=files, volume=volume, sessions=sessions)
+        return Parcel(files=files, volume=volume, is_saved=one.hosted.is_saved, sessions=sessions)
 
     def _read(self, one: _Departure, question: HandOver) -> tuple[Parcel, list[zmq.Frame]]:
         path = one.hosted.folder / question.file

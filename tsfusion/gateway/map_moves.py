@@ -9,11 +9,12 @@ from collections.abc import Callable, Sequence
 import zmq
 
 from tsfusion.core import logs
-from tsfusion.core.config import ServerConfig
-from tsfusion.core.errors import InvalidConfig, JournalError, TsfusionError
+from tsfusion.core.config import ServerConfig, VolumeConfig, make_settings
+from tsfusion.core.errors import InvalidConfig, JournalError, MapError, TsfusionError
 from tsfusion.gateway import map_arrivals
 from tsfusion.gateway.access_control import AccessControl
 from tsfusion.gateway.client_routes import ClientRoutes
+from tsfusion.gateway.fuser_supervisor import FuserSupervisor
 from tsfusion.gateway.map_arrivals import MapArrival, Request
 from tsfusion.gateway.map_departures import MapDepartures
 from tsfusion.gateway.map_registry import MapRegistry
@@ -57,6 +58,7 @@ class MapMoves:
         self._maps, self._routes, self._ports, self._access = maps, routes, ports, access
         self._departures = MapDepartures(server, maps, on_left=self._send_away, on_stay=self._call_back)
         self._arrivals: list[MapArrival] = []
+        self._fusers: dict[str, FuserSupervisor] = {}  # of maps that come
 
     def resume(self) -> None:
         """Go on with what an earlier process had copied whole; the server listens now."""
@@ -68,24 +70,53 @@ class MapMoves:
     def step(self) -> None:
         """Take over the maps that have come, and give up those that will not."""
         self._departures.step()
+        for one in self._arrivals:
+            self._prepare(one)
         for one in [one for one in self._arrivals if one.outcome is not None]:
             self._arrivals.remove(one)
+            fuser = self._fusers.pop(one.name, None)
             self._maps.end_to_take(one.name)
             outcome = one.outcome
             assert outcome is not None
             if isinstance(outcome, Moved):
                 try:
-                    self._maps.take_in(one.name)
+                    self._maps.take_in(one.name, fuser)
+                    fuser = None
                 except TsfusionError as error:
                     outcome = f"map {one.name} has come and cannot be opened: {error}"
             if isinstance(outcome, str):
                 log.error("%s", outcome, extra=logs.about(map=one.name))
+            if fuser is not None:
+                fuser.close(wait=False)
             one.on_end(outcome)
+
+    def _prepare(self, one: MapArrival) -> None:
+        """Have a map read where it is being copied to; where that fails it is read later."""
+        if one.prepared.is_set() or not one.wants_fuser.is_set():
+            return
+        fuser = self._fusers.get(one.name)
+        try:
+            if fuser is None:
+                volume = make_settings(VolumeConfig, one.volume)
+                fuser = self._fusers[one.name] = self._maps.open_ahead(one.name, one.folder, volume)
+            while fuser.receive() is not None:
+                pass
+            if fuser.is_prepared:
+                one.prepared.set()
+            elif fuser.ended():
+                raise MapError("its process ended")
+        except TsfusionError as error:
+            log.warning("the map cannot be read ahead: %s", error, extra=logs.about(map=one.name))
+            if (fuser := self._fusers.pop(one.name, None)) is not None:
+                fuser.close(wait=False)
+            one.prepared.set()
 
     def close(self) -> None:
         """End the threads, and close the files."""
         for one in self._arrivals:
             one.stop()
+        for fuser in self._fusers.values():
+            fuser.close()
         self._departures.close()
 
     def on_command(self, identity: bytes, command: Command, client: str) -> None:

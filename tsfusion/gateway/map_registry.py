@@ -17,11 +17,13 @@ from tsfusion.core.counts import count_of
 from tsfusion.core.errors import JournalError, TsfusionError
 from tsfusion.gateway import map_arrivals, moved_maps
 from tsfusion.gateway.client_routes import ClientRoutes
+from tsfusion.gateway.fuser_supervisor import FuserSupervisor
 from tsfusion.gateway.hosted_map import ForPeople, HostedMap
 from tsfusion.gateway.map_directory import MapDirectory, Place
 from tsfusion.gateway.metrics import Metrics
 from tsfusion.gateway.problems import Problem
 from tsfusion.gateway.sessions import Session
+from tsfusion.gateway.spare_fusers import SpareFusers
 from tsfusion.journal import state_folder
 from tsfusion.journal.record_scan import journal_error
 from tsfusion.wire.allowed_maps import ALL_MAPS, AllowedMaps
@@ -57,6 +59,7 @@ class MapRegistry:
         self._kept: dict[str, float] = {}  # free name that was given out → when
         self.place = ("", "")  # data and control address by which clients reach this server
         self.arriving: set[str] = set()  # maps that are being copied from another server
+        self._spares = SpareFusers(context, server)
         self._directory = MapDirectory(server.directory) if server.directory else None
         self._started = False
 
@@ -106,14 +109,18 @@ class MapRegistry:
 
     # --- other servers ---
 
+    def has(self, name: str) -> bool:
+        """Whether a map is open here, and not an empty one."""
+        hosted = self.get(name)
+        return hosted is not None and not hosted.is_empty
+
     def elsewhere(self, name: str) -> Place | None:
         """The server that has a map of which this one has nothing; None = no other has it.
 
         Raises:
             JournalError: when that cannot be read.
         """
-        hosted = self.get(name)
-        if (hosted is not None and not hosted.is_empty) or name in self.arriving:
+        if self.has(name) or name in self.arriving:
             return None
         entered = self._directory.place_of(name) if self._directory else None
         if entered is not None and entered != self.place:
@@ -165,14 +172,26 @@ class MapRegistry:
         if (hosted := self.get(name)) is not None:
             hosted.stay()
 
+    def open_ahead(self, name: str, folder: Path, volume: VolumeConfig) -> FuserSupervisor:
+        """A fuser that reads a map in a folder where it waits, for `take_in` to go on with.
+
+        Raises:
+            MapError: when the system cannot start it.
+        """
+        place = self._folder(name)
+        return FuserSupervisor(self._context, place, self._server, volume, ahead=folder, spares=self._spares)
+
     def give_away(self, name: str) -> None:
         """Close a map that another server has from now on, or that makes room for one that came."""
         hosted = self._open.pop(name, None)
         if hosted is not None:
             hosted.close(wait=False)
 
-    def take_in(self, name: str) -> None:
+    def take_in(self, name: str, fuser: FuserSupervisor | None = None) -> None:
         """Open a map that has come from another server.
+
+        Args:
+            fuser: that has read it ahead.
 
         Raises:
             TsfusionError: when it cannot be opened; its files are here then, and the next start tries again.
@@ -182,7 +201,7 @@ class MapRegistry:
         self.give_away(name)
         map_arrivals.install(self._server.state, name)
         self._enter(name)
-        self._open_map(name)
+        self._open_map(name, fuser)
 
     def greet(self, name: str) -> HostedMap | None:
         """A map by name, opened when it is on the disk; None = there is none, or `why_not` says why.
@@ -292,7 +311,7 @@ class MapRegistry:
             self._kept.pop(next(iter(self._kept)))
         return name
 
-    def _open_map(self, name: str) -> HostedMap:
+    def _open_map(self, name: str, fuser: FuserSupervisor | None = None) -> HostedMap:
         own = moved_maps.volume_of(self._folder(name))
         volume = own or self._volumes.get(name) or self._volumes[DEFAULT_MAP]
         try:
@@ -304,6 +323,8 @@ class MapRegistry:
                 routes=self._routes,
                 metrics=self._metrics,
                 watch=partial(self._watch, name),
+                fuser=fuser,
+                spares=self._spares,
             )
         except OSError as error:
             raise journal_error("open", self._folder(name), error) from error
@@ -340,6 +361,8 @@ class MapRegistry:
                 if not self._started or hosted.warm:
                     raise
                 self._give_up(hosted.name, error)
+        if self._started:
+            self._spares.step(self._volumes[DEFAULT_MAP], may_start=self.warm)
         return for_people
 
     @property
@@ -359,6 +382,7 @@ class MapRegistry:
 
     def finish(self) -> bool:
         """Have every fuser write its checkpoint and end; whether all have ended. Call it until they have."""
+        self._spares.close()
         for hosted in self:
             hosted.fuser.finish()
         return all(hosted.fuser.ended() for hosted in self)
@@ -370,6 +394,7 @@ class MapRegistry:
 
     def close(self) -> None:
         """End the fusers and finish the journals."""
+        self._spares.close()
         for hosted in self:
             hosted.close()
 

@@ -63,12 +63,14 @@ class Parcel(Struct, frozen=True, kw_only=True, omit_defaults=True):
 
     Attributes:
         volume: the map's settings.
+        is_saved: of `list`, whether the checkpoint that the first one asked for is there.
         sessions: of `freeze`.
         crc32: of the piece.
     """
 
     files: Annotated[tuple[MapFile, ...], Meta(max_length=MOST_FILES)] = ()
     volume: dict[str, Any] = {}
+    is_saved: bool = False
     sessions: tuple[MovedSession, ...] = ()
     crc32: int = 0
 
