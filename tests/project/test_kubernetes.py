@@ -5,6 +5,7 @@ import json
 import re
 import signal
 import subprocess
+import sys
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,22 @@ from tsfusion.core.config import ClientConfig, load
 from tsfusion.wire import key_folder, queries
 from tsfusion.wire.curve import client_keys
 
+_FUSER = f"""
+import sys
+sys.path.insert(0, {str(ROOT / "tests" / "support")!r})
+import sum_map
+sum_map.take_the_place_of_volume()
+from tsfusion.fuser.__main__ import main
+sys.exit(main())
+"""
+_QUICK = f"""
+import sys
+from tsfusion.gateway import fuser_process
+fuser_process.COMMAND = (sys.executable, "-c", {_FUSER!r})
+from tsfusion.__main__ import main
+main()
+"""
+QUICK = [sys.executable, "-c", _QUICK]  # the command with fusers that start without Taichi
 FILE = ROOT / "docs" / "deploy" / "kubernetes.yml"
 
 
@@ -57,7 +74,9 @@ def test_names_and_places_agree(objects: dict[str, dict[str, Any]]) -> None:
 class Pod:
     """What the example starts, as a process of this machine."""
 
-    def __init__(self, objects: dict[str, dict[str, Any]], folder: Path, name: str) -> None:
+    def __init__(
+        self, objects: dict[str, dict[str, Any]], folder: Path, name: str, command: list[str]
+    ) -> None:
         self.address = lasting_address()
         (container,) = objects["StatefulSet"]["spec"]["template"]["spec"]["containers"]
         settings = objects["ConfigMap"]["data"]["server.toml"]
@@ -71,7 +90,7 @@ class Pod:
         load(config)
         arguments = [one.replace("/config/server.toml", str(config)) for one in container["args"]]
         arguments = [re.sub(r"tcp://.+", self.address, one) for one in arguments]
-        self._command = [*COMMAND, *arguments, "--json"]
+        self._command = [*command, *arguments, "--json"]
         self.start()
 
     def start(self) -> None:
@@ -87,8 +106,9 @@ class Pod:
             end(self.process, signal.SIGKILL)
 
 
+@pytest.mark.parametrize("command", [QUICK, pytest.param(COMMAND, marks=pytest.mark.nightly)])
 def test_its_processes_serve_a_fleet_that_is_upgraded_one_by_one(
-    objects: dict[str, dict[str, Any]], tmp_path: Path
+    objects: dict[str, dict[str, Any]], tmp_path: Path, command: list[str]
 ) -> None:
     keys = tmp_path / "shared" / "keys" / "fleet"
     keys.parent.mkdir(parents=True)
@@ -98,7 +118,7 @@ def test_its_processes_serve_a_fleet_that_is_upgraded_one_by_one(
     key, server_key = tmp_path / "robot" / "robot.key_secret", keys / "server.key"
     known = client_keys(str(key), str(server_key))
     with ExitStack() as stack:
-        pods = [Pod(objects, tmp_path, name) for name in ("tsfusion-0", "tsfusion-1")]
+        pods = [Pod(objects, tmp_path, name, command) for name in ("tsfusion-0", "tsfusion-1")]
         for pod in pods:
             stack.callback(pod.close)
             pod.wait_ready()
