@@ -3,6 +3,7 @@
 
     python scripts/fleet.py                                  1, 10, 50 and 200 scanners at 0.5 keyframes/s
     python scripts/fleet.py --scanners 50 --maps 4           four maps, each with a fuser of its own
+    python scripts/fleet.py --scanners 50 --maps 4 --spare 3 the same, with fusers that wait for three of them
     python scripts/fleet.py --scanners 10 --flood --no-fuser as fast as the gateway makes them durable
     python scripts/fleet.py --flood --no-fuser --disk-wait 5 --state /dev/shm
                                                              the same with a disk whose waits are known
@@ -44,6 +45,7 @@ from tsfusion.journal import state_folder
 from tsfusion.wire.queries import fetch_health
 
 RAMP_S = 1.0  # in which the scanners begin one after the other
+_QUIET_S = 3.0  # in which a fuser that has nothing to do takes no processor time
 DRAIN_S = 60.0  # after the last keyframe
 TICKS = os.sysconf("SC_CLK_TCK")
 TARGETS = {"lost": 0, "jain": 0.95, "delay_p95_ms": 500.0, "gateway_mb": 512.0, "frozen_s": 2.0}
@@ -69,6 +71,7 @@ def _options() -> argparse.Namespace:
     )
     parser.add_argument("--scanners", type=int, nargs="+", default=[1, 10, 50, 200])
     parser.add_argument("--maps", type=int, default=1, help="over which they are spread (default 1)")
+    parser.add_argument("--spare", type=int, default=0, help="`spare_fusers` of the server (default 0)")
     parser.add_argument("--rate", type=float, default=0.5, help="keyframes a second of each (default 0.5)")
     parser.add_argument("--flood", action="store_true", help="as many as the server's credit allows")
     parser.add_argument("--seconds", type=float, default=20.0, help="for which they scan (default 20)")
@@ -107,13 +110,15 @@ def _case(folder: Path, count: int, options: argparse.Namespace, frames: list[li
     code = PROFILED.format(path=options.profile) if options.profile else ""
     if options.disk_wait is not None:
         code += SLOW_DISK.format(seconds=options.disk_wait / 1e3)
-    settings: dict[str, Any] = {"max_maps": max(options.maps, 4)}
+    settings: dict[str, Any] = {"max_maps": max(options.maps, 4), "spare_fusers": options.spare}
     if options.flood:
         settings |= {"quota_keyframes": 1e6, "quota_bytes": 1 << 40}  # else they are what is measured
     volume = VolumeConfig(voxel_size=options.voxel_size)
     made = keeping(folder, code=code, **settings) if options.no_fuser else None
     names = ["default", *(f"map-{i}" for i in range(1, options.maps))]
     with closing(Server(folder, volume, code=code, **settings)) if made is None else made as server:
+        if options.spare:
+            _wait_for_spares(server, 1 + options.spare)
         begin = time.monotonic() + 0.5
         end = begin + RAMP_S + options.seconds
         rate = None if options.flood else options.rate
@@ -131,7 +136,8 @@ def _case(folder: Path, count: int, options: argparse.Namespace, frames: list[li
     shutil.rmtree(folder)
     total = max(row["durable"], 1)
     row |= {
-        "scanners": count, "maps": len(names), "rate": rate, "seconds": options.seconds, "drained": done,
+        "scanners": count, "maps": len(names), "spare": options.spare, "rate": rate,
+        "seconds": options.seconds, "drained": done,
         "fuses": made is None, "keyframe_bytes": sum(map(len, frames[0])),
         "blocks": sum(one.blocks for one in maps), "map_bytes": sum(one.map_bytes for one in maps),
         "gateway_mb": memory["gateway"], "fusers_mb": round(memory["fusers"], 1),
@@ -217,6 +223,14 @@ def disk_floor(folder: Path, nbytes: int, seconds: float = 1.0) -> dict[str, flo
                 count += times
             found[name] = round(count / (time.monotonic() - began), 1)
     return found
+
+
+def _wait_for_spares(server: Server, count: int) -> None:
+    """Wait until so many fusers have started, and have nothing more to compile."""
+    before: dict[str, float] = {}
+    while len(server.children()) < count or before.get("fusers") != _cpu_seconds(server)["fusers"]:
+        before = _cpu_seconds(server)
+        time.sleep(_QUIET_S)
 
 
 def _cpu_seconds(server: Server) -> dict[str, float]:

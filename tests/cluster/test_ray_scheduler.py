@@ -57,6 +57,35 @@ def test_a_killed_worker_is_replaced_by_ray(tmp_path: Path) -> None:
     assert not doing()
 
 
+def test_a_node_that_is_killed_takes_no_keyframe_along(tmp_path: Path) -> None:
+    """Two nodes, each with a raylet and workers of its own as two machines have them; one ends at its job."""
+    from ray.cluster_utils import Cluster
+
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
+    try:
+        other = cluster.add_node(num_cpus=1)
+        found = keyframe_sources.listed(["synthetic:room"], options={"count": 24})
+        killed: list[int] = []
+
+        def kill() -> None:
+            if eventually(lambda: len(doing()) == 2, 120.0):  # a core each: one on each node
+                killed.extend(doing())
+                cluster.remove_node(other, allow_graceful=False)
+
+        killer = threading.Thread(target=kill)
+        killer.start()
+        run = fusion.fuse(found, CONFIG, tmp_path / "out", lambda: RayCluster(2, cluster.address), Silent())
+        killer.join()
+    finally:
+        cluster.shutdown()
+    whole = Volume(CONFIG)
+    for keyframe in keyframe_sources.reading(found.keyframes):
+        whole.integrate(keyframe())
+    assert len(killed) == 2
+    assert (run.map_hash, run.keyframes_fused) == (whole.map_hash(), 24)
+    assert run.workers_lost >= 1
+
+
 def test_a_cluster_that_is_not_there_is_told() -> None:
     with pytest.raises(TransportError, match="there is no Ray cluster"):
         RayCluster(1, "127.0.0.1:9")
