@@ -170,7 +170,11 @@ def test_doctor_says_what_to_do(here: Here, tmp_path: Path) -> None:
         (["mesh", "garbage.tsf", "a.ply", "--memory", "all"], "expected a number of bytes such as 2GB"),
         (["mesh", NOBODY, "a.ply", "--memory", "1GB"], "--memory has no effect on a live server's map"),
         (["mesh", NOBODY, "a.ply", "--threads", "1"], "--threads has no effect on a live server's map"),
-        (["mesh", NOBODY, "a.ply"], "no server answered at tcp://127.0.0.1:10 within 0.2 s"),
+        (["mesh", NOBODY, "a.ply"], "no server answered at tcp://127.0.0.1:9 (control tcp://127.0.0.1:10) w"),
+        (
+            ["map", "move", "yard", "--from", NOBODY, "--to", NOBODY, "--timeout", "0.2"],
+            "no server answered at tcp://127.0.0.1:9 (control tcp://127.0.0.1:10) within 0.2 s",
+        ),
     ],
 )
 def test_bad_input_is_one_line_and_leaves_nothing(

@@ -176,7 +176,8 @@ def test_nobody_is_1(asking: Here) -> None:
         done = asking(control, "--timeout", 0.3, "--json")
     assert (done.returncode, done.stdout) == (1, "")
     cure = "is `tsfusion serve` running there, and is the port right?"
-    assert done.stderr == f"tsfusion: no server answered at {control} within 0.3 s; {cure}\n"
+    nobody = f"no server answered at {NOBODY} (control {control}) within 0.3 s"
+    assert done.stderr == f"tsfusion: {nobody}; {cure}\n"
 
 
 def test_one_that_knows_no_health_is_1(asking: Here) -> None:

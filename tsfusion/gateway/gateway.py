@@ -51,6 +51,8 @@ _RENEW_TICK_MS = 10  # while the sockets are made anew
 _SNAPSHOT_INTERVAL = 1.0  # seconds
 _CLIENT_PROBLEMS = 10  # lines about single clients
 _REPLIES_SHARE = 4  # one fourth of the memory is for meshes and answers that wait to be read
+_PLACE_KEPT = 0.5  # seconds for which it is known at which server a map is
+_MOST_PLACES = 64
 _OF_AN_OPEN_MAP = frozenset({"forget", "ask", "status", "mesh"})
 Handlers = dict[sockets.AnySocket, Callable[[list[zmq.Frame]], None]]
 
@@ -98,6 +100,7 @@ class Gateway:
         self._questions = MapQuestions(
             ports, metrics, self._refused, unread=unread, max_bytes=most_unread, rate=server.quota_questions
         )
+        self._places: dict[str, tuple[tuple[str, str] | None, float]] = {}  # map → where it is, until when
         self._publishing: dict[str, bool] = {}  # map → whether its fuser was told to send triangles
         self._limits = ConnectionLimits(ports, access, self._refused, server.memory_bytes)
         self._activity = ActivityLog()
@@ -275,11 +278,18 @@ class Gateway:
 
     def _elsewhere(self, name: str) -> messages.Elsewhere | None:
         """The other server that has a map; None = none is known, or the map is open here."""
-        try:
-            place = None if self.maps.has(name) else self.maps.elsewhere(name)
-        except JournalError as error:
-            log.error("%s", error, extra=logs.about(map=name))
+        if self.maps.has(name):
             return None
+        now = time.monotonic()
+        place, until = self._places.get(name, (None, 0.0))
+        if now >= until:  # it is read from disks, and anybody may ask without end
+            try:
+                place = self.maps.elsewhere(name)
+            except JournalError as error:
+                log.error("%s", error, extra=logs.about(map=name))
+            if len(self._places) >= _MOST_PLACES:
+                self._places.clear()
+            self._places[name] = place, now + _PLACE_KEPT
         return None if place is None else messages.Elsewhere(*place)
 
     def _on_forget(self, identity: bytes, command: messages.Command, client: str) -> None:

@@ -75,6 +75,9 @@ class MapMoves:
         for one in [one for one in self._arrivals if one.outcome is not None]:
             self._arrivals.remove(one)
             fuser = self._fusers.pop(one.name, None)
+            if fuser is not None and (not fuser.is_prepared or fuser.ended()):
+                fuser.close(wait=False)
+                fuser = None
             self._maps.end_to_take(one.name)
             outcome = one.outcome
             assert outcome is not None
