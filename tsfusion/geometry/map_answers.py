@@ -92,7 +92,10 @@ class PointCloud:
     colors: NDArray[np.uint8] | None = None
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write the points with normals and colours as PLY, PCD, LAS or LAZ by the file's suffix.
+        """Write the points with normals and colours as PLY, PCD, LAS or LAZ, in the map's frame.
+
+        Args:
+            path: the file; `.ply`, `.pcd`, `.las` or `.laz`.
 
         Raises:
             OutputError: for another suffix, no points, or a path that cannot be written.

@@ -29,6 +29,14 @@ class SliceGrid:
     The centre of cell (row, column) is at origin + (column + 0.5, row + 0.5) · resolution in the slice's
     frame. Its axes are the rows of `axes`: p_slice = axes @ p_map, without a shift.
 
+    Attributes:
+        origin: (2,) metres in the slice's frame, the corner of cell (0, 0).
+        resolution: metres a cell.
+        shape: rows, columns.
+        low, high: metres along up, in the map's frame.
+        axes: (3, 3) float64, the slice's axes in the map's frame; the last one is up.
+        floor: metres along up from the map's origin, where the floor was found; None = not looked for.
+
     Examples:
         >>> volume = tsfusion.Volume(0.05)
         >>> added = volume.integrate(tsfusion.open_dataset("synthetic:room", count=1)[0])
@@ -47,13 +55,21 @@ class SliceGrid:
     floor: float | None = None  # height of the floor, metres from the map's origin; None = not looked for
 
     def cells_of(self, points: NDArray[np.floating]) -> NDArray[np.int64]:
-        """(n, 3) points of the map, metres → (n, 2) row and column, which may lie outside."""
+        """Cells of points: (n, 2) int64 row and column, which may lie outside of the slice.
+
+        Args:
+            points: (n, 3) metres in the map's frame.
+        """
         flat = np.asarray(points, np.float64) @ self.axes[:2].T
         cells: NDArray[np.int64] = np.floor((flat - self.origin) / self.resolution).astype(np.int64)
         return cells[:, ::-1]
 
     def centres(self, height: float | None = None) -> NDArray[np.float64]:
-        """(rows, columns, 3) centres in the map's frame, metres; at mid-height unless another is given."""
+        """Centres of the cells: (rows, columns, 3) float64 metres in the map's frame.
+
+        Args:
+            height: metres along up; None = half-way between `low` and `high`.
+        """
         rows, columns = (np.arange(count) + 0.5 for count in self.shape)
         u, v = np.meshgrid(columns * self.resolution, rows * self.resolution)
         h = np.full_like(u, (self.low + self.high) / 2 if height is None else height)
@@ -90,6 +106,11 @@ class OccupancySlice:
 
     `cells` (rows, columns) int8: 0 free, 100 occupied, −1 unseen, as in a `nav_msgs/OccupancyGrid`.
 
+    Attributes:
+        grid: where the cells are.
+        knows_free_space: whether the map was fused with `space_carving`; without it free space is known
+            only near surfaces.
+
     Examples:
         >>> volume = tsfusion.Volume(0.05)
         >>> added = volume.integrate(tsfusion.open_dataset("synthetic:room", count=1)[0])
@@ -103,8 +124,10 @@ class OccupancySlice:
     knows_free_space: bool  # whether the map was made with space_carving; else it knows it near surfaces
 
     def save(self, path: str | Path) -> list[Path]:
-        """Write the pair of files that ROS's map_server reads (.yaml or .pgm: both), a picture (.png), or
-        arrays (.npz). Returns the files.
+        """Write files for ROS's map_server, a picture or arrays. Returns the files.
+
+        Args:
+            path: `.yaml` or `.pgm` writes the pair that map_server reads, `.png` a picture, `.npz` arrays.
 
         Raises:
             OutputError: when a file cannot be written; InvalidConfig: for another suffix.
@@ -146,6 +169,10 @@ class DistanceSlice:
     the map knows that a cell lies behind one. Where nothing was seen it is the distance to the nearest
     surface that was; `cells` tells which these are, as in an `OccupancySlice`.
 
+    Attributes:
+        grid: where the cells are.
+        max_distance: metres.
+
     Examples:
         >>> volume = tsfusion.Volume(0.05)
         >>> added = volume.integrate(tsfusion.open_dataset("synthetic:room", count=1)[0])
@@ -161,6 +188,9 @@ class DistanceSlice:
 
     def save(self, path: str | Path) -> list[Path]:
         """Write a picture (.png) or arrays (.npz). Returns the files.
+
+        Args:
+            path: the file; its suffix decides.
 
         Raises:
             OutputError: when a file cannot be written; InvalidConfig: for another suffix.
@@ -190,6 +220,11 @@ class DistanceField:
     `occupancy` (X, Y, Z) int8 tells which these are: 0 free, 100 occupied, −1 unseen. The centre of voxel
     (i, j, k) is at origin + ((i, j, k) + 0.5) · voxel_size.
 
+    Attributes:
+        origin: (3,) float64 metres, the box's low corner.
+        voxel_size: metres.
+        max_distance: metres.
+
     Examples:
         >>> volume = tsfusion.Volume(0.05)
         >>> added = volume.integrate(tsfusion.open_dataset("synthetic:room", count=1)[0])
@@ -206,6 +241,9 @@ class DistanceField:
 
     def save(self, path: str | Path) -> list[Path]:
         """Write the arrays (.npz). Returns the files.
+
+        Args:
+            path: the file; its suffix decides.
 
         Raises:
             OutputError: when it cannot be written; InvalidConfig: for another suffix.

@@ -77,6 +77,9 @@ class Mesh:
         is not known it keeps the map's frame, too. Each file says its unit, its up direction, where it comes
         from, and which triangles are guessed (`mesh_encoding`); STL holds no colours.
 
+        Args:
+            path: the file; `.ply`, `.glb`, `.obj` or `.stl`.
+
         Raises:
             OutputError: for another suffix, an empty mesh, or a path that cannot be written.
         """
@@ -96,6 +99,9 @@ class Mesh:
     def save_points(self, path: str | os.PathLike[str]) -> Path:
         """Write the vertices with their normals and colours as PLY, PCD, LAS or LAZ, in the map's frame.
 
+        Args:
+            path: the file; `.ply`, `.pcd`, `.las` or `.laz`.
+
         Raises:
             OutputError: for another suffix, an empty mesh, or a path that cannot be written.
             MissingDependency: for LAS and LAZ without laspy.
@@ -104,7 +110,11 @@ class Mesh:
         return point_files.save(path, self.vertices, normals=self.normals, colors=self.colors, facts=facts)
 
     def encode(self, suffix: str) -> bytes:
-        """Encode the mesh as the content of a `.ply`, `.glb`, `.obj` or `.stl` file."""
+        """Encode the mesh as the content of a file.
+
+        Args:
+            suffix: `.ply`, `.glb`, `.obj` or `.stl`.
+        """
         return mesh_encoding.encode(self, suffix)
 
     def to_trimesh(self) -> Any:
@@ -145,7 +155,11 @@ class Mesh:
         return dataclasses.replace(self.of_faces(~islands[self.faces[:, 0]]), known_up=self.up)
 
     def islands(self, min_extent: float | None = None) -> NDArray[np.bool_]:
-        """(n,) bool: vertices of islands, as `without_islands` leaves them out."""
+        """Vertices of islands, as `without_islands` leaves them out: (n,) bool.
+
+        Args:
+            min_extent: metres; None = the bound of `without_islands`.
+        """
         if min_extent is None:
             return self._islands
         return mesh_islands.find_smaller(self.faces, self.vertices, min_extent)
@@ -204,7 +218,11 @@ class Mesh:
         )
 
     def of_faces(self, kept: NDArray[np.bool_] | NDArray[np.integer]) -> "Mesh":
-        """The faces of a (m,) bool, or of some numbers, and the vertices that they use, in the same order."""
+        """A mesh of some of the faces and the vertices that they use, in the same order.
+
+        Args:
+            kept: (m,) bool for each face, or the numbers of faces.
+        """
         chosen = np.flatnonzero(kept) if kept.dtype == np.bool_ else kept
         faces = np.take(self.faces, chosen, axis=0)
         first, last = (int(faces.min()), int(faces.max())) if len(faces) else (0, -1)
