@@ -148,6 +148,10 @@ class AskableMap(ReadableMap):
         Memory holds one tile of 16³ blocks and what lies around it, however large the map is. The values are
         those of `distance_field`.
 
+        Args:
+            max_distance: metres.
+            min_weight: as for `extract_mesh`.
+
         Raises:
             InvalidConfig: for a `max_distance` of too many voxels.
         """
@@ -209,11 +213,11 @@ class AskableMap(ReadableMap):
         space in a band before surfaces alone.
 
         Args:
-            low, high, options: as for `current_slice`.
+            low, high, options: as for `distance_slice`.
             need_free: refuse a map that was made without `space_carving`.
 
         Raises:
-            MapError: for such a map, or as `current_slice` does.
+            InvalidConfig, MapError: as `distance_slice`; MapError also for such a map.
         """
         if need_free and not self.config.space_carving:
             raise MapError(
@@ -227,7 +231,15 @@ class AskableMap(ReadableMap):
         """Horizontal distance of each cell to what stands between two heights.
 
         Args:
-            low, high, options: as for `current_slice`.
+            low, high: metres along up from the map's origin.
+            options: `box`: u0, v0, u1, v1 in metres along the slice's own axes (x and y where z is up; None =
+                around the whole map); `up`: away from the ground, such as "z" or "-y" (None = it is found);
+                `resolution`: metres, edge of a cell (None = the voxel size); `max_distance`: metres (2);
+                `min_weight`: as for `extract_mesh`; `above_floor`: count the heights from the floor.
+
+        Raises:
+            InvalidConfig: for another box, or too many cells.
+            MapError: for an empty map without a box, or where up or the floor cannot be found.
         """
         return self.current_slice(low, high, **options).distances()
 

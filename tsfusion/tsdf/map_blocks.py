@@ -22,6 +22,9 @@ class Blocks:
     What is stored is shown without copying, read-only: (n, 8, 8, 8) arrays that stay valid whatever the map
     does next. They show what keyframes change in these blocks until the map's memory grows.
 
+    Args:
+        store: the blocks of a map; `Volume.blocks()` gives them.
+
     Attributes:
         coordinates: (n, 3) int32, in units of 8 voxels.
         voxel_size: metres.

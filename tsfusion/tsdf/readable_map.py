@@ -146,6 +146,7 @@ class ReadableMap:
 
         Args:
             folder: where it waits in files without names.
+            min_weight: as for `extract_mesh`.
             up: away from the ground; None = it is found.
 
         Raises:
@@ -196,11 +197,12 @@ class ReadableMap:
         """What is different in a later map of the same frame, in numbers and as a coloured mesh.
 
         Args:
+            later: the other map.
             tolerance: metres between two surfaces that count as the same; default two voxels.
 
         Raises:
             MapError: when the maps have voxels of different sizes.
-            InvalidConfig: for a tolerance that is none.
+            InvalidConfig: for a tolerance that is not positive.
         """
         self._check_voxels(later)
         metres = 2 * self.config.voxel_size if tolerance is None else tolerance
@@ -228,6 +230,7 @@ class ReadableMap:
         `tsdf/voxel_arrays.py` describes the arrays.
 
         Args:
+            path: the file; `.npz`, `.zarr` or `.vdb`.
             dense: one array around the whole map, instead of its blocks; not of OpenVDB.
             field: `tsdf`, signed distances as fused with weights and colours, or `distance`, the Euclidean
                 distance field.

@@ -73,9 +73,12 @@ class Volume(AskableMap):
     share; where the device is missing, a warning says why, and they are fused on the CPU.
 
     Args:
-        memory_bytes: that the blocks may take of memory; those that no keyframe has changed for longest wait
+        config: a `VolumeConfig`, or the edge of a voxel in metres.
+        others: none; arguments in the order of another library are answered with what to write.
+        memory_bytes: bytes of memory for the blocks; those that no keyframe has changed for longest wait
             in files without names, and come back when they are touched (Linux). None = all stay in memory.
-        cache: folder of these files, on a disk, or all about it; default: `TMPDIR`, or /var/tmp.
+        cache: folder of these files, on a disk, or a `CacheConfig`; default: `TMPDIR`, or /var/tmp.
+        settings: fields of `VolumeConfig` by name.
 
     Raises:
         InvalidConfig: for an unknown setting or a value out of range.
@@ -145,6 +148,7 @@ class Volume(AskableMap):
 
         Args:
             keyframe: also a dict of a keyframe's fields, or an object with such attributes.
+            others: none; arguments in the order of another library are answered with what to write.
             fields: a keyframe's fields instead: `integrate(points=…, T_world_camera=…)`.
 
         Raises:
@@ -169,6 +173,9 @@ class Volume(AskableMap):
 
         Smoothed values cannot be un-smoothed: in the blocks it touched they fall back to the raw ones.
 
+        Args:
+            keyframe, others, fields: as for `integrate`.
+
         Raises:
             MapError: the map cannot hold this keyframe: a voxel of it has fewer votes than would be taken
                 away. A keyframe never integrated goes unnoticed where others left votes enough.
@@ -183,7 +190,8 @@ class Volume(AskableMap):
         keyframes, and move or remove none of those that are in it.
 
         Args:
-            same_frame: the maps are in one frame, although their scans found their poses each for itself.
+            other: a map of the same voxel size and layers; it stays as it is.
+            same_frame: the maps are in one frame, although each scan found its poses itself.
 
         Raises:
             MapError: when the voxels or layers differ, when both are the same map or hold the same keyframes,
@@ -346,6 +354,8 @@ class Volume(AskableMap):
         """Read a checkpoint back, verified against its own hash.
 
         Args:
+            path: a `.tsf` file that `save` wrote.
+            threads: as of a new map; None = as many as the machine has cores.
             memory_bytes, cache: as of a new map; one that is larger than the cache may be opens, too.
             changed: settings instead of the saved ones, of how the surface is read (`config.VIEW_SETTINGS`)
                 or of how the map may grow (`config.LIMIT_SETTINGS`); None = as saved.
@@ -383,6 +393,7 @@ class Volume(AskableMap):
         `extract_mesh(blocks=blocks_within(low, high))` of it is that of the whole map, to the last bit.
 
         Args:
+            path: as for `load`.
             low, high: (3,) block coordinates, first and last + 1.
             is_checked: the file was read as a whole just now: its digest is not compared again.
             changed: as of `load`.
@@ -398,7 +409,11 @@ class Volume(AskableMap):
         return volume
 
     def blocks_within(self, low: Sequence[int], high: Sequence[int]) -> NDArray[np.int32]:
-        """(n, 3) coordinates of the map's blocks low ≤ (x, y, z) < high."""
+        """Blocks of the map in a box: (n, 3) int32 coordinates, low ≤ (x, y, z) < high.
+
+        Args:
+            low, high: (3,) block coordinates, first and last + 1.
+        """
         blocks = unpack_keys(self._store.keys)
         return blocks[((blocks >= np.array(low)) & (blocks < np.array(high))).all(axis=1)]
 
