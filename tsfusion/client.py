@@ -143,10 +143,11 @@ class Client:
     def send(self, keyframe: Keyframe) -> int | None:
         """Put a keyframe into the spool; its number there, None when it is skipped (`stats.skipped`).
 
-        A dict of a keyframe's fields, or an object with such attributes, will do.
-
         Never waits for the network, unless the policy is `block`; never fails because of the disk. When the
         map has keyframes of another world, that is logged, and the keyframe waits in the spool.
+
+        Args:
+            keyframe: also a dict of a keyframe's fields, or an object with such attributes.
 
         Raises:
             TransportError: after `close`, also when that happens while this waits.
@@ -207,6 +208,9 @@ class Client:
     def connect(self, timeout: float | None = None) -> None:
         """Wait until the server has answered. Not needed before `send`.
 
+        Args:
+            timeout: seconds; None = `connect_timeout` of the client's settings.
+
         Raises:
             NotAllowed: as soon as the server turns the keys away, or the lack of them.
             WorldRefused: as soon as the server says that the map has keyframes of another world.
@@ -227,7 +231,11 @@ class Client:
             )
 
     def wait_answer(self, timeout: float) -> None:
-        """Wait until the server has answered or is known not to be there, at most `timeout` seconds."""
+        """Wait until the server has answered or is known not to be there.
+
+        Args:
+            timeout: seconds; then this returns without an error.
+        """
 
         def is_known() -> bool:
             return (
@@ -259,6 +267,9 @@ class Client:
     def flush(self, timeout: float = 10.0) -> None:
         """Wait until everything sent is on the server's disk, corrections included.
 
+        Args:
+            timeout: seconds.
+
         Raises:
             WorldRefused: as soon as the map turns out to have keyframes of another world.
             FlushTimeout: after `timeout` seconds; the rest stays in the spool and is still being sent.
@@ -277,6 +288,9 @@ class Client:
     def wait_fused(self, timeout: float = 60.0) -> None:
         """Wait until the map has taken or rejected everything sent (`stats.rejected` counts the latter).
 
+        Args:
+            timeout: seconds.
+
         Raises:
             FlushTimeout: after `timeout` seconds.
         """
@@ -286,8 +300,11 @@ class Client:
     def wait_settled(self, timeout: float = 60.0) -> None:
         """Wait until the map has everything sent, and each keyframe at its newest pose (`correct`).
 
-        The map is then the one that the keyframes make at these poses, to the bit. What other clients correct
-        in it is waited for, too.
+        The map is then the one that the keyframes make at these poses, to the bit. Corrections of other
+        clients are waited for, too.
+
+        Args:
+            timeout: seconds.
 
         Raises:
             FlushTimeout: after `timeout` seconds; the server goes on.
@@ -304,6 +321,9 @@ class Client:
 
     def wait_meshed(self, timeout: float = 60.0) -> None:
         """Wait until the server's mesh shows everything sent.
+
+        Args:
+            timeout: seconds.
 
         Raises:
             FlushTimeout: after `timeout` seconds.

@@ -116,13 +116,13 @@ class MapClient:
 
         Args:
             points: (n, 3) metres, at most `wire.questions.MOST_POINTS`: an answer is of one state of the map.
-            surface: None = the one that the map's settings say.
+            min_weight, surface: as for `Volume.extract_mesh`; None = as the map's settings say.
             timeout: seconds; None = the client's.
 
         Raises:
-            InvalidConfig: for points that are none, or too many.
+            InvalidConfig: for an array that holds no points, or too many.
             AnswerLate: when the map did not answer in time.
-            ServerUnreachable: when nobody is there.
+            ServerUnreachable: when no server answers.
             TransportError: when the server cannot answer, with the reason.
         """
         rows = checked_points(points).astype(np.float32)
@@ -144,7 +144,12 @@ class MapClient:
         surface: Surface | None = "raw",
         timeout: float | None = None,
     ) -> Answered[View]:
-        """What a pinhole camera sees of the surface; see `Volume.raycast`. Raises as `sample`."""
+        """What a pinhole camera sees of the surface; see `Volume.raycast`. Raises as `sample`.
+
+        Args:
+            intrinsics, T_world_camera, shape, min_weight, surface: as for `Volume.raycast`.
+            timeout: seconds; None = the client's.
+        """
         camera, T, (height, width) = checked_camera(intrinsics, T_world_camera, shape)
         question = Raycast(
             intrinsics=(camera.fx, camera.fy, camera.cx, camera.cy),
@@ -158,7 +163,11 @@ class MapClient:
         return _answered(View(**_all(arrays, "depth", "normals"), colors=colors), answer, delay)
 
     def occupancy_slice(self, low: float, high: float, **how: Any) -> Answered[OccupancySlice]:
-        """What stands between two heights; see `Volume.occupancy_slice`. Arguments as of `distance_slice`."""
+        """What stands between two heights; see `Volume.occupancy_slice`.
+
+        Args:
+            low, high, how: as for `distance_slice`, without `max_distance`.
+        """
         answer, arrays, delay = self._ask_slice("occupancy", low, high, **how)
         found = _all(arrays, "cells", "knows_free_space", *_GRID)
         sliced = OccupancySlice(_grid(found), found["cells"], bool(found["knows_free_space"]))
@@ -172,8 +181,8 @@ class MapClient:
 
         Args:
             low, high: metres along `up`.
-            how: `up`: needed here, such as "z"; `box`, `resolution`, `max_distance`, `min_weight`: as of
-                `Volume.current_slice`; `timeout`: seconds.
+            how: `up`: needed here, such as "z"; `box`, `resolution`, `max_distance`, `min_weight`: as for
+                `Volume.distance_slice`; `timeout`: seconds.
         """
         answer, arrays, delay = self._ask_slice("distance", low, high, **how)
         found = _all(arrays, "cells", "distance", "max_distance", *_GRID)
@@ -218,7 +227,13 @@ class MapClient:
     ) -> Answered[DistanceField]:
         """Distance of each voxel in a box to the nearest surface; see `Volume.distance_field`.
 
-        Its cost grows with the cube of `max_distance`, which is less here by custom. Raises as `sample`.
+        Raises as `sample`.
+
+        Args:
+            box: x0 y0 z0 x1 y1 z1, metres in the map's frame.
+            max_distance: metres; the cost grows with its cube.
+            subvoxel, min_weight: as for `Volume.distance_field`.
+            timeout: seconds; None = the client's.
         """
         question = Field(
             box=_numbers(box, 6),  # type: ignore[arg-type]
