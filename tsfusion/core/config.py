@@ -118,6 +118,8 @@ SENSORS: dict[str, SensorModel] = {
 class VolumeConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The map and how keyframes enter it. None = what the sensor preset says.
 
+    `tsfusion config dump`, and the site's page of settings, have every field with its unit, default and bounds.
+
     Examples:
         >>> config = tsfusion.VolumeConfig(voxel_size=0.05, sensor="lidar", max_range=40.0)
         >>> tsfusion.Volume(config).config.voxel_size
@@ -150,7 +152,14 @@ class VolumeConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     max_blocks_per_keyframe: Annotated[int, Meta(ge=1, le=1 << 19)] = 1 << 17
 
     def model(self, sensor: str | None = None) -> SensorModel:
-        """The sensor model of a keyframe (default: the map's), changed by what this config sets."""
+        """The sensor model of a keyframe, changed by what this config sets.
+
+        Args:
+            sensor: name of the keyframe's sensor preset; None = the map's.
+
+        Raises:
+            InvalidConfig: for an unknown name.
+        """
         name = sensor or self.sensor
         if name not in SENSORS:
             raise InvalidConfig(f"sensor must be one of {', '.join(SENSORS)}, got {name!r}")
@@ -304,7 +313,7 @@ class ScanConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True
 
 
 class Config(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A whole configuration file.
+    """A whole configuration file: `volume`, `server`, `client`, `scan`, and `maps` by name.
 
     Examples:
         >>> from tsfusion.core import config

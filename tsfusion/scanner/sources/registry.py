@@ -28,7 +28,9 @@ def open_source(spec: str, **options: object) -> Source:
     """Open `realsense[:SERIAL|FILE]`, `camera:PLACE`, `folder:PATH` or an installed package's `name[:…]`.
 
     Args:
-        options: as the source's class takes them; those that are None are left to it.
+                    spec: name and place, as `tsfusion scan` takes them.
+            options: as the source's class takes them; for None the source has its own default.
+
 
     Raises:
         InvalidConfig: no such source, it takes no such option, or not of that type.
