@@ -118,7 +118,7 @@ SENSORS: dict[str, SensorModel] = {
 class VolumeConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The map and how keyframes enter it. None = what the sensor preset says.
 
-    `tsfusion config dump`, and the site's page of settings, have every field with its unit, default and bounds.
+    `tsfusion config dump` and the page of settings have every field with its unit, default and bounds.
 
     Examples:
         >>> config = tsfusion.VolumeConfig(voxel_size=0.05, sensor="lidar", max_range=40.0)
