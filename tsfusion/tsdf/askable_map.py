@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a map is asked: distances at points, views, free space, distance fields, its points and voxels."""
+"""Questions to a map: distances at points, views, free space, distance fields, its points and voxels."""
 
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
@@ -75,7 +75,7 @@ class AskableMap(ReadableMap):
         min_weight: float | None = None,
         surface: Surface | None = None,
     ) -> View:
-        """What a pinhole camera sees of the surface: depth, normals, and colours if the map has them.
+        """View of the surface by a pinhole camera: depth, normals, and colours if the map has them.
 
         A surface is seen from its front alone, which is where the sensors were.
 
@@ -349,7 +349,7 @@ class AskableMap(ReadableMap):
         return self._mesh_buffers.nbytes + sum(kept.nbytes for kept in self._tiles.values())
 
     def _tiles_of(self, surface: Surface | None, min_weight: float) -> SurfaceTiles:
-        """What is kept of a surface for the next question, without what has changed since the last one."""
+        """Values kept of a surface for the next question, without those changed since the last one."""
         view, which = self._view(surface), (surface or self.model.surface, min_weight)
         try:
             changed = np.sort(self._store.keys[self._store.take_dirty(ASKED)])

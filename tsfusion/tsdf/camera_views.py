@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a pinhole camera sees of a map's surface; the work is in `kernels/rasterizer.py`."""
+"""View of a map's surface by a pinhole camera; the work is in `kernels/rasterizer.py`."""
 
 from collections.abc import Iterator
 
@@ -51,7 +51,7 @@ def look_at(
 def rasterised(
     mesh: Mesh, intrinsics: Intrinsics, T_world_camera: NDArray[np.float64], shape: tuple[int, int]
 ) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.int32]]:
-    """What each pixel sees, as `rasterizer.rasterise` writes it, and the vertices and faces that it drew.
+    """View of each pixel, as `rasterizer.rasterise` writes it, and the vertices and faces that it drew.
 
     The rasteriser knows one focal length and a centred image. A shear of space that keeps z makes any
     pinhole camera such a one.
@@ -113,7 +113,7 @@ def _joined(meshes: list[Mesh]) -> Mesh:
 
 
 def _nearer(one: View, other: View) -> View:
-    """Of two views of a camera, what is nearer, pixel by pixel."""
+    """Nearer of two views of a camera, pixel by pixel."""
     is_other = (other.depth > 0) & ((one.depth == 0) | (other.depth < one.depth))
     for ours, theirs in ((one.depth, other.depth), (one.normals, other.normals), (one.colors, other.colors)):
         if ours is not None and theirs is not None:

@@ -131,7 +131,7 @@ def write_pieces(
     map_hash: Callable[[], str] | None = None,
     between: Callable[[], None] = lambda: None,
 ) -> Path:
-    """As `write`, of blocks that come in pieces, so that no more than one of them is in memory.
+    """The same as `write`, of blocks that come in pieces, so that no more than one of them is in memory.
 
     Args:
         blocks: number of all of them.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""This process's end of the connection to the process that has a device (`device_process`)."""
+"""Near end of the connection to the process that has a device (`device_process`)."""
 
 import atexit
 import logging

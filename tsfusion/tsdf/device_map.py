@@ -25,7 +25,7 @@ _DTYPES = {"sums": ti.i64, "color_rgn": ti.i64, "color_b": ti.i32}
 
 
 class Job(NamedTuple):
-    """What a launch does (kernels/integrate.py)."""
+    """Task of a launch (kernels/integrate.py)."""
 
     which: int
     first_band: int

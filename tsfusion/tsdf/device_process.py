@@ -26,7 +26,7 @@ GROWS = ("make", "insert")  # what may fail for lack of memory, and then changes
 
 
 class _Device:
-    """What the process does: answers calls of maps by their numbers."""
+    """Main loop of the process: it answers calls of maps by their numbers."""
 
     def __init__(self, link: "Connection[Any, Any]", requests: SharedArrays, replies: SharedArrays) -> None:
         self._link, self._requests, self._replies = link, requests, replies

@@ -174,7 +174,7 @@ class FileArray(GrowingArray):
 
     @property
     def address(self) -> int:
-        """Of the first item, for ever."""
+        """Address of the first item, for ever."""
         return int(self.array.ctypes.data)
 
     def let_go(self, first: int, end: int) -> None:

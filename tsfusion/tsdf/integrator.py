@@ -39,7 +39,7 @@ Part = tuple[int, int]  # bands first … last - 1
 
 
 class KeyframeQuota(Struct, frozen=True):
-    """What a keyframe may take.
+    """Bounds of a keyframe.
 
     Attributes:
         cost: what its rays cost (`voxel_traversal.write_ray`), and 1000 for each block that it adds.
@@ -165,7 +165,7 @@ class Integrator:
         self._affordable -= len(keys)
 
     def _check_cost(self, most: int) -> int:
-        """What the rays cost; a keyframe that takes more time than one of any real sensor is refused."""
+        """Cost of the rays; a keyframe that takes more time than one of any real sensor is refused."""
         cost = int(self._buffers.bands[:, COST].sum(dtype=np.int64))
         if cost > most:
             raise KeyframeTooLarge(

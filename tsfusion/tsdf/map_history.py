@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a map says of the keyframes that it holds, by session, as the fuser writes it into a checkpoint.
+"""Keyframes that a map holds, by session, as the fuser writes them into a checkpoint.
 
 A session is one scanner's stream of numbered records. Its keyframes count once, so maps that hold the same
 ones must not be added. Its poses are in one coordinate frame, the session's world: maps of different worlds

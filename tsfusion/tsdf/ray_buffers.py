@@ -62,7 +62,7 @@ class RayBuffers:
 
     @property
     def owners(self) -> NDArray[np.int64]:
-        """Which unit adds to a block, by slot (kernels/integrate.py)."""
+        """Unit that adds to a block, by slot (kernels/integrate.py)."""
         return self._owners.array
 
     def reserve_touched(self, blocks: int) -> None:

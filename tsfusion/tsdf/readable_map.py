@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What is read from a map: surfaces, hashes, files of voxels. Nothing here changes it."""
+"""Readings of a map: surfaces, hashes, files of voxels. Nothing here changes it."""
 
 import hashlib
 import math
@@ -132,7 +132,7 @@ class ReadableMap:
             self._mesh_buffers = buffers
 
     def whole_values(self, surface: Surface | None = None) -> WholeMapValues:
-        """What `extract_mesh` of the whole map meshes, for `mesh_cells`, while the map stays as it is."""
+        """Values that `extract_mesh` of the whole map meshes, for `mesh_cells`, while the map stays."""
         return WholeMapValues(np.sort(self._store.keys), self._view(surface), field_regularizer.BATCH)
 
     def kept_values(self) -> KeptValues:
@@ -167,7 +167,7 @@ class ReadableMap:
         return mesh_tiles.run(keys, which, self._store, least, self._view(None))
 
     def provenance(self, source: str | None = None) -> Provenance:
-        """What a file of its surface says about the map; its hash is taken anew.
+        """Notes about the map for a file of its surface; its hash is taken anew.
 
         Args:
             source: file or folder that the map came from; its name is told, not where it lies.
@@ -183,7 +183,7 @@ class ReadableMap:
         return self._cells_reached(dirty, self.model.surface)
 
     def _cells_reached(self, dirty: NDArray[np.int32], surface: Surface) -> NDArray[np.int32]:
-        """As `cells_to_mesh`, of a surface."""
+        """The same as `cells_to_mesh`, of a surface."""
         return cells_of(unpack_keys(self.values_reached(dirty, surface)))
 
     def values_reached(self, dirty: NDArray[np.int32], surface: Surface | None = None) -> NDArray[np.int64]:
@@ -194,7 +194,7 @@ class ReadableMap:
         return field_regularizer.spread(keys, self._store, self._field) if surface == "field" else keys
 
     def diff(self, later: "ReadableMap", *, tolerance: float | None = None) -> MapDifference:
-        """What is different in a later map of the same frame, in numbers and as a coloured mesh.
+        """Differences in a later map of the same frame, in numbers and as a coloured mesh.
 
         Args:
             later: the other map.
@@ -274,7 +274,7 @@ class ReadableMap:
             raise MapError(f"the maps have voxels of {ours:g} m and {theirs:g} m: fuse one anew")
 
     def _checked_min_weight(self, min_weight: float | None) -> float:
-        """As given, or the sensor's."""
+        """Least weight as given, or the sensor's."""
         if min_weight is None:
             min_weight = self.model.min_weight
         most = integrate.WEIGHT_LIMIT / WEIGHT_ONE

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Which blocks of a map in files are in memory, and which of them leave it when they take too much."""
+"""Blocks of a map in files that are in memory, and those that leave it when they take too much."""
 
 import mmap
 import os
@@ -76,7 +76,7 @@ class Residency:
 
 
 def _pages_in_memory(first: int, count: int) -> NDArray[np.bool_]:
-    """Which of `count` pages from number `first` on are in this process's memory (Linux)."""
+    """Pages, of `count` from number `first` on, that are in this process's memory (Linux)."""
     found = np.ones(count, bool)
     with suppress(OSError), open("/proc/self/pagemap", "rb", buffering=0) as table:
         for i in range(0, count, _PART):

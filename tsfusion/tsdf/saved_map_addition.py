@@ -55,7 +55,7 @@ def add_files(paths: Sequence[Path], target: Path) -> CheckpointHeader:
 
 
 def _header(headers: Sequence[CheckpointHeader], blocks: int) -> CheckpointHeader:
-    """That of the sum."""
+    """Header of the sum."""
     first = headers[0]
     for other in headers[1:]:
         if (other.config.voxel_size, other.layers) != (first.config.voxel_size, first.layers):
@@ -113,7 +113,7 @@ class _Digest:
         self._waiting, self._count = [], 0
 
     def hexdigest(self) -> str:
-        """Of all that came."""
+        """Hash of all blocks that came."""
         self._take()
         self._side.wait()
         return self._digest.hexdigest()
@@ -134,12 +134,12 @@ class _Stream:
 
     @property
     def next_key(self) -> int:
-        """Of the next block."""
+        """Key of the next block."""
         return int(self._keys[self._taken])
 
     @property
     def last_key(self) -> int:
-        """Of the chunk that the next block is in."""
+        """Last key of the chunk that the next block is in."""
         chunk = self._current()
         return int(self._keys[chunk.first + chunk.blocks - 1])
 
@@ -164,7 +164,7 @@ class _Stream:
         return Piece(chunk.blocks, frame=chunk.frame)
 
     def keys_up_to(self, last: int) -> NDArray[np.int64]:
-        """Those of the next blocks."""
+        """Keys of the next blocks, up to `last`."""
         rest = self._keys[self._taken :]
         return rest[: np.searchsorted(rest, last, side="right")]
 

@@ -51,7 +51,7 @@ class Visibility(NamedTuple):
 
 
 class Sighting(NamedTuple):
-    """What an image sees of the points. `gray` is halved, `color` quartered."""
+    """View of the points by an image. `gray` is halved, `color` quartered."""
 
     number: int
     start: NDArray[np.float64]  # T_camera_world of its keyframe
@@ -75,7 +75,7 @@ class Look(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """Of all images: by index of the keyframe; pixels on a square metre in the best view of each point."""
+    """Views of all images, by index of the keyframe; pixels a square metre in the best view of each point."""
 
     images: dict[int, ImageFit]
     best: NDArray[np.float32]
@@ -129,7 +129,7 @@ def sighting(
     visibility: Visibility,
     best: NDArray[np.float32],
 ) -> Sighting:
-    """What an image sees; `best` is raised where it sees a point better than others."""
+    """View of an image; `best` is raised where it sees a point better than others."""
     found = np.empty((len(points), 3), np.float32)
     T = image.T_camera_world
     texture_baking.look(points, normals, T, T, image.camera, image.depth, image.clearness, *visibility, found)
@@ -174,7 +174,7 @@ def _aligned(
 def look(
     points: NDArray[np.float32], one: Sighting, image: NDArray[np.float32], T: NDArray[np.float64]
 ) -> Look:
-    """What a blurred image, of half the size, shows of points (n, 3) from T_camera_world."""
+    """Grey values of a blurred image, of half the size, at points (n, 3) from T_camera_world."""
     p = _camera_points(points, one, T)
     u, v = (x / 2 for x in pixels(one, p))  # `pyrDown` keeps the centres of even pixels
     slopes = [sampled(image, u + a, v + b) - sampled(image, u - a, v - b) for a, b in ((1, 0), (0, 1))]

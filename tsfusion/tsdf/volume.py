@@ -474,7 +474,7 @@ class Volume(AskableMap):
 def _writers(
     store: BlockStore, device: DeviceBlocks | None, config: VolumeConfig
 ) -> tuple[RayBuffers, Integrator]:
-    """What makes rays of keyframes and adds them to a map."""
+    """Maker of rays of keyframes, which adds them to a map."""
     if device is None:
         buffers = RayBuffers(color=config.color, regularised=store.corrected)
         return buffers, Integrator(store, buffers, config)

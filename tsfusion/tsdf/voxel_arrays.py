@@ -42,7 +42,7 @@ _EARLIEST = (1980, 1, 1, 0, 0, 0)  # as the date of every part: the same map giv
 
 
 class _Field(NamedTuple):
-    """What is written of each voxel."""
+    """Values written of each voxel."""
 
     dtype: DTypeLike
     unseen: float
