@@ -168,7 +168,7 @@ def add_rays(
     color_rgn: ti.types.ndarray(dtype=ti.i64, ndim=2),
     color_b: ti.types.ndarray(dtype=ti.i32, ndim=2),
 ):
-    """As `integrate.add_rays`, a thread a ray; `first_ray` … `end_ray` − 1 are the places of the bands' rays.
+    """The same as `integrate.add_rays`, a thread a ray; bands of rays `first_ray` … `end_ray` − 1.
 
     Updates are listed, then added, a thread each: so those of one ray do not wait for each other. Nothing is
     added inside a loop within a thread: after that, Mesa's software device (22.3) forgets which threads run.

@@ -52,7 +52,7 @@ def is_site(values: ti.template(), shape, at, own):
 
 @ti.func
 def slope(values: ti.template(), shape, at, own):
-    """What the distance gains with a voxel along each axis: towards the surface where it lies between the
+    """Gain of the distance with a voxel along each axis: towards the surface where it lies between the
     voxel and its neighbour, else from both neighbours that were seen."""
     gradient = vec3f(0.0)
     for a in ti.static(range(3)):

@@ -192,7 +192,7 @@ def vote_color(
 
 @ti.func
 def packed_step(rays: ti.template(), r, axis: ti.template(), towards):
-    """What a step of ray `r` along an axis adds to where it is."""
+    """Change of ray `r`'s place with a step along an axis."""
     turn = ti.cast(-rays[r, LOSS + axis] * QUANTA_PER_VOXEL, ti.i64)
     return (turn << 32) + towards * ti.static(STEPS[axis])
 

@@ -63,7 +63,7 @@ def start_device(arch: str) -> None:
 
 
 def first_line(error: BaseException) -> str:
-    """What an error of Taichi says first; the rest is where in Taichi it arose."""
+    """First line of an error of Taichi; the rest is where in Taichi it arose."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return lines[0] if lines else type(error).__name__
 

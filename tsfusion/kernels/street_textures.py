@@ -101,7 +101,7 @@ def wall_color(u, v, house, salt, g, foot):
 
 @ti.func
 def pane_color(across, up, wide, high, column, storey, salt, g, foot):
-    """What is in a window: dark glass, a curtain, or a blind that is partly down."""
+    """Inside of a window: dark glass, a curtain, or a blind that is partly down."""
     pane = rgb3(0.05, 0.06, 0.075) * (1 + 1.4 * g[2] + 1.2 * g[3] + 0.8 * cell(column, storey, salt + 1))
     open_ = 0.2 + 0.7 * cell(column, storey, salt + 3)
     if cell(column, storey, salt + 2) > 0.45 and ti.abs(across) > wide * open_:

@@ -252,7 +252,7 @@ def signs_around(state: ti.template(), around: ti.template(), r):
 
 @ti.func
 def triangles_around(state: ti.template(), around: ti.template(), r):
-    """Not zero if a cell that has one of the row's edges has triangles."""
+    """Flag, not zero if a cell that has one of the row's edges has triangles."""
     near = 0
     for c in ti.static(range(7)):
         near |= state[around[r, HERE - 9 * (c >> 2) - 3 * (c >> 1 & 1) - (c & 1)], 2]
