@@ -79,7 +79,7 @@ class ActivityLog:
 
 
 def _progress(name: str, one: MapHealth, before: MapHealth, seconds: float) -> str:
-    """What came into a map and was fused; empty = nothing."""
+    """Keyframes that came into a map and were fused, in words; empty = none."""
     received = one.keyframes_durable - before.keyframes_durable
     fused = max(one.keyframes_fused - before.keyframes_fused, 0)
     if received <= 0 and not fused:

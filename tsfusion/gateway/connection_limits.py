@@ -21,7 +21,7 @@ _UNNOTICED = 4  # one part in so many of the memory is for what comes in until i
 
 
 class ConnectionLimits:
-    """What connections may do to a gateway. Call `step` and `all_must_go` again and again.
+    """Limits of what connections may do to a gateway. Call `step` and `all_must_go` again and again.
 
     Args:
         refused: counts what is cut off, by reason.

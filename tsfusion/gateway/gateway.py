@@ -371,7 +371,7 @@ class Gateway:
         )
 
     def _find_problems(self, shown: AllowedMaps = ALL_MAPS) -> list[Problem]:
-        """What a person has to know of now: of the whole server first, then of its maps, then of clients."""
+        """Present problems: of the whole server first, then of its maps, then of clients."""
         found = [Problem(self.ports.problem, is_logged=True)] if self.ports.problem else []
         if self._access.problem:
             found.append(Problem(f"nobody may connect: {self._access.problem}", is_logged=True))

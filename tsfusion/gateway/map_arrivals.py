@@ -50,7 +50,7 @@ OnEnd = Callable[[Moved | str], None]
 
 
 class Request(Struct, frozen=True):
-    """What a person asked for: a map, and the server that has it."""
+    """Request to fetch a map, and the server that has it."""
 
     name: str
     source: str

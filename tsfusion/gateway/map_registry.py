@@ -403,7 +403,7 @@ class MapRegistry:
         return {hosted.name: hosted.health() for hosted in self}
 
     def problems(self) -> list[Problem]:
-        """What is wrong with the maps: what keeps them from taking or fusing keyframes comes first."""
+        """Problems of the maps; those that keep them from taking or fusing keyframes come first."""
         problems = [
             Problem(problem, hosted.name, is_logged=bool(hosted.disk.problem))
             for hosted in self

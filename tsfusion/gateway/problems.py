@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a person would call a problem: one plain line each, and since when it is there."""
+"""Problems as a person would name them: one plain line each, and since when each is there."""
 
 import logging
 import re

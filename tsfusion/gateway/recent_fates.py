@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What became of one client's keyframes in the last minute."""
+"""Fates of one client's keyframes in the last minute."""
 
 import time
 from collections import deque

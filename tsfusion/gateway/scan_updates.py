@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What scanners see, for who watches a map: where each keyframe was taken, and its picture as it came.
+"""News of scanners for viewers of a map: where each keyframe was taken, and its picture as it came.
 
 Nothing is decoded here, and the fuser has no part in it. Pictures may take so many bytes a second; of those
 that had to wait the newest of each scanner is sent as soon as there is room.
