@@ -53,7 +53,7 @@ class _Sweep:
 
 
 class FollowedMap:
-    """What is known of a map, and the next question about it.
+    """Known part of a map, and the next question about it.
 
     Attributes:
         epoch: of the fuser's process; empty = nothing is known.
@@ -90,7 +90,7 @@ class FollowedMap:
     # --- what to ask ---
 
     def question(self, now: float) -> Cells | None:
-        """What to ask now; None = nothing."""
+        """Next question; None = none."""
         if self._missed is not None and (self._sweep is None or not self._sweep.is_raw):
             self._sweep, self._missed = _Sweep(True, *self._missed), None
         elif self._sweep is None and not self.epoch:

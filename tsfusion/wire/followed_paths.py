@@ -33,7 +33,7 @@ class FollowedPaths:
         self._number: tuple[str, int] | None = None
 
     def question(self, now: float) -> Keyframes | None:
-        """What to ask now; None = nothing."""
+        """Next question; None = none."""
         if self._asked is None and self._is_due and now >= self._next:
             self._is_due, self._next = False, now + _PAUSE_S * max(self._answers, 1)
             self._asked, self._answers = Keyframes(), 0

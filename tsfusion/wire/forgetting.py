@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Which keyframes of a map are to be forgotten, and which were."""
+"""Keyframes of a map that are to be forgotten, and those that were."""
 
 from typing import Annotated
 
@@ -85,7 +85,7 @@ class ForgottenSession(Struct, frozen=True, kw_only=True):
 
 
 class Forgotten(Struct, frozen=True, kw_only=True):
-    """What became of a request to forget.
+    """Result of a request to forget.
 
     Attributes:
         sessions: that have keyframes of the selection.

@@ -50,7 +50,7 @@ class SurfacePart:
 
 
 class HeldCells:
-    """What somebody has of a map: for each cell of which state of the map it is."""
+    """Cells that a follower has of a map: for each one, of which state of the map it is."""
 
     def __init__(self) -> None:
         self._rows = np.zeros(0, _ROW)

@@ -29,7 +29,7 @@ _GRID = ("origin", "resolution", "heights", "axes")
 
 
 class Answered(Struct, Generic[Result], frozen=True, kw_only=True, eq=False):
-    """What a map answered, of which state of it, and how long that took.
+    """Answer of a map, of which state of it, and how long it took.
 
     Attributes:
         result: as of the method of `Volume` with the same name.
@@ -144,7 +144,7 @@ class MapClient:
         surface: Surface | None = "raw",
         timeout: float | None = None,
     ) -> Answered[View]:
-        """What a pinhole camera sees of the surface; see `Volume.raycast`. Raises as `sample`.
+        """View of the surface by a pinhole camera; see `Volume.raycast`. Raises as `sample`.
 
         Args:
             intrinsics, T_world_camera, shape, min_weight, surface: as for `Volume.raycast`.
@@ -163,7 +163,7 @@ class MapClient:
         return _answered(View(**_all(arrays, "depth", "normals"), colors=colors), answer, delay)
 
     def occupancy_slice(self, low: float, high: float, **how: Any) -> Answered[OccupancySlice]:
-        """What stands between two heights; see `Volume.occupancy_slice`.
+        """Costmap of what stands between two heights; see `Volume.occupancy_slice`.
 
         Args:
             low, high, how: as for `distance_slice`, without `max_distance`.

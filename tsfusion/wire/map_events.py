@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What happens to a map, as those who watch it hear of it: new triangles, where a scanner is, poses moved."""
+"""Events of a map, as its viewers hear of them: new triangles, where a scanner is, poses moved."""
 
 from dataclasses import dataclass
 

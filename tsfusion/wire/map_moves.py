@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What two servers say to each other when a map moves: the one that gets it asks, the other answers.
+"""Messages between two servers when a map moves: the one that gets it asks, the other answers.
 
     list    the map's files; from then on none of them is deleted, and a checkpoint is written
     read    a piece of a file

@@ -34,7 +34,7 @@ _WEIGHTS_S = 2.0  # that a question for weights may take
 
 
 class MapWatcher:
-    """What happens to a map of a running server (a `viewer.map_feed.MapFeed`).
+    """Events of a map of a running server (a `viewer.map_feed.MapFeed`).
 
     It never ends by itself: while the server is away, `LinkSeen` says so, and all comes again afterwards. A
     map that moves to another server is followed there (without keys, on this machine alone). Use it from one
@@ -138,7 +138,7 @@ class MapWatcher:
     # --- events ---
 
     def events(self, timeout: float) -> list[MapEvent]:
-        """What has happened since the last call; waits at most `timeout` seconds for the first event."""
+        """Events since the last call; waits at most `timeout` seconds for the first event."""
         deadline = time.monotonic() + timeout
         while True:
             self._step()

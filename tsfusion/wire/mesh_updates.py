@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What viewers of a map are sent: the triangles that have changed, and the keyframes as they come.
+"""Messages to viewers of a map: the triangles that have changed, and the keyframes as they come.
 
 A message of either kind begins with its topic, `mesh/MAP/` or `scan/MAP/`, then one of these structs as
 msgpack. After `Meshed` come the cells, (n, 3) int32, and the frames of `MeshLayout`: these triangles replace
@@ -17,7 +17,7 @@ from tsfusion.wire.record_header import SessionId, TransformRows
 
 
 class MeshUpdate(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """What a mesh update is of. An older server sends none.
+    """Facts about a mesh update. An older server sends none.
 
     Attributes:
         epoch: process of the server that fuses the map; a new one begins all numbers again.

@@ -79,7 +79,7 @@ class Ack(Struct, frozen=True, tag="ack"):
 
 
 class Nack(Struct, frozen=True, tag="nack"):
-    """This record, a keyframe or a correction, will never count.
+    """Refusal of a record, a keyframe or a correction, that will never count.
 
     Attributes:
         stage: `door` = it was not journaled and must not be sent again; `map` = it is journaled, but the

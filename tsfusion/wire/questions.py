@@ -73,7 +73,7 @@ class Sample(Struct, frozen=True, tag="sample", omit_defaults=True):
 
 
 class Raycast(Struct, frozen=True, tag="raycast", omit_defaults=True):
-    """What does a pinhole camera see of the surface? Arguments as of `Volume.raycast`.
+    """Question for the view of a pinhole camera. Arguments as of `Volume.raycast`.
 
     Attributes:
         intrinsics: fx, fy, cx, cy, pixels.
@@ -111,7 +111,7 @@ class Raycast(Struct, frozen=True, tag="raycast", omit_defaults=True):
 
 
 class Slice(Struct, frozen=True, tag="slice", omit_defaults=True):
-    """What stands between two heights? Arguments as of `Volume.current_slice`.
+    """Question for what stands between two heights. Arguments as of `Volume.current_slice`.
 
     Attributes:
         kind: `occupancy`, or also distances.
@@ -169,7 +169,7 @@ class Field(Struct, frozen=True, tag="field", omit_defaults=True):
 
 
 class Cells(Struct, frozen=True, tag="cells", omit_defaults=True):
-    """Which triangles do the map's cells have, in the order of their x, y and z, some hundred at once?
+    """Question for the triangles of the map's cells, in the order of their x, y and z, some hundred at once.
 
     Attributes:
         first: block coordinates of where to begin; None = with the first cell.
@@ -251,7 +251,7 @@ class MapState(Struct, frozen=True, kw_only=True):
 
 
 class Answer(Struct, frozen=True, kw_only=True):
-    """What a map answered; its arrays follow as frames.
+    """Answer of a map; its arrays follow as frames.
 
     Attributes:
         crc: CRC-32 of all frames.
