@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What one browser has to itself: its camera, measuring, pictures and downloads."""
+"""Controls of one browser: its camera, measuring, pictures and downloads."""
 
 import contextlib
 import time
@@ -32,7 +32,7 @@ _MARK = (213, 94, 0)
 
 
 class Shown(Protocol):
-    """What a browser's panel asks the page."""
+    """Requests of a browser's panel to the page."""
 
     voxel_size: float
     map_name: str
@@ -54,7 +54,7 @@ class Shown(Protocol):
         ...
 
     def shown_mesh(self) -> "Mesh":
-        """What is shown, in the map's frame."""
+        """Mesh of what is shown, in the map's frame."""
         ...
 
 

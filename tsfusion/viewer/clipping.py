@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a plane and a box leave of a map's tiles."""
+"""Parts of a map's tiles that a plane and a box leave."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -43,7 +43,7 @@ class Clipping:
         return "whole" if whole else "part"
 
     def cut(self, mesh: Mesh) -> Mesh:
-        """What is shown of a mesh; triangles across are cut there."""
+        """Shown part of a mesh; triangles across the border are cut there."""
         if self.normal is not None:
             mesh = mesh_cropping.cut(mesh, self.normal, self.offset)
         if self.box is not None and len(mesh.faces):

@@ -50,7 +50,7 @@ class ClippingControls:
 
     @property
     def clipping(self) -> Clipping:
-        """What the controls say."""
+        """State of the controls."""
         normal, offset = None, 0.0
         if self._plane.value != _NONE:
             sign = -1.0 if self._other.value else 1.0

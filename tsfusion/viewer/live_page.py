@@ -164,7 +164,7 @@ class LivePage:
         self._colors.values.ask(found)
 
     def _step(self, now: float) -> None:
-        """What is to do between two looks at the feed."""
+        """Work between two looks at the feed."""
         if self._updates and now >= self._next_apply:
             self._apply(now)
         self._obey(now)

@@ -24,7 +24,7 @@ class TimeLine:
 
 
 class MapFeed(Protocol):
-    """What is shown, event by event. For one thread, but for `weights`."""
+    """Source of what a page shows, event by event. For one thread, but for `weights`."""
 
     @property
     def title(self) -> str:
@@ -49,7 +49,7 @@ class MapFeed(Protocol):
         ...
 
     def events(self, timeout: float) -> list[MapEvent]:
-        """What has happened since the last call; waits at most `timeout` seconds for the first event."""
+        """Events since the last call; waits at most `timeout` seconds for the first event."""
         ...
 
     def weights(self, points: NDArray[np.float32]) -> NDArray[np.float32] | None:

@@ -82,7 +82,7 @@ class MapTiles:
         return self.apply_all([update], now_s)
 
     def apply_all(self, updates: Sequence[SurfaceUpdate], now_s: float) -> set[Key]:
-        """As `apply`, of several updates at once, of which the last has the newest cells.
+        """The same as `apply`, of several updates at once, of which the last has the newest cells.
 
         A scanner that stands still changes the same cells with each keyframe: only the newest are looked at.
         """
@@ -142,7 +142,7 @@ class MapTiles:
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """What an update has for one tile: cells, who saw them, each face's cell, and which faces of a mesh."""
+    """Part of an update for one tile: cells, who saw them, each face's cell, and which faces of a mesh."""
 
     cells: NDArray[np.int16]
     client: NDArray[np.int32]

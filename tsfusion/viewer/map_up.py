@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Which way is up in a map that grows: as it is told, or found again as more of it is seen."""
+"""Up direction of a map that grows: as it is told, or found again as more of it is seen."""
 
 import numpy as np
 from numpy.typing import NDArray

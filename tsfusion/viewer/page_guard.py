@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Who may open a page: requests are judged by their Host, Origin and token.
+"""Guard of a page: requests are judged by their Host, Origin and token.
 
 A foreign page can make a browser send requests to this machine, and a foreign name can be made to lead to it:
 so Host must name this server, and the Origin of a WebSocket must be that Host. Beyond loopback, a token must

@@ -60,11 +60,11 @@ class ScannerMarks:
 
     @property
     def sessions(self) -> list[bytes]:
-        """Of all scanners, in the order in which they came."""
+        """Sessions of all scanners, in the order in which they came."""
         return list(self._scanners)
 
     def name(self, session: bytes) -> str:
-        """What a person calls a scanner: its key's name, or the beginning of its session's number."""
+        """Name of a scanner for a person: its key's name, or the beginning of its session's number."""
         scanner = self._scanners.get(session)
         client = scanner.newest.client if scanner and scanner.newest else ""
         return client or session.hex()[:8]

@@ -26,7 +26,7 @@ _MARKS = {"scanners": "Scanners", "paths": "Paths", "first paths": "Paths before
 
 @dataclass
 class Orders:
-    """What browsers have asked for since the last look; None = nothing.
+    """Requests of browsers since the last look; None = none.
 
     Attributes:
         map_name: to be shown.
@@ -79,7 +79,7 @@ class SharedPanel:
         return self._view
 
     def take_orders(self, now: float, settled: float) -> Orders:
-        """What browsers have asked for; a time slider counts once it has rested for `settled` seconds."""
+        """Requests of browsers; a time slider counts once it has rested for `settled` seconds."""
         with self._lock:
             orders, self._orders = self._orders, Orders()
             if orders.place is not None and now < self._slid_at + settled:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a person has to know of a server, its maps and scanners, as HTML. Every text in it is escaped."""
+"""State of a server, its maps and scanners, as HTML. Every text in it is escaped."""
 
 from collections.abc import Iterable, Sequence
 from html import escape

@@ -139,7 +139,7 @@ class TileNodes:
         return self._sent_at.get(key, -np.inf) + pause
 
     def shown_mesh(self, key: Key, tile: Tile) -> Mesh:
-        """What is shown of a tile, in the colours that are shown."""
+        """Shown part of a tile, in the chosen colours."""
         mesh = Mesh(tile.mesh.vertices, tile.mesh.faces, tile.mesh.normals, self._colors.colors(key, tile))
         return mesh if self.clipping.side(tile.bounds) == "whole" else self.clipping.cut(mesh)
 

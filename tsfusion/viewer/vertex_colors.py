@@ -39,7 +39,7 @@ class Scale:
 
 
 class VertexColors:
-    """What colours mean at present. One for all browsers of a page.
+    """Present meaning of colours. One for all browsers of a page.
 
     Args:
         tiles: that get colours.
@@ -95,7 +95,7 @@ class VertexColors:
         return self.scale != before
 
     def legend(self) -> str:
-        """What the colours mean, as HTML."""
+        """Legend of the colours, as HTML."""
         if self.mode == CLIENT:
             names = [html.escape(self._of_client(session)) for session in self._tiles.clients]
             return " ".join(_swatch(of_number(i)) + name for i, name in enumerate(names)) or "not known"

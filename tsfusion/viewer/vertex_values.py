@@ -38,7 +38,7 @@ class VertexValues:
 
     @property
     def names(self) -> list[str]:
-        """What can be chosen."""
+        """Names of the quantities that can be chosen."""
         return list(self._functions)
 
     def choose(self, name: str) -> None:
