@@ -324,7 +324,7 @@ def _counts(found: "Samples") -> str:
 
 
 def _state(answers: "list[Answered[Any]]") -> str:
-    """Which map that was, and how long it took."""
+    """The state of the map that answered, and how long the answer took."""
     last = answers[-1]
     took = sum(one.delay_s for one in answers)
     words = f"a map of {last.state.keyframes} keyframes, answered in {1e3 * took:.1f} ms"

@@ -85,7 +85,7 @@ def fuse(
 
 
 def _settings(found: "Listed", file: Path | None, flags: dict[str, Any]) -> "VolumeConfig":
-    """Those of the saved map beside the first journal, or of the file, with every flag on top."""
+    """Settings of the saved map beside the first journal, or of the file, with every flag on top."""
     from msgspec.structs import asdict
 
     if file is None and found.config is not None:

@@ -185,7 +185,7 @@ def configuration(file: Path | None, *, preset: dict[str, Any] | None = None, **
 
 
 def byte_count(text: str | None) -> int | None:
-    """What `2GB`, `512MiB` or a number of bytes says; None = not given.
+    """Bytes of `2GB`, `512MiB` or a number; None = not given.
 
     Raises:
         InvalidConfig: for anything else.
@@ -205,7 +205,7 @@ def byte_count(text: str | None) -> int | None:
 
 
 def up_direction(text: str | None) -> "Up | None":
-    """What --up says; raises InvalidConfig for nonsense."""
+    """Direction of --up; raises InvalidConfig for nonsense."""
     from tsfusion.geometry import up_direction
 
     return None if text is None else up_direction.parse(text)

@@ -50,7 +50,7 @@ class Note(NamedTuple):
 
 
 class Screen(NamedTuple):
-    """What is shown at one moment; `headline` None = there are no keyframes."""
+    """Rows of one moment; `headline` None = there are no keyframes."""
 
     rows: list[Row] = []
     notes: list[Note] = []
@@ -93,7 +93,7 @@ class RunProgress:
         self._moved = 0.0  # time.monotonic(): a keyframe went a step further, or none was under way
 
     def screen(self, total: int | None, stats: "ClientStats", link: str, scan: "ScanState | None") -> Screen:
-        """What is shown; arguments as of `Progress.update`."""
+        """Rows to show; arguments as of `Progress.update`."""
         taken = stats.sent if scan is None else scan.frames
         taking, fusing = self._rates(taken, stats.fused)
         headline = Headline(

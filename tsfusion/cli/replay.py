@@ -116,7 +116,7 @@ def _is_synthetic(path: Path) -> bool:
 
 
 def _warn_of_disagreement(dataset: "Dataset") -> str | None:
-    """What is wrong where poses, camera and depth disagree, else None; printed on stderr, as colour is."""
+    """Mistake because of which poses, camera and depth disagree, or None; printed on stderr, as colour is."""
     from tsfusion.evaluation import pose_check
 
     report = pose_check.check(dataset)

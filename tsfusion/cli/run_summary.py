@@ -98,7 +98,7 @@ def mesh_lines(figures: dict[str, Any]) -> list[str]:
 
 
 def mesh_notes(figures: dict[str, Any]) -> list[str]:
-    """What a person may want to change about a mesh: a line each."""
+    """Hints about a mesh that a person may want to change: a line each."""
     notes = []
     if left_out := figures["left_out"].get("islands"):
         files = " and ".join(figures["left_out"]["files"])

@@ -15,7 +15,7 @@ _PROMPT = 1.0  # seconds: an answer that takes longer is missed
 
 
 class StatusScreen:
-    """What is shown of a server. One thread tells what it answers, another draws."""
+    """Screen of a server's state. One thread brings its answers, another draws."""
 
     def __init__(self, console: Console, address: str) -> None:
         self._console = console

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What every verb has in common: short help, examples, environment variables, renamed flags."""
+"""Parts that all verbs have in common: short help, examples, environment variables, renamed flags."""
 
 import re
 from collections.abc import Callable

@@ -148,7 +148,7 @@ def _feed(target: str | Path, map_: str | None, link: dict[str, Any]) -> "MapFee
 
 
 def _measures(target: str | Path, truth: str | None) -> "dict[str, Measure]":
-    """What else the map can be coloured by: its error, where the truth is given, or a run has measured it."""
+    """Further colours of a map: its error, where the truth is given, or a run has measured it."""
     if truth is not None:
         from tsfusion.pipelines.measured_errors import error_measure
 

@@ -50,7 +50,7 @@ class Display(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class Wishes:
-    """What a person wants beside the map.
+    """Wishes of a person beside the map.
 
     Attributes:
         up: away from the ground; None = it is found.
@@ -107,7 +107,7 @@ class FusedRun(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass
 class _Clock:
-    """What each step takes."""
+    """Time and memory of each step."""
 
     seconds: dict[str, float] = field(default_factory=dict)
     worker_seconds: dict[str, float] = field(default_factory=dict)

@@ -64,7 +64,7 @@ Keyframes = JournalKeyframes | DatasetKeyframes
 
 
 class Job(Struct, frozen=True, kw_only=True):
-    """What every job has.
+    """Fields of every job.
 
     Attributes:
         name: of the job, distinct in its run.

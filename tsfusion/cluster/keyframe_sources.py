@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What is fused: journals at their final poses, and datasets; listed by one process, read by others."""
+"""Sources of a fusion: journals at their final poses, and datasets; listed by one process, read by others."""
 
 import hashlib
 import os
@@ -51,7 +51,7 @@ class Listed(msgspec.Struct):
 
     @property
     def count(self) -> int:
-        """Of all sources together."""
+        """Number of keyframes of all sources together."""
         return sum(map(len, self.keyframes))
 
     def shares(self, count: int) -> list[list[Keyframes]]:
@@ -225,7 +225,7 @@ def _add_dataset(found: Listed, source: str, options: dict[str, Any]) -> dict[st
 
 
 def reading(keyframes: Sequence[Keyframes]) -> Iterator[Callable[[], Keyframe]]:
-    """What reads each keyframe, in their order.
+    """Readers of the keyframes, in their order.
 
     A call raises JournalError or DatasetError when it cannot be read, DecodeError or InvalidKeyframe when it
     is of no use, to a server neither.

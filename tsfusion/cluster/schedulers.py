@@ -34,7 +34,7 @@ class Scheduler(Protocol):
         """Begin a job; there are fewer than `workers` under way."""
 
     def wait(self) -> Sequence[Message]:
-        """What the jobs under way say next: at least one message. `Done`, `Failed` and `Lost` end a job."""
+        """Next messages of the jobs under way, at least one. `Done`, `Failed` and `Lost` end a job."""
 
     def close(self) -> None:
         """End all, also what is under way."""
@@ -52,7 +52,7 @@ class LocalProcesses:
 
     @property
     def pids(self) -> list[int]:
-        """Of the processes that do jobs now."""
+        """Pids of the processes that do jobs now."""
         return [key.data.process.pid for key in self._busy.get_map().values()]
 
     def start(self, job: AnyJob) -> None:

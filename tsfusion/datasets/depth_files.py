@@ -85,7 +85,7 @@ def _read_exr(path: Path) -> NDArray[Any]:
 
 
 def _described(image: NDArray[Any]) -> str:
-    """What a file holds in place of depth."""
+    """Description of a file's content in place of depth."""
     shape = f"shape {image.shape} of {image.dtype}"
     if image.ndim == 3 and image.dtype == np.uint8:
         return f"{shape}: a colour image"

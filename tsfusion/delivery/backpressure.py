@@ -153,7 +153,7 @@ class Thinning:
 
     @staticmethod
     def _one_of(shortage: float, faster: float) -> int:
-        """Of how many one is kept, so that a map gets no more than it takes.
+        """Number n of which one keyframe is kept, so that a map gets no more than it takes.
 
         Args:
             faster: times that the sensor is faster than the map; 0 = the spool's room is what runs short.
@@ -167,7 +167,7 @@ class Thinning:
         return (len(self._arrivals) - 1) / seconds if seconds > 0 else 0.0
 
     def _fullness(self, room: int) -> float:
-        """What waits, or what comes in `catch_up` seconds if that is less, in parts of the room that is left.
+        """Waiting keyframes, or those of `catch_up` seconds if they are fewer, as a share of the free room.
 
         So nothing is left out while the spool is not half full: it may be small and empty again soon.
         """

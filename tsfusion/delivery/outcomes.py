@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What became of a client's records: counts, and the first of those that were turned away, in words."""
+"""Fates of a client's records: counts, and the first of those that were turned away, in words."""
 
 from collections import Counter, OrderedDict
 

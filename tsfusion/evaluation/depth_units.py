@@ -17,7 +17,7 @@ MIN_SHARE = 0.8  # of the frames
 
 @dataclass(frozen=True)
 class DepthUnit:
-    """What one frame's depth shows of its unit.
+    """Evidence in one frame's depth for its unit.
 
     Attributes:
         typical_m: median depth, of a scan median range; 0 = nothing measured.
@@ -37,7 +37,7 @@ class DepthUnit:
 
 
 def depth_unit(frame: Frame, view: DepthView | None) -> DepthUnit:
-    """What a frame's depth, of which `view` is made, shows of its unit."""
+    """Evidence for its unit in a frame's depth, of which `view` is made."""
     if frame.depth is None:
         return DepthUnit(0.0 if view is None else view.range_m)
     depth = frame.depth[::4, ::4]

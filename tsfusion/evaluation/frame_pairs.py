@@ -31,7 +31,7 @@ STEP_ROUNDS = 8
 
 @dataclass(frozen=True, eq=False)
 class SeenFrame:
-    """What the check keeps of one frame.
+    """Parts of one frame that the check keeps.
 
     Attributes:
         kind: what the sensor measures.

@@ -229,7 +229,7 @@ def _content(dataset: Dataset, frame: SeenFrame) -> Content:
 def _disagreement(
     seen: _Comparison, tried: Mapping[str, Fits], corrected: Mapping[str, list[Motion]]
 ) -> PoseCheckReport | None:
-    """What is wrong; None where nothing is, or nobody can tell."""
+    """Mistake in words; None where there is none, or nobody can tell."""
     pairs, given, report = seen.pairs, seen.given, partial(PoseCheckReport, "disagree")
     gains = {name: mean_gain(fits, given) for name, fits in tried.items()}
     gain = max(gains.values())

@@ -18,7 +18,7 @@ _CAMERA_BODY = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0,
 
 @dataclass(frozen=True)
 class Content:
-    """What a dataset holds, as far as advice depends on it.
+    """Contents of a dataset, as far as advice depends on them.
 
     Attributes:
         measures: what the sensor measures.
@@ -59,7 +59,7 @@ class Mistake:
     kitti_text: str = ""
 
     def text_for(self, content: Content) -> str:
-        """What it is and what to do, in words of what the dataset holds."""
+        """Mistake and remedy, in the words of the dataset's contents."""
         text = self.text
         if self.scan_text is not None and content.measures == "points":
             text = self.scan_text

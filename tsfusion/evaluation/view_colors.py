@@ -18,7 +18,7 @@ MIN_CLEARNESS = 0.5  # of its depth's edge: there the registration of colour to 
 
 
 class ShownView(NamedTuple):
-    """What a mesh shows: (H, W, 3) float32 RGB, 0 to 255, and (H, W) float32 depth in metres, 0 = nothing."""
+    """View of a mesh: (H, W, 3) float32 RGB, 0 to 255, and (H, W) float32 depth in metres, 0 = nothing."""
 
     color: NDArray[np.float32]
     depth: NDArray[np.float32]
@@ -93,7 +93,7 @@ def registered(
 
 
 def as_bright(image: NDArray[np.float32], view: ShownView, where: NDArray[np.bool_]) -> ShownView:
-    """What a mesh shows, as bright as an image of it: RGB times three factors fitted where it is compared."""
+    """View of a mesh, as bright as an image of it: RGB times three factors fitted where it is compared."""
     where = where & np.isfinite(image).all(axis=2)
     there, other = image[where], view.color[where]
     factors = (there * other).sum(axis=0) / np.maximum((other * other).sum(axis=0), 1e-9)

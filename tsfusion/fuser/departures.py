@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Which keyframes are to leave a map: those that somebody names, and those beyond its window."""
+"""Keyframes that are to leave a map: those that somebody names, and those beyond its window."""
 
 from collections import deque
 from collections.abc import Callable

@@ -12,7 +12,7 @@ from tsfusion.wire import sockets
 
 
 class Inbox:
-    """What came over the socket and was not handled yet."""
+    """Messages that came over the socket and were not handled yet."""
 
     def __init__(self, link: sockets.AnySocket) -> None:
         self.orders: deque[ToFuser] = deque()  # in the order of their coming

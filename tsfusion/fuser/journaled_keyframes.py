@@ -131,7 +131,7 @@ class JournaledKeyframes:
         return FinalKeyframe(replace(found, T_world_camera=T), self.sessions[place.session])
 
     def places(self) -> list[KeyframePlace]:
-        """Of all, in their order."""
+        """Places of all keyframes, in their order."""
         return list(self._places)
 
     def poses(self) -> NDArray[np.float64]:

@@ -175,7 +175,7 @@ def answer_of(
     question: Sample | Raycast | Slice | Field,
     frames: list[memoryview],
 ) -> _Arrays:
-    """What a map answers, by name: the fields of `geometry.map_answers` and `geometry.map_grids`."""
+    """Answer of a map, by name: the fields of `geometry.map_answers` and `geometry.map_grids`."""
     if isinstance(question, Slice):
         return _slice_of(slices.get(question), question.kind)
     if isinstance(question, Field):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Whose keyframes touched the blocks of a map last: the stamps at which the session changed."""
+"""Sessions whose keyframes touched the blocks of a map last: the stamps at which the session changed."""
 
 from array import array
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What is answered to those who follow a map: its cells some at a time, and where its keyframes are."""
+"""Answers to followers of a map: its cells, some at a time, and where its keyframes are."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -32,7 +32,7 @@ class WatchedMap:
         return self._cells(asked) if isinstance(asked, Cells) else self._keyframes(asked)
 
     def _cells(self, asked: Cells) -> _Arrays:
-        """As `wire.mesh_updates.MeshUpdate` describes them, and `next`: where the others begin.
+        """Arrays as `wire.mesh_updates.MeshUpdate` describes them, and `next`: where the others begin.
 
         `state`: stamp, drops, and the number of the newest mesh update: all later changes come in later ones.
         """
@@ -61,7 +61,7 @@ class WatchedMap:
         return {name: np.asarray(array) for name, array in arrays.items()}
 
     def _keyframes(self, asked: Keyframes) -> _Arrays:
-        """As `FusedKeyframes` describes them."""
+        """Arrays as `FusedKeyframes` describes them."""
         found = self._poses.fused_after(asked.session, asked.after, KEYFRAMES_AT_ONCE)
         session, number = found.last or (b"", 0)
         return {

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a map answers: samples of its distance field, and what a camera would see of it."""
+"""Answers of a map: samples of its distance field, and the view of a camera."""
 
 import os
 from dataclasses import dataclass
@@ -45,7 +45,7 @@ class Samples:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """What a pinhole camera sees of the map's surface.
+    """View of the map's surface by a pinhole camera.
 
     Attributes:
         depth: (H, W) float32 metres along the optical axis; 0 = nothing hit, as in a keyframe's depth.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a robot is told of a map: distances and occupancy on a grid, and the files that planners read."""
+"""Grids of a map for robots: distances and occupancy, and the files that planners read."""
 
 import json
 from dataclasses import dataclass
@@ -78,7 +78,7 @@ class SliceGrid:
 
     @property
     def figures(self) -> dict[str, Any]:
-        """What stands beside the cells in a file."""
+        """Values beside the cells in a file."""
         return {
             "origin": np.array(self.origin), "resolution": np.float64(self.resolution),
             "heights": np.array([self.low, self.high]), "axes": self.axes,

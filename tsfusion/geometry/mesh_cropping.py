@@ -37,7 +37,7 @@ def cut(mesh: "Mesh", normal: NDArray[np.float64], offset: float) -> "Mesh":
 
 
 def _cut(mesh: "Mesh", height: NDArray[np.float32], plane: tuple[int, np.float32] | None = None) -> "Mesh":
-    """What lies above a plane, where vertices have a height ≥ 0.
+    """Part of a mesh above a plane, where vertices have a height ≥ 0.
 
     Args:
         plane: the axis that it is across, and where: cut vertices are there to the last bit.

@@ -102,7 +102,7 @@ FORMATS: dict[str, Callable[["Mesh"], bytes]] = {".ply": _ply, ".glb": _glb, ".o
 
 
 def facts_of(mesh: "Mesh") -> dict[str, str]:
-    """What a file says about its mesh: by name, a line each."""
+    """Notes in a file about its mesh: by name, a line each."""
     facts = {
         "generator": generator(),
         "unit": "metre",

@@ -10,7 +10,7 @@ ISLAND = 50  # vertices that a piece needs to be none: marching cubes makes abou
 
 
 def find(faces: NDArray[np.int32], vertices: int) -> NDArray[np.bool_]:
-    """Which of `vertices` vertices belong to pieces of fewer than `ISLAND` vertices: (n,) bool.
+    """Vertices, of `vertices`, that belong to pieces of fewer than `ISLAND` vertices: (n,) bool.
 
     That is as much surface as 7 × 7 voxels, 14 cm across at 2 cm. None where most triangles would be on
     islands: then they are the scene.
@@ -23,7 +23,7 @@ def find(faces: NDArray[np.int32], vertices: int) -> NDArray[np.bool_]:
 def find_smaller(
     faces: NDArray[np.int32], vertices: NDArray[np.float32], min_extent: float
 ) -> NDArray[np.bool_]:
-    """Which vertices belong to pieces whose box is less than `min_extent` metres across its corners: (n,)."""
+    """Vertices of pieces whose box is less than `min_extent` metres across its corners: (n,)."""
     checked_extent(min_extent)
     label = pieces(faces, len(vertices))
     order = np.argsort(label, kind="stable")

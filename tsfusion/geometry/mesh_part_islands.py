@@ -17,7 +17,7 @@ from tsfusion.geometry import mesh_islands
 
 @dataclass(frozen=True)
 class Islands:
-    """Which pieces of parts are islands.
+    """Pieces of parts that are islands.
 
     Attributes:
         small: (k,) bool by the numbers that the vertices have.

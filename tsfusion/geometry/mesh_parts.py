@@ -148,7 +148,7 @@ class MeshParts:
 
     @property
     def figures(self) -> dict[str, Any]:
-        """As a `Mesh` has them; nobody has looked for islands."""
+        """Figures as of a `Mesh`; islands are not looked for."""
         extent = self._high - self._low if self.vertices else np.zeros(3)
         return {
             "vertices": self.vertices,
@@ -199,7 +199,7 @@ class MeshParts:
         return path
 
     def _header(self) -> bytes:
-        """That of a PLY of one triangle, with the numbers of this mesh."""
+        """Header of a PLY of one triangle, with the numbers of this mesh."""
         corners, grey = np.eye(3, dtype=np.float32), np.zeros((3, 3), np.uint8)
         faces = np.arange(3, dtype=np.int32)[None]
         one = Mesh(corners, faces, corners, grey if self._has_color else None, known_up=self.up)

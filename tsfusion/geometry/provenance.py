@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a file of a surface says about itself, for whoever gets it without its map."""
+"""Notes of a surface file about itself, for readers who get it without its map."""
 
 from dataclasses import dataclass
 
@@ -26,7 +26,7 @@ class Provenance:
 
     @property
     def facts(self) -> dict[str, str]:
-        """What is known, by name, as text of one line each."""
+        """Known facts, by name, as text of one line each."""
         facts = {
             "source": self.source,
             "keyframes": self.keyframes,

@@ -30,7 +30,7 @@ def sample_ranges(keyframe: Keyframe) -> NDArray[np.float64]:
 
 
 def wrong_unit(keyframe: Keyframe) -> str:
-    """What to do about depth in a wrong unit, for a person; empty = it may be in metres.
+    """Advice about depth in a wrong unit, for a person; empty = it may be in metres.
 
     Judged by the median: metres where no sensor measures any.
     """

@@ -102,7 +102,7 @@ class TexturedMesh(Mesh):
 
     @property
     def figures(self) -> dict[str, Any]:
-        """As of a mesh, and of the texture: its pages, and the share of the surface that an image shows."""
+        """Figures as of a mesh, and of the texture: its pages, and how much of the surface an image shows."""
         texture = {
             "pages": [list(page.shape[1::-1]) for page in self.texture.pages],
             "seen": round(self.seen, 4),
@@ -110,7 +110,7 @@ class TexturedMesh(Mesh):
         return {**super().figures, "texture": texture}
 
     def of_faces(self, kept: NDArray[np.bool_] | NDArray[np.integer]) -> "TexturedMesh":
-        """As `Mesh.of_faces`."""
+        """The same as `Mesh.of_faces`."""
         part = super().of_faces(kept)
         return dataclasses.replace(self, **fields_of(part), texture=self.texture.of_faces(kept))
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Which way is up in a map: as given, by an accelerometer, by the floor, or by how cameras are held."""
+"""Up direction of a map: as given, by an accelerometer, by the floor, or by how cameras are held."""
 
 import math
 from collections.abc import Sequence

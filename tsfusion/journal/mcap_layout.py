@@ -214,7 +214,7 @@ def parse_record(raw: bytes, position: Position) -> Record | None:
 
 
 class ErasedHead(NamedTuple):
-    """What stands in the place of an erased record."""
+    """Filler in the place of an erased record."""
 
     segment: bytes
     session: bytes

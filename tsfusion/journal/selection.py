@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Which records of a journal are meant: times and sessions as a person writes them."""
+"""Selection of records of a journal: times and sessions as a person writes them."""
 
 import datetime
 import math

@@ -209,7 +209,7 @@ class _Pair:
         return found
 
     def turned(self, T: Transform) -> list[Transform]:
-        """What a symmetric place would also allow: quarter turns around the middle of what is common."""
+        """Other answers of a symmetric place: quarter turns around the middle of what is common."""
         points, _ = self._coarse[1].moved(T)
         middles = (np.median(points, axis=0), (points.min(axis=0) + points.max(axis=0)) / 2)
         up = self._a.mesh.up
@@ -227,7 +227,7 @@ class _Pair:
         return Registration(*self._sampled(self._voxel)).refined(T, _LAST_REACHES)
 
     def judged(self, T: Transform, *, fine: bool = False) -> _Answer:
-        """What speaks for and against a transform; `fine`: by every voxel of the surfaces."""
+        """Evidence for and against a transform; `fine`: by every voxel of the surfaces."""
         surfaces = self._sampled(self._voxel) if fine else self._coarse
         moved = self._coarse[0].moved(se3.inverse(T))[0], self._coarse[1].moved(T)[0]
         looks = self._looks_at(moved[1], moved[0])

@@ -179,7 +179,7 @@ class RewoundMap:
         self._now, self._to_remove = self._contents(self._way)
 
     def _contents(self, way: str) -> tuple[NDArray[np.int8], list[_Removed]]:
-        """Which keyframes are there where a way begins, and those to be removed."""
+        """Keyframes that are in the map where a way begins, and those to be removed."""
         if way == "empty":
             return np.full_like(self._saved, _ABSENT), []
         return (self._now, self._to_remove) if way == "on" else (self._saved.copy(), list(self._removed))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What is done to a mesh before it is shared: cut to a box, without crumbs, with fewer triangles."""
+"""Last steps before a mesh is shared: cut to a box, freed of small pieces, with fewer triangles."""
 
 import dataclasses
 from typing import TYPE_CHECKING, Any
@@ -55,7 +55,7 @@ class Finishing:
         return mesh.with_guesses_marked() if self.mark_guesses else mesh, left_out
 
     def legend(self, mesh: Mesh) -> list[dict[str, str]]:
-        """What the colour of guesses means, where there are any."""
+        """Meaning of the colour of guesses, where there are any."""
         if not self.mark_guesses or mesh.guessed is None:
             return []
         return [{"color": "#{:02x}{:02x}{:02x}".format(*GUESS_COLOR), "name": "guessed: nobody saw this"}]
@@ -69,7 +69,7 @@ def checked(
     simplify: str | None,
     mark_guesses: bool,
 ) -> Finishing:
-    """What a person asked for.
+    """Wishes of a person.
 
     Raises:
         InvalidConfig: for a value that is none, before anything takes time.

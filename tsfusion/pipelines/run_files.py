@@ -123,7 +123,7 @@ def write_report(work: Path, meshes: dict[str, Mesh]) -> None:
 
 
 def circumstances() -> Circumstances:
-    """Those of this process, now."""
+    """Circumstances of this process: when, where and by which command."""
     started = Path(sys.argv[0])
     is_command = started.stem == "tsfusion" or (
         started.name == "__main__.py" and started.parent.name == "tsfusion"

@@ -44,7 +44,7 @@ class SessionSummary(Struct, frozen=True):
 
 
 class MapSummary(Struct, frozen=True):
-    """What is known of a saved map without opening it.
+    """Facts of a saved map that is not opened.
 
     Attributes:
         nbytes: of the file; `voxel_bytes`: of its voxels in memory.

@@ -41,7 +41,7 @@ class ExistingMap(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """What a try found: where the scan's world lies in the map, or why that is not known."""
+    """Result of a try: where the scan's world lies in the map, or why that is not known."""
 
     T_map_world: Transform | None
     why: str

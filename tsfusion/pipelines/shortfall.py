@@ -53,7 +53,7 @@ def of_disk(stats: ClientStats) -> str:
 
 
 def cure_of_tracking(localizer: str) -> str:
-    """What to do when frames are lost, by the name of the localizer."""
+    """Advice when frames are lost, by the name of the localizer."""
     if localizer == "trajectory":
         return (
             "give the trajectory of this recording, in its clock (--time-offset SECONDS is added to the "

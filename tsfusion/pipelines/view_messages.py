@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a page's feed and the process that reads its map say to each other (no Taichi here)."""
+"""Messages between a page's feed and the process that reads its map (no Taichi here)."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -62,7 +62,7 @@ class Failed:
 
 @dataclass(frozen=True, eq=False)
 class Told:
-    """What has happened to a map."""
+    """Events of a map."""
 
     number: int
     events: list[MapEvent]

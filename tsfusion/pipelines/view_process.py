@@ -77,14 +77,14 @@ def _usual_map(state: Path) -> str | None:
 
 
 def _running(folder: Path) -> str:
-    """That a server has the map, where one has."""
+    """Note that a server has the map; empty = none has it."""
     if owner_of(folder, name=state_folder.LOCK_FILE) is None:
         return ""
     return "a server is at work on this map, and what it does from now on is not shown: view its address"
 
 
 class _Viewing:
-    """What the process does: shows one map after the other, and answers."""
+    """Main loop of the process: it shows one map after the other, and answers."""
 
     def __init__(self, link: "Connection[object, object]") -> None:
         self._link = link

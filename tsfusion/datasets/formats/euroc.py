@@ -142,7 +142,7 @@ def _calibrated(place: Path) -> tuple[Rectifier, Transform]:
 
 
 def _accelerometer(place: Path, T_body_camera: Transform) -> Accelerometer | None:
-    """That of `imu0`, where it is there."""
+    """Accelerometer of `imu0`, if there is one."""
     sensor, R_body_imu = place / "imu0" / "sensor.yaml", np.eye(3)
     try:
         if sensor.is_file():

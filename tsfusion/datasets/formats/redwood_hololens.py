@@ -176,7 +176,7 @@ class Redwood(DepthImages):
 def _poses(
     files: list[Path], path: Path | None, *, posed: bool, time_offset_s: float
 ) -> list[Transform | None]:
-    """Of a `.log` by number; of another trajectory by time, or one an image."""
+    """Poses of a `.log` by number; of another trajectory by time, or one for each image."""
     if path is None:
         return [None] * len(files)
     if is_log(path):

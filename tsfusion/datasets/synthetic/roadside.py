@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What stands beside a street along a path: houses, parked cars, trees, lamps, signs, hedges, fences, bins.
+"""Things beside a street along a path: houses, parked cars, trees, lamps, signs, hedges, fences, bins.
 
 The path is walked once. Whatever is put down must leave room around every part of the path and must not stand
 in what is there already: a path that comes back finds its own street again.

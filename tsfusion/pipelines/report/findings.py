@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a run left in its folder, read for a report: old runs have less, and nothing of it is required."""
+"""Files of a run's folder, read for a report: old runs have fewer, and none of them is required."""
 
 import csv
 import json

@@ -22,7 +22,7 @@ _NO_DELAY = "A saved map does not hold when its keyframes were fused: a run's re
 
 
 class AboutMap(NamedTuple):
-    """What is known of a saved map without its voxels; `poses` are those of the journal's keyframes."""
+    """Facts of a saved map without its voxels; `poses` are those of the journal's keyframes."""
 
     summary: MapSummary
     journal: JournalInfo | None

@@ -205,7 +205,7 @@ def _error_along(found: MapFindings, name: str) -> tuple[NDArray[np.float64], ND
 
 
 def keyframes(record: dict[str, Any]) -> str:
-    """What became of frames and keyframes."""
+    """Fates of frames and keyframes."""
     rejected = record.get("keyframes_rejected") or {}
     named = {
         f"{name} ({SKIP_REASONS[name]})" if name in SKIP_REASONS else name: n for name, n in rejected.items()

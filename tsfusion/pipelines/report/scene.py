@@ -17,7 +17,7 @@ _ROUNDS = 6
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What a 3-D view shows.
+    """Contents of a 3-D view.
 
     Attributes:
         mesh: with at most `MOST_TRIANGLES` triangles.
@@ -30,7 +30,7 @@ class Scene:
     full: int
 
     def header(self, up: NDArray[np.float64]) -> dict[str, object]:
-        """What the page has to know to unpack `packed`, as JSON can hold it."""
+        """Layout that the page needs to unpack `packed`, as JSON can hold it."""
         low, size = _box(self.mesh.vertices)
         return {
             "vertices": len(self.mesh.vertices),

@@ -65,7 +65,7 @@ class LimitedSource(LiveSource):
         return islice(iter(self._source), self._limit)
 
     def waits_for(self) -> str:
-        """What the source needs and what ends it."""
+        """Needs of the source, and its end."""
         return self._source.waits_for() if isinstance(self._source, LiveSource) else ""
 
     def close(self) -> None:

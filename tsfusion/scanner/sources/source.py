@@ -97,7 +97,7 @@ class LiveSource(ABC):
         """Yield each frame as soon as it arrives."""
 
     def waits_for(self) -> str:
-        """What it needs and what ends it, for a person; empty = nothing to say."""
+        """Needs of a source, and its end, for a person; empty = nothing to say."""
         return ""
 
     def close(self) -> None:

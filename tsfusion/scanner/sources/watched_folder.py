@@ -102,7 +102,7 @@ class WatchedFolder(LiveSource):
         self._since = time.monotonic()  # when something last changed
 
     def waits_for(self) -> str:
-        """What is there, what the next frame needs, and what ends the source, for a person."""
+        """Contents of the folder, needs of the next frame, and the end of the source, for a person."""
         there = len(self._list())
         if self._layout is None:
             wanted = f"no frames yet; waits for {folder_layouts.EXPECTED}"
