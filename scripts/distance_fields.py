@@ -105,7 +105,7 @@ def times() -> None:
 
 
 def free_space() -> None:
-    """What a map knows of a room's free space, with space carving and without."""
+    """Known part of a room's free space, with space carving and without."""
     recording = Synthetic("room", count=40)
     for carves in (False, True):
         volume = Volume(0.02, threads=1, space_carving=carves)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What keyframes pay for it that a live map is watched, and what a watcher costs.
+"""Cost of a watcher of a live map, and its effect on the delay of keyframes.
 
     python scripts/watch_live.py                                keyframes at 2 cm, 8 a second, for 30 s
     python scripts/watch_live.py --watchers 3 --stalled 1 --rate 5 --voxel-size 0.05

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Who follows a map ends with the map's own surface, whatever is lost, late, moved, forgotten or restarted.
+"""A follower of a map ends with the map's own surface, whatever is lost, late, moved, forgotten or restarted.
 
 Both ends run here, without sockets: what they say goes through a list from which messages are lost.
 """

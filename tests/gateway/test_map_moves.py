@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a server answers to one that asks for a map: only what belongs to the map, and never its only copy."""
+"""Answers of a server to another that asks for a map: only files of the map, and never its only copy."""
 
 import zlib
 from collections.abc import Iterator

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What viewers hear of each keyframe: its pose at once, its picture as it came, as long as there is room."""
+"""News of each keyframe for viewers: its pose at once, its picture as it came, as long as there is room."""
 
 import time
 from collections.abc import Iterator

@@ -72,7 +72,7 @@ def test_names_and_places_agree(objects: dict[str, dict[str, Any]]) -> None:
 
 
 class Pod:
-    """What the example starts, as a process of this machine."""
+    """Server that the example starts, as a process of this machine."""
 
     def __init__(
         self, objects: dict[str, dict[str, Any]], folder: Path, name: str, command: list[str]

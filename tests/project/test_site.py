@@ -25,7 +25,7 @@ _LOADS = {"link": "href", "script": "src", "img": "src", "iframe": "src", "sourc
 
 
 class Loaded(HTMLParser):
-    """What a page makes a browser load, and the ids in it."""
+    """Addresses that a page makes a browser load, and the ids in it."""
 
     def __init__(self, page: Path) -> None:
         super().__init__()
@@ -113,7 +113,7 @@ def test_each_page_fits_a_phone_and_shows_its_pictures(site: Path) -> None:
 
 
 def hooks() -> ModuleType:
-    """What `mkdocs.yml` names as its hooks."""
+    """Module that `mkdocs.yml` names as its hooks."""
     spec = spec_from_file_location("site_hooks", ROOT / "scripts" / "_site.py")
     assert spec is not None
     assert spec.loader is not None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Which frames become keyframes of the map."""
+"""Choice of the frames that become keyframes of the map."""
 
 import numpy as np
 import pytest

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What Khronos' validator says of GLB files; tests skip where it is not installed."""
+"""Verdict of Khronos' validator on GLB files; tests skip where it is not installed."""
 
 import json
 import shutil

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What somebody who watches a map holds, put together from events, and what the map would show anew."""
+"""Surface that a viewer of a map has put together from events, and the one that the map would show anew."""
 
 from collections.abc import Iterable
 

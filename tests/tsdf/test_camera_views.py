@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a camera sees of a map."""
+"""Views of a map by a camera."""
 
 import numpy as np
 import pytest

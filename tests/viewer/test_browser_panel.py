@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Whose the camera of a browser is: the page's, until somebody moves it, however slow the browser is."""
+"""Owner of a browser's camera: the page, until somebody moves it, however slow the browser is."""
 
 import contextlib
 from types import SimpleNamespace

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a plane and a box leave of a mesh, exactly."""
+"""Parts of a mesh that a plane and a box leave, exactly."""
 
 import numpy as np
 from formula_scenes import sphere_views, volume_of

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What browsers choose reaches the feed in the page's thread, once, and only what there is to choose."""
+"""Choices of browsers reach the feed in the page's thread, once, and only what there is to choose."""
 
 from collections.abc import Iterator
 from types import SimpleNamespace

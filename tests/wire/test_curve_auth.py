@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Who may connect, with real sockets and keys, and what the others are told."""
+"""Access by keys, with real sockets, and the answers to clients that are turned away."""
 
 import os
 import socket
