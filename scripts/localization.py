@@ -248,10 +248,11 @@ def _report(rows: list[dict[str, Any]]) -> str:
             if "corrected" in row:
                 named.append((f"  after {row['loops']} loops", _struct(row["corrected"])))
         lines.append(table(named))
-        lines += ["", f"{'':<24}{'frames':>8}{'lost':>6}{'CPU ms':>8}{'RSS MB':>8}  bar"]
+        width = max(len(row["name"]) for row in tracked)
+        lines += ["", f"{'':<{width}}{'frames':>8}{'lost':>6}{'CPU ms':>8}{'RSS MB':>8}  bar"]
         lines += [
-            f"{row['name']:<24}{row['frames']:>8}{row['lost']:>6}{row['cpu_ms']:>8.1f}"
-            f"{row['peak_rss_mb']:>8.0f}  {_bar(row)}"
+            f"{row['name']:<{width}}{row['frames']:>8}{row['lost']:>6}{row['cpu_ms']:>8.1f}"
+            f"{row['peak_rss_mb']:>8.0f}  {_bar(row)}".rstrip()
             for row in tracked
         ]
     for row in rows:
