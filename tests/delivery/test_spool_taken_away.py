@@ -144,8 +144,9 @@ def test_a_spool_whose_folder_goes_between_two_looks_is_taken_over(
     spool.close()
 
 
+@pytest.mark.parametrize("what", ["EIO", "said to be gone", "folder away for a moment"])
 def test_no_newer_file_is_deleted_before_an_older_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
 ) -> None:
     """The next scanner goes on behind the last number that is there: the server may know a higher one."""
     first, last = Spool(tmp_path, 1), 0
@@ -156,9 +157,11 @@ def test_no_newer_file_is_deleted_before_an_older_one(
     unlink = Path.unlink
 
     def refuse_the_first(path: Path, missing_ok: bool = False) -> None:
-        if path.name == "000001.mcap":
-            raise OSError(errno.EIO, os.strerror(errno.EIO))
-        unlink(path, missing_ok)
+        if path.name != "000001.mcap":
+            unlink(path, missing_ok)
+        elif what != "said to be gone":
+            code = errno.EIO if what == "EIO" else errno.ENOENT
+            raise OSError(code, os.strerror(code))
 
     with monkeypatch.context() as broken:
         broken.setattr(Path, "unlink", refuse_the_first)

@@ -306,7 +306,7 @@ FAULTS = (
     ),
     Fault(
         "delivery/spool.py",
-        '                    log.warning("%s", error)\n                    return False\n',
+        '                    log.warning("%s", error)\n                return False\n',
         "                    pass\n",
         "delivery/test_spool_taken_away.py::test_no_newer_file_is_deleted_before_an_older_one",
     ),

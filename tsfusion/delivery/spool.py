@@ -258,9 +258,9 @@ class Spool:
             try:
                 self._journal.forget(number)
             except JournalError as error:
-                if error.errno not in MISSING:  # it is gone with its folder
+                if error.errno not in MISSING:  # else it is away with its folder, and may come back
                     log.warning("%s", error)
-                    return False
+                return False
             self.used_bytes -= self._segments.pop(number).nbytes
             self._idle.discard(number)
         return True

@@ -339,6 +339,8 @@ class Journal:
         path = segment_path(self.folder, number)
         try:
             path.unlink(missing_ok=self.folder.exists())
+            if path.exists():  # a network file system may say that what is there is not
+                raise OSError(errno.EBUSY, os.strerror(errno.EBUSY))
         except OSError as error:
             raise journal_error("delete", path, error) from error
         self._closed.pop(number, None)
