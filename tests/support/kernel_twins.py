@@ -29,16 +29,17 @@ def sample(parameters: NDArray[np.float64], z: float, trust: float) -> tuple[int
 
 
 def make_ray(
-    end: Any, direction: Any, half: int, weight: int, color: int = 0, normal: Any = None
+    end: Any, direction: Any, half: int, weight: int, color: int = 0, normal: Any = None, before: int = 0
 ) -> NDArray[np.int32]:
     """One ray; `end` int 2⁻¹⁰ voxel, `direction` float of any length, `half` 2⁻⁸ voxel; with the `normal` of
-    the plane it ends on, or none."""
+    the plane it ends on, or none. Where it begins further `before` its end than its band, it carves."""
+    before = max(before, half)
     u = np.asarray(direction, np.float64) / np.linalg.norm(direction)
     unit = [int(x) for x in np.floor(u * 65536 + 0.5)]
     gradient = u if normal is None else np.asarray(normal) / (np.asarray(normal) @ u)
     loss = [int(x) for x in np.floor(gradient * 65536 + 0.5)]
     exact = [int(e) << 6 for e in end]
-    start = [e - (u * half >> 8) for e, u in zip(exact, unit, strict=True)]
+    start = [e - (u * before >> 8) for e, u in zip(exact, unit, strict=True)]
     voxel = [s >> 16 for s in start]
     crossing, interval = [NEVER] * 3, [NEVER] * 3
     for a in range(3):
@@ -50,7 +51,7 @@ def make_ray(
     downward = sum(1 << a for a in range(3) if unit[a] < 0)
     loss = [-g if x < 0 else g for g, x in zip(loss, unit, strict=True)]
     packed = np.uint32(weight << 24 | color).astype(np.int32)
-    last = (distance, half << 9, half << 8 | downward, packed)
+    last = (distance, before + half << 8, before << 8 | downward, packed)
     return np.array([*voxel, *crossing, *interval, *loss, *last], np.int32)
 
 
@@ -102,10 +103,13 @@ def integrate(rays: NDArray[np.int32], quanta_per_voxel: int) -> dict[Voxel, tup
     """(Σ w·m, Σ w) of every voxel the rays cross."""
     sums: dict[Voxel, tuple[int, int]] = defaultdict(lambda: (0, 0))
     for ray in rays:
-        w = weight_of(ray)
-        for voxel, distance in crossed(ray):
-            s, total = sums[voxel]
-            sums[voxel] = (s + w * quantize(distance, quanta_per_voxel), total + w)
+        length, end = int(ray[13]), int(ray[14]) & ~7
+        half = length - end
+        for (voxel, distance), leaves in crossed_until(ray):
+            w, m, (s, total) = weight_of(ray), quantize(distance, quanta_per_voxel), sums[voxel]
+            if leaves < end - half:  # free space
+                w, m = max(w >> 1, 1), quantize(half, quanta_per_voxel)
+            sums[voxel] = (s + w * m, total + w)
     return dict(sums)
 
 

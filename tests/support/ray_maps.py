@@ -53,7 +53,21 @@ def rays_along(segments: list[Segment], seed: int = 0) -> NDArray[np.int32]:
     return np.array(rays, np.int32).reshape(-1, RAY_FIELDS)
 
 
+def carving_rays(seed: int, count: int) -> NDArray[np.int32]:
+    """Rays that begin up to 300 voxels before they end: some before their band, some with it."""
+    random = np.random.default_rng(seed)
+    rays = [
+        kernel_twins.make_ray(
+            end, direction, half, int(random.integers(1, 256)), int(random.integers(0, 1 << 24)),
+            before=int(random.integers(-20, 300)) << 8,
+        )
+        for end, direction, half in random_segments(seed, count)
+    ]  # fmt: skip
+    return np.array(rays, np.int32)
+
+
 CASES = {name: rays_along(segments) for name, segments in SEGMENTS.items()}
+CASES["carving"] = carving_rays(4, 100)
 
 
 class RayMap:

@@ -12,38 +12,49 @@ import taichi as ti
 
 from tsfusion.kernels.block_hash import map_find, set_insert
 from tsfusion.kernels.block_windows import (
-    LEFT_WINDOW,
-    MOST_IN_WINDOW,
-    STEPS,
     UNKNOWN,
     WINDOW_BITS,
+    WINDOW_BLOCKS,
     WINDOW_SCRATCH,
     WINDOWS,
-    gather_bits,
     open_window,
+)
+from tsfusion.kernels.rays_abreast import (
+    ABREAST,
+    BAND,
+    BLOCK_AT,
+    COLORED,
+    DISTANCE_AT,
+    FREE,
+    LIST,
+    MET,
+    NOBODY,
+    ODD,
+    RAY,
+    RAY_LENGTH,
+    STRETCH,
+    UNCOLORED,
+    VOXELS,
+    WALKS,
+    WINDOW_AT,
+    begin,
+    measure,
+    walk,
+    window_of,
 )
 from tsfusion.kernels.voxel_traversal import (
     ADDED,
     COUNT,
-    CROSSING,
     DEFERRED,
-    DISTANCE,
-    END,
-    INTERVAL,
-    LENGTH,
-    LOSS,
+    NEVER,
     RUN,
     SHARED,
     START,
     UNIT,
     UPDATES,
-    VOXEL,
     WEIGHT_COLOR,
     pack,
-    ray_vector,
     ray_weight,
-    steps,
-    vec3i,
     voxel_of,
 )
 
@@ -71,14 +82,9 @@ LATER, OTHERS = 0, 1  # rays that are added `again`: to blocks that are missing,
 ABSENT, OF_ANOTHER, LEFT_OUT = (bit - (1 << 31) for bit in (1, 2, 4))
 BITS = 15
 
-# A listed update, one int64: the voxel's place in the layers; in the low half, never negative, w·m above nine
-# bits of w. What w·m and w, which may be negative, are greater by there:
-LEAST_PRODUCT, LEAST_VOTE = 1 << 18, 1 << 8
-LISTED = 2048  # updates that wait for each other
-
-COLORS_AT = WINDOW_SCRATCH + LISTED
+COLORS_AT = WINDOW_SCRATCH
 LISTED_COLORS = 512  # votes, one int64: the voxel's place above the colour
-UNIT_SCRATCH = COLORS_AT + LISTED_COLORS  # int64 of a unit: its windows, its updates, its votes for colours
+UNIT_SCRATCH = COLORS_AT + LISTED_COLORS  # int64 of a unit: its windows, votes for colours
 
 # What a launch does, `job`: which rays of which bands, on how many units, sign, slots from which on, how many
 # blocks may be missing, number of the keyframe, whether colours count
@@ -191,121 +197,68 @@ def vote_color(
 
 
 @ti.func
-def packed_step(rays: ti.template(), r, axis: ti.template(), towards):
-    """Change of ray `r`'s place with a step along an axis."""
-    turn = ti.cast(-rays[r, LOSS + axis] * QUANTA_PER_VOXEL, ti.i64)
-    return (turn << 32) + towards * ti.static(STEPS[axis])
-
-
-@ti.func
-def add_listed(
-    scratch: ti.template(), base, tail: ti.template(), colors: ti.template(), added: ti.template(), sign_,
-    sums: ti.template(), color_rgn: ti.template(), color_b: ti.template(), touched: ti.template(),
-    atomically: ti.template(),
+def add_votes(
+    scratch: ti.template(), base, colors: ti.template(), sign_, color_rgn: ti.template(),
+    color_b: ti.template(), touched: ti.template(), atomically: ti.template(),
 ):  # fmt: skip
-    """Add the listed updates: one after the other without a branch, so that misses of the cache overlap.
-
-    `tail` and `colors`: ends of the lists, which are empty then; `added` counts updates.
-    """
-    for i in range(base + WINDOW_SCRATCH, tail):
-        update = scratch[i]
-        lanes = ti.cast(ti.cast(update, ti.i32), ti.i64)
-        product, vote = (lanes >> 9) - LEAST_PRODUCT, (lanes & 511) - LEAST_VOTE
-        # both sums in one addition; their quotient minimises Σ w (x − m)²: paper eq. 2
-        add(sums, ti.cast(update >> 32, ti.i32), (product << WEIGHT_BITS) + vote, atomically)
+    """Add the listed votes for colours, and empty their list, which ends at `colors`."""
     for i in range(base + COLORS_AT, colors):
         vote_color(scratch[i], sign_, color_rgn, color_b, touched, atomically)
-    added += tail - (base + WINDOW_SCRATCH)
-    tail, colors = base + WINDOW_SCRATCH, base + COLORS_AT
+    colors = base + COLORS_AT
 
 
 @ti.func
-def add_ray(
-    rays: ti.template(), r, sign_, scratch: ti.template(), base, tail: ti.template(), colors: ti.template(),
-    added: ti.template(), last: ti.template(), blocks: ti.template(), oldest, mark, stamp, most_missing,
-    hash_keys: ti.template(), hash_slots: ti.template(), missing: ti.template(), owners: ti.template(),
-    stamps: ti.template(), places: ti.template(), dirty: ti.template(), touched: ti.template(),
-    sums: ti.template(), has_color, color_rgn: ti.template(), color_b: ti.template(),
+def add_stretch(
+    walks: ti.template(), k, listed: ti.template(), weight_color, sign_, scratch: ti.template(), base,
+    colors: ti.template(), added: ti.template(), oldest, mark, stamp, most_missing, hash_keys: ti.template(),
+    hash_slots: ti.template(), missing: ti.template(), owners: ti.template(), stamps: ti.template(),
+    places: ti.template(), dirty: ti.template(), touched: ti.template(), sums: ti.template(),
     of_others: ti.template(),
 ):  # fmt: skip
-    """List a ray's update of every voxel it crosses, and its vote for a colour (`add_listed`).
+    """Add the ray at place `k` to the voxels of its stretch, and list its vote for a colour.
 
-    `last` and its `blocks`: the window entered last, by any ray. Returns the bits of what it crosses.
+    `added` counts updates. Returns the bits of what the ray crosses (`ABSENT` …).
     """
-    # The loop works on scalars and reads no ray: for all the compiler knows, what it stores is what it reads.
-    weight, ends, length = ray_weight(rays, r), rays[r, END], rays[r, LENGTH]
-    end = ends & ~7
-    band_begins = end - (length - end)  # before it is free space
-    voxel, towards = ray_vector(rays, r, VOXEL), steps(ends)
-    next_x, next_y, next_z = rays[r, CROSSING], rays[r, CROSSING + 1], rays[r, CROSSING + 2]
-    every_x, every_y, every_z = rays[r, INTERVAL], rays[r, INTERVAL + 1], rays[r, INTERVAL + 2]
-    step_x, step_y = packed_step(rays, r, 0, towards[0]), packed_step(rays, r, 1, towards[1])
-    step_z = packed_step(rays, r, 2, towards[2])
-    at = ti.cast(rays[r, DISTANCE] * QUANTA_PER_VOXEL + 32768, ti.i64) << 32
-    window = voxel >> WINDOW_BITS
-    voxel &= (1 << WINDOW_BITS) - 1
-    for a in ti.static(range(3)):
-        at += voxel[a] * STEPS[a]
+    weight = (weight_color >> 24) & 255
     vote, free_vote = sign_ * weight, sign_ * ti.max(weight >> FREE_SHIFT, 1)
-    none = (LEAST_PRODUCT << 9) + LEAST_VOTE
-    band, free = none + vote, none + free_vote + (quantize(length - end) * free_vote << 9)
-    vote = vote << 9
-    crossed = 0
-    until = ti.select(
-        has_color == 1, end + 1, length
-    )  # stop behind the end point: its voxel takes the colour
-    inside = ti.cast(weight > 0, ti.i32)
-    while inside == 1:
-        if tail > base + COLORS_AT - MOST_IN_WINDOW or colors == base + UNIT_SCRATCH:
-            add_listed(
-                scratch, base, tail, colors, added, sign_, sums, color_rgn, color_b, touched, of_others
-            )  # fmt: skip
-        if window[0] != last[0] or window[1] != last[1] or window[2] != last[2]:
-            last = window
+    # both sums in one addition; their quotient minimises Σ w (x − m)²: paper eq. 2
+    half = walks[RAY_LENGTH + k] - ((walks[RAY_LENGTH + k] + walks[BAND + k]) >> 1)
+    free = (ti.cast(quantize(half) * free_vote, ti.i64) << WEIGHT_BITS) + free_vote
+    per_quantum = ti.cast(vote, ti.i64) << WEIGHT_BITS
+    before, uncolored = walks[FREE + k], walks[UNCOLORED + k]
+    number = walks[ODD + k]
+    window = window_of(walks, k, number)
+    blocks = open_window(window, scratch, base)
+    met = 0
+    n = ti.min(walks[VOXELS + k], STRETCH)
+    i = 0
+    while i < n:
+        place = listed[i * ABREAST + k]
+        if ((place >> WINDOW_AT) & 7) != number:
+            number = (place >> WINDOW_AT) & 7
+            window = window_of(walks, k, number)
             blocks = open_window(window, scratch, base)
-        leaves, first, is_x, is_y, is_z, left, stays = 0, 0, 0, 0, 0, 0, 1
-        while stays == 1:
-            first = ti.cast(scratch[blocks + gather_bits(ti.cast(at >> 3, ti.i32))], ti.i32)
+        b = (place >> BLOCK_AT) & (WINDOW_BLOCKS - 1)
+        first = ti.cast(scratch[blocks + b], ti.i32)
+        if first < 0:
             if first == UNKNOWN:
-                break
-            crossed |= first
-            # Masks, all bits or none, of the axis that is crossed next, the first of equals. By arithmetic: a
-            # comparison may become a branch, and this one is what processors predict worst.
-            leaves = ti.min(next_x, next_y, next_z)
-            is_x = ((next_x - next_y - 1) & (next_x - next_z - 1)) >> 31
-            is_y = ((next_y - next_z - 1) >> 31) & ~is_x
-            is_z = ~(is_x | is_y)
-            voxel_at = first + gather_bits(ti.cast(at, ti.i32))
-            m = ti.min(ti.max(ti.cast(at >> 48, ti.i32), -MAX_DISTANCE), MAX_DISTANCE)
-            lanes = ti.select(leaves < band_begins, free, m * vote + band)
-            scratch[tail] = (ti.cast(voxel_at, ti.i64) << 32) + lanes
-            tail += 1 + (first >> 31)
-            next_x += every_x & is_x
-            next_y += every_y & is_y
-            next_z += every_z & is_z
-            at += (step_x & is_x) + (step_y & is_y) + (step_z & is_z)
-            left = ti.cast(at, ti.i32) & LEFT_WINDOW
-            stays = ti.cast(leaves < until, ti.i32) & ti.cast(left == 0, ti.i32)
-        if first == UNKNOWN:
-            b = gather_bits(ti.cast(at >> 3, ti.i32))
-            block = (window << (WINDOW_BITS - 3)) + voxel_of(b)
-            scratch[blocks + b] = enter_block(
-                pack(block[0], block[1], block[2]), oldest, mark, stamp, most_missing, hash_keys, hash_slots,
-                missing, owners, stamps, places, dirty, touched, of_others,
-            )  # fmt: skip
-        else:
-            inside = ti.cast(leaves < length, ti.i32)
-            if has_color == 1 and until != length and leaves >= until:
-                until = length
-                if first >= 0:
-                    scratch[colors] = (scratch[tail - 1] >> 32 << 32) | (rays[r, WEIGHT_COLOR] & 0xFFFFFF)
-                    colors += 1
-            if left != 0:  # into the window beside it, at the other side
-                step = vec3i(towards[0] & is_x, towards[1] & is_y, towards[2] & is_z)
-                window += step
-                for a in ti.static(range(3)):
-                    at -= step[a] * (STEPS[a] << WINDOW_BITS)
-    return crossed
+                block = (window << (WINDOW_BITS - 3)) + voxel_of(b)
+                first = enter_block(
+                    pack(block[0], block[1], block[2]), oldest, mark, stamp, most_missing, hash_keys,
+                    hash_slots, missing, owners, stamps, places, dirty, touched, of_others,
+                )  # fmt: skip
+                scratch[blocks + b] = first
+            met |= ti.select(first < 0, first, 0)
+        if first >= 0:
+            at = first + (place & (CUBE - 1))
+            amount = ti.cast(place >> DISTANCE_AT, ti.i64) * per_quantum + vote
+            add(sums, at, ti.select(i < before, free, amount), of_others)
+            added += 1
+            if i == uncolored:
+                scratch[colors] = (ti.cast(at, ti.i64) << 32) | (weight_color & 0xFFFFFF)
+                colors += 1
+        i += 1
+    return met
 
 
 @ti.func
@@ -323,46 +276,65 @@ def add_bands(
     base = unit * UNIT_SCRATCH
     for i in range(WINDOWS):
         scratch[base + i] = 0
-    last, blocks = vec3i(2147483647), 0
-    tail, colors, added = base + WINDOW_SCRATCH, base + COLORS_AT, 0
+    walks, listed = ti.Vector([0] * WALKS), ti.Vector([0] * LIST)
+    for k in range(ABREAST):
+        walks[RAY + k], walks[FREE + k], walks[UNCOLORED + k] = NOBODY, 0, NEVER
+    colors, carves = base + COLORS_AT, 0
     for band in range(job[FIRST_BAND], job[LAST_BAND]):
         if bands[band, UNIT] == unit:
-            start, count, updates = bands[band, START], bands[band, COUNT], 0
+            start, count, added = bands[band, START], bands[band, COUNT], 0
             if which == ONLY_DEFERRED:
-                count, updates = bands[band, DEFERRED], bands[band, UPDATES]
+                count, added = bands[band, DEFERRED], bands[band, UPDATES]
             if which == ONLY_ADDED:
                 count = bands[band, ADDED]
             if ti.static(of_others):
-                count, updates = bands[band, SHARED], bands[band, UPDATES]
-            updates -= added + tail  # of the bands before
-            deferred, shared, n = 0, 0, 0
-            while n < count:
-                r = start + n
-                if ti.static(of_others):
-                    r = again[OTHERS, r]
-                elif which == ONLY_DEFERRED:
-                    r = again[LATER, r]
-                crossed = add_ray(
-                    rays, r, sign_, scratch, base, tail, colors, added, last, blocks, oldest, mark,
-                    stamp, most_missing, hash_keys, hash_slots, missing, owners, stamps, places,
-                    dirty, touched, sums, has_color, color_rgn, color_b, of_others,
-                )  # fmt: skip
-                if ti.static(not of_others):
-                    if (crossed & BITS & OF_ANOTHER) != 0:
-                        again[OTHERS, start + shared] = r
-                        shared += 1
-                    if (crossed & BITS & ABSENT) != 0:
-                        again[LATER, start + deferred] = r
-                        deferred += 1
-                        if which == ALL and touched[TOUCHED_OVERFLOW] == 1:
-                            count = n
-                n += 1
-            bands[band, UPDATES] = updates + added + tail
+                count, added = bands[band, SHARED], bands[band, UPDATES]
+            deferred, shared, n, walking = 0, 0, 0, 0
+            while n < count or walking > 0:
+                for k in range(ABREAST):
+                    while walks[RAY + k] == NOBODY and n < count:
+                        r = start + n
+                        n += 1
+                        if ti.static(of_others):
+                            r = again[OTHERS, r]
+                        elif which == ONLY_DEFERRED:
+                            r = again[LATER, r]
+                        if ray_weight(rays, r) > 0:
+                            begin(rays, r, QUANTA_PER_VOXEL, has_color, walks, k)
+                            walking += 1
+                            carves |= ti.cast(walks[BAND + k] > 0, ti.i32)
+                longest = measure(walks, carves, has_color)
+                walk(walks, ti.min(longest, STRETCH), listed)
+                if colors > base + UNIT_SCRATCH - ABREAST:
+                    add_votes(scratch, base, colors, sign_, color_rgn, color_b, touched, of_others)
+                for k in range(ABREAST):
+                    r = walks[RAY + k]
+                    if r != NOBODY:
+                        walks[MET + k] |= add_stretch(
+                            walks, k, listed, rays[r, WEIGHT_COLOR], sign_, scratch, base, colors,
+                            added, oldest, mark, stamp, most_missing, hash_keys, hash_slots, missing, owners,
+                            stamps, places, dirty, touched, sums, of_others,
+                        )  # fmt: skip
+                        if walks[UNCOLORED + k] < STRETCH:
+                            walks[COLORED + k] = NEVER
+                        if walks[VOXELS + k] <= STRETCH:
+                            walks[RAY + k] = NOBODY
+                            walking -= 1
+                            if ti.static(not of_others):
+                                if (walks[MET + k] & BITS & OF_ANOTHER) != 0:
+                                    again[OTHERS, start + shared] = r
+                                    shared += 1
+                                if (walks[MET + k] & BITS & ABSENT) != 0:
+                                    again[LATER, start + deferred] = r
+                                    deferred += 1
+                                    if which == ALL and touched[TOUCHED_OVERFLOW] == 1:
+                                        count = n
+            bands[band, UPDATES] = added
             if ti.static(not of_others):
                 bands[band, SHARED] = shared
                 if which == ALL:
                     bands[band, DEFERRED], bands[band, ADDED] = deferred, n
-    add_listed(scratch, base, tail, colors, added, sign_, sums, color_rgn, color_b, touched, of_others)
+    add_votes(scratch, base, colors, sign_, color_rgn, color_b, touched, of_others)
 
 
 @ti.kernel
