@@ -8,6 +8,7 @@ from it, does not depend on which thread came first. No locks, no compare-and-sw
 
 import taichi as ti
 
+from tsfusion.kernels.quick_launch import QuickLaunch
 from tsfusion.kernels.voxel_traversal import hash_key
 
 MAX_PROBES = 256
@@ -59,6 +60,7 @@ def map_find(keys: ti.template(), slots: ti.template(), mask, key):
     return slot
 
 
+@QuickLaunch
 @ti.kernel
 def insert_blocks(
     keys: ti.types.ndarray(dtype=ti.i64, ndim=1),

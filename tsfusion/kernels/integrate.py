@@ -19,6 +19,7 @@ from tsfusion.kernels.block_windows import (
     WINDOWS,
     open_window,
 )
+from tsfusion.kernels.quick_launch import QuickLaunch
 from tsfusion.kernels.rays_abreast import (
     ABREAST,
     BAND,
@@ -337,6 +338,7 @@ def add_bands(
     add_votes(scratch, base, colors, sign_, color_rgn, color_b, touched, of_others)
 
 
+@QuickLaunch
 @ti.kernel
 def add_rays(
     rays: ti.types.ndarray(dtype=ti.i32, ndim=2),
@@ -380,6 +382,7 @@ def add_rays(
             )  # fmt: skip
 
 
+@QuickLaunch
 @ti.kernel
 def largest_weights(
     sums: ti.types.ndarray(dtype=ti.i64, ndim=2),

@@ -23,6 +23,7 @@ from tsfusion.kernels.integrate import (
     lane_distance,
     lane_weight,
 )
+from tsfusion.kernels.quick_launch import QuickLaunch
 from tsfusion.kernels.voxel_traversal import (
     COUNT,
     LENGTH,
@@ -119,6 +120,7 @@ def substitute_back(
             crossed[at_crossed + DISTANCE + i * LANES + k] = votes[k]
 
 
+@QuickLaunch
 @ti.kernel
 def smooth_rays(
     rays: ti.types.ndarray(dtype=ti.i32, ndim=2),
@@ -191,6 +193,7 @@ def smooth_rays(
                 first += LANES
 
 
+@QuickLaunch
 @ti.kernel
 def commit_votes(
     touched: ti.types.ndarray(dtype=ti.i32, ndim=1),

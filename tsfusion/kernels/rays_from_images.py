@@ -11,6 +11,7 @@ One unit of parallel work is a band, a contiguous run of tiles with a region of 
 
 import taichi as ti
 
+from tsfusion.kernels.quick_launch import QuickLaunch
 from tsfusion.kernels.sensor_noise import (
     DROPS_LONE_SAMPLES,
     MAX_RANGE,
@@ -355,6 +356,7 @@ def write_layer_ray(
     return weight, cost
 
 
+@QuickLaunch
 @ti.kernel
 def rays_from_image(
     image: ti.types.ndarray(ndim=2),

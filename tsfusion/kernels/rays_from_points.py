@@ -7,6 +7,7 @@ One unit of parallel work is a band, a contiguous run of points with a region of
 
 import taichi as ti
 
+from tsfusion.kernels.quick_launch import QuickLaunch
 from tsfusion.kernels.sensor_noise import (
     MAX_RANGE,
     MIN_RANGE,
@@ -89,6 +90,7 @@ def write_bundle_ray(rays: ti.template(), r, first, model: ti.template(), pose: 
     return weight, cost
 
 
+@QuickLaunch
 @ti.kernel
 def rays_from_points(
     points: ti.types.ndarray(dtype=ti.f32, ndim=2),
