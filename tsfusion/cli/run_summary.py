@@ -23,6 +23,9 @@ def print_replay(run: "ReplaySummary") -> None:
         f"lost {sum(run.keyframes_rejected.values())}",
         f"delay      mean {delay.mean:.0f} ms, p50 {delay.p50:.0f}, p95 {delay.p95:.0f}, "
         f"p99 {delay.p99:.0f}, max {delay.max:.0f}; slope {run.delay_slope_ms_per_keyframe:+.2f} ms/keyframe",
+        "stages     "
+        + ", ".join(f"{name} {stage.p50:.1f}" for name, stage in run.stages_ms.items())
+        + " ms (p50)",
         *mesh_lines(run.mesh),
         f"map        {grouped(run.blocks)} blocks, hash {run.map_hash}",
         "memory     " + ", ".join(f"{name} {size(peak)}" for name, peak in run.peak_rss_bytes.items()),
