@@ -11,15 +11,16 @@ the distance is, to first order, that to the surface.
 import taichi as ti
 
 from tsfusion.kernels.block_hash import map_find
-from tsfusion.kernels.integrate import QUANTA_PER_VOXEL, lane_distance, lane_weight
+from tsfusion.kernels.integrate import CUBE, QUANTA_PER_VOXEL, lane_distance, lane_weight
 from tsfusion.kernels.sensor_noise import WEIGHT_ONE
 from tsfusion.kernels.voxel_traversal import RUN, VOXEL_LIMIT, offset_in_block, pack, vec3i
 
 ONE = 65536.0  # of a voxel
 UNKNOWN = -2  # slot of a block that was not looked up
+BANDS = 64  # of blocks: units of parallel work
 BAND = 512  # points that one thread takes at a time
 
-# What values are: Σ w·m / Σ w; that, with what `values` adds to Σ w·m; or `values`
+# What values are: Σ w·m / Σ w; that, with what `correction` adds to Σ w·m; or what `pair` put beside Σ w
 FUSED, CORRECTED, SOLVED = 0, 1, 2
 
 vec3f = ti.types.vector(3, ti.f32)
@@ -72,23 +73,24 @@ def corner_offset(voxel, c: ti.template()):
 
 
 @ti.func
-def read_voxel(slot, o, sums: ti.template(), kind, values: ti.template(), row_of: ti.template()):
-    """The sums of a voxel, and what `values` holds of it."""
+def read_voxel(row, o, sums: ti.template(), kind, correction: ti.template()):
+    """The sums of a voxel, and what `correction` holds of it."""
     held = ti.f32(0.0)
     if kind == CORRECTED:
-        held = values[slot, o]
-    elif kind == SOLVED:
-        held = values[row_of[slot], o]
-    return sums[slot, o], held
+        held = correction[row, o]
+    return sums[row, o], held
 
 
 @ti.func
 def value_of(packed, held, kind, min_weight):
     """Value of a voxel in quanta, NaN where it is unseen, and its weight."""
     w = lane_weight(packed)
+    solved = ti.bit_cast(ti.cast(packed >> 32, ti.i32), ti.f32)
+    if kind == SOLVED:
+        w = ti.cast(packed, ti.i32)
     weight = ti.cast(w, ti.f32)
     value = (ti.cast(lane_distance(packed), ti.f32) + held) / weight
-    value = ti.select(kind == SOLVED, held, value)
+    value = ti.select(kind == SOLVED, solved, value)
     return ti.select(w >= min_weight, value, ti.math.nan), weight
 
 
@@ -149,15 +151,36 @@ def list_blocks(
 
 
 @ti.kernel
+def pair(
+    slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    sums: ti.types.ndarray(dtype=ti.i64, ndim=2),
+    values: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    pairs: ti.types.ndarray(dtype=ti.i64, ndim=2),
+):
+    """Row n of `pairs`: row n of `values`, bits, in the upper halves; in the lower ones Σ w of `slots[n]`.
+
+    What `interpolate` reads of a point lies together then: at points in random order it waits for memory.
+    """
+    for run in range(BANDS * RUN):  # run loop: kernels/__init__.py
+        if run % RUN == 0:
+            band, count = run // RUN, slots.shape[0]
+            for n in range(count * band // BANDS, count * (band + 1) // BANDS):
+                slot = slots[n]
+                for o in range(CUBE):
+                    bits = ti.cast(ti.bit_cast(values[n, o], ti.i32), ti.i64)
+                    pairs[n, o] = bits << 32 | ti.cast(lane_weight(sums[slot, o]), ti.i64)
+
+
+@ti.kernel
 def interpolate(
     points: ti.types.ndarray(ndim=2),
     per_metre: ti.f64,
     map_keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
     map_slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    sums: ti.types.ndarray(dtype=ti.i64, ndim=2),
+    sums: ti.types.ndarray(dtype=ti.i64, ndim=2),  # SOLVED: pairs
     min_weight: ti.i32,
-    kind: ti.i32,  # FUSED, or what is in `values`
-    values: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    kind: ti.i32,
+    correction: ti.types.ndarray(dtype=ti.f32, ndim=2),
     row_of: ti.types.ndarray(dtype=ti.i32, ndim=1),  # SOLVED: row of a slot
     distance: ti.types.ndarray(dtype=ti.f32, ndim=1),
     weight: ti.types.ndarray(dtype=ti.f32, ndim=1),
@@ -184,16 +207,20 @@ def interpolate(
                 if inside and across == 0:  # two of three: eight corners in one block
                     slot = find_near(near, voxel, 0, map_keys, map_slots)
                     if slot >= 0:
-                        o = offset_in_block(voxel)
+                        o, row = offset_in_block(voxel), slot
+                        if kind == SOLVED:
+                            row = row_of[slot]
                         for c in ti.static(range(8)):
                             step = ti.static(64 * (c & 1) + 8 * (c >> 1 & 1) + (c >> 2))
-                            packed[c], held[c] = read_voxel(slot, o + step, sums, kind, values, row_of)
+                            packed[c], held[c] = read_voxel(row, o + step, sums, kind, correction)
                 elif inside:
                     for c in ti.static(range(8)):
                         slot = find_near(near, voxel, c & across, map_keys, map_slots)
                         if slot >= 0:
-                            o = corner_offset(voxel, c)
-                            packed[c], held[c] = read_voxel(slot, o, sums, kind, values, row_of)
+                            o, row = corner_offset(voxel, c), slot
+                            if kind == SOLVED:
+                                row = row_of[slot]
+                            packed[c], held[c] = read_voxel(row, o, sums, kind, correction)
                 v = corners_f(0.0)
                 w = corners_f(0.0)
                 for c in ti.static(range(8)):

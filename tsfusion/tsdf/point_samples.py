@@ -33,7 +33,7 @@ def sample(
 def _fill(
     found: Samples, points: NDArray[np.floating], store: BlockStore, min_weight: float, view: SurfaceView
 ) -> None:
-    kind, values, row_of = point_sampling.FUSED, store.correction, np.empty(0, np.int32)
+    kind, sums, row_of = point_sampling.FUSED, store.sums, np.empty(0, np.int32)
     if view is not values_of:
         slots = _needed(points, store)
         if len(slots) > _MOST_SOLVED and len(points) > 1:
@@ -42,13 +42,15 @@ def _fill(
                 _fill(_part(found, part), points[part], store, min_weight, view)
             return
         kind, values = point_sampling.SOLVED, view(store.keys[slots], store, min_weight)
+        sums = np.empty(values.shape, np.int64)
+        point_sampling.pair(slots.astype(np.int32), store.sums, values, sums)
         row_of = np.zeros(store.count, np.int32)
         row_of[slots] = np.arange(len(slots))
     elif store.corrected:
         kind = point_sampling.CORRECTED
     point_sampling.interpolate(
-        points, 1 / store.voxel_size, store.hash_keys, store.hash_slots, store.sums,
-        max(1, int(np.ceil(min_weight * WEIGHT_ONE))), kind, values, row_of,
+        points, 1 / store.voxel_size, store.hash_keys, store.hash_slots, sums,
+        max(1, int(np.ceil(min_weight * WEIGHT_ONE))), kind, store.correction, row_of,
         found.distance, found.weight, found.gradient,
     )  # fmt: skip
 
