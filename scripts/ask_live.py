@@ -8,7 +8,8 @@ The keyframes are recorded ones (640×480 depth and colour, from TSFUSION_DATA, 
 where these are missing, rendered ones. Two servers run, and a scanner, a process of its own, turns from one
 to the other every few seconds: a planner asks the one, nobody asks the other. A JSON line for each kind of
 question: `delay_ms` as the planner sees it over loopback, `waited_ms` of it until the map was free, `took_ms`
-to answer. The last line has the keyframes' delay, captured → fused, with and without questions.
+to answer. A recent view may be of a state that was the newest 0.2 s ago. The last line has the keyframes'
+delay, captured → fused, with and without questions.
 """
 
 import argparse
@@ -109,6 +110,10 @@ def kinds(keyframes: list[Keyframe], voxel_size: float) -> dict[str, Ask]:
         "100 points": some(100),
         "10000 points": some(10_000),
         "view of 640×480": lambda client: client.raycast(camera, pose, (480, 640)),
+        "recent view of 640×480": lambda client: client.raycast(camera, pose, (480, 640), max_age=0.2),
+        "recent view of 320×240": lambda client: client.raycast(
+            camera.scaled(0.5), pose, (240, 320), max_age=0.2
+        ),
         "slice of 20×20 m at 5 cm": lambda client: client.distance_slice(
             eye[1] - 1, eye[1] + 0.5, up="y", box=(-10, -10, 10, 10), resolution=max(0.05, voxel_size)
         ),

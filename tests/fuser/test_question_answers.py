@@ -18,13 +18,14 @@ from tsfusion.fuser import question_answers
 from tsfusion.fuser.current_keyframe import CurrentKeyframe
 from tsfusion.fuser.inbox import Inbox
 from tsfusion.fuser.kept_slices import KeptSlices
+from tsfusion.fuser.kept_views import KeptViews
 from tsfusion.fuser.keyframe_poses import KeyframePoses
 from tsfusion.fuser.messages import NOT_WORKING, Finish, FuserAnswer, FuserQuestion, Publish, encode
 from tsfusion.fuser.question_answers import QuestionAnswers
 from tsfusion.fuser.touched_by import TouchedBy
 from tsfusion.fuser.watched_map import WatchedMap
 from tsfusion.wire import questions
-from tsfusion.wire.questions import MapState, Sample, Slice
+from tsfusion.wire.questions import MapState, Raycast, Sample, Slice
 
 POINTS = np.array([[0, 0, 1.2], [0.1, 0.1, 1.25]], np.float32)
 FRAMES = questions.point_frames(POINTS)
@@ -270,3 +271,101 @@ def test_a_slice_that_was_given_up_is_made_anew(volume: Volume) -> None:
     slices.note_taken(volume.take_dirty())
     assert slices._changed == {}
     np.testing.assert_array_equal(slices.get(wanted).occupancy().cells, expected)
+
+
+def looked(max_age: float) -> Raycast:
+    """The question what the first keyframe's camera sees."""
+    keyframe = wall(0)
+    assert keyframe.intrinsics is not None
+    K, pose = keyframe.intrinsics, tuple(keyframe.T_world_camera.ravel().tolist())
+    return Raycast(
+        (K.fx, K.fy, K.cx, K.cy), pose, (keyframe.shape[0], keyframe.shape[1]), surface="raw", max_age=max_age
+    )
+
+
+class Growing:
+    """A map that grows, the views that are kept of it, and what a fresh map would show."""
+
+    def __init__(self) -> None:
+        self.volume = Volume(VOLUME)
+        self.views = KeptViews(self.volume, lambda: MapState(keyframes=self.volume.keyframes))
+
+    def add(self, number: int) -> None:
+        self.views.note_change()
+        self.volume.integrate(wall(number))
+
+    def prepare(self) -> None:
+        deadline = time.monotonic() + 60
+        while self.views.wait_s is not None:
+            assert time.monotonic() < deadline
+            self.views.prepare()
+
+    def assert_shows(self, max_age: float, keyframes: int) -> None:
+        """A view is of so many keyframes, and says so."""
+        view, state = self.views.get(looked(max_age))
+        fresh = Volume(VOLUME)
+        for number in range(keyframes):
+            fresh.integrate(wall(number))
+        question = looked(0)
+        wanted = fresh.raycast(question.intrinsics, question.matrix, question.shape, surface="raw")
+        assert state.keyframes == keyframes
+        for name in ("depth", "normals", "colors"):
+            assert np.array_equal(getattr(view, name), getattr(wanted, name)), name
+
+
+def test_a_view_that_may_be_behind_is_of_one_whole_state() -> None:
+    map_ = Growing()
+    map_.add(0)
+    map_.assert_shows(30.0, 1)
+    map_.add(1)
+    map_.assert_shows(30.0, 1)
+    map_.views.prepare()  # not all of it, perhaps
+    map_.prepare()
+    map_.assert_shows(30.0, 2)
+    map_.add(2)
+    map_.assert_shows(30.0, 2)
+    map_.assert_shows(0.0, 3)  # nobody is shown an old state who did not ask for it
+
+
+def test_a_view_is_no_older_than_it_may_be(monkeypatch: pytest.MonkeyPatch) -> None:
+    map_ = Growing()
+    map_.add(0)
+    map_.assert_shows(1.0, 1)
+    now = time.monotonic()
+    monkeypatch.setattr(time, "monotonic", lambda: now + 100)  # quiet for long: it is the newest still
+    map_.add(1)
+    map_.assert_shows(1.0, 1)
+    monkeypatch.setattr(time, "monotonic", lambda: now + 101.5)
+    map_.assert_shows(1.0, 2)
+
+
+def test_views_are_prepared_only_while_somebody_asks_for_such() -> None:
+    map_ = Growing()
+    map_.add(0)
+    map_.assert_shows(0.0, 1)
+    map_.add(1)
+    assert map_.views.wait_s is None
+    map_.assert_shows(5.0, 1)
+    assert map_.views.wait_s is not None
+    map_.volume.retract(wall(1))
+    map_.volume.release_empty()  # blocks have gone: nothing is kept of before
+    map_.assert_shows(5.0, 1)
+
+
+def test_preparing_gives_way_to_a_question(desk: Desk, volume: Volume) -> None:
+    desk.answers.views.get(looked(5.0))
+    desk.answers.views.note_change()
+    volume.integrate(wall(3))
+    volume.set_pause(desk.answers.give_between)
+    try:
+        desk.put(asked(1))
+        desk.answers.prepare()
+        assert desk.answers.views.wait_s is not None  # not done
+        assert not desk.numbers
+        desk.answers.give()
+        assert desk.numbers == [1]
+        while desk.answers.views.wait_s is not None:
+            desk.answers.prepare()
+    finally:
+        volume.set_pause(lambda: None)
+        volume.retract(wall(3))

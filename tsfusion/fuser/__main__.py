@@ -99,6 +99,8 @@ def _do_some(fuser: Fuser, *, idle: bool) -> bool:
         fuser.search()
     elif fuser.move_due(idle):
         fuser.move()
+    elif idle and fuser.prepare_due:
+        fuser.prepare()
     elif idle and fuser.warm_due:
         fuser.warm()
     elif idle and fuser.refine_due:

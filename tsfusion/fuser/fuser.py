@@ -146,6 +146,8 @@ class Fuser:
     def _note_next(self, session: bytes) -> None:
         """Note whose keyframe changes the map next."""
         self._touched_by.note(self._volume.stamp + 1, session)
+        if self._answers is not None:
+            self._answers.views.note_change()
 
     def answer(self) -> None:
         """Answer the questions that wait, before anything else is done."""
@@ -189,6 +191,8 @@ class Fuser:
             waits.append(round(1000 * self._live_mesh.refine_wait) + 1)
         if self._mover.waiting:
             waits.append(round(1000 * self._mover.seconds_left) + 1)
+        if self._answers is not None and (wait_s := self._answers.views.wait_s) is not None:
+            waits.append(round(1000 * wait_s) + 1)
         return min((wait for wait in waits if wait is not None), default=None)
 
     @property
@@ -223,6 +227,16 @@ class Fuser:
     def refine(self) -> None:
         """Mesh some cells again. Call it only while there is nothing else to do."""
         self._live_mesh.refine()
+
+    @property
+    def prepare_due(self) -> bool:
+        """Whether to work ahead of a question now."""
+        return self._answers is not None and self._answers.views.wait_s == 0.0
+
+    def prepare(self) -> None:
+        """Work ahead of a question. Call it only while there is nothing else to do."""
+        if self._answers is not None:
+            self._answers.prepare()
 
     def move_due(self, idle: bool) -> bool:
         """Whether a corrected keyframe is to be fused at its new pose now."""

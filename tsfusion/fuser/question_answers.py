@@ -18,6 +18,7 @@ from tsfusion.core.token_bucket import Bucket
 from tsfusion.fuser.current_keyframe import CurrentKeyframe
 from tsfusion.fuser.inbox import Inbox
 from tsfusion.fuser.kept_slices import KeptSlices
+from tsfusion.fuser.kept_views import KeptViews
 from tsfusion.fuser.messages import FuserAnswer, FuserQuestion
 from tsfusion.fuser.watched_map import WatchedMap
 from tsfusion.wire import questions
@@ -47,7 +48,7 @@ _Arrays = dict[str, NDArray[Any]]
 
 
 class AnswerGivenUp(TsfusionError):
-    """An answer took longer than it may."""
+    """An answer took longer than it may; or what was made ahead of questions gives way to one."""
 
 
 class QuestionAnswers:
@@ -72,9 +73,9 @@ class QuestionAnswers:
     ) -> None:
         self._volume, self._inbox, self._state, self._send = volume, inbox, state, send
         self._watched, self._at_work = watched, at_work
-        self.slices = KeptSlices(volume)
+        self.slices, self.views = KeptSlices(volume), KeptViews(volume, state)
         self._share = Bucket(_SHARE, time.monotonic(), burst=_BURST_S)
-        self._is_answering = False
+        self._is_answering = self._is_preparing = False
         self._until_s = 0.0  # of the answer that is being made, time.monotonic()
         self._began_s = 0.0  # likewise, time.process_time()
         self._is_aside = False  # whether it is made in the middle of a keyframe
@@ -115,7 +116,22 @@ class QuestionAnswers:
         else:
             self.give()
 
+    def prepare(self) -> None:
+        """Work a little ahead of questions that are likely (`KeptViews`), until something comes."""
+        self._is_answering = self._is_preparing = True
+        try:
+            self.views.prepare()
+        except (AnswerGivenUp, MemoryError):  # what was made is kept; the question itself says what is wrong
+            pass
+        finally:
+            self._is_answering = self._is_preparing = False
+
     def _check_time(self, now: float) -> None:
+        if self._is_preparing:
+            self._inbox.read()
+            if self._inbox.questions or self._inbox.orders:
+                raise AnswerGivenUp("something else has come")
+            return
         if now > self._until_s:
             raise AnswerGivenUp(questions.LATE)
         took = time.process_time() - self._began_s
@@ -144,7 +160,11 @@ class QuestionAnswers:
             return
         self._began_s, self._until_s = time.process_time(), asked.deadline_ns / 1e9
         try:
-            if isinstance(asked.question, Cells | Keyframes):
+            state: MapState | None = None
+            if isinstance(asked.question, Raycast):
+                view, state = self.views.get(asked.question)
+                arrays = {name: array for name, array in vars(view).items() if array is not None}
+            elif isinstance(asked.question, Cells | Keyframes):
                 arrays = self._watched.answer(asked.question)
             else:
                 arrays = answer_of(self._volume, self.slices, asked.question, frames)
@@ -161,7 +181,7 @@ class QuestionAnswers:
             now_ns = time.monotonic_ns()
             answer = Answer(
                 arrays=layouts,
-                state=self._state(),
+                state=state or self._state(),
                 crc=questions.crc_of(packed),
                 waited_s=(began_ns - asked.asked_ns) / 1e9,
                 took_s=(now_ns - began_ns) / 1e9,
@@ -172,7 +192,7 @@ class QuestionAnswers:
 def answer_of(
     volume: "Volume",
     slices: KeptSlices,
-    question: Sample | Raycast | Slice | Field,
+    question: Sample | Slice | Field,
     frames: list[memoryview],
 ) -> _Arrays:
     """Answer of a map, by name: the fields of `geometry.map_answers` and `geometry.map_grids`."""
@@ -180,12 +200,9 @@ def answer_of(
         return _slice_of(slices.get(question), question.kind)
     if isinstance(question, Field):
         return _field_of(volume, question)
-    how: dict[str, Any] = {"min_weight": question.min_weight, "surface": question.surface}
-    if isinstance(question, Raycast):
-        view = volume.raycast(question.intrinsics, question.matrix, question.shape, **how)
-        found = {"depth": view.depth, "normals": view.normals, "colors": view.colors}
-        return {name: array for name, array in found.items() if array is not None}
-    samples = volume.sample(questions.points_of(frames), **how)
+    samples = volume.sample(
+        questions.points_of(frames), min_weight=question.min_weight, surface=question.surface
+    )
     return {"distance": samples.distance, "weight": samples.weight, "gradient": samples.gradient}
 
 

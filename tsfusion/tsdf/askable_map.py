@@ -88,6 +88,33 @@ class AskableMap(ReadableMap):
         camera = checked_camera(intrinsics, T_world_camera, shape)
         return camera_views.cast(self._tiles_of(surface, self._checked_min_weight(min_weight)), *camera)
 
+    def settled_stamp(self, min_weight: float | None = None, surface: Surface | None = None) -> int | None:
+        """The `stamp` of the state that `raycast` or `settle` made whole last; None = it is not kept."""
+        return self._tiles_of(surface, self._checked_min_weight(min_weight)).settled
+
+    def raycast_settled(
+        self,
+        intrinsics: Intrinsics | ArrayLike,
+        T_world_camera: ArrayLike,
+        shape: tuple[int, int],
+        *,
+        min_weight: float | None = None,
+        surface: Surface | None = None,
+    ) -> View | None:
+        """As `raycast`, of the state of `settled_stamp`; None where some of it is not kept any more."""
+        camera = checked_camera(intrinsics, T_world_camera, shape)
+        least = self._checked_min_weight(min_weight)
+        return camera_views.cast_settled(self._tiles_of(surface, least), *camera)
+
+    def settle(self, most: int, *, min_weight: float | None = None, surface: Surface | None = None) -> bool:
+        """Mesh again what the last `raycast` showed and has changed since, at most so many cubes of it.
+
+        Returns:
+            Whether `raycast_settled` is of the map as it is now.
+        """
+        tiles = self._tiles_of(surface, self._checked_min_weight(min_weight))
+        return tiles.settled is not None and tiles.settle_some(most)
+
     def point_cloud(self, *, min_weight: float | None = None, surface: Surface | None = None) -> PointCloud:
         """Points of the surface, a vertex of its mesh each: at most three a voxel.
 

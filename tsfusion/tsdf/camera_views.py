@@ -24,11 +24,39 @@ def cast(
     """The view, (H, W), of a surface: of the tiles before the camera."""
     camera = intrinsics, T_world_camera, shape
     with np.errstate(over="ignore", invalid="ignore"):  # a focal length may be next to none
-        parts = _parts(tiles, _in_view(tiles, *camera))
-        seen = look_at(next(parts, _NOTHING), *camera)
-        for mesh in parts:
-            seen = _nearer(seen, look_at(mesh, *camera))
-    if tiles.has_color and seen.colors is None:
+        numbers = _in_view(tiles, *camera).tolist()
+        seen = _of_meshes(tiles.meshes(numbers), *camera, has_color=tiles.has_color)
+    tiles.settle(numbers)
+    return seen
+
+
+def cast_settled(
+    tiles: SurfaceTiles, intrinsics: Intrinsics, T_world_camera: NDArray[np.float64], shape: tuple[int, int]
+) -> View | None:
+    """As `cast`, of the map as it was when it was settled; None where that is not kept any more."""
+    camera = intrinsics, T_world_camera, shape
+    with np.errstate(over="ignore", invalid="ignore"):
+        meshes = tiles.settled_meshes(_in_view(tiles, *camera).tolist())
+        if meshes is None:
+            return None
+        return _of_meshes(iter(meshes), *camera, has_color=tiles.has_color)
+
+
+def _of_meshes(
+    meshes: Iterator[Mesh],
+    intrinsics: Intrinsics,
+    T_world_camera: NDArray[np.float64],
+    shape: tuple[int, int],
+    *,
+    has_color: bool,
+) -> View:
+    """The view of all of some meshes."""
+    camera = intrinsics, T_world_camera, shape
+    parts = _parts(meshes)
+    seen = look_at(next(parts, _NOTHING), *camera)
+    for mesh in parts:
+        seen = _nearer(seen, look_at(mesh, *camera))
+    if has_color and seen.colors is None:
         return View(seen.depth, seen.normals, np.zeros((*shape, 3), np.uint8))
     return seen
 
@@ -88,11 +116,11 @@ def _in_view(
     return np.asarray(numbers[shown[nearest_first]])
 
 
-def _parts(tiles: SurfaceTiles, numbers: NDArray[np.int64]) -> Iterator[Mesh]:
-    """Meshes of tiles, joined up to `MOST_TRIANGLES`."""
+def _parts(meshes: Iterator[Mesh]) -> Iterator[Mesh]:
+    """Meshes, joined up to `MOST_TRIANGLES`."""
     part: list[Mesh] = []
     triangles = 0
-    for mesh in tiles.meshes(numbers.tolist()):
+    for mesh in meshes:
         part.append(mesh)
         triangles += len(mesh.faces)
         if triangles >= MOST_TRIANGLES:

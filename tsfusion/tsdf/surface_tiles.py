@@ -2,6 +2,10 @@
 """A surface's values and meshes in cubes of 8³ blocks, kept while the map stays as it is.
 
 What a cube holds depends on the map alone: not on what was asked before, nor on how the map came about.
+
+The last state of which a view was made whole stays while the map goes on, as long as a newer one is not
+whole: meshes of cubes that change are kept beside the new ones. A view of it is of that state in every cube,
+for a cube that has not changed since is the same now.
 """
 
 from collections import OrderedDict
@@ -39,6 +43,12 @@ class SurfaceTiles:
         self._buffers = mesh_extraction.MeshBuffers()
         self._listed, self._numbers = 0, np.empty(0, np.int64)
         self._drops = store.drops
+        self.settled: int | None = None  # stamp of the state that was whole last
+        self._shown: list[int] = []  # cubes of that view
+        self._settled_numbers = self._numbers
+        self._changed: set[int] = set()  # cubes with other meshes since
+        self._before: dict[int, _Piece] = {}  # meshes that some of them had
+        self._lacking: list[int] | None = None  # cubes to mesh until it is settled; None: not looked for
 
     @property
     def values(self) -> SurfaceView:
@@ -57,7 +67,8 @@ class SurfaceTiles:
     @property
     def nbytes(self) -> int:
         """Memory of what is kept."""
-        return self._values.nbytes + self._meshes.nbytes + self._buffers.nbytes
+        before = sum(piece.nbytes for piece in self._before.values())
+        return self._values.nbytes + self._meshes.nbytes + before + self._buffers.nbytes
 
     def forget(self, changed: NDArray[np.int64]) -> None:
         """Let go of what depends on blocks that have changed: sorted keys."""
@@ -66,10 +77,51 @@ class SurfaceTiles:
             self._values.clear()
             self._meshes.clear()
             self._listed, self._numbers = 0, self._numbers[:0]
+            self.settled = None
         elif len(changed):
             reached = field_regularizer.around(changed, self._store, self._reach)
             self._values.forget(_tiles_of(reached))
-            self._meshes.forget(_tiles_of(field_regularizer.around(reached, self._store, 1)))
+            others = _tiles_of(field_regularizer.around(reached, self._store, 1))
+            self._keep_before(others)
+            self._meshes.forget(others)
+            self._lacking = None
+
+    def _keep_before(self, numbers: NDArray[np.int64]) -> None:
+        """Keep the meshes that cubes had when the map was settled."""
+        if self.settled is None:
+            return
+        for number in set(numbers.tolist()) - self._changed:
+            self._changed.add(number)
+            if (piece := self._meshes.get(number)) is not None:
+                self._before[number] = piece
+
+    def settle(self, numbers: Sequence[int]) -> None:
+        """Note that a view of these cubes has been made of the map as it is."""
+        self.settled, self._shown = self._store.stamp, list(numbers)
+        self._settled_numbers = self.numbers()
+        self._changed, self._before, self._lacking = set(), {}, None
+
+    def settle_some(self, most: int) -> bool:
+        """Mesh again a few cubes of the last view; whether the map is settled then."""
+        if self._lacking is None:  # what does not fit into what is kept is made once
+            self._lacking = [number for number in self._shown if self._meshes.get(number) is None]
+        for _ in self.meshes(self._lacking[:most]):
+            pass
+        self._lacking = self._lacking[most:]
+        if is_done := not self._lacking:
+            self.settle(self._shown)
+        return is_done
+
+    def settled_meshes(self, numbers: Sequence[int]) -> list[Mesh] | None:
+        """The meshes of some cubes as the map was when it was settled; None where one is not kept."""
+        if self.settled is None:
+            return None
+        there = set(self._settled_numbers.tolist()).intersection(numbers)
+        others = self._changed & there
+        if not others <= self._before.keys():
+            return None
+        same = sorted(there - others)
+        return [*(self._before[number].mesh for number in sorted(others)), *self.meshes(same)]
 
     def numbers(self) -> NDArray[np.int64]:
         """(n,) sorted numbers of the cubes with a block of the map."""

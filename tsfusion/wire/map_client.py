@@ -142,12 +142,16 @@ class MapClient:
         *,
         min_weight: float | None = None,
         surface: Surface | None = "raw",
+        max_age: float = 0.0,
         timeout: float | None = None,
     ) -> Answered[View]:
         """View of the surface by a pinhole camera; see `Volume.raycast`. Raises as `sample`.
 
         Args:
             intrinsics, T_world_camera, shape, min_weight, surface: as for `Volume.raycast`.
+            max_age: seconds for which the state that is shown may be behind the newest one. Of 0 the view is
+                of the newest, and what has just changed is meshed first. With 0.2 that is done ahead, for
+                cameras that look where the last one did; `state` says which state was shown.
             timeout: seconds; None = the client's.
         """
         camera, T, (height, width) = checked_camera(intrinsics, T_world_camera, shape)
@@ -157,6 +161,7 @@ class MapClient:
             shape=(height, width),
             min_weight=min_weight,
             surface=surface,
+            max_age=float(max_age),
         )
         answer, arrays, delay = self._ask(question, [], timeout)
         colors = arrays.pop("colors", None)

@@ -79,6 +79,7 @@ class Raycast(Struct, frozen=True, tag="raycast", omit_defaults=True):
         intrinsics: fx, fy, cx, cy, pixels.
         pose: the 16 numbers of T_world_camera, row by row.
         shape: height, width, pixels.
+        max_age: seconds since which the state of the map that is shown may not be the newest any more.
     """
 
     intrinsics: tuple[float, float, float, float]
@@ -86,6 +87,7 @@ class Raycast(Struct, frozen=True, tag="raycast", omit_defaults=True):
     shape: tuple[int, int]
     min_weight: float | None = None
     surface: Surface | None = None
+    max_age: float = 0.0
 
     @property
     def most_bytes(self) -> int:
@@ -102,6 +104,8 @@ class Raycast(Struct, frozen=True, tag="raycast", omit_defaults=True):
             return str(error)
         if math.prod(self.shape) > MOST_PIXELS:
             return f"a view may have {MOST_PIXELS} pixels, got {self.shape[0]} × {self.shape[1]}"
+        if not 0 <= self.max_age <= LONGEST_S:
+            return f"max_age must be 0 to {LONGEST_S:g} s, got {self.max_age}"
         return _problem_of_weight(self.min_weight)
 
     @property

@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: MIT
+"""Views of a state hardly older than the newest, meshed ahead: a camera looks where it looked before."""
+
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, TypedDict
+
+from tsfusion.core.config import Surface
+from tsfusion.geometry.map_answers import View
+from tsfusion.wire.questions import MapState, Raycast
+
+if TYPE_CHECKING:
+    from tsfusion.tsdf.volume import Volume
+
+_WANTED_S = 2.0  # after a view that may be behind: for so long the next one is prepared
+_CUBES_AT_ONCE = 4
+_REST_FACTOR = 1.0  # of the time without work, half at most
+
+
+class _How(TypedDict):
+    min_weight: float | None
+    surface: Surface | None
+
+
+class KeptViews:
+    """Views of one map, each of one state of it.
+
+    Args:
+        state: of the map, now.
+    """
+
+    def __init__(self, volume: "Volume", state: Callable[[], MapState]) -> None:
+        self._volume, self._state = volume, state
+        self._how = _How(min_weight=None, surface=None)  # of what is kept
+        self._kept: tuple[int, MapState] | None = None  # stamp and state of what is kept
+        self._newest_s = self._wanted_s = self._next_s = 0.0  # time.monotonic()
+
+    def note_change(self) -> None:
+        """Note that the map is about to change."""
+        if self._is_newest:
+            self._newest_s = time.monotonic()
+
+    def get(self, question: Raycast) -> tuple[View, MapState]:
+        """The view, and the state that it is of."""
+        how = _How(min_weight=question.min_weight, surface=question.surface)
+        camera = question.intrinsics, question.matrix, question.shape
+        now = time.monotonic()
+        if question.max_age > 0:
+            self._wanted_s = now + _WANTED_S
+        if self._kept is not None and how == self._how and not self._is_newest:
+            stamp, state = self._kept
+            is_kept = now - self._newest_s <= question.max_age and self._volume.settled_stamp(**how) == stamp
+            view = self._volume.raycast_settled(*camera, **how) if is_kept else None
+            if view is not None:
+                return view, state
+        view = self._volume.raycast(*camera, **how)
+        self._how, self._kept = how, (self._volume.stamp, self._state())
+        return view, self._kept[1]
+
+    @property
+    def wait_s(self) -> float | None:
+        """Seconds until there is something to prepare; None = nothing."""
+        now = time.monotonic()
+        if self._kept is None or self._is_newest or now >= self._wanted_s:
+            return None
+        return max(self._next_s - now, 0.0)
+
+    def prepare(self) -> None:
+        """Mesh a little of what the last view showed and has changed since."""
+        began = time.monotonic()
+        if self._volume.settled_stamp(**self._how) is None:
+            self._kept = None  # until the next view
+            return
+        try:
+            if self._volume.settle(_CUBES_AT_ONCE, **self._how):
+                self._kept = self._volume.stamp, self._state()
+        finally:
+            now = time.monotonic()
+            self._next_s = now + _REST_FACTOR * (now - began)
+
+    @property
+    def _is_newest(self) -> bool:
+        return self._kept is not None and self._kept[0] == self._volume.stamp
