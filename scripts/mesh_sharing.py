@@ -3,6 +3,7 @@
 
     python scripts/mesh_sharing.py                    the synthetic room: a table, then one JSON line
     python scripts/mesh_sharing.py --map my-map.tsf   thin the mesh of a map, too
+    python scripts/mesh_sharing.py --memory DATASET   instead of all that, what each step takes of memory
 
 Holes: discs are cut out of every depth image of the synthetic room, in the wall, in the sphere and across an
 edge of the box, and closed with `fill_holes`. The distance of the guessed vertices from the true surface
@@ -11,9 +12,16 @@ stands beside that of the seen ones within 20 cm of the hole.
 Thinning: distances of points on the thinned mesh from the full one and the other way round (from the plane of
 the nearest of points 5 mm apart, scipy), the border's edges that are kept, the mean difference of colour
 from the nearest vertex of the full mesh, the size of the GLB file, and CPU seconds.
+
+Memory: the dataset is fused with ever smaller voxels. Each step runs in a process of its own, with the map
+open; `bytes` is what its peak is above that of a process that opened the map and did nothing.
 """
 
 import argparse
+import json
+import subprocess
+import sys
+import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -25,7 +33,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from tsfusion import Mesh, Volume
+from tsfusion import Mesh, Volume, open_dataset
+from tsfusion.core.process import peak_rss_bytes
 from tsfusion.datasets import Synthetic
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.geometry.mesh_simplification import border_edges
@@ -131,6 +140,50 @@ def thinned(mesh: Mesh, targets: list[dict[str, float]]) -> Iterator[dict[str, A
         }  # fmt: skip
 
 
+STEPS = ("nothing", "mesh", "fill_holes", "simplify", "texture")
+
+
+def step_on(map_file: Path, source: str, step: str) -> dict[str, Any]:
+    """One step on a saved map, in this process: its peak, triangles and time."""
+    volume = Volume.load(map_file)
+    start, mesh = time.process_time(), None
+    if step != "nothing":
+        given: dict[str, dict[str, Any]] = {"fill_holes": {"fill_holes": 10}}
+        given["texture"] = {"texture": open_dataset(source)}
+        mesh = volume.extract_mesh(**given.get(step, {}))
+    if step == "simplify" and mesh is not None:
+        mesh.simplified(ratio=0.25)
+    return {
+        "step": step,
+        "blocks": volume.stats().blocks,
+        "map_bytes": volume.stats().bytes,
+        "triangles": 0 if mesh is None else len(mesh.faces),
+        "cpu_s": time.process_time() - start,
+        "peak_bytes": peak_rss_bytes(),
+    }
+
+
+def memory(source: str, sizes: list[float]) -> Iterator[dict[str, Any]]:
+    """What each step takes above the open map, with voxels of several sizes."""
+    with tempfile.TemporaryDirectory(prefix="tsfusion-memory-") as folder:
+        map_file = Path(folder) / "map.tsf"
+        for size in sizes:
+            dataset = open_dataset(source)
+            volume = Volume(size, sensor=dataset.sensor)
+            for index in range(len(dataset)):
+                volume.integrate(dataset[index])
+            volume.save(map_file)
+            empty = 0
+            for step in STEPS:
+                asked = ["--memory", source, "--map", str(map_file), "--step", step]
+                command = [sys.executable, __file__, *asked]
+                found = json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
+                empty = empty or found["peak_bytes"]
+                above = found.pop("peak_bytes") - empty
+                per_triangle = above / found["triangles"] if found["triangles"] else 0.0
+                yield {"voxel_m": size, **found, "bytes": above, "bytes_a_triangle": per_triangle}
+
+
 def table(rows: list[dict[str, Any]]) -> None:
     print("| " + " | ".join(rows[0]) + " |\n|" + "---|" * len(rows[0]))
     for row in rows:
@@ -145,7 +198,16 @@ def main() -> None:
     )
     parser.add_argument("--map", type=Path, help="a saved map whose mesh is thinned, too")
     parser.add_argument("--widths", type=int, nargs="+", default=[5, 10, 20])
+    parser.add_argument("--memory", metavar="DATASET", help="measure the memory that each step takes")
+    parser.add_argument("--voxel-sizes", type=float, nargs="+", default=[0.04, 0.02, 0.01], help="metres")
+    parser.add_argument("--step", choices=STEPS, help=argparse.SUPPRESS)
     given = parser.parse_args()
+    if given.step is not None:
+        print(json.dumps(step_on(given.map, given.memory, given.step)))
+        return
+    if given.memory is not None:
+        table(list(memory(given.memory, given.voxel_sizes)))
+        return
     dataset = Synthetic("room", "kinect", color=False)
     results: dict[str, list[dict[str, Any]]] = {"holes": list(holes(dataset, given.widths))}
     table(results["holes"])

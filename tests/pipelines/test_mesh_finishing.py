@@ -138,3 +138,20 @@ def test_a_mesh_larger_than_memory_loses_its_small_pieces(
     assert found["left_out"] == left_out
     head = (tmp_path / "m.ply").read_bytes().partition(b"end_header")[0].decode()
     assert f"comment map_hash {whole.map_hash()}\n" in head
+
+
+def test_a_step_that_would_outgrow_memory_is_refused() -> None:
+    steps = {"fill_holes": False, "simplify": False, "texture": False}
+    mesh_finishing.check_memory(10**9, 10**9, **steps)  # without steps the map's own memory counts
+    for step, flag in (("simplify", "--simplify"), ("texture", "--texture"), ("fill_holes", "--fill-holes")):
+        mesh_finishing.check_memory(10**9, 7 * 10**9, **{**steps, step: True})
+        with pytest.raises(InvalidConfig, match=f"{flag} needs all of the mesh.* give a --crop"):
+            mesh_finishing.check_memory(10**9, 3 * 10**9, **{**steps, step: True})
+
+
+def test_a_mesh_that_would_outgrow_memory_is_refused(here: Here, saved: Path, tmp_path: Path) -> None:
+    memory = ("--memory", Volume.load(saved, threads=2).stats().bytes)
+    done = here("mesh", saved, tmp_path / "a.ply", "--simplify", "50%", *memory)
+    assert done.returncode != 0
+    assert "--simplify needs all of the mesh" in done.stderr
+    assert not (tmp_path / "a.ply").exists()

@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     from tsfusion.tsdf.volume import Volume
 
 _MARGIN = 128  # voxels around a box that its surface depends on
+# Memory of a step beside the map and in its sizes, the most that scripts/mesh_sharing.py --memory found
+_FILLING, _SIMPLIFYING, _TEXTURING = 3.0, 6.0, 4.0
 Box = tuple[float, float, float, float, float, float]
 
 
@@ -89,6 +91,30 @@ def checked(
     if target is not None:
         mesh_simplification.library()
     return Finishing(crop=crop, min_component=min_component, simplify=target, mark_guesses=mark_guesses)
+
+
+def check_memory(map_bytes: int, most_bytes: int, *, fill_holes: bool, simplify: bool, texture: bool) -> None:
+    """Refuse steps that take many times the memory of the map, before they take it.
+
+    Args:
+        most_bytes: that the steps and the map may take.
+
+    Raises:
+        InvalidConfig: when they would take more.
+    """
+    steps = {
+        "--simplify": simplify * _SIMPLIFYING,
+        "--texture": texture * _TEXTURING,
+        "--fill-holes": fill_holes * _FILLING,
+    }
+    flag, times = max(steps.items(), key=lambda step: step[1])
+    needed = (1 + times) * map_bytes
+    if times and needed > most_bytes:
+        raise InvalidConfig(
+            f"{flag} needs all of the mesh, and may take {needed / 1e9:.3g} GB for a map of "
+            f"{map_bytes / 1e9:.3g} GB, where {most_bytes / 1e9:.3g} GB may be taken: give a --crop, or more "
+            "--memory"
+        )
 
 
 def part_around(volume: "Volume", box: Box, most_bytes: int) -> "Volume":
