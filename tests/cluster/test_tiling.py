@@ -67,6 +67,9 @@ def test_runs_of_a_mesh_are_the_whole_one_bit_for_bit(
     volume: Volume, tmp_path: Path, surface: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(field_regularizer, "BATCH", 64)  # blocks a tile
+    assert mesh_runs.shares(5 * 64, 8) == []
+    assert mesh_runs.shares(6 * 64, 8) == [range(3), range(3, 6)]
+    monkeypatch.setattr(mesh_runs, "LEAST_TILES", 1)
     file = volume.save(tmp_path / "map.tsf")
     whole = volume.extract_mesh(surface=surface)
     blocks = volume.stats().blocks

@@ -16,13 +16,14 @@ from tsfusion.tsdf.block_store import unpack_keys
 from tsfusion.tsdf.mesh_tiles import MeshRun, Numbered
 from tsfusion.tsdf.volume import Volume
 
+LEAST_TILES = 3  # of a run: its neighbours' tiles are solved for it, too
 _FARTHEST = 1 << 18  # beyond every block
 
 
 def shares(blocks: int, workers: int) -> list[range]:
     """The tiles of a map's mesh in runs, one for each worker; none where a single one does it as fast."""
     tiles = mesh_tiles.tile_count(blocks)
-    count = min(workers, tiles)
+    count = min(workers, tiles // LEAST_TILES)
     if count < 2:
         return []
     borders = np.linspace(0, tiles, count + 1).round().astype(int).tolist()
