@@ -9,10 +9,6 @@ answers. The wait for the disk is the floor that was measured without a server, 
 (`--disk-wait`). Two numbers are fitted to two runs: its work on a keyframe, and the way of an answer to the
 scanner and of the next keyframe back. All other points are predicted, and the script fails when one is off by
 more than 15 %.
-
-What it takes to fuse a journal anew is checked in the same way, against lines of scripts/cluster.py
-(--fused): processor time of a worker's start, of a keyframe, of an added block, of a mesh and its blocks, and
-of each further worker at the mesh are found from three runs, and the others are predicted.
 """
 
 import argparse
@@ -32,8 +28,6 @@ TOLERANCE = 0.15
 WINDOW = 8  # keyframes under way of a scanner (`window_keyframes`)
 BATCH = 16  # keyframes that a gateway reads before the others have their turn
 SIMULATED_S = 2.0
-FUSED = POINTS.with_name("fuse-points.jsonl")
-FIT_FUSED = ((80, 1), (320, 1), (320, 4))  # keyframes and workers
 Row = dict[str, Any]
 
 
@@ -118,64 +112,6 @@ def check(rows: list[Row]) -> tuple[Gateway, list[Row]]:
     return gateway, table
 
 
-# --- a journal fused anew ---
-
-
-class Fusing(Struct, frozen=True):
-    """Seconds of processor time of `tsfusion fuse`: of a worker's start, of each keyframe, of each block that
-    is added, of a mesh, of each of its blocks, of each further worker at it."""
-
-    start: float
-    keyframe: float
-    added_block: float
-    mesh: float
-    meshed_block: float
-    mesh_worker: float
-
-    def seconds(self, keyframes: int, blocks: int, workers: int) -> float:
-        """What a run takes of all cores together."""
-        fusing = workers * self.start + keyframes * self.keyframe
-        adding = blocks * self.added_block if workers > 1 else 0.0
-        return fusing + adding + self.mesh + blocks * self.meshed_block + (workers - 1) * self.mesh_worker
-
-
-def fit_fusing(rows: list[Row]) -> Fusing:
-    """The times that the fitted runs took: a short and a long one by one worker, a long one by several."""
-    short, long, shared = (
-        next(row for row in rows if (row["keyframes"], row["workers"]) == which) for which in FIT_FUSED
-    )
-
-    def line(name: str, by: str) -> tuple[float, float]:
-        slope = (long["worker_seconds"][name] - short["worker_seconds"][name]) / (long[by] - short[by])
-        return long["worker_seconds"][name] - slope * long[by], slope
-
-    start, keyframe = line("fusing", "keyframes")
-    mesh, meshed_block = line("meshing", "blocks")
-    whole = mesh + meshed_block * shared["blocks"]
-    return Fusing(
-        start=start,
-        keyframe=keyframe,
-        added_block=shared["worker_seconds"]["adding"] / shared["blocks"],
-        mesh=mesh,
-        meshed_block=meshed_block,
-        mesh_worker=(shared["worker_seconds"]["meshing"] - whole) / (shared["workers"] - 1),
-    )
-
-
-def check_fusing(rows: list[Row]) -> list[Row]:
-    """Each run beside the prediction."""
-    model, table = fit_fusing(rows), []
-    for row in rows:
-        predicted = model.seconds(row["keyframes"], row["blocks"], row["workers"])
-        measured = sum(row["worker_seconds"].values())
-        table.append({
-            "keyframes": row["keyframes"], "workers": row["workers"], "measured": round(measured, 2),
-            "predicted": round(predicted, 2), "error": round(predicted / measured - 1.0, 3),
-            "fitted": (row["keyframes"], row["workers"]) in FIT_FUSED,
-        })  # fmt: skip
-    return table
-
-
 # --- a city ---
 
 CORES = 16  # of a machine
@@ -224,23 +160,17 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("points", nargs="?", type=Path, default=POINTS)
-    parser.add_argument("--fused", type=Path, default=FUSED, help="lines that scripts/cluster.py printed")
     parser.add_argument("--json", action="store_true", help="one object")
     options = parser.parse_args()
-    rows, fused = (
-        [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-        for path in (options.points, options.fused)
-    )
+    rows = [json.loads(line) for line in options.points.read_text(encoding="utf-8").splitlines()]
     gateway, table = check(rows)
-    fusing = check_fusing(fused)
     keyframe_bytes = rows[0]["keyframe_bytes"]
     cities = [city(machines, keyframe_bytes) for machines in (1, 2, 4, 8, 16, 32, 64)]
-    worst = max(abs(row["error"]) for row in (*table, *fusing) if not row["fitted"])
+    worst = max(abs(row["error"]) for row in table if not row["fitted"])
     if options.json:
         milliseconds = {name: round(1e3 * getattr(gateway, name), 4) for name in Gateway.__struct_fields__}
         print(json.dumps({
-            "gateway_ms": milliseconds, "points": table, "fused": fusing, "worst_error": worst,
-            "city": cities,
+            "gateway_ms": milliseconds, "points": table, "worst_error": worst, "city": cities,
         }))  # fmt: skip
     else:
         for row in table:
@@ -248,12 +178,6 @@ def main() -> int:
                 f"{row['scanners']:4} scanners, disk wait {row['disk_wait_ms']:3.0f} ms: durable a second "
                 f"{row['measured']:7.1f} measured, {row['predicted']:7.1f} predicted "
                 f"({100 * row['error']:+.1f} %{', fitted' if row['fitted'] else ''})"
-            )
-        for row in fusing:
-            print(
-                f"{row['keyframes']:4} keyframes fused by {row['workers']}: {row['measured']:6.2f} CPU s "
-                f"measured, {row['predicted']:6.2f} predicted ({100 * row['error']:+.1f} %"
-                f"{', fitted' if row['fitted'] else ''})"
             )
         print(f"worst of those that were not fitted: {100 * worst:.1f} %")
         for one in cities:
