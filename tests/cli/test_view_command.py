@@ -153,7 +153,7 @@ def test_the_page_of_a_server_breaks_nothing_and_ends_with_it(tmp_path: Path) ->
         status, _, _, errors = ended(process, signal.SIGTERM)
     assert status == 0
     (warning,) = (line for line in errors.splitlines() if "page" in line)
-    assert warning == "tsfusion: WARNING: the page has ended with status -9; all else goes on"
+    assert warning == "tsfusion: WARNING: the page has ended with status -9; everything else goes on"
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
@@ -199,5 +199,5 @@ def test_a_page_that_does_not_start_is_a_warning(caplog: pytest.LogCaptureFixtur
         viewer.close()
     (line,) = (record.getMessage() for record in caplog.records)
     assert line.startswith(f"the page has ended with status 1: cannot show a page at 127.0.0.1:{port}: ")
-    assert line.endswith("; all else goes on")
+    assert line.endswith("; everything else goes on")
     assert not told

@@ -109,7 +109,7 @@ def forget(
         typer.echo("\n".join(_lines(found, erase=erase, dry_run=dry_run)))
     if found.unavailable:
         raise JournalError(
-            "keyframes that the journal has no more stay in the map, also where they would fit: of session "
+            "keyframes that the journal no longer has stay in the map, although they fit: of session "
             + "; ".join(found.unavailable)
         )
 

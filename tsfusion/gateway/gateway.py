@@ -231,7 +231,7 @@ class Gateway:
             identity, content, *points = frames
             message = messages.decode_to_server(content.buffer)
             if points and not (isinstance(message, messages.Command) and message.name == "ask"):
-                raise DecodeError(f"{len(points)} frames more than there may be")
+                raise DecodeError(f"{len(points)} frames too many")
         except (DecodeError, ValueError) as error:
             self._refused["control"] += 1
             log.debug("%s", error)

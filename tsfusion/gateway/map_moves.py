@@ -133,7 +133,7 @@ class MapMoves:
                 self._ask_for(identity, command)
                 return
             if command.hand_over is None:
-                raise JournalError("it is not said what is asked for")
+                raise JournalError("the request names no part of the map")
             if self._unread.count(identity) >= _MOST_UNREAD or self._unread.nbytes > self._max_bytes:
                 raise JournalError("earlier answers were not read yet")
             parcel, frames = self._departures.answer(command.map, command.hand_over)

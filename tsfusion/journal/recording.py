@@ -54,7 +54,7 @@ class JournalRecording:
         try:
             return codec.decode_keyframe(journal.read_at(path, offset).frames)
         except DecodeError as error:
-            raise JournalError(f"{path}: keyframe {index} is of no use: {error}") from error
+            raise JournalError(f"{path}: keyframe {index} cannot be used: {error}") from error
 
     def __iter__(self) -> Iterator[Keyframe]:
         return (self[index] for index in range(len(self)))

@@ -137,7 +137,8 @@ def choose(
         begins = JournaledKeyframes(place).sessions.values()
         first = selection.clock(min((one.first_ns for one in begins), default=last_ns))
         raise JournalError(
-            f"no keyframe of {place.path} is meant: it has records from {first} to {selection.clock(last_ns)}"
+            f"the selection leaves no keyframe of {place.path}, which has records from {first} to "
+            f"{selection.clock(last_ns)}"
         )
     return found
 

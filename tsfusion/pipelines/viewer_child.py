@@ -86,7 +86,7 @@ class ViewerChild:
             self._process.stdin.write(json.dumps(keys and msgspec.to_builtins(keys)) + "\n")
             self._process.stdin.flush()
         except OSError as error:
-            log.warning("the page cannot be shown: %s; all else goes on", error.strerror)
+            log.warning("the page cannot be shown: %s; everything else goes on", error.strerror)
         if self._process is not None:
             self._reader.start()
 
@@ -118,7 +118,7 @@ class ViewerChild:
                 why = f": {line.removeprefix('tsfusion: ')}"
         status = child.wait()
         if not self._is_ending:
-            log.warning("the page has ended with status %d%s; all else goes on", status, why)
+            log.warning("the page has ended with status %d%s; everything else goes on", status, why)
 
 
 def _reached(address: str) -> str:

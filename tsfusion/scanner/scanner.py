@@ -212,7 +212,7 @@ class Scanner:
         self._taken.add(name)
         self._localizer.settle()
         self._correct_if_known()
-        log.warning("lost for %.1f s (%s): what follows goes into a new map, %s", seconds, self._why, name)
+        log.warning("lost for %.1f s (%s): later keyframes go into a new map, %s", seconds, self._why, name)
         self._localizer.reset()
         self._selector.reset()
         self._state, self._lost_since, self._next = "starting", None, name

@@ -271,7 +271,7 @@ class ReadableMap:
     def _check_voxels(self, other: "ReadableMap") -> None:
         ours, theirs = self.config.voxel_size, other.config.voxel_size
         if ours != theirs:
-            raise MapError(f"the maps have voxels of {ours:g} m and {theirs:g} m: fuse one anew")
+            raise MapError(f"the maps have voxels of {ours:g} m and {theirs:g} m: fuse one of them again")
 
     def _checked_min_weight(self, min_weight: float | None) -> float:
         """Least weight as given, or the sensor's."""

@@ -59,7 +59,7 @@ def _header(headers: Sequence[CheckpointHeader], blocks: int) -> CheckpointHeade
     first = headers[0]
     for other in headers[1:]:
         if (other.config.voxel_size, other.layers) != (first.config.voxel_size, first.layers):
-            raise MapError("maps of different voxel sizes or layers cannot be added: fuse one anew")
+            raise MapError("maps of different voxel sizes or layers cannot be added: fuse one of them again")
     if blocks > first.config.max_blocks:
         raise MapFull(
             f"the map may hold at most max_blocks = {first.config.max_blocks} blocks; together they have "

@@ -15,6 +15,6 @@ def calm(callback: Callable[[Any], object]) -> Callable[[Any], None]:
         try:
             callback(event)
         except Exception as error:  # noqa: BLE001 - a browser may leave at any moment, in any call
-            log.warning("a browser's wish could not be granted: %s: %s", type(error).__name__, error)
+            log.warning("a request of a browser failed: %s: %s", type(error).__name__, error)
 
     return call

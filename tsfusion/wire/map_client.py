@@ -284,7 +284,7 @@ class MapClient:
         if reply.error is not None:
             raise CommandRefused(self.address, reply.error, retry=reply.retry)
         if reply.answer is None:
-            raise TransportError(f"the server at {self.address} answered without an answer")
+            raise TransportError(f"the server at {self.address} sent a reply without an answer")
         try:
             return reply.answer, questions.unpack(reply.answer, arrays), delay
         except DecodeError as error:

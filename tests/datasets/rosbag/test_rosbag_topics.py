@@ -92,7 +92,7 @@ def test_what_cannot_be_chosen_is_listed(tmp_path: Path) -> None:
             bag.camera_info(f"/{camera}/camera_info", CAMERA, SHAPE, T0)
             bag.cloud(f"/{camera}/points", records(), T0)
     with pytest.raises(
-        DatasetError, match=r"several fit \(/back/depth, /front/depth\): choose with depth_topic"
+        DatasetError, match=r"several topics fit \(/back/depth, /front/depth\): choose one with depth_topic"
     ):
         Bag(path)
     with pytest.raises(DatasetError, match=r"/front/depth \(sensor_msgs/Image, 1\)"):

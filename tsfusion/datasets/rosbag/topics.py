@@ -246,7 +246,7 @@ class TopicChooser:
         best = [one for one in found if rank(one) == highest]
         if len({one.base for one in best}) > 1:
             topics = ", ".join(sorted({one.base for one in best}))
-            raise self._error(f"several fit ({topics}): choose with {option}")
+            raise self._error(f"several topics fit ({topics}): choose one with {option}")
         return max(best, key=lambda one: (one.stream.messages, one.stream.kind == IMAGE))
 
 

@@ -146,7 +146,7 @@ def _times(path: Path) -> list[KeyframeTimes]:
     try:
         return [KeyframeTimes(**{name: int(row[name]) for name in stamps}) for row in rows]
     except (TypeError, ValueError) as error:
-        raise OutputError(f"{path} holds a row that is none: {error}") from error
+        raise OutputError(f"{path} holds a malformed row: {error}") from error
 
 
 def _growth(path: Path) -> dict[str, NDArray[np.float64]]:
@@ -154,7 +154,7 @@ def _growth(path: Path) -> dict[str, NDArray[np.float64]]:
     try:
         return {name: np.array([float(row[name]) for row in rows]) for name in (rows[0] if rows else ())}
     except (TypeError, ValueError) as error:
-        raise OutputError(f"{path} holds a row that is none: {error}") from error
+        raise OutputError(f"{path} holds a malformed row: {error}") from error
 
 
 def _rows(path: Path) -> list[dict[str, str]]:
