@@ -42,20 +42,18 @@ def ask(
     ] = None,
     slice_: Annotated[
         tuple[float, float] | None,
-        typer.Option("--slice", metavar="LOW HIGH", help="What stands between two heights, metres."),
+        typer.Option("--slice", metavar="LOW HIGH", help="Obstacles between two heights, metres."),
     ] = None,
-    distances: Annotated[
-        bool, typer.Option("--distances", help="And how far that is from each cell.")
-    ] = False,
+    distances: Annotated[bool, typer.Option("--distances", help="Also the distance from each cell.")] = False,
     box: Annotated[
         tuple[float, float, float, float] | None,
-        typer.Option(metavar="U V U V", help="Its corners; else around the map."),
+        typer.Option(metavar="U V U V", help="Its corners; default: the whole map."),
     ] = None,
     resolution: Annotated[
-        float | None, typer.Option(metavar="METRES", help="Edge of its cells; else a voxel's.")
+        float | None, typer.Option(metavar="METRES", help="Edge of its cells; default: a voxel.")
     ] = None,
     above_floor: Annotated[
-        bool, typer.Option("--above-floor", help="Its heights count from the floor (a saved map's).")
+        bool, typer.Option("--above-floor", help="Heights count from the floor (saved maps).")
     ] = False,
     up: Annotated[
         str | None, typer.Option(metavar="AXIS", help="Which way is up: z, -y, … or X,Y,Z.")
@@ -73,7 +71,7 @@ def ask(
         float | None,
         options.option("--min-weight", "COUNT", "Samples that a voxel needs to count.", rare=True),
     ] = None,
-    timeout: Annotated[float, typer.Option(metavar="SECONDS", help="For a live answer.")] = 5.0,
+    timeout: Annotated[float, typer.Option(metavar="SECONDS", help="Longest wait for a live answer.")] = 5.0,
     map_: options.Map = None,
     control: options.Control = None,
     key: options.Key = None,

@@ -46,14 +46,14 @@ def forget(
     ],
     *,
     session: Annotated[
-        str | None, typer.Option(metavar="ID", help="Of this session: how its id begins.")
+        str | None, typer.Option(metavar="ID", help="Session, by the beginning of its id.")
     ] = None,
-    client: Annotated[str | None, typer.Option(metavar="NAME", help="Of the client with this key.")] = None,
+    client: Annotated[str | None, typer.Option(metavar="NAME", help="Client, by its key's name.")] = None,
     since: Annotated[
         str | None,
-        typer.Option(metavar="TIME", help="From then on: ISO, or seconds from end."),
+        typer.Option(metavar="TIME", help="Not before: ISO, or seconds from end."),
     ] = None,
-    until: Annotated[str | None, typer.Option(metavar="TIME", help="Up to then.")] = None,
+    until: Annotated[str | None, typer.Option(metavar="TIME", help="Not after.")] = None,
     keyframes: Annotated[
         str | None, typer.Option(metavar="NUMBERS", help="By number in their session: 3-17,20.")
     ] = None,
@@ -65,7 +65,7 @@ def forget(
         ),
     ] = None,
     erase: Annotated[bool, typer.Option("--erase", help="Also delete them from the journal.")] = False,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say which that would be.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say which keyframes would go.")] = False,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
     map_: Annotated[str | None, typer.Option("--map", metavar="NAME", help="Which map.")] = None,
     control: options.Control = None,
@@ -83,7 +83,7 @@ def forget(
     after `tsfusion keys allow NAME --forget`.
 
     Exit status 1 also when nothing fits, or when some that fit stay in the
-    map because its journal has them no more.
+    map because its journal no longer has them.
     """
     from tsfusion.core.errors import JournalError
 

@@ -32,7 +32,7 @@ def fuse(
     ] = None,
     ray: Annotated[str | None, options.option("--ray", "[ADDRESS]", "By a Ray cluster (extra ray).")] = None,
     worker_memory: Annotated[
-        str | None, options.option("--worker-memory", "BYTES", "Of each worker, as 2GB.")
+        str | None, options.option("--worker-memory", "BYTES", "Memory of each worker, as 2GB.")
     ] = None,
     tile_size: Annotated[
         float | None, options.option("--tiles", "METRES", "Mesh in tiles, too: 3D Tiles.")

@@ -83,7 +83,7 @@ def merge(
     *,
     out: Out,
     same_frame: Annotated[
-        bool, typer.Option("--same-frame", help="They are in one frame, though found by scans each.")
+        bool, typer.Option("--same-frame", help="The maps are in one frame; this is not checked.")
     ] = False,
     json: options.Json = False,
 ) -> None:

@@ -25,7 +25,7 @@ def move(
         str, typer.Option("--from", metavar="ADDRESS", help="The server that has it: tcp://HOST:PORT.")
     ],
     to: Annotated[str, typer.Option("--to", metavar="ADDRESS", help="The server that is to have it.")],
-    timeout: Annotated[float, typer.Option(metavar="SECONDS", help="To wait for the end.")] = 3600.0,
+    timeout: Annotated[float, typer.Option(metavar="SECONDS", help="Longest wait for the end.")] = 3600.0,
     key: options.Key = None,
     server_key: options.ServerKey = None,
     json: options.Json = False,

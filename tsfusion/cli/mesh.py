@@ -44,7 +44,7 @@ def mesh(
     keep_islands: options.KeepIslands = None,
     until: Annotated[
         str | None,
-        typer.Option(metavar="TIME", help="As it was: ISO, or seconds from the end."),
+        typer.Option(metavar="TIME", help="As it was: ISO, or seconds from its end."),
     ] = None,
     only: Annotated[
         list[str] | None,
@@ -71,7 +71,7 @@ def mesh(
     ] = False,
     simplify: Annotated[
         str | None,
-        options.option("--simplify", "TARGET", "25%, 50000 triangles, or off by 5mm."),
+        options.option("--simplify", "TARGET", "25%, 50000 triangles, or 5mm of error."),
     ] = None,
     texture: Annotated[
         bool, typer.Option("--texture", help="Colour as sharp as the journal's images.")
@@ -83,7 +83,7 @@ def mesh(
     preview: Annotated[Path | None, typer.Option(metavar="PNG", help="Draw a picture, too.")] = None,
     memory: Annotated[
         str | None,
-        options.option("--memory", "BYTES", "Of the map, as 2GB; else half of the machine's.", rare=True),
+        options.option("--memory", "BYTES", "For the map, as 2GB; default: half of all.", rare=True),
     ] = None,
     control: options.Control = None,
     map_: options.Map = None,

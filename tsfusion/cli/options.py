@@ -88,15 +88,15 @@ State = Annotated[Path | None, option("--state", "DIR", "Keep the journal and th
 Connect = Annotated[str | None, option("--connect", "ADDRESS", "Send to this server, not to its own.")]
 Control = Annotated[
     str | None,
-    option("--control", "ADDRESS", "Its control address; else the port after the other.", rare=True),
+    option("--control", "ADDRESS", "Its control address; default: the next port.", rare=True),
 ]
-Map = Annotated[str | None, option("--map", "NAME", "Which of the server's maps; else default.")]
+Map = Annotated[str | None, option("--map", "NAME", "Which map; without it: default.")]
 NewMap = Annotated[
     str | None,
     option("--map", "NAME", "Map of the server; auto = next free one."),
 ]
 SameFrame = Annotated[
-    bool, option("--same-frame", None, "The poses are in the frame of the map that is there.", rare=True)
+    bool, option("--same-frame", None, "The poses are in the frame of the existing map.", rare=True)
 ]
 Key = Annotated[
     str | None,
@@ -112,12 +112,12 @@ RunJson = Annotated[bool, option("--json", None, "Print run.json, for a program 
 
 _rare_option = functools.partial(option, panel="Source", rare=True)
 
-MaxFrames = Annotated[int | None, option("--max-frames", "N", "Stop after so many.", min=1)]
-Start = Annotated[int, _rare_option("--start", "N", "Skip so many at the start.", min=0)]
-Stride = Annotated[int, _rare_option("--stride", "N", "Take every N-th only.", min=1)]
+MaxFrames = Annotated[int | None, option("--max-frames", "N", "Stop after so many frames.", min=1)]
+Start = Annotated[int, _rare_option("--start", "N", "Skip so many frames at the start.", min=0)]
+Stride = Annotated[int, _rare_option("--stride", "N", "Take only every N-th frame.", min=1)]
 Rate = Annotated[
     float | None,
-    _rare_option("--rate", "HZ", "So many a second; default: as fast as they are taken.", min=1e-3),
+    _rare_option("--rate", "HZ", "Play so many a second; default: as fast as possible.", min=1e-3),
 ]
 Trajectory = Annotated[
     Path | None, option("--trajectory", "FILE", "Poses of another SLAM: TUM's or KITTI's.")

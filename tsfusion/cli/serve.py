@@ -41,20 +41,20 @@ SERVER_OPTIONS: dict[str, Any] = {
     "log_format": _flag("--log-format", "FORMAT", "Log on stderr as text or json."),
     "log_level": _flag("--log-level", "LEVEL", "Log from debug, info, warning or error on."),
     "keep_seconds": Annotated[float | None, options.option(
-        "--keep-seconds", "SECONDS", "Forget what came so long before the newest keyframe.", rare=True)],
+        "--keep-seconds", "SECONDS", "Forget keyframes that came so long before the newest.", rare=True)],
     "keep_keyframes": Annotated[int | None, options.option(
         "--keep-keyframes", "N", "Forget all but the newest N keyframes of a map.", rare=True)],
     "keep_radius": Annotated[float | None, options.option(
-        "--keep-radius", "METRES", "Forget what was seen farther from the newest keyframe.", rare=True)],
-    "directory": _flag("--directory", "FILE", "Who of several servers has which map.", rare=True),
-    "advertise": _flag("--advertise", "ADDRESS", "By which clients reach this server.", rare=True),
+        "--keep-radius", "METRES", "Forget keyframes taken farther from the newest.", rare=True)],
+    "directory": _flag("--directory", "FILE", "File that says which server has which map.", rare=True),
+    "advertise": _flag("--advertise", "ADDRESS", "Address by which clients reach this server.", rare=True),
     "keys": _flag("--keys", "DIR",
                   "Who may connect: `tsfusion keys`; needed beyond this machine."),
     "fuser_memory_bytes": _flag("--memory", "BYTES",
                                 "Memory of each map's blocks, such as 2GB; more wait on the disk."),
     "fuser_disk_bytes": _flag("--disk", "BYTES",
-                              "Most that they may take there; default: what the disk has.", rare=True),
-    "cache": _flag("--cache", "DIR", "Folder where they wait; default: the map's own.", rare=True),
+                              "Most disk space for them; default: all that is free.", rare=True),
+    "cache": _flag("--cache", "DIR", "Folder for them; default: the map's own.", rare=True),
 }  # fmt: skip
 
 

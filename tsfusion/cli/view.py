@@ -49,10 +49,10 @@ def view(
         options.option("--listen", "HOST:PORT", "Where the page is; port 0 = free.", envvar="TSFUSION_VIEW"),
     ] = LISTEN,
     token: Annotated[
-        str | None, options.option("--token", "TEXT", "Needed to open it; else by need, at random.")
+        str | None, options.option("--token", "TEXT", "Needed to open it; default: random, if any.")
     ] = None,
     no_browser: Annotated[
-        bool, options.option("--no-browser", None, "Open none; the address is printed anyway.")
+        bool, options.option("--no-browser", None, "Open no browser; only print the address.")
     ] = False,
     control: options.Control = None,
     key: options.Key = None,
