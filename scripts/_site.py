@@ -29,7 +29,7 @@ BESIDE = {
 }
 MORE = "Guides"  # heading of the navigation for pages that it does not list
 _LINK = re.compile(r"(?<!!)\[([^\]]+)\]\(([^)#\s]+)(#[^)\s]*)?\)")
-_SETTING = re.compile(r"(?:# )?(\w+) = (.*?)(?: ?# (.*))?")
+_SETTING = re.compile(r"(?:# )?(\w+) = ?(.*?) *(?:# (.*))?")
 _DRAWING = re.compile(r'<p><img alt="[^"]*" src="([^"]*assets/[\w-]+\.svg)" ?/?></p>')
 
 
@@ -174,14 +174,14 @@ def settings_page() -> str:
     ]
     for line in to_toml(Config()).splitlines():
         if line.startswith("["):
-            heading = f"## {line}\n"
+            heading = f"\n## {line}\n"
             parts += [heading, parts.pop(), "\n| setting | default | meaning |\n|---|---|---|"]
         elif setting := _SETTING.fullmatch(line):
             name, value, meaning = (group or "" for group in setting.groups())
             cells = (f"`{name}`", f"`{value}`" if value else "", _text(meaning).replace("|", "\\|"))
             parts.append(f"| {' | '.join(cells)} |")
         elif line.startswith("# "):
-            parts.append(f"\n{line[2:]}")
+            parts.append(line[2:])
     parts += ["\n## Sensors\n", 'What `sensor = "NAME"` stands for; a setting of `[volume]` overrides it.\n']
     parts += ["| | " + " | ".join(f"`{name}`" for name in SENSORS) + " |", "|---" * (len(SENSORS) + 1) + "|"]
     for name in SensorModel.__struct_fields__:

@@ -9,6 +9,7 @@ from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
+import msgspec
 import pytest
 import typer
 from headless_browser import browser
@@ -16,6 +17,7 @@ from repository import ROOT
 
 import tsfusion
 from tsfusion import cli
+from tsfusion.core.config import Config
 
 pytestmark = pytest.mark.skipif(
     find_spec("material") is None or find_spec("mkdocstrings_handlers") is None,
@@ -74,6 +76,16 @@ def test_the_reference_has_every_verb_and_every_name(site: Path) -> None:
     ids = Loaded(site / "reference" / "python.html").ids
     found = {one.rsplit(".", 1)[-1] for one in ids}
     assert not set(tsfusion.__all__) - {"__version__"} - found
+
+
+def test_the_settings_have_a_table_for_each_part(site: Path) -> None:
+    page = (site / "reference" / "settings.html").read_text(encoding="utf-8")
+    parts = re.split(r'<h2 id="(\w+)">', page)[1:]
+    found = dict(zip(parts[::2], parts[1::2], strict=True))
+    for name in ("volume", "server", "client", "scan"):
+        fields = {field.name for field in msgspec.structs.fields(getattr(Config(), name))}
+        assert set(re.findall(r"<tr>\s*<td><code>(\w+)</code>", found[name])) == fields, name
+        assert "<td>##" not in page
 
 
 def test_each_drawing_takes_the_colours_of_the_page(site: Path) -> None:
