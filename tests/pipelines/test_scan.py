@@ -15,7 +15,17 @@ import cv2
 import numpy as np
 import pytest
 from clients_and_spools import NOBODY
-from command_processes import end, environment, eventually, python, read_until, server, started, tsfusion
+from command_processes import (
+    Here,
+    end,
+    environment,
+    eventually,
+    python,
+    read_until,
+    server,
+    started,
+    tsfusion,
+)
 from small_recordings import seven_scenes
 
 from tsfusion import Volume, open_dataset
@@ -30,7 +40,7 @@ from tsfusion.pipelines import engine
 from tsfusion.pipelines import scan as pipelines_scan
 from tsfusion.pipelines.scan_results import ScanSummary
 from tsfusion.scanner.sources.source import LiveSource
-from tsfusion.wire.queries import fetch_status
+from tsfusion.wire.queries import fetch_health
 
 VOXEL = 0.05
 SOURCE = "synthetic:room"
@@ -120,7 +130,7 @@ def test_without_taichi_to_a_server_elsewhere(walk: Path, tmp_path: Path) -> Non
         assert not (tmp_path / "out" / "mesh.ply").exists()
         assert run["peak_rss_bytes"]["client"] < 200e6
         sent = run["keyframes_sent"]
-        assert eventually(lambda: fetch_status(address, map_name="hall").keyframes_fused == sent)
+        assert eventually(lambda: fetch_health(address).maps["hall"].keyframes_fused == sent)
         kept = read_tum(tmp_path / "out" / "keyframes.txt")
         again = tsfusion(
             "scan", walk, "--connect", address, "--map", "hall", "--max-frames", 1,
@@ -158,7 +168,7 @@ def test_ctrl_c_without_a_server_keeps_all_for_the_next_scan(walk: Path, tmp_pat
             )
         )  # fmt: skip
         assert more["left"] == 0
-        assert eventually(lambda: fetch_status(address).keyframes_durable == run["left"])
+        assert eventually(lambda: fetch_health(address).maps["default"].keyframes_durable == run["left"])
 
 
 def test_ctrl_c_ends_a_scan_with_its_results(tmp_path: Path) -> None:
@@ -202,9 +212,9 @@ def test_a_recording_that_breaks_off_keeps_what_came_before(tmp_path: Path) -> N
     ],
 )
 def test_what_cannot_be_scanned_is_one_clear_line(
-    tmp_path: Path, arguments: list[str], status: int, words: str
+    here: Here, tmp_path: Path, arguments: list[str], status: int, words: str
 ) -> None:
-    done = tsfusion("scan", *arguments, "--out", tmp_path / "out")
+    done = here("scan", *arguments, "--out", tmp_path / "out")
     assert done.returncode == status
     assert words in done.stderr
     assert "Traceback" not in done.stderr
