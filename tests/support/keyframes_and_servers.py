@@ -25,7 +25,7 @@ from tsfusion.wire import codec, key_folder, sockets
 from tsfusion.wire.corrections import Correction
 from tsfusion.wire.curve import ClientKeys, client_keys
 
-DEADLINE = 60.0
+DEADLINE = 120.0
 CAMERA = Intrinsics(40.0, 40.0, 31.5, 23.5)
 SHAPE = (48, 64)
 VOLUME = VolumeConfig(voxel_size=0.04, threads=1)
