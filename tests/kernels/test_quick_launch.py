@@ -10,7 +10,9 @@ from tsfusion.kernels.quick_launch import QuickLaunch
 
 
 @ti.kernel
-def scale(values: ti.types.ndarray(), factor: ti.f64, shift: ti.i32, sums: ti.types.ndarray(ndim=1)):  # type: ignore[valid-type]
+def scale(
+    values: ti.types.ndarray(), factor: ti.f64, shift: ti.i32, sums: ti.types.ndarray(dtype=ti.i64, ndim=1)
+):
     """`sums` += rows of `values` · factor + shift."""
     for i in range(values.shape[0]):
         for j in range(values.shape[1]):
@@ -61,4 +63,4 @@ def test_what_another_taichi_keeps_elsewhere_is_launched_as_ever() -> None:
 def test_a_kernel_keeps_its_name_and_docstring() -> None:
     quick = QuickLaunch(scale)
     assert quick.__doc__ == scale.__doc__
-    assert quick.__name__ == "scale"  # type: ignore[attr-defined]
+    assert quick.__name__ == "scale"
