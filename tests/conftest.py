@@ -23,12 +23,9 @@ from tsfusion.core import logs
 from tsfusion.core.errors import MissingDependency
 
 os.environ["PYTHONPATH"] = os.pathsep.join(sys.path)  # programs that tests start find what tests find
-if os.environ.pop("PYTHONDONTWRITEBYTECODE", None):
-    # Not in the tree, then, but somewhere: each of hundreds of commands would compile its modules anew.
-    os.environ["PYTHONPYCACHEPREFIX"] = tempfile.mkdtemp(prefix="tsfusion-pycache-")
-    atexit.register(shutil.rmtree, os.environ["PYTHONPYCACHEPREFIX"], ignore_errors=True)
 OPTIONAL = ("kiss_icp", "open3d", "pooch", "pyrealsense2", "rosbags", "scipy", "xatlas")
 STDERR = pytest.StashKey[Any]()
+BYTECODE = "TEST_BYTECODE"  # environment: folder of what the commands that tests start compile
 DATA = Path(os.environ.get("TSFUSION_DATA", Path(__file__).parents[2] / "shared" / "data"))
 
 
@@ -44,6 +41,19 @@ def pytest_configure(config: pytest.Config) -> None:
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     config.stash[STDERR] = os.fdopen(os.dup(2), "w")
+    if os.environ.get("PYTHONDONTWRITEBYTECODE") and BYTECODE not in os.environ:
+        os.environ[BYTECODE] = tempfile.mkdtemp(prefix="tsfusion-bytecode-")
+        atexit.register(shutil.rmtree, os.environ[BYTECODE], ignore_errors=True)
+
+
+def pytest_collection_finish() -> None:
+    """Let hundreds of commands compile their modules once, also where nothing may be left in the tree.
+
+    Not this process, nor other workers: compiling an installed package may warn, which is an error here.
+    """
+    if BYTECODE in os.environ:
+        os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+        os.environ["PYTHONPYCACHEPREFIX"] = os.environ[BYTECODE]
 
 
 def pytest_unconfigure(config: pytest.Config) -> None:
