@@ -122,12 +122,12 @@ def state(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_mesh_of_map_state_and_journal_agree(state: Path, tmp_path: Path) -> None:
+def test_mesh_of_map_state_and_journal_agree(state: Path, here: Here, tmp_path: Path) -> None:
     vertices = set()
     for index, source in enumerate(
         ([state / "maps/default/map.tsf"], [state], [state / "maps/default/journal", "--voxel-size", VOXEL])
     ):
-        done = tsfusion("mesh", source[0], tmp_path / f"{index}.ply", *source[1:], "--json")
+        done = here("mesh", source[0], tmp_path / f"{index}.ply", *source[1:], "--json")
         assert done.returncode == 0, done.stderr
         figures = json.loads(done.stdout)
         vertices.add(figures["vertices"])

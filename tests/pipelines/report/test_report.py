@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-from command_processes import tsfusion
+from command_processes import Here, tsfusion
 from headless_browser import browser
 
 from tsfusion.core.errors import OutputError
@@ -235,14 +235,14 @@ def test_a_large_mesh_becomes_a_small_one_of_the_same_shape() -> None:
     assert (np.einsum("ij,ij->i", facing, small.vertices[small.faces[:, 0]]) > 0).mean() > 0.99
 
 
-def test_the_command_writes_a_page_of_a_run_and_of_a_map(folder: Path, tmp_path: Path) -> None:
+def test_the_command_writes_a_page_of_a_run_and_of_a_map(folder: Path, here: Here, tmp_path: Path) -> None:
     done = tsfusion("report", folder, "--out", tmp_path / "page.html")
     assert done.returncode == 0, done.stderr
     assert "page.html" in done.stdout
     assert (tmp_path / "page-side4.png").exists()
-    wrong = tsfusion("report", folder, "--out", tmp_path / "page.pdf")
+    wrong = here("report", folder, "--out", tmp_path / "page.pdf")
     assert (wrong.returncode, "expected a name ending in .html" in wrong.stderr) == (1, True)
-    nothing = tsfusion("report", tmp_path / "nothing", "--out", tmp_path / "nothing.html")
+    nothing = here("report", tmp_path / "nothing", "--out", tmp_path / "nothing.html")
     assert nothing.returncode == 1
     assert "does not exist" in nothing.stderr
 
