@@ -8,26 +8,7 @@ from tsfusion.kernels.integrate import QUANTA_PER_VOXEL, lane_weight
 from tsfusion.kernels.voxel_traversal import RUN, VOXEL_LIMIT, block_key, offset_in_block, vec3i
 from tsfusion.kernels.voxel_values import BANDS, distance_as_float
 
-CORNER, ALONG_ROW, ALONG_COLUMN, ALONG_HEIGHT = range(4)  # rows of a `frame`
-FRACTION_BITS = 32
-FRACTIONS = float(1 << FRACTION_BITS)
-FARTHEST = float(1 << 30)  # voxels: beyond any map
-KEPT = 16  # blocks of a column that the next column looks for first
-
 vec3d = ti.types.vector(3, ti.f64)
-
-
-@ti.func
-def frame_row(frame: ti.template(), n: ti.template()):
-    """Row n of a (4, 3) array."""
-    return vec3d(frame[n, 0], frame[n, 1], frame[n, 2])
-
-
-@ti.func
-def in_fractions(place):
-    """A place in voxels as int64, 2⁻³² voxel: a step is then an addition."""
-    held = ti.math.clamp(place, -FARTHEST, FARTHEST) * ti.cast(FRACTIONS, ti.f64)
-    return ti.cast(ti.floor(held + 0.5), ti.i64)
 
 
 @ti.kernel
@@ -38,7 +19,10 @@ def read_columns(
     column: ti.i32,
     across: ti.i32,
     heights: ti.i32,
-    frame: ti.types.ndarray(dtype=ti.f64, ndim=2),
+    corner: vec3d,
+    along_row: vec3d,
+    along_column: vec3d,
+    along_height: vec3d,
     map_keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
     map_slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
     sums: ti.types.ndarray(dtype=ti.i64, ndim=2),
@@ -52,16 +36,13 @@ def read_columns(
     seen, NaN where none was; `seen`: how many were.
 
     Cell n is (`row` + n // `width`, `column` + n % `width`). It has `across`² columns of `heights` samples;
-    these are `ALONG_ROW`, `ALONG_COLUMN`, `ALONG_HEIGHT` of the `frame` apart, in voxels, from its `CORNER`
-    on.
+    these are `along_row`, `along_column`, `along_height` apart, in voxels, from `corner` on.
     """
     mask = map_keys.shape[0] - 1
     for run in range(BANDS * RUN):  # run loop: kernels/__init__.py
         if run % RUN == 0:
             band, count = run // RUN, cells.shape[0]
-            corner, up = frame_row(frame, CORNER), in_fractions(frame_row(frame, ALONG_HEIGHT))
-            along_row, along_column = frame_row(frame, ALONG_ROW), frame_row(frame, ALONG_COLUMN)
-            kept_keys, kept_slots = ti.Vector([ti.i64(0)] * KEPT), ti.Vector([-1] * KEPT)
+            last, slot = vec3i(2147483647), -1
             for n in range(count * band // BANDS, count * (band + 1) // BANDS):
                 cell = cells[n]
                 first_row = (row + cell // width) * across
@@ -70,21 +51,14 @@ def read_columns(
                 for line in range(across * across):
                     r, c = first_row + line // across, first_column + line % across
                     foot = corner + along_row * ti.cast(r, ti.f64) + along_column * ti.cast(c, ti.f64)
-                    last, slot, kept = vec3i(2147483647), -1, -1
-                    place = in_fractions(foot)
-                    for _ in range(heights):
-                        voxel = ti.cast(place >> FRACTION_BITS, ti.i32)
-                        place += up
-                        if ti.max(ti.abs(voxel[0]), ti.abs(voxel[1]), ti.abs(voxel[2])) < VOXEL_LIMIT - 1:
+                    for h in range(heights):
+                        place = foot + along_height * ti.cast(h, ti.f64)
+                        if ti.max(ti.abs(place[0]), ti.abs(place[1]), ti.abs(place[2])) < VOXEL_LIMIT - 1:
+                            voxel = ti.floor(place, ti.i32)
                             block = voxel >> 3
                             if block[0] != last[0] or block[1] != last[1] or block[2] != last[2]:
                                 last = block
-                                kept = (kept + 1) % KEPT  # as high as the same one of the column before
-                                key = block_key(voxel)
-                                if kept_keys[kept] != key:
-                                    kept_keys[kept] = key
-                                    kept_slots[kept] = map_find(map_keys, map_slots, mask, key)
-                                slot = kept_slots[kept]
+                                slot = map_find(map_keys, map_slots, mask, block_key(voxel))
                             if slot >= 0:
                                 o = offset_in_block(voxel)
                                 packed = sums[slot, o]

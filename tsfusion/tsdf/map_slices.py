@@ -144,12 +144,11 @@ class CurrentSlice:
         along_column, along_row = (axis * (grid.resolution / n / size) for axis in grid.axes[:2])
         along_height = grid.axes[2] * ((grid.high - grid.low) / self._heights / size)
         corner = grid.axes[2] * (grid.low / size) + (along_column + along_row + along_height) / 2
-        frame = np.stack([corner, along_row, along_column, along_height])
         for i in range(0, len(cells), _PART):
             part = cells[i : i + _PART]
             kernels.read_columns(
                 part, self._shape[1], int(self._first[0]), int(self._first[1]), n, self._heights,
-                frame, store.hash_keys, store.hash_slots,
+                corner, along_row, along_column, along_height, store.hash_keys, store.hash_slots,
                 store.sums, store.correction, int(store.corrected), self._least, self._values, self._seen,
             )  # fmt: skip
             store.rest()
