@@ -17,7 +17,7 @@ from tsfusion import Client, MapClient, journal
 from tsfusion.core.config import ClientConfig
 from tsfusion.core.errors import TransportError
 from tsfusion.journal import state_folder
-from tsfusion.wire import queries
+from tsfusion.wire import queries, questions
 from tsfusion.wire.map_events import MapEvent, SurfaceUpdate
 from tsfusion.wire.map_watcher import MapWatcher
 
@@ -108,7 +108,7 @@ def test_a_live_map_moves_and_every_keyframe_is_in_it_once(
     acknowledged_more(sender)
     status = tsfusion("status", "--connect", one.address, "--map", "default")
     assert status.returncode == 0, status.stdout + status.stderr
-    with MapClient(one.address, timeout=DEADLINE) as live:
+    with MapClient(one.address, timeout=questions.LONGEST_S) as live:
         assert live.sample([[0.0, 0.0, 1.0]]).state.keyframes >= FEW
         assert live.address == two.address
     assert len(queries.fetch_mesh(one.address).faces)

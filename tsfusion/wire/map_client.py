@@ -258,7 +258,7 @@ class MapClient:
         """The answer, its arrays, and the seconds that it took."""
         seconds = self.timeout if timeout is None else timeout
         if not 0 < seconds <= questions.LONGEST_S:
-            raise InvalidConfig(f"timeout must be > 0 and up to {questions.LONGEST_S:g} s, got {timeout}")
+            raise InvalidConfig(f"timeout must be > 0 and up to {questions.LONGEST_S:g} s, got {seconds:g}")
         if problem := question.problem([memoryview(frame) for frame in frames]):
             raise InvalidConfig(problem)
         began, self._number = time.monotonic(), self._number + 1

@@ -194,7 +194,7 @@ def test_names_are_text_whatever_they_hold(tmp_path: Path) -> None:
         ("run.json", b"{", "cannot read"),
         ("run.json", b'{"a": 1}', "is of no run"),
         ("mesh.ply", b"ply\nnonsense", "cannot read"),
-        ("delay.csv", b"seq,captured_ns\n1,x\n", "a row that is none"),
+        ("delay.csv", b"seq,captured_ns\n1,x\n", "holds a malformed row"),
     ],
 )
 def test_damaged_results_are_one_line(tmp_path: Path, name: str, content: bytes, why: str) -> None:
