@@ -48,6 +48,8 @@ def test_taichi_refuses_what_it_would_refuse() -> None:
         quick(values, 1.0, 1, np.zeros((4, 1), np.int64))
     with pytest.raises(ti.TaichiRuntimeTypeError):
         quick(values, 1.0, 1.5, sums)
+    with pytest.raises(AssertionError, match=">f4"):
+        quick(values.astype(">f4"), 1.0, 1, sums)
     assert (sums == 16).all()
 
 

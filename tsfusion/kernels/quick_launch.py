@@ -76,7 +76,7 @@ def _kind(arguments: tuple[Any, ...]) -> tuple[int, ...] | None:
     kind = []
     for argument in arguments:
         if isinstance(argument, np.ndarray):
-            if not argument.flags.c_contiguous:
+            if not (argument.flags.c_contiguous and argument.dtype.isnative):  # `num` says nothing of bytes
                 return None
             kind.append(argument.dtype.num << 4 | argument.ndim)
         elif isinstance(argument, int | np.integer):
