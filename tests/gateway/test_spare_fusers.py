@@ -3,15 +3,20 @@
 
 import os
 import signal
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import pytest
+import zmq
 from keyframes_and_servers import connected, until
 from served_gateway import Served, record, serving_here
 
-from tsfusion.core.config import VolumeConfig
+from tsfusion.core.config import ServerConfig, VolumeConfig
+from tsfusion.gateway import fuser_process
+from tsfusion.gateway.spare_fusers import SpareFusers
 from tsfusion.wire import sockets
 
 
@@ -70,3 +75,32 @@ def test_they_end_with_the_server(tmp_path: Path) -> None:
         served.until(lambda: spares(served))
         (one,) = served.gateway.maps._spares._spares
     assert one.process.status is not None
+
+
+def test_none_begins_while_the_server_ends(served: Served) -> None:
+    maps = served.gateway.maps
+    maps.finish()
+    for _ in range(3):  # as until every map is saved
+        served.step()
+        assert not maps._spares._spares
+
+
+def test_after_one_that_never_gets_ready_the_next_one_waits(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    broken = (sys.executable, "-c", "raise SystemExit(3)")
+    volume, context = VolumeConfig(), zmq.Context[Any]()
+    made = SpareFusers(context, ServerConfig(state=str(tmp_path), spare_fusers=1))
+    try:
+        with mock.patch.object(fuser_process, "COMMAND", broken):
+            for pause in (1, 2, 4):
+                made._start_at = 0.0  # it is over
+                made.step(volume, may_start=True)
+                (one,) = made._spares
+                until(lambda one=one: one.process.status is not None)
+                made.step(volume, may_start=True)
+                assert not made._spares
+                assert f"it ended with status 3; it is tried again in {pause} s" in caplog.text
+    finally:
+        made.close()
+        context.term()

@@ -2,6 +2,7 @@
 """Fuser processes that wait for a map: started, with their kernels compiled, so that it opens at once."""
 
 import logging
+import time
 from contextlib import suppress
 from typing import Any
 
@@ -14,6 +15,8 @@ from tsfusion.gateway.fuser_process import FuserProcess
 
 log = logging.getLogger(__name__)
 
+_LONGEST_PAUSE = 60.0  # seconds between one start and the next, where they fail
+
 
 class _Spare:
     """A process, and the settings that it is for."""
@@ -21,6 +24,7 @@ class _Spare:
     def __init__(self, process: FuserProcess, volume: VolumeConfig) -> None:
         self.process, self.volume = process, volume
         self.is_warm = False
+        self.problem = ""  # why it cannot be of use; empty = it can
 
     def receive(self) -> None:
         """Take its messages."""
@@ -30,6 +34,8 @@ class _Spare:
                 if isinstance(message, fuser_messages.Started):
                     self.process.note_start()
                     self.process.socket.send(fuser_messages.encode(fuser_messages.Warm(self.volume)))
+                elif isinstance(message, fuser_messages.Failed):
+                    self.problem = message.message
                 self.is_warm |= isinstance(message, fuser_messages.Prepared)
 
 
@@ -39,7 +45,9 @@ class SpareFusers:
     def __init__(self, context: "zmq.Context[Any]", server: ServerConfig) -> None:
         self._context, self._server = context, server
         self._spares: list[_Spare] = []
-        self._was_full = False
+        self._was_full = self._is_closed = False
+        self._failures = 0  # in a row, of those that never became ready
+        self._start_at = 0.0  # time.monotonic()
 
     def take(self, name: str, volume: VolumeConfig) -> FuserProcess:
         """A process for a map: a spare one, or another that begins now.
@@ -54,32 +62,47 @@ class SpareFusers:
         return self._start(name)
 
     def step(self, volume: VolumeConfig, *, may_start: bool) -> None:
-        """Have as many as there are to be, for these settings; one begins after the other.
+        """Have as many as there are to be, for these settings, one after the other; after `close` none.
 
         Args:
             may_start: nobody waits for the processor time that it takes.
         """
+        if self._is_closed:
+            return
         for one in self._spares:
             one.receive()
+            if one.is_warm:
+                self._failures = 0
         for one in [one for one in self._spares if one.process.status is not None or one.volume != volume]:
             self._spares.remove(one)
+            if not one.is_warm and one.volume == volume:
+                self._on_failure(one.problem or f"it ended with status {one.process.status}")
             one.process.close(wait=False)
         count, are_warm = len(self._spares), all(one.is_warm for one in self._spares)
-        if are_warm and may_start and count < self._server.spare_fusers:
+        is_time = may_start and time.monotonic() >= self._start_at
+        if are_warm and is_time and count < self._server.spare_fusers:
             try:
                 self._spares.append(_Spare(self._start(""), volume))
             except (OSError, zmq.ZMQError) as error:
-                log.warning("a spare fuser cannot be started: %s", error)
+                self._on_failure(str(error))
         is_full = bool(count) and are_warm and count >= self._server.spare_fusers
         if is_full and not self._was_full:
             log.info("%s ready", count_of(count, "spare fuser is", "spare fusers are"))
         self._was_full = is_full
 
+    def _on_failure(self, why: str) -> None:
+        """Log it, and wait with the next one: its start takes a second of processor time."""
+        pause = min(2.0**self._failures, _LONGEST_PAUSE)
+        self._failures += 1
+        self._start_at = time.monotonic() + pause
+        log.warning("a spare fuser cannot be started: %s; it is tried again in %.0f s", why, pause)
+
     def _start(self, name: str) -> FuserProcess:
         return FuserProcess(self._context, name, self._server.log_format, self._server.log_level)
 
     def close(self) -> None:
-        """End them."""
+        """End them; no other begins: the server ends, and steps on until its maps are saved."""
+        self._is_closed = True
         for one in self._spares:
             one.process.close()
         self._spares.clear()
