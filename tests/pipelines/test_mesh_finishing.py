@@ -155,3 +155,21 @@ def test_a_mesh_that_would_outgrow_memory_is_refused(here: Here, saved: Path, tm
     assert done.returncode != 0
     assert "--simplify needs all of the mesh" in done.stderr
     assert not (tmp_path / "a.ply").exists()
+
+
+def test_of_a_map_too_large_for_a_step_the_part_around_the_box_is_taken(
+    saved: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mesh_finishing, "_MARGIN", 4)
+    whole = Volume.load(saved, threads=2)
+    steps = {"fill_holes": False, "simplify": True, "texture": False}
+    box, most = (-0.4, -0.4, 0.0, -0.1, 0.4, 0.4), 3 * whole.stats().bytes
+    with pytest.raises(InvalidConfig, match="--simplify needs all of the mesh"):
+        mesh_finishing.fitting(whole, None, most, **steps)
+    with pytest.raises(InvalidConfig, match="a smaller one"):
+        mesh_finishing.fitting(whole, (-9, -9, -9, 9, 9, 9), most, **steps)
+    part = mesh_finishing.fitting(whole, box, most, **steps)
+    assert part.stats().bytes < whole.stats().bytes
+    found, expected = (one.extract_mesh().cropped(box) for one in (part, whole))
+    assert len(found.faces) == len(expected.faces) > 1000
+    assert mesh_finishing.fitting(whole, box, 4 * whole.stats().bytes, **steps) is whole

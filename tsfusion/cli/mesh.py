@@ -151,9 +151,9 @@ def mesh(
                 raise InvalidConfig("--drop-islands needs all of the mesh, which is too large for memory")
             _write_tiles(found, source, out, given_up, min_component=min_component, json=json)
             return
-        mesh_finishing.check_memory(
-            found.volume.stats().bytes, 2 * most, fill_holes=fill_holes is not None,
-            simplify=simplify is not None, texture=texture,
+        found.volume = mesh_finishing.fitting(
+            found.volume, crop, most, fill_holes=fill_holes is not None, simplify=simplify is not None,
+            texture=texture,
         )  # fmt: skip
         made, legend = _extracted(found.volume, source, fill_holes, json), found.legend
     if given_up is not None:

@@ -112,9 +112,29 @@ def check_memory(map_bytes: int, most_bytes: int, *, fill_holes: bool, simplify:
     if times and needed > most_bytes:
         raise InvalidConfig(
             f"{flag} needs all of the mesh, and may take {needed / 1e9:.3g} GB for a map of "
-            f"{map_bytes / 1e9:.3g} GB, where {most_bytes / 1e9:.3g} GB may be taken: give a --crop, or more "
-            "--memory"
+            f"{map_bytes / 1e9:.3g} GB, where {most_bytes / 1e9:.3g} GB may be taken: give a --crop, a "
+            "smaller one, or more --memory"
         )
+
+
+def fitting(volume: "Volume", crop: Box | None, most_bytes: int, **steps: bool) -> "Volume":
+    """The map that a mesh is made from: where the steps would outgrow memory, the part around the box alone.
+
+    Args:
+        most_bytes: that the map may take; the steps and the map together take twice as much.
+        steps: as of `check_memory`.
+
+    Raises:
+        InvalidConfig: when they would take more, with the box, too; OutputError: as `part_around`.
+    """
+    try:
+        check_memory(volume.stats().bytes, 2 * most_bytes, **steps)
+    except InvalidConfig:
+        if crop is None:
+            raise
+        volume = part_around(volume, crop, most_bytes)
+        check_memory(volume.stats().bytes, 2 * most_bytes, **steps)
+    return volume
 
 
 def part_around(volume: "Volume", box: Box, most_bytes: int) -> "Volume":
