@@ -15,6 +15,7 @@ _SIDES = 12  # that are tried
 _SAMPLE = 20  # points of a tile
 _SHARE = (0.5, 99.5)  # percent of the points that are in the picture
 _FILLED = 0.92  # of the picture
+_MOST_VIEWS = 16  # of the whole map that are kept: for windows of so many shapes
 
 
 class View(NamedTuple):
@@ -91,6 +92,8 @@ class WholeViews:
                 self._sample = sample(self._tiles)
             view = whole(self._sample, self._up, aspect, covered=covered)
             if view is not None:
+                if len(self._views) >= _MOST_VIEWS:  # a window that is drawn larger has many
+                    self._views.clear()
                 self._views[aspect, covered] = view
         return view
 
