@@ -136,3 +136,23 @@ def test_what_is_kept_is_bounded_and_counted(views: list[Keyframe], monkeypatch:
         volume.sample(points, min_weight=weight)
     assert volume.stats().scratch_bytes - before < 3 * kept
     assert not (volume._store.dirty[: volume._store.count] & ASKED).any()
+
+
+def test_what_a_settled_view_keeps_is_bounded(views: list[Keyframe], monkeypatch: pytest.MonkeyPatch) -> None:
+    volume = Volume(VOXEL, threads=2)
+    volume.integrate(views[0])
+    camera = views[0].intrinsics, views[0].T_world_camera, (60, 80)
+    seen = volume.raycast(*camera, surface="raw")
+    volume.integrate(views[0])
+    settled = volume.raycast_settled(*camera, surface="raw")
+    assert settled is not None
+    assert np.array_equal(settled.depth, seen.depth)
+    (tiles,) = volume._tiles.values()
+    assert tiles._before
+    monkeypatch.setattr(surface_tiles, "MOST_BYTES", 1000)
+    volume.integrate(views[1])  # another side of the sphere
+    assert volume.settled_stamp(surface="raw") is None
+    assert volume.raycast_settled(*camera, surface="raw") is None
+    assert not tiles._before
+    now, fresh = (one.raycast(*camera, surface="raw") for one in (volume, copy_of(volume)))
+    assert np.array_equal(now.depth, fresh.depth)

@@ -23,7 +23,7 @@ from tsfusion.tsdf.surface_values import SurfaceView, values_of
 
 SIDE = 8  # blocks
 AT_ONCE = 16  # cubes that are meshed together
-MOST_BYTES = 32 << 20  # of values that are kept, and of meshes
+MOST_BYTES = 32 << 20  # of values that are kept, of meshes, and of meshes before a change
 
 _INSIDE = np.stack(np.meshgrid(*[np.arange(SIDE)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 
@@ -77,7 +77,7 @@ class SurfaceTiles:
             self._values.clear()
             self._meshes.clear()
             self._listed, self._numbers = 0, self._numbers[:0]
-            self.settled = None
+            self._forget_settled()
         elif len(changed):
             reached = field_regularizer.around(changed, self._store, self._reach)
             self._values.forget(_tiles_of(reached))
@@ -94,6 +94,12 @@ class SurfaceTiles:
             self._changed.add(number)
             if (piece := self._meshes.get(number)) is not None:
                 self._before[number] = piece
+        if sum(piece.nbytes for piece in self._before.values()) > MOST_BYTES:
+            self._forget_settled()  # the map has become another one while nobody looked at all of it
+
+    def _forget_settled(self) -> None:
+        self.settled = None
+        self._changed, self._before, self._lacking = set(), {}, None
 
     def settle(self, numbers: Sequence[int]) -> None:
         """Note that a view of these cubes has been made of the map as it is."""
