@@ -209,8 +209,8 @@ class MapWatcher:
         """Watch the map at the server that has it by now."""
         try:
             data, control = place_of(elsewhere, self._keys)
-        except InvalidConfig as error:
-            self._refusal = f"the map {self._map} is said to be at {elsewhere.address}: {error}"
+        except TransportError as error:
+            self._refusal = str(error)
             return
         self.address, self._control = data, control
         self._publish = sockets.connect_address(sockets.publish_address(data, control, None))

@@ -11,7 +11,7 @@ import zmq
 from numpy.typing import NDArray
 
 from tsfusion.core.config import DEFAULT_MAP
-from tsfusion.core.errors import DecodeError, NotAllowed, ServerUnreachable, TransportError
+from tsfusion.core.errors import DecodeError, InvalidConfig, NotAllowed, ServerUnreachable, TransportError
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.wire import messages, sockets
 from tsfusion.wire.connection import Connection
@@ -222,14 +222,17 @@ def place_of(elsewhere: Elsewhere, keys: ClientKeys | None) -> tuple[str, str]:
     """Data and control address of a server that a map is said to be at.
 
     Raises:
-        InvalidConfig: for addresses that are none, and without keys for those of other machines: anybody may
+        TransportError: for addresses that are none, and without keys for those of other machines: anybody may
             have said so.
     """
-    data = sockets.connect_address(elsewhere.address)
-    control = sockets.connect_address(control_address(data, elsewhere.control or None))
-    if keys is None:
-        sockets.check_reachable(data, has_keys=False)
-        sockets.check_reachable(control, has_keys=False)
+    try:
+        data = sockets.connect_address(elsewhere.address)
+        control = sockets.connect_address(control_address(data, elsewhere.control or None))
+        if keys is None:
+            sockets.check_reachable(data, has_keys=False)
+            sockets.check_reachable(control, has_keys=False)
+    except InvalidConfig as error:
+        raise TransportError(f"the map is said to be at {elsewhere.address}: {error}") from error
     return data, control
 
 
