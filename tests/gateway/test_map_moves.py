@@ -104,6 +104,23 @@ def test_a_server_that_falls_silent_loses_its_claim(asking: Asking, monkeypatch:
     assert "its move was given up" in str(asking.ask("commit", address="tcp://127.0.0.1:9").error)
 
 
+def test_a_move_that_cannot_begin_leaves_the_map_as_it_was(
+    asking: Asking, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hosted = asking.served.gateway.maps.get("default")
+    assert hosted is not None
+
+    def fails() -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as full:
+        full.setattr(hosted._journal, "rotate", fails)
+        assert "cannot close a file" in str(asking.ask("list").error)
+    assert not hosted.is_leaving
+    assert asking.parcel("list").files
+    assert hosted.is_leaving
+
+
 @pytest.mark.parametrize(
     "file", ["../../lock", "journal/../map.tsf", "/etc/passwd", "quarantine/../../x.mcap", "fuser.lock"]
 )

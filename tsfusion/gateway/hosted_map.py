@@ -252,8 +252,8 @@ class HostedMap:
         Raises:
             JournalError: when the disk refuses.
         """
-        self.is_leaving = True
         self._close_segment()
+        self.is_leaving = True  # not where that fails: nobody would have it stay
         self._checkpoints.ask()
 
     def freeze(self) -> None:
