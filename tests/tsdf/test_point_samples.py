@@ -93,6 +93,35 @@ def test_voxels_with_fewer_votes_are_unseen(volume: Volume, min_weight: float) -
     assert 0 < np.isfinite(found.distance).sum() < len(points)
 
 
+@pytest.mark.parametrize("surface", ["raw", "field"])
+@pytest.mark.parametrize("regularizer", ["off", "ray"])
+@pytest.mark.parametrize("far", [0, 40])
+def test_an_answer_does_not_depend_on_how_many_points_are_asked(
+    surface: str, regularizer: str, far: int
+) -> None:
+    """Many points go by a table of the map's blocks, unless these lie too far apart."""
+    volume = filled(6, regularizer=regularizer)
+    if far:
+        there = np.full((1, 3), far * 8 * VOXEL, np.float32)
+        volume.integrate(points=there, origins=there - np.float32(0.2), T_world_camera=np.eye(4))
+    random = np.random.default_rng(7)
+    count = 20 * volume.stats().blocks
+    points = random.uniform(-0.9, 0.9, (count, 3))
+    snapped = random.random((count, 3)) < 0.4
+    points[snapped] = np.round(points[snapped] / VOXEL * 2) * VOXEL / 2  # centres and borders
+    points[:6] = [
+        (np.nan, 0, 0), (0, np.inf, 0), (1e30, 0, 0), (0, 0, -1e30), (52424, 0, 0), (0.1, -52428, 0),
+    ]  # fmt: skip
+    by_table = volume.sample(points, surface=surface)  # type: ignore[arg-type]
+    assert 0.1 < np.isfinite(by_table.distance).mean() < 0.9
+    for first in range(0, count, count // 40):
+        part = slice(first, first + 10)
+        found = volume.sample(points[part], surface=surface)  # type: ignore[arg-type]
+        for name, values in vars(found).items():
+            expected = getattr(by_table, name)[part]
+            assert np.array_equal(values.view(np.uint32), expected.view(np.uint32)), name
+
+
 def test_an_empty_map_has_seen_nothing() -> None:
     found = Volume(VOXEL, threads=2).sample(np.zeros((3, 3)))
     assert np.isnan(found.distance).all()

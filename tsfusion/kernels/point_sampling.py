@@ -19,6 +19,7 @@ ONE = 65536.0  # of a voxel
 UNKNOWN = -2  # slot of a block that was not looked up
 BANDS = 64  # of blocks: units of parallel work
 BAND = 512  # points that one thread takes at a time
+BATCH = 64  # points of a band that wait for memory together
 
 # What values are: Σ w·m / Σ w; that, with what `correction` adds to Σ w·m; or what `pair` put beside Σ w
 FUSED, CORRECTED, SOLVED = 0, 1, 2
@@ -117,6 +118,37 @@ def blend_shares(v, f):
         if share > 0.0:
             total += share * v[c]
     return total
+
+
+@ti.func
+def write_sample(
+    n,
+    packed,
+    held,
+    f,
+    kind,
+    min_weight,
+    metres,
+    distance: ti.template(),
+    weight: ti.template(),
+    gradient: ti.template(),
+):
+    """Sample n: of the sums of its eight corners, at the place f in their cell."""
+    v = corners_f(0.0)
+    w = corners_f(0.0)
+    for c in ti.static(range(8)):
+        v[c], w[c] = value_of(packed[c], held[c], kind, min_weight)
+    total, slope = blend(v, f)
+    if not (total == total):  # Taichi's != is false of NaN
+        total = blend_shares(v, f)
+    slope *= ti.static(1.0 / QUANTA_PER_VOXEL)
+    # along oblique rays the distance grows faster than that to the surface
+    steep = slope.norm()
+    shorter = 1.0 / ti.select(steep > 1.0, steep, 1.0)
+    distance[n] = total * metres * shorter
+    weight[n] = blend(w, f)[0] * ti.static(1.0 / WEIGHT_ONE)
+    for a in ti.static(range(3)):
+        gradient[n, a] = slope[a] * shorter
 
 
 @ti.kernel
@@ -221,19 +253,82 @@ def interpolate(
                             if kind == SOLVED:
                                 row = row_of[slot]
                             packed[c], held[c] = read_voxel(row, o, sums, kind, correction)
-                v = corners_f(0.0)
-                w = corners_f(0.0)
-                for c in ti.static(range(8)):
-                    v[c], w[c] = value_of(packed[c], held[c], kind, min_weight)
                 f = ti.cast(place & 65535, ti.f32) * ti.static(1.0 / ONE)
-                total, slope = blend(v, f)
-                if not (total == total):  # Taichi's != is false of NaN
-                    total = blend_shares(v, f)
-                slope *= ti.static(1.0 / QUANTA_PER_VOXEL)
-                # along oblique rays the distance grows faster than that to the surface
-                steep = slope.norm()
-                shorter = 1.0 / ti.select(steep > 1.0, steep, 1.0)
-                distance[n] = total * metres * shorter
-                weight[n] = blend(w, f)[0] * ti.static(1.0 / WEIGHT_ONE)
-                for a in ti.static(range(3)):
-                    gradient[n, a] = slope[a] * shorter
+                write_sample(n, packed, held, f, kind, min_weight, metres, distance, weight, gradient)
+
+
+@ti.kernel
+def interpolate_within(
+    points: ti.types.ndarray(ndim=2),
+    per_metre: ti.f64,
+    rows: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    begin: vec3i,
+    size: vec3i,
+    sums: ti.types.ndarray(dtype=ti.i64, ndim=2),  # SOLVED: pairs
+    min_weight: ti.i32,
+    kind: ti.i32,
+    correction: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    distance: ti.types.ndarray(dtype=ti.f32, ndim=1),
+    weight: ti.types.ndarray(dtype=ti.f32, ndim=1),
+    gradient: ti.types.ndarray(dtype=ti.f32, ndim=2),
+):
+    """As `interpolate`, to the bit, at many points: by a table instead of the hash, and many at once.
+
+    `rows` has the rows in `sums` of the blocks in a box, which begins at block `begin` and has `size` of them
+    along x, y and z: -1 where there is none, as in the first two layers along each axis and in the last.
+
+    Points in random order wait for memory; here, those of a batch together: all are placed, then all sums are
+    touched that they need, then these are blended. Meanwhile a point's row of the answer has its block
+    (`weight`, bits), its voxel (`distance`, bits) and its place in the cell (`gradient`).
+    """
+    count = points.shape[0]
+    metres = ti.cast(1.0 / (per_metre * QUANTA_PER_VOXEL), ti.f32)
+    along = vec3i(size[1] * size[2], size[2], 1)
+    for run in range((count + BAND - 1) // BAND * RUN):  # run loop: kernels/__init__.py
+        if run % RUN == 0:
+            for part in range(BAND // BATCH):
+                first = run // RUN * BAND + part * BATCH
+                end = ti.min(first + BATCH, count)
+                for n in range(first, end):
+                    place, inside = place_of(points, n, per_metre)
+                    voxel = ti.cast(place >> 16, ti.i32)
+                    block = (voxel >> 3) - begin
+                    for a in ti.static(range(3)):
+                        inside = inside and block[a] >= 0 and block[a] < size[a] - 1
+                        gradient[n, a] = ti.cast(place[a] & 65535, ti.f32) * ti.static(1.0 / ONE)
+                    weight[n] = ti.bit_cast(ti.select(inside, block.dot(along), 0), ti.f32)
+                    distance[n] = ti.bit_cast(offset_in_block(voxel), ti.f32)
+                for n in range(first, end):
+                    block, o = ti.bit_cast(weight[n], ti.i32), ti.bit_cast(distance[n], ti.i32)
+                    voxel = vec3i(o >> 6, o >> 3 & 7, o & 7)
+                    touched = ti.i64(0)
+                    for c in ti.static(range(4)):  # eight voxels along z are a line of the cache
+                        k = c & crossing(voxel)
+                        row = rows[block + (k & 1) * along[0] + (k >> 1) * along[1]]
+                        if row >= 0:
+                            touched ^= sums[row, corner_offset(voxel, c)]
+                    distance[n] = ti.bit_cast(
+                        o | ti.cast(touched, ti.i32) << 9, ti.f32
+                    )  # else it is not read
+                for n in range(first, end):
+                    block, o = ti.bit_cast(weight[n], ti.i32), ti.bit_cast(distance[n], ti.i32) & 511
+                    voxel = vec3i(o >> 6, o >> 3 & 7, o & 7)
+                    across = crossing(voxel)
+                    packed = corners_l(0)
+                    held = corners_f(0.0)
+                    if across == 0:
+                        row = rows[block]
+                        if row >= 0:
+                            for c in ti.static(range(8)):
+                                step = ti.static(64 * (c & 1) + 8 * (c >> 1 & 1) + (c >> 2))
+                                packed[c], held[c] = read_voxel(row, o + step, sums, kind, correction)
+                    else:
+                        for c in ti.static(range(8)):
+                            k = c & across
+                            row = rows[block + vec3i(k & 1, k >> 1 & 1, k >> 2).dot(along)]
+                            if row >= 0:
+                                packed[c], held[c] = read_voxel(
+                                    row, corner_offset(voxel, c), sums, kind, correction
+                                )
+                    f = vec3f(gradient[n, 0], gradient[n, 1], gradient[n, 2])
+                    write_sample(n, packed, held, f, kind, min_weight, metres, distance, weight, gradient)

@@ -7,10 +7,11 @@ from numpy.typing import NDArray
 from tsfusion.geometry.map_answers import Samples
 from tsfusion.kernels import point_sampling
 from tsfusion.kernels.sensor_noise import WEIGHT_ONE
-from tsfusion.tsdf.block_store import BlockStore
+from tsfusion.tsdf.block_store import BlockStore, unpack_keys
 from tsfusion.tsdf.surface_values import SurfaceView, values_of
 
 _PART = 1 << 14  # points at a time where their blocks may have to come from a file
+_POINTS_A_BLOCK = 16  # of the map: where there are more, a table of its blocks pays
 _MOST_SOLVED = 1 << 14  # blocks whose values are gathered at a time: 32 MB
 
 
@@ -33,7 +34,7 @@ def sample(
 def _fill(
     found: Samples, points: NDArray[np.floating], store: BlockStore, min_weight: float, view: SurfaceView
 ) -> None:
-    kind, sums, row_of = point_sampling.FUSED, store.sums, np.empty(0, np.int32)
+    kind, sums, slots = point_sampling.FUSED, store.sums, None
     if view is not values_of:
         slots = _needed(points, store)
         if len(slots) > _MOST_SOLVED and len(points) > 1:
@@ -44,15 +45,42 @@ def _fill(
         kind, values = point_sampling.SOLVED, view(store.keys[slots], store, min_weight)
         sums = np.empty(values.shape, np.int64)
         point_sampling.pair(slots.astype(np.int32), store.sums, values, sums)
-        row_of = np.zeros(store.count, np.int32)
-        row_of[slots] = np.arange(len(slots))
     elif store.corrected:
         kind = point_sampling.CORRECTED
+    least = max(1, int(np.ceil(min_weight * WEIGHT_ONE)))
+    answer = found.distance, found.weight, found.gradient
+    keys = store.keys if slots is None else store.keys[slots]
+    table = _table(keys, len(points)) if len(points) >= _POINTS_A_BLOCK * len(keys) > 0 else None
+    if table is not None:
+        point_sampling.interpolate_within(
+            points, 1 / store.voxel_size, *table, sums, least, kind, store.correction, *answer
+        )
+        return
+    row_of = np.empty(0, np.int32)
+    if slots is not None:
+        row_of = np.zeros(store.count, np.int32)
+        row_of[slots] = np.arange(len(slots))
     point_sampling.interpolate(
-        points, 1 / store.voxel_size, store.hash_keys, store.hash_slots, sums,
-        max(1, int(np.ceil(min_weight * WEIGHT_ONE))), kind, store.correction, row_of,
-        found.distance, found.weight, found.gradient,
+        points, 1 / store.voxel_size, store.hash_keys, store.hash_slots, sums, least, kind, store.correction,
+        row_of, *answer,
     )  # fmt: skip
+
+
+def _table(
+    keys: NDArray[np.int64], most: int
+) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]] | None:
+    """Which of some blocks is where: `rows`, `begin` and `size` of `interpolate_within`.
+
+    None where these blocks lie so far apart that the table would have more than `most` numbers.
+    """
+    blocks = unpack_keys(keys)
+    begin = blocks.min(axis=0) - 2
+    size = blocks.max(axis=0) + 2 - begin
+    if np.prod(size, dtype=np.float64) > most:
+        return None
+    rows = np.full(size, -1, np.int32)
+    rows[tuple((blocks - begin).T)] = np.arange(len(keys))
+    return rows.ravel(), begin, size
 
 
 def _needed(points: NDArray[np.floating], store: BlockStore) -> NDArray[np.intp]:
