@@ -111,6 +111,9 @@ def kinds(keyframes: list[Keyframe], voxel_size: float) -> dict[str, Ask]:
         "10000 points": some(10_000),
         "view of 640×480": lambda client: client.raycast(camera, pose, (480, 640)),
         "recent view of 640×480": lambda client: client.raycast(camera, pose, (480, 640), max_age=0.2),
+        "recent depth of 640×480": lambda client: client.raycast(
+            camera, pose, (480, 640), max_age=0.2, normals=False, colors=False
+        ),
         "recent view of 320×240": lambda client: client.raycast(
             camera.scaled(0.5), pose, (240, 320), max_age=0.2
         ),

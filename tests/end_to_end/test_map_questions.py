@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from tsfusion import AnswerLate, Client, InvalidConfig, MapClient, ServerUnreachable, Volume
 from tsfusion.core.errors import TransportError
 from tsfusion.geometry.keyframe import Keyframe
+from tsfusion.geometry.map_answers import View
 from tsfusion.wire import key_folder, messages, questions, sockets
 from tsfusion.wire.curve import client_keys
 from tsfusion.wire.forgetting import Selection
@@ -72,6 +73,8 @@ def test_answers_are_those_of_the_map_itself(server: Server) -> None:
             many = asked.sample(points(MOST_POINTS))
             one = asked.sample(points(1), surface=None, min_weight=2.0)
             view = asked.raycast(CAMERA, np.eye(4), SHAPE)
+            bare = asked.raycast(CAMERA, np.eye(4), SHAPE, normals=False, colors=False)
+        equal(bare.result, View(view.result.depth))
         equal(many.result, volume.sample(points(MOST_POINTS), surface="raw"))
         equal(one.result, volume.sample(points(1), min_weight=2.0))
         equal(view.result, volume.raycast(CAMERA, np.eye(4), SHAPE, surface="raw"))
@@ -258,6 +261,49 @@ def test_what_the_client_does_not_ask(server: Server) -> None:
             asked.sample(points(1), timeout=0)
         with pytest.raises(InvalidConfig, match="pixels"):
             asked.raycast(CAMERA, np.eye(4), (4000, 4000))
+
+
+@pytest.mark.parametrize("age", [-0.1, -np.inf, np.inf, np.nan, 61.0])
+def test_an_age_out_of_range_is_asked_by_nobody_and_refused(server: Server, age: float) -> None:
+    with MapClient(server.address) as asked, pytest.raises(InvalidConfig, match="max_age must be 0 to 60 s"):
+        asked.raycast(CAMERA, np.eye(4), SHAPE, max_age=age)
+    before = fetch_health(server.address).refused.get("question", 0)
+    with closing(Raw(server)) as link:
+        refused = link.ask(msgspec.structs.replace(LOOK, max_age=age))
+        assert "max_age must be 0 to 60 s" in (refused.error or "")
+        assert refused.answer is None
+    assert fetch_health(server.address).refused["question"] == before + 1
+
+
+@pytest.mark.parametrize("age", ["0.2", "soon", b"1", None, [0.2], 10**400, 1j])
+def test_an_age_that_is_no_number(server: Server, age: Any) -> None:
+    with MapClient(server.address) as asked, pytest.raises(InvalidConfig, match="max_age must be a number"):
+        asked.raycast(CAMERA, np.eye(4), SHAPE, max_age=age)
+
+
+def test_an_age_in_words_is_a_message_that_is_refused(server: Server) -> None:
+    before = fetch_health(server.address).refused.get("control", 0)
+    question = msgspec.to_builtins(LOOK) | {"max_age": "soon"}
+    with closing(Raw(server)) as link:
+        link.send(msgspec.msgpack.encode({"type": "command", "name": "ask", "question": question}))
+        assert link.ask(SAMPLE, GOOD).answer is not None
+    assert fetch_health(server.address).refused["control"] == before + 1
+
+
+def test_a_server_of_an_earlier_version_sends_all_of_a_view(
+    server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It does not know that less was wanted: the client takes what it asked for."""
+    with MapClient(server.address, timeout=EASY) as asked:
+        ask = asked._ask
+
+        def ask_before(question: Any, frames: Any, timeout: Any) -> Any:
+            return ask(msgspec.structs.replace(question, normals=True, colors=True), frames, timeout)
+
+        monkeypatch.setattr(asked, "_ask", ask_before)
+        bare = asked.raycast(CAMERA, np.eye(4), SHAPE, normals=False, colors=False).result
+        assert (bare.normals, bare.colors) == (None, None)
+        assert (bare.depth > 0).any()
 
 
 def test_an_answer_that_is_late_is_an_error_in_time(tmp_path: Path) -> None:

@@ -5,6 +5,8 @@ import numpy as np
 import pytest
 
 from tsfusion import Intrinsics, InvalidConfig, Keyframe, Volume
+from tsfusion.core.config import Surface
+from tsfusion.tsdf import camera_views
 
 CAMERA = Intrinsics(100.0, 100.0, 79.5, 59.5)
 SHAPE = (120, 160)
@@ -25,6 +27,29 @@ def wall_map(*, color: bool = True) -> Volume:
 @pytest.fixture(scope="module")
 def volume() -> Volume:
     return wall_map()
+
+
+@pytest.mark.parametrize("surface", ["raw", "field"])
+@pytest.mark.parametrize(("normals", "colors"), [(False, False), (True, False), (False, True)])
+def test_what_is_not_wanted_is_left_out(
+    volume: Volume, monkeypatch: pytest.MonkeyPatch, surface: Surface, normals: bool, colors: bool
+) -> None:
+    T = np.eye(4)
+    T[:3, 3] = (-0.2, 0.1, 0.2)
+    whole = volume.raycast(CAMERA, T, SHAPE, surface=surface)
+    for triangles in (camera_views.MOST_TRIANGLES, 1):  # in one part; in many
+        monkeypatch.setattr(camera_views, "MOST_TRIANGLES", triangles)
+        view = volume.raycast(CAMERA, T, SHAPE, surface=surface, normals=normals, colors=colors)
+        settled = volume.raycast_settled(CAMERA, T, SHAPE, surface=surface, normals=normals, colors=colors)
+        assert settled is not None
+        for found in (view, settled):
+            assert np.array_equal(found.depth, whole.depth)
+            for name, wanted in (("normals", normals), ("colors", colors)):
+                assert (getattr(found, name) is not None) == wanted
+                assert not wanted or np.array_equal(getattr(found, name), getattr(whole, name))
+    away = volume.raycast(CAMERA, np.diag([-1.0, 1, -1, 1]), SHAPE, normals=normals, colors=colors)
+    assert not away.depth.any()
+    assert (away.normals is not None, away.colors is not None) == (normals, colors)
 
 
 @pytest.mark.parametrize(

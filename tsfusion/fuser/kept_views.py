@@ -22,6 +22,11 @@ class _How(TypedDict):
     surface: Surface | None
 
 
+class _Shown(TypedDict):
+    normals: bool
+    colors: bool
+
+
 class KeptViews:
     """Views of one map, each of one state of it.
 
@@ -44,16 +49,17 @@ class KeptViews:
         """The view, and the state that it is of."""
         how = _How(min_weight=question.min_weight, surface=question.surface)
         camera = question.intrinsics, question.matrix, question.shape
+        shown = _Shown(normals=question.normals, colors=question.colors)
         now = time.monotonic()
         if question.max_age > 0:
             self._wanted_s = now + _WANTED_S
         if self._kept is not None and how == self._how and not self._is_newest:
             stamp, state = self._kept
             is_kept = now - self._newest_s <= question.max_age and self._volume.settled_stamp(**how) == stamp
-            view = self._volume.raycast_settled(*camera, **how) if is_kept else None
+            view = self._volume.raycast_settled(*camera, **how, **shown) if is_kept else None
             if view is not None:
                 return view, state
-        view = self._volume.raycast(*camera, **how)
+        view = self._volume.raycast(*camera, **how, **shown)
         self._how, self._kept = how, (self._volume.stamp, self._state())
         return view, self._kept[1]
 

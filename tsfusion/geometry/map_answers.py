@@ -50,7 +50,8 @@ class View:
     Attributes:
         depth: (H, W) float32 metres along the optical axis; 0 = nothing hit, as in a keyframe's depth.
         normals: (H, W, 3) float32 unit normals in the world's frame, towards the camera; 0 = nothing hit.
-        colors: (H, W, 3) uint8 RGB (sRGB), 0 = nothing hit; None if the map holds none.
+            None if they were not asked for.
+        colors: (H, W, 3) uint8 RGB (sRGB), 0 = nothing hit; None if the map holds none, or likewise.
 
     Examples:
         >>> volume = tsfusion.Volume(0.05)
@@ -62,7 +63,7 @@ class View:
     """
 
     depth: NDArray[np.float32]
-    normals: NDArray[np.float32]
+    normals: NDArray[np.float32] | None = None
     colors: NDArray[np.uint8] | None = None
 
 

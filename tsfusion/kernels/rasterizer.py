@@ -145,8 +145,8 @@ def look_up(
     seen: ti.types.ndarray(dtype=ti.i64, ndim=2),
     vertices: ti.types.ndarray(dtype=ti.f32, ndim=2),
     faces: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    normals: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    colors: ti.types.ndarray(dtype=ti.u8, ndim=2),  # of no rows: none wanted
+    normals: ti.types.ndarray(dtype=ti.f32, ndim=2),  # of no rows: none wanted
+    colors: ti.types.ndarray(dtype=ti.u8, ndim=2),  # likewise
     focal: ti.f32,
     empty: ti.i64,
     depth: ti.types.ndarray(dtype=ti.f32, ndim=2),
@@ -156,6 +156,7 @@ def look_up(
     """Depth, unit normal and colour of every pixel that is not EMPTY, as the corners of its triangle say."""
     height, width = seen.shape[0], seen.shape[1]
     per_pixel = 1.0 / focal
+    is_more = normals.shape[0] + colors.shape[0] > 0
     for run in range(BANDS * RUN):  # run loop: kernels/__init__.py
         if run % RUN == 0:
             band = run // RUN
@@ -166,21 +167,24 @@ def look_up(
                 for u in range(width):
                     key = seen[v, u]
                     if key != empty:
+                        depth[v, u] = ti.bit_cast(ti.cast(key >> 32, ti.i32), ti.f32)
+                    if key != empty and is_more:
                         f = ti.cast(key, ti.i32)  # the low half
                         if f != last:
                             last = f
                             ia, ib, ic = faces[f, 0], faces[f, 1], faces[f, 2]
                             edges = opposite(corner(vertices, ia), corner(vertices, ib), corner(vertices, ic))
                             for k in ti.static(range(3)):
-                                towards[k, :] = tm.vec3(normals[ia, k], normals[ib, k], normals[ic, k])
+                                if normals.shape[0] > 0:
+                                    towards[k, :] = tm.vec3(normals[ia, k], normals[ib, k], normals[ic, k])
                                 if colors.shape[0] > 0:
                                     tints[k, :] = tm.vec3(colors[ia, k], colors[ib, k], colors[ic, k])
                         w = shares(edges, tm.vec3((u - 0.5 * (width - 1)) * per_pixel, y, 1.0))
-                        n = towards @ w
-                        n *= 1.0 / ti.max(n.norm(), 1e-9)
-                        depth[v, u] = ti.bit_cast(ti.cast(key >> 32, ti.i32), ti.f32)
-                        for k in ti.static(range(3)):
-                            normal[v, u, k] = n[k]
+                        if normals.shape[0] > 0:
+                            n = towards @ w
+                            n *= 1.0 / ti.max(n.norm(), 1e-9)
+                            for k in ti.static(range(3)):
+                                normal[v, u, k] = n[k]
                         if colors.shape[0] > 0:
                             tint = tints @ w
                             for k in ti.static(range(3)):

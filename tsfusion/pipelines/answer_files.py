@@ -128,12 +128,16 @@ def write_view(path: Path, found: View) -> None:
 
 
 def picture(view: View) -> NDArray[np.uint8]:
-    """(H, W, 3) RGB: the map's colours, or without any its shape in grey; white where nothing was hit."""
+    """(H, W, 3) RGB: the map's colours, or without any its shape in grey; white where nothing was hit.
+
+    A view of depth alone is one grey.
+    """
     hit = (view.depth > 0)[..., np.newaxis]
     if view.colors is not None:
         shown = view.colors
     else:
-        light = np.abs(view.normals @ np.array([0.4, -0.5, 0.77]))  # along no axis: no wall is black
+        normals = np.zeros((*view.depth.shape, 3)) if view.normals is None else view.normals
+        light = np.abs(normals @ np.array([0.4, -0.5, 0.77]))  # along no axis: no wall is black
         shown = np.repeat((60 + 190 * light.clip(0, 1)).astype(np.uint8)[..., np.newaxis], 3, axis=2)
     return np.where(hit, shown, np.uint8(255))
 

@@ -16,7 +16,8 @@ from tsfusion.wire.questions import MapState
 
 
 class SavedMapAnswers:
-    """A map in this process with the methods of `wire.map_client.MapClient`. `timeout` has no effect."""
+    """A map in this process with the methods of `wire.map_client.MapClient`. `timeout` and `max_age` have
+    no effect."""
 
     def __init__(self, volume: Volume) -> None:
         self._volume = volume
@@ -31,6 +32,7 @@ class SavedMapAnswers:
         T_world_camera: ArrayLike,
         shape: tuple[int, int],
         *,
+        max_age: float = 0.0,
         timeout: float | None = None,
         **how: Any,
     ) -> Answered[View]:

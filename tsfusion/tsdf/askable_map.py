@@ -74,6 +74,8 @@ class AskableMap(ReadableMap):
         *,
         min_weight: float | None = None,
         surface: Surface | None = None,
+        normals: bool = True,
+        colors: bool = True,
     ) -> View:
         """View of the surface by a pinhole camera: depth, normals, and colours if the map has them.
 
@@ -84,9 +86,11 @@ class AskableMap(ReadableMap):
             T_world_camera: (4, 4) pose, camera axes x right, y down, z forward.
             shape: (height, width), pixels.
             min_weight, surface: as for `extract_mesh`.
+            normals, colors: whether with them; depth alone is quicker.
         """
         camera = checked_camera(intrinsics, T_world_camera, shape)
-        return camera_views.cast(self._tiles_of(surface, self._checked_min_weight(min_weight)), *camera)
+        tiles = self._tiles_of(surface, self._checked_min_weight(min_weight))
+        return camera_views.cast(tiles, *camera, normals=normals, colors=colors)
 
     def settled_stamp(self, min_weight: float | None = None, surface: Surface | None = None) -> int | None:
         """The `stamp` of the state that `raycast` or `settle` made whole last; None = it is not kept."""
@@ -100,11 +104,14 @@ class AskableMap(ReadableMap):
         *,
         min_weight: float | None = None,
         surface: Surface | None = None,
+        normals: bool = True,
+        colors: bool = True,
     ) -> View | None:
         """As `raycast`, of the state of `settled_stamp`; None where some of it is not kept any more."""
         camera = checked_camera(intrinsics, T_world_camera, shape)
         least = self._checked_min_weight(min_weight)
-        return camera_views.cast_settled(self._tiles_of(surface, least), *camera)
+        tiles = self._tiles_of(surface, least)
+        return camera_views.cast_settled(tiles, *camera, normals=normals, colors=colors)
 
     def settle(self, most: int, *, min_weight: float | None = None, surface: Surface | None = None) -> bool:
         """Mesh again what the last `raycast` showed and has changed since, at most so many cubes of it.

@@ -2,6 +2,7 @@
 """View of a map's surface by a pinhole camera; the work is in `kernels/rasterizer.py`."""
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,23 +16,46 @@ from tsfusion.tsdf.surface_tiles import SurfaceTiles
 
 NEAR = 0.05  # metres in front of the eye where the view starts
 MOST_TRIANGLES = 1 << 21  # that are drawn at a time
+
+
+class _Wanted(NamedTuple):
+    """What a view shows beside depth."""
+
+    normals: bool
+    colors: bool
+
+
+_ALL = _Wanted(normals=True, colors=True)
 _NOTHING = Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
 
 
 def cast(
-    tiles: SurfaceTiles, intrinsics: Intrinsics, T_world_camera: NDArray[np.float64], shape: tuple[int, int]
+    tiles: SurfaceTiles,
+    intrinsics: Intrinsics,
+    T_world_camera: NDArray[np.float64],
+    shape: tuple[int, int],
+    *,
+    normals: bool = True,
+    colors: bool = True,
 ) -> View:
-    """The view, (H, W), of a surface: of the tiles before the camera."""
+    """The view, (H, W), of a surface: of the tiles before the camera; `normals`, `colors`: if with them."""
     camera = intrinsics, T_world_camera, shape
     with np.errstate(over="ignore", invalid="ignore"):  # a focal length may be next to none
         numbers = _in_view(tiles, *camera).tolist()
-        seen = _of_meshes(tiles.meshes(numbers), *camera, has_color=tiles.has_color)
+        wanted = _Wanted(normals, colors and tiles.has_color)
+        seen = _of_meshes(tiles.meshes(numbers), *camera, wanted)
     tiles.settle(numbers)
     return seen
 
 
 def cast_settled(
-    tiles: SurfaceTiles, intrinsics: Intrinsics, T_world_camera: NDArray[np.float64], shape: tuple[int, int]
+    tiles: SurfaceTiles,
+    intrinsics: Intrinsics,
+    T_world_camera: NDArray[np.float64],
+    shape: tuple[int, int],
+    *,
+    normals: bool = True,
+    colors: bool = True,
 ) -> View | None:
     """As `cast`, of the map as it was when it was settled; None where that is not kept any more."""
     camera = intrinsics, T_world_camera, shape
@@ -39,7 +63,7 @@ def cast_settled(
         meshes = tiles.settled_meshes(_in_view(tiles, *camera).tolist())
         if meshes is None:
             return None
-        return _of_meshes(iter(meshes), *camera, has_color=tiles.has_color)
+        return _of_meshes(iter(meshes), *camera, _Wanted(normals, colors and tiles.has_color))
 
 
 def _of_meshes(
@@ -47,33 +71,38 @@ def _of_meshes(
     intrinsics: Intrinsics,
     T_world_camera: NDArray[np.float64],
     shape: tuple[int, int],
-    *,
-    has_color: bool,
+    wanted: "_Wanted",
 ) -> View:
     """The view of all of some meshes."""
     camera = intrinsics, T_world_camera, shape
     parts = _parts(meshes)
-    seen = look_at(next(parts, _NOTHING), *camera)
+    seen = look_at(next(parts, _NOTHING), *camera, wanted)
     for mesh in parts:
-        seen = _nearer(seen, look_at(mesh, *camera))
-    if has_color and seen.colors is None:
+        seen = _nearer(seen, look_at(mesh, *camera, wanted))
+    if wanted.colors and seen.colors is None:
         return View(seen.depth, seen.normals, np.zeros((*shape, 3), np.uint8))
     return seen
 
 
 def look_at(
-    mesh: Mesh, intrinsics: Intrinsics, T_world_camera: NDArray[np.float64], shape: tuple[int, int]
+    mesh: Mesh,
+    intrinsics: Intrinsics,
+    T_world_camera: NDArray[np.float64],
+    shape: tuple[int, int],
+    wanted: "_Wanted" = _ALL,
 ) -> View:
-    """The view of a mesh, (H, W): depth, normals and colours of the first front side."""
+    """The view of a mesh, (H, W): depth, and normals and colours that are wanted, of the first front side."""
     focal = intrinsics.fx
     seen, vertices, faces = rasterised(mesh, intrinsics, T_world_camera, shape)
-    depth, normals = np.zeros(shape, np.float32), np.zeros((*shape, 3), np.float32)
-    colors = np.zeros((*shape, 3) if mesh.colors is not None else (1, 0, 3), np.uint8)
+    of_normals = mesh.normals if wanted.normals else _NOTHING.normals
+    of_colors = mesh.colors if wanted.colors and mesh.colors is not None else np.zeros((0, 3), np.uint8)
+    depth = np.zeros(shape, np.float32)
+    normals = np.zeros((*shape, 3) if wanted.normals else (1, 1, 3), np.float32)
+    colors = np.zeros((*shape, 3) if len(of_colors) else (1, 1, 3), np.uint8)
     rasterizer.look_up(
-        seen, vertices, faces, mesh.normals, colors[0] if mesh.colors is None else mesh.colors, focal,
-        rasterizer.EMPTY, depth, normals, colors,
-    )  # fmt: skip
-    return View(depth, normals, None if mesh.colors is None else colors)
+        seen, vertices, faces, of_normals, of_colors, focal, rasterizer.EMPTY, depth, normals, colors
+    )
+    return View(depth, normals if wanted.normals else None, colors if len(of_colors) else None)
 
 
 def rasterised(

@@ -143,6 +143,8 @@ class MapClient:
         min_weight: float | None = None,
         surface: Surface | None = "raw",
         max_age: float = 0.0,
+        normals: bool = True,
+        colors: bool = True,
         timeout: float | None = None,
     ) -> Answered[View]:
         """View of the surface by a pinhole camera; see `Volume.raycast`. Raises as `sample`.
@@ -152,6 +154,7 @@ class MapClient:
             max_age: seconds for which the state that is shown may be behind the newest one. Of 0 the view is
                 of the newest, and what has just changed is meshed first. With 0.2 that is done ahead, for
                 cameras that look where the last one did; `state` says which state was shown.
+            normals, colors: whether with them. Depth alone is a fifth of the bytes.
             timeout: seconds; None = the client's.
         """
         camera, T, (height, width) = checked_camera(intrinsics, T_world_camera, shape)
@@ -161,11 +164,19 @@ class MapClient:
             shape=(height, width),
             min_weight=min_weight,
             surface=surface,
-            max_age=float(max_age),
+            max_age=_number(max_age, "max_age"),
+            normals=bool(normals),
+            colors=bool(colors),
         )
         answer, arrays, delay = self._ask(question, [], timeout)
-        colors = arrays.pop("colors", None)
-        return _answered(View(**_all(arrays, "depth", "normals"), colors=colors), answer, delay)
+        found_colors = arrays.pop("colors", None)  # some maps have none
+        names = ["depth"]
+        if normals:
+            names.append("normals")
+        else:
+            arrays.pop("normals", None)  # of a server of an earlier version
+        view = View(**_all(arrays, *names), colors=found_colors if colors else None)
+        return _answered(view, answer, delay)
 
     def occupancy_slice(self, low: float, high: float, **how: Any) -> Answered[OccupancySlice]:
         """Costmap of what stands between two heights; see `Volume.occupancy_slice`.
@@ -330,6 +341,15 @@ def _numbers(given: Sequence[float], count: int) -> tuple[float, ...]:
     if numbers.shape != (count,):
         raise InvalidConfig(f"a box must be {count} numbers in metres, got {given}")
     return tuple(numbers.tolist())
+
+
+def _number(given: Any, name: str) -> float:
+    if isinstance(given, str | bytes):
+        raise InvalidConfig(f"{name} must be a number, got {given!r}")
+    try:
+        return float(given)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InvalidConfig(f"{name} must be a number, got {given!r}") from error
 
 
 def _grid(found: dict[str, NDArray[Any]]) -> SliceGrid:

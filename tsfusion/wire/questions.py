@@ -80,6 +80,7 @@ class Raycast(Struct, frozen=True, tag="raycast", omit_defaults=True):
         pose: the 16 numbers of T_world_camera, row by row.
         shape: height, width, pixels.
         max_age: seconds since which the state of the map that is shown may not be the newest any more.
+        normals, colors: whether with them. A server of an earlier version sends them anyway.
     """
 
     intrinsics: tuple[float, float, float, float]
@@ -88,11 +89,13 @@ class Raycast(Struct, frozen=True, tag="raycast", omit_defaults=True):
     min_weight: float | None = None
     surface: Surface | None = None
     max_age: float = 0.0
+    normals: bool = True
+    colors: bool = True
 
     @property
     def most_bytes(self) -> int:
         """Size of its answer, at the most."""
-        return 19 * math.prod(self.shape)
+        return (4 + 12 * self.normals + 3 * self.colors) * math.prod(self.shape)
 
     def problem(self, frames: Sequence[Any]) -> str:
         """Why this is not to be asked; empty = it may be. `frames`: what came with it."""
