@@ -18,6 +18,7 @@ from tsfusion import Client, Volume
 from tsfusion.core.errors import DatasetError
 from tsfusion.geometry.map_answers import View
 from tsfusion.pipelines import answer_files
+from tsfusion.pipelines.saved_map_answers import SavedMapAnswers
 from tsfusion.wire.questions import MOST_POINTS
 
 POINTS = np.array([[0.0, 0.0, 1.2], [0.1, 0.05, 1.27], [9.0, 9.0, 9.0]])
@@ -193,6 +194,14 @@ def test_a_picture_shows_colours_or_the_shape(tmp_path: Path) -> None:
     assert background == [255, 255, 255]
     assert len(set(wall_)) == 1
     assert 60 < wall_[0] < 255
+    assert answer_files.picture(View(depth))[0].tolist() == [[255, 255, 255], [60, 60, 60]]
+
+
+def test_a_saved_map_takes_what_a_live_one_takes() -> None:
+    asked = SavedMapAnswers(Volume(0.05, threads=2))
+    found = asked.raycast((40, 40, 31.5, 23.5), np.eye(4), (4, 6), max_age=0.2, timeout=1.0, normals=False)
+    assert found.result.depth.shape == (4, 6)
+    assert found.result.normals is None
 
 
 def test_the_command_needs_no_taichi_for_a_live_map(live: Server) -> None:

@@ -7,6 +7,7 @@ from collections import deque
 from pathlib import Path
 from typing import Any, cast
 
+import msgspec
 import numpy as np
 import pytest
 import zmq
@@ -323,6 +324,9 @@ def test_a_view_that_may_be_behind_is_of_one_whole_state() -> None:
     map_.prepare()
     map_.assert_shows(30.0, 2)
     map_.add(2)
+    depth_alone = msgspec.structs.replace(looked(30.0), normals=False, colors=False)
+    bare, state = map_.views.get(depth_alone)
+    assert (bare.normals, bare.colors, state.keyframes) == (None, None, 2)
     map_.assert_shows(30.0, 2)
     map_.assert_shows(0.0, 3)  # nobody is shown an old state who did not ask for it
 
