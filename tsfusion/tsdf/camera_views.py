@@ -71,11 +71,11 @@ def _of_meshes(
     intrinsics: Intrinsics,
     T_world_camera: NDArray[np.float64],
     shape: tuple[int, int],
-    wanted: "_Wanted",
+    wanted: _Wanted,
 ) -> View:
     """The view of all of some meshes."""
     camera = intrinsics, T_world_camera, shape
-    parts = _parts(meshes)
+    parts = _parts(meshes, wanted)
     seen = look_at(next(parts, _NOTHING), *camera, wanted)
     for mesh in parts:
         seen = _nearer(seen, look_at(mesh, *camera, wanted))
@@ -89,7 +89,7 @@ def look_at(
     intrinsics: Intrinsics,
     T_world_camera: NDArray[np.float64],
     shape: tuple[int, int],
-    wanted: "_Wanted" = _ALL,
+    wanted: _Wanted = _ALL,
 ) -> View:
     """The view of a mesh, (H, W): depth, and normals and colours that are wanted, of the first front side."""
     focal = intrinsics.fx
@@ -145,27 +145,29 @@ def _in_view(
     return np.asarray(numbers[shown[nearest_first]])
 
 
-def _parts(meshes: Iterator[Mesh]) -> Iterator[Mesh]:
-    """Meshes, joined up to `MOST_TRIANGLES`."""
+def _parts(meshes: Iterator[Mesh], wanted: _Wanted) -> Iterator[Mesh]:
+    """Meshes with what is wanted of them, joined up to `MOST_TRIANGLES`."""
     part: list[Mesh] = []
     triangles = 0
     for mesh in meshes:
         part.append(mesh)
         triangles += len(mesh.faces)
         if triangles >= MOST_TRIANGLES:
-            yield _joined(part)
+            yield _joined(part, wanted)
             part, triangles = [], 0
     if triangles:
-        yield _joined(part)
+        yield _joined(part, wanted)
 
 
-def _joined(meshes: list[Mesh]) -> Mesh:
+def _joined(meshes: list[Mesh], wanted: _Wanted) -> Mesh:
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)]).tolist()
     return Mesh(
         np.concatenate([mesh.vertices for mesh in meshes]),
         np.concatenate([mesh.faces + np.int32(s) for mesh, s in zip(meshes, starts, strict=False)]),
-        np.concatenate([mesh.normals for mesh in meshes]),
-        None if meshes[0].colors is None else np.concatenate([mesh.colors for mesh in meshes]),
+        np.concatenate([mesh.normals for mesh in meshes]) if wanted.normals else _NOTHING.normals,
+        None
+        if meshes[0].colors is None or not wanted.colors
+        else np.concatenate([mesh.colors for mesh in meshes]),
     )
 
 
