@@ -164,7 +164,7 @@ def step_on(map_file: Path, source: str, step: str) -> dict[str, Any]:
 
 
 def memory(source: str, sizes: list[float]) -> Iterator[dict[str, Any]]:
-    """What each step takes above the open map, with voxels of several sizes."""
+    """Memory of each step above that of the open map, with voxels of several sizes."""
     with tempfile.TemporaryDirectory(prefix="tsfusion-memory-") as folder:
         map_file = Path(folder) / "map.tsf"
         for size in sizes:

@@ -293,7 +293,7 @@ def test_an_age_in_words_is_a_message_that_is_refused(server: Server) -> None:
 def test_a_server_of_an_earlier_version_sends_all_of_a_view(
     server: Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It does not know that less was wanted: the client takes what it asked for."""
+    """A server of an earlier version sends all of a view; the client takes what it asked for."""
     with MapClient(server.address, timeout=EASY) as asked:
         ask = asked._ask
 

@@ -190,7 +190,7 @@ def _check_once(sources: Sequence[str]) -> None:
 
 
 def _place(source: str) -> str:
-    """What a source is told from others by: of this machine an absolute path without links."""
+    """Name that tells a source from others: of this machine an absolute path without links."""
     if source.startswith(SYNTHETIC):
         return source
     path = source.removeprefix("file://")

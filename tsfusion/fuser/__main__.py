@@ -111,7 +111,7 @@ def _do_some(fuser: Fuser, *, idle: bool) -> bool:
 
 
 class _Ahead:
-    """What is done before there is a map to work at."""
+    """Preparations before there is a map to work at."""
 
     def __init__(self, link: sockets.AnySocket) -> None:
         self._link = link

@@ -154,7 +154,7 @@ class Started(Struct, frozen=True, tag="started"):
 
 
 class Prepared(Struct, frozen=True, tag="prepared"):
-    """What `Warm` or `Open` asked for is done."""
+    """End of the preparations that `Warm` or `Open` asked for."""
 
 
 class Ready(Struct, frozen=True, tag="ready"):

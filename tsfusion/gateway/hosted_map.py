@@ -370,7 +370,7 @@ class HostedMap:
 
     @property
     def notices(self) -> list[str]:
-        """What a person should know of, though keyframes are taken and will be fused."""
+        """Problems that a person should know of, though keyframes are taken and will be fused."""
         return self._condition.notices
 
     def health(self) -> MapHealth:

@@ -21,7 +21,7 @@ _STALLED_AFTER = 10.0  # seconds in which keyframes wait and none is fused
 
 
 class MapCondition:
-    """What is known of an open map, whose parts are given.
+    """Condition of an open map, whose parts are given.
 
     Attributes:
         warm: the fuser has been ready once: from then on it is known what the map has.
@@ -81,7 +81,7 @@ class MapCondition:
 
     @property
     def notices(self) -> list[str]:
-        """What a person should know of, though keyframes are taken and will be fused."""
+        """Problems that a person should know of, though keyframes are taken and will be fused."""
         damaged, put_back = self._journal.damaged, self._journal.put_back
         lost = count_of(damaged, "keyframe of its journal is", "keyframes of its journal are")
         notices = [f"{lost} damaged and lost"] if damaged else []

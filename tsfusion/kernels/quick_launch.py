@@ -72,7 +72,7 @@ class QuickLaunch:
 
 
 def _kind(arguments: tuple[Any, ...]) -> tuple[int, ...] | None:
-    """What a launch depends on but for the values, in numbers; None where Taichi is to look for itself."""
+    """Types that a launch depends on, as numbers; None where Taichi is to look for itself."""
     kind = []
     for argument in arguments:
         if isinstance(argument, np.ndarray):

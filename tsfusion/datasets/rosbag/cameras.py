@@ -155,7 +155,7 @@ class Cameras:
         return self._recorded_view(images)
 
     def _recorded_view(self, images: ImageTopic) -> CameraView:
-        """The same as `view`, by the images' CameraInfo."""
+        """View of an image as by `view`, with the camera of the images' CameraInfo."""
         camera = self._checked(images)
         source = self._source(images)
         if self._is_rectified(images):
