@@ -77,6 +77,13 @@ def camera_of(rows: ti.template()):
 
 
 @ti.func
+def few(count):
+    """A number of rows or columns of a tile, known to be small: LLVM else adds to a loop one for 32 at once,
+    which never runs and takes long to compile."""
+    return count & 15
+
+
+@ti.func
 def depth_of(raw, reading):
     """Depth of a pixel's number in 2⁻¹⁰ voxel; 0 = no usable return. All float32, and no branch: a row of a
     tile is read in vectors."""
@@ -106,16 +113,16 @@ def load_tile(image: ti.template(), confidence: ti.template(), reading, left, to
     if bottom < TILE or right < TILE:
         for i in range(TILE_SAMPLES):
             depths[i] = 0
-        for y in range(bottom):
-            for x in range(right):
+        for y in range(few(bottom)):
+            for x in range(few(right)):
                 depths[y * TILE + x] = depth_of(ti.cast(image[top + y, left + x], ti.f32), reading)
     else:
         for y in range(TILE):
             for x in range(TILE):
                 depths[y * TILE + x] = depth_of(ti.cast(image[top + y, left + x], ti.f32), reading)
     if reading.has_confidence == 1:
-        for y in range(bottom):
-            for x in range(right):
+        for y in range(few(bottom)):
+            for x in range(few(right)):
                 if confidence[top + y, left + x] == 0:
                     depths[y * TILE + x] = 0
     valid = 0
@@ -208,8 +215,10 @@ def cell_shape(pixel):
 def layer_sums(depths: ti.template(), cell, above, up_to):
     """The cell's samples with depths in (`above`, `up_to`], as a `Layer`."""
     low, deepest, n, sum_q, sum_x, sum_y = 1 << 30, 0, 0, ti.i64(0), 0, 0
-    for y in range(cell.y, cell.y + cell.high):
-        for x in range(cell.x, cell.x + cell.wide):
+    for row in range(few(cell.high)):
+        y = cell.y + row
+        for column in range(few(cell.wide)):
+            x = cell.x + column
             q = depths[y * TILE + x]
             inside = (q > above) & (q <= up_to)
             one = ti.cast(inside, ti.i32)
@@ -229,7 +238,8 @@ def column_sums(depths: ti.template(), first, high, columns: ti.template()):
         columns[LEAST + x] = 1 << 30
         columns[GREATEST + x] = 0
         columns[SUM + x] = 0
-    for y in range(first, first + high):
+    for row in range(few(high)):
+        y = first + row
         for x in range(TILE):
             q = depths[y * TILE + x]
             columns[LEAST + x] = ti.min(columns[LEAST + x], q)
@@ -241,7 +251,8 @@ def column_sums(depths: ti.template(), first, high, columns: ti.template()):
 def full_layer(columns: ti.template(), cell):
     """All samples of a cell; n = 0 unless every pixel has one, of a depth of which twelve can be summed."""
     low, deepest, sum_q = 1 << 30, 0, ti.i64(0)
-    for x in range(cell.x, cell.x + cell.wide):
+    for column in range(few(cell.wide)):
+        x = cell.x + column
         low = ti.min(low, columns[LEAST + x])
         deepest = ti.max(deepest, columns[GREATEST + x])
         sum_q += columns[SUM + x]
@@ -301,12 +312,15 @@ def layer_color(
     """Mean colour 0xRRGGBB and summed confidence of a layer's samples."""
     n, bgr, trust = layer.n, vec3i(0), 0
     if n == cell.wide * cell.high and has_confidence == 0:
-        for x in range(cell.x, cell.x + cell.wide):
+        for column in range(few(cell.wide)):
+            x = cell.x + column
             for c in ti.static(range(3)):
                 bgr[c] += colors[3 * x + c]
     else:
-        for y in range(cell.y, cell.y + cell.high):
-            for x in range(cell.x, cell.x + cell.wide):
+        for row in range(few(cell.high)):
+            y = cell.y + row
+            for column in range(few(cell.wide)):
+                x = cell.x + column
                 q = depths[y * TILE + x]
                 if q >= layer.low and q <= layer.up_to:
                     if has_confidence == 1:
