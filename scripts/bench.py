@@ -157,6 +157,7 @@ class Stages:
         watched: list[tuple[Any, str, str]] = [
             (rays_from_images, "rays_from_image", "rays"), (rays_from_points, "rays_from_points", "rays"),
             (block_hash, "insert_blocks", "allocate"), (integrate, "add_rays", "integrate"),
+            (integrate, "add_shared_rays", "integrate"),
             (integrate, "largest_weights", "check"), (ray_smoothing, "smooth_rays", "regularise"),
             (ray_smoothing, "commit_votes", "regularise"),
         ]  # fmt: skip

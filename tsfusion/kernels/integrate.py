@@ -365,8 +365,8 @@ def add_rays(
     more than `MOST_MISSING` of them every band ends after the ray that it is at: `ONLY_ADDED` are those.
 
     Units run at the same time, each through its own bands. A block is of the unit that comes to it first and
-    adds to it alone, without atomics. Rays that cross blocks of other units are listed, too, and added to
-    these when all units are through, with atomics. The layers are flat: slot · 512 + offset.
+    adds to it alone, without atomics. Rays that cross blocks of other units are listed, too, for
+    `add_shared_rays`. The layers are flat: slot · 512 + offset.
     """
     for run in range(job[UNITS] * RUN):  # run loop: kernels/__init__.py
         if run % RUN == 0:
@@ -374,6 +374,32 @@ def add_rays(
                 run // RUN, rays, bands, again, job, hash_keys, hash_slots, missing, scratch, owners, stamps,
                 places, dirty, touched, sums, color_rgn, color_b, False,
             )  # fmt: skip
+
+
+@QuickLaunch
+@ti.kernel
+def add_shared_rays(
+    rays: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    bands: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    again: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    job: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    hash_keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
+    hash_slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    missing: ti.types.ndarray(dtype=ti.i64, ndim=1),
+    scratch: ti.types.ndarray(dtype=ti.i64, ndim=1),
+    owners: ti.types.ndarray(dtype=ti.i64, ndim=1),
+    stamps: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    places: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    dirty: ti.types.ndarray(dtype=ti.u8, ndim=1),
+    touched: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    sums: ti.types.ndarray(dtype=ti.i64, ndim=1),
+    color_rgn: ti.types.ndarray(dtype=ti.i64, ndim=1),
+    color_b: ti.types.ndarray(dtype=ti.i32, ndim=1),
+):
+    """Add the rays that cross blocks of other units to these, with atomics: after `add_rays`, same arguments.
+
+    A kernel of its own, because one thread need not wait until it is compiled.
+    """
     for run in range(job[UNITS] * RUN):
         if run % RUN == 0:
             add_bands(

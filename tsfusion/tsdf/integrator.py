@@ -258,9 +258,12 @@ class Integrator:
         """Add a part's rays to the blocks of slot ≥ `oldest`."""
         store, buffers = self._store, self._buffers
         job = which, *part, self.units, sign, oldest, most_missing, store.stamp, buffers.colored
-        integrate.add_rays(
+        arguments = (
             buffers.rays, buffers.bands, buffers.again, np.array(job, np.int32), store.hash_keys,
             store.hash_slots, buffers.missing, buffers.scratch, buffers.owners, store.stamps, store.places,
             store.dirty, buffers.touched, store.sums.reshape(-1), store.color_rgn.reshape(-1),
             store.color_b.reshape(-1),
         )  # fmt: skip
+        integrate.add_rays(*arguments)
+        if self.units > 1:
+            integrate.add_shared_rays(*arguments)
