@@ -1,14 +1,21 @@
 # SPDX-License-Identifier: MIT
-"""A model of what servers hold, simulated with SimPy, and checked against what scripts/fleet.py measured.
+"""A model of what servers hold and of what `tsfusion fuse` takes, simulated with SimPy, checked against what
+scripts/fleet.py and scripts/cluster.py measured.
 
     python scripts/capacity.py                          the committed points, the check, a city
     python scripts/capacity.py points.jsonl --json      other points: lines that scripts/fleet.py printed
+    python scripts/capacity.py --fuse lines.jsonl       … that scripts/cluster.py printed
 
 A gateway is one thread: it takes up to 16 keyframes that came, works on each, waits once for the disk, and
 answers. The wait for the disk is the floor that was measured without a server, and what the run added to it
 (`--disk-wait`). Two numbers are fitted to two runs: its work on a keyframe, and the way of an answer to the
-scanner and of the next keyframe back. All other points are predicted, and the script fails when one is off by
-more than 15 %.
+scanner and of the next keyframe back.
+
+`tsfusion fuse` is jobs that take turns on the cores: a worker's start and its share of the keyframes, the
+addition of the parts, a share of the mesh each, and its assembly. Two runs of one worker and one of two are
+fitted: the shortest, and the longest.
+
+All other points are predicted, and the script fails when one is off by more than 15 %.
 """
 
 import argparse
@@ -22,7 +29,10 @@ import simpy
 from msgspec import Struct
 from msgspec.structs import replace
 
-POINTS = Path(__file__).parents[1] / "docs" / "scale-points.jsonl"
+from tsfusion.cluster import mesh_runs
+
+DOCS = Path(__file__).parents[1] / "docs"
+POINTS, FUSE_POINTS = DOCS / "scale-points.jsonl", DOCS / "fuse-points.jsonl"
 FIT, FIT_DISK_WAIT_MS = (1, 10), 5  # scanners
 TOLERANCE = 0.15
 WINDOW = 8  # keyframes under way of a scanner (`window_keyframes`)
@@ -112,6 +122,100 @@ def check(rows: list[Row]) -> tuple[Gateway, list[Row]]:
     return gateway, table
 
 
+# --- fusing a journal ---
+
+TURN_S = 0.05  # of a job on a core, while others wait for one
+
+
+class Fusing(Struct, frozen=True):
+    """Seconds of `tsfusion fuse`: of the command beside its jobs; until a worker fuses, a keyframe; of adding
+    a block; until a worker meshes, a block; of putting the mesh of a block into the whole one."""
+
+    command: float
+    start: float
+    keyframe: float
+    adding: float
+    mesh_start: float
+    meshing: float
+    joining: float
+
+
+def simulate_fusing(model: Fusing, keyframes: int, blocks: int, workers: int, cores: int) -> float:
+    """Seconds of a whole run."""
+    env = simpy.Environment()
+    machine = simpy.Resource(env, cores)
+
+    def job(seconds: float) -> Iterator[Any]:
+        while seconds > 0:
+            with machine.request() as turn:
+                yield turn
+                yield env.timeout(min(seconds, TURN_S))
+            seconds -= TURN_S
+
+    def run() -> Iterator[Any]:
+        yield env.timeout(model.command)
+        share = model.start + model.keyframe * keyframes / workers
+        yield env.all_of([env.process(job(share)) for _ in range(workers)])
+        if workers > 1:
+            yield env.process(job(model.adding * blocks))
+        runs = len(mesh_runs.shares(blocks, workers)) or 1
+        share = model.mesh_start + model.meshing * blocks / runs
+        yield env.all_of([env.process(job(share)) for _ in range(runs)])
+        if runs > 1:
+            yield env.process(job(model.joining * blocks))
+
+    env.run(until=env.process(run()))
+    return float(env.now)
+
+
+def fit_fusing(rows: list[Row]) -> Fusing:
+    """The times that make up the three fitted runs."""
+    short, long = (min(_alone(rows), key=_keyframes), max(_alone(rows), key=_keyframes))
+    pair = next(row for row in rows if _is_pair(row, rows))
+    more, blocks = long["keyframes"] - short["keyframes"], long["blocks"] - short["blocks"]
+    keyframe = (long["seconds"]["fusing"] - short["seconds"]["fusing"]) / more
+    meshing = (long["seconds"]["meshing"] - short["seconds"]["meshing"]) / blocks
+    mesh_start = long["seconds"]["meshing"] - meshing * long["blocks"]
+    beside = [row["whole_seconds"] - sum(row["seconds"].values()) for row in (short, long, pair)]
+    together = pair["seconds"]["meshing"] - mesh_start - meshing * pair["blocks"] / 2
+    return Fusing(
+        command=sum(beside) / len(beside),
+        start=long["seconds"]["fusing"] - keyframe * long["keyframes"],
+        keyframe=keyframe,
+        adding=pair["seconds"]["adding"] / pair["blocks"],
+        mesh_start=mesh_start,
+        meshing=meshing,
+        joining=max(together, 0.0) / pair["blocks"],
+    )
+
+
+def _keyframes(row: Row) -> int:
+    return int(row["keyframes"])
+
+
+def _alone(rows: list[Row]) -> list[Row]:
+    return [row for row in rows if row["workers"] == 1]
+
+
+def _is_pair(row: Row, rows: list[Row]) -> bool:
+    """Whether it is the longest run of two workers."""
+    return bool(row["workers"] == 2 and row["keyframes"] == max(map(_keyframes, rows)))
+
+
+def check_fusing(rows: list[Row]) -> tuple[Fusing, list[Row]]:
+    """The fitted times, and each measured run beside the prediction."""
+    model, table = fit_fusing(rows), []
+    ends = {min(map(_keyframes, _alone(rows))), max(map(_keyframes, _alone(rows)))}
+    for row in rows:
+        predicted = simulate_fusing(model, row["keyframes"], row["blocks"], row["workers"], row["cores"])
+        table.append({
+            "workers": row["workers"], "keyframes": row["keyframes"], "measured": row["whole_seconds"],
+            "predicted": round(predicted, 1), "error": round(predicted / row["whole_seconds"] - 1.0, 3),
+            "fitted": (row["workers"] == 1 and row["keyframes"] in ends) or _is_pair(row, rows),
+        })  # fmt: skip
+    return model, table
+
+
 # --- a city ---
 
 CORES = 16  # of a machine
@@ -160,29 +264,45 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("points", nargs="?", type=Path, default=POINTS)
+    parser.add_argument("--fuse", type=Path, default=FUSE_POINTS, metavar="POINTS")
     parser.add_argument("--json", action="store_true", help="one object")
     options = parser.parse_args()
-    rows = [json.loads(line) for line in options.points.read_text(encoding="utf-8").splitlines()]
-    gateway, table = check(rows)
-    keyframe_bytes = rows[0]["keyframe_bytes"]
-    cities = [city(machines, keyframe_bytes) for machines in (1, 2, 4, 8, 16, 32, 64)]
-    worst = max(abs(row["error"]) for row in table if not row["fitted"])
+    gateway, table = check(rows := _read(options.points))
+    fusing, runs = check_fusing(_read(options.fuse))
+    cities = [city(machines, rows[0]["keyframe_bytes"]) for machines in (1, 2, 4, 8, 16, 32, 64)]
+    worst = max(abs(row["error"]) for row in table + runs if not row["fitted"])
     if options.json:
-        milliseconds = {name: round(1e3 * getattr(gateway, name), 4) for name in Gateway.__struct_fields__}
         print(json.dumps({
-            "gateway_ms": milliseconds, "points": table, "worst_error": worst, "city": cities,
+            "gateway_ms": _milliseconds(gateway), "points": table,
+            "fusing_ms": _milliseconds(fusing), "runs": runs, "worst_error": worst, "city": cities,
         }))  # fmt: skip
     else:
         for row in table:
             print(
                 f"{row['scanners']:4} scanners, disk wait {row['disk_wait_ms']:3.0f} ms: durable a second "
-                f"{row['measured']:7.1f} measured, {row['predicted']:7.1f} predicted "
-                f"({100 * row['error']:+.1f} %{', fitted' if row['fitted'] else ''})"
+                f"{row['measured']:7.1f} measured, {row['predicted']:7.1f} predicted ({_off(row)})"
+            )
+        for row in runs:
+            print(
+                f"{row['workers']:4} workers, {row['keyframes']} keyframes: seconds {row['measured']:5.1f} "
+                f"measured, {row['predicted']:5.1f} predicted ({_off(row)})"
             )
         print(f"worst of those that were not fitted: {100 * worst:.1f} %")
         for one in cities:
             print(f"{one['machines']:4} machines, {one['maps']} maps: {one['hours']:6.2f} h")
     return 0 if worst <= TOLERANCE else 1
+
+
+def _read(points: Path) -> list[Row]:
+    return [json.loads(line) for line in points.read_text(encoding="utf-8").splitlines()]
+
+
+def _off(row: Row) -> str:
+    return f"{100 * row['error']:+.1f} %{', fitted' if row['fitted'] else ''}"
+
+
+def _milliseconds(model: Struct) -> dict[str, float]:
+    return {name: round(1e3 * getattr(model, name), 4) for name in model.__struct_fields__}
 
 
 if __name__ == "__main__":

@@ -26,6 +26,9 @@ def test_what_was_not_fitted_is_predicted_within_fifteen_percent() -> None:
     checked = [one for one in found["points"] if not one["fitted"]]
     assert len(checked) >= 5
     assert all(abs(one["error"]) <= 0.15 for one in checked)
+    runs = [one for one in found["runs"] if not one["fitted"]]
+    assert {one["workers"] for one in runs} >= {1, 2, 4}
+    assert all(abs(one["error"]) <= 0.15 for one in runs)
     hours = [one["hours"] for one in found["city"]]
     assert hours == sorted(hours, reverse=True)
     assert hours[0] / hours[1] > 1.5
@@ -38,3 +41,14 @@ def test_a_measurement_that_does_not_fit_fails(tmp_path: Path) -> None:
     wrong["durable_a_second"] *= 2
     (tmp_path / "points.jsonl").write_text("".join(f"{json.dumps(one)}\n" for one in rows), encoding="utf-8")
     assert capacity(tmp_path / "points.jsonl").returncode == 1
+
+
+def test_a_run_of_fuse_that_does_not_fit_fails(tmp_path: Path) -> None:
+    lines = (ROOT / "docs" / "fuse-points.jsonl").read_text(encoding="utf-8").splitlines()
+    rows = [json.loads(line) for line in lines]
+    wrong = next(one for one in rows if one["workers"] == 4)
+    wrong["whole_seconds"] *= 2
+    (tmp_path / "runs.jsonl").write_text("".join(f"{json.dumps(one)}\n" for one in rows), encoding="utf-8")
+    done = capacity("--fuse", tmp_path / "runs.jsonl")
+    assert done.returncode == 1
+    assert json.loads(done.stdout)["worst_error"] > 0.4
