@@ -2,7 +2,6 @@
 """A gateway in this process that listens, with fusers that fuse nothing."""
 
 import contextlib
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -28,13 +27,10 @@ class Served:
     def __init__(self, gateway: Gateway) -> None:
         self.gateway = gateway
         self.addresses = gateway.ports.bind()
-        self.longest = 0.0  # CPU seconds of a step
         gateway.accept(self.addresses)
 
     def step(self) -> None:
-        began = time.thread_time()
         self.gateway.step()
-        self.longest = max(self.longest, time.thread_time() - began)
 
     @property
     def durable(self) -> int:
