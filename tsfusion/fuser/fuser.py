@@ -14,6 +14,7 @@ import time
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -440,10 +441,7 @@ class Fuser:
             map_hash=self._hashes[1],
             color_hash=self._hashes[2],
             peak_rss_bytes=process.peak_rss_bytes(),
-            versions={
-                "python": platform.python_version(),
-                **{name: version(name) for name in ("tsfusion", "taichi", "numpy", "pyzmq")},
-            },
+            versions=_versions(),
             config=msgspec.to_builtins(self._volume.config),
         )
 
@@ -460,6 +458,13 @@ class Fuser:
 
     def _send(self, message: Any, frames: list[Any] | None = None) -> None:
         self._link.send_multipart([fuser_messages.encode(message), *(frames or [])], copy=False)
+
+
+@cache
+def _versions() -> dict[str, str]:
+    """What the fuser runs on; files are read for it, which took longer than all else of a status."""
+    libraries = {name: version(name) for name in ("tsfusion", "taichi", "numpy", "pyzmq")}
+    return {"python": platform.python_version(), **libraries}
 
 
 def _reason(error: TsfusionError) -> str:
