@@ -12,19 +12,24 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import quick_fusers
 import small_disks
 from command_processes import Here
+from keyframes_and_servers import Server, serving
 
 from tsfusion.cli import main
 from tsfusion.core import logs
 from tsfusion.core.errors import MissingDependency
+from tsfusion.gateway import fuser_process
 
 os.environ["PYTHONPATH"] = os.pathsep.join(sys.path)  # programs that tests start find what tests find
 OPTIONAL = ("kiss_icp", "open3d", "pooch", "pyrealsense2", "rosbags", "scipy", "xatlas")
 STDERR = pytest.StashKey[Any]()
+Server.FUSER = fuser_process.COMMAND = quick_fusers.LAZY  # of servers that tests start, and in this process
 BYTECODE = "TEST_BYTECODE"  # environment: folder of what the commands that tests start compile
 DATA = Path(os.environ.get("TSFUSION_DATA", Path(__file__).parents[2] / "shared" / "data"))
 
@@ -147,12 +152,24 @@ def here(
     signal.signal(signal.SIGTERM, handler)
 
 
-@pytest.fixture(scope="module")
-def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    """One server for the tests of a module that leave it as it was or do not care what it holds."""
-    from keyframes_and_servers import serving
+@pytest.fixture
+def quick_servers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have servers of runs in this process start their fusers without compiling ahead."""
+    from tsfusion.pipelines import target_server
 
-    with serving(tmp_path_factory.mktemp("shared")) as server:
+    names = {name: getattr(subprocess, name) for name in ("PIPE", "TimeoutExpired")}
+    made = SimpleNamespace(Popen=quick_fusers.quick_server, **names)
+    monkeypatch.setattr(target_server, "subprocess", made)
+
+
+@pytest.fixture(scope="module")
+def shared(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    """One server for the tests of a module that leave it as it was or do not care what it holds.
+
+    Its fuser is the module's `FUSER`, where it has one.
+    """
+    fuser = getattr(request.module, "FUSER", None)
+    with serving(tmp_path_factory.mktemp("shared"), fuser=fuser) as server:
         yield server
 
 

@@ -12,7 +12,7 @@ import cv2
 import pytest
 import trimesh
 from clients_and_spools import deliver
-from command_processes import Here, descendants, end, read_until, server, started, tsfusion
+from command_processes import COMMAND, QUICK, Here, descendants, end, read_until, server, started, tsfusion
 from small_recordings import first_views
 
 from tsfusion import Client, FlushTimeout, Volume, VolumeConfig, journal
@@ -30,7 +30,7 @@ def test_serve_answers_and_ends_well(tmp_path: Path) -> None:
     (tmp_path / "cache").mkdir()
     may_wait = sys.platform == "linux" and not durable_files.is_in_memory(tmp_path)
     flags = ("--memory", "0.3GB", "--cache", tmp_path / "cache") if may_wait else ()
-    with server(tmp_path / "state", "--voxel-size", VOXEL, *flags) as (address, process):
+    with server(tmp_path / "state", "--voxel-size", VOXEL, *flags, command=COMMAND) as (address, process):
         if may_wait:
             maps = [Path(f"/proc/{pid}/maps").read_text() for pid in descendants(process.pid)]
             assert any(f"{tmp_path}/cache/" in mappings for mappings in maps)
@@ -76,8 +76,8 @@ def test_serve_answers_and_ends_well(tmp_path: Path) -> None:
         (("--cache", "."), "--cache has no effect without --memory: all blocks stay in memory"),
     ],
 )
-def test_what_bounds_no_memory_is_named(tmp_path: Path, flags: tuple[str, ...], message: str) -> None:
-    done = tsfusion("serve", "--state", tmp_path / "state", *flags)
+def test_what_bounds_no_memory_is_named(here: Here, flags: tuple[str, ...], message: str) -> None:
+    done = here("serve", "--state", "state", *flags)
     assert (done.returncode, message in done.stderr) == (1, True), done.stderr
 
 
@@ -100,7 +100,8 @@ def test_a_server_that_fell_silent_is_not_called_slow(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_ready_line_is_for_people_too(tmp_path: Path) -> None:
-    process = started("serve", "--listen", "tcp://127.0.0.1:0", "--state", tmp_path / "state")
+    words = ("serve", "--listen", "tcp://127.0.0.1:0", "--state", tmp_path / "state")
+    process = started(*words, command=QUICK)
     try:
         line = read_until(process, "ready")
         assert "ready in" in line
@@ -184,7 +185,7 @@ def test_the_mesh_of_a_map_larger_than_its_memory_is_written_in_tiles(
 
 
 @pytest.mark.slow
-def test_mesh_fuses_what_the_checkpoint_missed(state: Path, tmp_path: Path) -> None:
+def test_mesh_fuses_what_the_checkpoint_missed(state: Path, here: Here, tmp_path: Path) -> None:
     """A state folder whose map is older than its journal, as a killed server leaves it."""
     folder = tmp_path / "state/maps/default"
     shutil.copytree(state / "maps/default/journal", folder / "journal")
@@ -195,7 +196,7 @@ def test_mesh_fuses_what_the_checkpoint_missed(state: Path, tmp_path: Path) -> N
     saved.poses.add(first.session, first.seq, first.position, keyframe)
     saved.done[first.session] = SessionProgress(first.seq, "")
     assert saved.save()
-    done = tsfusion(
+    done = here(
         "mesh", tmp_path / "state", tmp_path / "a.glb", "--preview", tmp_path / "a.png", "--keep-islands"
     )
     assert done.returncode == 0, done.stderr

@@ -8,13 +8,16 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 from weakref import WeakKeyDictionary
 
+import quick_fusers
+
 COMMAND = [sys.executable, "-m", "tsfusion"]
+QUICK = quick_fusers.server_command(quick_fusers.LAZY)  # the same, its servers sooner ready
 DEADLINE = 240.0  # seconds: a cold kernel compilation on a slow machine that does other things as well
 Here = Callable[..., "subprocess.CompletedProcess[str]"]  # of the fixture `here`
 
@@ -41,10 +44,10 @@ def python(program: str, *arguments: object, **more: Any) -> "subprocess.Complet
     return subprocess.run(command, text=True, **{**options, **more})  # noqa: PLW1510
 
 
-def started(*arguments: object) -> "subprocess.Popen[str]":
+def started(*arguments: object, command: Sequence[str] = COMMAND) -> "subprocess.Popen[str]":
     """Start a command; its stderr goes with its stdout."""
     return subprocess.Popen(
-        [*COMMAND, *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        [*command, *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
         env=environment(), stdin=subprocess.DEVNULL,
     )  # fmt: skip
 
@@ -76,9 +79,12 @@ def read_until(process: "subprocess.Popen[str]", word: str, timeout: float = DEA
 
 
 @contextmanager
-def server(state: Path, *arguments: object) -> Iterator[tuple[str, "subprocess.Popen[str]"]]:
+def server(
+    state: Path, *arguments: object, command: Sequence[str] = QUICK
+) -> Iterator[tuple[str, "subprocess.Popen[str]"]]:
     """A running `tsfusion serve` on free ports: its address and process."""
-    process = started("serve", "--listen", "tcp://127.0.0.1:0", "--state", state, "--json", *arguments)
+    words = ("serve", "--listen", "tcp://127.0.0.1:0", "--state", state, "--json", *arguments)
+    process = started(*words, command=command)
     try:
         ready = json.loads(read_until(process, '"ready"'))
         yield ready["listen"], process

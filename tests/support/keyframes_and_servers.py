@@ -12,10 +12,11 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import msgspec
 import numpy as np
+import quick_fusers
 import zmq
 
 from tsfusion import Intrinsics, Keyframe, journal
@@ -132,7 +133,14 @@ class Server:
     Args:
         wait: until it is ready; else call `wait_ready` before anything that needs its addresses.
         code: run before it, in its process.
+        fuser: command of its fusers, one of `quick_fusers`; None = `FUSER`.
+
+    Attributes:
+        FUSER: command of fusers where none is chosen; None = the server's own. Tests set another one
+            (tests/conftest.py), scripts that measure do not.
     """
+
+    FUSER: ClassVar[tuple[str, ...] | None] = None
 
     def __init__(
         self,
@@ -141,6 +149,7 @@ class Server:
         *,
         wait: bool = True,
         code: str = "",
+        fuser: tuple[str, ...] | None = None,
         **settings: Any,
     ) -> None:
         self.state = state
@@ -149,7 +158,7 @@ class Server:
         arguments = [msgspec.json.encode(one).decode() for one in (config, volume)]
         self._words = tempfile.TemporaryFile("w+")  # noqa: SIM115  a pipe that nobody reads would fill up
         self.process = subprocess.Popen(
-            [sys.executable, "-c", code + _SERVE, *arguments],
+            [sys.executable, "-c", quick_fusers.chosen(fuser or self.FUSER) + code + _SERVE, *arguments],
             stdout=subprocess.PIPE,
             stderr=self._words,
             text=True,

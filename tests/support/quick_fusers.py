@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: MIT
+"""Commands that start a fuser sooner than the server's own does: hundreds of tests start one each.
+
+The server's own compiles all kernels ahead, a few seconds of a core. Tests that need no kernel, and those of
+everything around the map, need not wait for that; `tsfusion serve`, `replay` and `scan` in other tests do.
+"""
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+_PROGRAM = """
+import sys
+sys.path.insert(0, {folder!r})
+import quick_fusers
+quick_fusers.{before}()
+from tsfusion.fuser.__main__ import main
+sys.exit(main())
+"""
+
+
+def _command(before: str) -> tuple[str, ...]:
+    return sys.executable, "-c", _PROGRAM.format(folder=str(Path(__file__).parent), before=before)
+
+
+LAZY = _command("compile_when_needed")  # the real map
+SUMS = _command("sum_up")  # a `SumMap`: for tests that need no surface, only which keyframes are in the map
+
+
+def server_command(fuser: tuple[str, ...]) -> list[str]:
+    """The command `tsfusion`, whose servers start their fusers so."""
+    return [sys.executable, "-c", f"{chosen(fuser)}from tsfusion.__main__ import main\nmain()"]
+
+
+def quick_server(command: list[str], **more: Any) -> "subprocess.Popen[str]":
+    """Start the server of a run as `subprocess.Popen` does, with quick fusers."""
+    assert command[1:4] == ["-m", "tsfusion", "serve"], command
+    return subprocess.Popen([*server_command(LAZY), *command[3:]], **more)
+
+
+def compile_when_needed() -> None:
+    """Have maps of this process compile a kernel when it is first launched, and none ahead."""
+    from tsfusion.tsdf.volume import Volume
+
+    Volume.warming_up = lambda _: iter(())  # type: ignore[method-assign]
+
+
+def sum_up() -> None:
+    """Have this process's fuser add up digests of keyframes."""
+    import sum_map
+
+    sum_map.take_the_place_of_volume()
+
+
+def chosen(command: tuple[str, ...] | None) -> str:
+    """Code by which a server process starts its fusers so; None = by its own command."""
+    if command is None:
+        return ""
+    return f"from tsfusion.gateway import fuser_process\nfuser_process.COMMAND = {command!r}\n"
