@@ -138,6 +138,7 @@ def here(
     monkeypatch.chdir(tmp_path)
     for name in [name for name in os.environ if name.startswith("TSFUSION_")]:
         monkeypatch.delenv(name)
+    monkeypatch.setenv("TSFUSION_THREADS", "1")
     handler = signal.getsignal(signal.SIGTERM)
 
     def run(*arguments: object) -> "subprocess.CompletedProcess[str]":

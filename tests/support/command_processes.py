@@ -23,8 +23,12 @@ Here = Callable[..., "subprocess.CompletedProcess[str]"]  # of the fixture `here
 
 
 def environment() -> dict[str, str]:
-    """Variables of this process without tsfusion's own variables."""
-    return {key: value for key, value in os.environ.items() if not key.startswith("TSFUSION_")}
+    """Variables of this process, of tsfusion's own only one: kernels run on one thread.
+
+    Each test has about a core, and kernels that several threads need are not compiled.
+    """
+    others = {key: value for key, value in os.environ.items() if not key.startswith("TSFUSION_")}
+    return {**others, "TSFUSION_THREADS": "1"}
 
 
 def tsfusion(
