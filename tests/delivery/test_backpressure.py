@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from clients_and_spools import NOBODY, joined, send_all
 from keyframes_and_servers import DEADLINE, lasting_address, pose, serving, until, wall
+from quick_fusers import SUMS
 from repository import ROOT
 from scripted_server import scripted
 
@@ -329,13 +330,13 @@ def test_a_map_whose_server_is_killed_has_every_keyframe(tmp_path: Path) -> None
     """More than twice `backlog` come while nobody answers: the map gets them all."""
     state = tmp_path / "state"
     with (
-        serving(state, listen=lasting_address()) as server,
+        serving(state, fuser=SUMS, listen=lasting_address()) as server,
         Client(server.address, spool=tmp_path / "spool") as client,
     ):
         assert len(send_all(client, range(4))) == 4
         server.kill()
         assert len(send_all(client, range(4, 28))) == 24
-        with serving(state, listen=server.address) as again:
+        with serving(state, fuser=SUMS, listen=server.address) as again:
             client.wait_fused(DEADLINE)
             assert (client.stats.durable, client.stats.skipped) == (28, {})
             assert fetch_status(again.address).keyframes_fused == 28
@@ -346,14 +347,14 @@ def test_a_killed_server_and_drop_oldest(tmp_path: Path) -> None:
     """Every keyframe is in the map or was dropped, none is both."""
     config = ClientConfig(stall_timeout=0.5, backlog=4, policy="drop_oldest")
     with (
-        serving(tmp_path, listen=lasting_address()) as server,
+        serving(tmp_path, fuser=SUMS, listen=lasting_address()) as server,
         Client(server.address, config=config) as client,
     ):
         client.connect(DEADLINE)
         send_all(client, range(4))
         server.kill()
         send_all(client, range(4, 20))
-        with serving(tmp_path, listen=server.address) as again:
+        with serving(tmp_path, fuser=SUMS, listen=server.address) as again:
             client.wait_fused(DEADLINE)
             stats = client.stats
             assert stats.durable + stats.skipped["dropped"] == stats.sent == 20

@@ -8,6 +8,7 @@ import msgspec
 import pytest
 from clients_and_spools import NOBODY, joined, noise, send_all
 from keyframes_and_servers import DEADLINE, VOLUME, pose, serving, until, wall
+from quick_fusers import SUMS
 from scripted_server import number, scripted
 
 from tsfusion import Client
@@ -146,7 +147,7 @@ def test_what_is_larger_than_the_server_takes_is_not_sent(tmp_path: Path) -> Non
 def test_a_real_server_refuses_some_and_fuses_the_rest(tmp_path: Path) -> None:
     """Keyframes that look from too far away are refused; what is kept aside is not sent again, by nobody."""
     spool = tmp_path / "spool"
-    with serving(tmp_path / "state", quota_extent=10.0) as server:
+    with serving(tmp_path / "state", fuser=SUMS, quota_extent=10.0) as server:
         with Client(server.address, spool=spool, policy="spool_all") as client:
             for i in range(12):
                 client.send(wall(i, T_world_camera=pose(100.0 if i in (3, 4, 11) else 0.03 * i)))

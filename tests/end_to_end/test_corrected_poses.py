@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from clients_and_spools import NOBODY, QUICK
-from corrected_maps import fresh_map
+from corrected_maps import final_keyframes, fresh_map
 from delivery_verdict import VOXEL_SIZE
 from hostile_messages import hostile_corrections
 from keyframes_and_servers import (
@@ -27,6 +27,8 @@ from keyframes_and_servers import (
     until,
     wall,
 )
+from quick_fusers import SUMS
+from sum_map import hash_of
 
 from tsfusion import Client, journal
 from tsfusion.core.errors import FlushTimeout, InvalidKeyframe, KeyframeRefused
@@ -38,6 +40,7 @@ from tsfusion.wire.health import MapHealth
 from tsfusion.wire.queries import fetch_health, fetch_status
 
 SESSION = bytes(range(16))
+FUSER = SUMS  # but where keyframes are moved in a real map
 
 
 def scan(client: Client, count: int = 3) -> list[int]:
@@ -66,6 +69,11 @@ def fresh_hash(state: Path) -> str:
     return fresh_map(state_folder.find_journal(state).path, VOXEL_SIZE).map_hash()
 
 
+def hash_of_all(state: Path) -> str:
+    """The same where the map is a sum."""
+    return hash_of(final_keyframes(state_folder.find_journal(state).path))
+
+
 def test_corrections_stand_in_the_journal_between_keyframes(shared: Server, tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     first = [se3.exp(rng.normal(size=6)) for _ in range(3)]
@@ -90,7 +98,7 @@ def test_corrections_stand_in_the_journal_between_keyframes(shared: Server, tmp_
         assert (told.waiting, told.corrections_waiting, told.corrections_unavailable) == (0, 0, 0)
         assert told.keyframes_moved > 0
         assert told.keyframes_durable > told.keyframes_fused  # one was taken out
-    assert fetch_status(shared.address).map_hash == fresh_hash(shared.state)
+    assert fetch_status(shared.address).map_hash == hash_of_all(shared.state)
     assert records(shared.state, session) == [(seq, seq in (4, 6)) for seq in range(1, 7)]
     older, newer = journaled_corrections(shared.state)[-2:]
     assert older.poses.tobytes() == np.array(first).tobytes()
@@ -128,15 +136,15 @@ def test_a_fuser_that_dies_while_it_moves_keyframes(tmp_path: Path) -> None:
 
 
 def test_a_server_that_ends_moves_what_waits_first(tmp_path: Path) -> None:
-    with serving(tmp_path) as server, Client(server.address) as client:
+    with serving(tmp_path, fuser=FUSER) as server, Client(server.address) as client:
         client.correct({seq: pose(1.0 * seq) for seq in scan(client, 10)}, T_map_odometry=pose(0, 0.3))
         client.flush(DEADLINE)
         server.process.terminate()
         assert server.process.wait(DEADLINE) == 0
-    with serving(tmp_path) as server:
+    with serving(tmp_path, fuser=FUSER) as server:
         own = health_of(server)
         assert (own.corrections_waiting, own.keyframes_moved) == (0, 0)
-        assert fetch_status(server.address).map_hash == fresh_hash(tmp_path)
+        assert fetch_status(server.address).map_hash == hash_of_all(tmp_path)
 
 
 def test_only_what_was_sent_can_be_corrected(shared: Server, tmp_path: Path) -> None:
@@ -167,7 +175,7 @@ def test_ten_thousand_poses_while_keyframes_go_on(shared: Server, tmp_path: Path
 
 def test_what_the_server_refuses_is_told_and_kept_aside(tmp_path: Path) -> None:
     with (
-        serving(tmp_path / "state", quota_extent=100.0) as server,
+        serving(tmp_path / "state", fuser=FUSER, quota_extent=100.0) as server,
         Client(server.address, spool=tmp_path / "spool") as client,
     ):
         (seq,) = scan(client, 1)
@@ -214,7 +222,7 @@ def test_another_clients_session_cannot_be_corrected(tmp_path: Path) -> None:
     key_folder.allow(tmp_path / "server", "cart", key_folder.create_pair(tmp_path / "cart", "cart").public)
     cart = Secured({}, {**robot.client, "key": str(tmp_path / "cart" / "cart.key_secret")})
     with (
-        serving(tmp_path / "state", **robot.server) as server,  # type: ignore[arg-type]
+        serving(tmp_path / "state", fuser=FUSER, **robot.server) as server,  # type: ignore[arg-type]
         Client(server.address, spool=tmp_path / "spool", **robot.client) as client,  # type: ignore[arg-type]
     ):
         seqs = scan(client)
@@ -232,7 +240,7 @@ def test_another_clients_session_cannot_be_corrected(tmp_path: Path) -> None:
 
 def test_corrections_count_in_the_quota(tmp_path: Path) -> None:
     with (
-        serving(tmp_path / "state", quota_keyframes=10.0) as server,
+        serving(tmp_path / "state", fuser=FUSER, quota_keyframes=10.0) as server,
         Client(server.address, spool=tmp_path / "spool") as client,
     ):
         seqs = scan(client)
@@ -263,7 +271,7 @@ writer.Journal.append_all = append_all
 @pytest.mark.parametrize("writes", [False, True])
 def test_a_server_that_dies_before_it_answers(tmp_path: Path, writes: bool) -> None:
     state = tmp_path / "state"
-    with serving(state, listen=lasting_address(), code=_DIES.format(writes=writes)) as first:  # type: ignore[arg-type]
+    with serving(state, fuser=FUSER, listen=lasting_address(), code=_DIES.format(writes=writes)) as first:
         address = first.address
         client = Client(address, spool=tmp_path / "spool", config=QUICK)
         try:
@@ -276,7 +284,7 @@ def test_a_server_that_dies_before_it_answers(tmp_path: Path, writes: bool) -> N
             with pytest.raises(FlushTimeout, match="1 keyframe and 2 corrections not acknowledged"):
                 client.flush(0.1)
             assert client.stats.corrections_acknowledged == 0
-            with serving(state, listen=address):
+            with serving(state, fuser=FUSER, listen=address):
                 client.wait_fused(DEADLINE)
                 assert client.stats.corrections_acknowledged == 2
                 status = fetch_status(address)
@@ -306,7 +314,7 @@ client.close()
 @pytest.mark.parametrize("end", ["killed", "closed"])
 def test_a_scanner_that_dies_before_the_answer_leaves_them_to_the_next(tmp_path: Path, end: str) -> None:
     state, spool = tmp_path / "state", tmp_path / "spool"
-    with serving(state) as server:
+    with serving(state, fuser=FUSER) as server:
         command = [sys.executable, "-c", _SCANS, server.address, str(spool), end]
         with subprocess.Popen(command, stdin=-1, stdout=-1, text=True) as scanner:
             assert scanner.stdin is not None
@@ -317,7 +325,7 @@ def test_a_scanner_that_dies_before_the_answer_leaves_them_to_the_next(tmp_path:
             scanner.stdin.flush()
             assert scanner.wait(DEADLINE) == (-signal.SIGKILL if end == "killed" else 0)
     assert journaled_corrections(state) == []
-    with serving(state) as server, Client(server.address, spool=spool) as client:
+    with serving(state, fuser=FUSER) as server, Client(server.address, spool=spool) as client:
         session = session_of(client)
         client.flush(DEADLINE)
         assert client.stats.corrections_acknowledged == 2
@@ -332,7 +340,7 @@ def test_a_scanner_that_dies_before_the_answer_leaves_them_to_the_next(tmp_path:
 def test_a_restart_goes_on_behind_corrections(tmp_path: Path) -> None:
     """The checkpoint covers them; without one the journal is read again, and no count is off."""
     state = tmp_path / "state"
-    with serving(state) as server, Client(server.address, spool=tmp_path / "spool") as client:
+    with serving(state, fuser=FUSER) as server, Client(server.address, spool=tmp_path / "spool") as client:
         seqs = scan(client)
         client.correct({seqs[0]: pose(1)})
         client.wait_fused(DEADLINE)
@@ -341,7 +349,7 @@ def test_a_restart_goes_on_behind_corrections(tmp_path: Path) -> None:
     for lost in (False, True):
         if lost:
             (state / "maps" / "default" / "map.tsf").unlink()
-        with serving(state) as server:
+        with serving(state, fuser=FUSER) as server:
             until(lambda: fetch_status(server.address).fuser == "idle")
             status = fetch_status(server.address)
             assert (status.keyframes_durable, status.keyframes_fused) == (3, 3)
@@ -358,7 +366,7 @@ def test_what_an_earlier_development_version_left_is_named(
     for folder, name in ((old, f"{bytes(16).hex()}.tsc"), (spool, "corrections.tsc")):
         folder.mkdir(parents=True)
         (folder / name).write_bytes(b"TSFCOR")
-    with serving(state) as server, Client(server.address, spool=spool) as client:
+    with serving(state, fuser=FUSER) as server, Client(server.address, spool=spool) as client:
         scan(client)
         assert server.terminate() == 0
         assert server.stderr_text().count("as an earlier development version kept them") == 1

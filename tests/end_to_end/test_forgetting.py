@@ -8,6 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
+import sum_map
 from command_processes import Here
 from keyframes_and_servers import (
     DEADLINE,
@@ -21,6 +22,7 @@ from keyframes_and_servers import (
     until,
     wall,
 )
+from quick_fusers import SUMS
 
 from tsfusion import Client, journal
 from tsfusion.core.config import SERVER_SESSION
@@ -35,6 +37,7 @@ from tsfusion.wire.messages import PROTOCOL_VERSION, Denied, Hello
 from tsfusion.wire.queries import CommandRefused, fetch_health, fetch_status, forget
 
 COUNT = 4
+FUSER = SUMS  # of the server that some tests share
 
 
 def scan(server: Server, first: int, keys: Secured | None = None) -> str:
@@ -135,7 +138,7 @@ def test_a_key_forgets_its_own_keyframes_unless_it_may_forget_all(tmp_path: Path
     robot = secured(tmp_path)
     key_folder.allow(tmp_path / "server", "cart", key_folder.create_pair(tmp_path / "cart", "cart").public)
     cart = Secured({}, {**robot.client, "key": str(tmp_path / "cart" / "cart.key_secret")})
-    with serving(tmp_path / "state", **robot.server) as server:  # type: ignore[arg-type]
+    with serving(tmp_path / "state", fuser=SUMS, **robot.server) as server:  # type: ignore[arg-type]
         mine, other = scan(server, 0, robot), scan(server, 10, cart)
         with pytest.raises(CommandRefused, match="may forget keyframes of client cart only"):
             forget(server.address, Selection(client="robot"), keys=cart.keys)
@@ -146,7 +149,7 @@ def test_a_key_forgets_its_own_keyframes_unless_it_may_forget_all(tmp_path: Path
         assert key_folder.read_allow_list(tmp_path / "server").forget == ("cart",)
         until(lambda: _forgets(server, Selection(client="robot"), cart))
         until(lambda: fetch_status(server.address, keys=robot.keys).keyframes_fused == 0)
-        assert fetch_status(server.address, keys=robot.keys).map_hash == map_hash([])
+        assert fetch_status(server.address, keys=robot.keys).map_hash == sum_map.hash_of([])
 
 
 def _forgets(server: Server, selection: Selection, keys: Secured) -> bool:

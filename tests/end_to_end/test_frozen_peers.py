@@ -18,8 +18,10 @@ import pytest
 from bad_network import Proxy
 from clients_and_spools import NOBODY, send_all
 from delivery_verdict import verify
-from keyframes_and_servers import DEADLINE, Server, connected, map_hash, serving, until, wall
+from keyframes_and_servers import DEADLINE, Server, connected, serving, until, wall
+from quick_fusers import SUMS
 from scanner_process import Plan, Report, journals, numbers
+from sum_map import hash_of
 from supervisors import SCANNER
 
 from tsfusion import Client, journal
@@ -34,6 +36,7 @@ from tsfusion.wire.record_header import VERSION
 FREEZE = 6.0  # seconds: longer than any timeout of client and server
 SHORT_FREEZE = 3.0  # where the gateway lives, and would have noticed by then
 QUICK = ClientConfig(policy="spool_all", stall_timeout=0.5)
+FUSER = SUMS  # which keyframes are in the map is all that matters here
 
 
 @contextmanager
@@ -65,7 +68,7 @@ def outcome(server: Server, keyframes: int, state: Path) -> list[str]:
     until(lambda: fetch_status(server.address).keyframes_fused >= keyframes)
     status = fetch_status(server.address)
     assert server.terminate() == 0
-    return verify(state, keyframes, status.map_hash)
+    return verify(state, keyframes, status.map_hash, sums=True)
 
 
 # --- standing still ---
@@ -73,7 +76,7 @@ def outcome(server: Server, keyframes: int, state: Path) -> list[str]:
 
 def test_a_frozen_server_is_missed_and_catches_up(tmp_path: Path) -> None:
     state = tmp_path / "state"
-    with serving(state) as server, Client(server.address, config=QUICK) as client:
+    with serving(state, fuser=FUSER) as server, Client(server.address, config=QUICK) as client:
         client.send(wall(0))
         client.flush(timeout=DEADLINE)
         sending = stream(client, range(1, 41), FREEZE)
@@ -92,7 +95,7 @@ def test_a_frozen_server_is_missed_and_catches_up(tmp_path: Path) -> None:
 
 def test_a_frozen_scanner_holds_nobody_up(tmp_path: Path) -> None:
     state, report = tmp_path / "state", tmp_path / "report"
-    with serving(state) as server, Client(server.address, config=QUICK) as client:
+    with serving(state, fuser=FUSER) as server, Client(server.address, config=QUICK) as client:
         plan = Plan(
             address=server.address, spool=str(tmp_path / "spool"), state=str(state), count=60, rate=30,
             report=str(report),
@@ -114,7 +117,7 @@ def test_a_frozen_scanner_holds_nobody_up(tmp_path: Path) -> None:
 
 def test_a_frozen_fuser_is_waited_for(tmp_path: Path) -> None:
     state = tmp_path / "state"
-    with serving(state) as server, Client(server.address, config=QUICK) as client:
+    with serving(state, fuser=FUSER) as server, Client(server.address, config=QUICK) as client:
         client.send(wall(0))
         client.wait_fused(timeout=DEADLINE)
         with frozen(server.fuser_pid()):
@@ -129,7 +132,7 @@ def test_a_frozen_fuser_is_waited_for(tmp_path: Path) -> None:
 def test_a_fuser_that_stands_still_is_replaced(tmp_path: Path) -> None:
     state = tmp_path / "state"
     with (
-        serving(state, fuser_timeout=1.5, checkpoint_every=3) as server,
+        serving(state, fuser=FUSER, fuser_timeout=1.5, checkpoint_every=3) as server,
         Client(server.address, config=QUICK) as client,
     ):
         sending = stream(client, range(10), 1.0)
@@ -152,7 +155,7 @@ def test_a_copied_spool_is_one_session(tmp_path: Path, monkeypatch: pytest.Monke
     with Client(NOBODY, spool=spools[0]) as client:
         send_all(client, range(6))
     shutil.copytree(*spools)
-    with serving(state) as server:
+    with serving(state, fuser=FUSER) as server:
         with Client(server.address, spool=spools[0], config=QUICK) as first:
             assert first.send(wall(6)) > 6
             first.wait_fused(timeout=DEADLINE)
@@ -174,7 +177,7 @@ def test_two_that_share_a_session_at_once_spoil_nothing(tmp_path: Path) -> None:
     with Client(NOBODY, spool=spools[0]) as client:
         client.send(wall(0))
     shutil.copytree(*spools)
-    with serving(state) as server:
+    with serving(state, fuser=FUSER) as server:
         scanners = [Client(server.address, spool=folder, config=QUICK) for folder in spools]
         sending = [stream(scanner, range(i, 41, 2), 1.0) for i, scanner in enumerate(scanners, start=1)]
         for thread in sending:
@@ -192,7 +195,7 @@ def test_two_that_share_a_session_at_once_spoil_nothing(tmp_path: Path) -> None:
     assert len(found) == len(set(found)) == status.keyframes_fused
     kept = {number for folder in spools if journal.segments(folder) for number in numbers(folder)}
     assert {*found, *kept} == set(range(41))
-    assert map_hash(map(wall, found)) == status.map_hash
+    assert hash_of(map(wall, found)) == status.map_hash
 
 
 # --- another version ---
@@ -242,13 +245,13 @@ def test_a_clock_that_jumps_changes_nothing(tmp_path: Path, monkeypatch: pytest.
     real = time.time_ns
     monkeypatch.setattr(time, "time_ns", lambda: real() - 86400 * 10**9 * (time.monotonic_ns() // 10**9 % 2))
     state = tmp_path / "state"
-    with serving(state, code=_JUMPING) as server, Client(server.address, config=QUICK) as client:
+    with serving(state, fuser=FUSER, code=_JUMPING) as server, Client(server.address, config=QUICK) as client:
         stream(client, range(30), 3.0).join(DEADLINE)
         client.wait_fused(timeout=DEADLINE)
         delays = [times.fused_ns - times.captured_ns for times in client.records]
         assert all(0 < delay < 60e9 for delay in delays), delays
         server.kill()
-    with serving(state, code=_JUMPING) as server:
+    with serving(state, fuser=FUSER, code=_JUMPING) as server:
         assert outcome(server, 30, state) == []
     logged = [record.logged_ns for path in find_journal(state).files() for record in journal.records(path)]
     assert logged != sorted(logged), "the clock has not jumped"
@@ -268,7 +271,7 @@ def test_status_of_a_frozen_server_is_a_clear_error(shared: Server) -> None:
 def test_what_was_sent_again_counts_once(tmp_path: Path) -> None:
     """The connection hangs; the client opens another, and what hung comes after all."""
     state = tmp_path / "state"
-    with serving(state) as server, Proxy() as proxy:
+    with serving(state, fuser=FUSER) as server, Proxy() as proxy:
         proxy.target(server.address, server.control)
         with Client(proxy.address, spool=tmp_path / "spool", config=QUICK) as client:
             client.send(wall(0))
@@ -282,4 +285,4 @@ def test_what_was_sent_again_counts_once(tmp_path: Path) -> None:
             client.wait_fused(timeout=DEADLINE)
         status = fetch_status(server.address)
         assert server.terminate() == 0
-    assert verify(state, 6, status.map_hash) == []
+    assert verify(state, 6, status.map_hash, sums=True) == []

@@ -6,12 +6,15 @@ import signal
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import closing, suppress
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
 from command_processes import tsfusion
 from keyframes_and_servers import DEADLINE, Server, lasting_address, map_hash, pose, serving, until, wall
+from quick_fusers import SUMS
+from sum_map import SumMap, hash_of
 
 from tsfusion import Client, MapClient, journal
 from tsfusion.core.config import ClientConfig
@@ -49,10 +52,10 @@ class Sender:
         return [i % 40 for i in range(self.count)]
 
 
-@pytest.fixture
-def sending(tmp_path: Path) -> Iterator[tuple[Server, Server, Sender]]:
+@contextmanager
+def sending(tmp_path: Path, **settings: Any) -> Iterator[tuple[Server, Server, Sender]]:
     """Two servers, and a client that has sent some keyframes to the first."""
-    with serving(tmp_path / "one") as one, serving(tmp_path / "two") as two:
+    with serving(tmp_path / "one", **settings) as one, serving(tmp_path / "two", **settings) as two:
         sender = Sender(one.address, tmp_path / "spool")
         try:
             until(lambda: sender.client.stats.durable >= FEW)
@@ -90,60 +93,57 @@ def journaled(state: Path) -> Counter[int]:
 
 
 def check_map(state: Path, sent: list[int]) -> None:
-    """The map in a state folder is that of these keyframes, each once."""
+    """The map of sums in a state folder is that of these keyframes, each once."""
     assert journaled(state) == Counter(range(1, len(sent) + 1))
-    assert tsfusion("map", "hash", state).stdout.strip() == map_hash(map(wall, sent))
+    saved = SumMap.load(state_folder.map_folder(state, "default") / state_folder.MAP_FILE)
+    assert saved.map_hash() == hash_of(map(wall, sent))
 
 
-def test_a_live_map_moves_and_every_keyframe_is_in_it_once(
-    tmp_path: Path, sending: tuple[Server, Server, Sender]
-) -> None:
-    one, two, sender = sending
-    with closing(MapWatcher(one.address)) as watcher:
-        see(watcher, lambda: watcher.address == one.address)
-        moved = tsfusion("map", "move", "default", "--from", one.address, "--to", two.address)
-        assert moved.returncode == 0, moved.stderr
-        assert f"map default is at {two.address}" in moved.stdout
-        see(watcher, lambda: watcher.address == two.address)
-    acknowledged_more(sender)
-    status = tsfusion("status", "--connect", one.address, "--map", "default")
-    assert status.returncode == 0, status.stdout + status.stderr
-    with MapClient(one.address, timeout=questions.LONGEST_S) as live:
-        assert live.sample([[0.0, 0.0, 1.0]]).state.keyframes >= FEW
-        assert live.address == two.address
-    assert len(queries.fetch_mesh(one.address).faces)
-    with Client(one.address, spool=tmp_path / "late", config=QUICK) as late:  # knows only the first server
-        late.send(wall(41, T_world_camera=pose(5.0)))
-        late.flush(DEADLINE)
-    assert queries.fetch_health(two.address).maps["default"].sessions == 2
-    back = queries.move_map("default", two.address, one.address)
-    assert back.address == one.address
-    acknowledged_more(sender)
-    sent = sender.end()
-    assert (one.terminate(), two.terminate()) == (0, 0)
-    folder = state_folder.map_folder(tmp_path / "one", "default") / state_folder.JOURNAL_FOLDER
-    assert sum(journaled(tmp_path / "one").values()) == len(sent) + 1
-    assert len(journal.segments(folder)) >= 3
-    expected = map_hash([*map(wall, sent), wall(41, T_world_camera=pose(5.0))])
-    assert tsfusion("map", "hash", tmp_path / "one").stdout.strip() == expected
-    assert (tmp_path / "two" / "moved" / "default.json").exists()
+def test_a_live_map_moves_and_every_keyframe_is_in_it_once(tmp_path: Path) -> None:
+    with sending(tmp_path) as (one, two, sender):
+        with closing(MapWatcher(one.address)) as watcher:
+            see(watcher, lambda: watcher.address == one.address)
+            moved = tsfusion("map", "move", "default", "--from", one.address, "--to", two.address)
+            assert moved.returncode == 0, moved.stderr
+            assert f"map default is at {two.address}" in moved.stdout
+            see(watcher, lambda: watcher.address == two.address)
+        acknowledged_more(sender)
+        status = tsfusion("status", "--connect", one.address, "--map", "default")
+        assert status.returncode == 0, status.stdout + status.stderr
+        with MapClient(one.address, timeout=questions.LONGEST_S) as live:
+            assert live.sample([[0.0, 0.0, 1.0]]).state.keyframes >= FEW
+            assert live.address == two.address
+        assert len(queries.fetch_mesh(one.address).faces)
+        with Client(one.address, spool=tmp_path / "late", config=QUICK) as late:  # knows the first one only
+            late.send(wall(41, T_world_camera=pose(5.0)))
+            late.flush(DEADLINE)
+        assert queries.fetch_health(two.address).maps["default"].sessions == 2
+        back = queries.move_map("default", two.address, one.address)
+        assert back.address == one.address
+        acknowledged_more(sender)
+        sent = sender.end()
+        assert (one.terminate(), two.terminate()) == (0, 0)
+        folder = state_folder.map_folder(tmp_path / "one", "default") / state_folder.JOURNAL_FOLDER
+        assert sum(journaled(tmp_path / "one").values()) == len(sent) + 1
+        assert len(journal.segments(folder)) >= 3
+        expected = map_hash([*map(wall, sent), wall(41, T_world_camera=pose(5.0))])
+        assert tsfusion("map", "hash", tmp_path / "one").stdout.strip() == expected
+        assert (tmp_path / "two" / "moved" / "default.json").exists()
 
 
-def test_a_map_that_cannot_go_stays_and_goes_on(
-    tmp_path: Path, sending: tuple[Server, Server, Sender]
-) -> None:
-    one, two, sender = sending
-    with Client(two.address, spool=tmp_path / "other") as other:
-        other.send(wall(0))
-        other.flush(DEADLINE)
-    with pytest.raises(TransportError, match="has a map default of its own"):
-        queries.move_map("default", one.address, two.address)
-    with pytest.raises(TransportError, match="no map yard is open here"):
-        queries.move_map("yard", one.address, two.address)
-    acknowledged_more(sender)
-    sent = sender.end()
-    assert one.terminate() == 0
-    check_map(tmp_path / "one", sent)
+def test_a_map_that_cannot_go_stays_and_goes_on(tmp_path: Path) -> None:
+    with sending(tmp_path, fuser=SUMS) as (one, two, sender):
+        with Client(two.address, spool=tmp_path / "other") as other:
+            other.send(wall(0))
+            other.flush(DEADLINE)
+        with pytest.raises(TransportError, match="has a map default of its own"):
+            queries.move_map("default", one.address, two.address)
+        with pytest.raises(TransportError, match="no map yard is open here"):
+            queries.move_map("yard", one.address, two.address)
+        acknowledged_more(sender)
+        sent = sender.end()
+        assert one.terminate() == 0
+        check_map(tmp_path / "one", sent)
 
 
 _DIES_AT = """
@@ -172,7 +172,7 @@ def test_a_server_that_dies_while_a_map_moves_loses_nothing(tmp_path: Path, who:
     code = {role: _DIES_AT.format(patch=_DEATHS[who])}
     states = {name: tmp_path / name for name in addresses}
     servers = {
-        name: Server(states[name], listen=address, code=code.get(name, ""))
+        name: Server(states[name], listen=address, code=code.get(name, ""), fuser=SUMS)
         for name, address in addresses.items()
     }
     sender = Sender(addresses["giver"], tmp_path / "spool")
@@ -182,7 +182,7 @@ def test_a_server_that_dies_while_a_map_moves_loses_nothing(tmp_path: Path, who:
         asked.start()
         assert servers[role].process.wait(DEADLINE) == -signal.SIGKILL
         servers[role].close()
-        servers[role] = Server(states[role], listen=addresses[role])
+        servers[role] = Server(states[role], listen=addresses[role], fuser=SUMS)
         acknowledged_more(sender)
         sent = sender.end()
         assert [one.terminate() for one in servers.values()] == [0, 0]
@@ -205,8 +205,8 @@ def _try_to_move(addresses: dict[str, str]) -> None:
 def test_a_directory_tells_where_a_map_is(tmp_path: Path) -> None:
     directory = str(tmp_path / "maps.sqlite")
     with (
-        serving(tmp_path / "one", directory=directory) as one,
-        serving(tmp_path / "two", directory=directory) as two,
+        serving(tmp_path / "one", fuser=SUMS, directory=directory) as one,
+        serving(tmp_path / "two", fuser=SUMS, directory=directory) as two,
     ):
         with Client(one.address, spool=tmp_path / "first", map="yard", world="w") as first:
             first.send(wall(0))

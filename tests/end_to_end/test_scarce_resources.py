@@ -15,6 +15,7 @@ import zmq
 from clients_and_spools import NOBODY, QUICK, deliver, joined, send_all
 from command_processes import alive
 from keyframes_and_servers import DEADLINE, Server, connected, map_hash, serving, until, wall
+from quick_fusers import SUMS
 from scripted_server import scripted
 
 from tsfusion import Client, Volume, VolumeConfig
@@ -27,11 +28,13 @@ from tsfusion.wire import messages, sockets
 from tsfusion.wire.messages import Command
 from tsfusion.wire.queries import fetch_health
 
+FUSER = SUMS  # but where a map outgrows its memory
+
 # --- scarce file descriptors, a full or vanishing disk ---
 
 
 def test_a_server_out_of_file_descriptors_lives(tmp_path: Path) -> None:
-    with serving(tmp_path / "state") as server, Client(server.address, config=QUICK) as client:
+    with serving(tmp_path / "state", fuser=FUSER) as server, Client(server.address, config=QUICK) as client:
         client.send(wall(0))
         client.wait_fused(timeout=DEADLINE)
         pid = server.process.pid
@@ -208,7 +211,7 @@ def test_a_spooled_message_that_is_none_is_given_up(shared: Server, tmp_path: Pa
 def test_a_killed_server_leaves_no_socket_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with tempfile.TemporaryDirectory(prefix="t", dir="/tmp") as short:  # a socket's path has to be short
         monkeypatch.setenv("TMPDIR", short)
-        with serving(tmp_path / "state") as server:
+        with serving(tmp_path / "state", fuser=FUSER) as server:
             assert list(Path(short).iterdir()) == []  # nothing waits for a cleaner end
             fuser = server.fuser_pid()
             server.kill()

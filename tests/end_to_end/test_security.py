@@ -12,6 +12,7 @@ import zmq
 from clients_and_spools import QUICK, send_all
 from http_requests import get
 from keyframes_and_servers import DEADLINE, Server, serving, until, wall
+from quick_fusers import SUMS
 
 import tsfusion
 from tsfusion import Client
@@ -281,7 +282,10 @@ def test_a_key_for_some_maps_watches_no_other(site: Site, server: Server) -> Non
 
 def test_other_maps_take_effect_at_once(tmp_path: Path) -> None:
     site = Site(tmp_path)
-    with serving(site.state, keys=str(site.keys)) as server, site.client(server, "robot") as robot:
+    with (
+        serving(site.state, fuser=SUMS, keys=str(site.keys)) as server,
+        site.client(server, "robot") as robot,
+    ):
         robot.send(wall(0))
         robot.flush(timeout=DEADLINE)
         key_folder.allow(site.keys, "robot", maps=["yard-*"])
@@ -300,7 +304,7 @@ def test_other_maps_take_effect_at_once(tmp_path: Path) -> None:
 def test_a_revocation_cuts_at_once_and_others_go_on(tmp_path: Path) -> None:
     site = Site(tmp_path)
     with (
-        serving(site.state, keys=str(site.keys)) as server,
+        serving(site.state, fuser=SUMS, keys=str(site.keys)) as server,
         site.client(server, "robot", tmp_path / "spool") as robot,
         site.client(server, "cart") as cart,
     ):
@@ -329,7 +333,7 @@ def test_a_revocation_cuts_at_once_and_others_go_on(tmp_path: Path) -> None:
 
 def test_a_new_key_under_the_old_name_goes_on_with_the_spool(tmp_path: Path) -> None:
     site = Site(tmp_path)
-    with serving(site.state, keys=str(site.keys)) as server:
+    with serving(site.state, fuser=SUMS, keys=str(site.keys)) as server:
         with site.client(server, "robot", tmp_path / "spool") as robot:
             robot.send(wall(0))
             robot.flush(timeout=DEADLINE)
@@ -343,7 +347,7 @@ def test_a_new_key_under_the_old_name_goes_on_with_the_spool(tmp_path: Path) -> 
 
 def test_with_keys_every_interface_may_be_served(tmp_path: Path) -> None:
     site = Site(tmp_path)
-    with serving(site.state, keys=str(site.keys), listen="tcp://0.0.0.0:0") as server:
+    with serving(site.state, fuser=SUMS, keys=str(site.keys), listen="tcp://0.0.0.0:0") as server:
         address = server.address.replace("0.0.0.0", "127.0.0.1")
         assert fetch_health(address, keys=site.of("robot")).ready
         with pytest.raises(TransportError):
@@ -356,7 +360,7 @@ def test_a_damaged_allow_list_lets_nobody_in_until_it_is_mended(tmp_path: Path) 
     good = listed.read_bytes()
     with socket.create_server(("127.0.0.1", 0)) as drawn:
         page = f"127.0.0.1:{drawn.getsockname()[1]}"
-    with serving(site.state, keys=str(site.keys), metrics=page) as server:
+    with serving(site.state, fuser=SUMS, keys=str(site.keys), metrics=page) as server:
         fetch_health(server.address, keys=site.of("robot"))
         listed.write_bytes(good + b"[")
         with pytest.raises(NotAllowed):
@@ -367,4 +371,4 @@ def test_a_damaged_allow_list_lets_nobody_in_until_it_is_mended(tmp_path: Path) 
         assert fetch_health(server.address, keys=site.of("robot")).ready
     listed.write_bytes(good + b"[")
     with pytest.raises(RuntimeError, match=r"InvalidConfig: the allow-list .* is damaged"):
-        serving(site.state, keys=str(site.keys)).__enter__()
+        serving(site.state, fuser=SUMS, keys=str(site.keys)).__enter__()

@@ -13,6 +13,8 @@ import zmq
 from clients_and_spools import send_all
 from failures import raising
 from keyframes_and_servers import DEADLINE, Server, at_once, connected, map_hash, serving, until, wall
+from quick_fusers import SUMS
+from sum_map import hash_of
 
 import tsfusion
 from tsfusion import Client
@@ -70,7 +72,11 @@ def test_two_scanners_two_maps(tmp_path: Path) -> None:
 def test_a_server_opens_only_so_many_maps(tmp_path: Path) -> None:
     why = r"map attic cannot be opened: 1 are open; use one of them .* max_maps"
     refused = pytest.raises(ServerUnreachable, match=why)
-    with serving(tmp_path, max_maps=1) as server, Client(server.address, map="attic") as client, refused:
+    with (
+        serving(tmp_path, fuser=SUMS, max_maps=1) as server,
+        Client(server.address, map="attic") as client,
+        refused,
+    ):
         client.connect(timeout=5)
     assert state_folder.map_names(tmp_path) == ["default"]
 
@@ -91,7 +97,7 @@ def test_maps_that_cannot_be_opened_are_remembered_up_to_a_number(
 
 def test_a_map_takes_only_so_many_sessions(tmp_path: Path) -> None:
     code = "import tsfusion.gateway.sessions; tsfusion.gateway.sessions._MAX_SESSIONS = 2\n"
-    with contextlib.closing(Server(tmp_path, code=code)) as server:
+    with contextlib.closing(Server(tmp_path, code=code, fuser=SUMS)) as server:
         for i in range(2):
             scan(server.address, "default", range(i, i + 1))
         refused = pytest.raises(ServerUnreachable, match="map default has 2 sessions and takes no new one")
@@ -148,7 +154,7 @@ def test_a_flood_does_not_hold_up_another_scanner(tmp_path: Path) -> None:
 
 
 def test_who_sends_too_much_has_to_wait_and_loses_nothing(tmp_path: Path) -> None:
-    with serving(tmp_path, quota_keyframes=10.0) as server:
+    with serving(tmp_path, fuser=SUMS, quota_keyframes=10.0) as server:
         started = time.monotonic()
         scan(server.address, "default", range(23))
         scan(server.address, "default", range(23, 45))  # a new session is no way around it
@@ -214,7 +220,10 @@ def test_quotas_are_of_each_client_and_forget_strangers() -> None:
 def test_a_full_disk_is_said_and_waited_for(tmp_path: Path) -> None:
     """Nothing is lost: the client keeps what the server's disk has no room for."""
     most = 1 << 40
-    with serving(tmp_path / "state", min_free_bytes=most) as server, Client(server.address) as client:
+    with (
+        serving(tmp_path / "state", fuser=SUMS, min_free_bytes=most) as server,
+        Client(server.address) as client,
+    ):
         client.connect()
         client.send(wall())
         until(lambda: not fetch_health(server.address).ready)
@@ -229,7 +238,7 @@ def test_a_full_disk_is_said_and_waited_for(tmp_path: Path) -> None:
 def test_a_full_disk_with_room_again(small_disk: Callable[[int], Path]) -> None:
     folder = small_disk(24)
     with (
-        serving(folder, min_free_bytes=4 << 20) as server,
+        serving(folder, fuser=SUMS, min_free_bytes=4 << 20) as server,
         Client(server.address, policy="spool_all") as client,
     ):
         scan(server.address, "default", range(3))
@@ -247,7 +256,7 @@ def test_a_full_disk_with_room_again(small_disk: Callable[[int], Path]) -> None:
         filler.unlink()
         client.wait_fused(timeout=DEADLINE)
         until(lambda: fetch_health(server.address).ready)  # the disk is looked at once a second
-        assert fetch_status(server.address).map_hash == map_hash(map(wall, range(sent)))
+        assert fetch_status(server.address).map_hash == hash_of(map(wall, range(sent)))
         assert server.terminate() == 0
 
 
@@ -255,15 +264,15 @@ def test_a_journal_keeps_to_its_limit(tmp_path: Path) -> None:
     """Segments that two checkpoints cover are deleted; a restart still knows what was fused."""
     limit = 1 << 20
     settings = {"journal_bytes": limit, "segment_bytes": 1 << 16, "checkpoint_every": 40}
-    with serving(tmp_path, **settings) as server:
+    with serving(tmp_path, fuser=SUMS, **settings) as server:
         scan(server.address, "default", range(800))
         until(lambda: fetch_health(server.address).maps["default"].journal_bytes < 2 * limit)
         server.kill()
     assert len(JournalRecording(tmp_path)) < 800
-    with serving(tmp_path, **settings) as server:
+    with serving(tmp_path, fuser=SUMS, **settings) as server:
         until(lambda: fetch_health(server.address).maps["default"].keyframes_fused == 800)
         scan(server.address, "default", range(800, 810))
-        assert fetch_status(server.address).map_hash == map_hash(map(wall, range(810)))
+        assert fetch_status(server.address).map_hash == hash_of(map(wall, range(810)))
         assert server.terminate() == 0
 
 

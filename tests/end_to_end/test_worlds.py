@@ -9,6 +9,7 @@ import pytest
 from clients_and_spools import NOBODY, send_all
 from idle_fuser import keeping
 from keyframes_and_servers import DEADLINE, Server, connected, serving, until, wall
+from quick_fusers import SUMS
 
 from tsfusion import Client, journal
 from tsfusion.core.errors import InvalidConfig, TransportError, WorldRefused
@@ -54,7 +55,7 @@ def worlds(state: Path, map_name: str = "default") -> list[str]:
 
 
 def test_a_map_takes_one_world_and_those_that_share_its_frame(tmp_path: Path) -> None:
-    with serving(tmp_path / "state") as server:
+    with serving(tmp_path / "state", fuser=SUMS) as server:
         delivered(server.address, 0, 1, world="a")
         assert "map default has 2 keyframes" in refused(server.address, world="b")
         refused(server.address)  # given poses: nobody knows in which frame
@@ -64,7 +65,7 @@ def test_a_map_takes_one_world_and_those_that_share_its_frame(tmp_path: Path) ->
         assert fetch_health(server.address).refused["world"] >= 2
         assert server.terminate() == 0
     assert worlds(tmp_path / "state") == ["a", "a", "a", "c", "c"]
-    with serving(tmp_path / "state") as server:  # from the checkpoint and the journal
+    with serving(tmp_path / "state", fuser=SUMS) as server:  # from the checkpoint and the journal
         assert "map default has 5 keyframes" in refused(server.address, world="b")
         refused(server.address)
         delivered(server.address, 5, world="c")

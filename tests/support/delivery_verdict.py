@@ -6,6 +6,7 @@ from pathlib import Path
 
 from keyframes_and_servers import NUMBERED_NS, wall
 from scanner_process import Report, correction_number, journals
+from sum_map import SumMap, hash_of
 
 from tsfusion import journal
 from tsfusion.core.config import SERVER_SESSION
@@ -32,11 +33,14 @@ def client_problems(report: Report) -> list[str]:
     return [f"the scanner counts lost keyframes: {lost}"] if lost else []
 
 
-def verify(state: Path, keyframes: int, map_hash: str, correct_every: int = 0) -> list[str]:
+def verify(
+    state: Path, keyframes: int, map_hash: str, correct_every: int = 0, *, sums: bool = False
+) -> list[str]:
     """List what is wrong with the files and the map that a stopped server left.
 
     Args:
         correct_every: as in `scanner_process.Plan`.
+        sums: the map is a `SumMap`; without corrections.
     """
     problems = []
     corrected: list[int] = []
@@ -72,21 +76,24 @@ def verify(state: Path, keyframes: int, map_hash: str, correct_every: int = 0) -
     due = list(range(0, keyframes, correct_every)) if correct_every else []
     if sorted(corrected) != due:
         problems.append(f"the journal has the corrections {sorted(corrected)}, not {due}")
-    return problems + _map_problems(state, keyframes, map_hash, corrected=correct_every > 0)
+    return problems + _map_problems(state, keyframes, map_hash, corrected=correct_every > 0, sums=sums)
 
 
-def _map_problems(state: Path, keyframes: int, map_hash: str, *, corrected: bool) -> list[str]:
-    from corrected_maps import fresh_map
-
-    from tsfusion import Volume
-
+def _map_problems(state: Path, keyframes: int, map_hash: str, *, corrected: bool, sums: bool) -> list[str]:
     (path,) = [*state.glob("maps/*/map.tsf"), *state.glob("map.tsf")]
-    saved = Volume.load(path).map_hash()
-    if corrected:
-        (folder,) = journals(state)
-        wanted = fresh_map(folder, VOXEL_SIZE).map_hash()
+    if sums:
+        saved, wanted = SumMap.load(path).map_hash(), hash_of(map(wall, range(keyframes)))
     else:
-        wanted = undisturbed_hash(keyframes)
+        from corrected_maps import fresh_map
+
+        from tsfusion import Volume
+
+        saved = Volume.load(path).map_hash()
+        if corrected:
+            (folder,) = journals(state)
+            wanted = fresh_map(folder, VOXEL_SIZE).map_hash()
+        else:
+            wanted = undisturbed_hash(keyframes)
     hashes = {"undisturbed": wanted, "told": map_hash, "saved": saved}
     return [] if len(set(hashes.values())) == 1 else [f"the map's hashes differ: {hashes}"]
 

@@ -90,6 +90,10 @@ class SumMap:
         self.keyframes += 1
         return SimpleNamespace(samples=1, new_blocks=0)
 
+    def retract(self, keyframe: Keyframe) -> None:
+        self._total -= digest(keyframe)
+        self.keyframes -= 1
+
     def take_dirty(self) -> Any:
         return _NOTHING
 
