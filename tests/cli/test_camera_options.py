@@ -50,10 +50,11 @@ def test_check_takes_a_camera_and_names_it(here: Here, tmp_path: Path, kitchen: 
     assert f"  camera {CAMERA}, from camera-intrinsics.txt\n" in here("datasets", root).stdout
 
 
-def test_a_replay_names_its_camera(tmp_path: Path, kitchen: Path) -> None:
+@pytest.mark.usefixtures("quick_servers")
+def test_a_replay_names_its_camera(here: Here, tmp_path: Path, kitchen: Path) -> None:
     root = own_recordings.tum(tmp_path / "mine", own_recordings.views(kitchen, 2), camera=False)
     out = tmp_path / "out"
-    done = tsfusion("replay", root, "--intrinsics", "585,585,320,240", "--voxel-size", 0.08, "--out", out)
+    done = here("replay", root, "--intrinsics", "585,585,320,240", "--voxel-size", 0.08, "--out", out)
     assert done.returncode == 0, done.stderr
     assert f"camera     {CAMERA}, as given" in done.stdout
     assert json.loads((out / "run.json").read_text())["camera"] == f"{CAMERA}, as given"

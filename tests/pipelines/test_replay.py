@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-from command_processes import alive, descendants, end, eventually, read_until, started, tsfusion
+from command_processes import Here, alive, descendants, end, eventually, read_until, started, tsfusion
 from keyframes_and_servers import map_hash
 from small_recordings import first_views
 
@@ -86,8 +86,11 @@ def test_replay_over_sockets_is_the_map_of_the_library(run_folder: Path) -> None
 
 
 @pytest.mark.slow
-def test_a_journal_replays_to_the_same_map_under_a_new_name(run_folder: Path, tmp_path: Path) -> None:
-    done = tsfusion(
+@pytest.mark.usefixtures("quick_servers")
+def test_a_journal_replays_to_the_same_map_under_a_new_name(
+    run_folder: Path, here: Here, tmp_path: Path
+) -> None:
+    done = here(
         "replay", run_folder / "state", "--voxel-size", VOXEL, "--out", tmp_path / "again", "--json",
         "--state", tmp_path / "kept", "--map", "new",
     )  # fmt: skip
@@ -100,14 +103,17 @@ def test_a_journal_replays_to_the_same_map_under_a_new_name(run_folder: Path, tm
 
 
 @pytest.mark.slow
-def test_poses_added_to_a_map_are_said_to_be_in_its_frame(run_folder: Path, tmp_path: Path) -> None:
+@pytest.mark.usefixtures("quick_servers")
+def test_poses_added_to_a_map_are_said_to_be_in_its_frame(
+    run_folder: Path, here: Here, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     shutil.copytree(run_folder / "state", tmp_path / "state")
-    done = tsfusion(
+    done = here(
         "replay", "synthetic:room", "--max-frames", 1, "--voxel-size", VOXEL,
         "--state", tmp_path / "state", "--out", tmp_path / "again",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    assert "the map default has 6 keyframes already, and these are added to them" in done.stderr
+    assert "the map default has 6 keyframes already, and these are added to them" in caplog.text
 
 
 def slow_replay(out: Path) -> "subprocess.Popen[str]":
@@ -169,8 +175,9 @@ def test_a_replay_whose_server_dies_says_so(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_replay_without_a_surface_says_so(tmp_path: Path) -> None:
-    done = tsfusion(
+@pytest.mark.usefixtures("quick_servers")
+def test_a_replay_without_a_surface_says_so(here: Here, tmp_path: Path) -> None:
+    done = here(
         "replay", "synthetic:room", "--max-frames", 1, "--min-weight", 1000, "--out", tmp_path / "out"
     )
     assert done.returncode == 1
@@ -190,7 +197,7 @@ def test_demo(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("count", [40, pytest.param(125, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("count", [12, pytest.param(125, marks=pytest.mark.nightly)])
 def test_red_kitchen(data, tmp_path: Path, count: int) -> None:
     done = tsfusion(
         "replay", data("7scenes/redkitchen"), "--max-frames", count, "--voxel-size", 0.02, "--rate", 4,

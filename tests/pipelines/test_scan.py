@@ -43,6 +43,7 @@ from tsfusion.scanner.sources.source import LiveSource
 from tsfusion.wire.queries import fetch_health
 
 VOXEL = 0.05
+COARSE = ("--voxel-size", VOXEL)
 SOURCE = "synthetic:room"
 # As on a robot without Taichi: importing it fails.
 BARE = "import sys; sys.modules['taichi'] = None; from tsfusion.__main__ import main; main(sys.argv[1:])"
@@ -87,10 +88,11 @@ def figures(done: "subprocess.CompletedProcess[str]") -> dict[str, Any]:
 
 
 def scan(*arguments: object) -> "subprocess.CompletedProcess[str]":
-    return tsfusion("scan", "--voxel-size", VOXEL, *arguments)
+    return tsfusion("scan", *COARSE, *arguments)
 
 
-def test_a_scan_leaves_mesh_trajectory_and_figures(walk: Path, tmp_path: Path) -> None:
+@pytest.mark.usefixtures("quick_servers")
+def test_a_scan_leaves_mesh_trajectory_and_figures(walk: Path, here: Here, tmp_path: Path) -> None:
     out = tmp_path / "out"
     state = tmp_path / "state"
     run = figures(scan(walk, "--localizer", "rgbd", "--out", out, "--state", state, "--json"))
@@ -113,13 +115,13 @@ def test_a_scan_leaves_mesh_trajectory_and_figures(walk: Path, tmp_path: Path) -
     assert len(read_tum(out / "trajectory.txt").timestamps_ns) == 12
     assert len(read_tum(out / "keyframes.txt").timestamps_ns) == run["keyframes_sent"]
     assert cv2.imread(str(out / "preview.png")).std() > 5
-    shown = scan(walk, "--localizer", "given", "--out", tmp_path / "given", "--up", "-y")
+    shown = here("scan", walk, *COARSE, "--localizer", "given", "--out", tmp_path / "given", "--up", "-y")
     assert "up -y (given: 0.0000 -1.0000 0.0000)" in shown.stdout
     assert "12/12 localised by given" in shown.stdout
     assert "ATE" not in shown.stdout  # given poses have no error against themselves
 
 
-def test_without_taichi_to_a_server_elsewhere(walk: Path, tmp_path: Path) -> None:
+def test_without_taichi_to_a_server_elsewhere(walk: Path, here: Here, tmp_path: Path) -> None:
     with server(tmp_path / "state", "--voxel-size", VOXEL) as (address, process):
         command = ["scan", walk, "--connect", address, "--map", "hall",
                    "--spool", tmp_path / "spool", "--out", tmp_path / "out", "--json"]  # fmt: skip
@@ -132,7 +134,7 @@ def test_without_taichi_to_a_server_elsewhere(walk: Path, tmp_path: Path) -> Non
         sent = run["keyframes_sent"]
         assert eventually(lambda: fetch_health(address).maps["hall"].keyframes_fused == sent)
         kept = read_tum(tmp_path / "out" / "keyframes.txt")
-        again = tsfusion(
+        again = here(
             "scan", walk, "--connect", address, "--map", "hall", "--max-frames", 1,
             "--spool", tmp_path / "spool", "--out", tmp_path / "out", "--overwrite",
         )  # fmt: skip
@@ -143,7 +145,7 @@ def test_without_taichi_to_a_server_elsewhere(walk: Path, tmp_path: Path) -> Non
     assert stamps == [*kept.timestamps_ns]
 
 
-def test_ctrl_c_without_a_server_keeps_all_for_the_next_scan(walk: Path, tmp_path: Path) -> None:
+def test_ctrl_c_without_a_server_keeps_all_for_the_next_scan(walk: Path, here: Here, tmp_path: Path) -> None:
     spool = tmp_path / "spool"
     command = ["scan", SOURCE, "--rate", "3", "--connect", NOBODY, "--spool", spool]
     process = subprocess.Popen(
@@ -162,7 +164,7 @@ def test_ctrl_c_without_a_server_keeps_all_for_the_next_scan(walk: Path, tmp_pat
     assert len(JournalRecording(spool / "default")) == run["left"]
     with server(tmp_path / "state", "--voxel-size", VOXEL) as (address, _):
         more = figures(
-            tsfusion(
+            here(
                 "scan", walk, "--max-frames", 3, "--connect", address, "--map", "walk",
                 "--spool", spool, "--out", tmp_path / "more", "--json",
             )
@@ -186,9 +188,10 @@ def test_ctrl_c_ends_a_scan_with_its_results(tmp_path: Path) -> None:
     assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
 
 
-def test_a_recording_that_breaks_off_keeps_what_came_before(tmp_path: Path) -> None:
+@pytest.mark.usefixtures("quick_servers")
+def test_a_recording_that_breaks_off_keeps_what_came_before(here: Here, tmp_path: Path) -> None:
     folder = recording(tmp_path / "broken", broken=7)
-    done = scan(folder, "--out", tmp_path / "out")
+    done = here("scan", folder, *COARSE, "--out", tmp_path / "out")
     assert done.returncode == 1
     assert "cannot be decoded" in done.stderr.splitlines()[-1]
     run = json.loads((tmp_path / "out" / "run.json").read_text())
@@ -221,12 +224,13 @@ def test_what_cannot_be_scanned_is_one_clear_line(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_sensor_that_is_never_localised(tmp_path: Path) -> None:
+@pytest.mark.usefixtures("quick_servers")
+def test_a_sensor_that_is_never_localised(here: Here, tmp_path: Path) -> None:
     seven_scenes(tmp_path / "flat", 4, (48, 64))  # no texture, nothing near enough to be seen
-    done = scan(tmp_path / "flat", "--trajectory", tmp_path / "none.txt", "--out", tmp_path / "out")
+    done = here("scan", tmp_path / "flat", "--trajectory", tmp_path / "none.txt", "--out", tmp_path / "out")
     assert done.returncode == 1
     (tmp_path / "late.txt").write_text("5000 0 0 0 0 0 0 1\n5001 0 0 0 0 0 0 1\n")
-    done = scan(tmp_path / "flat", "--trajectory", tmp_path / "late.txt", "--out", tmp_path / "out")
+    done = here("scan", tmp_path / "flat", "--trajectory", tmp_path / "late.txt", "--out", tmp_path / "out")
     assert done.returncode == 1
     assert "was not localised in any of 4 frames" in done.stderr
     assert not (tmp_path / "out").exists()
@@ -244,16 +248,17 @@ def test_the_client_is_light() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("quick_servers")
 @pytest.mark.parametrize("count", [25, pytest.param(125, marks=pytest.mark.nightly)])
 def test_a_mesh_with_poses_of_its_own_is_as_good_as_with_the_true_ones(
-    data, tmp_path: Path, count: int
+    data, here: Here, tmp_path: Path, count: int
 ) -> None:
     kitchen = data("7scenes/redkitchen")
     for name in ("rgbd", "given"):
         run = figures(
-            tsfusion(
+            here(
                 "scan", kitchen, "--localizer", name, "--voxel-size", 0.02,
-                "--max-frames", count, "--out", tmp_path / name, "--json", timeout=400,
+                "--max-frames", count, "--out", tmp_path / name, "--json",
             )
         )  # fmt: skip
         assert run["frames_tracked"] == count
@@ -323,11 +328,11 @@ def test_a_frame_that_cannot_be_followed_keeps_what_came_before(
     assert not (tmp_path / "none").exists()
 
 
-def test_keyframes_that_are_refused_do_not_cost_the_results(walk: Path, tmp_path: Path) -> None:
+def test_keyframes_that_are_refused_do_not_cost_the_results(walk: Path, here: Here, tmp_path: Path) -> None:
     settings = tmp_path / "server.toml"
     settings.write_text("[server]\nquota_extent = 0.001\n")
     with server(tmp_path / "state", "--config", settings) as (address, _):
-        done = tsfusion(
+        done = here(
             "scan", walk, "--localizer", "given", "--connect", address,
             "--spool", tmp_path / "spool", "--out", tmp_path / "out", "--json",
         )  # fmt: skip
@@ -341,8 +346,9 @@ def test_keyframes_that_are_refused_do_not_cost_the_results(walk: Path, tmp_path
     assert len(read_tum(tmp_path / "out" / "trajectory.txt").timestamps_ns) == 12
 
 
-def test_a_map_without_a_surface_keeps_the_trajectory(walk: Path, tmp_path: Path) -> None:
-    done = scan(walk, "--max-frames", 2, "--min-weight", 1000, "--out", tmp_path / "out")
+@pytest.mark.usefixtures("quick_servers")
+def test_a_map_without_a_surface_keeps_the_trajectory(walk: Path, here: Here, tmp_path: Path) -> None:
+    done = here("scan", walk, *COARSE, "--max-frames", 2, "--min-weight", 1000, "--out", tmp_path / "out")
     assert done.returncode == 1
     assert "the map has no surface to write: 1 of 1 keyframes fused" in done.stderr.splitlines()[-1]
     assert len(read_tum(tmp_path / "out" / "trajectory.txt").timestamps_ns) == 2

@@ -288,10 +288,11 @@ def test_the_page_in_a_browser(folder: Path) -> None:
         assert len({url for url in chromium.requests if url.startswith("file:")}) == 1
 
 
-def test_a_state_folder_and_a_file_have_a_report(tmp_path: Path) -> None:
+@pytest.mark.usefixtures("quick_servers")
+def test_a_state_folder_and_a_file_have_a_report(here: Here, tmp_path: Path) -> None:
     """With the keyframes of its journal, whose they are, and the hash of the map that they make."""
     state = tmp_path / "my-maps"
-    done = tsfusion(
+    done = here(
         "replay", "synthetic:room", "--max-frames", 4, "--voxel-size", 0.1, "--state", state,
         "--out", tmp_path / "out", "--json",
     )  # fmt: skip
@@ -302,7 +303,7 @@ def test_a_state_folder_and_a_file_have_a_report(tmp_path: Path) -> None:
     file = tmp_path / "out" / "map.tsf"
     for source, words in ((state, ("000001.mcap", "closed")), (file, ("no journal",))):
         page = tmp_path / f"{source.name}.html"
-        done = tsfusion("report", source, "--out", page, "--json")
+        done = here("report", source, "--out", page, "--json")
         assert done.returncode == 0, done.stderr
         assert json.loads(done.stdout)["files"][-1] == str(page)
         found = Structure(page.read_text(encoding="utf-8"))
