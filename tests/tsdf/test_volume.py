@@ -490,7 +490,7 @@ def test_kernels_stay_in_bounds() -> None:
         "from tsfusion.kernels import runtime\n"
         "from tsfusion import Volume, Keyframe\n"
         "import taichi as ti\n"
-        "ti.init(arch=ti.cpu, debug=True, offline_cache=False, log_level=ti.ERROR)\n"
+        "ti.init(arch=ti.cpu, debug=True, offline_cache=True, log_level=ti.ERROR)\n"
         "runtime._started_threads = 2\n"
         "v = Volume(voxel_size=0.04, regularizer='ray')\n"
         "for k in formula_scenes.sphere_views(0.4, 2): v.integrate(k)\n"
