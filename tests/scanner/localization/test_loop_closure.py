@@ -111,7 +111,7 @@ def test_rooms_all_alike_are_not_one_room():
 @pytest.mark.slow
 @pytest.mark.parametrize("identical", [True, pytest.param(False, marks=pytest.mark.nightly)])
 def test_the_way_back_closes_each_room_with_itself(identical):
-    run = Run(frames_of(Synthetic(loop_worlds.rooms(identical=identical), count=150, path="return")))
+    run = Run(frames_of(Synthetic(loop_worlds.rooms(identical=identical), count=120, path="return")))
     assert len(run.loops) >= 30
     assert run.wrong() == []
     assert run.error(run.corrections[-1]).rmse <= 0.3 * run.error(None).rmse
