@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from support.corrupted_recordings import FOLDERS, Corrupted, opened
+from support.corrupted_recordings import FOLDERS, Corrupted, genuine, opened
 
 from tsfusion import cli
 from tsfusion.datasets import Dataset, open_dataset, select
@@ -228,7 +228,7 @@ def moved(x: float, y: float, scale: float = 1.0) -> Change:
 
 @pytest.mark.parametrize("name", FOLDERS)
 def test_registered_color_is_no_matter(name: str, data: Data) -> None:
-    assert check(opened(data(FOLDERS[name]))).color is None
+    assert genuine(data(FOLDERS[name])).color is None
 
 
 @pytest.mark.parametrize(

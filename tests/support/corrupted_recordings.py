@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from tsfusion.datasets import Dataset, open_dataset
 from tsfusion.datasets.dataset import Frames, frame_of
+from tsfusion.evaluation.pose_check import PoseCheckReport, check
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.se3 import Transform
 
@@ -55,3 +56,9 @@ class Corrupted(Frames):
 def opened(place: Path, **options: Any) -> Dataset:
     """The dataset, each frame read once for all tests."""
     return Corrupted(open_dataset(place, **options))
+
+
+@cache
+def genuine(place: Path) -> PoseCheckReport:
+    """The check of a dataset as it is, done once for all tests."""
+    return check(opened(place))
