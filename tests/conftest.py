@@ -155,7 +155,7 @@ def here(
 
 @pytest.fixture
 def quick_servers(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Have servers of runs in this process start their fusers without compiling ahead."""
+    """Have servers of runs in this process start quick fusers (`quick_fusers.LAZY`)."""
     from tsfusion.pipelines import target_server
 
     names = {name: getattr(subprocess, name) for name in ("PIPE", "TimeoutExpired")}

@@ -71,10 +71,11 @@ def test_a_file_and_a_server_answer_alike(
         assert view.returncode == 0, view.stderr
         assert "64×48 pixels, the surface in" in view.stdout
     for suffix in (".npz", "-view.npz", "-slice.npz"):
-        one, other = (np.load(tmp_path / f"{name}{suffix}") for name in ("file", "live"))
-        assert set(one) == set(other)
-        for key in one:
-            np.testing.assert_allclose(one[key], other[key], atol=1e-6)
+        file, live_too = (tmp_path / f"{name}{suffix}" for name in ("file", "live"))
+        with np.load(file) as one, np.load(live_too) as other:
+            assert set(one) == set(other)
+            for key in one:
+                np.testing.assert_allclose(one[key], other[key], atol=1e-6)
 
 
 def test_a_slice_for_map_server(here: Here, live: Server, tmp_path: Path) -> None:

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: MIT
 """Commands that start a fuser sooner than the server's own does: hundreds of tests start one each.
 
-The server's own compiles all kernels ahead, a few seconds of a core. Tests that need no kernel, and those of
-everything around the map, need not wait for that; `tsfusion serve`, `replay` and `scan` in other tests do.
+The server's own compiles kernels ahead, a few seconds of a core: those of keyframes before it is ready, the
+others when it has nothing else to do. Tests of everything around the map need no kernel; others need few.
 """
 
 import subprocess
 import sys
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ def _command(before: str) -> tuple[str, ...]:
     return sys.executable, "-c", _PROGRAM.format(folder=str(Path(__file__).parent), before=before)
 
 
-LAZY = _command("compile_when_needed")  # the real map
+LAZY = _command("compile_no_more_than_keyframes_need")  # the real map; ready as late as the server's own
 SUMS = _command("sum_up")  # a `SumMap`: for tests that need no surface, only which keyframes are in the map
 
 
@@ -39,11 +40,15 @@ def quick_server(command: list[str], **more: Any) -> "subprocess.Popen[str]":
     return subprocess.Popen([*server_command(LAZY), *command[3:]], **more)
 
 
-def compile_when_needed() -> None:
-    """Have maps of this process compile a kernel when it is first launched, and none ahead."""
+def compile_no_more_than_keyframes_need() -> None:
+    """Have maps of this process compile the kernels of questions and of the field when they are launched.
+
+    Not those of keyframes: who asks how far the map is would wait for them, on a loaded machine too long.
+    """
     from tsfusion.tsdf.volume import Volume
 
-    Volume.warming_up = lambda _: iter(())  # type: ignore[method-assign]
+    whole = Volume.warming_up
+    Volume.warming_up = lambda volume: islice(whole(volume), 1)  # type: ignore[method-assign]
 
 
 def sum_up() -> None:
