@@ -51,6 +51,7 @@ def test_the_table_is_long_and_every_row_asks_for_cause_and_cure() -> None:
     assert all(row.cause and row.cure and row.status for row in rows)
 
 
+@pytest.mark.usefixtures("quick_servers")
 @pytest.mark.parametrize("row", COMMANDS, ids=lambda row: row.line)
 def test_a_wrong_command_says_cause_and_cure(row: Wrong, named: dict[str, str]) -> None:
     status, said = run_command(row.line.format(**named))

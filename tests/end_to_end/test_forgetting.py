@@ -215,7 +215,7 @@ def test_a_window_in_a_journal_with_a_limit(tmp_path: Path, most: int) -> None:
 
 
 def test_a_server_that_keeps_a_window(tmp_path: Path) -> None:
-    with serving(tmp_path, keep_keyframes=5) as server:
+    with serving(tmp_path, fuser=SUMS, keep_keyframes=5) as server:
         scan(server, 0)
         with Client(server.address) as client:
             sent = [client.send(wall(i)) for i in range(10, 18)]
@@ -225,9 +225,9 @@ def test_a_server_that_keeps_a_window(tmp_path: Path) -> None:
         told = fetch_status(server.address)
         assert (told.keyframes_fused, told.keyframes_forgotten) == (5, 7)
         stay = [wall(9 + seq, T_world_camera=pose(0.01 * seq)) for seq in range(4, 9)]
-        assert told.map_hash == map_hash(stay)
+        assert told.map_hash == sum_map.hash_of(stay)
         server.kill()
-    with serving(tmp_path, keep_keyframes=2) as server:
+    with serving(tmp_path, fuser=SUMS, keep_keyframes=2) as server:
         until(lambda: fetch_status(server.address).keyframes_fused == 2)
         wait_settled(server)
-        assert fetch_status(server.address).map_hash == map_hash(stay[-2:])
+        assert fetch_status(server.address).map_hash == sum_map.hash_of(stay[-2:])
