@@ -267,10 +267,22 @@ def main() -> int:
     parser.add_argument("--fuse", type=Path, default=FUSE_POINTS, metavar="POINTS")
     parser.add_argument("--json", action="store_true", help="one object")
     options = parser.parse_args()
-    gateway, table = check(rows := _read(options.points))
-    fusing, runs = check_fusing(_read(options.fuse))
+    rows, lines = _read(options.points, parser), _read(options.fuse, parser)
+    try:
+        gateway, table = check(rows)
+    except (KeyError, TypeError, ValueError):
+        parser.error(f"{options.points} needs lines of scripts/fleet.py, with {FIT[0]} and {FIT[1]} scanners")
+    try:
+        fusing, runs = check_fusing(lines)
+    except (KeyError, StopIteration, TypeError, ValueError, ZeroDivisionError):
+        parser.error(
+            f"{options.fuse} needs lines of scripts/cluster.py: one worker with two numbers of keyframes, "
+            "and two workers with the larger one"
+        )
+    if not (errors := [abs(row["error"]) for row in table + runs if not row["fitted"]]):
+        parser.error("all points are fitted, and none is left to predict; give more of them")
     cities = [city(machines, rows[0]["keyframe_bytes"]) for machines in (1, 2, 4, 8, 16, 32, 64)]
-    worst = max(abs(row["error"]) for row in table + runs if not row["fitted"])
+    worst = max(errors)
     if options.json:
         print(json.dumps({
             "gateway_ms": _milliseconds(gateway), "points": table,
@@ -293,8 +305,11 @@ def main() -> int:
     return 0 if worst <= TOLERANCE else 1
 
 
-def _read(points: Path) -> list[Row]:
-    return [json.loads(line) for line in points.read_text(encoding="utf-8").splitlines()]
+def _read(points: Path, parser: argparse.ArgumentParser) -> list[Row]:
+    try:
+        return [json.loads(line) for line in points.read_text(encoding="utf-8").splitlines()]
+    except (OSError, ValueError) as error:
+        parser.error(f"cannot read {points}: {error}")
 
 
 def _off(row: Row) -> str:

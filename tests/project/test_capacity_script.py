@@ -52,3 +52,16 @@ def test_a_run_of_fuse_that_does_not_fit_fails(tmp_path: Path) -> None:
     done = capacity("--fuse", tmp_path / "runs.jsonl")
     assert done.returncode == 1
     assert json.loads(done.stdout)["worst_error"] > 0.4
+
+
+@pytest.mark.parametrize("case", ["empty", "absent", "of another script"])
+def test_points_that_do_not_suffice_are_named(case: str, tmp_path: Path) -> None:
+    points = tmp_path / "points.jsonl"
+    if case == "empty":
+        points.touch()
+    if case == "of another script":
+        points.write_bytes(POINTS.read_bytes())
+    done = capacity("--fuse", points)
+    assert done.returncode == 2, done.stdout
+    assert str(points) in done.stderr.splitlines()[-1]
+    assert "Traceback" not in done.stderr
