@@ -30,6 +30,8 @@ from tsfusion.kernels.voxel_traversal import RUN, vec3i, write_band, write_ray
 
 TILE = 12  # divided by both sides of every cell
 TILE_SAMPLES = TILE * TILE
+FEW = 15  # a number of rows or columns of a tile has four bits
+assert TILE <= FEW
 CELLS = ((2, 1), (2, 2), (3, 2), (3, 3), (4, 3), (4, 4), (6, 4), (6, 6), (12, 6), (12, 12))  # wide, high
 CELL_AREA = 1.0  # voxels across the ray
 PLANE_STEP = 2  # a plane is fitted to every second pixel of every second row
@@ -80,7 +82,7 @@ def camera_of(rows: ti.template()):
 def few(count):
     """A number of rows or columns of a tile, known to be small: LLVM else adds to a loop one for 32 at once,
     which never runs and takes long to compile."""
-    return count & 15
+    return count & FEW
 
 
 @ti.func
