@@ -70,7 +70,7 @@ def fresh_hash(state: Path) -> str:
 
 
 def hash_of_all(state: Path) -> str:
-    """The same where the map is a sum."""
+    """Hash of the sums of all keyframes of a journal, at their last poses."""
     return hash_of(final_keyframes(state_folder.find_journal(state).path))
 
 

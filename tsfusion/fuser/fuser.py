@@ -462,7 +462,7 @@ class Fuser:
 
 @cache
 def _versions() -> dict[str, str]:
-    """What the fuser runs on; files are read for it, which took longer than all else of a status."""
+    """Versions of Python and the libraries, read once: the files take longer than all else of a status."""
     libraries = {name: version(name) for name in ("tsfusion", "taichi", "numpy", "pyzmq")}
     return {"python": platform.python_version(), **libraries}
 
