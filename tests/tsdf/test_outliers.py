@@ -131,3 +131,22 @@ def test_gross_outliers_do_not_reach_the_surface() -> None:
         errors.append(np.abs(room.distance(mesh.vertices.astype(np.float64))).mean() * 1e3)
     assert errors[0] > 20.0
     assert errors[1] < 3.0
+
+
+def test_rays_that_share_the_carving_leave_nothing_out() -> None:
+    """Every voxel that the view looks through is free, nowhere by less than a quarter of all rays' votes."""
+    volume = volume_of([], voxel_size=0.02, color=False, space_carving=True, regularizer="off")
+    stats = volume.integrate(WALL)
+    blocks = volume.blocks()
+    inside = np.stack(np.meshgrid(*[np.arange(8)] * 3, indexing="ij"), axis=-1)
+    x, y, z = np.moveaxis((8 * blocks.coordinates[:, None, None, None] + inside + 0.5) * 0.02, -1, 0)
+    u, v = x / z * CAMERA.fx + CAMERA.cx, y / z * CAMERA.fy + CAMERA.cy
+    seen = (u > 2) & (u < SHAPE[1] - 3) & (v > 2) & (v < SHAPE[0] - 3) & (z > 0.4) & (z < 1.85)
+    assert seen.sum() > 300_000
+    sums = blocks.sums[seen]
+    assert ((sums >> 27) > 0).all(), "free"
+    pixels = CAMERA.fx * 0.02 * CAMERA.fy * 0.02 / z[seen] ** 2  # that a voxel covers
+    votes = (sums & ((1 << 27) - 1)) / (8 * pixels)  # a ray's pixels, at half of their weight
+    for near, far, least in ((0.4, 0.6, 0.2), (0.6, 0.9, 0.75), (0.9, 1.3, 0.75), (1.3, 1.85, 0.75)):
+        assert least < votes[(z[seen] > near) & (z[seen] < far)].mean() < 1.6
+    assert stats.updates < 0.9 * stats.rays * 2.0 / 0.02, "each ray alone would take 1.4 times its length"

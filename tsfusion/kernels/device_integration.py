@@ -28,7 +28,6 @@ from tsfusion.kernels.voxel_traversal import (
     DEFERRED,
     END,
     INTERVAL,
-    LENGTH,
     START,
     UPDATES,
     WEIGHT_COLOR,
@@ -38,6 +37,7 @@ from tsfusion.kernels.voxel_traversal import (
     next_step,
     offset_in_block,
     pack,
+    ray_length,
     ray_weight,
     vec3i,
 )
@@ -89,7 +89,7 @@ def missing_place(listed: ti.template(), i):
 @ti.func
 def crossed(rays: ti.template(), r):
     """How many voxels ray `r` crosses."""
-    n, length = 1, rays[r, LENGTH]
+    n, length = 1, ray_length(rays, r)[0]
     for a in ti.static(range(3)):
         if rays[r, CROSSING + a] < length:
             n += 1 + (length - 1 - rays[r, CROSSING + a]) // rays[r, INTERVAL + a]
@@ -105,7 +105,8 @@ def list_updates(
     from place `base` on, `most` in all; returns the number of updates, whether a block is missing, and the
     place of the voxel that takes the colour, or −1."""
     walk, weight = begin_walk(rays, r), ray_weight(rays, r)
-    ends, length = rays[r, END], rays[r, LENGTH]
+    ends = rays[r, END]
+    length, fourfold = ray_length(rays, r)
     end = ends & ~7
     band_begins = end - (length - end)  # before it is free space
     free_weight, free_distance = ti.max(weight >> FREE_SHIFT, 1), quantize(length - end)
@@ -125,7 +126,7 @@ def list_updates(
             slot = ti.select(slot < oldest, -1, slot)
         step, leaves = next_step(walk.crossing)
         is_free = leaves < band_begins
-        w = ti.select(is_free, free_weight, weight)
+        w = ti.select(is_free, ti.select(leaves < fourfold, free_weight << 2, free_weight), weight)
         m = ti.select(is_free, free_distance, ti.max(quantize(walk.distance), -MAX_DISTANCE))
         at = ti.select(slot >= 0, slot * CUBE + offset_in_block(walk.voxel), at)
         listed[base + n, PLACE] = at

@@ -26,6 +26,7 @@ from tsfusion.kernels.rays_abreast import (
     BLOCK_AT,
     COLORED,
     DISTANCE_AT,
+    FOURFOLD,
     FREE,
     LIST,
     MET,
@@ -226,7 +227,7 @@ def add_stretch(
     half = walks[RAY_LENGTH + k] - ((walks[RAY_LENGTH + k] + walks[BAND + k]) >> 1)
     free = (ti.cast(quantize(half) * free_vote, ti.i64) << WEIGHT_BITS) + free_vote
     per_quantum = ti.cast(vote, ti.i64) << WEIGHT_BITS
-    before, uncolored = walks[FREE + k], walks[UNCOLORED + k]
+    before, fourfold, uncolored = walks[FREE + k], walks[FOURFOLD + k], walks[UNCOLORED + k]
     number = walks[ODD + k]
     window = window_of(walks, k, number)
     blocks = open_window(window, scratch, base)
@@ -253,7 +254,8 @@ def add_stretch(
         if first >= 0:
             at = first + (place & (CUBE - 1))
             amount = ti.cast(place >> DISTANCE_AT, ti.i64) * per_quantum + vote
-            add(sums, at, ti.select(i < before, free, amount), of_others)
+            free_amount = ti.select(i < fourfold, free << 2, free)
+            add(sums, at, ti.select(i < before, free_amount, amount), of_others)
             added += 1
             if i == uncolored:
                 scratch[colors] = (ti.cast(at, ti.i64) << 32) | (weight_color & 0xFFFFFF)
@@ -279,7 +281,8 @@ def add_bands(
         scratch[base + i] = 0
     walks, listed = ti.Vector([0] * WALKS), ti.Vector([0] * LIST)
     for k in range(ABREAST):
-        walks[RAY + k], walks[FREE + k], walks[UNCOLORED + k] = NOBODY, 0, NEVER
+        walks[RAY + k], walks[FREE + k], walks[FOURFOLD + k] = NOBODY, 0, 0
+        walks[UNCOLORED + k] = NEVER
     colors, carves = base + COLORS_AT, 0
     for band in range(job[FIRST_BAND], job[LAST_BAND]):
         if bands[band, UNIT] == unit:

@@ -26,7 +26,6 @@ from tsfusion.kernels.integrate import (
 from tsfusion.kernels.quick_launch import QuickLaunch
 from tsfusion.kernels.voxel_traversal import (
     COUNT,
-    LENGTH,
     MAX_CROSSED,
     RUN,
     START,
@@ -35,6 +34,7 @@ from tsfusion.kernels.voxel_traversal import (
     block_key,
     next_step,
     offset_in_block,
+    ray_length,
     ray_weight,
     vec3i,
 )
@@ -155,7 +155,7 @@ def smooth_rays(
                         inside = ti.cast(ray_weight(rays, r) > 0, ti.i32)
                     if inside == 1:
                         walk = begin_walk(rays, r)
-                        length = rays[r, LENGTH]
+                        length = ray_length(rays, r)[0]
                         while inside == 1 and n < MAX_CROSSED:
                             block = walk.voxel >> 3
                             if block[0] != last[0] or block[1] != last[1] or block[2] != last[2]:

@@ -13,6 +13,7 @@ import taichi as ti
 
 from tsfusion.kernels.quick_launch import QuickLaunch
 from tsfusion.kernels.sensor_noise import (
+    CARVES_SPACE,
     DROPS_LONE_SAMPLES,
     MAX_RANGE,
     MIN_RANGE,
@@ -20,6 +21,7 @@ from tsfusion.kernels.sensor_noise import (
     before_width,
     bundle_weight,
     fixed_point,
+    fourfold_width,
     half_width,
     in_reach,
     layer_depth,
@@ -41,6 +43,7 @@ LEAST_PLANE = 9  # of these, for a plane
 PLANE_NOISE = 2.0  # the most mean squared residual of a plane, in σ² …
 PLANE_ROUGHNESS = 0.1 * 1024.0  # … and, squared, on top of it: 2⁻¹⁰ voxel
 PLANE_SIGMA = 1.0  # voxels: with more noise than that a plane says nothing about voxels
+LEAST_PASSED = 1 / 128  # NEVER_CARVED / MAX_CARVED
 LEAST_FACING = 0.15  # cosine between plane normal and ray: what is seen more edge-on has no plane
 
 
@@ -336,6 +339,22 @@ def layer_color(
 
 
 @ti.func
+def shares_passed(cell, pixel):
+    """Shares of a ray's length next to the sensor: where it carves no space, as rays of other cells do, and
+    where it carves with four votes, for those that do not; `pixel` = voxels that one spans at the ray's end.
+
+    Rays meet at the sensor. Nearer than half of the distance those of every second column and row are dense
+    enough, nearer than a quarter those of every fourth, and so on.
+    """
+    x, y = (cell.left + cell.x) // cell.wide, (cell.top + cell.y) // cell.high
+    sparse = 0.5 / (pixel * ti.max(cell.wide, cell.high))
+    passed, fourfold = sparse, 0.0
+    while ((x | y) & 1) == 0 and passed > LEAST_PASSED:
+        x, y, passed, fourfold = x >> 1, y >> 1, 0.5 * passed, sparse
+    return passed, fourfold
+
+
+@ti.func
 def write_layer_ray(
     rays: ti.template(), r, first, model: ti.template(), camera, plane, unit,
     color: ti.template(), has_color, confidence: ti.template(), has_confidence, depths: ti.template(),
@@ -367,8 +386,14 @@ def write_layer_ray(
         sigma = noise_sigma(model, z)
         weight = bundle_weight(model, sigma, trust)
         half = half_width(model, sigma)
-        before = before_width(model, half, direction.norm() * z)
-        cost = write_ray(rays, r, first, fixed_point(p), direction, gradient, before, half, weight, rgb)
+        length, passed, fourfold = direction.norm() * z, 0.0, 0.0
+        if model[CARVES_SPACE] > 0.0:
+            passed, fourfold = shares_passed(cell, ti.max(camera.du.norm(), camera.dv.norm()) * z)
+        before = before_width(model, half, length, passed)
+        cost = write_ray(
+            rays, r, first, fixed_point(p), direction, gradient, before, half,
+            fourfold_width(before, length, fourfold), weight, rgb,
+        )  # fmt: skip
     return weight, cost
 
 

@@ -58,12 +58,20 @@ def half_width(model: ti.template(), sigma):
 
 
 @ti.func
-def before_width(model: ti.template(), half, length):
-    """How far before its end a ray of `length` voxels begins, 2⁻⁸ voxel: its band, or nearly all."""
+def before_width(model: ti.template(), half, length, share):
+    """How far before its end a ray of `length` voxels begins, 2⁻⁸ voxel: its band, or with space carving all
+    but this `share` of it next to the sensor."""
     before = half
     if model[CARVES_SPACE] > 0.0:
-        before = ti.max(half, ti.cast((ti.min(length, MAX_CARVED) - NEVER_CARVED) * 256.0, ti.i32))
+        carved = ti.min(length, MAX_CARVED) - ti.max(length * share, NEVER_CARVED)
+        before = ti.max(half, ti.cast(carved * 256.0, ti.i32))
     return before
+
+
+@ti.func
+def fourfold_width(before, length, share):
+    """As far as a ray that begins `before` its end votes fourfold for free space, eights of a voxel."""
+    return ti.cast(ti.max(length * share - (length - before / 256.0), 0.0) / 8.0, ti.i32)
 
 
 @ti.func
