@@ -102,8 +102,12 @@ def _match(matcher: Any, left: NDArray[np.uint8], right: NDArray[np.uint8], sear
 
 def _agree(left: NDArray[np.int16], right: NDArray[np.int16], tolerance: float) -> NDArray[np.bool_]:
     """Whether the right image's disparity, at the pixel the left one points to, is the same: (H, W)."""
-    width = left.shape[1]
-    column = np.arange(width) - (left + UNITS // 2) // UNITS
-    other = np.take_along_axis(right, np.clip(column, 0, width - 1), axis=1)
-    same: NDArray[np.bool_] = (left > 0) & (column >= 0) & (np.abs(other - left) <= tolerance)
+    height, width = left.shape
+    pixel = np.empty((height, width, 2), np.int16)
+    pixel[..., 0] = np.arange(width) - (left + UNITS // 2) // UNITS
+    pixel[..., 1] = np.arange(height)[:, None]
+    other = cv2.remap(
+        right, pixel, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=-UNITS
+    )
+    same: NDArray[np.bool_] = (left > 0) & (other >= 0) & (cv2.absdiff(other, left) <= tolerance)
     return same
