@@ -142,6 +142,9 @@ class Noted(Localizer):
         self.answer = self._localizer.track(frame)
         return self.answer
 
+    def prepare(self) -> None:
+        self._localizer.prepare()
+
     def corrections(self) -> PoseCorrections | None:
         return self._localizer.corrections()
 

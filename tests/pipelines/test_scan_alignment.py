@@ -91,6 +91,9 @@ class Straight:
         one = {1: se3.transform(np.eye(3), (0.0, 0.1, 0.0))}
         return PoseCorrections(revision=1, anchors=one, T_corrected_world=one[1], loops=1)
 
+    def prepare(self) -> None:
+        pass
+
     def settle(self) -> None:
         pass
 

@@ -53,6 +53,9 @@ class Scripted:
         news, self._news = self._news, None
         return news
 
+    def prepare(self) -> None:
+        pass
+
     def settle(self) -> None:
         pass
 

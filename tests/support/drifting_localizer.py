@@ -46,6 +46,9 @@ class Drifting:
     def corrections(self) -> PoseCorrections | None:
         return None
 
+    def prepare(self) -> None:
+        pass
+
     def settle(self) -> None:
         pass
 

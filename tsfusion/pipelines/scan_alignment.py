@@ -175,6 +175,9 @@ class PlacedLocalizer:
             return found
         return replace(found, T_world_camera=se3.nearest(self._T @ found.T_world_camera))
 
+    def prepare(self) -> None:
+        self._localizer.prepare()
+
     def settle(self) -> None:
         self._localizer.settle()
 

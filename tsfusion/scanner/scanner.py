@@ -121,7 +121,7 @@ class Scanner:
             watch(self)
 
     def process(self, frame: Frame) -> None:
-        """Localize a frame, and send it if it is a keyframe."""
+        """Localize a frame, and send it if it is a keyframe; then prepare for the next."""
         self._begin_matching(frame)
         before = time.thread_time()
         found = self._localizer.track(frame)
@@ -131,6 +131,9 @@ class Scanner:
             self._handle_lost(found, frame)
         else:
             self._handle_pose(found, frame)
+        before = time.thread_time()
+        self._localizer.prepare()
+        self._tracking_cpu += time.thread_time() - before
         self._correct_if_known()
 
     def finish(self) -> None:

@@ -133,6 +133,20 @@ def test_another_place_is_no_motion(data: Data) -> None:
     assert larger.reason == "the image is 1241×376, unlike those before"
 
 
+def test_a_pose_does_not_wait_for_what_the_next_frame_needs(data: Data) -> None:
+    clip = frames(data, "06", 4)
+    prepared, alone = StereoLocalizer(), StereoLocalizer()
+    for index, frame in enumerate(clip):
+        found, expected = prepared.track(frame), alone.track(frame)
+        assert isinstance(found, Pose)
+        assert isinstance(expected, Pose)
+        np.testing.assert_array_equal(found.T_world_camera, expected.T_world_camera)
+        assert ("quick_disparity" in vars(frame)) == (index == 0)
+        prepared.prepare()
+        assert "quick_disparity" in vars(frame)
+        prepared.prepare()  # once is enough
+
+
 def test_reset_begins_a_new_world(data: Data) -> None:
     clip = frames(data, "06", 6)
     stereo = StereoLocalizer()

@@ -78,6 +78,13 @@ class Localizer(Protocol):
             InvalidKeyframe: when the frame lacks what this localizer needs (colour, depth, a stereo pair).
         """
 
+    def prepare(self) -> None:
+        """Do what the next frame needs of the last one, whose pose does not wait for it.
+
+        Call it when the pose was used; otherwise `track` does it first.
+        """
+        return
+
     def corrections(self) -> PoseCorrections | None:
         """Return corrections that are new since the last call; None = there are none, as in odometry."""
         return None

@@ -108,6 +108,10 @@ class LoopClosing:
                 self._search.add(self._keyframe, pose, frame)
         return pose
 
+    def prepare(self) -> None:
+        """Let the wrapped localizer prepare for the next frame."""
+        self._localizer.prepare()
+
     def settle(self) -> None:
         """Wait until every keyframe so far was compared with the places before it."""
         if self._search is not None:

@@ -101,6 +101,9 @@ class PoseFeed:
         """Return the sender's corrections if there are new ones since the last call."""
         return self._deformation.new_corrections()
 
+    def prepare(self) -> None:
+        """Nothing of a frame is left for later."""
+
     def settle(self) -> None:
         """Nothing is done beside `track`."""
 

@@ -52,18 +52,52 @@ class _Reference:
 
 
 @dataclass(frozen=True, eq=False)
-class _DisparityImage:
-    """Left image of a frame, its disparity, (H, W) pixels (0 = none), and the cameras."""
+class _View:
+    """One frame as the tracker sees it; its corners are found when they are asked for."""
 
+    frame: Frame
     gray: NDArray[np.uint8]
-    disparity: NDArray[np.float32]
     rig: StereoCamera
+
+    @classmethod
+    def of(cls, frame: Frame) -> "_View":
+        """Make the view of a frame. Raises InvalidKeyframe without an image or without depth."""
+        gray = frame.gray
+        if gray is None or (frame.depth_m is None and frame.right is None):
+            raise InvalidKeyframe(
+                f"the localizer stereo follows stereo pairs, or depth with a colour image; got {frame.kind}"
+                + ("" if frame.kind == "points" else " without colour")
+            )
+        assert frame.intrinsics is not None
+        return cls(frame, gray, StereoCamera(frame.intrinsics, frame.baseline_fx or DEPTH_CAMERA_BASELINE_FX))
+
+    @property
+    def disparity(self) -> NDArray[np.float32]:
+        """(H, W) pixels of disparity; 0 = none."""
+        quick, depth = self.frame.quick_disparity, self.frame.depth_m
+        if quick is not None:
+            return quick
+        assert depth is not None
+        return np.divide(self.rig.baseline_fx, depth, out=np.zeros_like(depth), where=depth > 0)
 
     @cached_property
     def corners(self) -> tuple[features.Pixels, NDArray[np.float32]]:
         """Corners of the left image, (n, 2) pixels, and their (n,) disparities."""
         pixels = features.corners(self.gray, MAX_CORNERS)
         return pixels, features.bilinear(self.disparity, pixels)
+
+    def reference(self, T_world_camera: se3.Transform) -> _Reference:
+        """The corners with disparity, at the frame's pose."""
+        pixels, disparity = self.corners
+        deep = disparity > MIN_DISPARITY
+        return _Reference(
+            gray=self.gray,
+            pixels=pixels[deep],
+            disparity=disparity[deep],
+            rig=self.rig,
+            timestamp_ns=self.frame.timestamp_ns,
+            T_world_camera=T_world_camera,
+        )
 
 
 class StereoLocalizer(Localizer):
@@ -80,47 +114,60 @@ class StereoLocalizer(Localizer):
         self._rectification = RectificationMonitor()
         self._reference: _Reference | None = None
         self._velocity: NDArray[np.float64] | None = None  # twist a second; a frame without timestamps
+        # The last frame, with its pose where it may be the next reference, until `prepare`.
+        self._newest: tuple[_View, se3.Transform | None] | None = None
 
     @property
     def rectification(self) -> RectificationCheck | None:
         """Check of the rectification by the pairs so far; None until there were eight."""
+        self.prepare()
         return self._rectification.check
 
     def track(self, frame: Frame) -> Pose | Lost:
         """Find the left camera's pose in the axes of the first one."""
-        image = _disparity_image(frame)
-        if frame.right is not None and self._rectification.wants_pair:
-            self._check_rows(image, frame.right)
-        reference, T, quality, moved = self._reference, np.eye(4), 1.0, np.inf
-        if reference is not None:
-            found = self._compare(reference, image.gray, frame.timestamp_ns)
-            if isinstance(found, str):
-                self._velocity = None
-                return Lost(reason=found, timestamp_ns=frame.timestamp_ns)
-            T, quality, moved = se3.nearest(reference.T_world_camera @ found[0]), found[1], found[2]
-        if moved > MIN_MOTION:
-            pixels, disparity = image.corners
-            deep = disparity > MIN_DISPARITY
-            seen = _Reference(
-                gray=image.gray,
-                pixels=pixels[deep],
-                disparity=disparity[deep],
-                rig=image.rig,
-                timestamp_ns=frame.timestamp_ns,
-                T_world_camera=T,
-            )
-            if reference is None and len(seen.pixels) < MIN_POINTS:
-                reason = f"only {len(seen.pixels)} corners with depth" + HINT * (frame.kind == "pair")
-                return Lost(reason=reason, timestamp_ns=frame.timestamp_ns)
-            if len(seen.pixels) >= MIN_POINTS:
-                self._reference = seen
-                self._anchors.distance = KEYFRAME_DISTANCE * seen.median_depth
+        self.prepare()
+        view = _View.of(frame)
+        if self._reference is None:
+            return self._start(view)
+        found = self._compare(self._reference, view.gray, frame.timestamp_ns)
+        if isinstance(found, str):
+            self._velocity = None
+            self._newest = view, None
+            return Lost(reason=found, timestamp_ns=frame.timestamp_ns)
+        T_reference_camera, quality, moved = found
+        T = se3.nearest(self._reference.T_world_camera @ T_reference_camera)
+        self._newest = view, T if moved > MIN_MOTION else None
         return self._anchors.pose(T, frame.timestamp_ns, quality=quality)
+
+    def prepare(self) -> None:
+        """Find the corners of the last frame and their disparity, with which the next one is compared."""
+        newest, self._newest = self._newest, None
+        if newest is None:
+            return
+        view, T = newest
+        if view.frame.right is not None and self._rectification.wants_pair:
+            self._check_rows(view, view.frame.right)
+        if T is None:
+            return
+        reference = view.reference(T)
+        if len(reference.pixels) >= MIN_POINTS:
+            self._reference = reference
+            self._anchors.distance = KEYFRAME_DISTANCE * reference.median_depth
 
     def reset(self) -> None:
         """Begin a new world at the next frame."""
-        self._reference = self._velocity = None
+        self._reference = self._velocity = self._newest = None
         self._anchors.reset()
+
+    def _start(self, view: _View) -> Pose | Lost:
+        """Make a frame the first of a world, if it has enough corners with depth."""
+        self._newest = view, np.eye(4)
+        self.prepare()
+        if self._reference is None:
+            count = np.count_nonzero(view.corners[1] > MIN_DISPARITY)
+            reason = f"only {count} corners with depth" + HINT * (view.frame.kind == "pair")
+            return Lost(reason=reason, timestamp_ns=view.frame.timestamp_ns)
+        return self._anchors.pose(np.eye(4), view.frame.timestamp_ns)
 
     def _compare(
         self, reference: _Reference, gray: NDArray[np.uint8], timestamp_ns: int
@@ -154,13 +201,13 @@ class StereoLocalizer(Localizer):
         self._velocity = se3.log(motion.T_old_new) / elapsed
         return motion.T_old_new, share, float(np.median(np.abs(new - old)[agree].max(axis=1)))
 
-    def _check_rows(self, image: _DisparityImage, right: NDArray[np.uint8]) -> None:
+    def _check_rows(self, view: _View, right: NDArray[np.uint8]) -> None:
         """Add a pair to the check, also corners without disparity: bad rectification may be the reason."""
-        pixels, disparity = image.corners
+        pixels, disparity = view.corners
         matched = disparity > 0
         guess = pixels.copy()
         guess[:, 0] -= np.where(matched, disparity, np.median(disparity[matched]) if matched.any() else 0)
-        other, found = features.follow(image.gray, right, pixels, guess=guess)
+        other, found = features.follow(view.gray, right, pixels, guess=guess)
         self._rectification.add_pair(pixels[found], other[found], right.shape)
 
     def _check_disparity(
@@ -174,24 +221,6 @@ class StereoLocalizer(Localizer):
         motion = refine(T, old, disparity, new[near], reference.rig, with_offset=True)
         if motion is not None:
             self._rectification.add_motion(motion.offset, motion.offset_sigma)
-
-
-def _disparity_image(frame: Frame) -> _DisparityImage:
-    """Make the disparity image of a frame. Raises InvalidKeyframe without an image or without depth."""
-    gray, depth = frame.gray, frame.depth_m
-    if gray is None or (depth is None and frame.right is None):
-        raise InvalidKeyframe(
-            f"the localizer stereo follows stereo pairs, or depth with a colour image; got {frame.kind}"
-            + ("" if frame.kind == "points" else " without colour")
-        )
-    assert frame.intrinsics is not None
-    rig = StereoCamera(frame.intrinsics, frame.baseline_fx or DEPTH_CAMERA_BASELINE_FX)
-    if frame.quick_disparity is not None:
-        return _DisparityImage(gray, frame.quick_disparity, rig)
-    assert depth is not None
-    return _DisparityImage(
-        gray, np.divide(rig.baseline_fx, depth, out=np.zeros_like(depth), where=depth > 0), rig
-    )
 
 
 def _elapsed(before_ns: int, now_ns: int) -> float:
