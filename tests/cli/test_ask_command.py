@@ -22,6 +22,7 @@ from tsfusion.pipelines.saved_map_answers import SavedMapAnswers
 from tsfusion.wire.questions import MOST_POINTS
 
 POINTS = np.array([[0.0, 0.0, 1.2], [0.1, 0.05, 1.27], [9.0, 9.0, 9.0]])
+PATIENT = ("--timeout", "60")  # on a machine with a lot to do
 SLICE = ("--slice", "-0.3", "0.3", "--up", "-y", "--box", "-1", "-2", "2", "0")
 VIEW = ("--view", *["0", "0", "0", "0", "0", "0", "1"], "--size", "64x48")
 
@@ -55,19 +56,19 @@ def test_a_file_and_a_server_answer_alike(
     """Points as a table, as an array, as JSON; a view."""
     np.save(tmp_path / "points.npy", POINTS)
     expected = volume.sample(POINTS, surface="raw")
-    for name, source in (("file", str(saved)), ("live", live.address)):
-        table = here("ask", source, "--points", tmp_path / "points.npy")
+    for name, *source in (("file", str(saved)), ("live", live.address, *PATIENT)):
+        table = here("ask", *source, "--points", tmp_path / "points.npy")
         assert table.returncode == 0, table.stderr
         rows = np.loadtxt(table.stdout.splitlines(), delimiter=",", skiprows=1)
         assert table.stdout.splitlines()[0] == ",".join(answer_files.COLUMNS)
         np.testing.assert_array_equal(rows[:, :3], POINTS)
         np.testing.assert_allclose(rows[:, 3], expected.distance, atol=1e-6)
         assert "3 points, of which the map has seen 2" in table.stderr
-        done = here("ask", source, tmp_path / f"{name}.npz", "--points", tmp_path / "points.npy", "--json")
+        done = here("ask", *source, tmp_path / f"{name}.npz", "--points", tmp_path / "points.npy", "--json")
         assert json.loads(done.stdout)["states"][0]["keyframes"] == 3
-        sliced = here("ask", source, tmp_path / f"{name}-slice.npz", "--distances", *SLICE)
+        sliced = here("ask", *source, tmp_path / f"{name}-slice.npz", "--distances", *SLICE)
         assert sliced.returncode == 0, sliced.stderr
-        view = here("ask", source, tmp_path / f"{name}-view.npz", *VIEW)
+        view = here("ask", *source, tmp_path / f"{name}-view.npz", *VIEW)
         assert view.returncode == 0, view.stderr
         assert "64×48 pixels, the surface in" in view.stdout
     for suffix in (".npz", "-view.npz", "-slice.npz"):
@@ -79,24 +80,24 @@ def test_a_file_and_a_server_answer_alike(
 
 
 def test_a_slice_for_map_server(here: Here, live: Server, tmp_path: Path) -> None:
-    done = here("ask", live.address, tmp_path / "slice.pgm", *SLICE)
+    done = here("ask", live.address, *PATIENT, tmp_path / "slice.pgm", *SLICE)
     assert done.returncode == 0, done.stderr
     assert "% occupied" in done.stdout
     assert "free space is known near surfaces alone" in done.stdout
     assert cv2.imread(str(tmp_path / "slice.pgm")).shape[:2] == (50, 75)
     assert "image: " in (tmp_path / "slice.yaml").read_text()
-    shares = json.loads(here("ask", live.address, tmp_path / "slice.png", *SLICE, "--json").stdout)
+    shares = json.loads(here("ask", live.address, *PATIENT, tmp_path / "slice.png", *SLICE, "--json").stdout)
     assert shares["free"] + shares["occupied"] + shares["unseen"] == pytest.approx(1)
-    done = here("ask", live.address, tmp_path / "no.png", "--slice", "0", "1")
+    done = here("ask", live.address, *PATIENT, tmp_path / "no.png", "--slice", "0", "1")
     assert (done.returncode, "--up" in done.stderr) == (1, True)
 
 
 def test_one_point_in_words_and_for_a_program(here: Here, live: Server) -> None:
-    words = here("ask", live.address, "--at", "0", "0", "1.2").stdout
+    words = here("ask", live.address, *PATIENT, "--at", "0", "0", "1.2").stdout
     assert " m in front of the surface" in words or " m behind the surface" in words
     assert "a map of 3 keyframes, answered in" in words
-    assert "-9 9 9: unseen" in here("ask", live.address, "--at", "-9", "9", "9").stdout
-    answer = json.loads(here("ask", live.address, "--at", "-9", "9", "9", "--json").stdout)
+    assert "-9 9 9: unseen" in here("ask", live.address, *PATIENT, "--at", "-9", "9", "9").stdout
+    answer = json.loads(here("ask", live.address, *PATIENT, "--at", "-9", "9", "9", "--json").stdout)
     assert answer["samples"] == [{"point": [-9, 9, 9], "distance": None, "weight": 0, "gradient": None}]
     assert answer["delay_ms"] > 0
 
@@ -104,7 +105,7 @@ def test_one_point_in_words_and_for_a_program(here: Here, live: Server) -> None:
 def test_many_points_are_asked_in_parts(here: Here, live: Server, tmp_path: Path) -> None:
     many = np.repeat(POINTS, MOST_POINTS // 2, axis=0)
     np.save(tmp_path / "many.npy", many)
-    done = here("ask", live.address, tmp_path / "out.npy", "--points", tmp_path / "many.npy")
+    done = here("ask", live.address, *PATIENT, tmp_path / "out.npy", "--points", tmp_path / "many.npy")
     assert done.returncode == 0, done.stderr
     distances = np.load(tmp_path / "out.npy")
     assert distances.shape == (len(many),)
@@ -209,7 +210,7 @@ def test_the_command_needs_no_taichi_for_a_live_map(live: Server) -> None:
     """A robot without it asks by the same verb."""
     done = python(
         "import sys; sys.modules['taichi'] = None; from tsfusion import cli; cli.main(sys.argv[1:])",
-        *("ask", live.address, "--at", "0", "0", "1.2"),
+        *("ask", live.address, *PATIENT, "--at", "0", "0", "1.2"),
     )
     assert done.returncode == 0, done.stderr
     assert "of the surface" in done.stdout

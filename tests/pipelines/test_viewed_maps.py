@@ -37,7 +37,8 @@ def state(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def feed(state: Path) -> Iterator[SavedMapFeed]:
-    with closing(open_feed(state, map_name="yard")) as feed:
+    with pytest.MonkeyPatch.context() as patch, closing(open_feed(state, map_name="yard")) as feed:
+        patch.setattr("tsfusion.pipelines.viewed_maps._ANSWER_S", DEADLINE_S)
         yield feed
 
 
