@@ -49,7 +49,7 @@ def _errors(rows: Sequence[AteRow]) -> list[tuple[str, ...]]:
         (
             row.outcome.name,
             row.part if row.until_frame is None else f"until frame {row.until_frame}",
-            *(f"{getattr(row.error, name):.3f}" for name in names),
+            *(f"{getattr(row.error, name):.4f}" for name in names),
             f"{row.error.drift_percent:.2f}",
         )
         for row in rows
