@@ -269,16 +269,16 @@ def main() -> int:
     options = parser.parse_args()
     rows, lines = _read(options.points, parser), _read(options.fuse, parser)
     try:
-        gateway, table = check(rows)
-    except (KeyError, TypeError, ValueError):
-        parser.error(f"{options.points} needs lines of scripts/fleet.py, with {FIT[0]} and {FIT[1]} scanners")
-    try:
         fusing, runs = check_fusing(lines)
     except (KeyError, StopIteration, TypeError, ValueError, ZeroDivisionError):
         parser.error(
             f"{options.fuse} needs lines of scripts/cluster.py: one worker with two numbers of keyframes, "
             "and two workers with the larger one"
         )
+    try:
+        gateway, table = check(rows)
+    except (KeyError, TypeError, ValueError):
+        parser.error(f"{options.points} needs lines of scripts/fleet.py, with {FIT[0]} and {FIT[1]} scanners")
     if not (errors := [abs(row["error"]) for row in table + runs if not row["fitted"]]):
         parser.error("all points are fitted, and none is left to predict; give more of them")
     cities = [city(machines, rows[0]["keyframe_bytes"]) for machines in (1, 2, 4, 8, 16, 32, 64)]
