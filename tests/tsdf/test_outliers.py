@@ -8,7 +8,7 @@ import pytest
 from formula_scenes import CAMERA, SHAPE, directions, look_at, plane_keyframe, volume_of
 from numpy.typing import NDArray
 
-from tsfusion import Keyframe, Volume
+from tsfusion import Intrinsics, Keyframe, Volume
 from tsfusion.core.errors import InvalidConfig
 from tsfusion.datasets import Synthetic
 from tsfusion.tsdf.block_store import unpack_keys
@@ -150,3 +150,15 @@ def test_rays_that_share_the_carving_leave_nothing_out() -> None:
     for near, far, least in ((0.4, 0.6, 0.2), (0.6, 0.9, 0.75), (0.9, 1.3, 0.75), (1.3, 1.85, 0.75)):
         assert least < votes[(z[seen] > near) & (z[seen] < far)].mean() < 1.6
     assert stats.updates < 0.9 * stats.rays * 2.0 / 0.02, "each ray alone would take 1.4 times its length"
+
+
+def test_what_is_very_far_away_carves_what_is_before_it() -> None:
+    """Each of four rays of 3000 voxels carves its farther half at least."""
+    camera = Intrinsics(6000.0, 6000.0, 1.5, 1.5)
+    far = Keyframe(depth=np.full((4, 4), 30.0, np.float32), intrinsics=camera, T_world_camera=np.eye(4))
+    volume = volume_of(
+        [], voxel_size=0.01, color=False, max_range=40.0, space_carving=True, regularizer="off"
+    )
+    stats = volume.integrate(far)
+    assert stats.rays == 4
+    assert stats.updates > 4 * 1450

@@ -44,6 +44,7 @@ PLANE_NOISE = 2.0  # the most mean squared residual of a plane, in σ² …
 PLANE_ROUGHNESS = 0.1 * 1024.0  # … and, squared, on top of it: 2⁻¹⁰ voxel
 PLANE_SIGMA = 1.0  # voxels: with more noise than that a plane says nothing about voxels
 LEAST_PASSED = 1 / 128  # NEVER_CARVED / MAX_CARVED
+LEAST_SPACING = 2 / 3  # voxels between rays: of closer ones the surface has more votes, and so has free space
 LEAST_FACING = 0.15  # cosine between plane normal and ray: what is seen more edge-on has no plane
 
 
@@ -347,7 +348,7 @@ def shares_passed(cell, pixel):
     enough, nearer than a quarter those of every fourth, and so on.
     """
     x, y = (cell.left + cell.x) // cell.wide, (cell.top + cell.y) // cell.high
-    sparse = 0.5 / (pixel * ti.max(cell.wide, cell.high))
+    sparse = 0.5 / ti.max(pixel * ti.max(cell.wide, cell.high), LEAST_SPACING)
     passed, fourfold = sparse, 0.0
     while ((x | y) & 1) == 0 and passed > LEAST_PASSED:
         x, y, passed, fourfold = x >> 1, y >> 1, 0.5 * passed, sparse
