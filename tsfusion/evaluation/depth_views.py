@@ -27,6 +27,8 @@ MIN_GROUND_SHARE = 0.25  # share of the points in one such slice that makes it t
 MAX_DISTANCE = 1e6  # metres; points beyond it are invalid
 MAX_TREE_POINTS = 20_000  # of a scan that others are compared with
 EXACT_KD_TREE = 4  # FLANN_INDEX_KDTREE_SINGLE
+_CELL_HASH = np.array([0x9E3779B97F4A7C1, 0x2545F4914F6CDD1D, 0x1B873593CC9E2D51])  # wraps at 64 bits
+_MIN_Z = 1e-6  # metres: a point nearer than this is behind the camera
 
 
 class DepthView(Protocol):
@@ -34,7 +36,7 @@ class DepthView(Protocol):
 
     @property
     def points(self) -> NDArray[np.float64]:
-        """(n, 3) float64, a part of the measured points, in the sensor's axes, metres."""
+        """(3, n) float64, a part of the measured points, in the sensor's axes, metres."""
         ...
 
     @property
@@ -58,7 +60,7 @@ class DepthView(Protocol):
         ...
 
     def deviation(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(n,) distance of (n, 3) points from the measured surface, in units of the tolerance.
+        """(n,) distance of (3, n) points from the measured surface, in units of the tolerance.
 
         Infinite where a point is out of view, or nothing was measured.
         """
@@ -81,7 +83,7 @@ def depth_view(frame: Frame) -> DepthView | None:
         assert frame.intrinsics is not None
         baseline = frame.baseline_fx if frame.kind == "disparity" else None
         made = _ImageView(frame.depth_m, frame.intrinsics, baseline)
-    return made if len(made.points) >= MAX_POINTS // 8 else None
+    return made if made.points.shape[1] >= MAX_POINTS // 8 else None
 
 
 def _stereo_view(frame: Frame) -> "_ImageView":
@@ -114,19 +116,23 @@ class _ImageView:
         scale: float = 1.0,
     ) -> None:
         """Take depth in an image `scale` times the size of the one that `camera` and `baseline_fx` are of."""
-        self._depth, self._baseline_fx, self._scale = depth_m, baseline_fx, scale
+        self._baseline_fx, self._scale = baseline_fx, scale
         self.stereo = baseline_fx is not None
         self.shape = tuple(round(side / scale) for side in depth_m.shape)
         rows, columns = np.nonzero(_without_edges(depth_m))
         chosen = np.linspace(0, len(rows) - 1, min(MAX_POINTS, len(rows))).astype(np.intp)
-        self._pixels = rows[chosen], columns[chosen]
+        self._pixels = np.stack([columns[chosen], rows[chosen]]).astype(np.float64)
+        self._z = depth_m[rows[chosen], columns[chosen]].astype(np.float64)
+        self._depth = np.pad(depth_m, 1)  # whatever is out of view falls on its border
+        self.range_m = float(np.median(self._z)) if len(self._z) else 0.0
         self._take(camera)
 
     def seen_by(self, camera: Intrinsics) -> "_ImageView":
         other = copy(self)
         if self._baseline_fx is not None:
             factor = camera.fx * self._scale / self._K.fx
-            other._depth, other._baseline_fx = self._depth * np.float32(factor), self._baseline_fx * factor
+            other._depth, other._z = self._depth * np.float32(factor), self._z * factor
+            other._baseline_fx, other.range_m = self._baseline_fx * factor, self.range_m * factor
         other._take(camera)
         return other
 
@@ -135,23 +141,25 @@ class _ImageView:
         self._K = K = camera if self._scale == 1 else camera.scaled(self._scale)
         fx_b = self._baseline_fx
         self._disparity = 0.0 if fx_b is None else DISPARITY_TOLERANCE / (fx_b * self._scale)
-        rows, columns = self._pixels
-        z = self._depth[rows, columns].astype(np.float64)
-        self.points = np.stack([(columns - K.cx) / K.fx * z, (rows - K.cy) / K.fy * z, z], axis=1)
-        self.range_m = float(np.median(z)) if len(z) else 0.0
+        self._focal, self._centre = np.array([[K.fx], [K.fy]]), np.array([[K.cx], [K.cy]])
+        self.points = np.empty((3, len(self._z)))
+        self.points[:2] = (self._pixels - self._centre) / self._focal * self._z
+        self.points[2] = self._z
 
     def deviation(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        K, (height, width) = self._K, self._depth.shape
-        z = points[:, 2]
-        front = z > 1e-6
-        near = np.where(front, z, 1.0)
-        column = np.clip(np.rint(K.fx * points[:, 0] / near + K.cx), -1, width).astype(np.intp)
-        row = np.clip(np.rint(K.fy * points[:, 1] / near + K.cy), -1, height).astype(np.intp)
-        seen = front & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        result = np.full(len(points), np.inf)
-        measured = self._depth[row[seen], column[seen]].astype(np.float64)
-        tolerance = MIN_TOLERANCE + DEPTH_TOLERANCE * measured + self._disparity * measured**2
-        result[seen] = np.where(measured > 0, np.abs(z[seen] - measured) / tolerance, np.inf)
+        height, width = self._depth.shape
+        z = points[2]
+        pixels = points[:2] / np.maximum(z, _MIN_Z)
+        pixels *= self._focal
+        pixels += self._centre + 1  # of the depth with its border
+        np.rint(pixels, out=pixels)
+        np.maximum(pixels, 0, out=pixels)
+        np.minimum(pixels, [[width - 1], [height - 1]], out=pixels)
+        column, row = pixels.astype(np.intp)
+        measured = self._depth.take(row * width + column, mode="clip").astype(np.float64)
+        tolerance = MIN_TOLERANCE + measured * (DEPTH_TOLERANCE + self._disparity * measured)
+        result: NDArray[np.float64] = np.abs(z - measured) / tolerance
+        result[(measured <= 0) | (z <= _MIN_Z)] = np.inf
         return result
 
 
@@ -179,7 +187,7 @@ class _ScanView:
         kept = _evenly_chosen(kept, MAX_TREE_POINTS)
         self._tree = _kd_tree(kept) if len(kept) else None
         self._box = (kept.min(axis=0), kept.max(axis=0)) if len(kept) else (np.zeros(3), np.zeros(3))
-        self.points = _evenly_chosen(kept, MAX_POINTS // 2)
+        self.points = np.ascontiguousarray(_evenly_chosen(kept, MAX_POINTS // 2).T)
 
     def seen_by(self, camera: Intrinsics) -> "_ScanView":
         del camera
@@ -187,11 +195,12 @@ class _ScanView:
 
     def deviation(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         assert self._tree is not None
-        near = ((points >= self._box[0]) & (points <= self._box[1])).all(axis=1)
-        deviation = np.full(len(points), np.inf)
+        rows = points.T
+        near = ((rows >= self._box[0]) & (rows <= self._box[1])).all(axis=1)
+        deviation = np.full(len(rows), np.inf)
         if near.any():
-            _, squared = self._tree.knnSearch(points[near].astype(np.float32), 1, params={})
-            tolerance = LIDAR_TOLERANCE + 0.005 * self.range_m + 0.01 * np.linalg.norm(points[near], axis=1)
+            _, squared = self._tree.knnSearch(rows[near].astype(np.float32), 1, params={})
+            tolerance = LIDAR_TOLERANCE + 0.005 * self.range_m + 0.01 * np.linalg.norm(rows[near], axis=1)
             deviation[near] = np.sqrt(squared[:, 0]) / tolerance
         return deviation
 
@@ -215,5 +224,6 @@ def _above_ground(points: NDArray[np.float64], range_m: float) -> NDArray[np.flo
 
 
 def _one_per_cell(points: NDArray[np.float64], cell: float) -> NDArray[np.float64]:
-    _, first = np.unique(np.round(points / cell).astype(np.int64), axis=0, return_index=True)
+    cells = np.round(points / cell).astype(np.int64)
+    _, first = np.unique(cells @ _CELL_HASH, return_index=True)
     return np.asarray(points[np.sort(first)])

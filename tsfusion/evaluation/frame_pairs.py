@@ -64,11 +64,14 @@ class FramePair:
 
     def fit(self, motion: Motion) -> float:
         """Fit of the first frame's points to the second's surface, 0 to 1; 0 if too few can be compared."""
-        deviation = self.second_view.deviation(se3.apply(motion, self.first_view.points))
-        compared = np.isfinite(deviation)
-        if compared.mean() < MIN_COMPARED:
+        points = motion[:3, :3] @ self.first_view.points
+        points += motion[:3, 3:]
+        deviation = self.second_view.deviation(points)
+        compared = np.count_nonzero(np.isfinite(deviation))
+        if compared < MIN_COMPARED * len(deviation):
             return 0.0
-        return float(np.maximum(0, 1 - deviation[compared] ** 2).mean())
+        fits = 1 - deviation * deviation
+        return float(np.maximum(fits, 0, out=fits).sum()) / compared
 
     def seen_by(self, camera: Intrinsics) -> "FramePair":
         """The pair if another camera had measured it."""
@@ -150,9 +153,10 @@ def _best_fit_near(pair: FramePair, motion: Motion) -> float:
     steps = np.array([FIRST_STEP * pair.second_view.range_m] * 3 + [FIRST_STEP] * 3)
     for _ in range(STEP_ROUNDS):
         before = best
-        for axis in range(6):
-            for way in (1.0, -1.0):
-                moved = se3.exp(way * steps[axis] * np.eye(6)[axis]) @ motion
+        corrections = se3.exp(np.stack([np.diag(steps), -np.diag(steps)], axis=1))  # (6 axes, 2 ways, 4, 4)
+        for of_axis in corrections:
+            for correction in of_axis:
+                moved = correction @ motion
                 if (fit := pair.fit(moved)) > best:
                     motion, best = moved, fit
                     break
