@@ -17,6 +17,7 @@ from tsfusion.core.errors import DatasetError
 from tsfusion.datasets import Synthetic
 from tsfusion.datasets.synthetic import worlds
 from tsfusion.datasets.synthetic.dataset import DEPTH_SCALE, kinect, stereo
+from tsfusion.datasets.synthetic.ray_tiles import RayTiles
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.geometry.measured_points import depth_metres, points_world
 from tsfusion.scanner.localization.rgbd.tracker import RGBDLocalizer
@@ -279,6 +280,22 @@ def test_rays_meet_what_the_twin_meets_first(world):
     found = np.where(depth_metres(keyframe) < 5.9, depth_metres(keyframe), 0)
     agree = np.abs(found - expected) < 2e-4
     assert agree.mean() > 0.99  # the rest graze an edge
+
+
+@pytest.mark.parametrize(
+    ("world", "sensor"), [("rooms", "kinect"), ("corridor", "kinect"), ("street", "lidar"), ("desk", "tof")]
+)
+def test_a_ray_that_is_asked_about_few_solids_sees_the_same(world, sensor, monkeypatch):
+    dataset = Synthetic(world, sensor, count=9, width=160)
+
+    def whole(tiles, T_world_sensor, solids):
+        of_a_tile = np.arange(len(solids), dtype=np.int32)
+        count = tiles.tile_of.max() + 1
+        return np.arange(count + 1, dtype=np.int32) * len(solids), np.tile(of_a_tile, count)
+
+    few = [digest(dataset[index]) for index in range(0, 9, 2)]
+    monkeypatch.setattr(RayTiles, "lists", whole)
+    assert [digest(dataset[index]) for index in range(0, 9, 2)] == few
 
 
 def test_a_kinect_v2_at_the_desk_has_its_noise_and_loses_outlines():

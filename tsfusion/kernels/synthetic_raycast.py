@@ -204,10 +204,11 @@ def solid_normal(solids: ti.template(), s, p_local):
 
 
 @ti.func
-def daylight(solids: ti.template(), p, normal):
+def daylight(solids: ti.template(), listed: ti.template(), first, last, p, normal):
     """Soft light from above and the side, dimmed in corners; the same from every view."""
     nearest = vec3(1, 1, 1)  # open space at three heights above the surface, as a share of the height
-    for s in range(solids.shape[0]):
+    for place in range(first, last):
+        s = listed[place]
         kind = ti.i32(solids[s, 0])
         away = p - vec3(solids[s, 1], solids[s, 2], solids[s, 3])
         radius = tm.length(vec3(solids[s, 4], solids[s, 5], solids[s, 6])) + 0.5
@@ -225,6 +226,9 @@ def cast(
     T_world_sensor: ti.types.ndarray(dtype=ti.f64, ndim=2),
     directions: ti.types.ndarray(dtype=ti.f64, ndim=2),
     solids: ti.types.ndarray(dtype=ti.f64, ndim=2),
+    tile_of: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    starts: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    listed: ti.types.ndarray(dtype=ti.i32, ndim=1),
     distance: ti.types.ndarray(dtype=ti.f64, ndim=1),
     incidence: ti.types.ndarray(dtype=ti.f64, ndim=1),
     color: ti.types.ndarray(dtype=ti.u8, ndim=2),
@@ -235,6 +239,9 @@ def cast(
         T_world_sensor: (4, 4) float64.
         directions: (n, 3) float64, sensor frame; with z = 1 the distance is a depth.
         solids: (m, 12) float64.
+        tile_of: (n,) int32, number of each ray's tile.
+        starts, listed: int32; the solids of tile t are `listed[starts[t] : starts[t + 1]]`, all that its rays
+            may meet, and those next to them, which dim the light.
         distance: (n,) float64, out: in units of the direction's length; 0 = nothing met.
         incidence: (n,) float64, out: |cosine| between ray and surface normal.
         color: (n, 3) uint8 BGR, out; of no rows = no colour wanted.
@@ -245,7 +252,9 @@ def cast(
         for r, c in ti.static(ti.ndrange(3, 3)):
             d[r] += T_world_sensor[r, c] * directions[i, c]
         best, hit = ti.f64(1e9), -1
-        for s in range(solids.shape[0]):
+        first, last = starts[tile_of[i]], starts[tile_of[i] + 1]
+        for place in range(first, last):
+            s = listed[place]
             if may_meet(solids, s, o, d):
                 t = solid_ray(solids, s, o, d)
                 if t < best:
@@ -261,7 +270,9 @@ def cast(
             distance[i] = best
             incidence[i] = ti.abs(normal.dot(d)) / tm.length(d)
             if color.shape[0] > 0:
-                rgb = solid_color(solids, hit, p_local, n_local) * daylight(solids, p, normal)
+                rgb = solid_color(solids, hit, p_local, n_local) * daylight(
+                    solids, listed, first, last, p, normal
+                )
                 for k in ti.static(range(3)):
                     color[i, k] = ti.cast(tm.clamp(rgb[2 - k], 0.0, 1.0) * 255.0 + 0.5, ti.u8)
         elif color.shape[0] > 0:

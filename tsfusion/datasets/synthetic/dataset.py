@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.dataset import Frames
 from tsfusion.datasets.synthetic import desk_world, loop_worlds, worlds
+from tsfusion.datasets.synthetic.ray_tiles import RayTiles
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
 
@@ -139,7 +140,10 @@ class Synthetic(Frames):
         self.lidar = LIDARS.get(self.world.name, LIDARS["room"])
         self._count, self._seed, self._noise, self._with_color = count, seed, noise, color
         self._steps = self.world.steps if given is None else count
-        self._directions = _lidar_rays(self.lidar) if sensor == "lidar" else _camera_rays(self.camera)
+        lidar = sensor == "lidar"
+        self._directions = _lidar_rays(self.lidar) if lidar else _camera_rays(self.camera)
+        shape = (self.lidar.rows, self.lidar.columns) if lidar else self.camera.size
+        self._tiles = RayTiles(self._directions, shape)
 
     def __len__(self) -> int:
         return self._count
@@ -194,7 +198,11 @@ class Synthetic(Frames):
         distance, incidence = np.empty(rays), np.empty(rays)
         color = np.empty((rays if self._with_color else 0, 3), dtype=np.uint8)
         reach = SENSORS[self.sensor] or self.lidar.max_range
-        kernels.cast(T, self._directions, self.world.near(T[:3, 3], reach), distance, incidence, color)
+        solids = self.world.near(T[:3, 3], reach)
+        starts, listed = self._tiles.lists(T, solids)
+        kernels.cast(
+            T, self._directions, solids, self._tiles.tile_of, starts, listed, distance, incidence, color
+        )
         return distance, incidence, color
 
     def _scan(
