@@ -48,7 +48,7 @@ from _paper_worlds import PaperWorld, sweep_worlds, worlds
 from _peers import unimportable
 
 from tsfusion.core import process
-from tsfusion.core.errors import TsfusionError
+from tsfusion.core.errors import OutputError, TsfusionError
 
 HERE = Path(__file__).parent
 _CHILD_S = 1800.0
@@ -75,6 +75,9 @@ def main() -> int:
     except KeyboardInterrupt:
         say("stopped; what is done is kept, and the same command goes on")
         return 130
+    except TsfusionError as error:
+        say(str(error))
+        return 1
 
 
 def parse() -> argparse.Namespace:
@@ -173,12 +176,13 @@ def rendered(world: PaperWorld, cache: Path) -> PaperWorld:
         orders = folder.with_suffix(".json")
         orders.write_bytes(told)
         began = time.monotonic()
+        said = folder.with_suffix(".log")
         say(f"rendering {world.title} into {folder} (once; not part of any run)")
-        child(
-            [str(HERE / "_paper_render.py"), str(orders), str(folder)],
-            folder.with_suffix(".log"),
-            _RENDERING_S,
-        )
+        try:
+            child([str(HERE / "_paper_render.py"), str(orders), str(folder)], said, _RENDERING_S)
+        except subprocess.SubprocessError as error:
+            why = f"{world.title} cannot be rendered into {folder}: {error}; see {said}"
+            raise OutputError(f"{why}; is another run of this command rendering it?") from error
         say(f"rendered in {time.monotonic() - began:.0f} s")
     return msgspec.structs.replace(world, cache=str(folder))
 

@@ -122,6 +122,18 @@ def test_a_bad_frame_is_lost_and_the_next_one_is_not(data: Data, spoil: Callable
     assert se3.distance(se3.inverse(whole[4].T_world_camera) @ last.T_world_camera) < 0.1
 
 
+@pytest.mark.parametrize("last", [5, 14])
+def test_half_a_second_without_frames_is_bridged(data: Data, last: int) -> None:
+    clip = frames(data, "06", last + 6)
+    stereo = StereoLocalizer()
+    poses(stereo, clip[last - 2 : last + 1])
+    found = stereo.track(clip[last + 5])
+    assert isinstance(found, Pose)
+    (whole,) = poses(StereoLocalizer(), clip[last - 2 :])[-1:]
+    assert se3.distance(whole.T_world_camera) > 6
+    assert se3.distance(se3.inverse(whole.T_world_camera) @ found.T_world_camera) < 0.3
+
+
 def test_another_place_is_no_motion(data: Data) -> None:
     clip, other = frames(data, "06", 30), frames(data, "01", 3)
     stereo = StereoLocalizer()

@@ -4,6 +4,7 @@
 from dataclasses import dataclass
 from functools import cached_property
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,12 +20,14 @@ from tsfusion.scanner.localization.tracking_keyframes import TrackingKeyframes
 MAX_CORNERS = 1000
 MIN_POINTS = 25  # that must agree
 MIN_SHARE, MIN_SHARE_SUDDEN = 0.25, 0.4  # of the followed points that must agree; in a sudden motion
+MIN_POINTS_EXPECTED = 15  # that must agree, and as great a share, on the motion that was expected
 PIXEL_TOLERANCE = 1.0  # KITTI 06 drifts by 0.82 % with it, by 0.90 % with 1.5
 MAX_OFFSET_ERROR = 3.0  # pixels: points with larger errors are left out of the search for offsets
 MIN_MOTION = 1.0  # pixels of median motion below which the old frame stays the reference
 MIN_DISPARITY = 1.0  # pixels
 SUDDEN_DISTANCE = 0.1  # of the points' median depth by which a motion may differ from the last one
 SUDDEN_ANGLE = np.radians(10)
+BELIEVED_S = 1.5  # seconds that the last velocity is believed when frames were missed
 KEYFRAME_DISTANCE = 0.15  # of the points' median depth to the next tracking keyframe
 HINT = " (is the view blank, the pair rectified, and left the left camera's?)"
 DEPTH_CAMERA_BASELINE_FX = 43.0  # px·m, of depth cameras without a known one (Kinect: 0.075 m × 575 px)
@@ -37,6 +40,7 @@ class _Reference:
     gray: NDArray[np.uint8]
     pixels: features.Pixels  # (n, 2) corners with depth
     disparity: NDArray[np.float32]  # (n,)
+    dense: NDArray[np.float32]  # (H, W) disparity of the whole image; 0 = none
     rig: StereoCamera
     timestamp_ns: int
     T_world_camera: se3.Transform
@@ -94,6 +98,7 @@ class _View:
             gray=self.gray,
             pixels=pixels[deep],
             disparity=disparity[deep],
+            dense=self.disparity,
             rig=self.rig,
             timestamp_ns=self.frame.timestamp_ns,
             T_world_camera=T_world_camera,
@@ -131,7 +136,6 @@ class StereoLocalizer(Localizer):
             return self._start(view)
         found = self._compare(self._reference, view.gray, frame.timestamp_ns)
         if isinstance(found, str):
-            self._velocity = None
             self._newest = view, None
             return Lost(reason=found, timestamp_ns=frame.timestamp_ns)
         T_reference_camera, quality, moved = found
@@ -176,10 +180,37 @@ class StereoLocalizer(Localizer):
         if gray.shape != reference.gray.shape:
             return f"the image is {gray.shape[1]}×{gray.shape[0]}, unlike those before"
         elapsed = _elapsed(reference.timestamp_ns, timestamp_ns)
+        if elapsed > BELIEVED_S:
+            self._velocity = None
         expected = None if self._velocity is None else se3.exp(self._velocity * elapsed)
-        pixels, followed = _follow(reference, gray, expected, thorough=self._rectification.wants_motion)
+        matches = _follow(reference, gray, expected, thorough=self._rectification.wants_motion)
+        found = self._motion(reference, *matches, expected)
+        if isinstance(found, str) and expected is not None:  # frames were missed, and all looks larger now
+            matches = _follow_warped(reference, gray, expected)
+            found = self._motion(reference, *matches, expected, only_expected=True)
+        if isinstance(found, str):
+            return found
+        self._velocity = se3.log(found[0]) / elapsed
+        return found
+
+    def _motion(
+        self,
+        reference: _Reference,
+        pixels: features.Pixels,
+        followed: NDArray[np.bool_],
+        expected: se3.Transform | None,
+        *,
+        only_expected: bool = False,
+    ) -> tuple[se3.Transform, float, float] | str:
+        """The motion that corners agree on, as `_compare`: (n, 2) where they are, (n,) which are known.
+
+        `only_expected`: fewer are enough, but for the expected motion alone.
+        """
+        least, share_of_least = (MIN_POINTS, MIN_SHARE)
+        if only_expected:
+            least, share_of_least = MIN_POINTS_EXPECTED, MIN_SHARE_SUDDEN
         old, disparity, new = reference.pixels[followed], reference.disparity[followed], pixels[followed]
-        if len(new) < MIN_POINTS:
+        if len(new) < least:
             return f"{len(new)} of {len(followed)} corners were found again"
         found = features.resection(
             reference.points[followed],
@@ -190,15 +221,15 @@ class StereoLocalizer(Localizer):
         )
         agree = np.zeros(len(new), bool) if found is None else found[1]
         share = float(agree.mean())
-        if found is None or agree.sum() < MIN_POINTS or share < MIN_SHARE:
+        if found is None or agree.sum() < least or share < share_of_least:
             return f"{agree.sum()} of {len(new)} points agree"
-        if share < MIN_SHARE_SUDDEN and _is_sudden(expected, found[0], reference.median_depth):
+        is_sudden = _is_sudden(expected, found[0], reference.median_depth)
+        if is_sudden and (only_expected or share < MIN_SHARE_SUDDEN):
             return f"{agree.sum()} of {len(new)} points agree on a sudden motion"
         motion = refine(found[0], old[agree], disparity[agree], new[agree], reference.rig)
         if motion is None:
             return f"{agree.sum()} points do not fix the motion"
         self._check_disparity(motion.T_old_new, reference, followed, new)
-        self._velocity = se3.log(motion.T_old_new) / elapsed
         return motion.T_old_new, share, float(np.median(np.abs(new - old)[agree].max(axis=1)))
 
     def _check_rows(self, view: _View, right: NDArray[np.uint8]) -> None:
@@ -240,6 +271,28 @@ def _follow(
         if found.mean() > 0.5:
             return pixels, found
     return features.follow(reference.gray, gray, reference.pixels)
+
+
+def _follow_warped(
+    reference: _Reference, gray: NDArray[np.uint8], expected: se3.Transform
+) -> tuple[features.Pixels, NDArray[np.bool_]]:
+    """Follow the reference's corners into the new image as the reference's camera would see it.
+
+    After a gap all that is near has grown; seen from the same place it has its old size, but for what the
+    expected motion is wrong by.
+    """
+    rig, T = reference.rig, se3.inverse(expected)
+    K, (height, width) = rig.intrinsics, gray.shape
+    u, v = np.arange(width), np.arange(height)[:, None]
+    x, y = ((u - K.cx) / K.fx).astype(np.float32), ((v - K.cy) / K.fy).astype(np.float32)
+    inverse_depth = reference.dense * np.float32(1 / rig.baseline_fx)  # 0: as far as can be
+    R, t = T[:3, :3].astype(np.float32), T[:3, 3].astype(np.float32)
+    X, Y, Z = (R[k, 0] * x + R[k, 1] * y + R[k, 2] + t[k] * inverse_depth for k in range(3))
+    ahead = np.maximum(Z, 1e-3)
+    at = np.dstack([K.fx * X / ahead + K.cx, K.fy * Y / ahead + K.cy]).astype(np.float32)
+    warped = cv2.remap(gray, at, None, cv2.INTER_LINEAR)
+    pixels, found = features.follow(reference.gray, warped, reference.pixels)
+    return rig.project(se3.apply(T, rig.lift(pixels, reference.disparity))), found
 
 
 def _is_sudden(expected: se3.Transform | None, found: se3.Transform, depth: float) -> bool:
