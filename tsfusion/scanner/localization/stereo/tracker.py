@@ -20,7 +20,7 @@ from tsfusion.scanner.localization.tracking_keyframes import TrackingKeyframes
 MAX_CORNERS = 1000
 MIN_POINTS = 25  # that must agree
 MIN_SHARE, MIN_SHARE_SUDDEN = 0.25, 0.4  # of the followed points that must agree; in a sudden motion
-MIN_POINTS_EXPECTED = 15  # that must agree, and as great a share, on the motion that was expected
+MIN_POINTS_EXPECTED = 15  # that must agree on the motion that was expected, after a gap
 PIXEL_TOLERANCE = 1.0  # KITTI 06 drifts by 0.82 % with it, by 0.90 % with 1.5
 MAX_OFFSET_ERROR = 3.0  # pixels: points with larger errors are left out of the search for offsets
 MIN_MOTION = 1.0  # pixels of median motion below which the old frame stays the reference
@@ -206,9 +206,7 @@ class StereoLocalizer(Localizer):
 
         `only_expected`: fewer are enough, but for the expected motion alone.
         """
-        least, share_of_least = (MIN_POINTS, MIN_SHARE)
-        if only_expected:
-            least, share_of_least = MIN_POINTS_EXPECTED, MIN_SHARE_SUDDEN
+        least = MIN_POINTS_EXPECTED if only_expected else MIN_POINTS
         old, disparity, new = reference.pixels[followed], reference.disparity[followed], pixels[followed]
         if len(new) < least:
             return f"{len(new)} of {len(followed)} corners were found again"
@@ -221,7 +219,7 @@ class StereoLocalizer(Localizer):
         )
         agree = np.zeros(len(new), bool) if found is None else found[1]
         share = float(agree.mean())
-        if found is None or agree.sum() < least or share < share_of_least:
+        if found is None or agree.sum() < least or share < MIN_SHARE:
             return f"{agree.sum()} of {len(new)} points agree"
         is_sudden = _is_sudden(expected, found[0], reference.median_depth)
         if is_sudden and (only_expected or share < MIN_SHARE_SUDDEN):
