@@ -75,7 +75,7 @@ class _View:
         assert frame.intrinsics is not None
         return cls(frame, gray, StereoCamera(frame.intrinsics, frame.baseline_fx or DEPTH_CAMERA_BASELINE_FX))
 
-    @property
+    @cached_property
     def disparity(self) -> NDArray[np.float32]:
         """(H, W) pixels of disparity; 0 = none."""
         quick, depth = self.frame.quick_disparity, self.frame.depth_m
