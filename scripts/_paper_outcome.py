@@ -8,7 +8,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from _paper_events import Story
+from _paper_events import SeenFrame, Story
 from _paper_limits import Death, Sample
 from msgspec import Struct
 from numpy.typing import NDArray
@@ -22,7 +22,7 @@ from tsfusion.wire.keyframe_times import Spread
 OUTCOME, POSES = "outcome.json", "poses.npz"
 DELAY, MEMORY = "delay.csv", "memory.csv"
 _MIB = 1 << 20
-LOST_FOR_GOOD = 20  # frames without a pose at the end of a run
+LOST_FOR_GOOD = 20  # frames in a row without a pose: as an end counts the first time
 _SETTLED_FROM = 0.5  # of a run: by then caches are full and kernels are loaded
 
 Poses = NDArray[np.float64]
@@ -101,22 +101,24 @@ def of_story(story: Story, rows: Sequence[MemoryRow], death: Death | None) -> di
     ledger = latency_ledger.summarise(story.times)
     located = [frame for frame in story.frames if frame.T_world_camera is not None]
     last = story.frames[-1] if story.frames else None
-    ended = last
-    if death is None and located and len(story.frames) - story.frames.index(located[-1]) > LOST_FOR_GOOD:
-        ended = located[-1]
+    ended, fused = last, story.fused
+    way_lost = _way_lost(story.frames) if death is None else None
+    if way_lost is not None:
+        ended, found = way_lost
         death = Death(
             "a lost sensor",
-            f"the localizer lost its way behind frame {ended.index}, and never found it again",
+            f"the localizer lost its way behind frame {ended.index}, and "
+            + ("never found it again" if found is None else f"found it again at frame {found.index} only"),
         )
+        fused = sum(0 < record.sent_ns <= ended.done_ns and record.fused_ns > 0 for record in story.times)
     stats = story.closing.get("stats", {})
-    sent, fused = len(story.times), story.fused
     return {
         "death": death.words if death else "",
         "died_of": death.of if death else "",
         "died_at": fused if death else None,
         "died_frame": ended.index if death and ended else None,
         "frames": len(story.frames), "located": len(located), "late": last.late if last else 0,
-        "lost": len(story.frames) - len(located), "sent": sent, "fused": fused,
+        "lost": len(story.frames) - len(located), "sent": len(story.times), "fused": story.fused,
         "skipped": {**stats.get("skipped", {}), **stats.get("rejected", {}), **stats.get("refused", {})},
         "drained": bool(story.closing.get("drained")), "loops": story.closing.get("loops", 0),
         "delay_ms": ledger.delay_ms, "slope_ms_per_keyframe": ledger.slope_ms_per_keyframe,
@@ -128,6 +130,15 @@ def of_story(story: Story, rows: Sequence[MemoryRow], death: Death | None) -> di
         "growth_mib": growth_mib(rows, until=_seconds(story)),
         "map_bytes": max((row.map_bytes for row in rows), default=0),
     }  # fmt: skip
+
+
+def _way_lost(frames: Sequence[SeenFrame]) -> tuple[SeenFrame, SeenFrame | None] | None:
+    """The last frame before the way was lost for good, and the one that found it again, if any did."""
+    known = [number for number, frame in enumerate(frames) if frame.T_world_camera is not None]
+    for number, following in zip(known, [*known[1:], len(frames)], strict=True):
+        if following - number - 1 >= LOST_FOR_GOOD:
+            return frames[number], frames[following] if following < len(frames) else None
+    return None
 
 
 def cores(story: Story) -> float:

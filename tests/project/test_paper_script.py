@@ -268,21 +268,27 @@ def test_what_a_killed_front_end_wrote_is_told() -> None:
     assert (fields["died_at"], fields["died_frame"], fields["sent"], fields["lost"]) == (1, 0, 2, 1)
 
 
-def test_a_localizer_that_never_found_its_way_again_is_the_end() -> None:
-    def lines(lost: int) -> list[str]:
+def test_a_localizer_that_lost_its_way_for_long_is_the_end() -> None:
+    def lines(lost: int, found: int = 0) -> list[str]:
         frame = {"event": "frame", "late": 0, "cpu_s": 0.1, "rss_bytes": 1, "queue": 0, "queue_bytes": 0}
-        pose = np.eye(4).tolist()
-        return [
-            json.dumps(
-                frame | {"t": n, "due_ns": n, "index": 2 * n, "T_world_camera": pose if n < 5 else None}
-            )
-            for n in range(5 + lost)
-        ]
+        keyframe = {"event": "keyframe", "captured_ns": 1}
+        told = []
+        for n in range(5 + lost + found):
+            pose = None if 5 <= n < 5 + lost else np.eye(4).tolist()
+            told.append(frame | {"t": 10 * n, "due_ns": n, "index": 2 * n, "T_world_camera": pose})
+            if pose is not None:
+                told.append(keyframe | {"t": 10 * n, "seq": n, "sent_ns": 10 * n + 1})
+                told.append({"event": "fused", "t": 10 * n + 5, "seq": n, "fuse_start_ns": 1, "map_bytes": 1})
+        return [json.dumps(event) for event in told]
 
     starved = _paper_outcome.of_story(_paper_events.of(lines(25)), [], None)
     assert (starved["died_of"], starved["died_frame"], starved["lost"]) == ("a lost sensor", 8, 25)
-    assert "behind frame 8" in starved["death"]
+    assert "behind frame 8, and never found it again" in starved["death"]
     assert _paper_outcome.of_story(_paper_events.of(lines(15)), [], None)["death"] == ""
+    late = _paper_outcome.of_story(_paper_events.of(lines(25, found=30)), [], None)
+    assert (late["died_frame"], late["died_at"], late["fused"]) == (8, 4, 35)
+    assert "found it again at frame 60 only" in late["death"]
+    assert _paper_outcome.of_story(_paper_events.of(lines(15, found=30)), [], None)["death"] == ""
 
 
 def test_memory_without_map_and_queue_is_what_grows() -> None:
