@@ -196,11 +196,15 @@ def smooth(
     smoothness: float,
     weighted: bool,
 ) -> dict[Voxel, float]:
-    """Regularised values after these rays; `before` holds (value, weight) of the voxels seen before."""
+    """Regularised values after these rays; `before` holds (value, weight) of the voxels seen before.
+
+    The free space before a ray's band is no part of its signal.
+    """
     added = integrate(rays, quanta_per_voxel)
     votes = defaultdict(list)
     for ray in rays:
-        voxels = crossed(ray)
+        length, end = int(ray[13]) & ~255, int(ray[14]) & ~7
+        voxels = [found for found, leaves in crossed_until(ray) if leaves >= end - (length - end)]
         t = [distance * quanta_per_voxel / 65536 for _, distance in voxels]
         w, y = [], []
         for voxel, _ in voxels:

@@ -99,11 +99,16 @@ class RayMap:
     def smooth(self, smoothness: float, *, weighted: bool = True, feedback: bool = True) -> None:
         s, store = self.buffers, self.store
         s.reserve_votes()
+        sums, correction, votes, voted = (
+            layer.reshape(-1) for layer in (store.sums, store.correction, s.votes, s.voted)
+        )
+        voted[0] = 0
         ray_smoothing.smooth_rays(
-            s.rays, s.bands, store.hash_keys, store.hash_slots, store.places, smoothness, int(weighted),
-            int(feedback), store.sums, store.correction, s.signal, s.crossed, s.votes,
+            s.rays, s.bands, self._integrator.units, store.hash_keys, store.hash_slots, s.scratch,
+            store.places, smoothness, int(weighted), int(feedback), sums, correction, s.signal, s.crossed,
+            votes, voted,
         )  # fmt: skip
-        ray_smoothing.commit_votes(s.touched, store.sums, s.votes, store.correction)
+        ray_smoothing.commit_votes(s.touched, sums, votes, voted, correction)
 
     def voxels(self) -> dict[kernel_twins.Voxel, tuple[int, int]]:
         """(slot, offset) of every voxel with votes."""

@@ -118,7 +118,6 @@ replay synthetic:room --min-weight nan | got nan | min_weight must be >= 0
 replay synthetic:room --min-weight 1e9 | got 1000000000.0 | min_weight must be <= 4194304
 replay synthetic:room --threads 0 | got 0 | threads must be >= 1
 replay synthetic:room --threads 1000 | got 1000 | threads must be <= 256
-replay synthetic:room --space-carving --regularizer ray | exclude each other | use regularizer = off
 TSFUSION_VOXEL_SIZE=big demo | TSFUSION_VOXEL_SIZE | should be a valid number | 2
 TSFUSION_SENSOR=ear demo | got 'ear' | must be one of kinect
 TSFUSION_CONFIG=missing.toml demo | missing.toml: No such file | `tsfusion config dump` writes one

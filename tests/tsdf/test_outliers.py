@@ -9,7 +9,6 @@ from formula_scenes import CAMERA, SHAPE, directions, look_at, plane_keyframe, v
 from numpy.typing import NDArray
 
 from tsfusion import Intrinsics, Keyframe, Volume
-from tsfusion.core.errors import InvalidConfig
 from tsfusion.datasets import Synthetic
 from tsfusion.tsdf.block_store import unpack_keys
 
@@ -78,9 +77,18 @@ def test_carving_is_a_sum_like_everything_else() -> None:
     assert both.map_hash() == alone.map_hash()
 
 
-def test_carving_and_smoothing_along_rays_exclude_each_other() -> None:
-    with pytest.raises(InvalidConfig, match="exclude each other"):
-        Volume(space_carving=True, regularizer="ray")
+def test_rays_that_carve_smooth_the_surface_all_the_same() -> None:
+    dataset = Synthetic("room", "stereo", count=12, width=160, color=False)
+    error, hashes = {}, set()
+    for regularizer in ("off", "ray"):
+        volume = Volume(voxel_size=0.04, sensor="stereo", space_carving=True, regularizer=regularizer)
+        for keyframe in dataset:
+            volume.integrate(keyframe)
+        vertices = volume.extract_mesh(surface="raw").vertices
+        error[regularizer] = np.abs(dataset.distance(vertices)).mean()
+        hashes.add(volume.map_hash())
+    assert error["ray"] < 0.92 * error["off"]
+    assert len(hashes) == 1
 
 
 def plate_views(thickness: float) -> list[Keyframe]:

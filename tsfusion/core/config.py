@@ -174,8 +174,7 @@ class VolumeConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
         """The map's own sensor model, once the settings are found to fit each other.
 
         Raises:
-            InvalidConfig: for ranges out of order, voxels so large that the sensor sees next to none, or
-                settings that exclude each other.
+            InvalidConfig: for ranges out of order, or voxels so large that the sensor sees next to none.
         """
         model = self.model()
         if model.min_range >= model.max_range:
@@ -195,11 +194,6 @@ class VolumeConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
             raise InvalidConfig(
                 f"voxel_size {self.voxel_size:g} m is too large for max_range {model.max_range:g} m: at "
                 f"least {LEAST_VOXELS} voxels must fit into it; 0.02 m suits a room, 0.1 m a street"
-            )
-        if self.space_carving and model.regularizer != "off":
-            raise InvalidConfig(
-                f"space_carving and the regularizer {model.regularizer!r} exclude each other: smoothing is "
-                "for the band around a ray's end; use regularizer = off"
             )
         return model
 

@@ -308,7 +308,7 @@ def add_bands(
                             walking += 1
                             carves |= ti.cast(walks[BAND + k] > 0, ti.i32)
                 longest = measure(walks, carves, has_color)
-                walk(walks, ti.min(longest, STRETCH), listed)
+                walk(walks, ti.min(longest, STRETCH), listed, listed, False)
                 if colors > base + UNIT_SCRATCH - ABREAST:
                     add_votes(scratch, base, colors, sign_, color_rgn, color_b, touched, of_others)
                 for k in range(ABREAST):

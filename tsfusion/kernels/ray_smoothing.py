@@ -9,44 +9,60 @@ voxel in the signal, spacing is uneven, and without t the penalty would bend a p
 A = I is the paper's; A = diag(W), scaled to mean 1, keeps settled voxels settled.
 
 Two passes, never in place: each ray solves against the frozen state and adds x̂ as integers; afterwards
-one owner a block writes the mean of its voxels' x̂.
+each voxel that was voted for becomes the mean of its x̂.
 """
 
 import taichi as ti
 
 from tsfusion.kernels.block_hash import map_find
+from tsfusion.kernels.block_windows import UNKNOWN, WINDOW_BITS, WINDOW_BLOCKS, WINDOWS, open_window
 from tsfusion.kernels.integrate import (
     CUBE,
     QUANTA_PER_VOXEL,
-    TOUCHED_COUNT,
     TOUCHED_HEADER,
+    UNIT_SCRATCH,
     lane_distance,
     lane_weight,
 )
 from tsfusion.kernels.quick_launch import QuickLaunch
+from tsfusion.kernels.rays_abreast import (
+    ABREAST,
+    BAND,
+    BLOCK_AT,
+    FREE,
+    HALF_A_QUANTUM,
+    LIST,
+    NOBODY,
+    ODD,
+    RAY,
+    STRETCH,
+    VOXELS,
+    WALKS,
+    WINDOW_AT,
+    begin,
+    measure,
+    walk,
+    window_of,
+)
 from tsfusion.kernels.voxel_traversal import (
     COUNT,
     MAX_CROSSED,
     RUN,
     START,
-    advance,
-    begin_walk,
-    block_key,
-    next_step,
-    offset_in_block,
-    ray_length,
+    UNIT,
+    pack,
     ray_weight,
-    vec3i,
+    voxel_of,
 )
 
-LANES = 8  # rays that are solved side by side, in vectors: a step of one waits for three divisions
-# Element i of lane k of a band's field stands at (band · FIELDS + field) · SIGNAL + i · LANES + k.
+LANES = ABREAST  # rays that are solved side by side, in vectors: a step of one waits for three divisions
+# Element i of lane k of a unit's field stands at (unit · FIELDS + field) · SIGNAL + i · LANES + k.
 SIGNAL = MAX_CROSSED * LANES
 SIGNAL_FIELDS = 4  # Σ w·m and then z, W, and the two off-diagonals of L
 STORED, WEIGHT, LEFT, FAR_LEFT = 0, SIGNAL, 2 * SIGNAL, 3 * SIGNAL
-CROSSED_FIELDS = 3  # t and then the vote, place of the block, voxel in it
-DISTANCE, PLACE, OFFSET = 0, SIGNAL, 2 * SIGNAL
-QUANTA = QUANTA_PER_VOXEL / 65536.0  # a unit of distance
+CROSSED_FIELDS = 2  # t and then the vote, place of the voxel in `votes`
+DISTANCE, PLACE = 0, SIGNAL
+QUANTA = 2.0**-16  # a unit of t
 VOTE_SCALE = 16.0  # x̂ is averaged in sixteenths of a quantum
 VOTE_BITS = 24
 
@@ -120,99 +136,154 @@ def substitute_back(
             crossed[at_crossed + DISTANCE + i * LANES + k] = votes[k]
 
 
+@ti.func
+def gather(
+    walks: ti.template(), k, listed: ti.template(), distances: ti.template(), feedback,
+    hash_keys: ti.template(), hash_slots: ti.template(), scratch: ti.template(), base,
+    places: ti.template(), sums: ti.template(), correction: ti.template(), signal: ti.template(),
+    crossed: ti.template(), at_signal, at_crossed, counts: ti.template(), totals: ti.template(),
+):  # fmt: skip
+    """Append what the map holds along the ray at place `k`, in its stretch and band, to the ray's signal."""
+    number = walks[ODD + k]
+    window = window_of(walks, k, number)
+    blocks = open_window(window, scratch, base)
+    n, total = counts[k], totals[k]
+    end = ti.min(walks[VOXELS + k], STRETCH)
+    i = walks[FREE + k]
+    while i < end and n < MAX_CROSSED:
+        place = listed[i * ABREAST + k]
+        if ((place >> WINDOW_AT) & 7) != number:
+            number = (place >> WINDOW_AT) & 7
+            window = window_of(walks, k, number)
+            blocks = open_window(window, scratch, base)
+        b = (place >> BLOCK_AT) & (WINDOW_BLOCKS - 1)
+        corners = scratch[blocks + b]  # of the block in `votes`, above that in the map's layers
+        if corners == UNKNOWN:
+            block = (window << (WINDOW_BITS - 3)) + voxel_of(b)
+            key = pack(block[0], block[1], block[2])
+            slot = map_find(hash_keys, hash_slots, hash_keys.shape[0] - 1, key)
+            corners = (ti.cast(places[slot] * CUBE, ti.i64) << 32) | (slot * CUBE)
+            scratch[blocks + b] = corners
+        o = place & (CUBE - 1)
+        at = ti.cast(corners, ti.i32) + o
+        packed = sums[at]
+        weight = ti.cast(lane_weight(packed), ti.f32)
+        stored = ti.cast(lane_distance(packed), ti.f32)
+        if feedback == 1:
+            stored += correction[at]
+        signal[at_signal + STORED + n * LANES + k] = stored
+        signal[at_signal + WEIGHT + n * LANES + k] = weight
+        crossed[at_crossed + DISTANCE + n * LANES + k] = distances[i * ABREAST + k] - HALF_A_QUANTUM
+        crossed[at_crossed + PLACE + n * LANES + k] = ti.cast(corners >> 32, ti.i32) + o
+        total += weight
+        n += 1
+        i += 1
+    counts[k], totals[k] = n, total
+
+
 @QuickLaunch
 @ti.kernel
 def smooth_rays(
     rays: ti.types.ndarray(dtype=ti.i32, ndim=2),
     bands: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    units: ti.i32,
     hash_keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
     hash_slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    scratch: ti.types.ndarray(dtype=ti.i64, ndim=1),
     places: ti.types.ndarray(dtype=ti.i32, ndim=1),
     smoothness: ti.f32,
     weighted: ti.i32,  # A = diag(W), scaled to mean 1, or I
     feedback: ti.i32,  # y from the stored regularised values, or from the raw sums
-    sums: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    correction: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    sums: ti.types.ndarray(dtype=ti.i64, ndim=1),
+    correction: ti.types.ndarray(dtype=ti.f32, ndim=1),
     signal: ti.types.ndarray(dtype=ti.f32, ndim=1),
     crossed: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    votes: ti.types.ndarray(dtype=ti.i64, ndim=2),
+    votes: ti.types.ndarray(dtype=ti.i64, ndim=1),
+    voted: ti.types.ndarray(dtype=ti.i32, ndim=1),
 ):
-    """Gather y along each ray, solve, and add x̂ to `votes` as (Σ x̂ · 16) · 2²⁴ + n."""
-    hash_mask = hash_keys.shape[0] - 1
-    for run in range(bands.shape[0] * RUN):  # run loop: kernels/__init__.py
+    """Gather y along each ray's band, solve, and add x̂ to `votes` as (Σ x̂ · 16) · 2²⁴ + n.
+
+    `units` run at the same time, each through its own bands. The layers are flat, as for `add_rays`. `voted`:
+    how many voxels have votes, then their places in `votes`.
+    """
+    for run in range(units * RUN):  # run loop: kernels/__init__.py
         if run % RUN == 0:
-            band = run // RUN
-            last, slot, place = vec3i(2147483647), -1, -1
-            first, end = bands[band, START], bands[band, START] + bands[band, COUNT]
-            at_signal, at_crossed = band * SIGNAL_FIELDS * SIGNAL, band * CROSSED_FIELDS * SIGNAL
+            unit = run // RUN
+            base, at_signal = unit * UNIT_SCRATCH, unit * SIGNAL_FIELDS * SIGNAL
+            at_crossed = unit * CROSSED_FIELDS * SIGNAL
+            for i in range(WINDOWS):
+                scratch[base + i] = 0
+            walks = ti.Vector([0] * WALKS)
+            listed, distances = ti.Vector([0] * LIST), ti.Vector([0] * LIST)
             counts, totals = ti.Vector([0] * LANES), ti.Vector([0.0] * LANES)
-            while first < end:
-                longest = 0
-                for k in range(LANES):
-                    r, n, total = first + k, 0, ti.f32(0.0)
-                    inside = 0
-                    if r < end:
-                        inside = ti.cast(ray_weight(rays, r) > 0, ti.i32)
-                    if inside == 1:
-                        walk = begin_walk(rays, r)
-                        length = ray_length(rays, r)[0]
-                        while inside == 1 and n < MAX_CROSSED:
-                            block = walk.voxel >> 3
-                            if block[0] != last[0] or block[1] != last[1] or block[2] != last[2]:
-                                last = block
-                                slot = map_find(hash_keys, hash_slots, hash_mask, block_key(walk.voxel))
-                                place = places[slot]
-                            o = offset_in_block(walk.voxel)
-                            packed = sums[slot, o]
-                            weight = ti.cast(lane_weight(packed), ti.f32)
-                            stored = ti.cast(lane_distance(packed), ti.f32)
-                            if feedback == 1:
-                                stored += correction[slot, o]
-                            signal[at_signal + STORED + n * LANES + k] = stored
-                            signal[at_signal + WEIGHT + n * LANES + k] = weight
-                            crossed[at_crossed + DISTANCE + n * LANES + k] = walk.distance
-                            crossed[at_crossed + PLACE + n * LANES + k] = place
-                            crossed[at_crossed + OFFSET + n * LANES + k] = o
-                            total += weight
-                            n += 1
-                            step, next_crossing = next_step(walk.crossing)
-                            if next_crossing >= length:
-                                inside = 0
-                            advance(walk, step)
-                    counts[k], totals[k] = n, total
-                    longest = ti.max(longest, n)
-                factorise(
-                    signal, crossed, at_signal, at_crossed, counts, totals, longest, weighted, smoothness
-                )
-                substitute_back(signal, crossed, at_signal, at_crossed, counts, longest)
-                for k in range(LANES):
-                    for i in range(counts[k]):
-                        at = at_crossed + i * LANES + k
-                        vote = (ti.cast(crossed[at + DISTANCE], ti.i64) << VOTE_BITS) + 1
-                        ti.atomic_add(votes[crossed[at + PLACE], crossed[at + OFFSET]], vote)
-                first += LANES
+            carves, listed_voxels = 0, 0
+            for band in range(bands.shape[0]):
+                r, end = bands[band, START], bands[band, START] + bands[band, COUNT]
+                if bands[band, UNIT] != unit:
+                    r = end
+                while r < end:
+                    for k in range(LANES):
+                        walks[RAY + k], counts[k], totals[k] = NOBODY, 0, 0.0
+                    walking, longest = 0, 0
+                    while walking < LANES and r < end:
+                        if ray_weight(rays, r) > 0:
+                            begin(rays, r, QUANTA_PER_VOXEL, 0, walks, walking)
+                            walks[FREE + walking] = 0
+                            carves |= ti.cast(walks[BAND + walking] > 0, ti.i32)
+                            walking += 1
+                        r += 1
+                    while walking > 0:
+                        count = ti.min(measure(walks, carves, 0), STRETCH)
+                        walk(walks, count, listed, distances, True)
+                        for k in range(LANES):
+                            if walks[RAY + k] != NOBODY:
+                                gather(
+                                    walks, k, listed, distances, feedback, hash_keys, hash_slots, scratch,
+                                    base, places, sums, correction, signal, crossed, at_signal, at_crossed,
+                                    counts, totals,
+                                )  # fmt: skip
+                                longest = ti.max(longest, counts[k])
+                                if walks[VOXELS + k] <= STRETCH or counts[k] == MAX_CROSSED:
+                                    walks[RAY + k] = NOBODY
+                                    walking -= 1
+                    factorise(
+                        signal, crossed, at_signal, at_crossed, counts, totals, longest, weighted, smoothness
+                    )
+                    substitute_back(signal, crossed, at_signal, at_crossed, counts, longest)
+                    for k in range(LANES):
+                        for i in range(counts[k]):
+                            at = at_crossed + i * LANES + k
+                            vote = (ti.cast(crossed[at + DISTANCE], ti.i64) << VOTE_BITS) + 1
+                            voxel = crossed[at + PLACE]
+                            if units == 1:  # an atomic addition waits until what it adds to is there
+                                before = votes[voxel]
+                                votes[voxel] = before + vote
+                                if before == 0:
+                                    listed_voxels += 1
+                                    voted[listed_voxels] = voxel
+                            elif ti.atomic_add(votes[voxel], vote) == 0:
+                                voted[1 + ti.atomic_add(voted[0], 1)] = voxel
+            if units == 1:
+                voted[0] = listed_voxels
 
 
 @QuickLaunch
 @ti.kernel
 def commit_votes(
     touched: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    sums: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    votes: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    correction: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    sums: ti.types.ndarray(dtype=ti.i64, ndim=1),
+    votes: ti.types.ndarray(dtype=ti.i64, ndim=1),
+    voted: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    correction: ti.types.ndarray(dtype=ti.f32, ndim=1),
 ):
     """A voxel's value (Σ w·m + correction) / Σ w becomes the mean that its rays propose; clears `votes`."""
-    count = touched[TOUCHED_COUNT]
-    for run in range(count * RUN):  # run loop: kernels/__init__.py
-        if run % RUN == 0:
-            i = run // RUN
-            slot = touched[TOUCHED_HEADER + i]
-            for v in range(CUBE):
-                vote = votes[i, v]
-                if vote != 0:
-                    packed = sums[slot, v]
-                    n = ti.cast(vote & ((1 << VOTE_BITS) - 1), ti.f64)
-                    x = ti.cast(vote >> VOTE_BITS, ti.f64) / (n * VOTE_SCALE)
-                    moved = x * lane_weight(packed) - ti.cast(lane_distance(packed), ti.f64)
-                    correction[slot, v] = ti.cast(moved, ti.f32)
-                    votes[i, v] = 0
+    for i in range(voted[0]):
+        place = voted[1 + i]
+        vote = votes[place]
+        votes[place] = 0
+        at = touched[TOUCHED_HEADER + place // CUBE] * CUBE + place % CUBE
+        packed = sums[at]
+        n = ti.cast(vote & ((1 << VOTE_BITS) - 1), ti.f64)
+        x = ti.cast(vote >> VOTE_BITS, ti.f64) / (n * VOTE_SCALE)
+        moved = x * lane_weight(packed) - ti.cast(lane_distance(packed), ti.f64)
+        correction[at] = ti.cast(moved, ti.f32)

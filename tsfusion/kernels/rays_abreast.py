@@ -46,6 +46,7 @@ AT, OFF, ODD, RAY_LENGTH, BAND, CLEAR, COLORED, RAY, MET, VOXELS, FREE, FOURFOLD
 )
 WALKS = 28 * ABREAST
 NOBODY = -1  # instead of a ray
+HALF_A_QUANTUM = 1 << 15  # of `OFF`, whose upper bits are rounded so
 
 
 @ti.func
@@ -65,7 +66,7 @@ def begin(rays: ti.template(), r, per_voxel: ti.template(), colors, walks: ti.te
         at += ONE[a] * ((voxel[a] & 7) + ((voxel[a] & 56) << (BLOCK_AT - 3)))
     walks[AT + k] = at
     walks[ODD + k] = 0
-    walks[OFF + k] = rays[r, DISTANCE] * per_voxel + 32768
+    walks[OFF + k] = rays[r, DISTANCE] * per_voxel + HALF_A_QUANTUM
     walks[RAY_LENGTH + k] = length
     walks[BAND + k] = end - (length - end)
     walks[CLEAR + k] = ti.min(fourfold, walks[BAND + k])
@@ -127,9 +128,11 @@ def window_of(walks: ti.template(), k, here):
 
 
 @ti.func
-def walk(walks: ti.template(), count, listed: ti.template()):
+def walk(
+    walks: ti.template(), count, listed: ti.template(), distances: ti.template(), exactly: ti.template()
+):
     """List `count` voxels of each ray, the first of all rays, then the second. Behind a ray's end stands
-    anything."""
+    anything. `exactly`: put the distances as `OFF` has them into `distances`, too."""
     for i in range(count):
         for k in range(ABREAST):
             at, off = walks[AT + k], walks[OFF + k]
@@ -146,5 +149,7 @@ def walk(walks: ti.template(), count, listed: ti.template()):
             stepped = (at | ~bits) + ti.select(is_x, walks[STEP + k], step)
             walks[AT + k] = (stepped & bits) | (at & ~bits)
             walks[OFF + k] = off + ti.select(is_x, walks[TURN + k], turn)
+            if ti.static(exactly):
+                distances[i * ABREAST + k] = off
             m = ti.min(ti.max(off >> 16, -MOST_LISTED), MOST_LISTED)
             listed[i * ABREAST + k] = (m << DISTANCE_AT) | at

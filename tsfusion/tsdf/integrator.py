@@ -246,11 +246,18 @@ class Integrator:
         s, store, model = self._buffers, self._store, self._model
         s.reserve_votes()
         weighted = model.regularizer == "ray"
-        ray_smoothing.smooth_rays(
-            s.rays, s.bands, store.hash_keys, store.hash_slots, store.places, model.smoothness, int(weighted),
-            int(model.feedback or not weighted), store.sums, store.correction, s.signal, s.crossed, s.votes,
-        )  # fmt: skip
-        ray_smoothing.commit_votes(s.touched, store.sums, s.votes, store.correction)
+        sums, correction, votes, voted = (
+            layer.reshape(-1) for layer in (store.sums, store.correction, s.votes, s.voted)
+        )
+        voted[0] = 0
+        try:
+            ray_smoothing.smooth_rays(
+                s.rays, s.bands, self.units, store.hash_keys, store.hash_slots, s.scratch, store.places,
+                model.smoothness, int(weighted), int(model.feedback or not weighted), sums, correction,
+                s.signal, s.crossed, votes, voted,
+            )  # fmt: skip
+        finally:  # also after an interrupt: the next keyframe's votes begin with none
+            ray_smoothing.commit_votes(s.touched, sums, votes, voted, correction)
 
     def _launch(
         self, part: Part, sign: int, *, which: int = ALL, oldest: int = 0, most_missing: int = NO_LIMIT

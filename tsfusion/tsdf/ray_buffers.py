@@ -44,6 +44,7 @@ class RayBuffers:
         self.signal = np.zeros(units * ray_smoothing.SIGNAL_FIELDS, np.float32)
         self.crossed = np.zeros(units * ray_smoothing.CROSSED_FIELDS, np.int32)
         self._votes = GrowingArray((CUBE,), np.int64, 1024 if regularised else 1)
+        self._voted = GrowingArray((CUBE,), np.int32, 1024 if regularised else 1)
 
     @property
     def touched(self) -> NDArray[np.int32]:
@@ -54,6 +55,11 @@ class RayBuffers:
     def votes(self) -> NDArray[np.int64]:
         """Votes of the smoother for each touched block; zero between keyframes."""
         return self._votes.array
+
+    @property
+    def voted(self) -> NDArray[np.int32]:
+        """How many voxels have votes, and where these are in `votes` (kernels/ray_smoothing.py)."""
+        return self._voted.array
 
     @property
     def touched_slots(self) -> NDArray[np.int32]:
@@ -151,11 +157,12 @@ class RayBuffers:
     def reserve_votes(self) -> None:
         """Make room for the votes of all touched blocks."""
         self._votes.reserve(int(self.touched[TOUCHED_COUNT]))
+        self._voted.reserve(int(self.touched[TOUCHED_COUNT]) + 1)
 
     @property
     def nbytes(self) -> int:
         arrays = [value for value in vars(self).values() if isinstance(value, np.ndarray)]
-        growing = self._touched, self._owners, self._votes
+        growing = self._touched, self._owners, self._votes, self._voted
         return sum(a.nbytes for a in arrays) + sum(g.array.nbytes for g in growing)
 
     def _reserve_rays(self, count: int) -> None:
