@@ -109,7 +109,8 @@ class StereoLocalizer(Localizer):
     """`Localizer` of rectified stereo pairs; also of disparity or depth images with an image beside them.
 
     A frame is compared with the last one that had a pose and had moved: a few bad or missing frames are
-    bridged, and a camera that stands still does not drift. (Keyframes several metres apart were worse in turns.)
+    bridged, and a camera that stands still does not drift. (Keyframes several metres apart were worse in
+    turns.)
     """
 
     absolute = False
