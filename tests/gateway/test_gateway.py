@@ -364,6 +364,18 @@ def test_a_vanished_temporary_folder_is_waited_for(
     drained(gateway)
 
 
+def test_the_temporary_folder_may_have_a_path_too_long_for_a_socket(
+    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    long = tmp_path / ("a" * 120)
+    long.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(long))
+    gateway = start(_CRASHES_ON_2)
+    stepped(gateway, lambda: gateway.maps.warm)
+    assert not default(gateway).problem
+    assert not list(long.iterdir())
+
+
 # --- folders and files that are away ---
 
 

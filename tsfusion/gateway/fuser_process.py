@@ -20,6 +20,7 @@ from tsfusion.fuser import messages as fuser_messages
 from tsfusion.wire import sockets
 
 _KILL_DEADLINE = 5.0  # seconds
+_SOCKET = "0"  # name of the file
 COMMAND = (sys.executable, "-m", "tsfusion.fuser")
 
 
@@ -41,11 +42,11 @@ class FuserProcess:
     ) -> None:
         self.has_started = False
         self._working = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115  nameless, held as long as this
-        self._scratch = Path(tempfile.mkdtemp(prefix="tsfusion-"))  # a socket's path has to be short
+        self._scratch = _socket_folder()
         self.socket = sockets.pair(context)  # the gateway's end
         try:
             self.clear_current_keyframe()
-            endpoint = f"ipc://{self._scratch}/0"
+            endpoint = f"ipc://{self._scratch}/{_SOCKET}"
             self.socket.bind(endpoint)
             self._process = subprocess.Popen(
                 [*COMMAND, endpoint, log_format, log_level, name],
@@ -121,3 +122,12 @@ class FuserProcess:
         self.socket.close()
         self._working.close()
         self.remove_socket_file()
+
+
+def _socket_folder() -> Path:
+    """A new folder of this user's alone, whose path is short enough for a socket's."""
+    folder = tempfile.mkdtemp(prefix="tsfusion-")
+    if len(os.fsencode(f"{folder}/{_SOCKET}")) > zmq.IPC_PATH_MAX_LEN:
+        os.rmdir(folder)
+        folder = tempfile.mkdtemp(prefix="tsfusion-", dir="/tmp")
+    return Path(folder)
