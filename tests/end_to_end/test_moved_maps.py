@@ -39,7 +39,7 @@ class Sender:
         self._thread.start()
 
     def _send(self) -> None:
-        while not self._stopping.wait(0.02):
+        while not self._stopping.wait(0.05):
             assert self.client.send(wall(self.count % 40)) is not None
             self.count += 1
 
