@@ -19,6 +19,7 @@ from health_snapshots import client, health, map_health
 from rich.console import Console
 
 from tsfusion.cli import status_screen
+from tsfusion.cli.health_poll import READY, ServerWatcher
 from tsfusion.cli.health_poll import ServerSnapshot as Seen
 from tsfusion.cli.status_view import MAX_CLIENTS, render
 from tsfusion.core.errors import TransportError
@@ -269,6 +270,15 @@ def test_watching_ends_when_nothing_gets_well(told: Health, asking: Here) -> Non
         done = asking(control, "--watch", 0.1, "--stall-after", 0.5)
     assert done.returncode == 3
     assert done.stdout.count("gateway 62.9 MB") > 1
+
+
+def test_who_reads_slowly_does_not_end_watching() -> None:
+    with serving(saying(health())) as (control, _):
+        watcher = ServerWatcher(NOBODY, control=control, keys=None, timeout=DEADLINE, stall_after=0.1)
+        for _look in range(2):
+            assert watcher.check_again().exit_status == READY
+            time.sleep(0.2)
+            assert not watcher.unwell
 
 
 def test_a_pause_does_not_end_watching() -> None:

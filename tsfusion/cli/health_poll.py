@@ -97,7 +97,7 @@ class ServerWatcher:
         self._timeout, self._stall_after, self._only = timeout, stall_after, only
         self._moved: dict[str, tuple[object, float]] = {}  # map → how far it was, since when
         self._statuses: dict[str, tuple[object, Status]] = {}  # map → how far it was, and its status then
-        self._well = time.monotonic()
+        self._asked = self._well = time.monotonic()
         self._rates = Rates()
 
     def check_once(self) -> ServerSnapshot:
@@ -126,14 +126,15 @@ class ServerWatcher:
         """
         health = self._health()
         snapshot = self._with_maps(self._judge(health), health, always=False)
+        self._asked = time.monotonic()
         if snapshot.exit_status == READY:
-            self._well = time.monotonic()
+            self._well = self._asked
         return snapshot
 
     @property
     def unwell(self) -> bool:
-        """Whether no snapshot of the last `stall_after` seconds was ready."""
-        return time.monotonic() - self._well >= self._stall_after
+        """Whether the newest snapshot was not ready, nor any in the `stall_after` seconds before it."""
+        return self._asked - self._well >= self._stall_after
 
     def _health(self) -> Health:
         wanted = self._only or None  # a map that moved is followed
