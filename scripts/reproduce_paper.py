@@ -75,7 +75,7 @@ def main() -> int:
     except KeyboardInterrupt:
         say("stopped; what is done is kept, and the same command goes on")
         return 130
-    except TsfusionError as error:
+    except (TsfusionError, OSError) as error:  # OSError: --out or --cache cannot be written
         say(str(error))
         return 1
 

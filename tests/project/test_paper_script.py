@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """scripts/reproduce_paper.py: its plan, its verdicts, its figures' data, and two modes from end to end."""
 
+import hashlib
 import json
 import os
 import signal
@@ -477,3 +478,18 @@ def test_a_mistake_is_one_line(arguments: tuple[str, ...], message: str, tmp_pat
         _, told = running.communicate(timeout=60)
     assert running.returncode == 2
     assert message in told.splitlines()[-1]
+
+
+@pytest.mark.parametrize("taken", ["out", "world"])
+def test_what_cannot_be_written_is_one_line(taken: str, tmp_path: Path) -> None:
+    world = _paper_worlds.worlds(quick=True, frames=2)[1]
+    (tmp_path / "worlds").mkdir()
+    digest = hashlib.sha256(msgspec.json.encode(world)).hexdigest()[:12]
+    file = tmp_path / {"out": "out", "world": f"worlds/{world.name}-{digest}"}[taken]
+    file.touch()
+    command = (sys.executable, str(SCRIPT), "--quick", "--frames", "2", "--only", world.name)
+    folders = ("--out", str(tmp_path / "out"), "--cache", str(tmp_path / "worlds"))
+    done = subprocess.run([*command, *folders], capture_output=True, text=True, timeout=240, check=False)
+    assert done.returncode == 1
+    assert str(file) in done.stderr.splitlines()[-1]
+    assert "Traceback" not in done.stderr

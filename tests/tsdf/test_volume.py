@@ -27,7 +27,7 @@ from tsfusion.core.errors import (
     MapQuota,
     WeightOverflow,
 )
-from tsfusion.kernels import integrate
+from tsfusion.kernels import integrate, ray_smoothing
 from tsfusion.kernels.integrate import QUANTA_PER_VOXEL
 from tsfusion.kernels.voxel_traversal import ADDED, COST, COUNT
 from tsfusion.tsdf.block_store import cells_of, unpack_keys
@@ -347,6 +347,25 @@ def test_an_interrupt_waits_for_the_keyframe() -> None:
         volume.integrate(VIEWS[1])
     assert volume.keyframes == 2
     assert volume.map_hash() == volume_of(VIEWS[:2]).map_hash()
+
+
+def test_a_failure_while_smoothing_leaves_no_vote_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+    def failing(*_: object) -> None:
+        raise MemoryError
+
+    volume, undisturbed = (
+        volume_of(VIEWS[:1], voxel_size=0.04, regularizer="ray", sensor="kinect") for _ in range(2)
+    )
+    with monkeypatch.context() as patch:
+        patch.setattr(ray_smoothing, "commit_votes", failing)
+        with pytest.raises(MemoryError):
+            volume.integrate(VIEWS[2])
+    assert not volume._integrator._buffers.votes.any()
+    for each in (volume, undisturbed):
+        each.integrate(VIEWS[1])
+    assert volume.map_hash() == undisturbed.map_hash()
+    meshes = [each.extract_mesh(surface="raw").vertices for each in (volume, undisturbed)]
+    assert np.array_equal(*meshes)
 
 
 def test_a_still_camera_can_carve_for_long() -> None:

@@ -256,8 +256,10 @@ class Integrator:
                 model.smoothness, int(weighted), int(model.feedback or not weighted), sums, correction,
                 s.signal, s.crossed, votes, voted,
             )  # fmt: skip
-        finally:  # also after an interrupt: the next keyframe's votes begin with none
             ray_smoothing.commit_votes(s.touched, sums, votes, voted, correction)
+        except BaseException:  # no vote of this keyframe may count for the next one
+            votes[voted[1 : 1 + voted[0]]] = 0
+            raise
 
     def _launch(
         self, part: Part, sign: int, *, which: int = ALL, oldest: int = 0, most_missing: int = NO_LIMIT

@@ -188,7 +188,8 @@ class StereoLocalizer(Localizer):
         found = self._motion(reference, *matches, expected)
         if isinstance(found, str) and expected is not None:  # frames were missed, and all looks larger now
             matches = _follow_warped(reference, gray, expected)
-            found = self._motion(reference, *matches, expected, only_expected=True)
+            again = self._motion(reference, *matches, expected, only_expected=True)
+            found = found if isinstance(again, str) else again
         if isinstance(found, str):
             return found
         self._velocity = se3.log(found[0]) / elapsed
