@@ -28,6 +28,7 @@ from tsfusion.kernels.sensor_noise import (
     noise_sigma,
     vec3,
 )
+from tsfusion.kernels.unfused import cross, dot, norm, product, quotient
 from tsfusion.kernels.voxel_traversal import RUN, vec3i, write_band, write_ray
 
 TILE = 12  # divided by both sides of every cell
@@ -54,8 +55,8 @@ Reading = ti.types.struct(
 )
 # Voxels: what a step right, a step down and pixel (0, 0) add to the direction of a pixel's ray; its start.
 Camera = ti.types.struct(du=vec3, dv=vec3, corner=vec3, origin=vec3)
-# Pixels of a tile: from (x, y), counted from the tile's corner (left, top).
-Cell = ti.types.struct(left=ti.i32, top=ti.i32, x=ti.i32, y=ti.i32, wide=ti.i32, high=ti.i32)
+# Pixels of a tile: from (x, y), counted from the tile's corner (left, top); its depths begin at `base`.
+Cell = ti.types.struct(left=ti.i32, top=ti.i32, x=ti.i32, y=ti.i32, wide=ti.i32, high=ti.i32, base=ti.i32)
 # A tile's plane, if it is flat: slopes of the depth, 2⁻¹⁰ voxel a pixel.
 Plane = ti.types.struct(is_flat=ti.i32, slope_x=ti.f32, slope_y=ti.f32)
 # Samples of a cell with depths in [low, up_to]: the deepest, their number, Σ depth, Σ x, Σ y.
@@ -74,12 +75,26 @@ def most_rays(height: int, width: int) -> int:
     return tiles_of(height, width) * TILE_SAMPLES
 
 
+def are_given(sums: object) -> bool:
+    """Whether a kernel has made sums of columns (`column_sums`, `color_sums`) for a function to use."""
+    return sums is not None
+
+
 @ti.func
 def camera_of(rows: ti.template()):
     """The (4, 3) rows of `ray_buffers._camera` as a `Camera`."""
     du, dv = vec3(rows[0, 0], rows[0, 1], rows[0, 2]), vec3(rows[1, 0], rows[1, 1], rows[1, 2])
     corner, origin = vec3(rows[2, 0], rows[2, 1], rows[2, 2]), vec3(rows[3, 0], rows[3, 1], rows[3, 2])
     return Camera(du, dv, corner, origin)
+
+
+@ti.func
+def reading_of(model: ti.template(), is_disparity, scale, has_confidence):
+    """How an image is read: its numbers' scale, float64, is metres a number or, of disparities, metres times
+    numbers."""
+    near, far = ti.cast(model[MIN_RANGE], ti.f32), ti.cast(model[MAX_RANGE], ti.f32)
+    per_metre = ti.cast(1.0 / (model[VOXEL_SIZE] / 1024.0), ti.f32)
+    return Reading(is_disparity, ti.cast(scale, ti.f32), has_confidence, near, far, per_metre)
 
 
 @ti.func
@@ -95,7 +110,7 @@ def depth_of(raw, reading):
     tile is read in vectors."""
     z = raw * reading.scale
     if reading.is_disparity == 1:
-        z = reading.scale / ti.max(raw, 1e-9)
+        z = quotient(reading.scale, ti.max(raw, 1e-9))
     # False for NaN as well
     usable = (raw > 0.0) & (z >= reading.near) & (z <= reading.far)
     return ti.select(usable, ti.cast(z * reading.per_metre, ti.i32), 0)
@@ -140,9 +155,9 @@ def load_tile(image: ti.template(), confidence: ti.template(), reading, left, to
 
 
 @ti.func
-def fit_plane(depths: ti.template(), anchor, sigma):
-    """Least squares q = c + x·slope_x + y·slope_y over a lattice of the tile; depths and `sigma` in 2⁻¹⁰
-    voxel, `anchor` near the depths."""
+def fit_plane(depths: ti.template(), base, anchor, sigma):
+    """Least squares q = c + x·slope_x + y·slope_y over a lattice of the tile whose depths begin at `base`;
+    these and `sigma` in 2⁻¹⁰ voxel, `anchor` near the depths."""
     sx, sy, sxx, sxy, syy, n = 0, 0, 0, 0, 0, 0
     sq, sxq, syq, sqq = 0, 0, 0, ti.i64(0)
     for row in range(TILE // PLANE_STEP):
@@ -150,7 +165,7 @@ def fit_plane(depths: ti.template(), anchor, sigma):
         row_n, row_x, row_xx, row_q, row_xq = 0, 0, 0, 0, 0
         for column in range(TILE // PLANE_STEP):
             x = column * PLANE_STEP
-            q = depths[y * TILE + x]
+            q = depths[base + y * TILE + x]
             here = ti.cast(q > 0, ti.i32)
             d = ti.select(q > 0, ti.min(ti.max(q - anchor, -(1 << 20)), 1 << 20), 0)
             row_n += here
@@ -174,37 +189,47 @@ def fit_plane(depths: ti.template(), anchor, sigma):
         cxx = sxx - ti.cast(sx * sx, ti.f64) / n
         cyy = syy - ti.cast(sy * sy, ti.f64) / n
         cxy = sxy - ti.cast(sx * sy, ti.f64) / n
-        cxq = ti.cast(sxq, ti.f64) - mean_q * sx
-        cyq = ti.cast(syq, ti.f64) - mean_q * sy
-        determinant = cxx * cyy - cxy * cxy
+        cxq = ti.cast(sxq, ti.f64) - product(mean_q, sx)
+        cyq = ti.cast(syq, ti.f64) - product(mean_q, sy)
+        determinant = product(cxx, cyy) - product(cxy, cxy)
         if determinant > 0.05 * cxx * cyy:
-            slope_x = (cxq * cyy - cyq * cxy) / determinant
-            slope_y = (cyq * cxx - cxq * cxy) / determinant
-            left_over = ti.cast(sqq, ti.f64) - mean_q * sq - slope_x * cxq - slope_y * cyq
-            if left_over < n * (PLANE_NOISE * sigma * sigma + PLANE_ROUGHNESS * PLANE_ROUGHNESS):
+            slope_x = (product(cxq, cyy) - product(cyq, cxy)) / determinant
+            slope_y = (product(cyq, cxx) - product(cxq, cxy)) / determinant
+            left_over = ti.cast(sqq, ti.f64) - product(mean_q, sq)
+            left_over -= product(slope_x, cxq)
+            left_over -= product(slope_y, cyq)
+            noise = product(PLANE_NOISE * sigma, sigma)
+            if left_over < n * (noise + PLANE_ROUGHNESS * PLANE_ROUGHNESS):
                 is_flat = 1
     return Plane(is_flat, slope_x, slope_y)
 
 
 @ti.func
-def tile_plane(model: ti.template(), unit, mean, depths: ti.template()):
+def tile_plane(model: ti.template(), unit, mean, depths: ti.template(), base):
     """The plane of a tile of `mean` depth (metres), if it is flat and noise does not hide it."""
     plane = Plane(0, 0.0, 0.0)
     sigma = noise_sigma(model, mean)
     if sigma < PLANE_SIGMA * model[VOXEL_SIZE]:
-        plane = fit_plane(depths, ti.cast(mean / unit, ti.i32), sigma / unit)
+        plane = fit_plane(depths, base, ti.cast(mean / unit, ti.i32), sigma / unit)
     return plane
 
 
 @ti.func
 def plane_gradient(ray, du, dv, z, slope_x, slope_y):
     """n / (n·u) of the plane through `ray`·z whose depth has these slopes a pixel; zero if seen edge-on."""
-    normal = (du * z + ray * slope_x).cross(dv * z + ray * slope_y)
-    along = normal.dot(ray)
+    right, down = product(du, z) + product(ray, slope_x), product(dv, z) + product(ray, slope_y)
+    normal = cross(right, down)
+    along = dot(normal, ray)
     gradient = vec3(0.0)
-    if along * along > LEAST_FACING * LEAST_FACING * normal.norm_sqr() * ray.norm_sqr():
-        gradient = normal * (ray.norm() / along)
+    if along * along > LEAST_FACING * LEAST_FACING * dot(normal, normal) * dot(ray, ray):
+        gradient = normal * (norm(ray) / along)
     return gradient
+
+
+@ti.func
+def pixel_width(camera):
+    """Voxels that a pixel spans at a depth of one metre."""
+    return ti.max(norm(camera.du), norm(camera.dv))
 
 
 @ti.func
@@ -225,7 +250,7 @@ def layer_sums(depths: ti.template(), cell, above, up_to):
         y = cell.y + row
         for column in range(few(cell.wide)):
             x = cell.x + column
-            q = depths[y * TILE + x]
+            q = depths[cell.base + y * TILE + x]
             inside = (q > above) & (q <= up_to)
             one = ti.cast(inside, ti.i32)
             low = ti.min(low, ti.select(inside, q, 1 << 30))
@@ -271,8 +296,10 @@ def full_layer(columns: ti.template(), cell):
 @ti.func
 def nearest_layer(model: ti.template(), unit, depths: ti.template(), columns: ti.template(), cell, above):
     """The nearest samples of a cell beyond depth `above` that may belong to one surface (n = 0: none), and
-    whether there are samples behind them."""
-    layer = full_layer(columns, cell)
+    whether there are samples behind them. `columns`: of `column_sums`, or None."""
+    layer = Layer(1 << 30, 0, 0, 0, 0, 0, 0)
+    if ti.static(are_given(columns)):
+        layer = full_layer(columns, cell)
     if above > 0 or layer.n == 0:
         layer = layer_sums(depths, cell, above, 1 << 30)
     if layer.n > 0:
@@ -315,19 +342,23 @@ def layer_color(
     color: ti.template(), has_color, confidence: ti.template(), has_confidence, depths: ti.template(),
     colors: ti.template(), cell, layer,
 ):  # fmt: skip
-    """Mean colour 0xRRGGBB and summed confidence of a layer's samples."""
+    """Mean colour 0xRRGGBB and summed confidence of a layer's samples; `colors`: of
+    `color_sums`, or None."""
     n, bgr, trust = layer.n, vec3i(0), 0
-    if n == cell.wide * cell.high and has_confidence == 0:
-        for column in range(few(cell.wide)):
-            x = cell.x + column
-            for c in ti.static(range(3)):
-                bgr[c] += colors[3 * x + c]
-    else:
+    is_summed = 0
+    if ti.static(are_given(colors)):
+        if n == cell.wide * cell.high and has_confidence == 0:
+            is_summed = 1
+            for column in range(few(cell.wide)):
+                x = cell.x + column
+                for c in ti.static(range(3)):
+                    bgr[c] += colors[3 * x + c]
+    if is_summed == 0:
         for row in range(few(cell.high)):
             y = cell.y + row
             for column in range(few(cell.wide)):
                 x = cell.x + column
-                q = depths[y * TILE + x]
+                q = depths[cell.base + y * TILE + x]
                 if q >= layer.low and q <= layer.up_to:
                     if has_confidence == 1:
                         trust += ti.cast(confidence[cell.top + y, cell.left + x], ti.i32)
@@ -370,8 +401,8 @@ def write_layer_ray(
     z = (ti.cast(layer.sum_q, ti.f64) / n + 0.5) * unit
     u = cell.left + ti.cast(layer.sum_x, ti.f64) / n
     v = cell.top + ti.cast(layer.sum_y, ti.f64) / n
-    direction = camera.corner + camera.du * u + camera.dv * v
-    p = camera.origin + direction * z
+    direction = camera.corner + product(camera.du, u) + product(camera.dv, v)
+    p = camera.origin + product(direction, z)
     weight, cost = 0, 0
     if in_reach(p):
         rgb, trust = 0, 255 * n
@@ -387,9 +418,9 @@ def write_layer_ray(
         sigma = noise_sigma(model, z)
         weight = bundle_weight(model, sigma, trust)
         half = half_width(model, sigma)
-        length, passed, fourfold = direction.norm() * z, 0.0, 0.0
+        length, passed, fourfold = norm(direction) * z, 0.0, 0.0
         if model[CARVES_SPACE] > 0.0:
-            passed, fourfold = shares_passed(cell, ti.max(camera.du.norm(), camera.dv.norm()) * z)
+            passed, fourfold = shares_passed(cell, pixel_width(camera) * z)
         before = before_width(model, half, length, passed)
         cost = write_ray(
             rays, r, first, fixed_point(p), direction, gradient, before, half,
@@ -423,9 +454,7 @@ def rays_from_image(
         if run % RUN == 0:
             band = run // RUN
             camera = camera_of(camera_rows)
-            near, far = ti.cast(model[MIN_RANGE], ti.f32), ti.cast(model[MAX_RANGE], ti.f32)
-            factor, per_metre = ti.cast(scale, ti.f32), ti.cast(1.0 / unit, ti.f32)
-            reading = Reading(is_disparity, factor, has_confidence, near, far, per_metre)
+            reading = reading_of(model, is_disparity, scale, has_confidence)
             first_tile = ti.cast(ti.cast(band, ti.i64) * tiles // count, ti.i32)
             last_tile = ti.cast(ti.cast(band + 1, ti.i64) * tiles // count, ti.i32)
             first_ray = first_tile * TILE_SAMPLES
@@ -439,12 +468,12 @@ def rays_from_image(
                 wide, high, plane = 1, 1, Plane(0, 0.0, 0.0)
                 if valid > 0 and bundle == 1:
                     mean = ti.cast(total, ti.f64) / valid * unit
-                    wide, high = cell_shape(mean * ti.max(camera.du.norm(), camera.dv.norm()))
-                    plane = tile_plane(model, unit, mean, depths)
+                    wide, high = cell_shape(mean * pixel_width(camera))
+                    plane = tile_plane(model, unit, mean, depths, 0)
                 across = TILE // wide
                 cells = ti.select(valid > 0, across * (TILE // high), 0)
                 for c in range(cells):
-                    cell = Cell(left, top, c % across * wide, c // across * high, wide, high)
+                    cell = Cell(left, top, c % across * wide, c // across * high, wide, high, 0)
                     if cell.x == 0:
                         column_sums(depths, cell.y, high, columns)
                         if has_color == 1:

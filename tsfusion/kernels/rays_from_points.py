@@ -21,6 +21,7 @@ from tsfusion.kernels.sensor_noise import (
     vec3,
     vec3f,
 )
+from tsfusion.kernels.unfused import dot, norm
 from tsfusion.kernels.voxel_traversal import RUN, write_band, write_ray
 
 
@@ -35,7 +36,7 @@ def transform(pose: ti.template(), q):
     """The point q (sensor frame, metres) in the map's frame, voxels."""
     p = vec3(0.0)
     for a in ti.static(range(3)):
-        p[a] = pose[a, 0] * q[0] + pose[a, 1] * q[1] + pose[a, 2] * q[2] + pose[a, 3]
+        p[a] = dot(vec3(pose[a, 0], pose[a, 1], pose[a, 2]), q) + pose[a, 3]
     return p
 
 
@@ -49,7 +50,7 @@ Bundle = ti.types.struct(
 def confidence_at(q, o, nearest, farthest, confidence: ti.template(), has_confidence, i):
     """Confidence in point i at q, seen from o; 0 if it is out of range. Ranges are squared metres."""
     found = 0
-    span = (q - o).norm_sqr()
+    span = dot(q - o, q - o)
     # False for NaN as well
     if span > 0.0 and span >= nearest and span <= farthest:
         found = 255
@@ -80,12 +81,12 @@ def write_bundle_ray(rays: ti.template(), r, first, model: ti.template(), pose: 
     origin, end = transform(pose, start), transform(pose, mean)
     weight, cost = 0, 0
     if in_reach(end) and in_reach(origin):
-        sigma = noise_sigma(model, (mean - start).norm())
+        sigma = noise_sigma(model, norm(mean - start))
         weight = bundle_weight(model, sigma, bundle.trust)
         half = half_width(model, sigma)
         rgb = ((bundle.red // n) << 16) | ((bundle.green // n) << 8) | (bundle.blue // n)
         direction, across = end - origin, vec3(0.0)
-        before = before_width(model, half, direction.norm(), 0.0)
+        before = before_width(model, half, norm(direction), 0.0)
         cost = write_ray(rays, r, first, fixed_point(end), direction, across, before, half, 0, weight, rgb)
     return weight, cost
 
@@ -128,7 +129,7 @@ def rays_from_points(
                 n = points_of_ray.n
                 ends = i == last_point
                 if confident > 0 and n > 0:
-                    ends = bundle == 0 or (q - anchor).norm_sqr() > spread
+                    ends = bundle == 0 or dot(q - anchor, q - anchor) > spread
                 if ends and n > 0:
                     start = common_start
                     if own_starts == 1:

@@ -7,6 +7,7 @@
 
 import taichi as ti
 
+from tsfusion.kernels.unfused import product
 from tsfusion.kernels.voxel_traversal import VOXEL_LIMIT, vec3i
 
 MODEL_FIELDS = 12
@@ -35,16 +36,16 @@ vec3f = ti.types.vector(3, ti.f32)
 def noise_sigma(model: ti.template(), z):
     """Standard deviation of a sample at depth (or range) z, metres."""
     away = z - model[SIGMA_Z0]
-    return model[SIGMA_FLOOR] + model[SIGMA_SLOPE] * away * away
+    return model[SIGMA_FLOOR] + product(model[SIGMA_SLOPE] * away, away)
 
 
 @ti.func
 def bundle_weight(model: ti.template(), sigma, trust):
     """Weight of samples whose confidences (0 … 255) sum to `trust`."""
-    w = ti.cast(trust, ti.f64) * (WEIGHT_ONE / 255.0)
+    w = product(ti.cast(trust, ti.f64), WEIGHT_ONE / 255.0)
     if sigma > model[FULL_WEIGHT_SIGMA]:
         ratio = model[FULL_WEIGHT_SIGMA] / sigma
-        w *= ti.max(ratio * ratio, LEAST_SHARE)
+        w = product(w, ti.max(ratio * ratio, LEAST_SHARE))
     return ti.min(ti.max(ti.cast(w + 0.5, ti.i32), 1), MAX_BUNDLE_WEIGHT)
 
 
@@ -71,7 +72,7 @@ def before_width(model: ti.template(), half, length, share):
 @ti.func
 def fourfold_width(before, length, share):
     """As far as a ray that begins `before` its end votes fourfold for free space, in eights of voxels."""
-    return ti.cast(ti.max(length * share - (length - before / 256.0), 0.0) / 8.0, ti.i32)
+    return ti.cast(ti.max(product(length, share) - (length - before / 256.0), 0.0) / 8.0, ti.i32)
 
 
 @ti.func

@@ -9,6 +9,8 @@ Units: position 2⁻¹⁰ voxel, direction 2⁻¹⁶, distance along the ray 2�
 
 import taichi as ti
 
+from tsfusion.kernels.unfused import dot, norm, product
+
 # First voxel of the band (3), next crossing an axis (3), crossing interval an axis (3), what the distance
 # loses with a step an axis (3), signed distance of the first voxel's centre to the surface along the ray
 # (positive before it), length of the band (its low 8 bits: how many times eight voxels of it get four votes
@@ -80,16 +82,16 @@ def write_ray(
     n / (n·u) for a plane of normal n; zero stands for the plane across the ray, whose gradient is u.
     `fourfold`: how many times eight voxels are as free as four rays say.
     """
-    length = direction.norm()
+    length = norm(direction)
     usable = weight
     if length <= 0.0:
         usable = 0
         length = 1.0
-    unit = direction * (DIRECTION_ONE / length)
+    unit = product(direction, DIRECTION_ONE / length)
     slope = gradient
-    if gradient.norm_sqr() == 0.0:
+    if dot(gradient, gradient) == 0.0:
         slope = unit / DIRECTION_ONE
-    dot = ti.i64(0)
+    distance = ti.i64(0)
     downward, across = 0, 0
     for a in ti.static(range(3)):
         u = ti.cast(ti.floor(unit[a] + 0.5), ti.i32)
@@ -111,12 +113,12 @@ def write_ray(
         rays[r, CROSSING + a] = crossing
         rays[r, INTERVAL + a] = interval
         loss = ti.cast(ti.floor(slope[a] * DIRECTION_ONE + 0.5), ti.i32)
-        dot += (exact - (ti.cast(voxel, ti.i64) << 16) - 32768) * loss
+        distance += (exact - (ti.cast(voxel, ti.i64) << 16) - 32768) * loss
         if u < 0:
             downward |= 1 << a
             loss = -loss
         rays[r, LOSS + a] = loss
-    rays[r, DISTANCE] = ti.cast(dot >> 16, ti.i32)
+    rays[r, DISTANCE] = ti.cast(distance >> 16, ti.i32)
     rays[r, LENGTH] = ((before + behind) << 8) | ti.min(fourfold, MOST_FOURFOLD)
     rays[r, END] = (before << 8) | downward
     rays[r, WEIGHT_COLOR] = (usable << 24) | color
