@@ -14,7 +14,7 @@ import pytest
 from formula_scenes import sphere_views
 
 from tsfusion import Keyframe, Volume
-from tsfusion.core.config import VolumeConfig, make_settings
+from tsfusion.core.config import Arch, VolumeConfig, make_settings
 from tsfusion.core.errors import InvalidConfig, MapError, MapFull
 from tsfusion.tsdf import device_link
 from tsfusion.tsdf.device_link import DeviceLost
@@ -26,23 +26,27 @@ POINTS = [
     Keyframe(points=random.normal(size=(500, 3)).astype(np.float32), T_world_camera=np.eye(4))
     for random in map(np.random.default_rng, range(3))
 ]
-HOW = "Debian and Ubuntu: apt-get install mesa-vulkan-drivers, a software device"
+HOW = {
+    "vulkan": "Debian and Ubuntu: apt-get install mesa-vulkan-drivers, a software device",
+    "cuda": "a GPU of NVIDIA's and its driver",
+}
 
 
-@pytest.fixture(scope="module", autouse=True)
-def vulkan() -> Iterator[None]:
-    if Volume(arch="vulkan").arch != "vulkan":
-        pytest.skip(f"no Vulkan device that can fuse ({HOW})")
-    yield
-    link = device_link.link_to("vulkan")
+@pytest.fixture(scope="module", params=HOW)
+def arch(request: pytest.FixtureRequest) -> Iterator[Arch]:
+    arch: Arch = request.param
+    if Volume(arch=arch).arch != arch:
+        pytest.skip(f"no {arch} device that can fuse ({HOW[arch]})")
+    yield arch
+    link = device_link.link_to(arch)
     assert link is not None
     link.close()
 
 
-def both(keyframes: list[Keyframe], **settings: Any) -> tuple[Volume, Volume]:
+def both(arch: Arch, keyframes: list[Keyframe], **settings: Any) -> tuple[Volume, Volume]:
     """The maps on the CPU and on the device."""
-    maps = Volume(0.05, **settings), Volume(0.05, arch="vulkan", **settings)
-    assert [one.arch for one in maps] == ["cpu", "vulkan"]
+    maps = Volume(0.05, **settings), Volume(0.05, arch=arch, **settings)
+    assert [one.arch for one in maps] == ["cpu", arch]
     for keyframe in keyframes:
         here, there = (one.integrate(keyframe) for one in maps)
         assert here == there
@@ -64,8 +68,8 @@ def assert_equal(here: Volume, there: Volume) -> None:
     ],
     ids=["colour", "exact", "carving", "points"],
 )
-def test_the_map_is_that_of_the_cpu(keyframes: list[Keyframe], settings: dict[str, Any]) -> None:
-    here, there = both(keyframes, **settings)
+def test_the_map_is_that_of_the_cpu(arch: Arch, keyframes: list[Keyframe], settings: dict[str, Any]) -> None:
+    here, there = both(arch, keyframes, **settings)
     assert_equal(here, there)
     for one in (here, there):
         one.retract(keyframes[0])
@@ -73,8 +77,8 @@ def test_the_map_is_that_of_the_cpu(keyframes: list[Keyframe], settings: dict[st
     assert sorted(there.take_dirty().tolist()) == sorted(here.take_dirty().tolist())
 
 
-def test_what_is_read_follows_what_is_added(tmp_path: Path) -> None:
-    here, there = both(COLORED[:2])
+def test_what_is_read_follows_what_is_added(arch: Arch, tmp_path: Path) -> None:
+    here, there = both(arch, COLORED[:2])
     meshes = [one.extract_mesh(surface="raw") for one in (here, there)]
     assert (meshes[0].vertices == meshes[1].vertices).all()
     for one in (here, there):
@@ -83,16 +87,16 @@ def test_what_is_read_follows_what_is_added(tmp_path: Path) -> None:
     assert (meshes[0].vertices == meshes[1].vertices).all()
     saved = there.save(tmp_path / "map.tsf")
     assert Volume.load(saved).config.arch == "cpu"
-    again = Volume.load(saved, arch="vulkan")
-    assert again.arch == "vulkan"
+    again = Volume.load(saved, arch=arch)
+    assert again.arch == arch
     for one in (here, again):
         one.integrate(COLORED[3])
     assert_equal(here, again)
 
 
-def test_what_is_written_reaches_the_device() -> None:
-    here, there = both(COLORED[:1])
-    more_here, more_there = both(COLORED[1:3])
+def test_what_is_written_reaches_the_device(arch: Arch) -> None:
+    here, there = both(arch, COLORED[:1])
+    more_here, more_there = both(arch, COLORED[1:3])
     here.merge(more_here)
     there.merge(more_there)
     for one in (here, there):
@@ -109,9 +113,9 @@ def test_what_is_written_reaches_the_device() -> None:
     assert_equal(*boxes)
 
 
-def test_a_refused_keyframe_changes_nothing() -> None:
-    room = both(VIEWS[:1])[0].stats().blocks
-    here, there = both(VIEWS[:1], max_blocks=room)
+def test_a_refused_keyframe_changes_nothing(arch: Arch) -> None:
+    room = both(arch, VIEWS[:1])[0].stats().blocks
+    here, there = both(arch, VIEWS[:1], max_blocks=room)
     before = there.map_hash()
     for one in (here, there):
         with pytest.raises(MapFull):
@@ -124,13 +128,13 @@ def test_a_refused_keyframe_changes_nothing() -> None:
     assert_equal(here, there)
 
 
-def test_smoothing_along_rays_needs_the_cpu(caplog: pytest.LogCaptureFixture) -> None:
-    assert Volume(0.05, regularizer="ray", arch="vulkan").arch == "cpu"
+def test_smoothing_along_rays_needs_the_cpu(arch: Arch, caplog: pytest.LogCaptureFixture) -> None:
+    assert Volume(0.05, regularizer="ray", arch=arch).arch == "cpu"
     assert "smoothing along rays (regularizer) needs the CPU" in caplog.text
 
 
-def test_a_map_grows_beyond_its_first_room() -> None:
-    maps = Volume(0.004, color=False), Volume(0.004, color=False, arch="vulkan")
+def test_a_map_grows_beyond_its_first_room(arch: Arch) -> None:
+    maps = Volume(0.004, color=False), Volume(0.004, color=False, arch=arch)
     for one in maps:
         one.integrate(VIEWS[0])
         one.integrate(VIEWS[2])
@@ -138,15 +142,15 @@ def test_a_map_grows_beyond_its_first_room() -> None:
     assert maps[0].map_hash() == maps[1].map_hash()
 
 
-def test_a_device_that_ends_is_noticed_and_another_map_finds_a_new_one() -> None:
-    _, there = both(VIEWS[:1])
-    link = device_link.link_to("vulkan")
+def test_a_device_that_ends_is_noticed_and_another_map_finds_a_new_one(arch: Arch) -> None:
+    _, there = both(arch, VIEWS[:1])
+    link = device_link.link_to(arch)
     assert link is not None
     link._process.kill()
     link._process.wait(10)
-    with pytest.raises(DeviceLost, match="vulkan"):
+    with pytest.raises(DeviceLost, match=arch):
         there.integrate(VIEWS[1])
-    here, there = both(VIEWS[1:2])
+    here, there = both(arch, VIEWS[1:2])
     assert_equal(here, there)
 
 

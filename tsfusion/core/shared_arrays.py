@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""Arrays that one process writes and another reads, in memory that both have mapped."""
+"""Arrays that one process writes and another reads, in memory that both have mapped; and waiting for a word
+of the other one."""
 
 import mmap
 import os
+import select
 import tempfile
+import time
 from collections.abc import Iterable
 from contextlib import suppress
 from typing import Any, NamedTuple
@@ -33,6 +36,16 @@ def make_file() -> int:
         return os.memfd_create("tsfusion")
     with tempfile.TemporaryFile() as file:
         return os.dup(file.fileno())
+
+
+def look_out(descriptor: int, seconds: float) -> None:
+    """Wait for something to read, so long at most, without sleeping: to be woken takes longer than what is
+    waited for."""
+    poll = select.poll()
+    poll.register(descriptor, select.POLLIN)
+    end = time.monotonic() + seconds
+    while not poll.poll(0) and time.monotonic() < end:
+        os.sched_yield()  # the other process may have to run on this core
 
 
 class SharedArrays:
@@ -79,6 +92,11 @@ class SharedArrays:
             return np.zeros(place.shape, place.dtype)
         found: NDArray[Any] = np.ndarray(place.shape, place.dtype, self._map, place.offset)
         return found
+
+    @property
+    def memory(self) -> NDArray[np.uint8]:
+        """All of the memory that is mapped."""
+        return np.empty(0, np.uint8) if self._map is None else np.frombuffer(self._map, np.uint8)
 
     def close(self) -> None:
         """Close the descriptor; arrays that were read stay."""

@@ -97,14 +97,16 @@ def find_blocks(
         slots[i] = map_find(map_keys, map_slots, mask, keys[i])
 
 
+@QuickLaunch
 @ti.kernel
 def find_places(
     keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
     map_keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
     places: ti.types.ndarray(dtype=ti.i32, ndim=1),
 ):
-    """Where blocks that are in the hash stand there."""
+    """Where blocks that are in the hash stand there. Serial, as `insert_blocks`."""
     mask = map_keys.shape[0] - 1
+    ti.loop_config(serialize=True)
     for n in range(keys.shape[0]):
         i = hash_key(keys[n]) & mask
         probes = 0

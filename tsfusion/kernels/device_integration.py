@@ -18,12 +18,13 @@ from tsfusion.kernels.integrate import (
     TOUCHED_COUNT,
     TOUCHED_HEADER,
     TOUCHED_MISMATCH,
+    TOUCHED_MISSING,
+    TOUCHED_OVERFLOW,
     WEIGHT_BITS,
     quantize,
 )
+from tsfusion.kernels.quick_launch import QuickLaunch
 from tsfusion.kernels.voxel_traversal import (
-    ADDED,
-    COUNT,
     CROSSING,
     DEFERRED,
     END,
@@ -47,14 +48,14 @@ from tsfusion.kernels.voxel_traversal import (
 LISTED_FIELDS, VOTE_FIELDS = 4, 2
 PLACE, PRODUCT, VOTE, LAST = 0, 1, 2, 3
 BLOCK, COLOR = 1, 1
-LISTED, FOUND, COUNTS = 0, 1, 2  # how many of them, how many missing blocks
+LISTED, FOUND, COUNTS = 0, 1, 2  # how many of them, how many missing blocks; int64
 WINNERS = 1 << 16
 MISSING, SKIPPED = -1, -2  # instead of a place: what is listed is a missing block, or nothing
 
 
 @ti.func
 def band_of(bands: ti.template(), r):
-    """The last band that begins at ray `r` or before it; those without rays begin where the next one does."""
+    """The last band that begins at place `r` or before it; those without places begin where the next does."""
     low, high = 0, bands.shape[0]
     while high - low > 1:
         middle = (low + high) >> 1
@@ -94,6 +95,12 @@ def crossed(rays: ti.template(), r):
         if rays[r, CROSSING + a] < length:
             n += 1 + (length - 1 - rays[r, CROSSING + a]) // rays[r, INTERVAL + a]
     return n
+
+
+@ti.func
+def listed_count(count: ti.template(), listed: ti.template()):
+    """How many updates are listed; none where they are more than there is room for."""
+    return ti.cast(ti.select(count[LISTED] <= listed.shape[0], count[LISTED], 0), ti.i32)
 
 
 @ti.func
@@ -142,6 +149,7 @@ def list_updates(
     return added, lacks, colored
 
 
+@QuickLaunch
 @ti.kernel
 def add_rays(
     rays: ti.types.ndarray(dtype=ti.i32, ndim=2),
@@ -156,78 +164,81 @@ def add_rays(
     oldest: ti.i32,
     stamp: ti.i32,
     has_color: ti.i32,
+    begins: ti.i32,
     hash_keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
     hash_slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
     winners: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    missing: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    missing: ti.types.ndarray(dtype=ti.i32, ndim=1),
     stamps: ti.types.ndarray(dtype=ti.i32, ndim=1),
     touched: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    count: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    count: ti.types.ndarray(dtype=ti.i64, ndim=1),
     listed: ti.types.ndarray(dtype=ti.i32, ndim=2),
     votes: ti.types.ndarray(dtype=ti.i32, ndim=2),
     sums: ti.types.ndarray(dtype=ti.i64, ndim=2),
     color_rgn: ti.types.ndarray(dtype=ti.i64, ndim=2),
     color_b: ti.types.ndarray(dtype=ti.i32, ndim=2),
 ):
-    """The same as `integrate.add_rays`, a thread a ray; bands of rays `first_ray` … `end_ray` − 1.
+    """The same as `integrate.add_rays`, a thread a ray; bands of places `first_ray` … `end_ray` − 1.
 
     Updates are listed, then added, a thread each: so those of one ray do not wait for each other. Nothing is
     added inside a loop within a thread: after that, Mesa's software device (22.3) forgets which threads run.
     Rays that cross missing blocks are marked in `deferred` instead of listed, and the blocks' coordinates are
-    in `missing`, some of them twice: of those that share a place in `winners`, one is
-    left out for every other one that is the same block. No band ends early: what was
-    added is all of its rays. A settled colour stays, as in `integrate.vote_color`.
+    in `missing`, some of them twice: of those that share a place in `winners`, one is left out for every
+    other one that is the same block. No band ends early: what was added is all of its rays. With `begins` = 1 the
+    list of touched blocks is empty first. Where `listed` has no room for all updates, none is made, and
+    `touched` says so. A settled colour stays, as in `integrate.vote_color`.
     """
     for band in range(first_band, end_band):
         if which == ALL:
             bands[band, DEFERRED], bands[band, UPDATES] = 0, 0
-            bands[band, ADDED] = bands[band, COUNT]
-    for i in range(COUNTS):
-        count[i] = 0
+        if band == first_band:
+            for i in ti.static(range(COUNTS)):
+                count[i] = 0
+            if begins == 1:
+                for i in ti.static(range(TOUCHED_HEADER)):
+                    touched[i] = 0
     for r in range(first_ray, end_ray):
-        band = band_of(bands, r)
-        place = r - bands[band, START]
-        is_wanted = ti.cast(place >= 0 and place < bands[band, COUNT], ti.i32)
-        if is_wanted == 1 and which == ONLY_DEFERRED:
-            is_wanted = deferred[r]
+        is_wanted = ti.cast(ray_weight(rays, r) > 0, ti.i32)
+        if which == ONLY_DEFERRED:
+            is_wanted &= deferred[r]
         votes[r - first_ray, PLACE] = SKIPPED
-        if is_wanted == 1 and ray_weight(rays, r) > 0:
+        if is_wanted == 1:
             most = crossed(rays, r)
-            base = ti.atomic_add(count[LISTED], most)
-            added, lacks, colored = list_updates(
-                rays, r, base, most, sign_, oldest, hash_keys, hash_slots, listed
-            )
-            votes[r - first_ray, PLACE] = colored
-            votes[r - first_ray, COLOR] = rays[r, WEIGHT_COLOR] & 0xFFFFFF
-            ti.atomic_add(bands[band, UPDATES], added)
-            if which == ALL:
-                deferred[r] = lacks
-                ti.atomic_add(bands[band, DEFERRED], lacks)
-    for i in range(count[LISTED]):
+            base = ti.atomic_add(count[LISTED], ti.cast(most, ti.i64))
+            if base + most <= listed.shape[0]:
+                added, lacks, colored = list_updates(
+                    rays, r, ti.cast(base, ti.i32), most, sign_, oldest, hash_keys, hash_slots, listed
+                )
+                votes[r - first_ray, PLACE] = colored
+                votes[r - first_ray, COLOR] = rays[r, WEIGHT_COLOR] & 0xFFFFFF
+                band = band_of(bands, r)
+                ti.atomic_add(bands[band, UPDATES], added)
+                if which == ALL:
+                    deferred[r] = lacks
+                    ti.atomic_add(bands[band, DEFERRED], lacks)
+    for i in range(listed_count(count, listed)):
         at = listed[i, PLACE]
         if at >= 0:
             # both sums in one addition; their quotient minimises Σ w (x − m)²: paper eq. 2
             product = ti.cast(listed[i, PRODUCT], ti.i64)
             ti.atomic_add(sums[at // CUBE, at % CUBE], (product << WEIGHT_BITS) + listed[i, VOTE])
-    for i in range(count[LISTED]):
-        at = listed[i, PLACE]
-        if at >= 0:
             list_block(at // CUBE, stamp, stamps, touched)
-    for i in range(ti.select(which == ALL, count[LISTED], 0)):
-        if listed[i, PLACE] == MISSING:
+        if at == MISSING and which == ALL:
             winners[missing_place(listed, i)] = i
-    for i in range(ti.select(which == ALL, count[LISTED], 0)):
+    for i in range(ti.select(which == ALL, listed_count(count, listed), 0)):
         if listed[i, PLACE] == MISSING:
             winner = winners[missing_place(listed, i)]
             is_another = ti.cast(missing_key(listed, winner) != missing_key(listed, i), ti.i32)
             if winner == i or is_another == 1:
-                n = ti.atomic_add(count[FOUND], 1)
-                if n < missing.shape[0]:
-                    for a in ti.static(range(3)):
-                        missing[n, a] = listed[i, BLOCK + a]
-    for i in range(ti.select(has_color == 1, end_ray - first_ray, 0)):
+                n = ti.cast(ti.atomic_add(count[FOUND], 1), ti.i32)
+                for a in ti.static(range(3)):
+                    missing[3 * n + a] = listed[i, BLOCK + a]
+    for i in range(ti.max(ti.select(has_color == 1, end_ray - first_ray, 0), 1)):
+        if i == 0:
+            touched[TOUCHED_OVERFLOW] = ti.cast(count[LISTED] > listed.shape[0], ti.i32)
+            touched[TOUCHED_MISSING] = ti.cast(count[FOUND], ti.i32)
         at, packed = votes[i, PLACE], votes[i, COLOR]
-        if at >= 0:
+        if at >= 0 and has_color == 1 and i < end_ray - first_ray:
             slot, o = at // CUBE, at % CUBE
             taken = ti.cast(color_rgn[slot, o] & 65535, ti.i32)
             if taken < COLOR_LIMIT or taken >= COLOR_LIMIT + (COLOR_LIMIT >> 1):
@@ -238,6 +249,7 @@ def add_rays(
                     touched[TOUCHED_MISMATCH] = 1
 
 
+@QuickLaunch
 @ti.kernel
 def write_hash(
     places: ti.types.ndarray(dtype=ti.i32, ndim=1),
@@ -250,15 +262,6 @@ def write_hash(
     for i in range(places.shape[0]):
         hash_keys[places[i]] = keys[i]
         hash_slots[places[i]] = slots[i]
-
-
-@ti.kernel
-def read_list(
-    listed: ti.types.ndarray(dtype=ti.i32, ndim=1), count: ti.i32, out: ti.types.ndarray(dtype=ti.i32, ndim=1)
-):
-    """Copy the first `count` numbers of a list."""
-    for i in range(count):
-        out[i] = listed[i]
 
 
 @ti.kernel
@@ -291,21 +294,7 @@ def move_rows(layer: ti.types.ndarray(ndim=2), count: ti.i32, larger: ti.types.n
 
 
 @ti.kernel
-def write_list(new: ti.types.ndarray(dtype=ti.i32, ndim=1), listed: ti.types.ndarray(dtype=ti.i32, ndim=1)):
-    """Set the first numbers of a list."""
-    for i in range(new.shape[0]):
-        listed[i] = new[i]
-
-
-@ti.kernel
 def move_list(listed: ti.types.ndarray(ndim=1), larger: ti.types.ndarray(ndim=1)):
     """Copy a list into a larger one."""
     for i in range(listed.shape[0]):
         larger[i] = listed[i]
-
-
-@ti.kernel
-def read_table(table: ti.types.ndarray(dtype=ti.i32, ndim=2), out: ti.types.ndarray(dtype=ti.i32, ndim=2)):
-    """Copy the first rows of a table."""
-    for i, a in ti.ndrange(out.shape[0], 3):
-        out[i, a] = table[i, a]

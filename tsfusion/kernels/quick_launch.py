@@ -8,15 +8,27 @@ number of threads.
 
 from collections.abc import Callable
 from functools import update_wrapper
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tsfusion.kernels import taichi as ti
 
 
+class Copied(NamedTuple):
+    """A NumPy array that a device has at an address: a kernel that only reads it is handed the copy there.
+
+    Its first launch, which is Taichi's own, copies the array itself.
+    """
+
+    array: NDArray[Any]
+    address: int
+
+
 class QuickLaunch:
-    """A kernel over contiguous NumPy arrays and numbers, launched as Taichi does once it knows their types.
+    """A kernel over arrays of NumPy (contiguous) and of Taichi and numbers, launched as Taichi does once it
+    knows their types.
 
     The first launch for each choice of dtypes and dimensions is Taichi's own, and so is every launch with
     other arguments, and with another version of Taichi.
@@ -45,6 +57,13 @@ class QuickLaunch:
                 context.set_arg_external_array_with_shape(
                     (place,), address, argument.nbytes, argument.shape, 0
                 )
+            elif isinstance(argument, ti.Ndarray):
+                context.set_arg_ndarray((place,), argument.arr)
+            elif isinstance(argument, Copied):
+                array = argument.array
+                context.set_arg_external_array_with_shape(
+                    (place,), argument.address, array.nbytes, array.shape, 0
+                )
             elif self._takes_floats[place]:
                 context.set_arg_float((place,), float(argument))
             else:
@@ -53,6 +72,7 @@ class QuickLaunch:
 
     def _begin(self, arguments: tuple[Any, ...], kind: tuple[int, ...] | None) -> None:
         """Launch the kernel as Taichi does, and keep what it has found out."""
+        arguments = tuple(one.array if isinstance(one, Copied) else one for one in arguments)
         self._kernel(*arguments)
         if kind is None:
             return
@@ -74,8 +94,11 @@ class QuickLaunch:
 def _kind(arguments: tuple[Any, ...]) -> tuple[int, ...] | None:
     """Types that a launch depends on, as numbers; None where Taichi is to look for itself."""
     kind = []
-    for argument in arguments:
-        if isinstance(argument, np.ndarray):
+    for given in arguments:
+        argument = given.array if isinstance(given, Copied) else given
+        if isinstance(argument, ti.Ndarray):
+            kind.append(-8 - (id(argument.dtype) << 4 | len(argument.shape)))
+        elif isinstance(argument, np.ndarray):
             if not (argument.flags.c_contiguous and argument.dtype.isnative):  # `num` says nothing of bytes
                 return None
             kind.append(argument.dtype.num << 4 | argument.ndim)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.config import Arch
-from tsfusion.tsdf.device_link import DeviceLink, link_to, refuse
+from tsfusion.tsdf.device_link import DeviceLink, Step, link_to, refuse
 
 log = logging.getLogger(__name__)
 
@@ -27,7 +27,9 @@ class DeviceBlocks:
         self._behind = np.zeros(0, bool)  # by slot: the store's row is behind the device's
         self._is_behind = False
         self._hash_size = 0  # of the device's copy
+        self.is_patient = False  # whether `insert` waits for the next call, which is then one instead of two
         self._unsent: list[NDArray[Any]] = []
+        self._first: list[Step] = []  # what goes with the next call
         weakref.finalize(self, link.forget_later, self._number)
 
     @property
@@ -36,7 +38,8 @@ class DeviceBlocks:
 
     def call(self, verb: str, *arguments: Any) -> Any:
         """Call a method of the `DeviceMap`."""
-        return self._link.call(self._number, verb, *arguments)
+        first, self._first = self._first, []
+        return self._link.call(self._number, verb, *arguments, first=first)
 
     def insert(
         self,
@@ -49,12 +52,17 @@ class DeviceBlocks:
         size of it.
 
         Raises:
-            MemoryError: there is no room for them; the device has those that it had.
+            MemoryError: there is no room for them; the device has those that it had. Where `is_patient`, the
+                next call raises it.
         """
         if len(hash_keys) != self._hash_size:
             places = np.flatnonzero(hash_keys).astype(np.int32)
-        self.call("insert", count, len(hash_keys), places, hash_keys[places], hash_slots[places])
+        arguments = count, len(hash_keys), places, hash_keys[places], hash_slots[places]
         self._hash_size = len(hash_keys)
+        if self.is_patient:
+            self._first.append(("insert", arguments))
+        else:
+            self.call("insert", *arguments)
 
     def drop(self, count: int, hash_keys: NDArray[np.int64], hash_slots: NDArray[np.int32]) -> None:
         """Let the device have `count` blocks, as the hash has them, and no others."""

@@ -8,19 +8,21 @@ from numpy.typing import NDArray
 
 from tsfusion.core.config import VolumeConfig
 from tsfusion.kernels.integrate import ALL, TOUCHED_MISSING
+from tsfusion.kernels.sensor_noise import WEIGHT_ONE
 from tsfusion.tsdf.block_store import BlockStore, pack_keys
 from tsfusion.tsdf.device_blocks import DeviceBlocks
-from tsfusion.tsdf.integrator import NO_LIMIT, Integrator, Part
+from tsfusion.tsdf.integrator import NO_LIMIT, PART_WEIGHT, Integrator, Part
 from tsfusion.tsdf.ray_buffers import RayBuffers
 
 
 class DeviceRayBuffers(RayBuffers):
     """The rays stay on the device; here are their bands, and what a launch says about blocks."""
 
-    def __init__(self, device: DeviceBlocks, *, color: bool) -> None:
+    def __init__(self, *, color: bool) -> None:
         super().__init__(color=color, regularised=False)
-        self._device = device
         self._missing_keys = np.empty(0, np.int64)
+        self.asked: tuple[Any, ...] = ()  # for which rays: a kernel's name and its arguments
+        self.is_light = False  # whether no lane can overflow that has reserve for a part
 
     def note_touched(self, found: NDArray[np.int32]) -> None:
         """Take over the touched blocks, behind their header."""
@@ -48,13 +50,21 @@ class DeviceRayBuffers(RayBuffers):
         self._missing_keys = np.empty(0, np.int64)
         self.touched[TOUCHED_MISSING] = 0
 
-    def _rays_of_points(self, *arguments: Any) -> None:
-        (bands,) = self._device.call("rays_of_points", *arguments)
-        self.bands = bands.copy()
+    @staticmethod
+    def as_read(image: NDArray[Any]) -> NDArray[Any]:
+        return np.ascontiguousarray(image)  # half of the bytes, where it is uint16
 
-    def _rays_of_image(self, *arguments: Any) -> None:
-        (bands,) = self._device.call("rays_of_image", *arguments)
-        self.bands = bands.copy()
+    def _rays_of_points(self, points: NDArray[Any], *rest: Any) -> None:
+        self._ask("rays_from_points", points, *rest)
+
+    def _rays_of_image(self, image: NDArray[Any], *rest: Any) -> None:
+        self._ask("rays_from_image", image, *rest)
+
+    def _ask(self, kind: str, measured: NDArray[Any], *rest: Any) -> None:
+        """Note which rays are to be made: that and what is to be done with them is one call."""
+        self.asked = kind, measured, *rest
+        samples = len(measured) if kind == "rays_from_points" else measured.size
+        self.is_light = samples * WEIGHT_ONE < PART_WEIGHT
 
 
 class DeviceIntegrator(Integrator):
@@ -67,18 +77,42 @@ class DeviceIntegrator(Integrator):
     ) -> None:
         super().__init__(store, buffers, config)
         self._device = device
+        self._ahead: list[NDArray[np.int32]] | None = None  # what the first launch found, when it was made
 
-    def _begin(self) -> None:
-        super()._begin()
-        self._store.send()
-        self._device.call("begin")
+    def _begin(self, sign: int) -> None:
+        """Make the rays, and add them in the same call: nearly always all of them are one part."""
+        super()._begin(sign)
+        store, buffers = self._store, self._buffers
+        store.send()
+        kind, *arguments = buffers.asked
+        job = (ALL, 0, len(buffers.bands), sign, 0, store.stamp, int(buffers.colored))
+        self._ahead = None
+        found = self._device.call("make_rays", kind, job if buffers.is_light else None, *arguments)
+        buffers.bands = found[0].copy()
+        if buffers.is_light:
+            self._ahead = [one.copy() for one in found]
+
+    def _take_back(self, added: list[Part], sign: int, before: int) -> None:
+        if self._ahead is not None:  # refused before it was looked at
+            self._ahead, added = None, [(0, len(self._buffers.bands))]
+        super()._take_back(added, sign, before)
+
+    def _insert(self, keys: NDArray[np.int64]) -> None:
+        self._device.is_patient = True
+        try:
+            super()._insert(keys)
+        finally:
+            self._device.is_patient = False
 
     def _launch(
         self, part: Part, sign: int, *, which: int = ALL, oldest: int = 0, most_missing: int = NO_LIMIT
     ) -> None:
         store, buffers = self._store, self._buffers
-        job = which, *part, sign, oldest, store.stamp, int(buffers.colored)
-        buffers.bands, touched, missing = (one.copy() for one in self._device.call("add", job))
+        found, self._ahead = self._ahead, None
+        if found is None:
+            job = which, *part, sign, oldest, store.stamp, int(buffers.colored)
+            found = [one.copy() for one in self._device.call("add", job)]
+        buffers.bands, touched, missing = found
         buffers.note_touched(touched)
         buffers.note_missing(missing)
         store.note_touched(buffers.touched_slots)

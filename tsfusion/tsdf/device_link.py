@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 import threading
+from collections.abc import Sequence
 from contextlib import suppress
 from multiprocessing.connection import Connection
 from typing import Any
@@ -16,13 +17,16 @@ from numpy.typing import NDArray
 
 from tsfusion.core import process
 from tsfusion.core.config import Arch
-from tsfusion.core.shared_arrays import Place, SharedArrays, make_file
+from tsfusion.core.shared_arrays import Place, SharedArrays, look_out, make_file
 
 log = logging.getLogger(__name__)
+
+Step = tuple[str, tuple[Any, ...]]  # a method and its arguments
 
 _COMMAND = (sys.executable, "-m", "tsfusion.tsdf.device_process")
 _START_S = 120.0  # a device's first start compiles its driver's own kernels, too
 _END_S = 3.0
+_ANSWER_S = 0.002  # in which a GPU answers
 
 
 class DeviceLost(RuntimeError):
@@ -83,8 +87,14 @@ class DeviceLink:
         """Let a map go before the next call: this may be called at any time, also during one."""
         self._forgotten.append(number)
 
-    def call(self, number: int, verb: str, *arguments: Any) -> Any:
+    def call(self, number: int, verb: str, *arguments: Any, first: Sequence[Step] = ()) -> Any:
         """Call a method of a map (`DeviceMap`); arrays in the result are valid until the next call.
+
+        Args:
+            number: of the map.
+            verb: name of the method.
+            arguments: of the method; arrays are copied.
+            first: methods that are called before, and their arguments; if one fails, the others are not.
 
         Raises:
             MemoryError: the device has no memory for more; the map is as it was.
@@ -92,25 +102,30 @@ class DeviceLink:
         """
         with process.uninterrupted():  # an answer that nobody took would be the next call's
             while self._forgotten:
-                self._ask(self._forgotten.pop(), "forget", ())
-            return self._ask(number, verb, arguments)
+                self._ask(self._forgotten.pop(), [("forget", ())])
+            return self._ask(number, [*first, (verb, arguments)])
 
-    def _ask(self, number: int, verb: str, arguments: tuple[Any, ...]) -> Any:
+    def _ask(self, number: int, steps: list[Step]) -> Any:
         if self._has_ended:
             raise DeviceLost(f"the process with the device {self.arch} has ended")
         self._requests.begin()
-        packed = [self._requests.write([one])[0] if isinstance(one, np.ndarray) else one for one in arguments]
+        packed = [(verb, [self._packed(one) for one in arguments]) for verb, arguments in steps]
         try:
-            self._link.send((number, verb, packed))
+            self._link.send((number, packed))
         except OSError as error:
             self.close()
             raise DeviceLost(f"the process with the device {self.arch} has ended") from error
         return self._receive(None)
 
+    def _packed(self, argument: Any) -> Any:
+        return self._requests.write([argument])[0] if isinstance(argument, np.ndarray) else argument
+
     def _receive(self, timeout: float | None) -> Any:
         how: str = "failed"
         found: Any = "its process has ended"
         with suppress(EOFError, OSError):
+            if timeout is None:
+                look_out(self._link.fileno(), _ANSWER_S)
             how, found = self._link.recv() if self._link.poll(timeout) else (how, "it does not start")
         if how == "memory":
             raise MemoryError(f"the device {self.arch} has no memory for more of the map ({found})")

@@ -12,15 +12,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.kernels import device_integration as kernels
-from tsfusion.kernels import integrate, rays_from_images, rays_from_points
+from tsfusion.kernels import device_rays, integrate, rays_from_images
 from tsfusion.kernels import taichi as ti
-from tsfusion.kernels.integrate import CUBE, TOUCHED_COUNT, TOUCHED_HEADER
-from tsfusion.kernels.voxel_traversal import BAND_FIELDS, COST, RAY_FIELDS, START
+from tsfusion.kernels.device_copies import Copies
+from tsfusion.kernels.integrate import (
+    CUBE,
+    TOUCHED_COUNT,
+    TOUCHED_HEADER,
+    TOUCHED_MISSING,
+    TOUCHED_OVERFLOW,
+)
+from tsfusion.kernels.voxel_traversal import BAND_FIELDS, COST, RAY_FIELDS
 from tsfusion.tsdf.checkpoint import LAYER_DTYPES
 
-POINT_BANDS = 64  # of points, at whose ends bundles end: those of a map on the CPU
+BANDS = 64  # those of a map on the CPU: at their ends bundles of points end
 _FIRST_BLOCKS = 1024
 _LISTED = 1 << 22  # updates, 16 bytes each, that a launch lists
+_FEW_TOUCHED, _FEW_MISSING = 4096, 1024  # blocks whose numbers are read at once
 _DTYPES = {"sums": ti.i64, "color_rgn": ti.i64, "color_b": ti.i32}
 
 
@@ -39,69 +47,119 @@ class Job(NamedTuple):
 class DeviceMap:
     """The blocks of one map, as numbered by its `BlockStore`, and the rays of its current keyframe."""
 
-    def __init__(self, layers: tuple[str, ...]) -> None:
+    def __init__(self, layers: tuple[str, ...], copies: Copies) -> None:
         self._layer_names = layers
+        self._copies = copies
         self._count = 0
         self._layers = {name: _zeros(dtype, 1, CUBE) for name, dtype in _DTYPES.items()}
         self._stamps = _zeros(ti.i32, 1)
         self._hash_keys, self._hash_slots = _zeros(ti.i64, 4), _zeros(ti.i32, 4)
         self._touched = _zeros(ti.i32, TOUCHED_HEADER)
-        self._winners, self._missing = _zeros(ti.i32, kernels.WINNERS), _zeros(ti.i32, 1, 3)
-        self._rays, self._bands = _zeros(ti.i32, 1, RAY_FIELDS), _zeros(ti.i32, 1, BAND_FIELDS)
+        self._winners, self._missing = _zeros(ti.i32, kernels.WINNERS), _zeros(ti.i32, 3)
+        self._rays, self._bands = _zeros(ti.i32, 1, RAY_FIELDS), _zeros(ti.i32, BANDS, BAND_FIELDS)
+        self._depths, self._tiles = _zeros(ti.i32, 1), _zeros(ti.i32, 1, device_rays.TILE_FIELDS)
         self._deferred = _zeros(ti.i32, 1)
-        self._begins, self._costs = [0, 0], np.zeros(2, np.int64)  # of bands: first rays, Σ what they cost
-        self._list_counts = _zeros(ti.i32, kernels.COUNTS)
+        self._begins = np.zeros(BANDS + 1, np.int64)  # first places of bands, and the last one's end
+        self._list_counts = _zeros(ti.i64, kernels.COUNTS)
         self._color_votes = _zeros(ti.i32, 1, kernels.VOTE_FIELDS)
         self._listed = _zeros(ti.i32, 1, kernels.LISTED_FIELDS)
         self._reserve(_FIRST_BLOCKS)
+        self._reserve_list(_LISTED)
 
-    def rays_of_image(self, image: NDArray[Any], *rest: Any) -> NDArray[np.int32]:
-        """Make a keyframe's rays, as `rays_from_images.rays_from_image` of these arguments, a band a tile;
-        returns the bands."""
-        places = rays_from_images.most_rays(*image.shape)
-        self._reserve_rays(places, rays_from_images.tiles_of(*image.shape))
-        rays_from_images.rays_from_image(image, *rest, self._rays, self._bands)
-        return self._note_bands(places)
+    def make_rays(
+        self, kind: str, job: tuple[int, ...] | None, *arguments: Any
+    ) -> tuple[NDArray[np.int32], ...]:
+        """Make a keyframe's rays, as the kernel of this name in `kernels.device_rays` of these arguments, and
+        add them, if there is a job; returns what `add` does, or the bands alone."""
+        rooms = self._room_for_image if kind == "rays_from_image" else self._room_for_points
+        scratch = rooms(*arguments[0].shape)
+        arrays = [i for i, one in enumerate(arguments) if isinstance(one, np.ndarray)]
+        handed = list(arguments)
+        for i, one in zip(arrays, self._copies.given(*(arguments[i] for i in arrays)), strict=True):
+            handed[i] = one
+        getattr(device_rays, kind)(*handed, *scratch, self._rays, self._bands)
+        if job is not None:
+            return self.add(job, begins=True)
+        return tuple(self._copies.read((self._bands, BANDS)))
 
-    def rays_of_points(self, points: NDArray[np.float32], *rest: Any) -> NDArray[np.int32]:
-        """Likewise as `rays_from_points.rays_from_points`."""
-        self._reserve_rays(len(points), POINT_BANDS)
-        rays_from_points.rays_from_points(points, *rest, self._rays, self._bands)
-        return self._note_bands(len(points))
+    def _room_for_image(self, height: int, width: int) -> tuple[Any, Any]:
+        """Make room for an image's rays; returns the scratch arrays of its kernel."""
+        tiles = rays_from_images.tiles_of(height, width)
+        self._share_places(tiles, rays_from_images.TILE_SAMPLES)
+        self._depths = _at_least(self._depths, ti.i32, rays_from_images.most_rays(height, width))
+        self._tiles = _at_least(self._tiles, ti.i32, tiles, device_rays.TILE_FIELDS)
+        return self._depths, self._tiles
 
-    def begin(self) -> None:
-        """Empty the list of touched blocks."""
-        kernels.write_list(np.zeros(TOUCHED_HEADER, np.int32), self._touched)
+    def _room_for_points(self, count: int, _: int) -> tuple[Any]:
+        """Likewise for points."""
+        self._share_places(count, 1)
+        self._depths = _at_least(self._depths, ti.i32, count)
+        return (self._depths,)
 
-    def add(self, given: tuple[int, ...]) -> tuple[NDArray[np.int32], ...]:
+    def _share_places(self, units: int, places: int) -> None:
+        """Share out units of work to the bands, each of so many places for rays."""
+        self._begins = np.arange(BANDS + 1, dtype=np.int64) * units // BANDS * places
+        self._rays = _at_least(self._rays, ti.i32, units * places, RAY_FIELDS)
+        self._deferred = _at_least(self._deferred, ti.i32, units * places)
+
+    def add(self, given: tuple[int, ...], *, begins: bool = False) -> tuple[NDArray[np.int32], ...]:
         """Add rays to the map's blocks; returns the bands, the touched blocks behind their header, and (n, 3)
-        coordinates of missing blocks, of which some may be there twice."""
-        found = []
-        job, at = Job(*given), self._layers
-        for first, end in self._runs(job.first_band, job.end_band):
-            first_ray, end_ray = self._begins[first], self._begins[end]
-            self._color_votes = _at_least(self._color_votes, ti.i32, end_ray - first_ray, kernels.VOTE_FIELDS)
-            kernels.add_rays(
-                self._rays, self._bands, self._deferred, first_ray, end_ray, job.which, first, end,
-                *job[3:], self._hash_keys, self._hash_slots, self._winners, self._missing, self._stamps,
-                self._touched, self._list_counts, self._listed, self._color_votes, at["sums"],
-                at["color_rgn"], at["color_b"],
-            )  # fmt: skip
-            if job.which == integrate.ALL:
-                found.append(self._read_missing())
-        missing = np.concatenate(found) if found else np.empty((0, 3), np.int32)
-        return self._read_bands(), self._read_touched(), missing
+        coordinates of missing blocks, of which some may be there twice.
 
-    def _runs(self, first: int, end: int) -> Iterator[tuple[int, int]]:
+        Args:
+            given: a `Job`.
+            begins: whether they are the first of their keyframe, so that no block is touched before.
+        """
+        job = Job(*given)
+        self._launch(job, job.first_band, job.end_band, begins)
+        bands, touched, missing = self._read_results(_FEW_TOUCHED, _FEW_MISSING)
+        if not touched[TOUCHED_OVERFLOW]:
+            return bands, touched, missing
+        found = []
+        for first, end in self._runs(bands, job.first_band, job.end_band):
+            self._launch(job, first, end, begins and first == job.first_band)
+            found.append(self._read_results(0, _FEW_MISSING)[2].copy())
+        bands, touched, _ = self._read_results(_FEW_TOUCHED, 0)
+        return bands, touched, np.concatenate(found)
+
+    def _launch(self, job: Job, first: int, end: int, begins: bool) -> None:
+        at, first_ray, end_ray = self._layers, int(self._begins[first]), int(self._begins[end])
+        self._color_votes = _at_least(self._color_votes, ti.i32, end_ray - first_ray, kernels.VOTE_FIELDS)
+        kernels.add_rays(
+            self._rays, self._bands, self._deferred, first_ray, end_ray, job.which, first, end, *job[3:],
+            int(begins), self._hash_keys, self._hash_slots, self._winners, self._missing, self._stamps,
+            self._touched, self._list_counts, self._listed, self._color_votes, at["sums"], at["color_rgn"],
+            at["color_b"],
+        )  # fmt: skip
+
+    def _read_results(self, few_touched: int, few_missing: int) -> tuple[NDArray[np.int32], ...]:
+        """Bands, touched blocks behind their header, and coordinates of missing blocks: as many of the latter
+        two as there are, or more than a few of them are expected."""
+        end = TOUCHED_HEADER + min(few_touched, self._stamps.shape[0])
+        bands, touched, missing = self._copies.read(
+            (self._bands, BANDS * BAND_FIELDS), (self._touched, end), (self._missing, 3 * few_missing)
+        )
+        touched_end, found = TOUCHED_HEADER + int(touched[TOUCHED_COUNT]), int(touched[TOUCHED_MISSING])
+        if touched_end > end or found > few_missing:
+            bands, touched, missing = self._copies.read(
+                (self._bands, BANDS * BAND_FIELDS), (self._touched, touched_end), (self._missing, 3 * found)
+            )
+        return bands.reshape(BANDS, BAND_FIELDS), touched[:touched_end], missing[: 3 * found].reshape(-1, 3)
+
+    def _runs(self, bands: NDArray[np.int32], first: int, end: int) -> Iterator[tuple[int, int]]:
         """Runs of the bands whose updates fit into the list; it grows for a band that does not."""
+        # what a ray costs is no less than the voxels and blocks that it crosses
+        costs = np.concatenate([[0], np.cumsum(2 * bands[:, COST].astype(np.int64))])
         while first < end:
-            fits = int(np.searchsorted(self._costs, self._costs[first] + _LISTED, side="right")) - 1
+            fits = int(np.searchsorted(costs, costs[first] + _LISTED, side="right")) - 1
             last = min(max(fits, first + 1), end)
-            most = int(self._costs[last] - self._costs[first])
-            self._listed = _at_least(self._listed, ti.i32, most, kernels.LISTED_FIELDS)
-            self._missing = _at_least(self._missing, ti.i32, most, 3)
+            self._reserve_list(int(costs[last] - costs[first]))
             yield first, last
             first = last
+
+    def _reserve_list(self, updates: int) -> None:
+        self._listed = _at_least(self._listed, ti.i32, updates, kernels.LISTED_FIELDS)
+        self._missing = _at_least(self._missing, ti.i32, 3 * updates)
 
     def insert(
         self,
@@ -118,7 +176,8 @@ class DeviceMap:
         if self._hash_keys.shape[0] != size:
             self._hash_keys, self._hash_slots = _zeros(ti.i64, size), _zeros(ti.i32, size)
         if len(places):
-            kernels.write_hash(places, keys, slots, self._hash_keys, self._hash_slots)
+            handed = self._copies.given(places, keys, slots)
+            kernels.write_hash(*handed, self._hash_keys, self._hash_slots)
 
     def drop(self, count: int) -> None:
         """Have `count` blocks, and none of them in the hash; voxels of slots beyond become zero."""
@@ -135,7 +194,8 @@ class DeviceMap:
         bounds = _zeros(ti.i32, max(self._count, 1))
         integrate.largest_weights(self._layers["sums"], self._touched, bounds)
         found: NDArray[np.int32] = bounds.to_numpy()
-        return found[self._read_touched()[TOUCHED_HEADER:]]
+        _, touched, _ = self._read_results(_FEW_TOUCHED, 0)
+        return found[touched[TOUCHED_HEADER:]]
 
     def read(self, name: str, slots: NDArray[np.int32], rows: NDArray[Any]) -> None:
         """Copy blocks' rows of a layer."""
@@ -162,42 +222,6 @@ class DeviceMap:
                 kernels.move_rows(self._layers[name], self._count, larger)
             self._stamps, self._touched = stamps, touched
             self._layers |= layers
-
-    def _reserve_rays(self, count: int, bands: int) -> None:
-        self._rays = _at_least(self._rays, ti.i32, count, RAY_FIELDS)
-        self._deferred = _at_least(self._deferred, ti.i32, count)
-        if self._bands.shape[0] != bands:
-            self._bands = _zeros(ti.i32, bands, BAND_FIELDS)
-
-    def _note_bands(self, places: int) -> NDArray[np.int32]:
-        bands = self._read_bands()
-        self._begins = [*bands[:, START].tolist(), places]
-        # what a ray costs is no less than the voxels and blocks that it crosses
-        self._costs = np.concatenate([[0], np.cumsum(2 * bands[:, COST].astype(np.int64))])
-        return bands
-
-    def _read_bands(self) -> NDArray[np.int32]:
-        found: NDArray[np.int32] = self._bands.to_numpy()
-        return found
-
-    def _read_header(self) -> NDArray[np.int32]:
-        header = np.empty(TOUCHED_HEADER, np.int32)
-        kernels.read_list(self._touched, TOUCHED_HEADER, header)
-        return header
-
-    def _read_missing(self) -> NDArray[np.int32]:
-        counts = np.empty(kernels.COUNTS, np.int32)
-        kernels.read_list(self._list_counts, kernels.COUNTS, counts)
-        found = np.empty((int(counts[kernels.FOUND]), 3), np.int32)
-        if len(found):
-            kernels.read_table(self._missing, found)
-        return found
-
-    def _read_touched(self) -> NDArray[np.int32]:
-        end = TOUCHED_HEADER + int(self._read_header()[TOUCHED_COUNT])
-        found = np.empty(end, np.int32)
-        kernels.read_list(self._touched, end, found)
-        return found
 
 
 def _zeros(dtype: Any, *shape: int) -> Any:

@@ -14,14 +14,15 @@ import numpy as np
 
 from tsfusion.core import process
 from tsfusion.core.errors import MissingDependency
-from tsfusion.core.shared_arrays import Place, SharedArrays
-from tsfusion.kernels import runtime
+from tsfusion.core.shared_arrays import Place, SharedArrays, look_out
+from tsfusion.kernels import device_copies, runtime
 from tsfusion.kernels.integrate import CUBE
 from tsfusion.tsdf.checkpoint import LAYER_DTYPES
 
 if TYPE_CHECKING:
     from tsfusion.tsdf.device_map import DeviceMap
 
+NEXT_S = 0.0005  # in which a keyframe's second call comes
 GROWS = ("make", "insert")  # what may fail for lack of memory, and then changes nothing
 
 
@@ -30,20 +31,32 @@ class _Device:
 
     def __init__(self, link: "Connection[Any, Any]", requests: SharedArrays, replies: SharedArrays) -> None:
         self._link, self._requests, self._replies = link, requests, replies
+        self._copies = device_copies.copies()
+        self._pinned = 0  # address of the requests' memory
         self._maps: dict[int, DeviceMap] = {}
 
     def run(self) -> None:
         """Answer until the other end is closed."""
         try:
             while True:
-                number, verb, arguments = self._link.recv()
-                self._link.send(self._answer(number, verb, arguments))
+                look_out(self._link.fileno(), NEXT_S)
+                number, steps = self._link.recv()
+                answer: tuple[str, Any] = "done", None
+                for verb, arguments in steps:
+                    answer = self._answer(number, verb, arguments)
+                    if answer[0] != "done":
+                        break
+                self._link.send(answer)
         except (EOFError, OSError):
             pass
 
     def _answer(self, number: int, verb: str, arguments: tuple[Any, ...]) -> tuple[str, Any]:
         self._replies.begin()
         given = [self._requests.read(one) if isinstance(one, Place) else one for one in arguments]
+        memory = self._requests.memory
+        if len(memory) and memory.ctypes.data != self._pinned:
+            self._pinned = memory.ctypes.data
+            self._copies.pin(memory)
         try:
             return "done", self._do(number, verb, given)
         except (RuntimeError, MemoryError) as error:
@@ -53,7 +66,7 @@ class _Device:
         if verb == "make":
             from tsfusion.tsdf.device_map import DeviceMap
 
-            self._maps[number] = DeviceMap(*given)
+            self._maps[number] = DeviceMap(given[0], self._copies)
             return None
         if verb == "forget":
             self._maps.pop(number, None)

@@ -28,7 +28,7 @@ def agrees(link: DeviceLink) -> bool:
     expected = _fused(on_cpu, buffers, Integrator(on_cpu, buffers, _CONFIG))
     device = DeviceBlocks(link, _LAYERS)
     on_device = _store(device)
-    rays = DeviceRayBuffers(device, color=True)
+    rays = DeviceRayBuffers(color=True)
     found = _fused(on_device, rays, DeviceIntegrator(on_device, device, rays, _CONFIG))
     return all((here == there).all() for here, there in zip(found, expected, strict=True))
 

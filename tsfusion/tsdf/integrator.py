@@ -10,6 +10,7 @@ from collections.abc import Iterator
 
 import numpy as np
 from msgspec import Struct
+from numpy.typing import NDArray
 
 from tsfusion.core.config import VolumeConfig
 from tsfusion.core.errors import KeyframeTooLarge, MapError, MapFull, MapQuota, WeightOverflow
@@ -74,14 +75,14 @@ class Integrator:
                 it was.
         """
         self._room = self._affordable = NO_LIMIT
-        if quota is not None and sign > 0:
-            self._affordable = (quota.cost - self._check_cost(quota.cost)) // _BLOCK_COST
-            self._room = quota.blocks
         before = self._admitted = self._store.count
-        self._begin()
+        self._begin(sign)
         added: list[Part] = []
         updates = 0
         try:
+            if quota is not None and sign > 0:
+                self._affordable = (quota.cost - self._check_cost(quota.cost)) // _BLOCK_COST
+                self._room = quota.blocks
             for part in self._parts():
                 self._add(part, sign)  # Σ w·m and Σ w: paper eq. 2
                 added.append(part)
@@ -107,8 +108,8 @@ class Integrator:
         if self._store.count > before:
             self._store.drop(before)
 
-    def _begin(self) -> None:
-        """Empty the list of touched blocks."""
+    def _begin(self, sign: int) -> None:
+        """Empty the list of touched blocks; `sign` is that of what follows."""
         self._store.stamp += 1
         self._buffers.touched[:TOUCHED_HEADER] = 0
         self._buffers.reserve_touched(self._store.count)
@@ -158,11 +159,15 @@ class Integrator:
         keys = buffers.take_missing()
         oldest = store.count
         buffers.reserve_touched(oldest + len(keys))
-        store.insert(keys)
+        self._insert(keys)
         self._launch(part, +1, which=ONLY_DEFERRED, oldest=oldest)
         self._admitted = store.count
         self._room -= len(keys)
         self._affordable -= len(keys)
+
+    def _insert(self, keys: NDArray[np.int64]) -> None:
+        """Have blocks of these keys before something is added to them."""
+        self._store.insert(keys)
 
     def _check_cost(self, most: int) -> int:
         """Cost of the rays; a keyframe that takes more time than one of any real sensor is refused."""

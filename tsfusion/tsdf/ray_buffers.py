@@ -86,8 +86,8 @@ class RayBuffers:
         before = np.cumsum(cost) - cost // 2
         self.bands[:, UNIT] = np.minimum(before * units // int(cost.sum()), units - 1)
 
-    def make_rays(self, keyframe: Keyframe, config: VolumeConfig) -> int:
-        """Fill `rays`; returns the number of samples that went into them."""
+    def make_rays(self, keyframe: Keyframe, config: VolumeConfig) -> None:
+        """Fill `rays`."""
         voxel_size, bundle = config.voxel_size, int(config.bundle)
         parameters = model_parameters(
             config.model(keyframe.sensor), voxel_size, keyframe.baseline_fx,
@@ -109,14 +109,22 @@ class RayBuffers:
             height = keyframe.shape[0]
             color = keyframe.color if self.colored else None
             self._rays_of_image(
-                # The kernel reads float32; of two types it would be compiled twice, a second at each start.
-                keyframe.measurement.astype(np.float32, copy=False),
+                self.as_read(keyframe.measurement),
                 int(keyframe.kind == "disparity"), _depth_scale(keyframe),
                 *_optional(None if color is None else color.reshape(height, -1), 2),
                 *_optional(keyframe.confidence, 2),
                 _camera(keyframe, voxel_size), parameters, bundle,
             )  # fmt: skip
+
+    @property
+    def samples(self) -> int:
+        """Number of samples that went into the rays."""
         return int(self.bands[:, SAMPLES].sum())
+
+    @staticmethod
+    def as_read(image: NDArray[Any]) -> NDArray[Any]:
+        """An image as the kernel reads it, which for two types would be compiled twice, a second a start."""
+        return image.astype(np.float32, copy=False)
 
     def _rays_of_points(self, points: Any, *rest: Any) -> None:
         """Run `rays_from_points`, which takes these arguments and then the buffers."""

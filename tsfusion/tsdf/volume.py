@@ -447,12 +447,13 @@ class Volume(AskableMap):
         if sign < 0 and self.keyframes == 0:
             raise MapError("cannot retract a keyframe from a map that holds none")
         blocks_before = self._store.count
-        samples = self._ray_buffers.make_rays(keyframe, self.config)  # paper eq. 1
+        self._ray_buffers.make_rays(keyframe, self.config)  # paper eq. 1
         if sign > 0:  # one that is moved is there twice until it is retracted: no time to ask
             self._store.pause()
         self._has_retracted |= sign < 0
         with process.uninterrupted():
             updates = self._integrator.apply(sign, self.quota)  # paper eq. 2 and 3
+            samples = self._ray_buffers.samples
             if samples:
                 self.keyframes += sign
                 self._note_held(keyframe, sign)
@@ -478,7 +479,7 @@ def _writers(
     if device is None:
         buffers = RayBuffers(color=config.color, regularised=store.corrected)
         return buffers, Integrator(store, buffers, config)
-    on_device = DeviceRayBuffers(device, color=config.color)
+    on_device = DeviceRayBuffers(color=config.color)
     return on_device, DeviceIntegrator(store, device, on_device, config)
 
 
