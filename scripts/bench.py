@@ -13,7 +13,7 @@ of weight 2 on. `1thread` is one thread on one pinned core. Machines differ and 
 who is faster. `field` meshes the default surface, `off` the raw one; `remesh` is the mesh of what a keyframe
 changed; `floor` the least time that memory traffic takes.
 With `--arch` the same keyframes go in turn to a map on that device; `ratio` has its wall time against the
-CPU's, and `device` says whether both maps are the same.
+CPU's; `device` says whether both maps are the same, and how many keyframes a second each takes by itself.
 Recorded cases need TSFUSION_DATA (default ../shared/data) and are left out, with a word, where it is missing.
 """
 
@@ -192,7 +192,7 @@ def run_case(case: Case, threads: int, keyframes: int, arch: str) -> dict[str, A
     """Measure one case in this process, with Open3D in turn where it can do the same."""
     threads = case.threads or threads
     os.environ["OMP_NUM_THREADS"] = str(threads)
-    if threads == 1:
+    if threads == 1 and arch == "cpu":  # the process that has the device would be on the same core
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     source = Source(case.source, keyframes)
     peer = None
@@ -261,8 +261,19 @@ def run(case: Case, source: Source, threads: int, peer: Open3D | None, arch: str
         row["open3d"] = {"keyframe": figures(spent[2])}
     if device is not None:
         same = device.map_hash() == row["map_hash"]
-        row["device"] = {"arch": device.arch, "keyframe": figures(spent[-1]), "same_map": same}
+        rates = {one: keyframes_per_s(Volume(**settings, arch=one), source.fused) for one in ("cpu", arch)}
+        row["device"] = {
+            "arch": device.arch, "keyframe": figures(spent[-1]), "same_map": same, "keyframes_per_s": rates
+        }  # fmt: skip
     return row
+
+
+def keyframes_per_s(volume: Any, keyframes: list[Any]) -> float:
+    """How many keyframes an empty map takes a second, one after the other and nothing else between."""
+    began = time.perf_counter()
+    for keyframe in keyframes:
+        volume.integrate(keyframe)
+    return round(len(keyframes) / (time.perf_counter() - began), 1)
 
 
 def elsewhere(keyframe: Any, metres: float) -> Any:

@@ -120,10 +120,10 @@ def test_rays_from_images_equal_the_twin(kind: str, bundled: bool) -> None:
     parameters = model_parameters(SENSORS["stereo"], voxel_size, keyframe.baseline_fx)
     buffers = RayBuffers(color=False, regularised=False)
     config = VolumeConfig(sensor="stereo", voxel_size=voxel_size, bundle=bundled)
-    samples = buffers.make_rays(keyframe, config)
+    buffers.make_rays(keyframe, config)
     expected, used = expected_rays(keyframe, parameters, voxel_size, bundled, filtered=True)
     assert 0 < used < np.count_nonzero(depth_of(keyframe, parameters))  # some lone pixels are dropped
-    assert samples == used
+    assert buffers.samples == used
     close(rays_of(buffers), expected)
 
 
@@ -187,7 +187,7 @@ def test_rays_from_points_equal_the_twin(own_origins: bool, bundled: bool) -> No
     voxel_size, model = 0.2, SENSORS["scanner"]
     buffers = RayBuffers(color=False, regularised=False)
     config = VolumeConfig(sensor="scanner", voxel_size=voxel_size, bundle=bundled)
-    samples = buffers.make_rays(keyframe, config)
+    buffers.make_rays(keyframe, config)
     parameters = model_parameters(model, voxel_size, None)
     starts = np.zeros((700, 3)) if origins is None else origins.astype(np.float64)
     expected = []
@@ -200,5 +200,5 @@ def test_rays_from_points_equal_the_twin(own_origins: bool, bundled: bool) -> No
             weight, half = kernel_twins.sample(parameters, float(np.linalg.norm(end - start)), 255 * len(run))
             end = kernel_twins.fixed((end + pose[:3, 3]) / voxel_size)
             expected.append(kernel_twins.make_ray(end, p[run].mean(axis=0) - start, half, weight))
-    assert samples == 699
+    assert buffers.samples == 699
     close(rays_of(buffers), expected)

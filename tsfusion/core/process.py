@@ -145,13 +145,17 @@ def oom_kills() -> int:
     return 0
 
 
+_holds_back = False  # the main thread is within `uninterrupted`
+
+
 @contextmanager
 def uninterrupted() -> Iterator[None]:
     """Hold Ctrl-C and SIGTERM back until the end of the block.
 
     The block runs to its end, and code in it that swallows exceptions cannot swallow these signals.
     """
-    if threading.current_thread() is not threading.main_thread():
+    global _holds_back  # noqa: PLW0603  as the handlers are the process's
+    if _holds_back or threading.current_thread() is not threading.main_thread():
         yield  # signals only ever interrupt the main thread
         return
     came: list[tuple[int, FrameType | None]] = []
@@ -163,9 +167,11 @@ def uninterrupted() -> Iterator[None]:
     for held in (signal.SIGINT, signal.SIGTERM):
         if signal.getsignal(held) is not None:  # one that Python did not set cannot be put back
             usual[held] = signal.signal(held, later)
+    _holds_back = True
     try:
         yield
     finally:
+        _holds_back = False
         for number, handler in usual.items():
             signal.signal(number, handler)
     for number, frame in came:

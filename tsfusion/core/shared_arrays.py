@@ -2,6 +2,7 @@
 """Arrays that one process writes and another reads, in memory that both have mapped; and waiting for a word
 of the other one."""
 
+import math
 import mmap
 import os
 import select
@@ -27,7 +28,7 @@ class Place(NamedTuple):
 
     @property
     def end(self) -> int:
-        return self.offset + int(np.prod(self.shape, dtype=np.int64)) * np.dtype(self.dtype).itemsize
+        return self.offset + math.prod(self.shape) * np.dtype(self.dtype).itemsize
 
 
 def make_file() -> int:
@@ -68,9 +69,9 @@ class SharedArrays:
     def empty(self, shape: tuple[int, ...], dtype: DTypeLike) -> tuple[NDArray[Any], Place]:
         """An array to be filled, and where it is."""
         place = Place(-(-self._end // _ALIGNMENT) * _ALIGNMENT, shape, np.dtype(dtype).str)
-        self._end = place.end
-        if place.end > self._size:
-            os.ftruncate(self._descriptor, -(-max(place.end, 2 * self._size) // _STEP) * _STEP)
+        self._end = end = place.end
+        if end > self._size:
+            os.ftruncate(self._descriptor, -(-max(end, 2 * self._size) // _STEP) * _STEP)
         return self.read(place), place
 
     def write(self, arrays: Iterable[NDArray[Any]]) -> list[Place]:
@@ -88,7 +89,7 @@ class SharedArrays:
             # Arrays of the earlier mapping keep it.
             self._size = os.fstat(self._descriptor).st_size
             self._map = mmap.mmap(self._descriptor, max(self._size, 1)) if self._size else None
-        if self._map is None or not np.prod(place.shape):
+        if self._map is None or 0 in place.shape:
             return np.zeros(place.shape, place.dtype)
         found: NDArray[Any] = np.ndarray(place.shape, place.dtype, self._map, place.offset)
         return found

@@ -6,8 +6,10 @@ writes to it: 0.15 ms for four numbers on a GPU of 2024. On CUDA the driver is a
 """
 
 import ctypes
+import math
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -18,15 +20,13 @@ from tsfusion.kernels.quick_launch import Copied
 
 _ALIGNMENT = 256  # bytes
 _FIRST_BYTES = 1 << 20
+_SMALL_BYTES = 1 << 12
+_DTYPES = {ti.i32: np.dtype(np.int32), ti.i64: np.dtype(np.int64)}
 
 
 @ti.kernel
-def _read(
-    source: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    count: ti.i32,
-    out: ti.types.ndarray(dtype=ti.i32, ndim=1),
-):
-    for i in range(count):
+def _read(source: ti.types.ndarray(ndim=1), out: ti.types.ndarray(ndim=1)):
+    for i in range(out.shape[0]):
         out[i] = source[i]
 
 
@@ -43,21 +43,22 @@ class Copies:
         """What a kernel (`QuickLaunch`) that reads these arrays is handed; valid until the next call."""
         return arrays
 
-    def read(self, *wanted: tuple[Any, int]) -> list[NDArray[np.int32]]:
-        """The first numbers of Taichi's int32 arrays, valid until the next call.
+    def read(self, *wanted: tuple[Any, int]) -> list[NDArray[Any]]:
+        """The first items of Taichi's arrays of int32 or int64, valid until the next call.
 
         Args:
-            wanted: arrays, and how many numbers of each; whole rows, where there are rows.
+            wanted: arrays of one dimension or two, and how many numbers or rows of each.
         """
         found = []
         for source, count in wanted:
-            out = np.empty(count, np.int32)
-            if len(source.shape) == 2:
-                _read_rows(source, out.reshape(-1, source.shape[1]))
-            elif count:
-                _read(source, count, out)
+            out = np.empty((count, *source.shape[1:]), _DTYPES[source.dtype])
+            if count:
+                (_read_rows if out.ndim == 2 else _read)(source, out)
             found.append(out)
         return found
+
+    def finish(self) -> None:
+        """Wait until what was given is copied: from then on it may change. `read` waits, too."""
 
     def pin(self, memory: NDArray[np.uint8]) -> None:
         """Let this memory, instead of any before, be copied from faster, where the device can."""
@@ -78,32 +79,44 @@ class CudaCopies(Copies):
         self._registered: NDArray[np.uint8] | None = None
 
     def given(self, *arrays: NDArray[Any]) -> Sequence[Any]:
-        ends = np.cumsum([-(-array.nbytes // _ALIGNMENT) * _ALIGNMENT for array in arrays]).tolist()
-        if ends[-1] > self._there.shape[0]:
-            self._there = self._room(2 * ends[-1])
+        begins = [0] * len(arrays)
+        end = small_end = 0
+        for i in sorted(range(len(arrays)), key=lambda i: arrays[i].nbytes):
+            begins[i] = _aligned(end)
+            end = begins[i] + arrays[i].nbytes
+            small_end = end if arrays[i].nbytes <= _SMALL_BYTES else small_end
+        if end > self._there.shape[0]:
+            self._there = self._room(2 * end)
         first = self._address(self._there)
-        copied = []
-        for array, begin in zip(arrays, [0, *ends], strict=False):
-            address = first + begin
-            if array.nbytes:
-                self._call("cuMemcpyHtoDAsync_v2", _U64(address), *_memory(array), None)
-            copied.append(Copied(array, address))
-        return copied
+        small = np.empty(small_end, np.uint8)  # which go together
+        for array, begin in zip(arrays, begins, strict=True):
+            if array.nbytes <= _SMALL_BYTES:
+                small[begin : begin + array.nbytes] = array.reshape(-1).view(np.uint8)
+            else:
+                self._call("cuMemcpyHtoDAsync_v2", _U64(first + begin), *_memory(array), None)
+        if small_end:
+            self._call("cuMemcpyHtoDAsync_v2", _U64(first), *_memory(small), None)
+        return [Copied(array, first + begin) for array, begin in zip(arrays, begins, strict=True)]
 
-    def read(self, *wanted: tuple[Any, int]) -> list[NDArray[np.int32]]:
-        ends = np.cumsum([count for _, count in wanted]).tolist()
-        if 4 * ends[-1] > self._here.nbytes:
-            self._call("cuMemFreeHost", ctypes.c_void_p(self._here.ctypes.data))
-            self._here = self._pinned(8 * ends[-1])
-        found = []
-        for (source, count), begin in zip(wanted, [0, *ends], strict=False):
-            out = self._here[begin : begin + count]
+    def read(self, *wanted: tuple[Any, int]) -> list[NDArray[Any]]:
+        found: list[NDArray[Any]] = []
+        end = 0
+        for source, count in wanted:
+            shape, dtype = (count, *source.shape[1:]), _DTYPES[source.dtype]
+            begin, nbytes = _aligned(end), math.prod(shape) * dtype.itemsize
+            end = begin + nbytes
+            if end > len(self._here):
+                self._here = self._pinned(2 * end)  # what was read into the other stays there
+            out = self._here[begin:end].view(dtype).reshape(shape)
             if count:
-                address, nbytes = _memory(out)
-                self._call("cuMemcpyDtoHAsync_v2", address, _U64(self._address(source)), nbytes, None)
+                address, size = _memory(out)
+                self._call("cuMemcpyDtoHAsync_v2", address, _U64(self._address(source)), size, None)
             found.append(out)
-        self._call("cuStreamSynchronize", None)
+        self.finish()
         return found
+
+    def finish(self) -> None:
+        self._call("cuStreamSynchronize", None)
 
     def pin(self, memory: NDArray[np.uint8]) -> None:
         if self._registered is not None:
@@ -118,11 +131,11 @@ class CudaCopies(Copies):
     def _room(self, nbytes: int) -> Any:
         return ti.ndarray(ti.u8, (nbytes,))
 
-    def _pinned(self, nbytes: int) -> NDArray[np.int32]:
+    def _pinned(self, nbytes: int) -> NDArray[np.uint8]:
+        """Memory that is copied to faster; it is kept until the process ends."""
         address = ctypes.c_void_p()
         self._call("cuMemAllocHost_v2", ctypes.byref(address), _U64(nbytes))
-        buffer = (ctypes.c_int32 * (nbytes // 4)).from_address(address.value or 0)
-        return np.ctypeslib.as_array(buffer)
+        return np.ctypeslib.as_array((ctypes.c_uint8 * nbytes).from_address(address.value or 0))
 
     def _call(self, name: str, *arguments: Any) -> None:
         """Call the driver.
@@ -138,6 +151,10 @@ class CudaCopies(Copies):
 _U64 = ctypes.c_uint64
 
 
+def _aligned(nbytes: int) -> int:
+    return -(-nbytes // _ALIGNMENT) * _ALIGNMENT
+
+
 def _memory(array: NDArray[Any]) -> tuple[Any, Any]:
     """Address and size of an array."""
     return ctypes.c_void_p(array.ctypes.data), _U64(array.nbytes)
@@ -146,5 +163,6 @@ def _memory(array: NDArray[Any]) -> tuple[Any, Any]:
 def copies() -> Copies:
     """Copies to and from the device that Taichi was started on."""
     if ti.lang.impl.current_cfg().arch == ti.cuda:
-        return CudaCopies()
+        with suppress(OSError):
+            return CudaCopies()
     return Copies()

@@ -25,12 +25,16 @@ from tsfusion.kernels.integrate import (
 )
 from tsfusion.kernels.quick_launch import QuickLaunch
 from tsfusion.kernels.voxel_traversal import (
+    COST,
+    COUNT,
     CROSSING,
     DEFERRED,
     END,
     INTERVAL,
+    SAMPLES,
     START,
     UPDATES,
+    WEIGHT,
     WEIGHT_COLOR,
     advance,
     begin_walk,
@@ -48,7 +52,7 @@ from tsfusion.kernels.voxel_traversal import (
 LISTED_FIELDS, VOTE_FIELDS = 4, 2
 PLACE, PRODUCT, VOTE, LAST = 0, 1, 2, 3
 BLOCK, COLOR = 1, 1
-LISTED, FOUND, COUNTS = 0, 1, 2  # how many of them, how many missing blocks; int64
+COUNTS = 2  # of a keyframe's launches: nearly always there are two
 WINNERS = 1 << 16
 MISSING, SKIPPED = -1, -2  # instead of a place: what is listed is a missing block, or nothing
 
@@ -98,9 +102,15 @@ def crossed(rays: ti.template(), r):
 
 
 @ti.func
-def listed_count(count: ti.template(), listed: ti.template()):
+def listed_count(count, listed: ti.template()):
     """How many updates are listed; none where they are more than there is room for."""
-    return ti.cast(ti.select(count[LISTED] <= listed.shape[0], count[LISTED], 0), ti.i32)
+    return ti.cast(ti.select(count <= listed.shape[0], count, 0), ti.i32)
+
+
+@ti.func
+def vote_count(has_color, count, listed: ti.template(), rays):
+    """How many votes for colours are cast; none where no updates are made."""
+    return ti.select(has_color == 1, ti.select(count <= listed.shape[0], rays, 0), 0)
 
 
 @ti.func
@@ -149,6 +159,18 @@ def list_updates(
     return added, lacks, colored
 
 
+@ti.func
+def begin_keyframe(bands: ti.template(), band, count: ti.template(), touched: ti.template()):
+    """Nothing is counted of a band of the next keyframe, and with the first band nothing at all."""
+    for field in ti.static((COUNT, SAMPLES, WEIGHT, COST, DEFERRED, UPDATES)):
+        bands[band, field] = 0
+    if band == 0:
+        for i in ti.static(range(COUNTS)):
+            count[i] = 0
+        for i in ti.static(range(TOUCHED_HEADER)):
+            touched[i] = 0
+
+
 @QuickLaunch
 @ti.kernel
 def add_rays(
@@ -158,45 +180,36 @@ def add_rays(
     first_ray: ti.i32,
     end_ray: ti.i32,
     which: ti.i32,
-    first_band: ti.i32,
-    end_band: ti.i32,
     sign_: ti.i32,
     oldest: ti.i32,
     stamp: ti.i32,
     has_color: ti.i32,
-    begins: ti.i32,
     hash_keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
     hash_slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
     winners: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    missing: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    missing: ti.types.ndarray(dtype=ti.i64, ndim=1),
     stamps: ti.types.ndarray(dtype=ti.i32, ndim=1),
     touched: ti.types.ndarray(dtype=ti.i32, ndim=1),
     count: ti.types.ndarray(dtype=ti.i64, ndim=1),
+    turn: ti.i32,
     listed: ti.types.ndarray(dtype=ti.i32, ndim=2),
     votes: ti.types.ndarray(dtype=ti.i32, ndim=2),
     sums: ti.types.ndarray(dtype=ti.i64, ndim=2),
     color_rgn: ti.types.ndarray(dtype=ti.i64, ndim=2),
     color_b: ti.types.ndarray(dtype=ti.i32, ndim=2),
 ):
-    """The same as `integrate.add_rays`, a thread a ray; bands of places `first_ray` … `end_ray` − 1.
+    """The same as `integrate.add_rays`, a thread a ray, of places `first_ray` … `end_ray` − 1.
 
     Updates are listed, then added, a thread each: so those of one ray do not wait for each other. Nothing is
     added inside a loop within a thread: after that, Mesa's software device (22.3) forgets which threads run.
-    Rays that cross missing blocks are marked in `deferred` instead of listed, and the blocks' coordinates are
-    in `missing`, some of them twice: of those that share a place in `winners`, one is left out for every
-    other one that is the same block. No band ends early: what was added is all of its rays. With `begins` = 1 the
-    list of touched blocks is empty first. Where `listed` has no room for all updates, none is made, and
-    `touched` says so. A settled colour stays, as in `integrate.vote_color`.
+    Rays that cross missing blocks are marked in `deferred` instead of listed, and the blocks' keys are in
+    `missing`, some of them twice: of those that share a place in `winners`, one is left out for every
+    other one that is the same block. No band ends early: what was added is all of its rays. `count[turn]` is
+    zero, and then how many updates were to be listed; where they are more than `listed` has room for, none
+    is made, and `touched` says so. A settled colour stays, as in `integrate.vote_color`.
+
+    Each loop is two tasks of a device, of which the first finds out where the second ends: fewer are faster.
     """
-    for band in range(first_band, end_band):
-        if which == ALL:
-            bands[band, DEFERRED], bands[band, UPDATES] = 0, 0
-        if band == first_band:
-            for i in ti.static(range(COUNTS)):
-                count[i] = 0
-            if begins == 1:
-                for i in ti.static(range(TOUCHED_HEADER)):
-                    touched[i] = 0
     for r in range(first_ray, end_ray):
         is_wanted = ti.cast(ray_weight(rays, r) > 0, ti.i32)
         if which == ONLY_DEFERRED:
@@ -204,7 +217,7 @@ def add_rays(
         votes[r - first_ray, PLACE] = SKIPPED
         if is_wanted == 1:
             most = crossed(rays, r)
-            base = ti.atomic_add(count[LISTED], ti.cast(most, ti.i64))
+            base = ti.atomic_add(count[turn], ti.cast(most, ti.i64))
             if base + most <= listed.shape[0]:
                 added, lacks, colored = list_updates(
                     rays, r, ti.cast(base, ti.i32), most, sign_, oldest, hash_keys, hash_slots, listed
@@ -216,7 +229,7 @@ def add_rays(
                 if which == ALL:
                     deferred[r] = lacks
                     ti.atomic_add(bands[band, DEFERRED], lacks)
-    for i in range(listed_count(count, listed)):
+    for i in range(listed_count(count[turn], listed)):
         at = listed[i, PLACE]
         if at >= 0:
             # both sums in one addition; their quotient minimises Σ w (x − m)²: paper eq. 2
@@ -225,20 +238,27 @@ def add_rays(
             list_block(at // CUBE, stamp, stamps, touched)
         if at == MISSING and which == ALL:
             winners[missing_place(listed, i)] = i
-    for i in range(ti.select(which == ALL, listed_count(count, listed), 0)):
-        if listed[i, PLACE] == MISSING:
-            winner = winners[missing_place(listed, i)]
-            is_another = ti.cast(missing_key(listed, winner) != missing_key(listed, i), ti.i32)
-            if winner == i or is_another == 1:
-                n = ti.cast(ti.atomic_add(count[FOUND], 1), ti.i32)
-                for a in ti.static(range(3)):
-                    missing[3 * n + a] = listed[i, BLOCK + a]
-    for i in range(ti.max(ti.select(has_color == 1, end_ray - first_ray, 0), 1)):
-        if i == 0:
-            touched[TOUCHED_OVERFLOW] = ti.cast(count[LISTED] > listed.shape[0], ti.i32)
-            touched[TOUCHED_MISSING] = ti.cast(count[FOUND], ti.i32)
-        at, packed = votes[i, PLACE], votes[i, COLOR]
-        if at >= 0 and has_color == 1 and i < end_ray - first_ray:
+    # the missing blocks; then the votes for colours; at last what did not fit
+    for i in range(
+        ti.select(which == ALL, listed_count(count[turn], listed), 0)
+        + vote_count(has_color, count[turn], listed, end_ray - first_ray)
+        + 1
+    ):
+        ends = ti.select(which == ALL, listed_count(count[turn], listed), 0)
+        k = ti.min(i, ti.max(ends - 1, 0))
+        if (i < ends) & (listed[k, PLACE] == MISSING):
+            winner = winners[missing_place(listed, k)]
+            is_another = ti.cast(missing_key(listed, winner) != missing_key(listed, k), ti.i32)
+            if winner == k or is_another == 1:
+                missing[ti.atomic_add(touched[TOUCHED_MISSING], 1)] = missing_key(listed, k)
+        v = i - ends
+        if v == vote_count(has_color, count[turn], listed, end_ray - first_ray):
+            touched[TOUCHED_OVERFLOW] = ti.cast(count[turn] > listed.shape[0], ti.i32)
+            v = -1
+        at, packed = SKIPPED, 0
+        if v >= 0:
+            at, packed = votes[v, PLACE], votes[v, COLOR]
+        if at >= 0:
             slot, o = at // CUBE, at % CUBE
             taken = ti.cast(color_rgn[slot, o] & 65535, ti.i32)
             if taken < COLOR_LIMIT or taken >= COLOR_LIMIT + (COLOR_LIMIT >> 1):
@@ -247,6 +267,28 @@ def add_rays(
                 ti.atomic_add(color_b[slot, o], sign_ * (packed & 255))
                 if sign_ < 0 and (before & 65535) == 0:
                     touched[TOUCHED_MISMATCH] = 1
+
+
+@ti.kernel
+def begin_turn(
+    touched: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    count: ti.types.ndarray(dtype=ti.i64, ndim=1),
+    turn: ti.i32,
+):
+    """Let rays be added once more: nothing is listed, and no block missing."""
+    for _ in range(1):
+        count[turn] = 0
+        touched[TOUCHED_MISSING] = 0
+
+
+@ti.kernel
+def restore_counts(
+    bands: ti.types.ndarray(dtype=ti.i32, ndim=2), counts: ti.types.ndarray(dtype=ti.i32, ndim=2)
+):
+    """Let the bands have counted no more updates and deferred rays than `counts`, earlier bands, says."""
+    for band in range(bands.shape[0]):
+        for field in ti.static((DEFERRED, UPDATES)):
+            bands[band, field] = counts[band, field]
 
 
 @QuickLaunch

@@ -7,6 +7,7 @@ Rays have fixed places, so a band's rays do not follow each other: a place witho
 
 import taichi as ti
 
+from tsfusion.kernels.device_integration import begin_keyframe
 from tsfusion.kernels.quick_launch import QuickLaunch
 from tsfusion.kernels.rays_from_images import (
     TILE,
@@ -65,8 +66,11 @@ def rays_from_image(
     tiles: ti.types.ndarray(dtype=ti.i32, ndim=2),
     rays: ti.types.ndarray(dtype=ti.i32, ndim=2),
     bands: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    launch_counts: ti.types.ndarray(dtype=ti.i64, ndim=1),
+    touched: ti.types.ndarray(dtype=ti.i32, ndim=1),
 ):
-    """Fill `rays` as `rays_from_images.rays_from_image` does; a tile has `TILE_SAMPLES` places."""
+    """Fill `rays` as `rays_from_images.rays_from_image` does, and begin a keyframe; a tile has `TILE_SAMPLES`
+    places."""
     tiles_x = (image.shape[1] + TILE - 1) // TILE
     tile_count = tiles_x * ((image.shape[0] + TILE - 1) // TILE)
     count = bands.shape[0]
@@ -79,8 +83,7 @@ def rays_from_image(
             depth = depth_at(image, confidence, reading, v, u)
         depths[i] = depth
         if i < count:
-            for field in ti.static((COUNT, SAMPLES, WEIGHT, COST)):
-                bands[i, field] = 0
+            begin_keyframe(bands, i, launch_counts, touched)
             first_tile = ti.cast(ti.cast(i, ti.i64) * tile_count // count, ti.i32)
             bands[i, START] = first_tile * TILE_SAMPLES
     for tile in range(tile_count):
@@ -149,18 +152,21 @@ def rays_from_points(
     trusts: ti.types.ndarray(dtype=ti.i32, ndim=1),  # confidence in each point, 0 = none; < 0: begins a ray
     rays: ti.types.ndarray(dtype=ti.i32, ndim=2),
     bands: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    launch_counts: ti.types.ndarray(dtype=ti.i64, ndim=1),
+    touched: ti.types.ndarray(dtype=ti.i32, ndim=1),
 ):
-    """Fill `rays` as `rays_from_points.rays_from_points` does; a ray's place is that of its first point."""
+    """Fill `rays` as `rays_from_points.rays_from_points` does, and begin a keyframe; a ray's place is that of
+    its first point."""
     count = points.shape[0]
-    for band in range(bands.shape[0]):
-        for field in ti.static((COUNT, SAMPLES, WEIGHT, COST)):
-            bands[band, field] = 0
-        bands[band, START] = ti.cast(ti.cast(band, ti.i64) * count // bands.shape[0], ti.i32)
-    for i in range(count):
+    for i in range(ti.max(count, bands.shape[0])):
+        if i < bands.shape[0]:
+            begin_keyframe(bands, i, launch_counts, touched)
+            bands[i, START] = ti.cast(ti.cast(i, ti.i64) * count // bands.shape[0], ti.i32)
         nearest = ti.cast(model[MIN_RANGE] * model[MIN_RANGE], ti.f32)
         farthest = ti.cast(model[MAX_RANGE] * model[MAX_RANGE], ti.f32)
-        o = row(starts, ti.select(starts.shape[0] == 1, 0, i))
-        trusts[i] = confidence_at(row(points, i), o, nearest, farthest, confidence, has_confidence, i)
+        if i < count:
+            o = row(starts, ti.select(starts.shape[0] == 1, 0, i))
+            trusts[i] = confidence_at(row(points, i), o, nearest, farthest, confidence, has_confidence, i)
     for band in range(bands.shape[0]):
         spread = ti.cast(model[VOXEL_SIZE] * model[VOXEL_SIZE], ti.f32)
         end = ti.cast(ti.cast(band + 1, ti.i64) * count // bands.shape[0], ti.i32)

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 from tsfusion.kernels import taichi as ti
 
+_INTEGERS, _FLOATS = (int, np.integer), (float, np.floating)
+
 
 class Copied(NamedTuple):
     """A NumPy array that a device has at an address: a kernel that only reads it is handed the copy there.
@@ -102,9 +104,9 @@ def _kind(arguments: tuple[Any, ...]) -> tuple[int, ...] | None:
             if not (argument.flags.c_contiguous and argument.dtype.isnative):  # `num` says nothing of bytes
                 return None
             kind.append(argument.dtype.num << 4 | argument.ndim)
-        elif isinstance(argument, int | np.integer):
+        elif isinstance(argument, _INTEGERS):
             kind.append(-1)
-        elif isinstance(argument, float | np.floating):
+        elif isinstance(argument, _FLOATS):
             kind.append(-2)
         else:
             return None

@@ -174,7 +174,6 @@ class BlockStore:
         assert self._device is not None
         self._device.note_added(slots, self.count)
         self.stamps[slots], self.dirty[slots] = self.stamp, CHANGED
-        self.places[slots] = np.arange(len(slots), dtype=np.int32)
 
     def limit(self, nbytes: int) -> None:
         """Let the map take no more than so many bytes of memory from now on; a larger one stays as it is.
@@ -231,6 +230,12 @@ class BlockStore:
             self.hash_keys, self.hash_slots = np.zeros(size, np.int64), np.zeros(size, np.int32)
             self._hash(0)
 
+    @property
+    def spare(self) -> int:
+        """Number of blocks that `insert` takes without more memory."""
+        fits = min(array.capacity for array in self._arrays())
+        return max(min(fits, len(self.hash_keys) // 2, self.most_blocks) - self.count, 0)
+
     def insert(self, keys: NDArray[np.int64]) -> None:
         """Append blocks with distinct new keys; their voxels are zero. Raises as `reserve`."""
         first, count = self.count, self.count + len(keys)
@@ -238,7 +243,7 @@ class BlockStore:
         self._keys.array[first:count] = keys
         self.count = count
         self._hash(first)
-        if self._device is not None:
+        if self._device is not None and self._device.sends_blocks != "never":
             places = np.empty(len(keys), np.int32)
             block_hash.find_places(keys, self.hash_keys, places)
             try:

@@ -3,7 +3,7 @@
 
 import logging
 import weakref
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,8 @@ class DeviceBlocks:
         self._behind = np.zeros(0, bool)  # by slot: the store's row is behind the device's
         self._is_behind = False
         self._hash_size = 0  # of the device's copy
-        self.is_patient = False  # whether `insert` waits for the next call, which is then one instead of two
+        # When `insert` tells the device: later = with the next call; never = it has them.
+        self.sends_blocks: Literal["now", "later", "never"] = "now"
         self._unsent: list[NDArray[Any]] = []
         self._first: list[Step] = []  # what goes with the next call
         weakref.finalize(self, link.forget_later, self._number)
@@ -52,16 +53,16 @@ class DeviceBlocks:
         size of it.
 
         Raises:
-            MemoryError: there is no room for them; the device has those that it had. Where `is_patient`, the
-                next call raises it.
+            MemoryError: there is no room for them; the device has those that it had. Where they are sent
+                later, the next call raises it.
         """
         if len(hash_keys) != self._hash_size:
             places = np.flatnonzero(hash_keys).astype(np.int32)
         arguments = count, len(hash_keys), places, hash_keys[places], hash_slots[places]
         self._hash_size = len(hash_keys)
-        if self.is_patient:
+        if self.sends_blocks == "later":
             self._first.append(("insert", arguments))
-        else:
+        elif self.sends_blocks == "now":
             self.call("insert", *arguments)
 
     def drop(self, count: int, hash_keys: NDArray[np.int64], hash_slots: NDArray[np.int32]) -> None:

@@ -26,6 +26,7 @@ Step = tuple[str, tuple[Any, ...]]  # a method and its arguments
 _COMMAND = (sys.executable, "-m", "tsfusion.tsdf.device_process")
 _START_S = 120.0  # a device's first start compiles its driver's own kernels, too
 _END_S = 3.0
+_SENT_BYTES = 1 << 10
 _ANSWER_S = 0.002  # in which a GPU answers
 
 
@@ -118,7 +119,10 @@ class DeviceLink:
         return self._receive(None)
 
     def _packed(self, argument: Any) -> Any:
-        return self._requests.write([argument])[0] if isinstance(argument, np.ndarray) else argument
+        """An argument as it is sent: of a large array its place in the memory that both processes have."""
+        if isinstance(argument, np.ndarray) and argument.nbytes > _SENT_BYTES:
+            return self._requests.write([argument])[0]
+        return argument
 
     def _receive(self, timeout: float | None) -> Any:
         how: str = "failed"

@@ -34,7 +34,7 @@ from tsfusion.tsdf.ray_buffers import BANDS, RayBuffers
 PART_WEIGHT = WEIGHT_LIMIT  # what a lane has in reserve: no part can make one overflow unnoticed
 
 NO_LIMIT = 1 << 30  # blocks
-_BLOCK_COST = 1000  # of a block that is added: it takes 9 µs where memory is touched for the first time
+BLOCK_COST = 1000  # of a block that is added: it takes 9 µs where memory is touched for the first time
 
 Part = tuple[int, int]  # bands first … last - 1
 
@@ -62,6 +62,7 @@ class Integrator:
         self._admitted = 0  # blocks of the map that deferred rays have been added to
         self._room = 0  # blocks that the keyframe may still add to the map, for its sender's share of it
         self._affordable = 0  # blocks that it may still add, for what they cost
+        self._most_cost = NO_LIMIT  # of its rays and these
         self.units = min(runtime.threads(), BANDS)  # which add at the same time
 
     def apply(self, sign: int, quota: KeyframeQuota | None = None) -> int:
@@ -74,15 +75,16 @@ class Integrator:
             MapFull, WeightOverflow: when adding; MapError: when taking away what is not there. The map is as
                 it was.
         """
-        self._room = self._affordable = NO_LIMIT
+        self._room = self._affordable = self._most_cost = NO_LIMIT
+        if quota is not None and sign > 0:
+            self._room, self._most_cost = quota.blocks, quota.cost
         before = self._admitted = self._store.count
         self._begin(sign)
         added: list[Part] = []
         updates = 0
         try:
             if quota is not None and sign > 0:
-                self._affordable = (quota.cost - self._check_cost(quota.cost)) // _BLOCK_COST
-                self._room = quota.blocks
+                self._affordable = (quota.cost - self._check_cost(quota.cost)) // BLOCK_COST
             for part in self._parts():
                 self._add(part, sign)  # Σ w·m and Σ w: paper eq. 2
                 added.append(part)
@@ -161,9 +163,13 @@ class Integrator:
         buffers.reserve_touched(oldest + len(keys))
         self._insert(keys)
         self._launch(part, +1, which=ONLY_DEFERRED, oldest=oldest)
-        self._admitted = store.count
-        self._room -= len(keys)
-        self._affordable -= len(keys)
+        self._note_admitted(len(keys))
+
+    def _note_admitted(self, blocks: int) -> None:
+        """Note that new blocks have been added to."""
+        self._admitted = self._store.count
+        self._room -= blocks
+        self._affordable -= blocks
 
     def _insert(self, keys: NDArray[np.int64]) -> None:
         """Have blocks of these keys before something is added to them."""
@@ -191,7 +197,7 @@ class Integrator:
         if missing > self._affordable:
             raise KeyframeTooLarge(
                 f"{missing} new blocks or more take longer to add than a keyframe may (quota_cost, of which "
-                f"a block takes {_BLOCK_COST}); raise voxel_size or quota_cost, or send fewer points"
+                f"a block takes {BLOCK_COST}); raise voxel_size or quota_cost, or send fewer points"
             )
         if missing > self._room:
             raise MapQuota(
