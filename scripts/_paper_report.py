@@ -284,8 +284,8 @@ def _ate(rows: Sequence[AteRow]) -> str:
     lines = []
     for key, group in groups.items():
         errors = [row.error for row in group]
-        means = [f"{np.mean([getattr(error, name) for error in errors]):.3f}" for name in _STATISTICS]
-        spread = f"± {np.std([error.rmse for error in errors]):.3f}" if len(errors) > 1 else ""
+        means = [f"{np.mean([getattr(error, name) for error in errors]):.4f}" for name in _STATISTICS]
+        spread = f"± {np.std([error.rmse for error in errors]):.4f}" if len(errors) > 1 else ""
         drift = f"{np.mean([error.drift_percent for error in errors]):.2f}"
         late = f"{np.mean([row.outcome.late for row in group]):.0f}"
         lines.append((" · ".join(key), *means, spread, drift, late, str(len(errors))))

@@ -28,7 +28,7 @@ from tsfusion.core.config import (
     VolumeConfig,
     override,
 )
-from tsfusion.core.errors import JournalError, TransportError
+from tsfusion.core.errors import JournalError, TransportError, TsfusionError
 from tsfusion.core.folder_lock import owner_of
 from tsfusion.delivery import left_spools
 from tsfusion.geometry.mesh import Mesh
@@ -41,6 +41,8 @@ START_DEADLINE = 180.0  # seconds; a cold kernel compilation on a slow machine
 STOP_DEADLINE = 60.0  # seconds; draining and the checkpoint
 _ROUTINE = re.compile("tsfusion: (DEBUG|INFO|WARNING): ")  # lines of a server's log that are no error
 _WARNING = re.compile("tsfusion(?: fuser)?: WARNING: (.*)")
+_ERROR = re.compile("tsfusion(?: fuser)?: ERROR: (.*)|(Fatal Python error: .*)")
+_ERRORS_TOLD = 3
 _NAME_TIMEOUT = 1.0  # seconds for a server to name a free map: a sensor waits
 NEW_MAP = "auto"  # as the name of a map: the next one that nobody has
 log = logging.getLogger(__name__)
@@ -94,6 +96,12 @@ class ServerChild:
             reason = errors[-1].removeprefix("tsfusion") if errors else "; was it killed?"
             raise TransportError(f"the server ended with status {self._process.returncode}{reason}")
 
+    def tell_errors(self) -> None:
+        """Repeat the last errors of its log: why it did not do what it was asked for."""
+        found = map(_ERROR.match, self._log.read_text(encoding="utf-8", errors="replace").splitlines())
+        for error in [one[1] or one[2] for one in found if one][-_ERRORS_TOLD:]:
+            log.error("the server says: %s", error)
+
     def stop(self) -> None:
         """Let the server drain and save its map; kill it when that takes too long."""
         self._process.terminate()
@@ -129,8 +137,10 @@ def serving(server: ServerConfig, volume: VolumeConfig, scratch: Path) -> Iterat
         child.wait_ready()
         yield child
         child.stop()
-    except BaseException:
+    except BaseException as error:
         child.kill()
+        if isinstance(error, TsfusionError):
+            child.tell_errors()
         raise
 
 
