@@ -40,6 +40,10 @@ KINDS = {
                  confidence=random.integers(0, 256, 500, np.uint8))
         for random in map(np.random.default_rng, range(3))
     ],
+    "few points": [
+        Keyframe(points=np.float32([[1, 0, 2], [1, 0, 2.01], [0, 1, 3]])[:count], T_world_camera=np.eye(4))
+        for count in (3, 1)
+    ],
     "points with starts": [
         Keyframe(points=random.normal(size=(200, 3)).astype(np.float32), T_world_camera=np.eye(4),
                  origins=random.normal(size=(200, 3)).astype(np.float32))
@@ -154,6 +158,15 @@ def test_maps_and_counts_are_those_of_the_cpu(link: HereLink, kind: str, setting
     assert sorted(here.take_dirty().tolist()) == sorted(there.take_dirty().tolist())
     for keyframe in KINDS[kind]:
         assert here.retract(keyframe) == there.retract(keyframe)
+    assert_equal(here, there)
+
+
+def test_a_keyframe_without_points_changes_nothing(link: HereLink) -> None:
+    here, there = both()
+    nothing = Keyframe(points=np.zeros((0, 3), np.float32), T_world_camera=np.eye(4))
+    for keyframe in (VIEWS[0], nothing, VIEWS[1]):
+        assert here.integrate(keyframe) == there.integrate(keyframe)
+    assert here.keyframes == there.keyframes == 2
     assert_equal(here, there)
 
 

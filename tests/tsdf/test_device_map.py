@@ -26,6 +26,12 @@ POINTS = [
     Keyframe(points=random.normal(size=(500, 3)).astype(np.float32), T_world_camera=np.eye(4))
     for random in map(np.random.default_rng, range(3))
 ]
+FEW_POINTS = [
+    replace(one, points=np.ascontiguousarray(one.points[:5])) for one in POINTS if one.points is not None
+]
+MILLIMETRES = [
+    replace(view, depth=(view.depth * 1000).astype(np.uint16), depth_scale=0.001) for view in VIEWS
+]
 HOW = {
     "vulkan": "Debian and Ubuntu: apt-get install mesa-vulkan-drivers, a software device",
     "cuda": "a GPU of NVIDIA's and its driver",
@@ -65,8 +71,10 @@ def assert_equal(here: Volume, there: Volume) -> None:
         (VIEWS, {"bundle": False, "color": False}),
         (VIEWS, {"space_carving": True}),
         (POINTS, {"sensor": "tof"}),
+        (FEW_POINTS, {}),
+        (MILLIMETRES, {}),
     ],
-    ids=["colour", "exact", "carving", "points"],
+    ids=["colour", "exact", "carving", "points", "few points", "millimetres"],
 )
 def test_the_map_is_that_of_the_cpu(arch: Arch, keyframes: list[Keyframe], settings: dict[str, Any]) -> None:
     here, there = both(arch, keyframes, **settings)

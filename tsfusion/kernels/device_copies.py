@@ -40,7 +40,7 @@ class Copies:
     """By kernels of Taichi, on any device."""
 
     def given(self, *arrays: NDArray[Any]) -> Sequence[Any]:
-        """What a kernel (`QuickLaunch`) that reads these arrays is handed; valid until the next call."""
+        """Arguments for a kernel (`QuickLaunch`) that reads these arrays; valid until the next call."""
         return arrays
 
     def read(self, *wanted: tuple[Any, int]) -> list[NDArray[Any]]:

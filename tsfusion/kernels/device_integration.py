@@ -198,7 +198,7 @@ def add_rays(
     color_rgn: ti.types.ndarray(dtype=ti.i64, ndim=2),
     color_b: ti.types.ndarray(dtype=ti.i32, ndim=2),
 ):
-    """The same as `integrate.add_rays`, a thread a ray, of places `first_ray` … `end_ray` − 1.
+    """Add rays as `integrate.add_rays` does, a thread a ray, those of places `first_ray` … `end_ray` − 1.
 
     Updates are listed, then added, a thread each: so those of one ray do not wait for each other. Nothing is
     added inside a loop within a thread: after that, Mesa's software device (22.3) forgets which threads run.

@@ -46,8 +46,8 @@ class Job(NamedTuple):
 
 
 class Room(NamedTuple):
-    """What a keyframe may take: new blocks for which all memory is there, blocks touched, and Σ of what its
-    rays and its new blocks cost (`integrator.KeyframeQuota`)."""
+    """Limits of a keyframe: new blocks for which all memory is there, blocks touched, and Σ of what its rays
+    and its new blocks cost (`integrator.KeyframeQuota`)."""
 
     new: int
     touched: int
