@@ -90,13 +90,11 @@ class Frame:
         fields = {name: getattr(keyframe, name) for name in names}
         return cls(**{**fields, "sensor": keyframe.sensor or sensor})
 
-    def keyframe(
-        self, T_world_camera: NDArray[np.float64], *, disparity: NDArray[np.uint16] | None = None
-    ) -> Keyframe:
-        """Make a keyframe of the frame; a stereo pair's is that of `match`, or is matched now."""
+    def keyframe(self, T_world_camera: NDArray[np.float64]) -> Keyframe:
+        """Make a keyframe of the frame; a stereo pair is matched for it."""
         if self.kind != "pair":
             return self._at(T_world_camera)
-        return self._at(T_world_camera, disparity=self.match() if disparity is None else disparity)
+        return self._at(T_world_camera, disparity=self.match())
 
     def match(self) -> NDArray[np.uint16]:
         """Disparity of a stereo pair at full resolution: (H, W) uint16 in 1/16 px, 0 = uncertain."""

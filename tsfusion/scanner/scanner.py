@@ -19,7 +19,6 @@ from tsfusion.core.config import MAP_NAME_LENGTH, ScanConfig
 from tsfusion.core.counts import count_of
 from tsfusion.delivery.outcomes import ClientStats
 from tsfusion.geometry.frame import Frame
-from tsfusion.scanner.early_matching import EarlyMatching, ExpectedPose
 from tsfusion.scanner.keyframe_selection import KeyframeSelector, Selector
 from tsfusion.scanner.localization.localizer import Localizer, Lost, Pose, PoseCorrections
 from tsfusion.scanner.tracked_trajectory import TrackedTrajectory
@@ -110,7 +109,6 @@ class Scanner:
         self._state: State = "starting"
         self._frames = self._lost = 0
         self._tracking_cpu = 0.0
-        self._matching, self._expected = EarlyMatching(), ExpectedPose()
         self._selected: Counter[str] = Counter()
         self.submaps: list[Submap] = [Submap(map_name, connect(map_name))]
 
@@ -122,7 +120,6 @@ class Scanner:
 
     def process(self, frame: Frame) -> None:
         """Localize a frame, and send it if it is a keyframe; then prepare for the next."""
-        self._begin_matching(frame)
         before = time.thread_time()
         found = self._localizer.track(frame)
         self._tracking_cpu += time.thread_time() - before
@@ -172,12 +169,6 @@ class Scanner:
             keyframe_delay_ms=_newest_delay(clients[-1]),
         )
 
-    def _begin_matching(self, frame: Frame) -> None:
-        """Begin to match the pair of a frame that will be a keyframe if the sensor moves on as it does."""
-        expected = self._expected.at(frame.timestamp_ns) if frame.kind == "pair" else None
-        if expected is not None and self._selector.reason(frame, expected) is not None:
-            self._matching.begin(frame)
-
     def _handle_pose(self, pose: Pose, frame: Frame) -> None:
         if self._state == "lost":
             log.info("the sensor is found again")
@@ -186,18 +177,16 @@ class Scanner:
             self.submaps.append(Submap(self._next, self._connect(self._next)))
             self._next = None
         submap, T = self.submaps[-1], pose.T_world_camera
-        self._expected.add(frame.timestamp_ns, T)
         reason = self._selector.reason(frame, T)
         seq = None
         if reason is not None:
             self._selected[reason] += 1
             self._selector.accept(frame, T)
-            seq = submap.client.send(self._matching.keyframe(frame, T))
+            seq = submap.client.send(frame.keyframe(T))
         submap.located.add(pose, frame.T_world_camera, seq, frame.specific_force)
 
     def _handle_lost(self, lost: Lost, frame: Frame) -> None:
         self._lost += 1
-        self._expected.reset()
         if self._state == "tracking":
             log.warning("the sensor is lost: %s", lost.reason)
         self._why = self.last_loss = lost.reason
