@@ -153,9 +153,9 @@ def test_a_pose_does_not_wait_for_what_the_next_frame_needs(data: Data) -> None:
         assert isinstance(found, Pose)
         assert isinstance(expected, Pose)
         np.testing.assert_array_equal(found.T_world_camera, expected.T_world_camera)
-        assert ("quick_disparity" in vars(frame)) == (index == 0)
+        assert ("tracking_disparity" in vars(frame)) == (index == 0)
         prepared.prepare()
-        assert "quick_disparity" in vars(frame)
+        assert "tracking_disparity" in vars(frame)
         prepared.prepare()  # once is enough
 
 

@@ -273,7 +273,7 @@ def _described(frame: Frame) -> PlaceView | None:
 
 def _depth(frame: Frame) -> NDArray[np.float32] | None:
     """Depth of a frame, (H, W) metres; of a stereo pair by quick matching."""
-    disparity = frame.quick_disparity
+    disparity = frame.tracking_disparity
     if disparity is None or frame.baseline_fx is None:
         return frame.depth_m
     depth = np.zeros_like(disparity)

@@ -78,7 +78,7 @@ class _View:
     @cached_property
     def disparity(self) -> NDArray[np.float32]:
         """(H, W) pixels of disparity; 0 = none."""
-        quick, depth = self.frame.quick_disparity, self.frame.depth_m
+        quick, depth = self.frame.tracking_disparity, self.frame.depth_m
         if quick is not None:
             return quick
         assert depth is not None

@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: MIT
+"""Frames of stereo pairs: matched once, for the keyframe and for tracking."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tsfusion.geometry import frame as frame_module
+from tsfusion.geometry.frame import Frame
+from tsfusion.geometry.keyframe import Intrinsics
+
+SHIFT = 8  # pixels of disparity
+
+
+def pair() -> Frame:
+    """A wall of noise, parallel to both cameras."""
+    wall = np.random.default_rng(0).integers(0, 256, (64, 256 + SHIFT), dtype=np.uint8)
+    return Frame(
+        sensor="stereo", left=wall[:, :-SHIFT].copy(), right=wall[:, SHIFT:].copy(), baseline_fx=50.0,
+        intrinsics=Intrinsics(200.0, 200.0, 128.0, 32.0),
+    )  # fmt: skip
+
+
+def test_a_keyframes_disparity_serves_tracking_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    frame = pair()
+
+    def twice(*_: Any) -> None:
+        raise AssertionError("the pair was matched already")
+
+    keyframe = frame.keyframe(np.eye(4))
+    monkeypatch.setattr(frame_module, "Matcher", twice)
+    monkeypatch.setattr(frame_module, "quick_disparity", twice)
+    disparity = frame.tracking_disparity
+    assert disparity is not None
+    assert disparity.dtype == np.float32
+    np.testing.assert_array_equal(disparity * 16, keyframe.disparity)
+    np.testing.assert_array_equal(frame.keyframe(np.eye(4)).disparity, keyframe.disparity)
+    assert np.median(disparity[disparity > 0]) == SHIFT
+
+
+def test_tracking_alone_matches_half_the_resolution() -> None:
+    frame = pair()
+    disparity = frame.tracking_disparity
+    assert disparity is not None
+    np.testing.assert_array_equal(disparity, frame_module.quick_disparity(frame.left, frame.right))
+    assert frame.tracking_disparity is disparity
+    frame.keyframe(np.eye(4))  # later: what was found before stays
+    assert frame.tracking_disparity is disparity
+
+
+def test_other_frames_have_nothing_to_match() -> None:
+    depth = np.full((4, 4), 1000, np.uint16)
+    frame = Frame(sensor="kinect", depth=depth, intrinsics=Intrinsics(4.0, 4.0, 2.0, 2.0))
+    np.testing.assert_array_equal(frame.keyframe(np.eye(4)).depth, depth)
+    assert frame.tracking_disparity is None
+    matched = dataclasses.replace(pair(), left=None, right=None, disparity=pair().matched)
+    assert matched.tracking_disparity is None
