@@ -13,7 +13,6 @@ import signal
 import sys
 import time
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -38,6 +37,7 @@ from tsfusion.scanner.sources.source import LiveSource
 
 OUTDOORS = ("stereo", "lidar")
 MAP, CORRECTED = "map.tsf", "corrected.npz"
+_READ_AHEAD, _READ_NS = 5, 25_000_000  # frames that are read before they are due; time for one
 _MESH_S = 5.0  # for the last mesh, of which only a stamp is wanted
 
 
@@ -83,29 +83,33 @@ class LiveRecording(LiveSource):
         return self.skipped.get("late", 0)
 
     def __iter__(self) -> Iterator[Frame]:
-        with ThreadPoolExecutor(1, thread_name_prefix="camera") as camera:
-            began = time.monotonic_ns()
-            self._log.note("start")
-            yield from self._played(camera, began)
-
-    def _played(self, camera: ThreadPoolExecutor, began: int) -> Iterator[Frame]:
-        """Frames by the clock; the next one's files are read before it is due, as a camera has no files."""
+        """Frames by the clock; files are read while nothing is to be done, as a camera has no files."""
         offsets = ((self._stamps - self._stamps[0]) * self._pace).astype(np.int64)
-        following, ahead = 0, camera.submit(frame_of, self._dataset, 0)
+        read = {index: frame_of(self._dataset, index) for index in range(min(_READ_AHEAD, len(offsets)))}
+        following, began = 0, time.monotonic_ns()
+        self._log.note("start")
         while following < len(offsets) and not self._closed.is_set():
-            self._closed.wait(max(0.0, (began + int(offsets[following]) - time.monotonic_ns()) / 1e9))
+            due = began + int(offsets[following])
+            self._read_on(read, following, due)
+            self._closed.wait(max(0.0, (due - time.monotonic_ns()) / 1e9))
             newest = int(np.searchsorted(offsets, time.monotonic_ns() - began, side="right")) - 1
             if newest > following:
                 self._skip("late", newest - following)
             self.index = max(newest, following)
             self.due_ns = began + int(offsets[self.index])
-            frame = ahead.result() if self.index == following else frame_of(self._dataset, self.index)
+            frame = read.pop(self.index) if self.index in read else frame_of(self._dataset, self.index)
             following = self.index + 1
-            if following < len(offsets):
-                ahead = camera.submit(frame_of, self._dataset, following)
             yield dataclasses.replace(
                 frame, timestamp_ns=int(self._stamps[self.index]), captured_ns=self.due_ns
             )
+
+    def _read_on(self, read: dict[int, Frame], following: int, due_ns: int) -> None:
+        """Read the files of the frames from `following` on, as long as the next one is not due."""
+        for index in [index for index in read if index < following]:
+            del read[index]
+        for index in range(following, min(following + _READ_AHEAD, self.length)):
+            if index not in read and time.monotonic_ns() + _READ_NS < due_ns:
+                read[index] = frame_of(self._dataset, index)
 
 
 class PlannedKeyframes:
