@@ -65,6 +65,8 @@ DISTANCE, PLACE = 0, SIGNAL
 QUANTA = 2.0**-16  # a unit of t
 VOTE_SCALE = 16.0  # x̂ is averaged in sixteenths of a quantum
 VOTE_BITS = 24
+CHUNK = 512  # places of the list of voted voxels that a unit takes at a time
+NO_VOXEL = -1  # in such a place
 
 
 @ti.func
@@ -204,7 +206,8 @@ def smooth_rays(
     """Gather y along each ray's band, solve, and add x̂ to `votes` as (Σ x̂ · 16) · 2²⁴ + n.
 
     `units` run at the same time, each through its own bands. The layers are flat, as for `add_rays`. `voted`:
-    how many voxels have votes, then their places in `votes`.
+    the length of the list of voxels that have votes, then their places in `votes`, or `NO_VOXEL`; each unit
+    takes `CHUNK` of its places at a time.
     """
     for run in range(units * RUN):  # run loop: kernels/__init__.py
         if run % RUN == 0:
@@ -216,7 +219,7 @@ def smooth_rays(
             walks = ti.Vector([0] * WALKS)
             listed, distances = ti.Vector([0] * LIST), ti.Vector([0] * LIST)
             counts, totals = ti.Vector([0] * LANES), ti.Vector([0.0] * LANES)
-            carves, listed_voxels = 0, 0
+            carves, here, chunk_end = 0, 0, 0
             for band in range(bands.shape[0]):
                 r, end = bands[band, START], bands[band, START] + bands[band, COUNT]
                 if bands[band, UNIT] != unit:
@@ -255,16 +258,19 @@ def smooth_rays(
                             at = at_crossed + i * LANES + k
                             vote = (ti.cast(crossed[at + DISTANCE], ti.i64) << VOTE_BITS) + 1
                             voxel = crossed[at + PLACE]
+                            before = votes[voxel]
                             if units == 1:  # an atomic addition waits until what it adds to is there
-                                before = votes[voxel]
                                 votes[voxel] = before + vote
-                                if before == 0:
-                                    listed_voxels += 1
-                                    voted[listed_voxels] = voxel
-                            elif ti.atomic_add(votes[voxel], vote) == 0:
-                                voted[1 + ti.atomic_add(voted[0], 1)] = voxel
-            if units == 1:
-                voted[0] = listed_voxels
+                            else:
+                                before = ti.atomic_add(votes[voxel], vote)
+                            if before == 0:
+                                if here == chunk_end:
+                                    here = 1 + ti.atomic_add(voted[0], CHUNK)
+                                    chunk_end = here + CHUNK
+                                voted[here] = voxel
+                                here += 1
+            for i in range(here, chunk_end):
+                voted[i] = NO_VOXEL
 
 
 @QuickLaunch
@@ -279,11 +285,12 @@ def commit_votes(
     """A voxel's value (Σ w·m + correction) / Σ w becomes the mean that its rays propose; clears `votes`."""
     for i in range(voted[0]):
         place = voted[1 + i]
-        vote = votes[place]
-        votes[place] = 0
-        at = touched[TOUCHED_HEADER + place // CUBE] * CUBE + place % CUBE
-        packed = sums[at]
-        n = ti.cast(vote & ((1 << VOTE_BITS) - 1), ti.f64)
-        x = ti.cast(vote >> VOTE_BITS, ti.f64) / (n * VOTE_SCALE)
-        moved = x * lane_weight(packed) - ti.cast(lane_distance(packed), ti.f64)
-        correction[at] = ti.cast(moved, ti.f32)
+        if place != NO_VOXEL:
+            vote = votes[place]
+            votes[place] = 0
+            at = touched[TOUCHED_HEADER + place // CUBE] * CUBE + place % CUBE
+            packed = sums[at]
+            n = ti.cast(vote & ((1 << VOTE_BITS) - 1), ti.f64)
+            x = ti.cast(vote >> VOTE_BITS, ti.f64) / (n * VOTE_SCALE)
+            moved = x * lane_weight(packed) - ti.cast(lane_distance(packed), ti.f64)
+            correction[at] = ti.cast(moved, ti.f32)

@@ -269,7 +269,8 @@ class Integrator:
             )  # fmt: skip
             ray_smoothing.commit_votes(s.touched, sums, votes, voted, correction)
         except BaseException:  # no vote of this keyframe may count for the next one
-            votes[voted[1 : 1 + voted[0]]] = 0
+            listed = voted[1 : 1 + voted[0]]
+            votes[listed[listed != ray_smoothing.NO_VOXEL]] = 0
             raise
 
     def _launch(

@@ -165,7 +165,8 @@ class RayBuffers:
     def reserve_votes(self) -> None:
         """Make room for the votes of all touched blocks."""
         self._votes.reserve(int(self.touched[TOUCHED_COUNT]))
-        self._voted.reserve(int(self.touched[TOUCHED_COUNT]) + 1)
+        # one for its length; each unit may leave a part of its last chunk empty
+        self._voted.reserve(int(self.touched[TOUCHED_COUNT]) + 1 + BANDS * ray_smoothing.CHUNK // CUBE)
 
     @property
     def nbytes(self) -> int:
