@@ -272,28 +272,34 @@ def add_bands(
     touched: ti.template(), sums: ti.template(), color_rgn: ti.template(), color_b: ti.template(),
     of_others: ti.template(),
 ):  # fmt: skip
-    """Add the rays of a unit's bands to its own blocks; or those that cross blocks `of_others` to these."""
+    """Add the rays of a unit's bands to its own blocks; or a share of those that cross blocks `of_others` to
+    these: whoever came first to a block that two units share has it, so that one unit may have them all."""
     which, stamp = job[WHICH], job[STAMP]
     sign_, oldest, most_missing, has_color = job[SIGN], job[OLDEST], job[MOST_MISSING], job[HAS_COLOR]
+    base, owner = unit * UNIT_SCRATCH, -1
     mark = (ti.cast(stamp, ti.i64) << 32) | unit
-    base = unit * UNIT_SCRATCH
-    for i in range(WINDOWS):
-        scratch[base + i] = 0
     walks, listed = ti.Vector([0] * WALKS), ti.Vector([0] * LIST)
     for k in range(ABREAST):
         walks[RAY + k], walks[FREE + k], walks[FOURFOLD + k] = NOBODY, 0, 0
         walks[UNCOLORED + k] = NEVER
     colors, carves = base + COLORS_AT, 0
     for band in range(job[FIRST_BAND], job[LAST_BAND]):
-        if bands[band, UNIT] == unit:
+        if ti.static(of_others) or bands[band, UNIT] == unit:
             start, count, added = bands[band, START], bands[band, COUNT], 0
+            n = 0
             if which == ONLY_DEFERRED:
                 count, added = bands[band, DEFERRED], bands[band, UPDATES]
             if which == ONLY_ADDED:
                 count = bands[band, ADDED]
             if ti.static(of_others):
-                count, added = bands[band, SHARED], bands[band, UPDATES]
-            deferred, shared, n, walking = 0, 0, 0, 0
+                n = unit * bands[band, SHARED] // job[UNITS]
+                count, added = (unit + 1) * bands[band, SHARED] // job[UNITS], 0
+            if bands[band, UNIT] != owner:
+                owner = bands[band, UNIT]
+                mark = (ti.cast(stamp, ti.i64) << 32) | owner
+                for i in range(WINDOWS):
+                    scratch[base + i] = 0
+            deferred, shared, walking = 0, 0, 0
             while n < count or walking > 0:
                 for k in range(ABREAST):
                     while walks[RAY + k] == NOBODY and n < count:
@@ -333,9 +339,10 @@ def add_bands(
                                     deferred += 1
                                     if which == ALL and touched[TOUCHED_OVERFLOW] == 1:
                                         count = n
-            bands[band, UPDATES] = added
-            if ti.static(not of_others):
-                bands[band, SHARED] = shared
+            if ti.static(of_others):
+                ti.atomic_add(bands[band, UPDATES], added)
+            else:
+                bands[band, UPDATES], bands[band, SHARED] = added, shared
                 if which == ALL:
                     bands[band, DEFERRED], bands[band, ADDED] = deferred, n
     add_votes(scratch, base, colors, sign_, color_rgn, color_b, touched, of_others)

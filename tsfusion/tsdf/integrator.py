@@ -27,7 +27,7 @@ from tsfusion.kernels.integrate import (
     WEIGHT_LIMIT,
 )
 from tsfusion.kernels.sensor_noise import WEIGHT_ONE
-from tsfusion.kernels.voxel_traversal import COST, DEFERRED, FAR_COST, UPDATES, WEIGHT
+from tsfusion.kernels.voxel_traversal import COST, DEFERRED, FAR_COST, SHARED, UPDATES, WEIGHT
 from tsfusion.tsdf.block_store import BlockStore
 from tsfusion.tsdf.ray_buffers import BANDS, RayBuffers
 
@@ -286,5 +286,5 @@ class Integrator:
             store.color_b.reshape(-1),
         )  # fmt: skip
         integrate.add_rays(*arguments)
-        if self.units > 1:
+        if self.units > 1 and buffers.bands[part[0] : part[1], SHARED].any():
             integrate.add_shared_rays(*arguments)
