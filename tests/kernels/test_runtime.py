@@ -46,3 +46,25 @@ def test_a_missing_library_of_the_system_is_named(tmp_path: Path) -> None:
     assert "taichi does not load" in done.stderr
     assert "libX11.so.6" in done.stderr
     assert "install libx11-6" in done.stderr
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="a system without cores of one's own")
+def test_threads_of_kernels_have_a_core_each() -> None:
+    """Else two that are woken together often share one: at 2 cm two threads took longer than one."""
+    program = """
+import os, time
+import numpy as np
+from tsfusion import Volume
+from tsfusion.core import process
+ours = process.cores()
+volume = Volume(0.05, threads=len(ours))
+before = {thread: cpu_ns(thread) for thread in os.listdir("/proc/self/task")}
+depth = np.full((480, 640), 2000, np.uint16)
+for _ in range(20):
+    volume.integrate(depth=depth, intrinsics=(500, 500, 320, 240), T_world_camera=np.eye(4), sensor="kinect")
+busy = sorted(before, key=lambda thread: cpu_ns(thread) - before[thread])
+workers = [int(thread) for thread in busy if int(thread) != os.getpid()][-len(ours):]
+print(sorted(map(sorted, map(os.sched_getaffinity, workers))) == [[core] for core in ours])
+"""
+    reads = "def cpu_ns(thread): return int(open(f'/proc/self/task/{thread}/schedstat').read().split()[0])\n"
+    assert python(reads + program).stdout == "True\n"

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: MIT
 """`tsfusion fuse`."""
 
-import os
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -9,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tsfusion.cli import options, verbs
+from tsfusion.core import process
 
 if TYPE_CHECKING:
     from tsfusion.cluster.fusion import FusedRun
@@ -72,7 +72,7 @@ def fuse(
             found,
             _settings(found, config, settings),
             out,
-            partial(_scheduler, workers or os.cpu_count() or 1, ray),
+            partial(_scheduler, workers or len(process.cores()), ray),
             display,
             wishes=wishes,
             overwrite=overwrite,

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: MIT
 """Taichi is started once, here, on the thread that will launch kernels."""
 
-import os
 import textwrap
 from contextlib import redirect_stdout, suppress
 from functools import cache
 from io import StringIO
 from types import SimpleNamespace
 
+from tsfusion.core import process
 from tsfusion.core.errors import MissingDependency
 
 _started_threads: int | None = None
@@ -27,8 +27,9 @@ def start(threads: int | None = None) -> None:
 
     if _started_threads is None:
         _leave_out_source_lines()
-        _started_threads = threads or os.cpu_count() or 1
-        with redirect_stdout(StringIO()):  # `ti.init` prints; a program may be reading our stdout
+        _started_threads = threads or len(process.cores())
+        # `ti.init` starts the threads of kernels last, and prints; a program may be reading our stdout
+        with process.cores_of_their_own(_started_threads), redirect_stdout(StringIO()):
             ti.init(
                 arch=ti.cpu,
                 cpu_max_num_threads=_started_threads,
