@@ -107,7 +107,7 @@ class LiveRecording(LiveSource):
         """Read the files of the frames from `following` on, as long as the next one is not due."""
         for index in [index for index in read if index < following]:
             del read[index]
-        for index in range(following, min(following + _READ_AHEAD, self.length)):
+        for index in range(following, min(following + _READ_AHEAD, len(self._stamps))):
             if index not in read and time.monotonic_ns() + _READ_NS < due_ns:
                 read[index] = frame_of(self._dataset, index)
 

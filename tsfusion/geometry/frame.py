@@ -113,7 +113,8 @@ class Frame:
         if self.left is None or self.right is None:
             return None
         if "matched" in vars(self):
-            return self.matched * np.float32(1 / UNITS)
+            whole: NDArray[np.float32] = self.matched * np.float32(1 / UNITS)
+            return whole
         return quick_disparity(self.left, self.right)
 
     @property
