@@ -27,6 +27,7 @@ from tsfusion.core.errors import MissingDependency
 from tsfusion.gateway import fuser_process
 
 os.environ["PYTHONPATH"] = os.pathsep.join(sys.path)  # programs that tests start find what tests find
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of workers, which start later; as commands do
 OPTIONAL = ("kiss_icp", "open3d", "pooch", "pyrealsense2", "rosbags", "scipy", "xatlas")
 STDERR = pytest.StashKey[Any]()
 Server.FUSER = fuser_process.COMMAND = quick_fusers.LAZY  # of servers that tests start, and in this process

@@ -2,6 +2,7 @@
 """The `tsfusion` command as a person or a script meets it: output, exit status, and what is left behind."""
 
 import json
+import os
 import signal
 import socket
 import subprocess
@@ -52,6 +53,22 @@ def test_help_names_every_verb() -> None:
     done = tsfusion("--help")
     assert done.returncode == 0
     assert all(verb in done.stdout for verb in VERBS)
+
+
+@pytest.mark.parametrize("given", ["", "3"])
+def test_small_products_take_one_thread_unless_somebody_says_otherwise(given: str) -> None:
+    program = """
+import os
+from contextlib import suppress
+from tsfusion.__main__ import main
+with suppress(SystemExit):
+    main(["--version"])
+print(os.environ["OPENBLAS_NUM_THREADS"])
+"""
+    environment = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
+    if given:
+        environment["OPENBLAS_NUM_THREADS"] = given
+    assert python(program, env=environment).stdout.splitlines()[-1] == (given or "1")
 
 
 def test_nothing_is_help_and_version_is_a_line(here: Here) -> None:

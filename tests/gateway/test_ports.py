@@ -16,7 +16,7 @@ from keyframes_and_servers import connected, secured, wall
 from served_gateway import Served, record, serving_here
 
 from tsfusion import Client
-from tsfusion.gateway import access_control, ports
+from tsfusion.gateway import access_control, connections, ports
 from tsfusion.gateway.connections import Connection, Connections
 from tsfusion.wire import key_folder, messages, sockets
 from tsfusion.wire.curve import ClientKeys, client_keys
@@ -59,6 +59,13 @@ def xsub(context: "zmq.Context[Any]", keys: ClientKeys | None = None) -> sockets
 PORTS = {"data": b"PUSH", "control": b"DEALER", "publish": b"SUB"}
 
 
+@pytest.fixture
+def viewers_may_talk(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else a slow flood is cut off for its bytes before its message is whole."""
+    monkeypatch.setattr(connections, "_VIEWER_BYTES", 1 << 30)
+
+
+@pytest.mark.usefixtures("viewers_may_talk")
 @pytest.mark.parametrize("port", PORTS)
 def test_a_message_of_frames_without_end_is_not_read_to_its_end(
     served: Served, port: str, monkeypatch: pytest.MonkeyPatch
@@ -91,6 +98,7 @@ def test_a_message_of_frames_without_end_is_not_read_to_its_end(
         served.until(lambda: viewer.poll(0) or len(served.gateway._subscriptions) == 1)
 
 
+@pytest.mark.usefixtures("viewers_may_talk")
 def test_viewers_that_connect_anew_are_counted_anew(served: Served) -> None:
     """A viewer that did not come back would have its map meshed for nobody."""
     with (
