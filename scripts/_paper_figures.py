@@ -60,7 +60,7 @@ def delays(worlds: Sequence[PaperWorld], outcomes: Sequence[Outcome], runs: Path
     shown = [world for world in worlds if _of(world, outcomes)]
     if not shown:
         return False
-    figure = Figure(figsize=(6.4 * len(shown), 4.4), dpi=130, layout="constrained")
+    figure = Figure(figsize=(6.4 * len(shown), 5.4), dpi=130, layout="constrained")
     axes = figure.subplots(1, len(shown), squeeze=False)[0]
     for letter, axis, world in zip("abcdef", axes, shown, strict=False):
         for outcome in _of(world, outcomes):
@@ -75,7 +75,7 @@ def delays(worlds: Sequence[PaperWorld], outcomes: Sequence[Outcome], runs: Path
         axis.yaxis.set_major_formatter("{x:,.0f}")
         axis.yaxis.set_minor_formatter("")
         axis.set_title(f"({letter}) {world.stands_for}: {world.title}", fontsize=9)
-        axis.legend(fontsize=7, loc="best")
+        axis.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=2)
         axis.grid(True, which="major", alpha=0.3)
     figure.savefig(path)
     return True
