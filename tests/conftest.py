@@ -63,8 +63,12 @@ def pytest_collection_finish() -> None:
 
 
 def pytest_unconfigure(config: pytest.Config) -> None:
-    """End this process a minute after its last test, even if a thread of a failed one still waits."""
-    faulthandler.dump_traceback_later(60, exit=True, file=config.stash[STDERR])
+    """End this process a minute after its last test, even if a thread of a failed one still waits.
+
+    Not a worker: it waits for the others' last tests, however long they take, and pytest-xdist ends it.
+    """
+    if not hasattr(config, "workerinput"):
+        faulthandler.dump_traceback_later(60, exit=True, file=config.stash[STDERR])
 
 
 def pytest_timeout_set_timer(item: pytest.Item, settings: Any) -> None:
