@@ -10,6 +10,8 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
+import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -30,6 +32,7 @@ os.environ["PYTHONPATH"] = os.pathsep.join(sys.path)  # programs that tests star
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of workers, which start later; as commands do
 OPTIONAL = ("kiss_icp", "open3d", "pooch", "pyrealsense2", "rosbags", "scipy", "xatlas")
 STDERR = pytest.StashKey[Any]()
+PARENT = pytest.StashKey[int]()
 Server.FUSER = fuser_process.COMMAND = quick_fusers.LAZY  # of servers that tests start, and in this process
 BYTECODE = "TEST_BYTECODE"  # environment: folder of what the commands that tests start compile
 DATA = Path(os.environ.get("TSFUSION_DATA", Path(__file__).parents[2] / "shared" / "data"))
@@ -47,6 +50,7 @@ def pytest_configure(config: pytest.Config) -> None:
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     config.stash[STDERR] = os.fdopen(os.dup(2), "w")
+    config.stash[PARENT] = os.getppid()
     if os.environ.get("PYTHONDONTWRITEBYTECODE") and BYTECODE not in os.environ:
         os.environ[BYTECODE] = tempfile.mkdtemp(prefix="tsfusion-bytecode-")
         atexit.register(shutil.rmtree, os.environ[BYTECODE], ignore_errors=True)
@@ -65,10 +69,15 @@ def pytest_collection_finish() -> None:
 def pytest_unconfigure(config: pytest.Config) -> None:
     """End this process a minute after its last test, even if a thread of a failed one still waits.
 
-    Not a worker: it waits for the others' last tests, however long they take, and pytest-xdist ends it.
+    A worker first waits for the others' last tests, however long they take: until the controller has ended.
     """
-    if not hasattr(config, "workerinput"):
+
+    def end_soon() -> None:
+        while hasattr(config, "workerinput") and os.getppid() == config.stash[PARENT]:
+            time.sleep(1)
         faulthandler.dump_traceback_later(60, exit=True, file=config.stash[STDERR])
+
+    threading.Thread(target=end_soon, daemon=True).start()
 
 
 def pytest_timeout_set_timer(item: pytest.Item, settings: Any) -> None:
