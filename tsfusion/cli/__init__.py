@@ -36,6 +36,7 @@ from tsfusion.cli import (
     view,
 )
 from tsfusion.core.errors import TsfusionError
+from tsfusion.core.versions import version_of
 
 INTERRUPTED = 128 + signal.SIGINT
 TERMINATED = 128 + signal.SIGTERM
@@ -112,9 +113,7 @@ def _root(
     version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False,
 ) -> None:
     if version:
-        from importlib.metadata import version as installed
-
-        typer.echo(f"tsfusion {installed('tsfusion')}")
+        typer.echo(f"tsfusion {version_of('tsfusion')}")
     elif context.invoked_subcommand is None:
         typer.echo(context.get_help())
 

@@ -15,7 +15,6 @@ from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +23,7 @@ import msgspec
 from tsfusion import journal
 from tsfusion.core import process
 from tsfusion.core.errors import JournalError, TsfusionError
+from tsfusion.core.versions import version_of
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.fuser.current_keyframe import CurrentKeyframe
 from tsfusion.fuser.departures import Departures
@@ -463,7 +463,7 @@ class Fuser:
 @cache
 def _versions() -> dict[str, str]:
     """Versions of Python and the libraries, read once: the files take longer than all else of a status."""
-    libraries = {name: version(name) for name in ("tsfusion", "taichi", "numpy", "pyzmq")}
+    libraries = {name: version_of(name) for name in ("tsfusion", "taichi", "numpy", "pyzmq")}
     return {"python": platform.python_version(), **libraries}
 
 

@@ -7,7 +7,6 @@ The gateway's thread writes (`observe`, `health`), another thread answers HTTP; 
 import platform
 import time
 from collections.abc import Callable, Iterator
-from importlib.metadata import version
 from pathlib import Path
 
 from prometheus_client import CollectorRegistry, Histogram, generate_latest
@@ -16,6 +15,7 @@ from prometheus_client.registry import Collector
 
 from tsfusion.core.config import ServerConfig
 from tsfusion.core.logs import printable
+from tsfusion.core.versions import version_of
 from tsfusion.gateway import metrics_families
 from tsfusion.gateway.metrics_http import HttpResponse, MetricsPage
 from tsfusion.wire.health import Health
@@ -150,7 +150,7 @@ class Metrics(Collector):
     def collect(self) -> Iterator[Metric]:
         """The figures of the last snapshot: all but the delays."""
         build = GaugeMetricFamily("tsfusion_build_info", "Versions.", labels=("version", "python"))
-        build.add_metric((version("tsfusion"), platform.python_version()), 1)
+        build.add_metric((version_of("tsfusion"), platform.python_version()), 1)
         yield build
         seen = self._seen
         age = self._clock() - seen[1] if seen else None

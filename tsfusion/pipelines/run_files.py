@@ -9,7 +9,6 @@ import shlex
 import sys
 import time
 from contextlib import suppress
-from importlib import metadata
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,6 +20,7 @@ from numpy.typing import NDArray
 from tsfusion.client import ClientStats
 from tsfusion.core import process
 from tsfusion.core.output_folder import RECORD
+from tsfusion.core.versions import version_of
 from tsfusion.datasets.dataset import NOMINAL_NS
 from tsfusion.datasets.trajectory_files import write_tum
 from tsfusion.geometry import up_direction
@@ -163,9 +163,4 @@ def versions() -> dict[str, str]:
     """Versions of Python, the platform, tsfusion and the packages it stands on."""
     packages = "tsfusion taichi numpy opencv-python-headless pyzmq trimesh mcap msgspec zstandard"
     found = {"python": platform.python_version(), "platform": platform.platform()}
-    for name in packages.split():
-        try:
-            found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            found[name] = "missing"
-    return found
+    return found | {name: version_of(name) for name in packages.split()}

@@ -12,13 +12,13 @@ import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from importlib.metadata import version
 from pathlib import Path
 from typing import IO, Any
 
 from tsfusion.core import durable_files, folder_lock
 from tsfusion.core.durable_files import size_of
 from tsfusion.core.errors import DatasetError, OutputError
+from tsfusion.core.versions import version_of
 
 Watcher = Callable[[int, int], None]  # bytes there, bytes of all (0 = unknown)
 
@@ -65,7 +65,7 @@ def download(url: str, part: Path, watch: Watcher) -> None:
 def _request(url: str, part: Path, watch: Watcher) -> bool:
     """Send one request; True if the file is complete then."""
     start, validator = size_of(part), _validator(part)
-    headers = {"User-Agent": f"tsfusion/{version('tsfusion')}", "Accept-Encoding": "identity"}
+    headers = {"User-Agent": f"tsfusion/{version_of('tsfusion')}", "Accept-Encoding": "identity"}
     if start and validator:
         headers |= {"Range": f"bytes={start}-", "If-Range": validator}
     try:
