@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Memory, limits, signals and the end of this process, as the operating system offers them."""
 
+import _signal  # type: ignore[import-not-found]  # `signal` makes enumerations of numbers: 5 µs a call
 import ctypes
 import os
 import resource
@@ -195,15 +196,15 @@ def uninterrupted() -> Iterator[None]:
         came.append((number, frame))
 
     for held in (signal.SIGINT, signal.SIGTERM):
-        if signal.getsignal(held) is not None:  # one that Python did not set cannot be put back
-            usual[held] = signal.signal(held, later)
+        if _signal.getsignal(held) is not None:  # one that Python did not set cannot be put back
+            usual[held] = _signal.signal(held, later)
     _holds_back = True
     try:
         yield
     finally:
         _holds_back = False
         for number, handler in usual.items():
-            signal.signal(number, handler)
+            _signal.signal(number, handler)
     for number, frame in came:
         handler = signal.getsignal(number)  # the first signal's handler may have set it
         if callable(handler):

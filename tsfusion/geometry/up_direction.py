@@ -111,9 +111,12 @@ class HeldSensor:
             times: -1 takes it out again.
         """
         up = T_world_sensor[:3, 2] if sensor == "lidar" else -T_world_sensor[:3, 1]
-        rows = [up, T_world_sensor[:3, 3]] + ([] if force is None else [T_world_sensor[:3, :3] @ force])
-        rounded = np.round(np.array(rows) / _GRAIN) * _GRAIN
-        self._sums[: len(rows)] += times * np.column_stack((rounded, np.ones(len(rows))))
+        rows = np.ones((2 if force is None else 3, 4))
+        rows[0, :3], rows[1, :3] = up, T_world_sensor[:3, 3]
+        if force is not None:
+            rows[2, :3] = T_world_sensor[:3, :3] @ force
+        rows[:, :3] = np.rint(rows[:, :3] / _GRAIN) * _GRAIN
+        self._sums[: len(rows)] += times * rows
 
     def merge(self, other: "HeldSensor") -> None:
         """Take the keyframes of another into account."""

@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from tsfusion.kernels import taichi as ti
 
 _INTEGERS, _FLOATS = (int, np.integer), (float, np.floating)
+_INTEGER, _FLOAT, _OF_TAICHI, _OF_NUMPY, _COPIED = -1, -2, -3, -4, -5
+_WHAT: dict[type, int] = {}  # of the types of arguments that were seen: to ask anew takes half of a launch
 
 
 class Copied(NamedTuple):
@@ -53,19 +55,17 @@ class QuickLaunch:
             return
         kernel, code = known
         context = kernel.make_launch_context()
+        set_ndarray, set_array = context.set_arg_ndarray, context.set_arg_external_array_with_shape
         for place, argument in enumerate(arguments):
-            if isinstance(argument, np.ndarray):
+            what = _WHAT[type(argument)]
+            if what == _OF_TAICHI:
+                set_ndarray((place,), argument.arr)
+            elif what == _OF_NUMPY:
                 address = argument.__array_interface__["data"][0]
-                context.set_arg_external_array_with_shape(
-                    (place,), address, argument.nbytes, argument.shape, 0
-                )
-            elif isinstance(argument, ti.Ndarray):
-                context.set_arg_ndarray((place,), argument.arr)
-            elif isinstance(argument, Copied):
+                set_array((place,), address, argument.nbytes, argument.shape, 0)
+            elif what == _COPIED:
                 array = argument.array
-                context.set_arg_external_array_with_shape(
-                    (place,), argument.address, array.nbytes, array.shape, 0
-                )
+                set_array((place,), argument.address, array.nbytes, array.shape, 0)
             elif self._takes_floats[place]:
                 context.set_arg_float((place,), float(argument))
             else:
@@ -96,18 +96,31 @@ class QuickLaunch:
 def _kind(arguments: tuple[Any, ...]) -> tuple[int, ...] | None:
     """Types that a launch depends on, as numbers; None where Taichi is to look for itself."""
     kind = []
-    for given in arguments:
-        argument = given.array if isinstance(given, Copied) else given
-        if isinstance(argument, ti.Ndarray):
+    for argument in arguments:
+        what = _WHAT.get(type(argument))
+        if what == _OF_TAICHI:
             kind.append(-8 - (id(argument.dtype) << 4 | len(argument.shape)))
-        elif isinstance(argument, np.ndarray):
-            if not (argument.flags.c_contiguous and argument.dtype.isnative):  # `num` says nothing of bytes
+        elif what == _OF_NUMPY or what == _COPIED:
+            array = argument.array if what == _COPIED else argument
+            if not (array.flags.c_contiguous and array.dtype.isnative):  # `num` says nothing of bytes
                 return None
-            kind.append(argument.dtype.num << 4 | argument.ndim)
-        elif isinstance(argument, _INTEGERS):
-            kind.append(-1)
-        elif isinstance(argument, _FLOATS):
-            kind.append(-2)
-        else:
+            kind.append(array.dtype.num << 4 | array.ndim)
+        elif what is not None:
+            kind.append(what)
+        elif (found := _what(argument)) is None:
             return None
+        else:
+            _WHAT[type(argument)] = found
+            return _kind(arguments)
     return tuple(kind)
+
+
+def _what(argument: Any) -> int | None:
+    """What an argument is, whatever its type's name; None = nothing that a kernel takes."""
+    for kind, what in (
+        (ti.Ndarray, _OF_TAICHI), (np.ndarray, _OF_NUMPY), (Copied, _COPIED), (_INTEGERS, _INTEGER),
+        (_FLOATS, _FLOAT),
+    ):  # fmt: skip
+        if isinstance(argument, kind):
+            return what
+    return None

@@ -120,6 +120,9 @@ class Integrator:
     def _parts(self) -> Iterator[Part]:
         """Bands in runs of limited weight; nearly always all of them."""
         weights = np.cumsum(self._buffers.bands[:, WEIGHT], dtype=np.int64)  # of the bands up to each
+        if weights[-1] < PART_WEIGHT:
+            yield 0, len(weights)
+            return
         first = 0
         while first < len(weights):
             before = int(weights[first - 1]) if first else 0
@@ -223,9 +226,9 @@ class Integrator:
         store, slots = self._store, self._buffers.touched_slots
         if sign > 0:
             most = int(self._buffers.bands[part[0] : part[1], WEIGHT].sum())
-            bounds = store.bounds[slots].astype(np.int64) + most
-            if not len(slots) or int(bounds.max()) < WEIGHT_LIMIT:
-                store.bounds[slots] = bounds
+            bounds = store.bounds[slots]
+            if not len(slots) or int(bounds.max()) + most < WEIGHT_LIMIT:
+                store.bounds[slots] = bounds + most
                 return
         self._measure_touched()
         bad = int(np.count_nonzero(store.bounds[slots] >= WEIGHT_LIMIT))

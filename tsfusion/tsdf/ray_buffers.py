@@ -31,6 +31,8 @@ class RayBuffers:
     the keys of those that the map does not have (`missing`, a hash set)."""
 
     def __init__(self, *, color: bool, regularised: bool) -> None:
+        self._modelled: tuple[Any, ...] = ()  # what `_parameters` are of
+        self._parameters = np.empty(0)
         self.color = color
         self.colored = False  # the current keyframe brings colour, and the map keeps it
         self.rays = np.zeros((0, RAY_FIELDS), np.int32)
@@ -89,10 +91,7 @@ class RayBuffers:
     def make_rays(self, keyframe: Keyframe, config: VolumeConfig) -> None:
         """Fill `rays`."""
         voxel_size, bundle = config.voxel_size, int(config.bundle)
-        parameters = model_parameters(
-            config.model(keyframe.sensor), voxel_size, keyframe.baseline_fx,
-            outlier_filter=config.outlier_filter, space_carving=config.space_carving,
-        )  # fmt: skip
+        parameters = self._model(config, keyframe.sensor, keyframe.baseline_fx)
         self.colored = self.color and keyframe.color is not None
         T = keyframe.T_world_camera
         if keyframe.kind == "points":
@@ -115,6 +114,19 @@ class RayBuffers:
                 *_optional(keyframe.confidence, 2),
                 _camera(keyframe, voxel_size), parameters, bundle,
             )  # fmt: skip
+
+    def _model(
+        self, config: VolumeConfig, sensor: str | None, baseline_fx: float | None
+    ) -> NDArray[np.float64]:
+        """The sensor model, which is nearly always that of the keyframe before."""
+        modelled = config, sensor, baseline_fx
+        if modelled != self._modelled:
+            self._parameters = model_parameters(
+                config.model(sensor), config.voxel_size, baseline_fx,
+                outlier_filter=config.outlier_filter, space_carving=config.space_carving,
+            )  # fmt: skip
+            self._modelled = modelled
+        return self._parameters
 
     @property
     def samples(self) -> int:
@@ -219,9 +231,11 @@ def _camera(keyframe: Keyframe, voxel_size: float) -> NDArray[np.float64]:
     """(4, 3) float64, voxels: a pixel's step right, its step down, pixel (0, 0), and the camera's centre."""
     K, T = keyframe.intrinsics, keyframe.T_world_camera
     assert K is not None  # checked by Keyframe
-    R = T[:3, :3] / voxel_size
-    du, dv = R[:, 0] / K.fx, R[:, 1] / K.fy
-    return np.stack([du, dv, R[:, 2] - K.cx * du - K.cy * dv, T[:3, 3] / voxel_size])
+    rows = np.ascontiguousarray(T[:3].T) / voxel_size
+    rows[0] /= K.fx
+    rows[1] /= K.fy
+    rows[2] = rows[2] - K.cx * rows[0] - K.cy * rows[1]
+    return rows
 
 
 def _optional(array: NDArray[np.uint8] | None, dims: int) -> tuple[NDArray[Any], int]:
