@@ -17,6 +17,7 @@ from tsfusion import Keyframe, Volume
 from tsfusion.core.errors import KeyframeTooLarge, MapFull, MapQuota
 from tsfusion.kernels import device_copies, runtime
 from tsfusion.kernels.device_copies import Copies, CudaCopies
+from tsfusion.kernels.device_integration import APART, NEW
 from tsfusion.tsdf import device_blocks, device_map
 from tsfusion.tsdf.checkpoint import LAYER_DTYPES
 from tsfusion.tsdf.integrator import KeyframeQuota
@@ -175,16 +176,73 @@ def test_a_keyframe_is_one_call(link: HereLink) -> None:
     there.integrate(VIEWS[0])
     link.calls.clear()
     assert there.integrate(VIEWS[1]).new_blocks > 0
-    assert link.calls == ["make_rays"]
+    assert link.calls == ["fuse"]
     assert there.integrate(VIEWS[1]).new_blocks == 0
-    assert link.calls == ["make_rays", "make_rays"]
+    assert link.calls == ["fuse", "fuse"]
 
 
-def test_many_new_blocks_are_two_calls(link: HereLink) -> None:
+def assert_hash_is_the_map_s(there: Volume, link: HereLink) -> None:
+    """What the device has entered into its hash, many at the same time, is where it is one by one."""
+    of_device, store = link.maps[-1], there._store
+    assert (of_device._hash_keys.to_numpy() == store.hash_keys).all()
+    used = store.hash_keys != 0
+    assert (of_device._hash_slots.to_numpy()[used] == store.hash_slots[used]).all()
+
+
+def test_many_new_blocks_are_one_call_and_have_the_places_of_the_map(link: HereLink) -> None:
     here, there = both(voxel_size=0.005)
     for keyframe in VIEWS:
         assert here.integrate(keyframe) == there.integrate(keyframe)
-    assert link.calls.count("insert") > 1
+    assert link.calls == ["fuse"] * len(VIEWS)
+    told = link.maps[-1]._told.to_numpy()
+    assert 0 < told[APART] < told[NEW], "no two of them share a place"
+    assert_hash_is_the_map_s(there, link)
+    assert_equal(here, there)
+
+
+@pytest.mark.parametrize("first", [16, 256])
+def test_a_map_without_room_grows_by_more_calls(
+    link: HereLink, monkeypatch: pytest.MonkeyPatch, first: int
+) -> None:
+    monkeypatch.setattr(device_blocks.DeviceBlocks, "first_blocks", first)
+    for module in (device_map, device_blocks):
+        monkeypatch.setattr(module, "FIRST_BLOCKS", first)
+        monkeypatch.setattr(module, "FIRST_HASH", 4 * first)
+    here, there = both(voxel_size=0.01)
+    for keyframe in VIEWS:
+        assert here.integrate(keyframe) == there.integrate(keyframe)
+    assert link.calls.count("insert") > 0
+    assert_hash_is_the_map_s(there, link)
+    assert_equal(here, there)
+    there.retract(VIEWS[1])
+    here.retract(VIEWS[1])
+    assert here.release_empty() == there.release_empty()
+    assert here.integrate(VIEWS[2]) == there.integrate(VIEWS[2])
+    assert_hash_is_the_map_s(there, link)
+    assert_equal(here, there)
+
+
+def test_a_missing_block_that_is_listed_twice_is_added_once(
+    link: HereLink, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here, there = both()
+    of_device = link.maps[-1]
+    read, doubled = of_device._read_results, []
+
+    def read_doubled() -> Any:
+        told, missing = read()
+        if len(missing) and not doubled:
+            doubled.append(len(missing))
+            missing = np.concatenate([missing, missing[:3]])
+        return told, missing
+
+    monkeypatch.setattr(of_device, "_read_results", read_doubled)
+    there.limit_memory(1 << 30)
+    there.quota = KeyframeQuota(cost=1 << 29)
+    monkeypatch.setattr(type(there._store), "spare", 0)  # so that blocks are told of, not admitted
+    for keyframe in VIEWS:
+        assert here.integrate(keyframe) == there.integrate(keyframe)
+    assert doubled
     assert_equal(here, there)
 
 
@@ -194,7 +252,6 @@ def test_updates_that_do_not_fit_into_the_list_are_made_in_runs(
 ) -> None:
     monkeypatch.setattr(device_map, "_LISTED", 1000)
     monkeypatch.setattr(device_map, "_FEW_TOUCHED", 3)
-    monkeypatch.setattr(device_map, "_FEW_MISSING", 2)
     here, there = both(**settings)
     keyframes = KINDS["colour and confidence"]
     for keyframe in keyframes:

@@ -6,6 +6,7 @@ import math
 import mmap
 import os
 import select
+import socket
 import tempfile
 import time
 from collections.abc import Iterable
@@ -16,6 +17,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 _ALIGNMENT = 64  # bytes
+MOST_SAID = 1 << 17  # bytes of a message
 _STEP = 1 << 20
 
 
@@ -47,6 +49,16 @@ def look_out(descriptor: int, seconds: float) -> None:
     end = time.monotonic() + seconds
     while not poll.poll(0) and time.monotonic() < end:
         os.sched_yield()  # the other process may have to run on this core
+
+
+def talking_sockets() -> tuple[socket.socket, socket.socket]:
+    """Two ends of a connection between processes that keeps messages apart; reading an end says nothing (b"")
+    once the other one is closed.
+
+    Raises:
+        OSError: the system has no such connections (macOS).
+    """
+    return socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
 
 
 class SharedArrays:

@@ -3,38 +3,36 @@
 
 Every voxel gets what `integrate.add_rays` gives it: the additions are the same integers, and their order
 shows nowhere. Arrays are a device's (`ti.ndarray`); those of the map have a row of 512 voxels a slot.
+
+What is counted is counted in many places first: a device makes one addition to a place after the other.
 """
 
 import taichi as ti
 
 from tsfusion.kernels.block_hash import map_find
 from tsfusion.kernels.integrate import (
-    ALL,
     COLOR_LIMIT,
     CUBE,
     FREE_SHIFT,
     MAX_DISTANCE,
-    ONLY_DEFERRED,
     TOUCHED_COUNT,
     TOUCHED_HEADER,
     TOUCHED_MISMATCH,
     TOUCHED_MISSING,
     TOUCHED_OVERFLOW,
     WEIGHT_BITS,
+    lane_weight,
     quantize,
 )
 from tsfusion.kernels.quick_launch import QuickLaunch
+from tsfusion.kernels.rays_from_images import TILE_SAMPLES
 from tsfusion.kernels.voxel_traversal import (
-    COST,
-    COUNT,
+    BAND_FIELDS,
     CROSSING,
     DEFERRED,
     END,
     INTERVAL,
-    SAMPLES,
-    START,
     UPDATES,
-    WEIGHT,
     WEIGHT_COLOR,
     advance,
     begin_walk,
@@ -47,48 +45,149 @@ from tsfusion.kernels.voxel_traversal import (
     vec3i,
 )
 
-# A listed update: place of the voxel in the layers, w·m and w; of a missing block: its coordinates. A vote
-# for a colour: place and 0xRRGGBB.
-LISTED_FIELDS, VOTE_FIELDS = 4, 2
-PLACE, PRODUCT, VOTE, LAST = 0, 1, 2, 3
-BLOCK, COLOR = 1, 1
-COUNTS = 2  # of a keyframe's launches: nearly always there are two
-WINNERS = 1 << 16
-MISSING, SKIPPED = -1, -2  # instead of a place: what is listed is a missing block, or nothing
+# `told`, what the host reads of a launch: the header of the touched blocks (kernels/integrate.py); how many
+# new blocks are blocks of the map now; how many missing ones have a place in the hash that no other one
+# wants; whether two of them are the same; the bands, of which the k-th also counts updates of every 64th ray;
+# keys of new blocks, in the order of their slots, two numbers each; slots of touched blocks.
+NEW, APART, ARE_SAME = (TOUCHED_HEADER + i for i in range(3))
+HEADER = 16
+BANDS = 64  # those of a map on the CPU: at their ends bundles of points end
+FEW_NEW = 4096  # blocks that a launch makes blocks of the map itself
+BANDS_AT = HEADER
+FRESH_AT = BANDS_AT + BANDS * BAND_FIELDS
+TOUCHED_AT = FRESH_AT + 2 * FEW_NEW
+FIRST_BLOCKS = 8192  # that a map has room for at first
+FIRST_HASH = 4 * FIRST_BLOCKS
+LACKING = DEFERRED  # of a band: updates of missing blocks
+
+# A listed update: place of the voxel in the layers, w·m << WEIGHT_FIELD | w, and the key of a missing block,
+# of which the place is −1 − number of the voxel in it.
+LISTED_FIELDS = 4
+PLACE, AMOUNT, KEY = 0, 1, 2
+WEIGHT_FIELD = 10  # bits: 255, four times
+SKIPPED = -1 - CUBE  # instead of a place
+
+# Rays in groups, by their places: voxels that they cross, and where their updates begin in the list.
+GROUP, GROUP_FIELDS = TILE_SAMPLES, 2
+CROSSED, BASE = 0, 1
+LISTED, COSTS = 0, 1  # in `totals`: updates that are listed, and what the rays cost
+
+WINNERS = 1 << 16  # places of a table, of which there are two
+CLAIMS = 1 << 14  # places of another one: how many missing blocks want a place in the hash
+HASH_PLACE, RANK = 0, 1  # of a missing block, if there are few
+
+BEGINNERS = max(TOUCHED_AT, CLAIMS)
+
+# Limits of a keyframe: new blocks, touched ones, what rays and new blocks cost; and what one of these does
+ROOM_NEW, ROOM_TOUCHED, ROOM_COST, BLOCK_COST = 0, 1, 2, 3
 
 
 @ti.func
-def band_of(bands: ti.template(), r):
-    """The last band that begins at place `r` or before it; those without places begin where the next does."""
-    low, high = 0, bands.shape[0]
-    while high - low > 1:
-        middle = (low + high) >> 1
-        if bands[middle, START] <= r:
-            low = middle
-        else:
-            high = middle
-    return low
+def band_field(band, field: ti.template()):
+    """Where a band's field is in `told`."""
+    return BANDS_AT + band * BAND_FIELDS + field
 
 
 @ti.func
-def list_block(slot, stamp, stamps: ti.template(), touched: ti.template()):
+def begin_keyframe(i, told: ti.template(), claims: ti.template()):
+    """The i-th of `BEGINNERS` threads empties what is told of the keyframe before."""
+    if i < TOUCHED_AT:
+        told[i] = 0
+    if i < CLAIMS:
+        claims[i] = 0
+
+
+@ti.func
+def begin_groups(i, groups: ti.template(), totals: ti.template()):
+    """The i-th thread empties what is counted of a launch, if there are as many groups."""
+    if i == 0:
+        totals[LISTED], totals[COSTS] = 0, 0
+    if i < groups.shape[0]:
+        groups[i, CROSSED] = 0
+
+
+@ti.func
+def begin_list(g, groups: ti.template(), totals: ti.template(), listed: ti.template()):
+    """Give a group its part of the list."""
+    base = ti.atomic_add(totals[LISTED], ti.cast(groups[g, CROSSED], ti.i64))
+    groups[g, BASE] = ti.cast(ti.min(base, ti.i64(listed.shape[0])), ti.i32)
+
+
+@ti.func
+def list_block(slot, stamp, stamps: ti.template(), told: ti.template()):
     """List a block among those that the keyframe touches, once."""
     if stamps[slot] != stamp:
         if ti.atomic_max(stamps[slot], stamp) != stamp:
-            place = ti.atomic_add(touched[TOUCHED_COUNT], 1)
-            touched[TOUCHED_HEADER + place] = slot
+            place = ti.atomic_add(told[TOUCHED_COUNT], 1)
+            told[TOUCHED_AT + place] = slot
+
+
+@ti.func
+def joined(low, high):
+    """A key of its two numbers."""
+    return (ti.cast(high, ti.i64) << 32) | (ti.cast(low, ti.i64) & ti.i64(4294967295))
 
 
 @ti.func
 def missing_key(listed: ti.template(), i):
     """Key of the missing block that is listed at place i."""
-    return pack(listed[i, BLOCK], listed[i, BLOCK + 1], listed[i, BLOCK + 2])
+    return joined(listed[i, KEY], listed[i, KEY + 1])
 
 
 @ti.func
-def missing_place(listed: ti.template(), i):
-    """Where it is in the table of `WINNERS` places."""
-    return hash_key(missing_key(listed, i)) & (WINNERS - 1)
+def winner_place(key, table: ti.template()):
+    """Where a block is in one of the two tables of `WINNERS` places."""
+    return table * WINNERS + ((hash_key(key) >> (15 * table)) & (WINNERS - 1))
+
+
+@ti.func
+def is_winner(i, listed: ti.template(), winners: ti.template()):
+    """Whether a block is to be listed among the missing ones from place i: nearly always from one place."""
+    key = missing_key(listed, i)
+    first, second = winners[winner_place(key, 0)], winners[winner_place(key, 1)]
+    found = 1
+    if missing_key(listed, first) == key:
+        found = ti.cast(first == i, ti.i32)
+    elif missing_key(listed, second) == key:
+        found = ti.cast(second == i, ti.i32)
+    return found
+
+
+@ti.func
+def fresh_key(told: ti.template(), rank):
+    """Key of a new block."""
+    return joined(told[FRESH_AT + 2 * rank], told[FRESH_AT + 2 * rank + 1])
+
+
+@ti.func
+def rank_of(told: ti.template(), key):
+    """Which of the new blocks one of them is: those that share no place come first, by their keys."""
+    rank = rank_within(told, key, 0, told[APART])
+    if rank < 0:
+        rank = rank_within(told, key, told[APART], told[TOUCHED_MISSING])
+    return rank
+
+
+@ti.func
+def rank_within(told: ti.template(), key, first, end):
+    """Likewise among a run of them; −1 if it is not there."""
+    low, high = first, end
+    while high - low > 1:
+        middle = (low + high) >> 1
+        if fresh_key(told, middle) <= key:
+            low = middle
+        else:
+            high = middle
+    found = -1
+    if first < end:
+        found = ti.select(fresh_key(told, low) == key, low, -1)
+    return found
+
+
+@ti.func
+def shares_place(k, places: ti.template(), claims: ti.template()):
+    """Whether the k-th missing block may share its place in the hash with another one."""
+    return ti.cast(claims[places[k, HASH_PLACE] & (CLAIMS - 1)] > 1, ti.i32)
 
 
 @ti.func
@@ -102,84 +201,274 @@ def crossed(rays: ti.template(), r):
 
 
 @ti.func
-def listed_count(count, listed: ti.template()):
-    """How many updates are listed; none where they are more than there is room for."""
-    return ti.cast(ti.select(count <= listed.shape[0], count, 0), ti.i32)
-
-
-@ti.func
-def vote_count(has_color, count, listed: ti.template(), rays):
-    """How many votes for colours are cast; none where no updates are made."""
-    return ti.select(has_color == 1, ti.select(count <= listed.shape[0], rays, 0), 0)
-
-
-@ti.func
 def list_updates(
-    rays: ti.template(), r, base, most, sign_, oldest, hash_keys: ti.template(), hash_slots: ti.template(),
+    rays: ti.template(), r, base, most, oldest, hash_keys: ti.template(), hash_slots: ti.template(),
     listed: ti.template(),
 ):  # fmt: skip
-    """List the update of every voxel that ray `r` crosses in blocks of slot ≥ `oldest`, and missing blocks,
-    from place `base` on, `most` in all; returns the number of updates, whether a block is missing, and the
-    place of the voxel that takes the colour, or −1."""
+    """List the update of every voxel that ray `r` crosses in blocks of slot ≥ `oldest` and in missing blocks,
+    from place `base` on, `most` in all; returns the numbers of updates and of those in missing blocks, and
+    where the update is whose voxel takes the colour, or −1."""
     walk, weight = begin_walk(rays, r), ray_weight(rays, r)
     ends = rays[r, END]
     length, fourfold = ray_length(rays, r)
     end = ends & ~7
     band_begins = end - (length - end)  # before it is free space
     free_weight, free_distance = ti.max(weight >> FREE_SHIFT, 1), quantize(length - end)
-    last, slot = vec3i(2147483647), -1
-    added, lacks, colored, n = 0, 0, SKIPPED, 0
+    last, slot, key = vec3i(2147483647), -1, ti.i64(0)
+    added, lacking, colored, n = 0, 0, -1, 0
     is_colored = ti.select(end + 1 == length, 1, 0)  # or is to have none
     while n < most:
         block = walk.voxel >> 3
-        is_new = (block[0] != last[0]) | (block[1] != last[1]) | (block[2] != last[2])
-        at = SKIPPED
-        if is_new:
+        if (block[0] != last[0]) | (block[1] != last[1]) | (block[2] != last[2]):
             last = block
             key = pack(block[0], block[1], block[2])
             slot = map_find(hash_keys, hash_slots, hash_keys.shape[0] - 1, key)
-            lacks |= ti.select(slot < 0, 1, 0)
-            at = ti.select(slot < 0, MISSING, SKIPPED)
-            slot = ti.select(slot < oldest, -1, slot)
         step, leaves = next_step(walk.crossing)
         is_free = leaves < band_begins
         w = ti.select(is_free, ti.select(leaves < fourfold, free_weight << 2, free_weight), weight)
         m = ti.select(is_free, free_distance, ti.max(quantize(walk.distance), -MAX_DISTANCE))
-        at = ti.select(slot >= 0, slot * CUBE + offset_in_block(walk.voxel), at)
+        offset = offset_in_block(walk.voxel)
+        at = ti.select(slot >= oldest, slot * CUBE + offset, SKIPPED)
+        at = ti.select(slot < 0, -1 - offset, at)
         listed[base + n, PLACE] = at
-        listed[base + n, PRODUCT] = ti.select(at == MISSING, block[0], sign_ * w * m)
-        listed[base + n, VOTE] = ti.select(at == MISSING, block[1], sign_ * w)
-        listed[base + n, LAST] = block[2]
-        added += ti.select(at >= 0, 1, 0)
+        listed[base + n, AMOUNT] = ((w * m) << WEIGHT_FIELD) | w
+        if slot < 0:
+            listed[base + n, KEY] = ti.cast(key, ti.i32)
+            listed[base + n, KEY + 1] = ti.cast(key >> 32, ti.i32)
+        added += ti.cast(at >= 0, ti.i32)
+        lacking += ti.cast(slot < 0, ti.i32)
         takes_color = (is_colored == 0) & (leaves > end)
-        colored = ti.select(takes_color, at, colored)
+        colored = ti.select(takes_color, base + n, colored)
         is_colored = ti.select(takes_color, 1, is_colored)
         advance(walk, step)
         n += 1
-    return added, lacks, colored
+    return added, lacking, colored
 
 
 @ti.func
-def begin_keyframe(bands: ti.template(), band, count: ti.template(), touched: ti.template()):
-    """Nothing is counted of a band of the next keyframe, and with the first band nothing at all."""
-    for field in ti.static((COUNT, SAMPLES, WEIGHT, COST, DEFERRED, UPDATES)):
-        bands[band, field] = 0
-    if band == 0:
-        for i in ti.static(range(COUNTS)):
-            count[i] = 0
-        for i in ti.static(range(TOUCHED_HEADER)):
-            touched[i] = 0
+def add_update(listed: ti.template(), i, at, sign_, sums: ti.template()):
+    """Make the update that is listed at place i, of the voxel at place `at` of the layers."""
+    # both sums in one addition; their quotient minimises Σ w (x − m)²: paper eq. 2
+    packed = listed[i, AMOUNT]
+    product, w = ti.cast(packed >> WEIGHT_FIELD, ti.i64), packed & ((1 << WEIGHT_FIELD) - 1)
+    ti.atomic_add(sums[at // CUBE, at % CUBE], sign_ * ((product << WEIGHT_BITS) + w))
+
+
+@ti.func
+def vote_color(at, packed, sign_, told: ti.template(), color_rgn: ti.template(), color_b: ti.template()):
+    """Add a vote 0xRRGGBB for a voxel's colour. A settled one stays, as in `integrate.vote_color`."""
+    slot, o = at // CUBE, at % CUBE
+    taken = ti.cast(color_rgn[slot, o] & 65535, ti.i32)
+    if taken < COLOR_LIMIT or taken >= COLOR_LIMIT + (COLOR_LIMIT >> 1):
+        red, green = ti.cast((packed >> 16) & 255, ti.i64), ti.cast((packed >> 8) & 255, ti.i64)
+        before = ti.atomic_add(color_rgn[slot, o], sign_ * ((red << 40) + (green << 16) + 1))
+        ti.atomic_add(color_b[slot, o], sign_ * (packed & 255))
+        if sign_ < 0 and (before & 65535) == 0:
+            told[TOUCHED_MISMATCH] = 1
+
+
+@ti.func
+def listed_end(count, totals: ti.template(), listed: ti.template()):
+    """How many updates of `count` rays are listed; none where they are more than there is room for."""
+    is_listed = (count > 0) & (totals[LISTED] <= listed.shape[0])
+    return ti.cast(ti.select(is_listed, totals[LISTED], 0), ti.i32)
+
+
+@ti.func
+def whole_groups(count):
+    """Places for so many rays in whole groups."""
+    return (count + GROUP - 1) // GROUP * GROUP
+
+
+@ti.func
+def place_of(j):
+    """Place of the ray that the j-th thread looks at. Of a cell of four pixels only the first place has one:
+    neighbours look at every fourth place, where all of them have a ray, or none."""
+    return j // GROUP * GROUP + j % GROUP % (GROUP // 4) * 4 + j % GROUP // (GROUP // 4)
+
+
+@ti.func
+def list_rays(
+    rays: ti.template(), first_ray, count, places_end, oldest, groups: ti.template(), totals: ti.template(),
+    listed: ti.template(), marks: ti.template(), hash_keys: ti.template(), hash_slots: ti.template(),
+    told: ti.template(),
+):  # fmt: skip
+    """List the updates of `count` rays, which are in `places_end` places of whole groups. `marks`: of each,
+    where in its group's part of the list it begins, and then where the update is that takes its colour.
+
+    Each loop is a task of a device, in this function and the next ones; so is the first of each end.
+    """
+    for j in range(places_end):
+        i = place_of(j)
+        r = first_ray + ti.min(i, count - 1)
+        if totals[LISTED] > listed.shape[0]:
+            told[TOUCHED_OVERFLOW] = 1
+        elif i < count and ray_weight(rays, r) > 0:
+            made, lacked, colored = list_updates(
+                rays, r, groups[i // GROUP, BASE] + marks[i], crossed(rays, r), oldest, hash_keys, hash_slots,
+                listed,
+            )  # fmt: skip
+            marks[i] = colored
+            if made > 0:
+                ti.atomic_add(told[band_field(i % BANDS, UPDATES)], made)
+            if lacked > 0:
+                ti.atomic_add(told[band_field(i % BANDS, LACKING)], lacked)
+        elif i < count:
+            marks[i] = -1
+
+
+@ti.func
+def add_listed(
+    end, sign_, stamp, listed: ti.template(), winners: ti.template(), missing: ti.template(),
+    places: ti.template(), claims: ti.template(), hash_keys: ti.template(), stamps: ti.template(),
+    told: ti.template(), sums: ti.template(),
+):  # fmt: skip
+    """Make the first `end` updates of the list, a thread each: so those of one ray do not wait for each
+    other. Nothing is added inside a loop within a thread: after that, Mesa's software device (22.3) forgets
+    which threads run. Keys of missing blocks go to `missing`, hardly any of them twice (`is_winner`)."""
+    for i in range(end):
+        at = listed[i, PLACE]
+        if at >= 0:
+            add_update(listed, i, at, sign_, sums)
+            list_block(at // CUBE, stamp, stamps, told)
+        elif at > SKIPPED:
+            key = missing_key(listed, i)
+            winners[winner_place(key, 0)] = i
+            winners[winner_place(key, 1)] = i
+    for i in range(end):
+        at = listed[i, PLACE]
+        if at < 0 and at > SKIPPED:
+            if is_winner(i, listed, winners) == 1:
+                k, key = ti.atomic_add(told[TOUCHED_MISSING], 1), missing_key(listed, i)
+                missing[k] = key
+                if k < FEW_NEW:
+                    mask, probes = hash_keys.shape[0] - 1, 0
+                    place = hash_key(key) & mask
+                    while hash_keys[place] != 0 and probes <= mask:
+                        place = (place + 1) & mask
+                        probes += 1
+                    places[k, HASH_PLACE] = place
+                    ti.atomic_add(claims[place & (CLAIMS - 1)], 1)
+
+
+@ti.func
+def vote_colors(
+    votes_end, sign_, rays: ti.template(), first_ray, listed: ti.template(), marks: ti.template(),
+    told: ti.template(), hash_keys: ti.template(), hash_slots: ti.template(), oldest,
+    color_rgn: ti.template(), color_b: ti.template(),
+):  # fmt: skip
+    """Cast the votes for colours of `votes_end` − 1 rays, if their updates were made; and enter the blocks
+    into the hash that may share a place, of new ones from slot `oldest` on: one after the other."""
+    for k in range(votes_end):
+        i = k - 1
+        if i < 0:
+            mask = hash_keys.shape[0] - 1
+            for n in range(told[APART], told[NEW]):
+                key = fresh_key(told, n)
+                place = hash_key(key) & mask
+                while hash_keys[place] != 0:
+                    place = (place + 1) & mask
+                hash_keys[place] = key
+                hash_slots[place] = oldest + n
+        elif marks[i] >= 0 and told[TOUCHED_OVERFLOW] == 0:
+            at = listed[marks[i], PLACE]
+            if at >= 0:
+                packed = rays[first_ray + i, WEIGHT_COLOR] & 0xFFFFFF
+                vote_color(at, packed, sign_, told, color_rgn, color_b)
+
+
+@ti.func
+def order_new(missing: ti.template(), places: ti.template(), claims: ti.template(), told: ti.template()):
+    """Put the missing blocks in order, if they are few: those that share no place in the hash first."""
+    for k in range(FEW_NEW):
+        if k < told[TOUCHED_MISSING] and told[TOUCHED_MISSING] <= FEW_NEW:
+            key, shares = missing[k], shares_place(k, places, claims)
+            rank, are_same = 0, 0
+            for j in range(told[TOUCHED_MISSING]):
+                others = shares_place(j, places, claims)
+                rank += ti.cast((others < shares) | ((others == shares) & (missing[j] < key)), ti.i32)
+                are_same |= ti.cast((missing[j] == key) & (j != k), ti.i32)
+            told[FRESH_AT + 2 * rank] = ti.cast(key, ti.i32)
+            told[FRESH_AT + 2 * rank + 1] = ti.cast(key >> 32, ti.i32)
+            places[k, RANK] = rank
+            if shares == 0:
+                ti.atomic_add(told[APART], 1)
+            if are_same == 1:
+                told[ARE_SAME] = 1
+
+
+@ti.func
+def new_blocks(room: ti.template(), totals: ti.template(), told: ti.template()):
+    """How many missing blocks there is room for: all of them, or none."""
+    new = told[TOUCHED_MISSING]
+    cost = totals[COSTS] + new * room[BLOCK_COST]
+    if (
+        new > room[ROOM_NEW]
+        or told[ARE_SAME] == 1
+        or told[TOUCHED_COUNT] + new > room[ROOM_TOUCHED]
+        or cost > room[ROOM_COST]
+    ):
+        new = 0
+    return new
+
+
+@ti.func
+def add_new(
+    end, oldest, sign_, stamp, room: ti.template(), totals: ti.template(), listed: ti.template(),
+    missing: ti.template(), places: ti.template(), claims: ti.template(), hash_keys: ti.template(),
+    hash_slots: ti.template(), stamps: ti.template(), told: ti.template(), sums: ti.template(),
+):  # fmt: skip
+    """Have the new blocks from slot `oldest` on, if there is room, and make the updates of the list in them.
+
+    The hash becomes the one that `block_hash.insert_blocks` makes of them in the order of their slots. Those
+    that share no place with others enter it here, the others at last (`vote_colors`).
+    """
+    for i in range(end):
+        new = new_blocks(room, totals, told)
+        if i == 0:
+            told[NEW] = new
+        if i < new:
+            told[TOUCHED_AT + told[TOUCHED_COUNT] + i] = oldest + i
+            stamps[oldest + i] = stamp
+            if shares_place(i, places, claims) == 0:
+                hash_keys[places[i, HASH_PLACE]] = missing[i]
+                hash_slots[places[i, HASH_PLACE]] = oldest + places[i, RANK]
+        at = listed[i, PLACE]
+        if new > 0 and at < 0 and at > SKIPPED:
+            at = (oldest + rank_of(told, missing_key(listed, i))) * CUBE + (-1 - at)
+            listed[i, PLACE] = at
+            add_update(listed, i, at, sign_, sums)
+
+
+@ti.func
+def add_and_admit(
+    rays: ti.template(), count, places_end, votes_end, sign_, stamp, first_slot, room: ti.template(),
+    hash_keys: ti.template(), hash_slots: ti.template(), winners: ti.template(), missing: ti.template(),
+    places: ti.template(), claims: ti.template(), stamps: ti.template(), told: ti.template(),
+    groups: ti.template(), totals: ti.template(), listed: ti.template(), marks: ti.template(),
+    sums: ti.template(), color_rgn: ti.template(), color_b: ti.template(),
+):  # fmt: skip
+    """Add a keyframe's first `count` rays and their colours (`vote_colors`); missing blocks become the map's,
+    from `first_slot` on, if they are few and there is `room` for them."""
+    list_rays(rays, 0, count, places_end, 0, groups, totals, listed, marks, hash_keys, hash_slots, told)
+    end = listed_end(count, totals, listed)
+    add_listed(end, sign_, stamp, listed, winners, missing, places, claims, hash_keys, stamps, told, sums)
+    order_new(missing, places, claims, told)
+    add_new(
+        end, first_slot, sign_, stamp, room, totals, listed, missing, places, claims, hash_keys, hash_slots,
+        stamps, told, sums,
+    )  # fmt: skip
+    vote_colors(
+        votes_end, sign_, rays, 0, listed, marks, told, hash_keys, hash_slots, first_slot, color_rgn, color_b
+    )
 
 
 @QuickLaunch
 @ti.kernel
 def add_rays(
     rays: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    bands: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    deferred: ti.types.ndarray(dtype=ti.i32, ndim=1),
     first_ray: ti.i32,
     end_ray: ti.i32,
-    which: ti.i32,
     sign_: ti.i32,
     oldest: ti.i32,
     stamp: ti.i32,
@@ -188,107 +477,45 @@ def add_rays(
     hash_slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
     winners: ti.types.ndarray(dtype=ti.i32, ndim=1),
     missing: ti.types.ndarray(dtype=ti.i64, ndim=1),
+    places: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    claims: ti.types.ndarray(dtype=ti.i32, ndim=1),
     stamps: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    touched: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    count: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    turn: ti.i32,
+    told: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    groups: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    totals: ti.types.ndarray(dtype=ti.i64, ndim=1),
     listed: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    votes: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    marks: ti.types.ndarray(dtype=ti.i32, ndim=1),
     sums: ti.types.ndarray(dtype=ti.i64, ndim=2),
     color_rgn: ti.types.ndarray(dtype=ti.i64, ndim=2),
     color_b: ti.types.ndarray(dtype=ti.i32, ndim=2),
 ):
-    """Add rays as `integrate.add_rays` does, a thread a ray, those of places `first_ray` … `end_ray` − 1.
-
-    Updates are listed, then added, a thread each: so those of one ray do not wait for each other. Nothing is
-    added inside a loop within a thread: after that, Mesa's software device (22.3) forgets which threads run.
-    Rays that cross missing blocks are marked in `deferred` instead of listed, and the blocks' keys are in
-    `missing`, some of them twice: of those that share a place in `winners`, one is left out for every
-    other one that is the same block. No band ends early: what was added is all of its rays. `count[turn]` is
-    zero, and then how many updates were to be listed; where they are more than `listed` has room for, none
-    is made, and `touched` says so. A settled colour stays, as in `integrate.vote_color`.
-
-    Each loop is two tasks of a device, of which the first finds out where the second ends: fewer are faster.
-    """
-    for r in range(first_ray, end_ray):
-        is_wanted = ti.cast(ray_weight(rays, r) > 0, ti.i32)
-        if which == ONLY_DEFERRED:
-            is_wanted &= deferred[r]
-        votes[r - first_ray, PLACE] = SKIPPED
-        if is_wanted == 1:
-            most = crossed(rays, r)
-            base = ti.atomic_add(count[turn], ti.cast(most, ti.i64))
-            if base + most <= listed.shape[0]:
-                added, lacks, colored = list_updates(
-                    rays, r, ti.cast(base, ti.i32), most, sign_, oldest, hash_keys, hash_slots, listed
-                )
-                votes[r - first_ray, PLACE] = colored
-                votes[r - first_ray, COLOR] = rays[r, WEIGHT_COLOR] & 0xFFFFFF
-                band = band_of(bands, r)
-                ti.atomic_add(bands[band, UPDATES], added)
-                if which == ALL:
-                    deferred[r] = lacks
-                    ti.atomic_add(bands[band, DEFERRED], lacks)
-    for i in range(listed_count(count[turn], listed)):
-        at = listed[i, PLACE]
-        if at >= 0:
-            # both sums in one addition; their quotient minimises Σ w (x − m)²: paper eq. 2
-            product = ti.cast(listed[i, PRODUCT], ti.i64)
-            ti.atomic_add(sums[at // CUBE, at % CUBE], (product << WEIGHT_BITS) + listed[i, VOTE])
-            list_block(at // CUBE, stamp, stamps, touched)
-        if at == MISSING and which == ALL:
-            winners[missing_place(listed, i)] = i
-    # the missing blocks; then the votes for colours; at last what did not fit
-    for i in range(
-        ti.select(which == ALL, listed_count(count[turn], listed), 0)
-        + vote_count(has_color, count[turn], listed, end_ray - first_ray)
-        + 1
-    ):
-        ends = ti.select(which == ALL, listed_count(count[turn], listed), 0)
-        k = ti.min(i, ti.max(ends - 1, 0))
-        if (i < ends) & (listed[k, PLACE] == MISSING):
-            winner = winners[missing_place(listed, k)]
-            is_another = ti.cast(missing_key(listed, winner) != missing_key(listed, k), ti.i32)
-            if winner == k or is_another == 1:
-                missing[ti.atomic_add(touched[TOUCHED_MISSING], 1)] = missing_key(listed, k)
-        v = i - ends
-        if v == vote_count(has_color, count[turn], listed, end_ray - first_ray):
-            touched[TOUCHED_OVERFLOW] = ti.cast(count[turn] > listed.shape[0], ti.i32)
-            v = -1
-        at, packed = SKIPPED, 0
-        if v >= 0:
-            at, packed = votes[v, PLACE], votes[v, COLOR]
-        if at >= 0:
-            slot, o = at // CUBE, at % CUBE
-            taken = ti.cast(color_rgn[slot, o] & 65535, ti.i32)
-            if taken < COLOR_LIMIT or taken >= COLOR_LIMIT + (COLOR_LIMIT >> 1):
-                red, green = ti.cast((packed >> 16) & 255, ti.i64), ti.cast((packed >> 8) & 255, ti.i64)
-                before = ti.atomic_add(color_rgn[slot, o], sign_ * ((red << 40) + (green << 16) + 1))
-                ti.atomic_add(color_b[slot, o], sign_ * (packed & 255))
-                if sign_ < 0 and (before & 65535) == 0:
-                    touched[TOUCHED_MISMATCH] = 1
-
-
-@ti.kernel
-def begin_turn(
-    touched: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    count: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    turn: ti.i32,
-):
-    """Let rays be added once more: nothing is listed, and no block missing."""
-    for _ in range(1):
-        count[turn] = 0
-        touched[TOUCHED_MISSING] = 0
-
-
-@ti.kernel
-def restore_counts(
-    bands: ti.types.ndarray(dtype=ti.i32, ndim=2), counts: ti.types.ndarray(dtype=ti.i32, ndim=2)
-):
-    """Let the bands have counted no more updates and deferred rays than `counts`, earlier bands, says."""
-    for band in range(bands.shape[0]):
-        for field in ti.static((DEFERRED, UPDATES)):
-            bands[band, field] = counts[band, field]
+    """Add rays of places `first_ray` … `end_ray` − 1 as `integrate.add_rays` does, to blocks of slot ≥
+    `oldest`; missing blocks are told of. Where the updates are more than `listed` has room for, none is made,
+    and `told` says so."""
+    count = end_ray - first_ray
+    for i in range(groups.shape[0] + BANDS):
+        if i >= BANDS:
+            begin_groups(i - BANDS, groups, totals)
+        if i < BANDS:
+            told[band_field(i, UPDATES)], told[band_field(i, LACKING)] = 0, 0
+        if i == 0:
+            for field in ti.static((TOUCHED_OVERFLOW, TOUCHED_MISSING, NEW, APART)):
+                told[field] = 0
+    for i in range(count):
+        if ray_weight(rays, first_ray + i) > 0:
+            marks[i] = ti.atomic_add(groups[i // GROUP, CROSSED], crossed(rays, first_ray + i))
+    for g in range((count + GROUP - 1) // GROUP):
+        begin_list(g, groups, totals, listed)
+    list_rays(
+        rays, first_ray, count, whole_groups(count), oldest, groups, totals, listed, marks, hash_keys,
+        hash_slots, told,
+    )  # fmt: skip
+    end = listed_end(count, totals, listed)
+    add_listed(end, sign_, stamp, listed, winners, missing, places, claims, hash_keys, stamps, told, sums)
+    vote_colors(
+        1 + has_color * count, sign_, rays, first_ray, listed, marks, told, hash_keys, hash_slots, 0,
+        color_rgn, color_b,
+    )  # fmt: skip
 
 
 @QuickLaunch
@@ -304,6 +531,22 @@ def write_hash(
     for i in range(places.shape[0]):
         hash_keys[places[i]] = keys[i]
         hash_slots[places[i]] = slots[i]
+
+
+@QuickLaunch
+@ti.kernel
+def largest_weights(
+    sums: ti.types.ndarray(dtype=ti.i64, ndim=2),
+    slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    count: ti.i32,
+    found: ti.types.ndarray(dtype=ti.i32, ndim=1),
+):
+    """`found[i]` = the largest weight lane in block `slots[i]`, of the first `count`."""
+    for i in range(count):
+        most = 0
+        for v in range(CUBE):
+            most = ti.max(most, lane_weight(sums[slots[i], v]))
+        found[i] = most
 
 
 @ti.kernel

@@ -3,11 +3,25 @@
 make, to the bit, a thread a pixel or point.
 
 Rays have fixed places, so a band's rays do not follow each other: a place without a ray has weight 0.
+The kernels add the rays, too (`device_integration`): one launch takes half of the time of two.
 """
 
 import taichi as ti
 
-from tsfusion.kernels.device_integration import begin_keyframe
+from tsfusion.kernels.device_integration import (
+    BANDS,
+    BEGINNERS,
+    COSTS,
+    CROSSED,
+    GROUP,
+    add_and_admit,
+    band_field,
+    begin_groups,
+    begin_keyframe,
+    begin_list,
+    crossed,
+    whole_groups,
+)
 from tsfusion.kernels.quick_launch import QuickLaunch
 from tsfusion.kernels.rays_from_images import (
     TILE,
@@ -33,59 +47,37 @@ from tsfusion.kernels.rays_from_points import (
 )
 from tsfusion.kernels.sensor_noise import DROPS_LONE_SAMPLES, MAX_RANGE, MIN_RANGE, VOXEL_SIZE, vec3, vec3f
 from tsfusion.kernels.unfused import dot
-from tsfusion.kernels.voxel_traversal import COST, COUNT, SAMPLES, START, WEIGHT, WEIGHT_COLOR
+from tsfusion.kernels.voxel_traversal import COST, COUNT, SAMPLES, WEIGHT, WEIGHT_COLOR
 
-# A tile: width and height of its cells, whether it is flat, and the slopes of its plane (float32's bits).
-TILE_FIELDS = 8
-WIDE, HIGH, FLAT, SLOPE_X, SLOPE_Y = 0, 1, 2, 3, 4
+# A tile: width and height of its cells, whether it is flat, the slopes of its plane (float32's bits), and
+# what is counted of its rays: fields of a band.
+TILE_FIELDS = 16
+WIDE, HIGH, FLAT, SLOPE_X, SLOPE_Y, COUNTED = 0, 1, 2, 3, 4, 8
+COUNTS = (COUNT, SAMPLES, WEIGHT, COST)
 
 
 @ti.func
-def note_rays(bands: ti.template(), band, count, samples, weight, cost):
-    """Count rays of a band: not inside a loop within a thread (`device_integration.add_rays`)."""
-    ti.atomic_add(bands[band, COUNT], count)
-    ti.atomic_add(bands[band, SAMPLES], samples)
-    ti.atomic_add(bands[band, WEIGHT], weight)
-    ti.atomic_add(bands[band, COST], cost)
-
-
-@QuickLaunch
-@ti.kernel
-def rays_from_image(
-    image: ti.types.ndarray(ndim=2),
-    is_disparity: ti.i32,
-    scale: ti.f64,
-    color: ti.types.ndarray(dtype=ti.u8, ndim=2),
-    has_color: ti.i32,
-    confidence: ti.types.ndarray(dtype=ti.u8, ndim=2),
-    has_confidence: ti.i32,
-    camera_rows: ti.types.ndarray(dtype=ti.f64, ndim=2),
-    model: ti.types.ndarray(dtype=ti.f64, ndim=1),
-    bundle: ti.i32,
-    depths: ti.types.ndarray(dtype=ti.i32, ndim=1),  # of each tile's pixels, one tile after the other
-    tiles: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    rays: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    bands: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    launch_counts: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    touched: ti.types.ndarray(dtype=ti.i32, ndim=1),
-):
-    """Fill `rays` as `rays_from_images.rays_from_image` does, and begin a keyframe; a tile has `TILE_SAMPLES`
-    places."""
+def image_rays(
+    image: ti.template(), is_disparity, scale, color: ti.template(), has_color, confidence: ti.template(),
+    has_confidence, camera_rows: ti.template(), model: ti.template(), bundle, depths: ti.template(),
+    tiles: ti.template(), rays: ti.template(), told: ti.template(), groups: ti.template(),
+    totals: ti.template(), listed: ti.template(), marks: ti.template(), claims: ti.template(),
+):  # fmt: skip
+    """Begin a keyframe, and fill `rays` as `rays_from_images.rays_from_image` does; a tile has `TILE_SAMPLES`
+    places. Each loop is a task of a device."""
     tiles_x = (image.shape[1] + TILE - 1) // TILE
     tile_count = tiles_x * ((image.shape[0] + TILE - 1) // TILE)
-    count = bands.shape[0]
-    for i in range(tile_count * TILE_SAMPLES):
-        tile, place = i // TILE_SAMPLES, i % TILE_SAMPLES
-        v, u = tile // tiles_x * TILE + place // TILE, tile % tiles_x * TILE + place % TILE
-        depth = 0
-        if v < image.shape[0] and u < image.shape[1]:
-            reading = reading_of(model, is_disparity, scale, has_confidence)
-            depth = depth_at(image, confidence, reading, v, u)
-        depths[i] = depth
-        if i < count:
-            begin_keyframe(bands, i, launch_counts, touched)
-            first_tile = ti.cast(ti.cast(i, ti.i64) * tile_count // count, ti.i32)
-            bands[i, START] = first_tile * TILE_SAMPLES
+    for i in range(BEGINNERS + tile_count * TILE_SAMPLES):
+        begin_keyframe(i, told, claims)
+        begin_groups(i, groups, totals)
+        if i >= BEGINNERS:
+            tile, place = (i - BEGINNERS) // TILE_SAMPLES, (i - BEGINNERS) % TILE_SAMPLES
+            v, u = tile // tiles_x * TILE + place // TILE, tile % tiles_x * TILE + place % TILE
+            depth = 0
+            if v < image.shape[0] and u < image.shape[1]:
+                reading = reading_of(model, is_disparity, scale, has_confidence)
+                depth = depth_at(image, confidence, reading, v, u)
+            depths[i - BEGINNERS] = depth
     for tile in range(tile_count):
         unit = model[VOXEL_SIZE] / 1024.0  # metres
         valid, total = 0, ti.i64(0)
@@ -101,8 +93,10 @@ def rays_from_image(
         tiles[tile, WIDE], tiles[tile, HIGH], tiles[tile, FLAT] = wide, high, plane.is_flat
         tiles[tile, SLOPE_X] = ti.bit_cast(plane.slope_x, ti.i32)
         tiles[tile, SLOPE_Y] = ti.bit_cast(plane.slope_y, ti.i32)
+        for field in ti.static(COUNTS):
+            tiles[tile, COUNTED + field] = 0
     for i in range(tile_count * TILE_SAMPLES):
-        tile, c = i // TILE_SAMPLES, i % TILE_SAMPLES
+        tile, c = i % tile_count, i // tile_count  # neighbours in tiles alike: all of them have work, or none
         wide, high = tiles[tile, WIDE], tiles[tile, HIGH]
         across = TILE // wide
         if c < across * (TILE // high):
@@ -112,10 +106,9 @@ def rays_from_image(
             plane = Plane(tiles[tile, FLAT], slope_x, ti.bit_cast(tiles[tile, SLOPE_Y], ti.f32))
             left, top, base = tile % tiles_x * TILE, tile // tiles_x * TILE, tile * TILE_SAMPLES
             cell = Cell(left, top, c % across * wide, c // across * high, wide, high, base)
-            band = ti.cast((ti.cast(tile, ti.i64) * count + count - 1) // tile_count, ti.i32)
             out = base + c * wide * high
             end, above = out + wide * high, 0
-            samples, total_weight, total_cost = 0, 0, 0
+            samples, total_weight, total_cost, total_crossed = 0, 0, 0, 0
             while above >= 0:
                 layer, more = nearest_layer(model, unit, depths, None, cell, above)
                 keep = layer.n > 0
@@ -130,48 +123,53 @@ def rays_from_image(
                         samples += layer.n
                         total_weight += weight
                         total_cost += cost
+                        marks[out] = total_crossed
+                        total_crossed += crossed(rays, out)
                         out += 1
                 above = ti.select(more, layer.up_to, -1)
-            note_rays(bands, band, out - (end - wide * high), samples, total_weight, total_cost)
+            if samples > 0:
+                before = ti.atomic_add(groups[tile, CROSSED], total_crossed)
+                for r in range(end - wide * high, out):
+                    marks[r] += before
+                ti.atomic_add(tiles[tile, COUNTED + COUNT], out - (end - wide * high))
+                ti.atomic_add(tiles[tile, COUNTED + SAMPLES], samples)
+                ti.atomic_add(tiles[tile, COUNTED + WEIGHT], total_weight)
+                ti.atomic_add(tiles[tile, COUNTED + COST], total_cost)
             for r in range(out, end):
                 rays[r, WEIGHT_COLOR] = 0
+    for tile in range(tile_count):
+        band = ti.cast((ti.cast(tile, ti.i64) * BANDS + BANDS - 1) // tile_count, ti.i32)
+        for field in ti.static(COUNTS):
+            ti.atomic_add(told[band_field(band, field)], tiles[tile, COUNTED + field])
+        ti.atomic_add(totals[COSTS], ti.cast(tiles[tile, COUNTED + COST], ti.i64))
+        begin_list(tile, groups, totals, listed)
 
 
-@QuickLaunch
-@ti.kernel
-def rays_from_points(
-    points: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    starts: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    color: ti.types.ndarray(dtype=ti.u8, ndim=2),
-    has_color: ti.i32,
-    confidence: ti.types.ndarray(dtype=ti.u8, ndim=1),
-    has_confidence: ti.i32,
-    pose: ti.types.ndarray(dtype=ti.f64, ndim=2),
-    model: ti.types.ndarray(dtype=ti.f64, ndim=1),
-    bundle: ti.i32,
-    trusts: ti.types.ndarray(dtype=ti.i32, ndim=1),  # confidence in each point, 0 = none; < 0: begins a ray
-    rays: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    bands: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    launch_counts: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    touched: ti.types.ndarray(dtype=ti.i32, ndim=1),
-):
-    """Fill `rays` as `rays_from_points.rays_from_points` does, and begin a keyframe; a ray's place is that of
+@ti.func
+def point_rays(
+    points: ti.template(), starts: ti.template(), color: ti.template(), has_color, confidence: ti.template(),
+    has_confidence, pose: ti.template(), model: ti.template(), bundle, trusts: ti.template(),
+    rays: ti.template(), told: ti.template(), groups: ti.template(), totals: ti.template(),
+    listed: ti.template(), marks: ti.template(), claims: ti.template(),
+):  # fmt: skip
+    """Begin a keyframe, and fill `rays` as `rays_from_points.rays_from_points` does; a ray's place is that of
     its first point."""
     count = points.shape[0]
-    for i in range(ti.max(count, bands.shape[0])):
-        if i < bands.shape[0]:
-            begin_keyframe(bands, i, launch_counts, touched)
-            bands[i, START] = ti.cast(ti.cast(i, ti.i64) * count // bands.shape[0], ti.i32)
-        nearest = ti.cast(model[MIN_RANGE] * model[MIN_RANGE], ti.f32)
-        farthest = ti.cast(model[MAX_RANGE] * model[MAX_RANGE], ti.f32)
-        if i < count:
+    for k in range(BEGINNERS + count):
+        begin_keyframe(k, told, claims)
+        begin_groups(k, groups, totals)
+        i = k - BEGINNERS
+        if i >= 0:
+            nearest = ti.cast(model[MIN_RANGE] * model[MIN_RANGE], ti.f32)
+            farthest = ti.cast(model[MAX_RANGE] * model[MAX_RANGE], ti.f32)
             o = row(starts, ti.select(starts.shape[0] == 1, 0, i))
             trusts[i] = confidence_at(row(points, i), o, nearest, farthest, confidence, has_confidence, i)
-    for band in range(bands.shape[0]):
+    for band in range(BANDS):
         spread = ti.cast(model[VOXEL_SIZE] * model[VOXEL_SIZE], ti.f32)
-        end = ti.cast(ti.cast(band + 1, ti.i64) * count // bands.shape[0], ti.i32)
+        begin = ti.cast(ti.cast(band, ti.i64) * count // BANDS, ti.i32)
+        end = ti.cast(ti.cast(band + 1, ti.i64) * count // BANDS, ti.i32)
         anchor, has_anchor = vec3f(0.0), 0
-        for i in range(bands[band, START], end):
+        for i in range(begin, end):
             if trusts[i] > 0:
                 q = row(points, i)
                 if has_anchor == 0 or bundle == 0 or dot(q - anchor, q - anchor) > spread:
@@ -180,8 +178,8 @@ def rays_from_points(
     for i in range(count):
         rays[i, WEIGHT_COLOR] = 0
         if trusts[i] < 0:
-            band = ti.cast((ti.cast(i, ti.i64) * bands.shape[0] + bands.shape[0] - 1) // count, ti.i32)
-            end = ti.cast(ti.cast(band + 1, ti.i64) * count // bands.shape[0], ti.i32)
+            band = ti.cast((ti.cast(i, ti.i64) * BANDS + BANDS - 1) // count, ti.i32)
+            end = ti.cast(ti.cast(band + 1, ti.i64) * count // BANDS, ti.i32)
             one = Bundle(0, 0, 0, 0, 0, vec3(0.0), vec3(0.0))
             k, is_within = i, 1
             while is_within == 1:
@@ -198,4 +196,110 @@ def rays_from_points(
                 start = one.sum_o * (1.0 / one.n)
             weight, cost = write_bundle_ray(rays, i, i, model, pose, one, start)
             if weight > 0:
-                note_rays(bands, band, 1, one.n, weight, cost)
+                ti.atomic_add(told[band_field(band, COUNT)], 1)
+                ti.atomic_add(told[band_field(band, SAMPLES)], one.n)
+                ti.atomic_add(told[band_field(band, WEIGHT)], weight)
+                ti.atomic_add(told[band_field(band, COST)], cost)
+                marks[i] = ti.atomic_add(groups[i // GROUP, CROSSED], crossed(rays, i))
+    for g in range((count + GROUP - 1) // GROUP + BANDS):
+        if g < BANDS:
+            ti.atomic_add(totals[COSTS], ti.cast(told[band_field(g, COST)], ti.i64))
+        else:
+            begin_list(g - BANDS, groups, totals, listed)
+
+
+@QuickLaunch
+@ti.kernel
+def fuse_image(
+    image: ti.types.ndarray(ndim=2),
+    is_disparity: ti.i32,
+    scale: ti.f64,
+    color: ti.types.ndarray(dtype=ti.u8, ndim=2),
+    has_color: ti.i32,
+    confidence: ti.types.ndarray(dtype=ti.u8, ndim=2),
+    has_confidence: ti.i32,
+    camera_rows: ti.types.ndarray(dtype=ti.f64, ndim=2),
+    model: ti.types.ndarray(dtype=ti.f64, ndim=1),
+    bundle: ti.i32,
+    depths: ti.types.ndarray(dtype=ti.i32, ndim=1),  # of each tile's pixels, one tile after the other
+    tiles: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    rays: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    count: ti.i32,
+    sign_: ti.i32,
+    stamp: ti.i32,
+    first_slot: ti.i32,
+    room: ti.types.ndarray(dtype=ti.i64, ndim=1),
+    hash_keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
+    hash_slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    winners: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    missing: ti.types.ndarray(dtype=ti.i64, ndim=1),
+    places: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    claims: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    stamps: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    told: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    groups: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    totals: ti.types.ndarray(dtype=ti.i64, ndim=1),
+    listed: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    marks: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    sums: ti.types.ndarray(dtype=ti.i64, ndim=2),
+    color_rgn: ti.types.ndarray(dtype=ti.i64, ndim=2),
+    color_b: ti.types.ndarray(dtype=ti.i32, ndim=2),
+):
+    """Make an image's rays and add the first `count` of them: all or none."""
+    # Here, because each end of a loop that is found later is a task of its own
+    rays_end, places_end, votes_end = count, whole_groups(count), 1 + has_color * count
+    image_rays(
+        image, is_disparity, scale, color, has_color, confidence, has_confidence, camera_rows, model, bundle,
+        depths, tiles, rays, told, groups, totals, listed, marks, claims,
+    )  # fmt: skip
+    add_and_admit(
+        rays, rays_end, places_end, votes_end, sign_, stamp, first_slot, room, hash_keys, hash_slots, winners,
+        missing, places, claims, stamps, told, groups, totals, listed, marks, sums, color_rgn, color_b,
+    )  # fmt: skip
+
+
+@QuickLaunch
+@ti.kernel
+def fuse_points(
+    points: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    starts: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    color: ti.types.ndarray(dtype=ti.u8, ndim=2),
+    has_color: ti.i32,
+    confidence: ti.types.ndarray(dtype=ti.u8, ndim=1),
+    has_confidence: ti.i32,
+    pose: ti.types.ndarray(dtype=ti.f64, ndim=2),
+    model: ti.types.ndarray(dtype=ti.f64, ndim=1),
+    bundle: ti.i32,
+    trusts: ti.types.ndarray(dtype=ti.i32, ndim=1),  # confidence in each point, 0 = none; < 0: begins a ray
+    rays: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    count: ti.i32,
+    sign_: ti.i32,
+    stamp: ti.i32,
+    first_slot: ti.i32,
+    room: ti.types.ndarray(dtype=ti.i64, ndim=1),
+    hash_keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
+    hash_slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    winners: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    missing: ti.types.ndarray(dtype=ti.i64, ndim=1),
+    places: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    claims: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    stamps: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    told: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    groups: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    totals: ti.types.ndarray(dtype=ti.i64, ndim=1),
+    listed: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    marks: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    sums: ti.types.ndarray(dtype=ti.i64, ndim=2),
+    color_rgn: ti.types.ndarray(dtype=ti.i64, ndim=2),
+    color_b: ti.types.ndarray(dtype=ti.i32, ndim=2),
+):
+    """Make the rays of points and add the first `count` of them: all or none."""
+    rays_end, places_end, votes_end = count, whole_groups(count), 1 + has_color * count
+    point_rays(
+        points, starts, color, has_color, confidence, has_confidence, pose, model, bundle, trusts, rays,
+        told, groups, totals, listed, marks, claims,
+    )  # fmt: skip
+    add_and_admit(
+        rays, rays_end, places_end, votes_end, sign_, stamp, first_slot, room, hash_keys, hash_slots, winners,
+        missing, places, claims, stamps, told, groups, totals, listed, marks, sums, color_rgn, color_b,
+    )  # fmt: skip

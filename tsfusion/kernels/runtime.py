@@ -10,6 +10,8 @@ from types import SimpleNamespace
 from tsfusion.core import process
 from tsfusion.core.errors import MissingDependency
 
+_GRID = 2048  # blocks of 128 threads of a device's task: of four times as many, most only end: 5 µs each task
+
 _started_threads: int | None = None
 
 
@@ -50,7 +52,10 @@ def start_device(arch: str) -> None:
 
     _leave_out_source_lines()
     with redirect_stdout(StringIO()):
-        ti.init(arch=getattr(ti, arch), fast_math=False, offline_cache=True, log_level=ti.ERROR)
+        ti.init(
+            arch=getattr(ti, arch), fast_math=False, offline_cache=True, log_level=ti.ERROR,
+            saturating_grid_dim=_GRID,
+        )  # fmt: skip
     if ti.cfg.arch != getattr(ti, arch):
         raise MissingDependency("Taichi finds no such device, or no driver of one")
     from tsfusion.kernels import device_check

@@ -60,13 +60,14 @@ class BlockStore:
         self.stamp = 0  # number of the last keyframe, added or taken away; a map that is opened begins at 0
         self.most_blocks = MAX_ITEMS
         self.pause: Callable[[], None] = lambda: None  # between two steps of a long pass that only reads
-        self.hash_keys = np.zeros(4 * _FIRST_CAPACITY, np.int64)
-        self.hash_slots = np.zeros(4 * _FIRST_CAPACITY, np.int32)
-        self._keys = GrowingArray((), np.int64, _FIRST_CAPACITY)
-        self._dirty = GrowingArray((), np.uint8, _FIRST_CAPACITY)
-        self._stamps, self._places, self._bounds = (
-            GrowingArray((), np.int32, _FIRST_CAPACITY) for _ in range(3)
-        )
+        # Blocks that fit into the memory that is there
+        self._room = device.first_blocks if device else _FIRST_CAPACITY
+        self._hash_keys = np.zeros(4 * self._room, np.int64)
+        self._hash_slots = np.zeros(4 * self._room, np.int32)
+        self._hashed = 0  # blocks that are in the hash; the others follow when somebody asks
+        self._keys = GrowingArray((), np.int64, self._room)
+        self._dirty = GrowingArray((), np.uint8, self._room)
+        self._stamps, self._places, self._bounds = (GrowingArray((), np.int32, self._room) for _ in range(3))
         present = {"sums": True, "color_rgn": color, "color_b": color, "correction": corrected}
         self._present = [name for name, there in present.items() if there]
         self._device = device
@@ -83,8 +84,8 @@ class BlockStore:
         if name not in self._present:
             return GrowingArray(*kind, 1)
         if cache is None:
-            return GrowingArray(*kind, _FIRST_CAPACITY)
-        return FileArray(*kind, _FIRST_CAPACITY, Path(cache.folder), cache.min_free_bytes)
+            return GrowingArray(*kind, self._room)
+        return FileArray(*kind, self._room, Path(cache.folder), cache.min_free_bytes)
 
     @property
     def _files(self) -> list[FileArray]:
@@ -109,6 +110,18 @@ class BlockStore:
         """(count, 512) rows of a layer, not copied (`GrowingArray.shown`); None if there is none."""
         self._fetch()
         return self._layers[layer].shown(self.count) if layer in self._present else None
+
+    @property
+    def hash_keys(self) -> NDArray[np.int64]:
+        """The hash from block to slot (kernels/block_hash.py): keys."""
+        self._hash()
+        return self._hash_keys
+
+    @property
+    def hash_slots(self) -> NDArray[np.int32]:
+        """Likewise slots."""
+        self._hash()
+        return self._hash_slots
 
     @property
     def keys(self) -> NDArray[np.int64]:
@@ -223,18 +236,20 @@ class BlockStore:
                 f"the map may have {self.most_blocks} blocks in the memory that is set; "
                 f"it has {self.count}, and {count - self.count} more are needed"
             )
+        if count <= self._room:
+            return
         for array in self._arrays():
             array.reserve(count)
-        if 2 * count > len(self.hash_keys):
+        if 2 * count > len(self._hash_keys):
             size = 1 << (2 * count - 1).bit_length()  # of the count alone, not of how it was reached
-            self.hash_keys, self.hash_slots = np.zeros(size, np.int64), np.zeros(size, np.int32)
-            self._hash(0)
+            self._hash_keys, self._hash_slots = np.zeros(size, np.int64), np.zeros(size, np.int32)
+            self._hashed = 0
+        self._room = min(len(self._hash_keys) // 2, *(array.capacity for array in self._arrays()))
 
     @property
     def spare(self) -> int:
         """Number of blocks that `insert` takes without more memory."""
-        fits = min(array.capacity for array in self._arrays())
-        return max(min(fits, len(self.hash_keys) // 2, self.most_blocks) - self.count, 0)
+        return max(min(self._room, self.most_blocks) - self.count, 0)
 
     def insert(self, keys: NDArray[np.int64]) -> None:
         """Append blocks with distinct new keys; their voxels are zero. Raises as `reserve`."""
@@ -242,7 +257,6 @@ class BlockStore:
         self.reserve(count)
         self._keys.array[first:count] = keys
         self.count = count
-        self._hash(first)
         if self._device is not None and self._device.sends_blocks != "never":
             places = np.empty(len(keys), np.int32)
             block_hash.find_places(keys, self.hash_keys, places)
@@ -258,8 +272,8 @@ class BlockStore:
             array.array[count : self.count] = 0
         self.count = count
         self.drops += 1
-        self.hash_keys[:] = self.hash_slots[:] = 0
-        self._hash(0)
+        self._hash_keys[:] = self._hash_slots[:] = 0
+        self._hashed = 0
         if self._device is not None:
             self._device.drop(count, self.hash_keys, self.hash_slots)
 
@@ -318,11 +332,13 @@ class BlockStore:
                 yield self.keys[chunk], rows[chunk]
             self.rest()
 
-    def _hash(self, first: int) -> None:
-        """Put the blocks from `first` on into the hash."""
-        block_hash.insert_blocks(
-            self._keys.array, first, self.count - first, first, self.hash_keys, self.hash_slots
-        )
+    def _hash(self) -> None:
+        """Put the blocks into the hash that are not there yet."""
+        first, self._hashed = self._hashed, self.count
+        if first < self.count:
+            block_hash.insert_blocks(
+                self._keys.array, first, self.count - first, first, self._hash_keys, self._hash_slots
+            )
 
     @property
     def bytes_per_block(self) -> int:
@@ -336,7 +352,7 @@ class BlockStore:
     @property
     def nbytes(self) -> int:
         """Size of the blocks and their hash, bytes."""
-        return self.count * self.bytes_per_block + self.hash_keys.nbytes + self.hash_slots.nbytes
+        return self.count * self.bytes_per_block + self._hash_keys.nbytes + self._hash_slots.nbytes
 
     @property
     def resident_bytes(self) -> int:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.config import Arch
+from tsfusion.kernels.device_integration import FIRST_BLOCKS, FIRST_HASH
 from tsfusion.tsdf.device_link import DeviceLink, Step, link_to, refuse
 
 log = logging.getLogger(__name__)
@@ -20,13 +21,15 @@ class DeviceBlocks:
     """Keyframes are added on the device. The store's rows follow when somebody reads them (`fetch`), and the
     device's when somebody has written to the store's (`send`)."""
 
+    first_blocks = FIRST_BLOCKS
+
     def __init__(self, link: DeviceLink, layers: tuple[str, ...]) -> None:
         self._link = link
         self._names = layers
         self._number = link.new_map(layers)
         self._behind = np.zeros(0, bool)  # by slot: the store's row is behind the device's
         self._is_behind = False
-        self._hash_size = 0  # of the device's copy
+        self._hash_size = FIRST_HASH  # of the device's copy
         # When `insert` tells the device: later = with the next call; never = it has them.
         self.sends_blocks: Literal["now", "later", "never"] = "now"
         self._unsent: list[NDArray[Any]] = []

@@ -1,20 +1,24 @@
 # SPDX-License-Identifier: MIT
 """Rays and integration where the map's blocks are on a device: the transaction is `Integrator`'s."""
 
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.config import VolumeConfig
+from tsfusion.kernels.device_integration import BANDS_AT, FRESH_AT, LACKING, NEW
 from tsfusion.kernels.integrate import (
     ALL,
+    ONLY_ADDED,
     TOUCHED_COUNT,
     TOUCHED_HEADER,
     TOUCHED_MISSING,
     TOUCHED_OVERFLOW,
 )
 from tsfusion.kernels.sensor_noise import WEIGHT_ONE
+from tsfusion.kernels.voxel_traversal import BAND_FIELDS, DEFERRED, UPDATES
 from tsfusion.tsdf.block_store import BlockStore
 from tsfusion.tsdf.device_blocks import DeviceBlocks
 from tsfusion.tsdf.integrator import BLOCK_COST, NO_LIMIT, PART_WEIGHT, Integrator, Part
@@ -30,11 +34,12 @@ class DeviceRayBuffers(RayBuffers):
         self.asked: tuple[Any, ...] = ()  # for which rays: a kernel's name and its arguments
         self.is_light = False  # whether no lane can overflow that has reserve for a part
 
-    def note_touched(self, found: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Take over the header of the touched blocks, and more of them; returns the slots of these."""
-        new, end = found[TOUCHED_HEADER:], TOUCHED_HEADER + int(found[TOUCHED_COUNT])
+    def note_told(self, told: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Take over what a launch tells of blocks; returns the slots of those that are touched for the first
+        time."""
+        new, end = told[FRESH_AT + 2 * told[NEW] :], TOUCHED_HEADER + int(told[TOUCHED_COUNT])
         self._touched.reserve(end)
-        self.touched[:TOUCHED_HEADER] = found[:TOUCHED_HEADER]
+        self.touched[:TOUCHED_HEADER] = told[:TOUCHED_HEADER]
         self.touched[TOUCHED_OVERFLOW] = 0  # which on the CPU is said of `missing`
         self.touched[end - len(new) : end] = new
         return new
@@ -65,15 +70,15 @@ class DeviceRayBuffers(RayBuffers):
         return np.ascontiguousarray(image)  # half of the bytes, where it is uint16
 
     def _rays_of_points(self, points: NDArray[Any], *rest: Any) -> None:
-        self._ask("rays_from_points", points, *rest)
+        self._ask("point_rays", points, *rest)
 
     def _rays_of_image(self, image: NDArray[Any], *rest: Any) -> None:
-        self._ask("rays_from_image", image, *rest)
+        self._ask("image_rays", image, *rest)
 
     def _ask(self, kind: str, measured: NDArray[Any], *rest: Any) -> None:
         """Note which rays are to be made: that and what is to be done with them is one call."""
         self.asked = kind, measured, *rest
-        samples = len(measured) if kind == "rays_from_points" else measured.size
+        samples = len(measured) if kind == "point_rays" else measured.size
         self.is_light = samples * WEIGHT_ONE < PART_WEIGHT
 
 
@@ -87,7 +92,8 @@ class DeviceIntegrator(Integrator):
     ) -> None:
         super().__init__(store, buffers, config)
         self._device = device
-        self._ahead: list[NDArray[Any]] | None = None  # what the first launch found, when it was made
+        # What the first launch told, and keys of missing blocks, when it was made
+        self._ahead: tuple[NDArray[np.int32], NDArray[np.int64]] | None = None
         self._has_inserted = False  # it has inserted the missing blocks, too
 
     def _begin(self, sign: int) -> None:
@@ -100,10 +106,12 @@ class DeviceIntegrator(Integrator):
         new = min(self._most_missing(), store.spare) if sign > 0 else 0
         room = new, config.max_blocks_per_keyframe, self._most_cost, BLOCK_COST
         self._ahead, self._has_inserted = None, False
-        found = self._device.call("make_rays", kind, job if buffers.is_light else None, room, *arguments)
+        found = self._device.call("fuse", kind, job if buffers.is_light else None, room, *arguments)
+        told = found[0].copy()
+        buffers.bands = _bands(told).copy()
+        buffers.bands[:, UPDATES] = buffers.bands[:, DEFERRED] = 0
         if buffers.is_light:
-            self._ahead = [one.copy() for one in found]
-        buffers.bands = self._ahead[0] if self._ahead else found[0].copy()
+            self._ahead = told, keys_told(told, found)
 
     def _take_back(self, added: list[Part], sign: int, before: int) -> None:
         if self._ahead is not None:  # refused before it was looked at
@@ -130,17 +138,40 @@ class DeviceIntegrator(Integrator):
         self, part: Part, sign: int, *, which: int = ALL, oldest: int = 0, most_missing: int = NO_LIMIT
     ) -> None:
         store, buffers = self._store, self._buffers
-        found, self._ahead = self._ahead, None
-        if found is None:
+        ahead, self._ahead = self._ahead, None
+        if ahead is None:
             job = which, *part, sign, oldest, store.stamp, int(buffers.colored)
-            found = [*(one.copy() for one in self._device.call("add", job)), np.array(False)]
-        buffers.bands, touched, missing, self._has_inserted = *found[:3], bool(found[3])
+            found = self._device.call("add", job)
+            told = found[0].copy()
+            missing = keys_told(told, found)
+        else:
+            told, missing = ahead
+        self._has_inserted = bool(told[NEW])
         if self._has_inserted:
             self._insert_when("never", missing)
         else:
             buffers.note_missing(missing)
-        store.note_touched(buffers.note_touched(touched))
+        store.note_touched(buffers.note_told(told))
+        if which != ONLY_ADDED:
+            made = _bands(told)[:, UPDATES].sum()
+            if self._has_inserted:
+                made += _bands(told)[:, LACKING].sum()
+            buffers.bands[part[0], UPDATES] += made
+            buffers.bands[part[0], DEFERRED] = len(missing)
 
     def _measure_touched(self) -> None:
-        (bounds,) = self._device.call("largest_weights")
-        self._store.bounds[self._buffers.touched_slots] = bounds
+        slots = self._buffers.touched_slots
+        if len(slots):
+            (self._store.bounds[slots],) = self._device.call("largest_weights", slots)
+
+
+def keys_told(told: NDArray[np.int32], found: Sequence[NDArray[Any]]) -> NDArray[np.int64]:
+    """Keys of the blocks that a launch has made blocks of the map, or of those that it found missing."""
+    if new := int(told[NEW]):
+        return told[FRESH_AT : FRESH_AT + 2 * new].view(np.int64)
+    return found[1].copy() if len(found) > 1 else np.empty(0, np.int64)
+
+
+def _bands(told: NDArray[np.int32]) -> NDArray[np.int32]:
+    """The bands in what a launch tells."""
+    return told[BANDS_AT:FRESH_AT].reshape(-1, BAND_FIELDS)

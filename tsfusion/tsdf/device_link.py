@@ -3,25 +3,26 @@
 
 import atexit
 import logging
-import socket
+import select
 import subprocess
 import sys
 import threading
 from collections.abc import Sequence
 from contextlib import suppress
-from multiprocessing.connection import Connection
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core import process
 from tsfusion.core.config import Arch
-from tsfusion.core.shared_arrays import Place, SharedArrays, look_out, make_file
+from tsfusion.core.shared_arrays import MOST_SAID, Place, SharedArrays, look_out, make_file, talking_sockets
 
 log = logging.getLogger(__name__)
 
 Step = tuple[str, tuple[Any, ...]]  # a method and its arguments
+SentArray = tuple[int, str, tuple[int, ...], bytes | int]  # which argument, dtype, shape, content or offset
 
 _COMMAND = (sys.executable, "-m", "tsfusion.tsdf.device_process")
 _START_S = 120.0  # a device's first start compiles its driver's own kernels, too
@@ -55,7 +56,10 @@ class DeviceLink:
         self._forgotten: list[int] = []
         descriptors = make_file(), make_file()
         self._requests, self._replies = (SharedArrays(one) for one in descriptors)
-        ours, theirs = socket.socketpair()
+        try:
+            self._link, theirs = talking_sockets()
+        except OSError as error:
+            raise DeviceLost(f"the device {arch} cannot be used: {error}") from error
         with theirs:
             passed = [theirs.fileno(), *descriptors]
             ends_with_thread = threading.current_thread() is threading.main_thread()
@@ -66,7 +70,6 @@ class DeviceLink:
                 pass_fds=passed,
                 **process.OWN_GROUP,
             )
-        self._link: Connection[Any, Any] = Connection(ours.detach())
         atexit.register(self.close)
         self._receive(_START_S)
 
@@ -110,27 +113,37 @@ class DeviceLink:
         if self._has_ended:
             raise DeviceLost(f"the process with the device {self.arch} has ended")
         self._requests.begin()
-        packed = [(verb, [self._packed(one) for one in arguments]) for verb, arguments in steps]
+        packed = [(verb, *self._packed(arguments)) for verb, arguments in steps]
         try:
-            self._link.send((number, packed))
+            self._link.send(msgspec.msgpack.encode((number, packed)))
         except OSError as error:
             self.close()
             raise DeviceLost(f"the process with the device {self.arch} has ended") from error
         return self._receive(None)
 
-    def _packed(self, argument: Any) -> Any:
-        """An argument as it is sent: of a large array its place in the memory that both processes have."""
-        if isinstance(argument, np.ndarray) and argument.nbytes > _SENT_BYTES:
-            return self._requests.write([argument])[0]
-        return argument
+    def _packed(self, arguments: Sequence[Any]) -> tuple[list[Any], list[SentArray]]:
+        """Arguments as they are sent, and the arrays among them: of large ones the place in the memory that
+        both processes have."""
+        values, arrays = list(arguments), list[SentArray]()
+        for i, one in enumerate(arguments):
+            if isinstance(one, np.ndarray):
+                values[i] = None
+                is_large = one.nbytes > _SENT_BYTES
+                where = self._requests.write([one])[0].offset if is_large else one.tobytes()
+                arrays.append((i, one.dtype.str, one.shape, where))
+        return values, arrays
 
     def _receive(self, timeout: float | None) -> Any:
         how: str = "failed"
         found: Any = "its process has ended"
-        with suppress(EOFError, OSError):
+        with suppress(OSError):
             if timeout is None:
                 look_out(self._link.fileno(), _ANSWER_S)
-            how, found = self._link.recv() if self._link.poll(timeout) else (how, "it does not start")
+            elif not select.select([self._link], [], [], timeout)[0]:
+                self.close()
+                raise DeviceLost(f"the device {self.arch} cannot be used: it does not start")
+            if answer := self._link.recv(MOST_SAID):
+                how, found = msgspec.msgpack.decode(answer)
         if how == "memory":
             raise MemoryError(f"the device {self.arch} has no memory for more of the map ({found})")
         if how == "failed":

@@ -11,25 +11,28 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.kernels import block_hash, device_rays, integrate, rays_from_images
 from tsfusion.kernels import device_integration as kernels
+from tsfusion.kernels import device_rays, integrate, rays_from_images
 from tsfusion.kernels import taichi as ti
 from tsfusion.kernels.device_copies import Copies
-from tsfusion.kernels.integrate import (
-    CUBE,
-    TOUCHED_COUNT,
-    TOUCHED_HEADER,
-    TOUCHED_MISSING,
-    TOUCHED_OVERFLOW,
+from tsfusion.kernels.device_integration import (
+    BANDS,
+    BANDS_AT,
+    FEW_NEW,
+    FIRST_BLOCKS,
+    FIRST_HASH,
+    FRESH_AT,
+    GROUP,
+    LACKING,
+    NEW,
+    TOUCHED_AT,
 )
-from tsfusion.kernels.voxel_traversal import BAND_FIELDS, COST, RAY_FIELDS
+from tsfusion.kernels.integrate import CUBE, TOUCHED_COUNT, TOUCHED_MISSING, TOUCHED_OVERFLOW
+from tsfusion.kernels.voxel_traversal import BAND_FIELDS, COST, RAY_FIELDS, UPDATES
 from tsfusion.tsdf.checkpoint import LAYER_DTYPES
 
-BANDS = 64  # those of a map on the CPU: at their ends bundles of points end
-_FIRST_BLOCKS = 1024
 _LISTED = 1 << 22  # updates, 16 bytes each, that a launch lists
-_FEW_TOUCHED, _FEW_MISSING = 4096, 1024  # blocks whose numbers are read at once
-_FEW_NEW = 256  # blocks that one thread enters into the hash: 0.2 ms on a GPU
+_FEW_TOUCHED = 4096  # blocks whose numbers are read at once
 _DTYPES = {"sums": ti.i64, "color_rgn": ti.i64, "color_b": ti.i32}
 
 
@@ -64,65 +67,59 @@ class DeviceMap:
         self._count = 0
         self._layers = {name: _zeros(dtype, 1, CUBE) for name, dtype in _DTYPES.items()}
         self._stamps = _zeros(ti.i32, 1)
-        self._hash_keys, self._hash_slots = _zeros(ti.i64, 4), _zeros(ti.i32, 4)
-        self._touched = _zeros(ti.i32, TOUCHED_HEADER)
-        self._winners, self._missing = _zeros(ti.i32, kernels.WINNERS), _zeros(ti.i64, 1)
-        self._rays, self._bands = _zeros(ti.i32, 1, RAY_FIELDS), _zeros(ti.i32, BANDS, BAND_FIELDS)
+        self._hash_keys, self._hash_slots = _zeros(ti.i64, FIRST_HASH), _zeros(ti.i32, FIRST_HASH)
+        self._told = _zeros(ti.i32, TOUCHED_AT)
+        self._winners, self._missing = _zeros(ti.i32, 2 * kernels.WINNERS), _zeros(ti.i64, 1)
+        self._places, self._claims = _zeros(ti.i32, FEW_NEW, 2), _zeros(ti.i32, kernels.CLAIMS)
+        self._rays, self._marks = _zeros(ti.i32, 1, RAY_FIELDS), _zeros(ti.i32, 1)
         self._depths, self._tiles = _zeros(ti.i32, 1), _zeros(ti.i32, 1, device_rays.TILE_FIELDS)
-        self._deferred = _zeros(ti.i32, 1)
+        self._groups, self._totals = _zeros(ti.i32, 1, kernels.GROUP_FIELDS), _zeros(ti.i64, 2)
+        self._shared = 0, 0  # units of work, and places of each
         self._begins = np.zeros(BANDS + 1, np.int64)  # first places of bands, and the last one's end
-        self._turns, self._told = 0, 0  # launches of the keyframe; touched blocks that were told of
-        self._counted = np.zeros((BANDS, BAND_FIELDS), np.int32)  # the bands after the last launch
-        self._list_counts = _zeros(ti.i64, kernels.COUNTS)
-        self._color_votes = _zeros(ti.i32, 1, kernels.VOTE_FIELDS)
+        self._costs = np.zeros(BANDS, np.int64)  # of the bands' rays
+        self._known = 0  # touched blocks that were told of
         self._listed = _zeros(ti.i32, 1, kernels.LISTED_FIELDS)
-        self._reserve(_FIRST_BLOCKS)
+        self._reserve(FIRST_BLOCKS)
         self._reserve_list(_LISTED)
 
-    def make_rays(
+    def fuse(
         self, kind: str, job: tuple[int, ...] | None, room: tuple[int, ...], *arguments: Any
     ) -> tuple[NDArray[Any], ...]:
-        """Make a keyframe's rays, as the kernel of this name in `kernels.device_rays` of these arguments, and
-        add them, if there is a `Job`.
+        """Make a keyframe's rays, as the function of this name in `kernels.device_rays` of these arguments,
+        and add them, if there is a `Job`. Missing blocks are blocks of the map then, if there is `Room` for
+        them, and `NEW` of what is told says so.
 
         Returns:
-            The bands alone; or what `add` does, and whether the missing blocks are blocks of the map now, as
-            there was `Room` for them, and what belongs to them was added.
+            As `add`.
         """
-        rooms = self._room_for_image if kind == "rays_from_image" else self._room_for_points
-        scratch = rooms(*arguments[0].shape)
+        is_image = kind == "image_rays"
+        kernel = device_rays.fuse_image if is_image else device_rays.fuse_points
+        shape = arguments[0].shape
+        scratch = self._room_for_image(*shape) if is_image else self._room_for_points(shape[0])
+        limits = Room(*room)
+        spare = min(self._stamps.shape[0], self._hash_keys.shape[0] // 2) - self._count
+        limits = limits._replace(new=min(limits.new, FEW_NEW, spare))
+        count, sign, stamp = (int(self._begins[-1]), *job[3:6:2]) if job else (0, 0, 0)
         arrays = [i for i, one in enumerate(arguments) if isinstance(one, np.ndarray)]
+        *given, limit = self._copies.given(*(arguments[i] for i in arrays), np.array(limits, np.int64))
         handed = list(arguments)
-        for i, one in zip(arrays, self._copies.given(*(arguments[i] for i in arrays)), strict=True):
+        for i, one in zip(arrays, given, strict=True):
             handed[i] = one
-        getattr(device_rays, kind)(
-            *handed, *scratch, self._rays, self._bands, self._list_counts, self._touched
-        )
-        self._turns, self._told, self._counted = 0, 0, np.zeros((BANDS, BAND_FIELDS), np.int32)
-        if job is None:
-            return tuple(self._copies.read((self._bands, BANDS)))
-        bands, touched, missing = self.add(job)
-        has_room = self._has_room(Room(*room), bands, len(touched) - TOUCHED_HEADER, len(missing))
-        if has_room:
-            oldest, before = self._count, touched[TOUCHED_HEADER:].copy()
-            self._count += len(missing)
-            block_hash.insert_blocks(
-                *self._copies.given(missing), 0, len(missing), oldest, self._hash_keys, self._hash_slots
-            )
-            bands, touched, _ = self.add((integrate.ONLY_DEFERRED, *job[1:4], oldest, *job[5:]))
-            touched = np.concatenate([touched[:TOUCHED_HEADER], before, touched[TOUCHED_HEADER:]])
-        return bands, touched, missing, np.array(has_room)
-
-    def _has_room(self, room: Room, bands: NDArray[np.int32], touched: int, new: int) -> bool:
-        """Whether there are new blocks, and they may be added at once."""
-        count = self._count + new
-        cost = int(bands[:, COST].sum(dtype=np.int64)) + room.block_cost * new
-        return (
-            0 < new <= min(room.new, _FEW_NEW)
-            and count <= min(self._stamps.shape[0], self._hash_keys.shape[0] // 2)
-            and touched + new <= room.touched
-            and cost <= room.cost
-        )
+        at = self._layers
+        kernel(
+            *handed, *scratch, self._rays, count, sign, stamp, self._count, limit, self._hash_keys,
+            self._hash_slots, self._winners, self._missing, self._places, self._claims, self._stamps,
+            self._told, self._groups, self._totals, self._listed, self._marks, at["sums"], at["color_rgn"],
+            at["color_b"],
+        )  # fmt: skip
+        self._known = 0
+        told, missing = self._read_results()
+        self._costs = bands_of(told)[:, COST].astype(np.int64)
+        if told[NEW]:
+            self._count += int(told[NEW])
+        elif told[TOUCHED_OVERFLOW] and job:
+            return self.add(job)
+        return self._news(told, missing)
 
     def _room_for_image(self, height: int, width: int) -> tuple[Any, Any]:
         """Make room for an image's rays; returns the scratch arrays of its kernel."""
@@ -132,7 +129,7 @@ class DeviceMap:
         self._tiles = _at_least(self._tiles, ti.i32, tiles, device_rays.TILE_FIELDS)
         return self._depths, self._tiles
 
-    def _room_for_points(self, count: int, _: int) -> tuple[Any]:
+    def _room_for_points(self, count: int) -> tuple[Any]:
         """Likewise for points."""
         self._share_places(count, 1)
         self._depths = _at_least(self._depths, ti.i32, count)
@@ -140,63 +137,71 @@ class DeviceMap:
 
     def _share_places(self, units: int, places: int) -> None:
         """Share out units of work to the bands, each of so many places for rays."""
+        if (units, places) == self._shared:
+            return
+        self._shared = units, places
         self._begins = np.arange(BANDS + 1, dtype=np.int64) * units // BANDS * places
         self._rays = _at_least(self._rays, ti.i32, units * places, RAY_FIELDS)
-        self._deferred = _at_least(self._deferred, ti.i32, units * places)
+        self._marks = _at_least(self._marks, ti.i32, units * places)
+        self._groups = _at_least(self._groups, ti.i32, units * places // GROUP + 1, kernels.GROUP_FIELDS)
 
     def add(self, given: tuple[int, ...]) -> tuple[NDArray[Any], ...]:
         """Add rays to the map's blocks.
 
         Returns:
-            The bands, the slots of blocks that the keyframe touches for the first time behind the header of
-            all, and the keys of missing blocks, in order.
+            What is told of the keyframe (kernels/device_integration.py), with the slots of blocks that it
+            touches for the first time; and, if any are missing, the keys of missing blocks, in order.
         """
         job = Job(*given)
         self._launch(job, job.first_band, job.end_band)
-        bands, touched, missing = self._read_results()
-        if touched[TOUCHED_OVERFLOW]:
-            kernels.restore_counts(self._bands, self._counted)
-            found = []
-            for first, end in self._runs(bands.copy(), job.first_band, job.end_band):
+        told, missing = self._read_results()
+        if told[TOUCHED_OVERFLOW]:
+            found, counted = [], np.zeros((BANDS, BAND_FIELDS), np.int32)
+            for first, end in self._runs(job.first_band, job.end_band):
                 self._launch(job, first, end)
-                bands, touched, missing = self._read_results()
-                found.append(missing.copy())
+                told, missing = self._read_results()
+                counted += bands_of(told)
+                found.append(missing)
             missing = np.concatenate(found)
-        self._counted = bands.copy()
-        told, self._told = self._told, int(touched[TOUCHED_COUNT])
-        if told:
-            touched = np.concatenate([touched[:TOUCHED_HEADER], touched[TOUCHED_HEADER + told :]])
-        return bands, touched, np.unique(missing) if job.which == integrate.ALL else missing[:0]
+            for field in (UPDATES, LACKING):
+                bands_of(told)[:, field] = counted[:, field]
+        return self._news(told, missing if job.which == integrate.ALL else missing[:0])
+
+    def _news(self, told: NDArray[np.int32], missing: NDArray[np.int64]) -> tuple[NDArray[Any], ...]:
+        """What is told, without the slots that were told of before and places without a key; and missing
+        blocks, in order."""
+        known, self._known = self._known, int(told[TOUCHED_COUNT])
+        told = np.concatenate([told[: FRESH_AT + 2 * told[NEW]], told[TOUCHED_AT + known :]])
+        return (told, np.unique(missing)) if len(missing) else (told,)
 
     def _launch(self, job: Job, first: int, end: int) -> None:
         at, first_ray, end_ray = self._layers, int(self._begins[first]), int(self._begins[end])
-        self._color_votes = _at_least(self._color_votes, ti.i32, end_ray - first_ray, kernels.VOTE_FIELDS)
-        turn, self._turns = min(self._turns, kernels.COUNTS - 1), self._turns + 1
-        if self._turns > 1 and (self._turns > kernels.COUNTS or job.which == integrate.ALL):
-            kernels.begin_turn(self._touched, self._list_counts, turn)
         kernels.add_rays(
-            self._rays, self._bands, self._deferred, first_ray, end_ray, job.which, *job[3:], self._hash_keys,
-            self._hash_slots, self._winners, self._missing, self._stamps, self._touched, self._list_counts,
-            turn, self._listed, self._color_votes, at["sums"], at["color_rgn"], at["color_b"],
+            self._rays, first_ray, end_ray, *job[3:], self._hash_keys, self._hash_slots, self._winners,
+            self._missing, self._places, self._claims, self._stamps, self._told, self._groups, self._totals,
+            self._listed, self._marks, at["sums"], at["color_rgn"], at["color_b"],
         )  # fmt: skip
 
-    def _read_results(self) -> tuple[NDArray[Any], ...]:
-        """Bands, touched blocks behind their header, and keys of missing blocks, of which some may be there
-        twice."""
-        few = TOUCHED_HEADER + min(_FEW_TOUCHED, self._stamps.shape[0]), _FEW_MISSING
+    def _read_results(self) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+        """What is told, and the keys of missing blocks, of which some may be there twice."""
+        size = TOUCHED_AT + min(_FEW_TOUCHED, self._stamps.shape[0])
         for _ in range(2):  # the second time, if it was not all
-            found = self._copies.read((self._bands, BANDS), (self._touched, few[0]), (self._missing, few[1]))
-            bands, touched, missing = found
-            all_ = TOUCHED_HEADER + int(touched[TOUCHED_COUNT]), int(touched[TOUCHED_MISSING])
-            if all_[0] <= few[0] and all_[1] <= few[1]:
+            (told,) = self._copies.read((self._told, size))
+            all_ = TOUCHED_AT + int(told[TOUCHED_COUNT] + told[NEW])
+            if all_ <= size:
                 break
-            few = all_
-        return bands, touched[: all_[0]], missing[: all_[1]]
+            size = all_
+        told = told[:all_].copy()  # for some bytes are read anew
+        told[TOUCHED_COUNT] += told[NEW]
+        if told[NEW] or not told[TOUCHED_MISSING]:
+            return told, np.empty(0, np.int64)
+        (found,) = self._copies.read((self._missing, int(told[TOUCHED_MISSING])))
+        return told, found.copy()
 
-    def _runs(self, bands: NDArray[np.int32], first: int, end: int) -> Iterator[tuple[int, int]]:
+    def _runs(self, first: int, end: int) -> Iterator[tuple[int, int]]:
         """Runs of the bands whose updates fit into the list; it grows for a band that does not."""
-        # what a ray costs is no less than the voxels and blocks that it crosses
-        costs = np.concatenate([[0], np.cumsum(2 * bands[:, COST].astype(np.int64))])
+        # what a ray costs is no less than the voxels that it crosses
+        costs = np.concatenate([[0], np.cumsum(self._costs)])
         while first < end:
             fits = int(np.searchsorted(costs, costs[first] + _LISTED, side="right")) - 1
             last = min(max(fits, first + 1), end)
@@ -237,12 +242,12 @@ class DeviceMap:
         self._count = count
         self._hash_keys.fill(0)
 
-    def largest_weights(self) -> NDArray[np.int32]:
-        """The largest weight in each touched block."""
-        bounds = _zeros(ti.i32, max(self._count, 1))
-        integrate.largest_weights(self._layers["sums"], self._touched, bounds)
-        _, touched, _ = self._read_results()
-        found: NDArray[np.int32] = bounds.to_numpy()[touched[TOUCHED_HEADER:]]
+    def largest_weights(self, slots: NDArray[np.int32]) -> NDArray[np.int32]:
+        """The largest weight in each of these blocks."""
+        self._marks = _at_least(self._marks, ti.i32, len(slots))
+        handed = self._copies.given(slots)
+        kernels.largest_weights(self._layers["sums"], *handed, len(slots), self._marks)
+        (found,) = self._copies.read((self._marks, len(slots)))
         return found
 
     def read(self, name: str, slots: NDArray[np.int32], rows: NDArray[Any]) -> None:
@@ -262,14 +267,19 @@ class DeviceMap:
         capacity = self._stamps.shape[0]
         if count > capacity:
             size = max(count, 2 * capacity)
-            stamps, touched = _zeros(ti.i32, size), _zeros(ti.i32, TOUCHED_HEADER + size)
+            stamps, told = _zeros(ti.i32, size), _zeros(ti.i32, TOUCHED_AT + size)
             layers = {name: _zeros(_DTYPES[name], size, CUBE) for name in self._layer_names}
-            for here, there in ((self._stamps, stamps), (self._touched, touched)):
+            for here, there in ((self._stamps, stamps), (self._told, told)):
                 kernels.move_list(here, there)
             for name, larger in layers.items():
                 kernels.move_rows(self._layers[name], self._count, larger)
-            self._stamps, self._touched = stamps, touched
+            self._stamps, self._told = stamps, told
             self._layers |= layers
+
+
+def bands_of(told: NDArray[np.int32]) -> NDArray[np.int32]:
+    """The bands in what is told."""
+    return told[BANDS_AT:FRESH_AT].reshape(BANDS, BAND_FIELDS)
 
 
 def _zeros(dtype: Any, *shape: int) -> Any:

@@ -6,30 +6,33 @@ Taichi has one device a process. Whoever reads maps (meshes, the field, question
 """
 
 import signal
+import socket
 import sys
-from multiprocessing.connection import Connection
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
+import msgspec
 import numpy as np
 
 from tsfusion.core import process
 from tsfusion.core.errors import MissingDependency
-from tsfusion.core.shared_arrays import Place, SharedArrays, look_out
+from tsfusion.core.shared_arrays import MOST_SAID, Place, SharedArrays, look_out
 from tsfusion.kernels import device_copies, runtime
 from tsfusion.kernels.integrate import CUBE
 from tsfusion.tsdf.checkpoint import LAYER_DTYPES
 
 if TYPE_CHECKING:
+    from tsfusion.tsdf.device_link import SentArray
     from tsfusion.tsdf.device_map import DeviceMap
 
-NEXT_S = 0.0005  # in which a keyframe's second call comes
+NEXT_S = 0.001  # in which the next call comes, where keyframes follow each other
 GROWS = ("make", "insert")  # what may fail for lack of memory, and then changes nothing
 
 
 class _Device:
     """Main loop of the process: it answers calls of maps by their numbers."""
 
-    def __init__(self, link: "Connection[Any, Any]", requests: SharedArrays, replies: SharedArrays) -> None:
+    def __init__(self, link: socket.socket, requests: SharedArrays, replies: SharedArrays) -> None:
         self._link, self._requests, self._replies = link, requests, replies
         self._copies = device_copies.copies()
         self._pinned = 0  # address of the requests' memory
@@ -37,22 +40,27 @@ class _Device:
 
     def run(self) -> None:
         """Answer until the other end is closed."""
-        try:
+        with suppress(OSError):
             while True:
                 look_out(self._link.fileno(), NEXT_S)
-                number, steps = self._link.recv()
+                said = self._link.recv(MOST_SAID)
+                if not said:
+                    return
+                number, steps = msgspec.msgpack.decode(said)
                 answer: tuple[str, Any] = "done", None
-                for verb, arguments in steps:
-                    answer = self._answer(number, verb, arguments)
+                for step in steps:
+                    answer = self._answer(number, *step)
                     if answer[0] != "done":
                         break
-                self._link.send(answer)
-        except (EOFError, OSError):
-            pass
+                self._link.send(msgspec.msgpack.encode(answer))
 
-    def _answer(self, number: int, verb: str, arguments: tuple[Any, ...]) -> tuple[str, Any]:
+    def _answer(self, number: int, verb: str, given: list[Any], arrays: list["SentArray"]) -> tuple[str, Any]:
         self._replies.begin()
-        given = [self._requests.read(one) if isinstance(one, Place) else one for one in arguments]
+        for i, dtype, shape, where in arrays:
+            if isinstance(where, int):
+                given[i] = self._requests.read(Place(where, shape, dtype))
+            else:
+                given[i] = np.ndarray(shape, dtype, where)
         memory = self._requests.memory
         if len(memory) and memory.ctypes.data != self._pinned:
             self._pinned = memory.ctypes.data
@@ -75,10 +83,10 @@ class _Device:
             return self._read(self._maps[number], *given)
         found = getattr(self._maps[number], verb)(*given)
         if isinstance(found, np.ndarray):
-            return self._replies.write([found])
+            found = (found,)
         return self._replies.write(found) if isinstance(found, tuple) else found
 
-    def _read(self, one: "DeviceMap", names: tuple[str, ...], slots: Any) -> list[Place]:
+    def _read(self, one: "DeviceMap", names: list[str], slots: Any) -> list[Place]:
         """Rows of layers, copied from the device to where the other process reads them."""
         places = []
         for name in names:
@@ -98,13 +106,13 @@ def main() -> None:
         process.on_parent_end(signal.SIGKILL)
     process.end_first()
     process.lift_memory_limit()  # which counts what a driver maps, too
-    connection: Connection[Any, Any] = Connection(link)
+    connection = socket.socket(fileno=link)
     try:
         runtime.start_device(sys.argv[4])
     except MissingDependency as error:
-        connection.send(("failed", str(error)))
+        connection.send(msgspec.msgpack.encode(("failed", str(error))))
         return
-    connection.send(("done", None))
+    connection.send(msgspec.msgpack.encode(("done", None)))
     _Device(connection, SharedArrays(requests), SharedArrays(replies)).run()
 
 
