@@ -247,3 +247,12 @@ def test_a_mesh_is_asked_for_again_when_the_server_says_so(monkeypatch: pytest.M
     for answer, error, timeout in ((lambda _: next(replies), "no room", 5.0), (lambda _: again, "busy", 0.3)):
         with fake_server.serving(answer) as (control, _), pytest.raises(TransportError, match=error):
             fetch_mesh(NOBODY, control=control, timeout=timeout)
+
+
+def test_a_server_that_falls_silent_has_said_why_there_is_no_mesh() -> None:
+    replies = iter([messages.Reply(name="mesh", error="busy", retry=True)])
+    with (
+        fake_server.serving(lambda _: next(replies, None)) as (control, _),
+        pytest.raises(TransportError, match="busy"),
+    ):
+        fetch_mesh(NOBODY, control=control, timeout=1.5)

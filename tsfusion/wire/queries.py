@@ -125,6 +125,7 @@ def fetch_mesh(
     """
     command = Command(name="mesh", map=map_name, min_weight=min_weight)
     deadline = time.monotonic() + timeout
+    refused: CommandRefused | None = None
     while True:
         try:
             left = max(deadline - time.monotonic(), 0.0)
@@ -133,6 +134,11 @@ def fetch_mesh(
         except CommandRefused as error:
             if not error.retry or time.monotonic() + 2 * _AGAIN_INTERVAL > deadline:
                 raise
+            refused = error
+        except ServerUnreachable as error:
+            if refused is None:
+                raise
+            raise refused from error  # it is there, and said why not
         time.sleep(_AGAIN_INTERVAL)
     if reply.mesh is None:
         raise TransportError(f"the server at {address} answered without a mesh")
