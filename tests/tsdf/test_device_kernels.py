@@ -261,6 +261,18 @@ def test_updates_that_do_not_fit_into_the_list_are_made_in_runs(
     assert_equal(here, there)
 
 
+def test_blocks_that_runs_find_missing_count_together(
+    link: HereLink, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    needed = Volume(0.05).integrate(VIEWS[0]).blocks
+    monkeypatch.setattr(device_map, "_LISTED", 500)
+    here, there = both(max_blocks=needed - 1)
+    for one in (here, there):
+        with pytest.raises(MapFull):
+            one.integrate(VIEWS[0])
+        assert one.stats().blocks == 0
+
+
 def test_parts_of_limited_weight_are_added_one_after_the_other(
     link: HereLink, monkeypatch: pytest.MonkeyPatch
 ) -> None:

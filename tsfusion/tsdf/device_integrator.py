@@ -147,11 +147,12 @@ class DeviceIntegrator(Integrator):
         else:
             told, missing = ahead
         self._has_inserted = bool(told[NEW])
+        touched = buffers.note_told(told)
         if self._has_inserted:
             self._insert_when("never", missing)
         else:
             buffers.note_missing(missing)
-        store.note_touched(buffers.note_told(told))
+        store.note_touched(touched)
         if which != ONLY_ADDED:
             made = _bands(told)[:, UPDATES].sum()
             if self._has_inserted:
