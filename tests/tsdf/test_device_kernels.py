@@ -17,7 +17,7 @@ from tsfusion import Keyframe, Volume
 from tsfusion.core.errors import KeyframeTooLarge, MapFull, MapQuota
 from tsfusion.kernels import device_copies, runtime
 from tsfusion.kernels.device_copies import Copies, CudaCopies
-from tsfusion.kernels.device_integration import APART, NEW
+from tsfusion.kernels.device_told import APART, NEW
 from tsfusion.tsdf import device_blocks, device_map
 from tsfusion.tsdf.checkpoint import LAYER_DTYPES
 from tsfusion.tsdf.integrator import KeyframeQuota
@@ -182,7 +182,7 @@ def test_a_keyframe_is_one_call(link: HereLink) -> None:
 
 
 def assert_hash_is_the_map_s(there: Volume, link: HereLink) -> None:
-    """What the device has entered into its hash, many at the same time, is where it is one by one."""
+    """The device enters many blocks into its hash at once; each is where the host's, one by one, has it."""
     of_device, store = link.maps[-1], there._store
     assert (of_device._hash_keys.to_numpy() == store.hash_keys).all()
     used = store.hash_keys != 0

@@ -10,26 +10,37 @@ What is counted is counted in many places first: a device makes one addition to 
 import taichi as ti
 
 from tsfusion.kernels.block_hash import map_find
+from tsfusion.kernels.device_told import (
+    APART,
+    ARE_SAME,
+    BANDS,
+    CLAIMS,
+    FEW_NEW,
+    FRESH_AT,
+    LACKING,
+    NEW,
+    TOUCHED_AT,
+    band_field,
+    fresh_key,
+    joined,
+    rank_of,
+)
 from tsfusion.kernels.integrate import (
     COLOR_LIMIT,
     CUBE,
     FREE_SHIFT,
     MAX_DISTANCE,
     TOUCHED_COUNT,
-    TOUCHED_HEADER,
     TOUCHED_MISMATCH,
     TOUCHED_MISSING,
     TOUCHED_OVERFLOW,
     WEIGHT_BITS,
-    lane_weight,
     quantize,
 )
 from tsfusion.kernels.quick_launch import QuickLaunch
 from tsfusion.kernels.rays_from_images import TILE_SAMPLES
 from tsfusion.kernels.voxel_traversal import (
-    BAND_FIELDS,
     CROSSING,
-    DEFERRED,
     END,
     INTERVAL,
     UPDATES,
@@ -45,21 +56,6 @@ from tsfusion.kernels.voxel_traversal import (
     vec3i,
 )
 
-# `told`, what the host reads of a launch: the header of the touched blocks (kernels/integrate.py); how many
-# new blocks are blocks of the map now; how many missing ones have a place in the hash that no other one
-# wants; whether two of them are the same; the bands, of which the k-th also counts updates of every 64th ray;
-# keys of new blocks, in the order of their slots, two numbers each; slots of touched blocks.
-NEW, APART, ARE_SAME = (TOUCHED_HEADER + i for i in range(3))
-HEADER = 16
-BANDS = 64  # those of a map on the CPU: at their ends bundles of points end
-FEW_NEW = 4096  # blocks that a launch makes blocks of the map itself
-BANDS_AT = HEADER
-FRESH_AT = BANDS_AT + BANDS * BAND_FIELDS
-TOUCHED_AT = FRESH_AT + 2 * FEW_NEW
-FIRST_BLOCKS = 8192  # that a map has room for at first
-FIRST_HASH = 4 * FIRST_BLOCKS
-LACKING = DEFERRED  # of a band: updates of missing blocks
-
 # A listed update: place of the voxel in the layers, w·m << WEIGHT_FIELD | w, and the key of a missing block,
 # of which the place is −1 − number of the voxel in it.
 LISTED_FIELDS = 4
@@ -73,28 +69,10 @@ CROSSED, BASE = 0, 1
 LISTED, COSTS = 0, 1  # in `totals`: updates that are listed, and what the rays cost
 
 WINNERS = 1 << 16  # places of a table, of which there are two
-CLAIMS = 1 << 14  # places of another one: how many missing blocks want a place in the hash
 HASH_PLACE, RANK = 0, 1  # of a missing block, if there are few
-
-BEGINNERS = max(TOUCHED_AT, CLAIMS)
 
 # Limits of a keyframe: new blocks, touched ones, what rays and new blocks cost; and what one of these does
 ROOM_NEW, ROOM_TOUCHED, ROOM_COST, BLOCK_COST = 0, 1, 2, 3
-
-
-@ti.func
-def band_field(band, field: ti.template()):
-    """Where a band's field is in `told`."""
-    return BANDS_AT + band * BAND_FIELDS + field
-
-
-@ti.func
-def begin_keyframe(i, told: ti.template(), claims: ti.template()):
-    """The i-th of `BEGINNERS` threads empties what is told of the keyframe before."""
-    if i < TOUCHED_AT:
-        told[i] = 0
-    if i < CLAIMS:
-        claims[i] = 0
 
 
 @ti.func
@@ -123,12 +101,6 @@ def list_block(slot, stamp, stamps: ti.template(), told: ti.template()):
 
 
 @ti.func
-def joined(low, high):
-    """A key of its two numbers."""
-    return (ti.cast(high, ti.i64) << 32) | (ti.cast(low, ti.i64) & ti.i64(4294967295))
-
-
-@ti.func
 def missing_key(listed: ti.template(), i):
     """Key of the missing block that is listed at place i."""
     return joined(listed[i, KEY], listed[i, KEY + 1])
@@ -150,37 +122,6 @@ def is_winner(i, listed: ti.template(), winners: ti.template()):
         found = ti.cast(first == i, ti.i32)
     elif missing_key(listed, second) == key:
         found = ti.cast(second == i, ti.i32)
-    return found
-
-
-@ti.func
-def fresh_key(told: ti.template(), rank):
-    """Key of a new block."""
-    return joined(told[FRESH_AT + 2 * rank], told[FRESH_AT + 2 * rank + 1])
-
-
-@ti.func
-def rank_of(told: ti.template(), key):
-    """Which of the new blocks one of them is: those that share no place come first, by their keys."""
-    rank = rank_within(told, key, 0, told[APART])
-    if rank < 0:
-        rank = rank_within(told, key, told[APART], told[TOUCHED_MISSING])
-    return rank
-
-
-@ti.func
-def rank_within(told: ti.template(), key, first, end):
-    """Likewise among a run of them; −1 if it is not there."""
-    low, high = first, end
-    while high - low > 1:
-        middle = (low + high) >> 1
-        if fresh_key(told, middle) <= key:
-            low = middle
-        else:
-            high = middle
-    found = -1
-    if first < end:
-        found = ti.select(fresh_key(told, low) == key, low, -1)
     return found
 
 
@@ -516,70 +457,3 @@ def add_rays(
         1 + has_color * count, sign_, rays, first_ray, listed, marks, told, hash_keys, hash_slots, 0,
         color_rgn, color_b,
     )  # fmt: skip
-
-
-@QuickLaunch
-@ti.kernel
-def write_hash(
-    places: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    hash_keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    hash_slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
-):
-    """Write keys and slots to places of the hash from block to slot."""
-    for i in range(places.shape[0]):
-        hash_keys[places[i]] = keys[i]
-        hash_slots[places[i]] = slots[i]
-
-
-@QuickLaunch
-@ti.kernel
-def largest_weights(
-    sums: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    count: ti.i32,
-    found: ti.types.ndarray(dtype=ti.i32, ndim=1),
-):
-    """`found[i]` = the largest weight lane in block `slots[i]`, of the first `count`."""
-    for i in range(count):
-        most = 0
-        for v in range(CUBE):
-            most = ti.max(most, lane_weight(sums[slots[i], v]))
-        found[i] = most
-
-
-@ti.kernel
-def read_rows(
-    layer: ti.types.ndarray(ndim=2),
-    slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    rows: ti.types.ndarray(ndim=2),
-):
-    """`rows[i]` = row `slots[i]` of a layer."""
-    for i in range(slots.shape[0] * CUBE):
-        rows[i // CUBE, i % CUBE] = layer[slots[i // CUBE], i % CUBE]
-
-
-@ti.kernel
-def write_rows(
-    layer: ti.types.ndarray(ndim=2),
-    slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    rows: ti.types.ndarray(ndim=2),
-):
-    """Row `slots[i]` of a layer = `rows[i]`."""
-    for i in range(slots.shape[0] * CUBE):
-        layer[slots[i // CUBE], i % CUBE] = rows[i // CUBE, i % CUBE]
-
-
-@ti.kernel
-def move_rows(layer: ti.types.ndarray(ndim=2), count: ti.i32, larger: ti.types.ndarray(ndim=2)):
-    """Copy the first `count` rows of a layer into a larger one."""
-    for i in range(count * CUBE):
-        larger[i // CUBE, i % CUBE] = layer[i // CUBE, i % CUBE]
-
-
-@ti.kernel
-def move_list(listed: ti.types.ndarray(ndim=1), larger: ti.types.ndarray(ndim=1)):
-    """Copy a list into a larger one."""
-    for i in range(listed.shape[0]):
-        larger[i] = listed[i]

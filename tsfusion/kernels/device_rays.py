@@ -9,19 +9,16 @@ The kernels add the rays, too (`device_integration`): one launch takes half of t
 import taichi as ti
 
 from tsfusion.kernels.device_integration import (
-    BANDS,
-    BEGINNERS,
     COSTS,
     CROSSED,
     GROUP,
     add_and_admit,
-    band_field,
     begin_groups,
-    begin_keyframe,
     begin_list,
     crossed,
     whole_groups,
 )
+from tsfusion.kernels.device_told import BANDS, BEGINNERS, band_field, begin_keyframe
 from tsfusion.kernels.quick_launch import QuickLaunch
 from tsfusion.kernels.rays_from_images import (
     TILE,

@@ -116,7 +116,7 @@ def _kind(arguments: tuple[Any, ...]) -> tuple[int, ...] | None:
 
 
 def _what(argument: Any) -> int | None:
-    """What an argument is, whatever its type's name; None = nothing that a kernel takes."""
+    """The class of an argument, also of a type derived from a usual one; None = Taichi is to look."""
     for kind, what in (
         (ti.Ndarray, _OF_TAICHI), (np.ndarray, _OF_NUMPY), (Copied, _COPIED), (_INTEGERS, _INTEGER),
         (_FLOATS, _FLOAT),

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.config import Arch
-from tsfusion.kernels.device_integration import FIRST_BLOCKS, FIRST_HASH
+from tsfusion.kernels.device_told import FIRST_BLOCKS, FIRST_HASH
 from tsfusion.tsdf.device_link import DeviceLink, Step, link_to, refuse
 
 log = logging.getLogger(__name__)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.config import VolumeConfig
-from tsfusion.kernels.device_integration import BANDS_AT, FRESH_AT, LACKING, NEW
+from tsfusion.kernels.device_told import BANDS_AT, FRESH_AT, LACKING, NEW
 from tsfusion.kernels.integrate import (
     ALL,
     ONLY_ADDED,

@@ -54,12 +54,12 @@ class DeviceLink:
         self._has_ended = False
         self._maps = 0
         self._forgotten: list[int] = []
-        descriptors = make_file(), make_file()
-        self._requests, self._replies = (SharedArrays(one) for one in descriptors)
         try:
             self._link, theirs = talking_sockets()
         except OSError as error:
             raise DeviceLost(f"the device {arch} cannot be used: {error}") from error
+        descriptors = make_file(), make_file()
+        self._requests, self._replies = (SharedArrays(one) for one in descriptors)
         with theirs:
             passed = [theirs.fileno(), *descriptors]
             ends_with_thread = threading.current_thread() is threading.main_thread()
@@ -139,10 +139,9 @@ class DeviceLink:
         with suppress(OSError):
             if timeout is None:
                 look_out(self._link.fileno(), _ANSWER_S)
-            elif not select.select([self._link], [], [], timeout)[0]:
-                self.close()
-                raise DeviceLost(f"the device {self.arch} cannot be used: it does not start")
-            if answer := self._link.recv(MOST_SAID):
+            if timeout is not None and not select.select([self._link], [], [], timeout)[0]:
+                found = "it does not start"
+            elif answer := self._link.recv(MOST_SAID):
                 how, found = msgspec.msgpack.decode(answer)
         if how == "memory":
             raise MemoryError(f"the device {self.arch} has no memory for more of the map ({found})")

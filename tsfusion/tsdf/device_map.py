@@ -12,17 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.kernels import device_integration as kernels
-from tsfusion.kernels import device_rays, integrate, rays_from_images
+from tsfusion.kernels import device_rays, device_rows, integrate, rays_from_images
 from tsfusion.kernels import taichi as ti
 from tsfusion.kernels.device_copies import Copies
-from tsfusion.kernels.device_integration import (
+from tsfusion.kernels.device_told import (
     BANDS,
     BANDS_AT,
+    CLAIMS,
     FEW_NEW,
     FIRST_BLOCKS,
     FIRST_HASH,
     FRESH_AT,
-    GROUP,
     LACKING,
     NEW,
     TOUCHED_AT,
@@ -70,7 +70,7 @@ class DeviceMap:
         self._hash_keys, self._hash_slots = _zeros(ti.i64, FIRST_HASH), _zeros(ti.i32, FIRST_HASH)
         self._told = _zeros(ti.i32, TOUCHED_AT)
         self._winners, self._missing = _zeros(ti.i32, 2 * kernels.WINNERS), _zeros(ti.i64, 1)
-        self._places, self._claims = _zeros(ti.i32, FEW_NEW, 2), _zeros(ti.i32, kernels.CLAIMS)
+        self._places, self._claims = _zeros(ti.i32, FEW_NEW, 2), _zeros(ti.i32, CLAIMS)
         self._rays, self._marks = _zeros(ti.i32, 1, RAY_FIELDS), _zeros(ti.i32, 1)
         self._depths, self._tiles = _zeros(ti.i32, 1), _zeros(ti.i32, 1, device_rays.TILE_FIELDS)
         self._groups, self._totals = _zeros(ti.i32, 1, kernels.GROUP_FIELDS), _zeros(ti.i64, 2)
@@ -143,7 +143,9 @@ class DeviceMap:
         self._begins = np.arange(BANDS + 1, dtype=np.int64) * units // BANDS * places
         self._rays = _at_least(self._rays, ti.i32, units * places, RAY_FIELDS)
         self._marks = _at_least(self._marks, ti.i32, units * places)
-        self._groups = _at_least(self._groups, ti.i32, units * places // GROUP + 1, kernels.GROUP_FIELDS)
+        self._groups = _at_least(
+            self._groups, ti.i32, units * places // kernels.GROUP + 1, kernels.GROUP_FIELDS
+        )
 
     def add(self, given: tuple[int, ...]) -> tuple[NDArray[Any], ...]:
         """Add rays to the map's blocks.
@@ -168,8 +170,8 @@ class DeviceMap:
         return self._news(told, missing if job.which == integrate.ALL else missing[:0])
 
     def _news(self, told: NDArray[np.int32], missing: NDArray[np.int64]) -> tuple[NDArray[Any], ...]:
-        """What is told, without the slots that were told of before and places without a key; and missing
-        blocks, in order."""
+        """The answer to the host: what a launch told, without slots that an earlier one told of and places
+        without a key; and missing blocks, in order."""
         known, self._known = self._known, int(told[TOUCHED_COUNT])
         told = np.concatenate([told[: FRESH_AT + 2 * told[NEW]], told[TOUCHED_AT + known :]])
         return (told, np.unique(missing)) if len(missing) else (told,)
@@ -183,7 +185,7 @@ class DeviceMap:
         )  # fmt: skip
 
     def _read_results(self) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
-        """What is told, and the keys of missing blocks, of which some may be there twice."""
+        """`told` of the last launch, and the keys of missing blocks, of which some may be there twice."""
         size = TOUCHED_AT + min(_FEW_TOUCHED, self._stamps.shape[0])
         for _ in range(2):  # the second time, if it was not all
             (told,) = self._copies.read((self._told, size))
@@ -229,7 +231,7 @@ class DeviceMap:
             self._hash_keys, self._hash_slots = _zeros(ti.i64, size), _zeros(ti.i32, size)
         if len(places):
             handed = self._copies.given(places, keys, slots)
-            kernels.write_hash(*handed, self._hash_keys, self._hash_slots)
+            device_rows.write_hash(*handed, self._hash_keys, self._hash_slots)
             self._copies.finish()
 
     def drop(self, count: int) -> None:
@@ -238,7 +240,7 @@ class DeviceMap:
         for name in self._layer_names:
             if len(gone):
                 rows = np.zeros((len(gone), CUBE), LAYER_DTYPES[name])
-                kernels.write_rows(self._layers[name], gone, rows)
+                device_rows.write_rows(self._layers[name], gone, rows)
         self._count = count
         self._hash_keys.fill(0)
 
@@ -246,17 +248,17 @@ class DeviceMap:
         """The largest weight in each of these blocks."""
         self._marks = _at_least(self._marks, ti.i32, len(slots))
         handed = self._copies.given(slots)
-        kernels.largest_weights(self._layers["sums"], *handed, len(slots), self._marks)
+        device_rows.largest_weights(self._layers["sums"], *handed, len(slots), self._marks)
         (found,) = self._copies.read((self._marks, len(slots)))
         return found
 
     def read(self, name: str, slots: NDArray[np.int32], rows: NDArray[Any]) -> None:
         """Copy blocks' rows of a layer."""
-        kernels.read_rows(self._layers[name], slots, rows)
+        device_rows.read_rows(self._layers[name], slots, rows)
 
     def write(self, name: str, slots: NDArray[np.int32], rows: NDArray[Any]) -> None:
         """Set blocks' rows of a layer."""
-        kernels.write_rows(self._layers[name], slots, rows)
+        device_rows.write_rows(self._layers[name], slots, rows)
 
     def _reserve(self, count: int) -> None:
         """Make room for so many blocks.
@@ -270,9 +272,9 @@ class DeviceMap:
             stamps, told = _zeros(ti.i32, size), _zeros(ti.i32, TOUCHED_AT + size)
             layers = {name: _zeros(_DTYPES[name], size, CUBE) for name in self._layer_names}
             for here, there in ((self._stamps, stamps), (self._told, told)):
-                kernels.move_list(here, there)
+                device_rows.move_list(here, there)
             for name, larger in layers.items():
-                kernels.move_rows(self._layers[name], self._count, larger)
+                device_rows.move_rows(self._layers[name], self._count, larger)
             self._stamps, self._told = stamps, told
             self._layers |= layers
 

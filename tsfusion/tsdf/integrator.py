@@ -120,9 +120,6 @@ class Integrator:
     def _parts(self) -> Iterator[Part]:
         """Bands in runs of limited weight; nearly always all of them."""
         weights = np.cumsum(self._buffers.bands[:, WEIGHT], dtype=np.int64)  # of the bands up to each
-        if weights[-1] < PART_WEIGHT:
-            yield 0, len(weights)
-            return
         first = 0
         while first < len(weights):
             before = int(weights[first - 1]) if first else 0
@@ -227,7 +224,7 @@ class Integrator:
         if sign > 0:
             most = int(self._buffers.bands[part[0] : part[1], WEIGHT].sum())
             bounds = store.bounds[slots]
-            if not len(slots) or int(bounds.max()) + most < WEIGHT_LIMIT:
+            if int(bounds.max(initial=0)) + most < WEIGHT_LIMIT:
                 store.bounds[slots] = bounds + most
                 return
         self._measure_touched()
