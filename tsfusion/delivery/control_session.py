@@ -67,7 +67,7 @@ class ControlSession:
         self._unsaid = 0  # records that were rejected since they were
         self._is_lost = False  # whether it was said that the server is gone or silent
         self._moved_to: tuple[str, str] | None = None
-        self._hops = 0  # since a server let us in
+        self._hops = 0  # to other servers, since one let us in
 
     @property
     def terms(self) -> messages.Welcome | None:
@@ -228,17 +228,12 @@ class ControlSession:
             self._outbox.change_link_state(self._outbox.link_state.opening(why))
             self.greet_again(_HELLO_INTERVAL[1])
         elif denied.reason == "moved":
-            self._on_moved(denied)
+            self.greet_again()
+            self._moved_to = (denied.address, denied.control)
         elif denied.reason == "world":
             self._on_other_world(denied)
         else:
             self._refuse(f"the server at {self._address} refuses this client: {denied.message}")
-
-    def _on_moved(self, denied: messages.Denied) -> None:
-        """Go to the server that has the map."""
-        self._hops += 1
-        self.greet_again(0.0 if self._hops <= _MOST_HOPS else _HOP_INTERVAL)
-        self._moved_to = (denied.address, denied.control)
 
     def take_move(self) -> tuple[str, str] | None:
         """Addresses, data and control, of the server that has the map; told once. None = go nowhere."""
@@ -250,6 +245,7 @@ class ControlSession:
         why = f"map {self._hello.map} is on another server: going on at {address}"
         self._outbox.change_link_state(self._outbox.link_state.away(why))
         log.info("%s", why)
+        self._hops += 1
         self._address = address
         self.clock.clear()
         self.last_heard = time.monotonic()
