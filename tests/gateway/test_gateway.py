@@ -28,6 +28,7 @@ from tsfusion.datasets import open_dataset
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.gateway import fuser_process, fuser_supervisor
 from tsfusion.gateway.access_control import AccessControl
+from tsfusion.gateway.fuser_process import FuserProcess
 from tsfusion.gateway.gateway import Gateway
 from tsfusion.gateway.metrics import Metrics
 from tsfusion.gateway.ports import Ports
@@ -522,7 +523,9 @@ def test_checkpoints_that_are_lost_with_what_only_they_held_are_said(start: Star
 
 def test_the_last_words_of_a_dead_fuser_are_not_heard(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
     """ZeroMQ may deliver them late, when its keyframes are handed out anew."""
-    monkeypatch.setattr(fuser_process.FuserProcess, "remove_socket_file", lambda _: None)
+    ended: list[FuserProcess] = []
+    remove = FuserProcess.remove_socket_file
+    monkeypatch.setattr(FuserProcess, "remove_socket_file", lambda one: ended.append(one) or None)
     gateway = start(_CANNOT_COME_BACK)
     (hosted,) = gateway.maps
     stepped(gateway, lambda: hosted.fuser._restart_at > time.monotonic() + 0.5)
@@ -536,6 +539,9 @@ def test_the_last_words_of_a_dead_fuser_are_not_heard(start: Start, monkeypatch:
         gateway.step()
     finally:
         late.close(linger=0)
+        monkeypatch.setattr(FuserProcess, "remove_socket_file", remove)
+        for one in ended:
+            remove(one)
 
 
 _DIES_MOVING = """
