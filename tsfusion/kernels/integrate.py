@@ -210,16 +210,17 @@ def add_votes(
 
 
 @ti.func
-def add_stretch(
+def list_updates(
     walks: ti.template(), k, listed: ti.template(), weight_color, sign_, scratch: ti.template(), base,
-    colors: ti.template(), added: ti.template(), oldest, mark, stamp, most_missing, hash_keys: ti.template(),
-    hash_slots: ti.template(), missing: ti.template(), owners: ti.template(), stamps: ti.template(),
-    places: ti.template(), dirty: ti.template(), touched: ti.template(), sums: ti.template(),
-    of_others: ti.template(),
+    colors: ti.template(), voxels: ti.template(), amounts: ti.template(), count: ti.template(), oldest, mark,
+    stamp, most_missing, hash_keys: ti.template(), hash_slots: ti.template(), missing: ti.template(),
+    owners: ti.template(), stamps: ti.template(), places: ti.template(), dirty: ti.template(),
+    touched: ti.template(), of_others: ti.template(),
 ):  # fmt: skip
-    """Add the ray at place `k` to the voxels of its stretch, and list its vote for a colour.
+    """List the voxels of the stretch of the ray at place `k`, and what is added to each, `count` so far; its
+    vote for a colour, too.
 
-    `added` counts updates. Returns the bits of what the ray crosses (`ABSENT` …).
+    Returns the bits of what the ray crosses (`ABSENT` …).
     """
     weight = (weight_color >> 24) & 255
     vote, free_vote = sign_ * weight, sign_ * ti.max(weight >> FREE_SHIFT, 1)
@@ -255,8 +256,8 @@ def add_stretch(
             at = first + (place & (CUBE - 1))
             amount = ti.cast(place >> DISTANCE_AT, ti.i64) * per_quantum + vote
             free_amount = ti.select(i < fourfold, free << 2, free)
-            add(sums, at, ti.select(i < before, free_amount, amount), of_others)
-            added += 1
+            voxels[count], amounts[count] = at, ti.select(i < before, free_amount, amount)
+            count += 1
             if i == uncolored:
                 scratch[colors] = (ti.cast(at, ti.i64) << 32) | (weight_color & 0xFFFFFF)
                 colors += 1
@@ -279,6 +280,7 @@ def add_bands(
     base, owner = unit * UNIT_SCRATCH, -1
     mark = (ti.cast(stamp, ti.i64) << 32) | unit
     walks, listed = ti.Vector([0] * WALKS), ti.Vector([0] * LIST)
+    voxels, amounts = ti.Vector([0] * LIST), ti.Vector([0] * LIST, dt=ti.i64)
     for k in range(ABREAST):
         walks[RAY + k], walks[FREE + k], walks[FOURFOLD + k] = NOBODY, 0, 0
         walks[UNCOLORED + k] = NEVER
@@ -317,13 +319,14 @@ def add_bands(
                 walk(walks, ti.min(longest, STRETCH), listed, listed, False)
                 if colors > base + UNIT_SCRATCH - ABREAST:
                     add_votes(scratch, base, colors, sign_, color_rgn, color_b, touched, of_others)
+                updates = 0
                 for k in range(ABREAST):
                     r = walks[RAY + k]
                     if r != NOBODY:
-                        walks[MET + k] |= add_stretch(
+                        walks[MET + k] |= list_updates(
                             walks, k, listed, rays[r, WEIGHT_COLOR], sign_, scratch, base, colors,
-                            added, oldest, mark, stamp, most_missing, hash_keys, hash_slots, missing, owners,
-                            stamps, places, dirty, touched, sums, of_others,
+                            voxels, amounts, updates, oldest, mark, stamp, most_missing, hash_keys,
+                            hash_slots, missing, owners, stamps, places, dirty, touched, of_others,
                         )  # fmt: skip
                         if walks[UNCOLORED + k] < STRETCH:
                             walks[COLORED + k] = NEVER
@@ -339,6 +342,10 @@ def add_bands(
                                     deferred += 1
                                     if which == ALL and touched[TOUCHED_OVERFLOW] == 1:
                                         count = n
+                # A loop of its own, so short that a processor waits for dozens of voxels' sums at once.
+                for i in range(updates):
+                    add(sums, voxels[i], amounts[i], of_others)
+                added += updates
             if ti.static(of_others):
                 ti.atomic_add(bands[band, UPDATES], added)
             else:

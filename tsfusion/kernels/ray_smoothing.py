@@ -139,17 +139,16 @@ def substitute_back(
 
 
 @ti.func
-def gather(
-    walks: ti.template(), k, listed: ti.template(), distances: ti.template(), feedback,
-    hash_keys: ti.template(), hash_slots: ti.template(), scratch: ti.template(), base,
-    places: ti.template(), sums: ti.template(), correction: ti.template(), signal: ti.template(),
-    crossed: ti.template(), at_signal, at_crossed, counts: ti.template(), totals: ti.template(),
+def list_voxels(
+    walks: ti.template(), k, listed: ti.template(), distances: ti.template(), hash_keys: ti.template(),
+    hash_slots: ti.template(), scratch: ti.template(), base, places: ti.template(), voxels: ti.template(),
+    crossed: ti.template(), at_crossed, counts: ti.template(),
 ):  # fmt: skip
-    """Append what the map holds along the ray at place `k`, in its stretch and band, to the ray's signal."""
+    """Append the voxels of the ray at place `k`, in its stretch and band, to those it crosses."""
     number = walks[ODD + k]
     window = window_of(walks, k, number)
     blocks = open_window(window, scratch, base)
-    n, total = counts[k], totals[k]
+    n = counts[k]
     end = ti.min(walks[VOXELS + k], STRETCH)
     i = walks[FREE + k]
     while i < end and n < MAX_CROSSED:
@@ -167,20 +166,36 @@ def gather(
             corners = (ti.cast(places[slot] * CUBE, ti.i64) << 32) | (slot * CUBE)
             scratch[blocks + b] = corners
         o = place & (CUBE - 1)
-        at = ti.cast(corners, ti.i32) + o
-        packed = sums[at]
-        weight = ti.cast(lane_weight(packed), ti.f32)
-        stored = ti.cast(lane_distance(packed), ti.f32)
-        if feedback == 1:
-            stored += correction[at]
-        signal[at_signal + STORED + n * LANES + k] = stored
-        signal[at_signal + WEIGHT + n * LANES + k] = weight
+        voxels[n * LANES + k] = ti.cast(corners, ti.i32) + o
         crossed[at_crossed + DISTANCE + n * LANES + k] = distances[i * ABREAST + k] - HALF_A_QUANTUM
         crossed[at_crossed + PLACE + n * LANES + k] = ti.cast(corners >> 32, ti.i32) + o
-        total += weight
         n += 1
         i += 1
-    counts[k], totals[k] = n, total
+    counts[k] = n
+
+
+@ti.func
+def gather(
+    voxels: ti.template(), counts: ti.template(), totals: ti.template(), feedback, sums: ti.template(),
+    correction: ti.template(), signal: ti.template(), at_signal,
+):  # fmt: skip
+    """Put what the map holds in the voxels that each ray crosses into its signal.
+
+    Apart from listing them, as in `add_bands`: a processor waits for more of them at once.
+    """
+    for k in range(LANES):
+        total = 0.0
+        for i in range(counts[k]):
+            at = voxels[i * LANES + k]
+            packed = sums[at]
+            weight = ti.cast(lane_weight(packed), ti.f32)
+            stored = ti.cast(lane_distance(packed), ti.f32)
+            if feedback == 1:
+                stored += correction[at]
+            signal[at_signal + STORED + i * LANES + k] = stored
+            signal[at_signal + WEIGHT + i * LANES + k] = weight
+            total += weight
+        totals[k] = total
 
 
 @QuickLaunch
@@ -218,6 +233,7 @@ def smooth_rays(
                 scratch[base + i] = 0
             walks = ti.Vector([0] * WALKS)
             listed, distances = ti.Vector([0] * LIST), ti.Vector([0] * LIST)
+            voxels, fresh = ti.Vector([0] * SIGNAL), ti.Vector([0] * SIGNAL)
             counts, totals = ti.Vector([0] * LANES), ti.Vector([0.0] * LANES)
             carves, here, chunk_end = 0, 0, 0
             for band in range(bands.shape[0]):
@@ -226,7 +242,7 @@ def smooth_rays(
                     r = end
                 while r < end:
                     for k in range(LANES):
-                        walks[RAY + k], counts[k], totals[k] = NOBODY, 0, 0.0
+                        walks[RAY + k], counts[k] = NOBODY, 0
                     walking, longest = 0, 0
                     while walking < LANES and r < end:
                         if ray_weight(rays, r) > 0:
@@ -240,19 +256,20 @@ def smooth_rays(
                         walk(walks, count, listed, distances, True)
                         for k in range(LANES):
                             if walks[RAY + k] != NOBODY:
-                                gather(
-                                    walks, k, listed, distances, feedback, hash_keys, hash_slots, scratch,
-                                    base, places, sums, correction, signal, crossed, at_signal, at_crossed,
-                                    counts, totals,
+                                list_voxels(
+                                    walks, k, listed, distances, hash_keys, hash_slots, scratch, base,
+                                    places, voxels, crossed, at_crossed, counts,
                                 )  # fmt: skip
                                 longest = ti.max(longest, counts[k])
                                 if walks[VOXELS + k] <= STRETCH or counts[k] == MAX_CROSSED:
                                     walks[RAY + k] = NOBODY
                                     walking -= 1
+                    gather(voxels, counts, totals, feedback, sums, correction, signal, at_signal)
                     factorise(
                         signal, crossed, at_signal, at_crossed, counts, totals, longest, weighted, smoothness
                     )
                     substitute_back(signal, crossed, at_signal, at_crossed, counts, longest)
+                    first_votes = 0  # of voxels that had none; no branch, which would wait for memory
                     for k in range(LANES):
                         for i in range(counts[k]):
                             at = at_crossed + i * LANES + k
@@ -263,12 +280,14 @@ def smooth_rays(
                                 votes[voxel] = before + vote
                             else:
                                 before = ti.atomic_add(votes[voxel], vote)
-                            if before == 0:
-                                if here == chunk_end:
-                                    here = 1 + ti.atomic_add(voted[0], CHUNK)
-                                    chunk_end = here + CHUNK
-                                voted[here] = voxel
-                                here += 1
+                            fresh[first_votes] = voxel
+                            first_votes += ti.cast(before == 0, ti.i32)
+                    for i in range(first_votes):
+                        if here == chunk_end:
+                            here = 1 + ti.atomic_add(voted[0], CHUNK)
+                            chunk_end = here + CHUNK
+                        voted[here] = fresh[i]
+                        here += 1
             for i in range(here, chunk_end):
                 voted[i] = NO_VOXEL
 
