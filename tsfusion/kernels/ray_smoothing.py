@@ -181,7 +181,7 @@ def gather(
 ):  # fmt: skip
     """Put what the map holds in the voxels that each ray crosses into its signal.
 
-    Apart from listing them, as in `add_bands`: a processor waits for more of them at once.
+    Apart from listing them: so a processor waits for more of them at once (`integrate.add_updates`).
     """
     for k in range(LANES):
         total = 0.0
@@ -233,7 +233,7 @@ def smooth_rays(
                 scratch[base + i] = 0
             walks = ti.Vector([0] * WALKS)
             listed, distances = ti.Vector([0] * LIST), ti.Vector([0] * LIST)
-            voxels, fresh = ti.Vector([0] * SIGNAL), ti.Vector([0] * SIGNAL)
+            voxels = ti.Vector([0] * SIGNAL)  # of the layers; then, in `votes`, those that had no vote
             counts, totals = ti.Vector([0] * LANES), ti.Vector([0.0] * LANES)
             carves, here, chunk_end = 0, 0, 0
             for band in range(bands.shape[0]):
@@ -269,7 +269,7 @@ def smooth_rays(
                         signal, crossed, at_signal, at_crossed, counts, totals, longest, weighted, smoothness
                     )
                     substitute_back(signal, crossed, at_signal, at_crossed, counts, longest)
-                    first_votes = 0  # of voxels that had none; no branch, which would wait for memory
+                    first_votes = 0
                     for k in range(LANES):
                         for i in range(counts[k]):
                             at = at_crossed + i * LANES + k
@@ -280,13 +280,13 @@ def smooth_rays(
                                 votes[voxel] = before + vote
                             else:
                                 before = ti.atomic_add(votes[voxel], vote)
-                            fresh[first_votes] = voxel
-                            first_votes += ti.cast(before == 0, ti.i32)
+                            voxels[first_votes] = voxel
+                            first_votes += ti.cast(before == 0, ti.i32)  # a branch would wait for memory
                     for i in range(first_votes):
                         if here == chunk_end:
                             here = 1 + ti.atomic_add(voted[0], CHUNK)
                             chunk_end = here + CHUNK
-                        voted[here] = fresh[i]
+                        voted[here] = voxels[i]
                         here += 1
             for i in range(here, chunk_end):
                 voted[i] = NO_VOXEL
