@@ -10,7 +10,7 @@ import zmq
 
 from tsfusion.fuser.messages import FuserAnswer, FuserQuestion
 from tsfusion.gateway import map_questions
-from tsfusion.gateway.map_questions import MOST_OF_A_CLIENT, MOST_WAITING, MapQuestions
+from tsfusion.gateway.map_questions import MOST_OF_A_CLIENT, MOST_UNREAD, MOST_WAITING, MapQuestions
 from tsfusion.gateway.memory_guard import PendingReplies
 from tsfusion.gateway.metrics import Metrics
 from tsfusion.gateway.question_counts import QuestionCounts
@@ -99,6 +99,19 @@ def test_answers_that_nobody_reads_fill_no_memory() -> None:
     desk.answer(300)
     assert not desk.ask(b"third")
     assert "fill the memory" in desk.error
+
+
+def test_small_answers_may_leave_late() -> None:
+    """ZeroMQ says so after the client has read some, and asked on: seen on a machine with much to do."""
+    desk = Desk(most_bytes=100_000)
+    for _ in range(MOST_UNREAD):
+        assert desk.ask(b"quick"), desk.error
+        desk.answer(200)
+    assert not desk.ask(b"quick")
+    assert (desk.error, desk.replies[-1].retry) == (
+        "64 answers of this client are not read yet; ask again",
+        True,
+    )
 
 
 def test_answers_that_come_all_at_once_fill_no_memory() -> None:

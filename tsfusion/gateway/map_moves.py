@@ -28,7 +28,7 @@ from tsfusion.wire.messages import Command, Reply
 log = logging.getLogger(__name__)
 
 _MOST_ARRIVALS = 4  # at once
-_MOST_UNREAD = 8  # answers to one server that have not left: of one that was read it is known a bit later
+_MOST_UNREAD = 32  # answers to one server that have not left: of one that was read it is known later
 
 
 class MapMoves:
@@ -134,7 +134,7 @@ class MapMoves:
                 return
             if command.hand_over is None:
                 raise JournalError("the request names no part of the map")
-            if self._unread.count(identity) >= _MOST_UNREAD or self._unread.nbytes > self._max_bytes:
+            if self._unread.of(identity)[0] >= _MOST_UNREAD or self._unread.nbytes > self._max_bytes:
                 raise JournalError("earlier answers were not read yet")
             parcel, frames = self._departures.answer(command.map, command.hand_over)
         except TsfusionError as refusal:

@@ -24,7 +24,10 @@ from tsfusion.gateway.question_counts import QuestionCounts
 from tsfusion.wire import messages, questions
 
 MOST_WAITING = 32  # questions of all clients, of a map: it looks at each of their answers
-MOST_OF_A_CLIENT = 4  # that wait, or whose answer is not read yet
+MOST_OF_A_CLIENT = 4  # that wait
+# Answers of a client that have not left: ZeroMQ may say late that they have, on a machine with much to do
+MOST_UNREAD = 64
+_UNREAD_SHARE = 1 / 4  # of the memory of all such answers; four of any size may wait
 _MOST_CLIENTS = 4096
 
 
@@ -120,9 +123,12 @@ class MapQuestions:
         if self._rate_of(waiting.owner).wait(1.0, time.monotonic()):
             return f"a client may ask {self._rate:g} questions a second (quota_questions)"
         of_map = [one for one in self._waiting.values() if one.command.map == command.map]
-        own = sum(one.owner == waiting.owner for one in self._waiting.values())
-        if own + self._unread.count(waiting.owner + b"\0") >= MOST_OF_A_CLIENT:
+        if sum(one.owner == waiting.owner for one in self._waiting.values()) >= MOST_OF_A_CLIENT:
             return f"{MOST_OF_A_CLIENT} questions of this client are under way"
+        unread, nbytes = self._unread.of(waiting.owner + b"\0")
+        is_much = unread >= MOST_OF_A_CLIENT and nbytes > _UNREAD_SHARE * self._max_bytes
+        if is_much or unread >= MOST_UNREAD:
+            return f"{unread} answers of this client are not read yet"
         if len(of_map) >= MOST_WAITING:
             return "too many questions at once"
         assert command.question is not None

@@ -55,10 +55,11 @@ class PendingReplies:
         self._forget()
         return reader in self._trackers
 
-    def count(self, owner: bytes) -> int:
-        """Number of replies that wait for readers whose keys begin so."""
+    def of(self, owner: bytes) -> tuple[int, int]:
+        """Number of replies that wait for readers whose keys begin so, and their bytes."""
         self._forget()
-        return sum(key.startswith(owner) for key in self._trackers)
+        own = [nbytes for key, (_, nbytes) in self._trackers.items() if key.startswith(owner)]
+        return len(own), sum(own)
 
     @property
     def nbytes(self) -> int:
