@@ -2,6 +2,7 @@
 """Processes that are started, the terminal, and the cores that threads run on."""
 
 import os
+import platform
 import subprocess
 import sys
 import threading
@@ -52,3 +53,26 @@ def test_as_many_threads_as_cores_have_one_each() -> None:
         assert [os.sched_getaffinity(thread) for thread in apart] == [{core} for core in ours]
         for thread in (0, early, first, *free):
             assert os.sched_getaffinity(thread) == set(ours)
+
+
+_ALLOCATES = """
+import resource
+import numpy as np
+from tsfusion.core import process
+process.keep_freed_memory()
+def work():
+    return sum(int(array[-1]) for array in [np.ones(600_000, np.uint8) for _ in range(20)])
+for _ in range(3):
+    work()
+before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+for _ in range(20):
+    work()
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another allocator")
+def test_freed_memory_does_not_come_back_page_by_page() -> None:
+    """Twenty times 12 MB, 3,000 pages, as the arrays of keyframes come and go."""
+    found = subprocess.run([sys.executable, "-c", _ALLOCATES], check=True, capture_output=True).stdout
+    assert int(found) < 2_000

@@ -15,6 +15,7 @@ from types import FrameType
 from typing import Any
 
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # malloc.h
 
 # Arguments of Popen: the terminal's Ctrl-C does not reach the process. It stays in this session where Python
 # can do that: Linux shares the cores among sessions (autogroup), and a process in one of its own that mostly
@@ -67,6 +68,17 @@ def give_back_memory() -> None:
     """Return freed memory that the allocator keeps to the system (glibc; elsewhere nothing happens)."""
     with suppress(OSError, AttributeError):
         ctypes.CDLL(None).malloc_trim(0)
+
+
+def keep_freed_memory() -> None:
+    """Have the allocator keep up to 32 MB of what is freed, for arrays of up to 8 MB (glibc).
+
+    Else a keyframe's arrays go back to the system, and come again page by page: 1.5 ms of 7 in a fuser.
+    """
+    with suppress(OSError, AttributeError):
+        mallopt = ctypes.CDLL(None).mallopt
+        mallopt(_M_MMAP_THRESHOLD, 8 << 20)
+        mallopt(_M_TRIM_THRESHOLD, 32 << 20)
 
 
 def data_bytes() -> int:

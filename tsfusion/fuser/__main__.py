@@ -179,6 +179,7 @@ def main() -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)  # a terminal or supervisor signals all; the gateway decides
     signal.signal(signal.SIGTTOU, signal.SIG_IGN)  # a line of the log does not stop it (`stty tostop`)
+    process.keep_freed_memory()
     return run(endpoint)
 
 
