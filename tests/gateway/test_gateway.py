@@ -525,7 +525,7 @@ def test_the_last_words_of_a_dead_fuser_are_not_heard(start: Start, monkeypatch:
     """ZeroMQ may deliver them late, when its keyframes are handed out anew."""
     ended: list[FuserProcess] = []
     remove = FuserProcess.remove_socket_file
-    monkeypatch.setattr(FuserProcess, "remove_socket_file", lambda one: ended.append(one) or None)
+    monkeypatch.setattr(FuserProcess, "remove_socket_file", lambda one: ended.append(one))  # noqa: PLW0108
     gateway = start(_CANNOT_COME_BACK)
     (hosted,) = gateway.maps
     stepped(gateway, lambda: hosted.fuser._restart_at > time.monotonic() + 0.5)
