@@ -36,6 +36,7 @@ def start(threads: int | None = None) -> None:
                 arch=ti.cpu,
                 cpu_max_num_threads=_started_threads,
                 fast_math=False,  # a reassociated float would make two kernels disagree
+                cfg_optimization=False,  # LLVM does the same, and Taichi's took three quarters of compiling
                 offline_cache=True,
                 log_level=ti.ERROR,
             )
@@ -53,8 +54,8 @@ def start_device(arch: str) -> None:
     _leave_out_source_lines()
     with redirect_stdout(StringIO()):
         ti.init(
-            arch=getattr(ti, arch), fast_math=False, offline_cache=True, log_level=ti.ERROR,
-            saturating_grid_dim=_GRID,
+            arch=getattr(ti, arch), fast_math=False, cfg_optimization=arch == "cuda", offline_cache=True,
+            log_level=ti.ERROR, saturating_grid_dim=_GRID,
         )  # fmt: skip
     if ti.cfg.arch != getattr(ti, arch):
         raise MissingDependency("Taichi finds no such device, or no driver of one")
