@@ -29,9 +29,10 @@ from tsfusion.kernels.rays_from_images import (
     cell_shape,
     depth_at,
     is_supported,
-    nearest_layer,
     pixel_width,
     reading_of,
+    samples_of,
+    take_nearest,
     tile_plane,
     write_layer_ray,
 )
@@ -104,10 +105,11 @@ def image_rays(
             left, top, base = tile % tiles_x * TILE, tile // tiles_x * TILE, tile * TILE_SAMPLES
             cell = Cell(left, top, c % across * wide, c // across * high, wide, high, base)
             out = base + c * wide * high
-            end, above = out + wide * high, 0
+            end = out + wide * high
             samples, total_weight, total_cost, total_crossed = 0, 0, 0, 0
-            while above >= 0:
-                layer, more = nearest_layer(model, unit, depths, None, cell, above)
+            rest = samples_of(depths, None, cell)
+            while rest.n > 0:
+                layer = take_nearest(model, unit, depths, cell, rest)
                 keep = layer.n > 0
                 if layer.n == 1 and model[DROPS_LONE_SAMPLES] > 0.0:
                     keep = 1 == is_supported(image, confidence, reading, cell, layer)
@@ -123,7 +125,6 @@ def image_rays(
                         marks[out] = total_crossed
                         total_crossed += crossed(rays, out)
                         out += 1
-                above = ti.select(more, layer.up_to, -1)
             if samples > 0:
                 before = ti.atomic_add(groups[tile, CROSSED], total_crossed)
                 for r in range(end - wide * high, out):

@@ -243,23 +243,24 @@ def cell_shape(pixel):
 
 
 @ti.func
-def layer_sums(depths: ti.template(), cell, above, up_to):
-    """The cell's samples with depths in (`above`, `up_to`], as a `Layer`."""
-    low, deepest, n, sum_q, sum_x, sum_y = 1 << 30, 0, 0, ti.i64(0), 0, 0
+def layer_sums(depths: ti.template(), cell, low, up_to):
+    """The cell's samples with depths in [`low`, `up_to`], and the least depth beyond (1 << 30: none)."""
+    least, deepest, beyond, n, sum_q, sum_x, sum_y = 1 << 30, 0, 1 << 30, 0, ti.i64(0), 0, 0
     for row in range(few(cell.high)):
         y = cell.y + row
         for column in range(few(cell.wide)):
             x = cell.x + column
             q = depths[cell.base + y * TILE + x]
-            inside = (q > above) & (q <= up_to)
+            inside = (q >= low) & (q <= up_to)
             one = ti.cast(inside, ti.i32)
-            low = ti.min(low, ti.select(inside, q, 1 << 30))
+            least = ti.min(least, ti.select(inside, q, 1 << 30))
             deepest = ti.max(deepest, ti.select(inside, q, 0))
+            beyond = ti.min(beyond, ti.select(q > up_to, q, 1 << 30))
             n += one
             sum_q += ti.select(inside, q, 0)
             sum_x += x * one
             sum_y += y * one
-    return Layer(low, up_to, deepest, n, sum_q, sum_x, sum_y)
+    return Layer(least, up_to, deepest, n, sum_q, sum_x, sum_y), beyond
 
 
 @ti.func
@@ -279,36 +280,43 @@ def column_sums(depths: ti.template(), first, high, columns: ti.template()):
 
 
 @ti.func
-def full_layer(columns: ti.template(), cell):
-    """All samples of a cell; n = 0 unless every pixel has one, of a depth of which twelve can be summed."""
-    low, deepest, sum_q = 1 << 30, 0, ti.i64(0)
-    for column in range(few(cell.wide)):
-        x = cell.x + column
-        low = ti.min(low, columns[LEAST + x])
-        deepest = ti.max(deepest, columns[GREATEST + x])
-        sum_q += columns[SUM + x]
-    area = cell.wide * cell.high
-    n = ti.select((low > 0) & (deepest < MOST_SUMMED), area, 0)
-    sum_x, sum_y = cell.x * area + area * (cell.wide - 1) // 2, cell.y * area + area * (cell.high - 1) // 2
-    return Layer(low, 1 << 30, deepest, n, sum_q, sum_x, sum_y)
+def samples_of(depths: ti.template(), columns: ti.template(), cell):
+    """All samples of a cell; `columns`: of `column_sums`, or None."""
+    samples, is_known = Layer(1 << 30, 1 << 30, 0, 0, 0, 0, 0), 0
+    if ti.static(are_given(columns)):
+        low, deepest, sum_q = 1 << 30, 0, ti.i64(0)
+        for column in range(few(cell.wide)):
+            x = cell.x + column
+            low = ti.min(low, columns[LEAST + x])
+            deepest = ti.max(deepest, columns[GREATEST + x])
+            sum_q += columns[SUM + x]
+        if low > 0 and deepest < MOST_SUMMED:  # every pixel has one
+            n = cell.wide * cell.high
+            sum_x, sum_y = cell.x * n + n * (cell.wide - 1) // 2, cell.y * n + n * (cell.high - 1) // 2
+            samples, is_known = Layer(low, 1 << 30, deepest, n, sum_q, sum_x, sum_y), 1
+        elif deepest <= 0:
+            is_known = 1
+    if is_known == 0:
+        samples, _ = layer_sums(depths, cell, 1, 1 << 30)
+    return samples
 
 
 @ti.func
-def nearest_layer(model: ti.template(), unit, depths: ti.template(), columns: ti.template(), cell, above):
-    """The nearest samples of a cell beyond depth `above` that may belong to one surface (n = 0: none), and
-    whether there are samples behind them. `columns`: of `column_sums`, or None."""
-    layer = Layer(1 << 30, 0, 0, 0, 0, 0, 0)
-    if ti.static(are_given(columns)):
-        layer = full_layer(columns, cell)
-    if above > 0 or layer.n == 0:
-        layer = layer_sums(depths, cell, above, 1 << 30)
-    if layer.n > 0:
-        tolerance = ti.cast(ti.min(layer_depth(model, layer.low * unit) / unit, 1e9), ti.i32)
-        layer.up_to = layer.low + tolerance
-    more = layer.n > 1 and layer.deepest > layer.up_to
-    if more:
-        layer = layer_sums(depths, cell, above, layer.up_to)
-    return layer, more
+def take_nearest(model: ti.template(), unit, depths: ti.template(), cell, rest: ti.template()):
+    """The nearest of the `rest` of a cell's samples that may belong to one surface; they leave it."""
+    layer = rest
+    tolerance = ti.cast(ti.min(layer_depth(model, rest.low * unit) / unit, 1e9), ti.i32)
+    layer.up_to = rest.low + tolerance
+    if rest.deepest > layer.up_to:
+        layer, beyond = layer_sums(depths, cell, rest.low, layer.up_to)
+        rest.low = beyond
+        rest.n = ti.select(layer.n > 0, rest.n - layer.n, 0)
+        rest.sum_q -= layer.sum_q
+        rest.sum_x -= layer.sum_x
+        rest.sum_y -= layer.sum_y
+    else:
+        rest.n = 0
+    return layer
 
 
 @ti.func
@@ -478,9 +486,9 @@ def rays_from_image(
                         column_sums(depths, cell.y, high, columns)
                         if has_color == 1:
                             color_sums(color, left, top, cell.y, high, colors)
-                    above = 0
-                    while above >= 0:  # one layer of depth after the other
-                        layer, more = nearest_layer(model, unit, depths, columns, cell, above)
+                    rest = samples_of(depths, columns, cell)
+                    while rest.n > 0:  # one layer of depth after the other
+                        layer = take_nearest(model, unit, depths, cell, rest)
                         keep = layer.n > 0
                         if layer.n == 1 and model[DROPS_LONE_SAMPLES] > 0.0:
                             keep = 1 == is_supported(image, confidence, reading, cell, layer)
@@ -494,5 +502,4 @@ def rays_from_image(
                                 total_cost += cost
                                 samples += layer.n
                                 out += 1
-                        above = ti.select(more, layer.up_to, -1)
             write_band(bands, band, first_ray, out, samples, total_weight, total_cost)
