@@ -4,6 +4,7 @@
 from collections.abc import Iterator
 
 import msgspec
+import numpy as np
 import pytest
 from keyframes_and_servers import wall
 
@@ -33,6 +34,25 @@ def test_a_sealed_map_reads_as_before(entries: int) -> None:
     assert read == content
     assert not is_damaged(sealed)
     assert not is_damaged(msgspec.msgpack.encode(content))
+
+
+@pytest.mark.parametrize("bits", [1, 2, 3])
+def test_damage_to_the_seal_itself_does_not_hide_other_damage(bits: int) -> None:
+    """A pose that was no rotation was refused for good, where a bit of the seal had flipped as well."""
+    sealed = seal(msgspec.msgpack.encode({"pose": [1.0, 2.0, 3.0], "number": 7}))
+    at = sealed.index(b"check") - 1
+    random = np.random.default_rng(bits)
+    for place in range(at):
+        worn = bytearray(sealed)
+        worn[place] ^= 1 << random.integers(8)
+        for bit in random.choice(8 * len(b".check.."), bits, replace=False):
+            worn[at + bit // 8] ^= 1 << bit % 8
+        assert is_damaged(worn)
+
+
+@pytest.mark.parametrize("end", [b"", b"\x01", b"\xa5check", b"\xcb" + bytes(8), b"\xff" * 12, bytes(12)])
+def test_a_message_without_a_seal_is_an_older_versions(end: bytes) -> None:
+    assert not is_damaged(b"\x81" + end)
 
 
 @pytest.mark.parametrize("kind", ["keyframe", "correction"])
