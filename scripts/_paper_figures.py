@@ -186,6 +186,8 @@ def surfaces(rows: Sequence[dict[str, Any]], path: Path) -> bool:
         shown = [row for row in whole if row["sensor"] == sensor]
         for method, color in _METHODS.items():
             line = sorted((r["completeness"], r["precision"]) for r in shown if r["method"] == method)
+            if not line:  # a system that is not installed, or does not take this sensor
+                continue
             own = [r for r in shown if r["method"] == method and r["min_weight"] is None]
             axis.plot(*np.array(line).reshape(-1, 2).T, "-", color=color, linewidth=1.2, label=method)
             axis.plot([r["completeness"] for r in own], [r["precision"] for r in own], "o", color=color)
