@@ -55,6 +55,14 @@ def test_a_message_without_a_seal_is_an_older_versions(end: bytes) -> None:
     assert not is_damaged(b"\x81" + end)
 
 
+def test_random_bytes_are_not_taken_for_a_seal() -> None:
+    """Its sender would be asked for the same message again and again."""
+    random = np.random.default_rng(0)
+    assert not any(
+        is_damaged(message.tobytes()) for message in random.integers(0, 256, (200_000, 12), np.uint8)
+    )
+
+
 @pytest.mark.parametrize("kind", ["keyframe", "correction"])
 def test_no_flipped_bit_changes_a_header(kind: str) -> None:
     if kind == "keyframe":

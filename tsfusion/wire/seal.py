@@ -11,7 +11,7 @@ from typing import Any
 
 _MARK = b"\xa5check\xc4\x04"  # the key, and the head of a value of four bytes
 _CRC_BYTES = 4
-_MOST_WORN = 16  # bits of its 64 by which a mark may differ and be one: chance comes nowhere near
+_MOST_WORN = 4  # bits of its 64 by which a mark may differ and be one: of random bytes 1 in 10¹³ come so near
 _FIXMAP, _MOST_IN_FIXMAP, _MAP16 = 0x80, 15, 0xDE  # of the msgpack format
 
 
