@@ -75,8 +75,11 @@ def main() -> int:
     except KeyboardInterrupt:
         say("stopped; what is done is kept, and the same command goes on")
         return 130
-    except (TsfusionError, OSError) as error:  # OSError: --out or --cache cannot be written
+    except TsfusionError as error:
         say(str(error))
+        return 1
+    except OSError as error:
+        say(f"cannot write {error.filename}: {error.strerror}; choose another --out or --cache")
         return 1
 
 

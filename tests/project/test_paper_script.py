@@ -429,6 +429,16 @@ def interrupted(tmp_path: Path) -> tuple[str, ...]:
     return arguments
 
 
+def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with reproduce("--out", tmp_path / "file" / "out", "--only", "desk1", data=tmp_path) as running:
+        _, told = running.communicate(timeout=120)
+    assert running.returncode == 1
+    assert f"cannot write {tmp_path / 'file' / 'out'}" in told
+    assert "choose another --out or --cache" in told
+    assert "Traceback" not in told
+
+
 @pytest.mark.nightly
 def test_two_modes_from_end_to_end(interrupted: tuple[str, ...], tmp_path: Path) -> None:
     with reproduce(*interrupted, data=tmp_path) as running:
