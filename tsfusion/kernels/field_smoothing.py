@@ -8,43 +8,72 @@ y = Σ w·m / Σ w and W = Σ w are read from the map, x near a flat surface is 
 counts (Geman and McClure; the gentler 1 / √(1 + …) rounds edges by a quarter more, docs/accuracy.md).
 
 The voxels near the surface are numbered into one dense list with the numbers of their neighbours; a missing
-one has the number past the end, where all is 0. A step is two sweeps of the list, each writing only its own
-voxel: the first leaves q = ω D2 x, the second goes down the gradient W (x − y) + λ D2ᵀ q. Hence no order of
-threads can show. A launch costs as much as a step of a thousand voxels: one does several steps.
+one has the number past the end, where all is 0. Which cells of a block are listed is a bit each: `planes`, 64
+cells a word, and `places`, where the first cell of each word stands in the list. A cell's number is a count
+of bits, so what looks for numbers reads a hundred bytes a block.
+
+A step is two sweeps of the list, each writing only its own voxel: the first leaves q = ω D2 x, the second
+goes down the gradient W (x − y) + λ D2ᵀ q. Hence no order of threads can show. A launch costs as much as a
+step of a thousand voxels: one does several steps. An array for each axis and side, and four voxels read
+before one is written: where an array is, LLVM looks up again after each store.
 """
 
 import taichi as ti
 
-from tsfusion.kernels.integrate import CUBE, lane_weight
+from tsfusion.kernels.integrate import lane_weight
+from tsfusion.kernels.quick_launch import QuickLaunch
 from tsfusion.kernels.sensor_noise import WEIGHT_ONE
+from tsfusion.kernels.surface_cells import lowest
 from tsfusion.kernels.voxel_traversal import RUN
 
-NONE = -1
 AT_ONCE = 3  # steps of a launch
+ABREAST = 4  # voxels of an iteration, whose number divides the list's: the last ones of it may be nobody
+
+abreast = ti.types.vector(ABREAST, ti.f32)
+
+
+@ti.func
+def count_bits(plane):
+    """How many bits of a word are set."""
+    return ti.cast(ti.math.popcnt(plane), ti.i32)
+
+
+@ti.func
+def without_lowest(plane):
+    """A word without the lowest bit that it has."""
+    return plane & (plane - ti.u64(1))
 
 
 @ti.kernel
-def number_voxels(
+def mark_voxels(
     values: ti.types.ndarray(dtype=ti.f32, ndim=2),
     reach: ti.f32,
-    number: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    counts: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    planes: ti.types.ndarray(dtype=ti.u64, ndim=2),
+    counts: ti.types.ndarray(dtype=ti.i32, ndim=2),
 ):
-    """Number the voxels of each block that were seen within `reach` quanta of the surface; −1 elsewhere."""
+    """Mark the voxels of each block that were seen within `reach` quanta of the surface."""
     for run in range(values.shape[0] * RUN):  # run loop: kernels/__init__.py
         if run % RUN == 0:
             b = run // RUN
-            n = 0
-            for o in range(CUBE):
-                is_near = abs(values[b, o]) <= reach  # never true of NaN
-                number[b, o] = ti.select(is_near, n, NONE)
-                n += ti.cast(is_near, ti.i32)
-            counts[b] = n
+            for word in range(planes.shape[1]):
+                plane = ti.u64(0)
+                for j in range(64):  # LLVM makes vectors of it
+                    is_near = abs(values[b, 64 * word + j]) <= reach  # never true of NaN
+                    plane |= ti.cast(is_near, ti.u64) << ti.cast(j, ti.u64)
+                planes[b, word] = plane
+                counts[b, word] = count_bits(plane)
+
+
+@ti.func
+def number_of(planes: ti.template(), places: ti.template(), b, o):
+    """Number in the list of a cell that is listed; of another, the next one's."""
+    below = (ti.u64(1) << ti.cast(o & 63, ti.u64)) - ti.u64(1)
+    return places[b, o >> 6] + count_bits(planes[b, o >> 6] & below)
 
 
 @ti.func
 def neighbour(
-    number: ti.template(), starts: ti.template(), around: ti.template(), bits, b, o, axis, side, none
+    planes: ti.template(), places: ti.template(), around: ti.template(), bits, b, o, axis, side, none
 ):
     """Number in the list of the cell before or after cell o along an axis, `none` if it is not in it."""
     shift = (2 - axis) * bits
@@ -52,17 +81,18 @@ def neighbour(
     at = ((o >> shift) & mask) + 2 * side - 1
     block = ti.select((at & ~mask) == 0, b, around[b, 2 * axis + side])
     row = ti.max(block, 0)  # without branches: whether a cell is listed cannot be foretold
-    k = number[row, (o & ~(mask << shift)) | ((at & mask) << shift)]
-    return ti.select((block >= 0) & (k >= 0), starts[row] + k, none)
+    cell = (o & ~(mask << shift)) | ((at & mask) << shift)
+    is_listed = (planes[row, cell >> 6] >> ti.cast(cell & 63, ti.u64)) & ti.u64(1)
+    return ti.select((block >= 0) & (is_listed == ti.u64(1)), number_of(planes, places, row, cell), none)
 
 
 @ti.func
 def link(
-    number: ti.template(), starts: ti.template(), around: ti.template(), bits, b, o, i, links: ti.template()
+    planes: ti.template(), places: ti.template(), around: ti.template(), bits, b, o, i, links: ti.template()
 ):
-    """Row i of `links`: the numbers of the cells beside cell o, the number of rows where there is none."""
+    """Column i of `links`: the numbers of the cells beside cell o, how many columns where there is none."""
     for side in ti.static(range(6)):
-        links[i, side] = neighbour(number, starts, around, bits, b, o, side // 2, side % 2, links.shape[0])
+        links[side, i] = neighbour(planes, places, around, bits, b, o, side // 2, side % 2, links.shape[1])
 
 
 @ti.kernel
@@ -71,8 +101,8 @@ def list_voxels(
     slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
     sums: ti.types.ndarray(dtype=ti.i64, ndim=2),
     around: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (blocks, 6): −x, +x, −y, +y, −z, +z; −1 = none
-    number: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    starts: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (blocks + 1,)
+    planes: ti.types.ndarray(dtype=ti.u64, ndim=2),
+    places: ti.types.ndarray(dtype=ti.i32, ndim=2),
     links: ti.types.ndarray(dtype=ti.i32, ndim=2),
     y: ti.types.ndarray(dtype=ti.f32, ndim=1),
     weight: ti.types.ndarray(dtype=ti.f32, ndim=1),
@@ -82,14 +112,17 @@ def list_voxels(
     for run in range(values.shape[0] * RUN):  # run loop: kernels/__init__.py
         if run % RUN == 0:
             b = run // RUN
-            for o in range(ti.select(starts[b] < starts[b + 1], CUBE, 0)):
-                k = number[b, o]
-                if k >= 0:
-                    i = starts[b] + k
+            for word in range(planes.shape[1]):
+                left = planes[b, word]
+                i = places[b, word]
+                while left != 0:
+                    o = 64 * word + lowest(left)
                     y[i] = values[b, o]
                     x[i] = values[b, o]
                     weight[i] = ti.cast(lane_weight(sums[slots[b], o]), ti.f32) / WEIGHT_ONE
-                    link(number, starts, around, 3, b, o, i, links)
+                    link(planes, places, around, 3, b, o, i, links)
+                    i += 1
+                    left = without_lowest(left)
 
 
 @ti.func
@@ -103,35 +136,36 @@ def parent_of(o, bits):
 
 
 @ti.kernel
-def number_parents(
+def mark_parents(
     bits: ti.i32,  # of the finer cells
-    number: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    coarse_number: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    coarse_counts: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    planes: ti.types.ndarray(dtype=ti.u64, ndim=2),
+    coarse_planes: ti.types.ndarray(dtype=ti.u64, ndim=2),
+    coarse_counts: ti.types.ndarray(dtype=ti.i32, ndim=2),
 ):
-    """Number the cells that hold a listed finer cell."""
-    for run in range(number.shape[0] * RUN):  # run loop: kernels/__init__.py
+    """Mark the cells that hold a listed finer cell."""
+    for run in range(planes.shape[0] * RUN):  # run loop: kernels/__init__.py
         if run % RUN == 0:
             b = run // RUN
-            for c in range(coarse_number.shape[1]):
-                coarse_number[b, c] = NONE
-            for o in range(number.shape[1]):
-                if number[b, o] >= 0:
-                    coarse_number[b, parent_of(o, bits)] = 0
-            n = 0
-            for c in range(coarse_number.shape[1]):
-                if coarse_number[b, c] == 0:
-                    coarse_number[b, c] = n
-                    n += 1
-            coarse_counts[b] = n
+            for word in range(coarse_planes.shape[1]):
+                coarse_planes[b, word] = ti.u64(0)
+            for word in range(planes.shape[1]):
+                left = planes[b, word]
+                while left != 0:
+                    c = parent_of(64 * word + lowest(left), bits)
+                    coarse_planes[b, c >> 6] = coarse_planes[b, c >> 6] | (
+                        ti.u64(1) << ti.cast(c & 63, ti.u64)
+                    )
+                    left = without_lowest(left)
+            for word in range(coarse_planes.shape[1]):
+                coarse_counts[b, word] = count_bits(coarse_planes[b, word])
 
 
 @ti.func
 def slope(links: ti.template(), x: ti.template(), i, axis):
     """Difference to the next cell along an axis: central, one-sided at the rim, 0 alone."""
-    m = links[i, 2 * axis]
-    p = links[i, 2 * axis + 1]
-    none = links.shape[0]
+    m = links[2 * axis, i]
+    p = links[2 * axis + 1, i]
+    none = links.shape[1]
     result = ti.f32(0.0)
     if m < none and p < none:
         result = 0.5 * (x[p] - x[m])
@@ -152,13 +186,13 @@ def off_center(o, bits, axis):
 def list_parents(
     bits: ti.i32,  # of the finer cells
     around: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    number: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    starts: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    planes: ti.types.ndarray(dtype=ti.u64, ndim=2),
+    places: ti.types.ndarray(dtype=ti.i32, ndim=2),
     links: ti.types.ndarray(dtype=ti.i32, ndim=2),
     y: ti.types.ndarray(dtype=ti.f32, ndim=1),
     weight: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    coarse_number: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    coarse_starts: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    coarse_planes: ti.types.ndarray(dtype=ti.u64, ndim=2),
+    coarse_places: ti.types.ndarray(dtype=ti.i32, ndim=2),
     coarse_links: ti.types.ndarray(dtype=ti.i32, ndim=2),
     coarse_y: ti.types.ndarray(dtype=ti.f32, ndim=1),
     coarse_weight: ti.types.ndarray(dtype=ti.f32, ndim=1),
@@ -168,27 +202,35 @@ def list_parents(
 
     Each value is moved to the cell's centre along its own slope: ramps stay ramps where cells are missing.
     """
-    for run in range(number.shape[0] * RUN):  # run loop: kernels/__init__.py
+    for run in range(planes.shape[0] * RUN):  # run loop: kernels/__init__.py
         if run % RUN == 0:
             b = run // RUN
-            for c in range(coarse_number.shape[1]):
-                if coarse_number[b, c] >= 0:
-                    i = coarse_starts[b] + coarse_number[b, c]
+            for word in range(coarse_planes.shape[1]):
+                left = coarse_planes[b, word]
+                i = coarse_places[b, word]
+                while left != 0:
                     coarse_y[i] = 0.0
                     coarse_weight[i] = 0.0
-                    link(coarse_number, coarse_starts, around, bits - 1, b, c, i, coarse_links)
-            for o in range(number.shape[1]):
-                if number[b, o] >= 0:
-                    k = starts[b] + number[b, o]
-                    i = coarse_starts[b] + coarse_number[b, parent_of(o, bits)]
+                    c = 64 * word + lowest(left)
+                    link(coarse_planes, coarse_places, around, bits - 1, b, c, i, coarse_links)
+                    i += 1
+                    left = without_lowest(left)
+            for word in range(planes.shape[1]):
+                left = planes[b, word]
+                k = places[b, word]
+                while left != 0:
+                    o = 64 * word + lowest(left)
+                    i = number_of(coarse_planes, coarse_places, b, parent_of(o, bits))
                     value = y[k]
                     for axis in ti.static(range(3)):
                         value -= off_center(o, bits, axis) * slope(links, y, k, axis)
                     coarse_y[i] = coarse_y[i] + weight[k] * value
                     coarse_weight[i] = coarse_weight[i] + weight[k]
-            for c in range(coarse_number.shape[1]):
-                if coarse_number[b, c] >= 0:
-                    i = coarse_starts[b] + coarse_number[b, c]
+                    k += 1
+                    left = without_lowest(left)
+            for word in range(coarse_planes.shape[1]):
+                first = coarse_places[b, word]
+                for i in range(first, first + count_bits(coarse_planes[b, word])):
                     coarse_y[i] = coarse_y[i] / coarse_weight[i]
                     coarse_x[i] = coarse_y[i]
 
@@ -197,101 +239,160 @@ def list_parents(
 def refine(
     bits: ti.i32,  # of the finer cells
     links: ti.types.ndarray(dtype=ti.i32, ndim=2),  # of the coarse cells
-    coarse_number: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    coarse_starts: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    coarse_planes: ti.types.ndarray(dtype=ti.u64, ndim=2),
+    coarse_places: ti.types.ndarray(dtype=ti.i32, ndim=2),
     coarse_x: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    number: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    starts: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    planes: ti.types.ndarray(dtype=ti.u64, ndim=2),
+    places: ti.types.ndarray(dtype=ti.i32, ndim=2),
     x: ti.types.ndarray(dtype=ti.f32, ndim=1),
 ):
     """Start the finer cells from the coarse solution, linear inside each coarse cell."""
-    for run in range(number.shape[0] * RUN):  # run loop: kernels/__init__.py
+    for run in range(planes.shape[0] * RUN):  # run loop: kernels/__init__.py
         if run % RUN == 0:
             b = run // RUN
-            for o in range(number.shape[1]):
-                if number[b, o] >= 0:
-                    i = coarse_starts[b] + coarse_number[b, parent_of(o, bits)]
+            for word in range(planes.shape[1]):
+                left = planes[b, word]
+                k = places[b, word]
+                while left != 0:
+                    o = 64 * word + lowest(left)
+                    i = number_of(coarse_planes, coarse_places, b, parent_of(o, bits))
                     value = coarse_x[i]
                     for axis in ti.static(range(3)):
                         value += 0.5 * off_center(o, bits, axis) * slope(links, coarse_x, i, axis)
-                    x[starts[b] + number[b, o]] = value
+                    x[k] = value
+                    k += 1
+                    left = without_lowest(left)
 
 
+@ti.func
+def bend(before: ti.template(), after: ti.template(), x: ti.template(), i):
+    """Second difference of x along the axis of these neighbours."""
+    return x[before[i]] - 2.0 * x[i] + x[after[i]]
+
+
+@ti.func
+def share_of(before: ti.template(), after: ti.template(), bent, sharpness, i):
+    """ω along an axis."""
+    share = 1.0 / (1.0 + (sharpness * bent) * (sharpness * bent))
+    return ti.select(ti.max(before[i], after[i]) < before.shape[0], share, 0.0)
+
+
+@QuickLaunch
 @ti.kernel
 def weigh(
-    links: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    x_before: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    x_after: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    y_before: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    y_after: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    z_before: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    z_after: ti.types.ndarray(dtype=ti.i32, ndim=1),
     x: ti.types.ndarray(dtype=ti.f32, ndim=1),
     sharpness: ti.f32,  # 1 / ε; 0: ω = 1
     weight: ti.types.ndarray(dtype=ti.f32, ndim=1),
     smoothness: ti.f32,
-    omega: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    omega_x: ti.types.ndarray(dtype=ti.f32, ndim=1),
+    omega_y: ti.types.ndarray(dtype=ti.f32, ndim=1),
+    omega_z: ti.types.ndarray(dtype=ti.f32, ndim=1),
     inverse: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    q: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    q_x: ti.types.ndarray(dtype=ti.f32, ndim=1),
+    q_y: ti.types.ndarray(dtype=ti.f32, ndim=1),
+    q_z: ti.types.ndarray(dtype=ti.f32, ndim=1),
 ):
     """ω = 1 / (1 + (D2 x / ε)²), 0 where one of the three cells is missing; q = ω D2 x; and 1 / M with
     M = W + 4 λ Σ |D2|ᵀ ω: then 0 < M⁻¹ A ≤ 1, as (1, −2, 1) has an l1 norm of 4."""
-    for i in range(links.shape[0]):
-        for axis in ti.static(range(3)):
-            m = links[i, 2 * axis]
-            p = links[i, 2 * axis + 1]
-            bent = x[m] - 2.0 * x[i] + x[p]
-            share = 1.0 / (1.0 + (sharpness * bent) * (sharpness * bent))
-            share = ti.select(ti.max(m, p) < links.shape[0], share, 0.0)
-            omega[i, axis] = share
-            q[i, axis] = share * bent
-    for i in range(links.shape[0]):
-        total = ti.f32(0.0)
-        for axis in ti.static(range(3)):
-            total += (
-                2.0 * omega[i, axis] + omega[links[i, 2 * axis], axis] + omega[links[i, 2 * axis + 1], axis]
-            )
-        whole = weight[i] + 4.0 * smoothness * total
-        inverse[i] = ti.select(whole > 0.0, 1.0 / whole, 0.0)  # what nothing draws at stays
+    for group in range(x_before.shape[0] // ABREAST):
+        along_x, along_y, along_z = abreast(0.0), abreast(0.0), abreast(0.0)
+        share_x, share_y, share_z = abreast(0.0), abreast(0.0), abreast(0.0)
+        for n in ti.static(range(ABREAST)):
+            i = ABREAST * group + n
+            along_x[n] = bend(x_before, x_after, x, i)
+            along_y[n] = bend(y_before, y_after, x, i)
+            along_z[n] = bend(z_before, z_after, x, i)
+            share_x[n] = share_of(x_before, x_after, along_x[n], sharpness, i)
+            share_y[n] = share_of(y_before, y_after, along_y[n], sharpness, i)
+            share_z[n] = share_of(z_before, z_after, along_z[n], sharpness, i)
+        for n in ti.static(range(ABREAST)):
+            i = ABREAST * group + n
+            omega_x[i], omega_y[i], omega_z[i] = share_x[n], share_y[n], share_z[n]
+            q_x[i], q_y[i], q_z[i] = share_x[n] * along_x[n], share_y[n] * along_y[n], share_z[n] * along_z[n]
+    for group in range(x_before.shape[0] // ABREAST):
+        whole = abreast(0.0)
+        for n in ti.static(range(ABREAST)):
+            i = ABREAST * group + n
+            total = 2.0 * omega_x[i] + omega_x[x_before[i]] + omega_x[x_after[i]]
+            total += 2.0 * omega_y[i] + omega_y[y_before[i]] + omega_y[y_after[i]]
+            total += 2.0 * omega_z[i] + omega_z[z_before[i]] + omega_z[z_after[i]]
+            whole[n] = weight[i] + 4.0 * smoothness * total
+        for n in ti.static(range(ABREAST)):  # what nothing draws at stays
+            inverse[ABREAST * group + n] = ti.select(whole[n] > 0.0, 1.0 / whole[n], 0.0)
 
 
+@QuickLaunch
 @ti.kernel
 def relax(
-    links: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    x_before: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    x_after: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    y_before: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    y_after: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    z_before: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    z_after: ti.types.ndarray(dtype=ti.i32, ndim=1),
     y: ti.types.ndarray(dtype=ti.f32, ndim=1),
     weight: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    omega: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    omega_x: ti.types.ndarray(dtype=ti.f32, ndim=1),
+    omega_y: ti.types.ndarray(dtype=ti.f32, ndim=1),
+    omega_z: ti.types.ndarray(dtype=ti.f32, ndim=1),
     inverse: ti.types.ndarray(dtype=ti.f32, ndim=1),
     smoothness: ti.f32,
     steps: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (AT_ONCE, 2): share of the last, gain of the residual
     bent: ti.i32,  # whether q is of this x
-    q: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    q_x: ti.types.ndarray(dtype=ti.f32, ndim=1),
+    q_y: ti.types.ndarray(dtype=ti.f32, ndim=1),
+    q_z: ti.types.ndarray(dtype=ti.f32, ndim=1),
     step: ti.types.ndarray(dtype=ti.f32, ndim=1),
     x: ti.types.ndarray(dtype=ti.f32, ndim=1),
 ):
     """Some steps of the Chebyshev iteration, each after q = ω D2 x along each axis."""
     for k in ti.static(range(AT_ONCE)):
-        for i in range(links.shape[0] * (1 - bent if ti.static(k == 0) else 1)):
-            twice = 2.0 * x[i]
-            for axis in ti.static(range(3)):
-                q[i, axis] = omega[i, axis] * (x[links[i, 2 * axis]] - twice + x[links[i, 2 * axis + 1]])
-        for i in range(links.shape[0]):
-            back = ti.f32(0.0)
-            for axis in ti.static(range(3)):
-                back += q[links[i, 2 * axis], axis] - 2.0 * q[i, axis] + q[links[i, 2 * axis + 1], axis]
-            residual = weight[i] * (y[i] - x[i]) - smoothness * back
-            change = steps[k, 0] * step[i] + steps[k, 1] * inverse[i] * residual
-            step[i] = change
-            x[i] = x[i] + change
+        for group in range(x_before.shape[0] // ABREAST * (1 - bent if ti.static(k == 0) else 1)):
+            along_x, along_y, along_z = abreast(0.0), abreast(0.0), abreast(0.0)
+            for n in ti.static(range(ABREAST)):
+                i = ABREAST * group + n
+                along_x[n] = omega_x[i] * bend(x_before, x_after, x, i)
+                along_y[n] = omega_y[i] * bend(y_before, y_after, x, i)
+                along_z[n] = omega_z[i] * bend(z_before, z_after, x, i)
+            for n in ti.static(range(ABREAST)):
+                i = ABREAST * group + n
+                q_x[i], q_y[i], q_z[i] = along_x[n], along_y[n], along_z[n]
+        for group in range(x_before.shape[0] // ABREAST):
+            change, moved = abreast(0.0), abreast(0.0)
+            for n in ti.static(range(ABREAST)):
+                i = ABREAST * group + n
+                back = bend(x_before, x_after, q_x, i)
+                back += bend(y_before, y_after, q_y, i)
+                back += bend(z_before, z_after, q_z, i)
+                residual = weight[i] * (y[i] - x[i]) - smoothness * back
+                change[n] = steps[k, 0] * step[i] + steps[k, 1] * inverse[i] * residual
+                moved[n] = x[i] + change[n]
+            for n in ti.static(range(ABREAST)):
+                i = ABREAST * group + n
+                step[i], x[i] = change[n], moved[n]
 
 
 @ti.kernel
 def write_values(
-    number: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    starts: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    planes: ti.types.ndarray(dtype=ti.u64, ndim=2),
+    places: ti.types.ndarray(dtype=ti.i32, ndim=2),
     x: ti.types.ndarray(dtype=ti.f32, ndim=1),
     values: ti.types.ndarray(dtype=ti.f32, ndim=2),
 ):
     """The field where it was solved; other values stay."""
-    for run in range(number.shape[0] * RUN):  # run loop: kernels/__init__.py
+    for run in range(planes.shape[0] * RUN):  # run loop: kernels/__init__.py
         if run % RUN == 0:
             b = run // RUN
-            if starts[b] < starts[b + 1]:
-                for o in range(CUBE):
-                    k = number[b, o]
-                    if k >= 0:
-                        values[b, o] = x[starts[b] + k]
+            for word in range(planes.shape[1]):
+                left = planes[b, word]
+                i = places[b, word]
+                while left != 0:
+                    values[b, 64 * word + lowest(left)] = x[i]
+                    i += 1
+                    left = without_lowest(left)

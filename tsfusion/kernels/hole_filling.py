@@ -7,7 +7,7 @@ regulariser, whose `bend` and `relax` then solve it: paper eq. 3 with no weight 
 
 import taichi as ti
 
-from tsfusion.kernels.field_smoothing import link
+from tsfusion.kernels.field_smoothing import count_bits, link, without_lowest
 from tsfusion.kernels.integrate import CUBE
 from tsfusion.kernels.normal_smoothing import block_at, value_at
 from tsfusion.kernels.surface_cells import case_of, corner_planes, lowest
@@ -136,31 +136,33 @@ def mark_unseen(
 
 
 @ti.kernel
-def number_marked(
+def take_marked(
     around: ti.types.ndarray(dtype=ti.i32, ndim=2),
     values: ti.types.ndarray(dtype=ti.f32, ndim=2),
     marks: ti.types.ndarray(dtype=ti.u8, ndim=2),
-    number: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    counts: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    planes: ti.types.ndarray(dtype=ti.u64, ndim=2),
+    counts: ti.types.ndarray(dtype=ti.i32, ndim=2),
 ):
-    """Number the voxels to solve and the seen ones up to `RING` before or behind them along an axis."""
+    """Take the voxels to solve and the seen ones up to `RING` before or behind them along an axis."""
     for run in range(values.shape[0] * RUN):  # run loop: kernels/__init__.py
         if run % RUN == 0:
             b = run // RUN
-            n = 0
-            for o in range(CUBE):
-                taken = ti.cast(marks[b, o], ti.i32)
-                if taken == 0 and values[b, o] == values[b, o]:
-                    for k in range(6 * RING):
-                        q = voxel_of(o)
-                        q[k // (2 * RING)] += k % RING + 1 if k // RING % 2 == 0 else -(k % RING + 1)
-                        row = block_at(around, b, q)
-                        if row >= 0:
-                            if marks[row, offset_in_block(q)] == UNSEEN:
-                                taken = BESIDE
-                number[b, o] = ti.select(taken > 0, n, -1)
-                n += ti.cast(taken > 0, ti.i32)
-            counts[b] = n
+            for word in range(planes.shape[1]):
+                plane = ti.u64(0)
+                for j in range(64):
+                    o = 64 * word + j
+                    taken = ti.cast(marks[b, o], ti.i32)
+                    if taken == 0 and values[b, o] == values[b, o]:
+                        for k in range(6 * RING):
+                            q = voxel_of(o)
+                            q[k // (2 * RING)] += k % RING + 1 if k // RING % 2 == 0 else -(k % RING + 1)
+                            row = block_at(around, b, q)
+                            if row >= 0:
+                                if marks[row, offset_in_block(q)] == UNSEEN:
+                                    taken = BESIDE
+                    plane |= ti.cast(taken > 0, ti.u64) << ti.cast(j, ti.u64)
+                planes[b, word] = plane
+                counts[b, word] = count_bits(plane)
 
 
 @ti.kernel
@@ -168,8 +170,8 @@ def list_marked(
     sides: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (blocks, 6): −x, +x, −y, +y, −z, +z; −1 = none
     values: ti.types.ndarray(dtype=ti.f32, ndim=2),
     marks: ti.types.ndarray(dtype=ti.u8, ndim=2),
-    number: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    starts: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    planes: ti.types.ndarray(dtype=ti.u64, ndim=2),
+    places: ti.types.ndarray(dtype=ti.i32, ndim=2),
     links: ti.types.ndarray(dtype=ti.i32, ndim=2),
     y: ti.types.ndarray(dtype=ti.f32, ndim=1),
     weight: ti.types.ndarray(dtype=ti.f32, ndim=1),
@@ -180,17 +182,20 @@ def list_marked(
     for run in range(values.shape[0] * RUN):  # run loop: kernels/__init__.py
         if run % RUN == 0:
             b = run // RUN
-            for o in range(CUBE):
-                k = number[b, o]
-                if k >= 0:
-                    i = starts[b] + k
+            for word in range(planes.shape[1]):
+                left = planes[b, word]
+                i = places[b, word]
+                while left != 0:
+                    o = 64 * word + lowest(left)
                     seen = marks[b, o] != UNSEEN
                     value = ti.select(seen, values[b, o], 0.0)
                     y[i] = value
                     x[i] = value
                     weight[i] = ti.select(seen, ti.f32(SEEN_WEIGHT), 0.0)
                     layer[i] = ti.select(seen, 0, EARLY)
-                    link(number, starts, sides, 3, b, o, i, links)
+                    link(planes, places, sides, 3, b, o, i, links)
+                    i += 1
+                    left = without_lowest(left)
 
 
 @ti.kernel
@@ -205,15 +210,15 @@ def extend(
     Returns how many got one.
     """
     given = 0
-    for i in range(links.shape[0]):
+    for i in range(links.shape[1]):
         if layer[i] == EARLY:
             total = ti.f32(0.0)
             count = ti.f32(0.0)
             for side in ti.static(range(6)):
-                m = links[i, side]
+                m = links[side, i]
                 if layer[m] < sweep:
                     value = x[m]
-                    far = links[ti.min(m, links.shape[0] - 1), side]
+                    far = links[side, ti.min(m, links.shape[1] - 1)]
                     if layer[far] < sweep:
                         value += x[m] - x[far]
                     total += value

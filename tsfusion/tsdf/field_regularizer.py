@@ -26,6 +26,8 @@ LEAST_REACH = 2.0  # voxels
 COARSE_FROM = 64.0  # λ that smooths over more voxels than so few iterations reach
 NORMAL_SAMPLES = 3  # voxels to each side of the surface: less would be no ray
 
+WORD = 64  # cells
+
 _KEY_STEP = np.array([1 << 42, 1 << 21, 1], np.int64)  # one block along x, y, z in a packed key
 AROUND = np.array([(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)]) @ _KEY_STEP
 SIDES = np.array([sign * step for step in _KEY_STEP for sign in (-1, 1)], np.int64)
@@ -122,22 +124,28 @@ def spread(keys: NDArray[np.int64], store: BlockStore, settings: FieldSettings) 
 
 @dataclass
 class Level:
-    """Listed cells of one resolution: `bits` = log2 of the cells a side of a block."""
+    """Listed cells of one resolution: `bits` = log2 of the cells a side of a block.
+
+    `planes`, `places`: which cells, and where in the list (`kernels/field_smoothing.py`).
+    """
 
     bits: int
-    number: NDArray[np.int32]
-    starts: NDArray[np.int32]
+    planes: NDArray[np.uint64]
+    places: NDArray[np.int32]
     links: NDArray[np.int32]
     y: NDArray[np.float32]
     weight: NDArray[np.float32]
     x: NDArray[np.float32]
 
     @classmethod
-    def make(cls, bits: int, number: NDArray[np.int32], counts: NDArray[np.int32]) -> "Level":
-        total = int(counts.sum())
+    def make(cls, bits: int, planes: NDArray[np.uint64], counts: NDArray[np.int32]) -> "Level":
+        """An empty list of the marked cells; `counts` has those of each word."""
+        places = np.append(0, np.cumsum(counts)).astype(np.int32)
+        total = -(-int(places[-1]) // kernels.ABREAST) * kernels.ABREAST
         y, weight, x = (np.zeros(total + 1, np.float32) for _ in range(3))  # the last stands for "none"
-        starts = np.append(0, np.cumsum(counts)).astype(np.int32)
-        return cls(bits, number, starts, np.empty((total, 6), np.int32), y, weight, x)
+        links = np.empty((6, total), np.int32)
+        links[:, int(places[-1]) :] = total
+        return cls(bits, planes, places[:-1].reshape(counts.shape), links, y, weight, x)
 
     def relax(
         self, smoothness: float, rounds: Sequence[Round], pause: Callable[[], None] = lambda: None
@@ -148,17 +156,17 @@ class Level:
             pause: called after each launch.
         """
         total = len(self.x)
-        omega, bent = np.zeros((total, 3), np.float32), np.zeros((total, 3), np.float32)
+        omega, bent = np.zeros((3, total), np.float32), np.zeros((3, total), np.float32)
         inverse, step = np.empty(total, np.float32), np.zeros(total, np.float32)
         for edge, lowest, count in rounds:
-            kernels.weigh(self.links, self.x, 1 / edge, self.weight, smoothness, omega, inverse, bent)
+            kernels.weigh(*self.links, self.x, 1 / edge, self.weight, smoothness, *omega, inverse, *bent)
             pause()
             steps = np.zeros((-(-count // kernels.AT_ONCE), kernels.AT_ONCE, 2), np.float32)
             steps.reshape(-1, 2)[:count] = list(chebyshev(lowest, count))
             for n, some in enumerate(steps):
                 kernels.relax(
-                    self.links, self.y, self.weight, omega, inverse, smoothness, some, int(n == 0),
-                    bent, step, self.x,
+                    *self.links, self.y, self.weight, *omega, inverse, smoothness, some, int(n == 0),
+                    *bent, step, self.x,
                 )  # fmt: skip
                 pause()
 
@@ -180,12 +188,12 @@ def _solve_batch(
         if depth < settings.coarser:
             coarse = levels[depth + 1]
             kernels.refine(
-                level.bits, coarse.links, coarse.number, coarse.starts, coarse.x,
-                level.number, level.starts, level.x,
+                level.bits, coarse.links, coarse.planes, coarse.places, coarse.x,
+                level.planes, level.places, level.x,
             )  # fmt: skip
         # between cells of twice the size a bend is 4 times as large, and there are 8 times fewer
         level.relax(settings.smoothness / 2**depth, settings.rounds(depth), store.pause)
-    kernels.write_values(levels[0].number, levels[0].starts, levels[0].x, values)
+    kernels.write_values(levels[0].planes, levels[0].places, levels[0].x, values)
     if not is_all:
         rows = index_of(keys, wanted)
         solved[rows < 0] = np.nan
@@ -197,26 +205,32 @@ def _list(
 ) -> list[Level]:
     """The voxels near the surface, and their coarser cells."""
     sides = index_of(keys, keys[:, None] + SIDES)
-    number, counts = np.empty((len(keys), CUBE), np.int32), np.empty(len(keys), np.int32)
-    kernels.number_voxels(values, settings.reach * QUANTA_PER_VOXEL, number, counts)
-    fine = Level.make(3, number, counts)
+    planes, counts = marks_of(len(keys), CUBE)
+    kernels.mark_voxels(values, settings.reach * QUANTA_PER_VOXEL, planes, counts)
+    fine = Level.make(3, planes, counts)
     kernels.list_voxels(
         values, store.slots_of(keys), store.sums, sides,
-        fine.number, fine.starts, fine.links, fine.y, fine.weight, fine.x,
+        fine.planes, fine.places, fine.links, fine.y, fine.weight, fine.x,
     )  # fmt: skip
     store.keep_within_memory()
     levels = [fine]
     for _ in range(settings.coarser):
-        number = np.empty((len(keys), fine.number.shape[1] // 8), np.int32)
-        kernels.number_parents(fine.bits, fine.number, number, counts)
-        coarse = Level.make(fine.bits - 1, number, counts)
+        planes, counts = marks_of(len(keys), 8 ** (fine.bits - 1))
+        kernels.mark_parents(fine.bits, fine.planes, planes, counts)
+        coarse = Level.make(fine.bits - 1, planes, counts)
         kernels.list_parents(
-            fine.bits, sides, fine.number, fine.starts, fine.links, fine.y, fine.weight,
-            coarse.number, coarse.starts, coarse.links, coarse.y, coarse.weight, coarse.x,
+            fine.bits, sides, fine.planes, fine.places, fine.links, fine.y, fine.weight,
+            coarse.planes, coarse.places, coarse.links, coarse.y, coarse.weight, coarse.x,
         )  # fmt: skip
         levels.append(coarse)
         fine = coarse
     return levels
+
+
+def marks_of(blocks: int, cells: int) -> tuple[NDArray[np.uint64], NDArray[np.int32]]:
+    """Room for the marks of so many cells a block, a bit each, and for how many each word has."""
+    shape = blocks, -(-cells // WORD)
+    return np.empty(shape, np.uint64), np.empty(shape, np.int32)
 
 
 def chebyshev(lowest: float, steps: int) -> Iterator[tuple[float, float]]:

@@ -120,12 +120,12 @@ def _solve(
     around = _rows(local, local[:, None] + field_regularizer.AROUND)
     kernels.mark_unseen(local, around, values, rims, _ball(voxels), _SLAB, _SLOPE, marks)
     level, layer = _list(local, around, values, marks)
-    if len(level.links):
+    if level.links.size:
         _relax(level, voxels)
-    level.number[marks != kernels.UNSEEN] = field_smoothing.NONE
     level.x[layer == kernels.EARLY] = np.nan
-    values.fill(np.nan)  # they are not asked for
-    field_smoothing.write_values(level.number, level.starts, level.x, values)
+    values.fill(np.nan)
+    field_smoothing.write_values(level.planes, level.places, level.x, values)
+    values[marks != kernels.UNSEEN] = np.nan  # they are not asked for
     return values[_rows(local, part)]
 
 
@@ -136,16 +136,16 @@ def _list(
     marks: NDArray[np.uint8],
 ) -> tuple[field_regularizer.Level, NDArray[np.int32]]:
     """The marked voxels with first values and the seen ones beside them; the layer of each, 0 where seen."""
-    number, counts = np.empty((len(local), CUBE), np.int32), np.empty(len(local), np.int32)
-    kernels.number_marked(around, values, marks, number, counts)
-    level = field_regularizer.Level.make(3, number, counts)
+    planes, counts = field_regularizer.marks_of(len(local), CUBE)
+    kernels.take_marked(around, values, marks, planes, counts)
+    level = field_regularizer.Level.make(3, planes, counts)
     layer = np.full(len(level.x), kernels.EARLY, np.int32)
     sides = _rows(local, local[:, None] + field_regularizer.SIDES)
     kernels.list_marked(
-        sides, values, marks, level.number, level.starts, level.links, level.y, level.weight, level.x, layer
+        sides, values, marks, level.planes, level.places, level.links, level.y, level.weight, level.x, layer
     )
     sweep = 1
-    while len(level.links) and kernels.extend(sweep, level.links, layer, level.x):
+    while level.links.size and kernels.extend(sweep, level.links, layer, level.x):
         sweep += 1
     return level, layer
 
