@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from tsfusion.core.durable_files import replacing
 from tsfusion.core.errors import InvalidConfig
 from tsfusion.tsdf import checkpoint
-from tsfusion.tsdf.block_store import unpack_keys
+from tsfusion.tsdf.block_store import distinct_blocks, unpack_keys
 
 USUAL_BLOCKS = 16_384  # of a tile
 _BLOCK_BYTES = 24 << 10  # of a block that is meshed: its sums, values, the field's solution, triangles
@@ -54,7 +54,7 @@ def boxes(file: Path, tile_size: float | None, most: int) -> list[Box]:
         raise InvalidConfig(
             f"a tile must have an edge of {8 * header.config.voxel_size:g} m or more, got {tile_size:g} m"
         )
-    cubes = np.unique(blocks // side, axis=0) * side
+    cubes = distinct_blocks((blocks // side).astype(np.int32)) * side
     return [((x, y, z), (x + side, y + side, z + side)) for x, y, z in cubes.tolist()]
 
 

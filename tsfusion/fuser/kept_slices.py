@@ -37,6 +37,8 @@ class KeptSlices:
         Raises:
             InvalidConfig: for too many cells.
         """
+        from tsfusion.tsdf.block_store import distinct_blocks
+
         if question.box is None:  # around the map, which grows
             return self._made(question)
         key = msgspec.structs.replace(question, kind="distance")
@@ -45,7 +47,7 @@ class KeptSlices:
             found = self._made(key)
         else:
             blocks = np.concatenate([*changed, self._volume.changed_blocks()])
-            found.update(np.unique(blocks, axis=0))
+            found.update(distinct_blocks(blocks))
         self._kept[key], self._changed[key] = found, []
         if len(self._kept) > _MOST_KEPT:
             del self._changed[self._kept.popitem(last=False)[0]]

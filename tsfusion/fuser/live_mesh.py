@@ -103,7 +103,7 @@ class LiveMesh:
         self._sent_until = self._volume.stamp, self._volume.drops
 
     def _update(self) -> None:
-        from tsfusion.tsdf.block_store import cells_of
+        from tsfusion.tsdf.block_store import cells_of, distinct_blocks, unpack_keys
 
         started = time.monotonic()
         blocks = self._volume.take_dirty()
@@ -118,9 +118,10 @@ class LiveMesh:
             self._send(self._message(meshed_ns))
             return
         if self._volume.model.surface != "raw":
-            unrefined = np.concatenate([self._unrefined, self._volume.cells_to_mesh(blocks)])
-            self._unrefined = np.unique(unrefined, axis=0)
-            self._refined.forget(self._volume.values_reached(blocks))
+            reached = self._volume.values_reached(blocks)
+            unrefined = np.concatenate([self._unrefined, cells_of(unpack_keys(reached))])
+            self._unrefined = distinct_blocks(unrefined)
+            self._refined.forget(reached)
         self._publish(meshed_ns, len(blocks), found, refined=self._volume.model.surface == "raw")
 
     @property

@@ -5,6 +5,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.config import SensorModel, VolumeConfig
+from tsfusion.core.distinct_integers import distinct
 from tsfusion.core.errors import InvalidConfig
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.geometry.measured_points import points_camera
@@ -47,4 +48,4 @@ def _blocks(points: NDArray[np.float64], voxel_size: float, model: SensorModel) 
         return 0
     x, y, z = np.floor(points / (_BLOCK * voxel_size)).astype(np.int64).T
     support = min(max(3 * model.sigma_floor / voxel_size, model.min_support), model.max_support)
-    return round(len(np.unique((x << 42) ^ (y << 21) ^ z)) * (1 + 2 * support / _BLOCK))
+    return round(len(distinct((x << 42) ^ (y << 21) ^ z)) * (1 + 2 * support / _BLOCK))

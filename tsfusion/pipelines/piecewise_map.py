@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.counts import count_of
+from tsfusion.core.distinct_integers import distinct
 from tsfusion.core.errors import DecodeError, JournalError
 from tsfusion.core.readable_numbers import counted
 from tsfusion.pipelines.map_rewinding import RewoundMap
@@ -147,9 +148,9 @@ class PiecewiseMap:
         volume = self._volume
         assert volume is not None
         blocks = volume.take_dirty()
-        self._stale = np.union1d(self._stale, pack_keys(cells_of(blocks)))
+        self._stale = distinct(np.append(self._stale, pack_keys(cells_of(blocks))))
         if not self._is_raw:
-            self._unrefined = np.union1d(self._unrefined, pack_keys(volume.cells_to_mesh(blocks)))
+            self._unrefined = distinct(np.append(self._unrefined, pack_keys(volume.cells_to_mesh(blocks))))
 
     def _show_raw(self) -> None:
         assert self._volume is not None

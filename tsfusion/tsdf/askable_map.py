@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tsfusion.core.config import Surface, VolumeConfig
+from tsfusion.core.distinct_integers import distinct
 from tsfusion.core.errors import MapError
 from tsfusion.geometry import up_direction
 from tsfusion.geometry.keyframe import Intrinsics
@@ -290,7 +291,7 @@ class AskableMap(ReadableMap):
             cells: (n, 3) int32 block coordinates; of a block that the map does not have there are none.
             values: of `whole_values`, for the very triangles of the whole map's mesh, or of `kept_values`.
         """
-        keys = np.unique(pack_keys(cells))
+        keys = distinct(pack_keys(cells))
         return self._mesh_keys(keys, self._checked_min_weight(None), values or self._view(surface))
 
     def _mesh_keys(self, keys: NDArray[np.int64], min_weight: float, view: SurfaceView) -> CellMeshes:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.config import CacheConfig
+from tsfusion.core.distinct_integers import distinct
 from tsfusion.core.errors import MapFull
 from tsfusion.kernels import block_hash
 from tsfusion.kernels.integrate import CHANGED, CUBE, WEIGHT_MASK
@@ -374,6 +375,11 @@ def unpack_keys(keys: NDArray[np.int64]) -> NDArray[np.int32]:
     return (np.stack([keys >> 42, keys >> 21, keys], axis=1) & mask).astype(np.int32) - (1 << 20)
 
 
+def distinct_blocks(coordinates: NDArray[np.int32]) -> NDArray[np.int32]:
+    """(n, 3) block coordinates, each once, in the order of their keys: (m, 3) int32."""
+    return unpack_keys(distinct(pack_keys(coordinates)))
+
+
 def cells_of(coordinates: NDArray[np.int32]) -> NDArray[np.int32]:
     """The blocks whose cells read these blocks: themselves and their neighbours towards −x, −y, −z."""
-    return unpack_keys(np.unique((pack_keys(coordinates)[:, None] - CELL_STEPS).ravel()))
+    return unpack_keys(distinct(pack_keys(coordinates)[:, None] - CELL_STEPS))

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.config import Arch
+from tsfusion.core.distinct_integers import distinct
 from tsfusion.kernels.device_told import FIRST_BLOCKS, FIRST_HASH
 from tsfusion.tsdf.device_link import DeviceLink, Step, link_to, refuse
 
@@ -102,7 +103,7 @@ class DeviceBlocks:
         """Bring the device's rows of `count` blocks up to date."""
         if not self._unsent:
             return
-        slots = np.unique(np.concatenate(self._unsent))
+        slots = distinct(np.concatenate(self._unsent))
         slots = slots[slots < count].astype(np.int32)
         for i in range(0, len(slots), _CHUNK):
             chunk = slots[i : i + _CHUNK]

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tsfusion.core.distinct_integers import distinct
 from tsfusion.kernels import device_integration as kernels
 from tsfusion.kernels import device_rays, device_rows, integrate, rays_from_images
 from tsfusion.kernels import taichi as ti
@@ -174,7 +175,7 @@ class DeviceMap:
         without a key; and missing blocks, in order."""
         known, self._known = self._known, int(told[TOUCHED_COUNT])
         told = np.concatenate([told[: FRESH_AT + 2 * told[NEW]], told[TOUCHED_AT + known :]])
-        return (told, np.unique(missing)) if len(missing) else (told,)
+        return (told, distinct(missing)) if len(missing) else (told,)
 
     def _launch(self, job: Job, first: int, end: int) -> None:
         at, first_ray, end_ray = self._layers, int(self._begins[first]), int(self._begins[end])

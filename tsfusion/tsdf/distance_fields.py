@@ -19,7 +19,7 @@ from tsfusion.geometry import openvdb_files
 from tsfusion.geometry.map_grids import FREE, OCCUPIED, UNSEEN, DistanceField
 from tsfusion.kernels import distance_transform as kernels
 from tsfusion.kernels.integrate import QUANTA_PER_VOXEL
-from tsfusion.tsdf.block_store import BlockStore, unpack_keys
+from tsfusion.tsdf.block_store import BlockStore, distinct_blocks, unpack_keys
 from tsfusion.tsdf.map_crop import voxel_range
 from tsfusion.tsdf.surface_values import values_of
 
@@ -91,8 +91,8 @@ def in_blocks(store: BlockStore, max_distance: float, min_weight: float) -> Iter
     rings = -(-reach.margin // 8)
     around = -(-rings // _TILE)  # tiles
     steps = np.array(list(np.ndindex((2 * around + 1,) * 3)), np.int32) - around
-    own = np.unique(blocks // _TILE, axis=0)
-    tiles = np.unique((own[:, None] + steps).reshape(-1, 3), axis=0)
+    own = distinct_blocks(blocks // _TILE)
+    tiles = distinct_blocks((own[:, None] + steps).reshape(-1, 3))
     for tile in tiles[openvdb_files.order_of(tiles * _TILE)]:
         first, end = tile * _TILE, (tile + 1) * _TILE
         near = blocks[((blocks >= first - rings) & (blocks < end + rings)).all(axis=1)]

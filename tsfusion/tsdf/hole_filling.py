@@ -15,6 +15,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from tsfusion.core.distinct_integers import distinct
 from tsfusion.core.errors import InvalidConfig
 from tsfusion.geometry import guessed_patches
 from tsfusion.geometry.mesh import Mesh
@@ -175,7 +176,7 @@ def _ball(voxels: int) -> NDArray[np.int32]:
 def _spread(keys: NDArray[np.int64], rings: int) -> NDArray[np.int64]:
     """Keys of the blocks up to so many blocks away, whether the map has them or not; sorted."""
     for _ in range(rings):
-        keys = np.unique((keys[:, None] + field_regularizer.AROUND).ravel())
+        keys = distinct(keys[:, None] + field_regularizer.AROUND)
     return keys
 
 

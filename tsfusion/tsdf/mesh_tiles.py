@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tsfusion.core.distinct_integers import distinct
 from tsfusion.geometry.mesh_parts import MeshPart
 from tsfusion.tsdf import field_regularizer, mesh_extraction
 from tsfusion.tsdf.block_store import CELL_STEPS, BlockStore
@@ -151,7 +152,7 @@ def _tiles(
     for number in reversed(which):
         begin = number * size
         own = keys[begin : begin + size]
-        wanted = np.unique((own[:, None] - CELL_STEPS).ravel())  # they share the edges of these blocks
+        wanted = distinct(own[:, None] - CELL_STEPS)  # they share the edges of these blocks
         wanted = wanted[store.slots_of(wanted) >= 0]
         mesh, rows = mesh_extraction.extract_rows(wanted, store, min_weight, buffers, values)
         a = int(np.searchsorted(rows, own[0]))

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.config import Surface, VolumeConfig
+from tsfusion.core.distinct_integers import distinct
 from tsfusion.core.errors import InvalidConfig, MapError
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.mesh_parts import MeshParts, joined
@@ -116,7 +117,7 @@ class ReadableMap:
             if np.shape(blocks)[1:] != (3,) or np.asarray(blocks).dtype.kind != "i":
                 raise InvalidConfig(f"blocks must be (n, 3) integers, got {np.asarray(blocks)!r}")
             reachable = (np.abs(np.asarray(blocks, np.int64)) < 1 << 18).all(axis=1)  # others have no key
-            chosen = np.unique(pack_keys(blocks[reachable]))
+            chosen = distinct(pack_keys(blocks[reachable]))
             chosen = chosen[store.slots_of(chosen) >= 0]
         with self._own_buffers() as buffers:
             mesh = extract(np.sort(chosen), self._store, min_weight, buffers, self._view(surface))

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tsfusion.core.distinct_integers import distinct
 from tsfusion.core.errors import MapError, MapFull, WeightOverflow
 from tsfusion.core.side_thread import SideThread
 from tsfusion.geometry.up_direction import HeldSensor
@@ -41,7 +42,7 @@ def add_files(paths: Sequence[Path], target: Path) -> CheckpointHeader:
         CheckpointError: when one cannot be read, or the sum cannot be written.
     """
     headers, keys = zip(*(checkpoint.keys_of(path) for path in paths), strict=True)
-    blocks = len(np.unique(np.concatenate(keys)))
+    blocks = len(distinct(np.concatenate(keys)))
     header = _header(headers, blocks)
     with ExitStack() as opened:
         streams = [
@@ -194,7 +195,7 @@ def _pieces(streams: Sequence[_Stream], layers: Sequence[str], digest: _Digest) 
         if first.is_at_chunk and all(one.next_key > last for one in left[1:]):
             yield first.pass_on(digest)
             continue
-        keys = np.unique(np.concatenate([one.keys_up_to(last) for one in left]))
+        keys = distinct(np.concatenate([one.keys_up_to(last) for one in left]))
         for i in range(0, len(keys), CHUNK):
             yield _sum(keys[i : i + CHUNK], left, layers, digest)
 

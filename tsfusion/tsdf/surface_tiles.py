@@ -15,6 +15,7 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from tsfusion.core.distinct_integers import distinct
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.kernels.integrate import CUBE
 from tsfusion.tsdf import field_regularizer, mesh_extraction
@@ -133,7 +134,7 @@ class SurfaceTiles:
         """(n,) sorted numbers of the cubes with a block of the map."""
         if self._listed < self._store.count:  # new blocks come last
             new = _tiles_of(self._store.keys[self._listed :])
-            self._numbers = np.union1d(self._numbers, new)
+            self._numbers = distinct(np.append(self._numbers, new))
             self._listed = self._store.count
         return self._numbers
 
@@ -269,4 +270,4 @@ def _tile_of(keys: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _tiles_of(keys: NDArray[np.int64]) -> NDArray[np.int64]:
-    return np.unique(_tile_of(keys))
+    return distinct(_tile_of(keys))

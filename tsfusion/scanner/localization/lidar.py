@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tsfusion.core.distinct_integers import distinct
 from tsfusion.core.errors import InvalidKeyframe, MissingDependency
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
@@ -230,7 +231,7 @@ def _is_upright(points: Points, voxel: float) -> NDArray[np.bool_]:
 
 def _overlap(points: Points, around: Points, voxel: float) -> float:
     """Share of the points whose voxel, or a neighbour of it, holds points of the map."""
-    occupied = np.unique(_keys(around, voxel))
+    occupied = distinct(_keys(around, voxel))
     keys = _keys(points, voxel)
     hit = np.zeros(len(keys), bool)
     for step in (0, 1, -1, 1 << 21, -(1 << 21), 1 << 42, -(1 << 42)):

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tsfusion.core.distinct_integers import distinct
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.scanner.localization.features import back_project, bilinear
@@ -128,7 +129,7 @@ class PlaceIndex:
         bits = np.unpackbits(view.descriptors, axis=1)
         powers = 1 << np.arange(_BITS)
         keys = [(bits[:, chosen] @ powers) + (table << _BITS) for table, chosen in enumerate(self._bits)]
-        return np.unique(np.concatenate(keys)).astype(np.int64)
+        return distinct(np.concatenate(keys)).astype(np.int64)
 
     def _votes_for(self, view: PlaceView) -> NDArray[np.float64]:
         rows = np.unpackbits(self._table[self._keys(view)], axis=1)[:, : self._capacity]
