@@ -212,6 +212,9 @@ VIEW_SETTINGS = (
 RUN_SETTINGS = ("threads", "arch")
 # Settings of a map that limit how it grows: a saved one goes on with others.
 LIMIT_SETTINGS = ("max_blocks", "max_blocks_per_keyframe")
+# Against `quota_cost`: a block that is added (9 µs where memory is touched for the first time), and how many
+# times as much a keyframe may cost whose rays also vote for the free space before them
+BLOCK_COST, CARVING_QUOTA = 1000, 10
 
 
 class CacheConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -22,6 +22,7 @@ import msgspec
 
 from tsfusion import journal
 from tsfusion.core import process
+from tsfusion.core.config import CARVING_QUOTA
 from tsfusion.core.errors import JournalError, TsfusionError
 from tsfusion.core.versions import version_of
 from tsfusion.fuser import messages as fuser_messages
@@ -52,7 +53,6 @@ _FOR_A_CHECKPOINT = 64 << 20  # bytes beyond both
 LOCK = "fuser.lock"  # in the map's folder
 _PATIENCE_S = 10.0  # for a record that the system refuses to read, or whose segment is not there
 _RETRY_MS = 500  # until it is tried again
-_CARVING = 10  # times `quota_cost` where rays also vote for the free space before them
 # Where keyframes leave as they come, each costs as much as another that comes: half of the time for moves
 _WINDOW_REST_FACTOR = 1.0
 _MORE_MS = 50  # milliseconds within which the next record comes, if the gateway said that one waits
@@ -377,7 +377,7 @@ class Fuser:
         from tsfusion.tsdf.integrator import KeyframeQuota
 
         taken = self._map.blocks
-        cost = self._begin.quota_cost * (_CARVING if self._volume.config.space_carving else 1)
+        cost = self._begin.quota_cost * (CARVING_QUOTA if self._volume.config.space_carving else 1)
         self._volume.quota = KeyframeQuota(cost)
         if client:
             share = int(self._begin.quota_map * self._volume.most_blocks)
