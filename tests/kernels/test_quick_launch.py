@@ -33,6 +33,7 @@ def test_launches_follow_values_shapes_and_dtypes() -> None:
             scale(values, 2, np.int64(7), expected)
             assert (found == expected).all()
             assert rows == 0 or found.any()
+    assert quick._compiled  # else Taichi would have launched them all
 
 
 def test_taichi_refuses_what_it_would_refuse() -> None:
@@ -51,6 +52,21 @@ def test_taichi_refuses_what_it_would_refuse() -> None:
     with pytest.raises(AssertionError, match=">f4"):
         quick(values.astype(">f4"), 1.0, 1, sums)
     assert (sums == 16).all()
+
+
+@ti.kernel
+def add_vector(step: ti.types.vector(3, ti.i32), sums: ti.types.ndarray(dtype=ti.i64, ndim=1)):
+    for a in ti.static(range(3)):
+        sums[a] += step[a]
+
+
+def test_vectors_are_left_to_taichi() -> None:
+    runtime.start(2)
+    quick, sums = QuickLaunch(add_vector), np.zeros(3, np.int64)
+    for _ in range(3):
+        quick(np.array([1, 2, 3], np.int32), sums)
+    assert sums.tolist() == [3, 6, 9]
+    assert not quick._compiled
 
 
 def test_what_another_taichi_keeps_elsewhere_is_launched_as_ever() -> None:

@@ -84,6 +84,7 @@ def insert_blocks(
         map_slots[i] = first_slot + n
 
 
+@QuickLaunch
 @ti.kernel
 def find_blocks(
     keys: ti.types.ndarray(dtype=ti.i64, ndim=1),

@@ -11,6 +11,7 @@ Grids are flat arrays of (X, Y, Z), z fastest. A site is a voxel at the surface.
 
 import taichi as ti
 
+from tsfusion.kernels.quick_launch import QuickLaunch
 from tsfusion.kernels.voxel_traversal import RUN, vec3i
 
 BANDS = 64  # units of parallel work; fixed, so that nothing depends on the thread count
@@ -82,6 +83,7 @@ def surface_offset(values: ti.template(), shape, at):
     return offset / ti.max(1.0, offset.norm())
 
 
+@QuickLaunch
 @ti.kernel
 def mark_sites(
     values: ti.types.ndarray(dtype=ti.f32, ndim=1),
@@ -114,6 +116,7 @@ def last_place(p, g_p, site_p, q, g_q, site_q):
     return last
 
 
+@QuickLaunch
 @ti.kernel
 def spread_along_lines(
     squared: ti.types.ndarray(dtype=ti.i32, ndim=1),

@@ -44,6 +44,7 @@ def without_lowest(plane):
     return plane & (plane - ti.u64(1))
 
 
+@QuickLaunch
 @ti.kernel
 def mark_voxels(
     values: ti.types.ndarray(dtype=ti.f32, ndim=2),
@@ -95,6 +96,7 @@ def link(
         links[side, i] = neighbour(planes, places, around, bits, b, o, side // 2, side % 2, links.shape[1])
 
 
+@QuickLaunch
 @ti.kernel
 def list_voxels(
     values: ti.types.ndarray(dtype=ti.f32, ndim=2),
@@ -135,6 +137,7 @@ def parent_of(o, bits):
     return ((((x >> 1) << (bits - 1)) | (y >> 1)) << (bits - 1)) | (z >> 1)
 
 
+@QuickLaunch
 @ti.kernel
 def mark_parents(
     bits: ti.i32,  # of the finer cells
@@ -182,6 +185,7 @@ def off_center(o, bits, axis):
     return ti.cast((o >> ((2 - axis) * bits)) & 1, ti.f32) - 0.5
 
 
+@QuickLaunch
 @ti.kernel
 def list_parents(
     bits: ti.i32,  # of the finer cells
@@ -235,6 +239,7 @@ def list_parents(
                     coarse_x[i] = coarse_y[i]
 
 
+@QuickLaunch
 @ti.kernel
 def refine(
     bits: ti.i32,  # of the finer cells
@@ -378,6 +383,7 @@ def relax(
                 step[i], x[i] = change[n], moved[n]
 
 
+@QuickLaunch
 @ti.kernel
 def write_values(
     planes: ti.types.ndarray(dtype=ti.u64, ndim=2),

@@ -8,6 +8,7 @@ the number of bits before its own.
 
 import taichi as ti
 
+from tsfusion.kernels.quick_launch import QuickLaunch
 from tsfusion.kernels.surface_cells import case_of, corner_planes, lowest
 from tsfusion.kernels.voxel_traversal import RUN, unpack, vec3i
 from tsfusion.kernels.voxel_values import BANDS
@@ -142,6 +143,7 @@ def color_at(
     return shade + 0.5
 
 
+@QuickLaunch
 @ti.kernel
 def emit_vertices(
     count: ti.i32,
@@ -207,6 +209,7 @@ def vertex_on(edges: ti.template(), starts: ti.template(), first: ti.template(),
     return first[row, 0] + starts[row, plane] + ti.cast(ti.math.popcnt(before), ti.i32)
 
 
+@QuickLaunch
 @ti.kernel
 def emit_faces(
     count: ti.i32,

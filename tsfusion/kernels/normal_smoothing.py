@@ -8,6 +8,7 @@ the centre row of (I + λ D2ᵀD2)⁻¹, as many samples a side as were seen.
 import taichi as ti
 
 from tsfusion.kernels.integrate import CUBE
+from tsfusion.kernels.quick_launch import QuickLaunch
 from tsfusion.kernels.voxel_traversal import RUN, offset_in_block, vec3i, voxel_of
 
 vec3f = ti.types.vector(3, ti.f32)
@@ -46,6 +47,7 @@ def interpolate(values: ti.template(), around: ti.template(), b, p):
     return total
 
 
+@QuickLaunch
 @ti.kernel
 def smooth_along_normals(
     rows: ti.types.ndarray(dtype=ti.i32, ndim=1),  # the blocks to write; −1 = none there

@@ -12,6 +12,7 @@ import taichi as ti
 
 from tsfusion.kernels.block_hash import map_find
 from tsfusion.kernels.integrate import CUBE, QUANTA_PER_VOXEL, lane_distance, lane_weight
+from tsfusion.kernels.quick_launch import QuickLaunch
 from tsfusion.kernels.sensor_noise import WEIGHT_ONE
 from tsfusion.kernels.voxel_traversal import RUN, VOXEL_LIMIT, offset_in_block, pack, vec3i
 
@@ -151,6 +152,7 @@ def write_sample(
         gradient[n, a] = slope[a] * shorter
 
 
+@QuickLaunch
 @ti.kernel
 def list_blocks(
     points: ti.types.ndarray(ndim=2),
@@ -182,6 +184,7 @@ def list_blocks(
                                 is_needed[slot] = ti.u8(1)
 
 
+@QuickLaunch
 @ti.kernel
 def pair(
     slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
@@ -203,6 +206,7 @@ def pair(
                     pairs[n, o] = bits << 32 | ti.cast(lane_weight(sums[slot, o]), ti.i64)
 
 
+@QuickLaunch
 @ti.kernel
 def interpolate(
     points: ti.types.ndarray(ndim=2),

@@ -85,12 +85,21 @@ class QuickLaunch:
             kernel = primal.compiled_kernels[primal.ensure_compiled(*arguments)]
             program = runtime.prog
             code = program.compile_kernel(program.config(), program.get_device_caps(), kernel)
+            if not all(map(_is_known, primal.arguments)):
+                return
             floats = ti.types.primitive_types.real_type_ids
             self._takes_floats = [id(argument.annotation) in floats for argument in primal.arguments]
             self._compiled[kind] = kernel, code
             self._program = program
         except (AttributeError, KeyError, TypeError):  # another version of Taichi
             self._program = None
+
+
+def _is_known(argument: Any) -> bool:
+    """Whether an argument is an array or a number; a vector is made of the numbers of an array."""
+    annotation = argument.annotation
+    numbers = ti.types.primitive_types.type_ids
+    return isinstance(annotation, ti.types.ndarray_type.NdarrayType) or id(annotation) in numbers
 
 
 def _kind(arguments: tuple[Any, ...]) -> tuple[int, ...] | None:

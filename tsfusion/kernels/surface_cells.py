@@ -12,6 +12,7 @@ Blocks are rows of arrays. Row `count` stands for every block that is not there:
 import taichi as ti
 
 from tsfusion.kernels.block_hash import map_find
+from tsfusion.kernels.quick_launch import QuickLaunch
 from tsfusion.kernels.voxel_traversal import RUN, hash_key
 from tsfusion.kernels.voxel_values import BANDS
 
@@ -259,6 +260,7 @@ def triangles_around(state: ti.template(), around: ti.template(), r):
     return near
 
 
+@QuickLaunch
 @ti.kernel
 def find_cells(
     count: ti.i32,

@@ -5,6 +5,7 @@ import taichi as ti
 
 from tsfusion.kernels.block_hash import map_find
 from tsfusion.kernels.integrate import CUBE, WEIGHT_BITS, lane_weight
+from tsfusion.kernels.quick_launch import QuickLaunch
 from tsfusion.kernels.voxel_traversal import RUN
 
 BANDS = 64  # units of parallel work; fixed, so that nothing depends on the thread count
@@ -22,6 +23,7 @@ def distance_as_float(packed):
     return high * 65536.0 + low
 
 
+@QuickLaunch
 @ti.kernel
 def read_values(
     count: ti.i32,
