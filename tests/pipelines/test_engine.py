@@ -95,6 +95,7 @@ def test_why_nothing_moves_is_logged_once_and_named_at_the_end(
 
 def test_a_run_whose_disk_is_full_says_so() -> None:
     assert "the disk of their spool is full" in no_surface(stats(0, 0, skipped={"disk": 4}), "")
+    assert "raise --voxel-size" in no_surface(stats(4, 4), "")
 
 
 def test_a_server_elsewhere_that_takes_nothing_is_left(monkeypatch: pytest.MonkeyPatch) -> None:

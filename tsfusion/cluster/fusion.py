@@ -345,7 +345,7 @@ class _Run:
             ]
         )
         if not done.files:
-            raise OutputError("the map has no surface to write: fuse more of the scene or lower --min-weight")
+            raise OutputError(f"{run_files.NO_SURFACE}: {run_files.MORE_SURFACE}")
         return done
 
     def _tiles(self, doing: CarryingOut, file: str, mesh: Done) -> list[Done]:

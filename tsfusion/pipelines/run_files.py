@@ -33,6 +33,11 @@ from tsfusion.wire.keyframe_times import KeyframeTimes
 
 MAP = "map.tsf"
 REPORT = "report.html"
+NO_SURFACE = "the map has no surface to write"
+MORE_SURFACE = (
+    "scan more of the scene, lower --min-weight, or raise --voxel-size where measurements are far apart "
+    "(0.1 to 0.2 suits a LiDAR)"
+)
 log = logging.getLogger(__name__)
 _MESH_FILES = (("mesh", ".ply"), ("mesh", ".glb"), ("preview", ".png"))
 
@@ -154,9 +159,9 @@ def no_surface(stats: ClientStats, rejection: str) -> str:
         rejection: why the map did not take the first keyframe that it rejected; empty = it took all.
     """
     if lost := shortfall.of_disk(stats):
-        return f"the map has no surface to write: {lost}"
-    why = rejection if not stats.fused and rejection else "scan more of the scene or lower --min-weight"
-    return f"the map has no surface to write: {stats.fused} of {stats.sent} keyframes fused; {why}"
+        return f"{NO_SURFACE}: {lost}"
+    why = rejection if not stats.fused and rejection else MORE_SURFACE
+    return f"{NO_SURFACE}: {stats.fused} of {stats.sent} keyframes fused; {why}"
 
 
 def versions() -> dict[str, str]:
