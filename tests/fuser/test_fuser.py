@@ -200,6 +200,19 @@ def test_watchers_get_the_triangles(tmp_path: Path) -> None:
     assert [memoryview(frame).nbytes % 3 for frame in frames] == [0] * 5
 
 
+def test_nothing_is_meshed_while_nobody_watches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    position, fuser, link = opened_with_one(tmp_path)
+    with monkeypatch.context() as patched:
+        patched.setattr(tsfusion.Volume, "mesh_cells", raising(AssertionError("meshed for nobody")))
+        fuser.handle(order(0, position))
+        fuser.mesh()
+    meshed, frames = link.sent[-1]
+    assert isinstance(meshed, Meshed)
+    assert (meshed.layout, frames) == (None, [])
+    fuser.handle(messages.FuserQuery(1, Command(name="mesh")))
+    assert link.last().layout.faces > 0
+
+
 def test_what_was_meshed_as_fused_is_refined_bit_by_bit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The mesh that follows the map: its changed part raw at once, and refined when nothing else is to do."""
+"""The mesh that viewers get: the map's changed part raw at once, and refined when nothing else is to do."""
 
 import logging
 import time
@@ -88,6 +88,7 @@ class LiveMesh:
     def update(self) -> None:
         """Bring the mesh up to date with the raw surface: it is fast, and the next keyframe may be near.
 
+        Nothing is meshed while nobody watches: a mesh on request is made of the map as it is then.
         Without enough memory, viewers miss a part; a mesh on request is whole, once there is enough.
         """
         try:
@@ -108,15 +109,16 @@ class LiveMesh:
         started = time.monotonic()
         blocks = self._volume.take_dirty()
         self._on_taken(blocks)
-        cells = cells_of(blocks)
-        found = self._volume.mesh_cells(cells, "raw")
+        if not self._watched:  # whoever comes gets all of the map's mesh first
+            self._note_meshed()
+            self._next = started + self._interval
+            self._send(self._message(time.monotonic_ns()))
+            return
+        found = self._volume.mesh_cells(cells_of(blocks), "raw")
         self._note_meshed()
         pause = max(self._interval, _REST_FACTOR * (time.monotonic() - started))
         self._next = time.monotonic() + pause
         meshed_ns = time.monotonic_ns()
-        if not self._watched:
-            self._send(self._message(meshed_ns))
-            return
         if self._volume.model.surface != "raw":
             reached = self._volume.values_reached(blocks)
             unrefined = np.concatenate([self._unrefined, cells_of(unpack_keys(reached))])
