@@ -28,6 +28,27 @@ VERBS = [
 ]  # fmt: skip
 
 
+@pytest.mark.parametrize(
+    ("sensor", "chosen", "flag", "voxel_size"),
+    [
+        ("kinect", None, None, 0.02), ("lidar", None, None, 0.1), ("lidar", "scanner", None, 0.02),
+        ("scanner", "lidar", None, 0.1), ("lidar", None, 0.3, 0.3), (None, None, None, 0.02),
+    ],
+)  # fmt: skip
+def test_a_sensor_brings_its_usual_voxel_size(
+    sensor: str | None, chosen: str | None, flag: float | None, voxel_size: float
+) -> None:
+    preset = options.sensor_preset(sensor, chosen)
+    found = options.configuration(None, preset=preset, sensor=chosen, voxel_size=flag).volume
+    assert (found.voxel_size, found.sensor) == (voxel_size, chosen or sensor or "kinect")
+
+
+def test_a_file_beats_the_usual_voxel_size(tmp_path: Path) -> None:
+    (tmp_path / "mine.toml").write_text("[volume]\nvoxel_size = 0.05\n")
+    found = options.configuration(tmp_path / "mine.toml", preset=options.sensor_preset("lidar", None))
+    assert found.volume.voxel_size == 0.05
+
+
 def scene(folder: Path, *, pose: str | None = None, depth: bytes | None = None) -> Path:
     """A one-frame dataset in the 7-Scenes layout."""
     seven_scenes(folder, 1, (48, 64))

@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -66,6 +67,15 @@ def test_replay_leaves_everything(run_folder: Path) -> None:
         rows = list(csv.DictReader(file))
     assert len(rows) == 6
     assert all(float(row["delay_ms"]) > 0 for row in rows)
+
+
+def test_a_lidars_map_has_voxels_that_its_points_fill(data: Callable[[str], Path], tmp_path: Path) -> None:
+    done = tsfusion("replay", data("kitti07_lidar_keyframes"), "--out", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    assert "voxels: 0.1 m, usual for a lidar (--voxel-size gives others)" in done.stderr
+    run = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert run["config"]["volume"]["voxel_size"] == 0.1
+    assert run["mesh"]["triangles"] > 50_000
 
 
 def test_a_replay_says_where_up_is_and_its_glb_stands(run_folder: Path) -> None:

@@ -92,7 +92,7 @@ def _settings(found: "Listed", file: Path | None, flags: dict[str, Any]) -> "Vol
         # a sensor that is chosen anew brings its own settings; None = what its preset says
         preset = {name: value for name, value in asdict(found.config).items() if value is not None}
     else:
-        preset = {} if found.sensor is None else {"sensor": found.sensor}
+        preset = options.sensor_preset(found.sensor, flags["sensor"])
     preset["threads"] = 1  # a worker is a process on a core
     return options.configuration(file, preset=preset, **flags).volume
 

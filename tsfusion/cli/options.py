@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tsfusion.cli import verbs
+from tsfusion.cli import output, verbs
 
 if TYPE_CHECKING:
-    from tsfusion.core.config import ClientConfig, Config, ServerConfig
+    from tsfusion.core.config import ClientConfig, Config, ServerConfig, VolumeConfig
     from tsfusion.geometry.up_direction import Up
 
 
@@ -31,7 +31,8 @@ _map_option = functools.partial(option, panel="Map")
 
 # By name: a setting of the `volume` table, or one that `configuration` turns into some.
 MAP_OPTIONS: dict[str, Any] = {
-    "voxel_size": Annotated[float | None, _map_option("--voxel-size", "METRES", "Edge of a voxel.")],
+    "voxel_size": Annotated[float | None, _map_option(
+        "--voxel-size", "METRES", "Edge of a voxel; default 0.02, with a LiDAR 0.1.")],
     "sensor": Annotated[str | None, _map_option(
         "--sensor", "NAME", "kinect, tof, realsense, stereo, lidar, scanner.",
         autocompletion=lambda: ["kinect", "tof", "realsense", "stereo", "lidar", "scanner"])],
@@ -182,6 +183,25 @@ def configuration(file: Path | None, *, preset: dict[str, Any] | None = None, **
     changed = {name: config.override(getattr(loaded, name), **given) for name, given in tables.items()}
     changed["volume"].checked_model()
     return config.Config(client=loaded.client, **changed)
+
+
+def sensor_preset(sensor: str | None, chosen: str | None) -> dict[str, Any]:
+    """What a recording's sensor presets of the `volume` table, for `configuration`.
+
+    Args:
+        chosen: the sensor of `--sensor`; None = not given.
+    """
+    from tsfusion.core.config import USUAL_VOXEL_SIZES
+
+    usual = {"sensor": sensor, "voxel_size": USUAL_VOXEL_SIZES.get(chosen or sensor or "")}
+    return {name: value for name, value in usual.items() if value is not None}
+
+
+def tell_voxel_size(volume: "VolumeConfig", preset: dict[str, Any], connect: str | None) -> None:
+    """Say which voxels an own map has where that is the sensor's doing; a server's map has its own."""
+    if connect is None and preset.get("voxel_size") == volume.voxel_size:
+        text = f"voxels: {volume.voxel_size:g} m, usual for a {volume.sensor} (--voxel-size gives others)"
+        output.text(text, err=True, indent=8)
 
 
 def byte_count(text: str | None) -> int | None:

@@ -67,7 +67,9 @@ def replay(
         path, unpack=unpack, sequence=sequence, modality=modality, trajectory=trajectory,
         **options.camera(intrinsics, calibration) | options.dataset_options(option),
     )  # fmt: skip
-    chosen = options.configuration(config, preset={"sensor": dataset.sensor}, **settings)
+    preset = options.sensor_preset(dataset.sensor, settings["sensor"])
+    chosen = options.configuration(config, preset=preset, **settings)
+    options.tell_voxel_size(chosen.volume, preset, connect)
     if start or stride > 1 or max_frames is not None:
         dataset = select(dataset, start=start, stride=stride, limit=max_frames)
     for reason, count in dataset.skipped.items():

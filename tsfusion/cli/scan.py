@@ -124,7 +124,9 @@ def scan(
         poses = settings["trajectory"] or settings["feed"] or "found from the frames"
         typer.echo(f"{waits_for}; poses: {poses}", err=True)
     with opened, _ended_by_signals(opened), progress.shown(quiet=json) as display:
-        chosen = options.configuration(config, preset={"sensor": opened.sensor}, **settings)
+        preset = options.sensor_preset(opened.sensor, settings["sensor"])
+        chosen = options.configuration(config, preset=preset, **settings)
+        options.tell_voxel_size(chosen.volume, preset, connect)
         client = options.client_settings(
             chosen, connect, control=control, map=map_, key=key, server_key=server_key
         )

@@ -113,6 +113,9 @@ SENSORS: dict[str, SensorModel] = {
     "lidar": SensorModel(sigma_floor=0.02, min_range=1.0, max_range=100.0, min_support=4.0),
     "scanner": SensorModel(sigma_floor=0.0002, min_range=0.0, max_range=100.0),
 }
+# Metres, of the maps that commands make where nobody says; with another sensor `VolumeConfig`'s. Points of a
+# LiDAR are decimetres apart: between them, voxels of 2 cm are unseen, and a map of them has no surface.
+USUAL_VOXEL_SIZES = {"lidar": 0.1}
 
 
 class VolumeConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
