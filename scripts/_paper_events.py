@@ -119,10 +119,6 @@ def _tell(story: Story, times: dict[int, KeyframeTimes], event: dict[str, Any]) 
         record = times[event["seq"]]
         record.fuse_start_ns, record.fused_ns = event["fuse_start_ns"], event["t"]
         story.map_bytes.append((event["t"], event["map_bytes"]))
-    elif kind == "meshed":
-        for record in times.values():
-            if record.fused_ns and not record.meshed_ns:
-                record.meshed_ns = event["t"]
     elif kind == "end":
         story.ended = True
         story.closing = {k: v for k, v in event.items() if k not in ("event", "t")}

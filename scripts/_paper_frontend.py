@@ -38,7 +38,6 @@ from tsfusion.scanner.sources.source import LiveSource
 OUTDOORS = ("stereo", "lidar")
 MAP, CORRECTED = "map.tsf", "corrected.npz"
 _READ_AHEAD, _READ_NS = 5, 25_000_000  # frames that are read before they are due; time for one
-_MESH_S = 5.0  # for the last mesh, of which only a stamp is wanted
 
 
 class FrontEndPlan(Struct, frozen=True, kw_only=True):
@@ -250,7 +249,6 @@ def _finish(plan: FrontEndPlan, scanner: Scanner, sink: Any, folder: Path, log: 
     with suppress(FlushTimeout):
         sink.wait_settled(plan.drain_s)
         drained = True
-        sink.wait_meshed(_MESH_S)
     for record in sink.records:
         log.note("keyframe", **msgspec.to_builtins(record))
     submap = scanner.submaps[0]

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Fusion in the process that localises: the paper's "traditional" design, built of this project's own parts.
 
-The same kernels, the same map and the same mesh as in the server, in a thread beside the localizer. A Taichi
+The same kernels and the same map as in the server, in a thread beside the localizer. A Taichi
 kernel holds Python's global lock for its whole run, so the localizer stands still while a keyframe is fused:
 that is what the design suffers from here, besides the queue between both.
 """
@@ -9,8 +9,7 @@ that is what the design suffers from here, besides the queue between both.
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
-from contextlib import nullcontext
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +17,12 @@ import numpy as np
 from _paper_events import EventLog
 from numpy.typing import NDArray
 
-from tsfusion.core.config import ServerConfig, VolumeConfig
+from tsfusion.core.config import VolumeConfig
 from tsfusion.core.errors import MapError
 from tsfusion.delivery.outcomes import ClientStats
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.wire.keyframe_times import KeyframeTimes
 
-_POLL_S = 0.05
 _START_S = 180.0  # a cold compilation
 
 
@@ -112,46 +110,26 @@ class FusionBeside:
             self._ready.set()
 
     def _fuse_all(self) -> None:
-        from tsfusion.fuser.live_mesh import LiveMesh
-        from tsfusion.fuser.touched_by import TouchedBy
         from tsfusion.tsdf.volume import Volume
 
         volume = Volume(self._config)
         volume.warm_up()
-
-        def note_meshed(*_message: object) -> None:
-            self._log.note("meshed")
-
-        mesh = LiveMesh(
-            volume,
-            interval=ServerConfig().mesh_interval,
-            sparing=nullcontext,
-            send=note_meshed,
-            touched_by=TouchedBy(),
-            epoch="",
-        )
         self._ready.set()
-        while (taken := self._take(lambda: mesh.is_due(idle=True))) is not None:
-            if taken:
-                self._fuse(volume, *taken)
-                mesh.note_answer()
-            if mesh.is_due(idle=not self._waiting):
-                mesh.update()
+        while (taken := self._take()) is not None:
+            self._fuse(volume, *taken)
         assert self._keep is not None
         self.map_hash = volume.map_hash()
         volume.save(self._keep)
 
-    def _take(self, has_work: Callable[[], bool]) -> tuple[int, Keyframe] | tuple[()] | None:
-        """The oldest keyframe that waits; () = there is none now, but the mesh is behind; None = the end."""
+    def _take(self) -> tuple[int, Keyframe] | None:
+        """The oldest keyframe that waits, as soon as there is one; None = the end."""
         with self._changed:
             self._busy = False
             self._changed.notify_all()
             while not self._waiting:
                 if self._closing:
                     return None
-                if has_work():
-                    return ()
-                self._changed.wait(_POLL_S)
+                self._changed.wait()
             self._busy = True
             return self._waiting.popleft()
 

@@ -257,12 +257,10 @@ def test_what_a_killed_front_end_wrote_is_told() -> None:
         {"event": "keyframe", "t": 10, "seq": 1, "captured_ns": 5, "sent_ns": 10},
         {"event": "keyframe", "t": 20, "seq": 2, "captured_ns": 15, "sent_ns": 20},
         {"event": "fused", "t": 30, "seq": 1, "fuse_start_ns": 11, "map_bytes": 4096},
-        {"event": "meshed", "t": 31},
     ]
     story = _paper_events.of([*map(json.dumps, lines), '{"event":"fused","t":4'])
     assert story.fused == 1
     assert [record.fused_ns for record in story.times] == [30, 0]
-    assert [record.meshed_ns for record in story.times] == [31, 0]
     assert story.map_bytes == [(30, 4096)]
     assert not story.ended
     fields = _paper_outcome.of_story(story, [], _paper_limits.Death("memory", "killed"))
