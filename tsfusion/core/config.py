@@ -215,9 +215,6 @@ VIEW_SETTINGS = (
 RUN_SETTINGS = ("threads", "arch")
 # Settings of a map that limit how it grows: a saved one goes on with others.
 LIMIT_SETTINGS = ("max_blocks", "max_blocks_per_keyframe")
-# Against `quota_cost`: a block that is added (9 µs where memory is touched for the first time), and how many
-# times as much a keyframe may cost whose rays also vote for the free space before them
-BLOCK_COST, CARVING_QUOTA = 1000, 10
 
 
 class CacheConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -247,7 +244,7 @@ class ServerConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     window_keyframes: Annotated[int, Meta(ge=1, le=1024)] = 8  # credit: unacknowledged keyframes a client
     window_bytes: Annotated[int, Meta(ge=1 << 16)] = 16 << 20
     checkpoint_every: Annotated[int, Meta(ge=0)] = 500  # keyframes; 0 = only at shutdown
-    mesh_interval: NonNegative = 0.2  # seconds between incremental meshes while busy
+    mesh_interval: NonNegative = 0.2  # seconds between two meshes for viewers while busy
     journal_bytes: Bytes | None = None  # per map; the oldest keyframes are deleted first; None = keep all
     # Of each map, against its newest keyframe, whoever sent it; what is beyond is forgotten. None = keep all
     keep_seconds: Positive | None = None  # from a keyframe's coming to the newest one's

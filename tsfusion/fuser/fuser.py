@@ -22,7 +22,6 @@ import msgspec
 
 from tsfusion import journal
 from tsfusion.core import process
-from tsfusion.core.config import CARVING_QUOTA
 from tsfusion.core.errors import JournalError, TsfusionError
 from tsfusion.core.versions import version_of
 from tsfusion.fuser import messages as fuser_messages
@@ -51,6 +50,7 @@ if TYPE_CHECKING:
 _FOR_KEYFRAMES = 256 << 20  # bytes of working memory that meshes leave free
 _FOR_A_CHECKPOINT = 64 << 20  # bytes beyond both
 LOCK = "fuser.lock"  # in the map's folder
+_CARVING = 10  # times `quota_cost` where rays also vote for the free space before them
 _PATIENCE_S = 10.0  # for a record that the system refuses to read, or whose segment is not there
 _RETRY_MS = 500  # until it is tried again
 # Where keyframes leave as they come, each costs as much as another that comes: half of the time for moves
@@ -377,7 +377,7 @@ class Fuser:
         from tsfusion.tsdf.integrator import KeyframeQuota
 
         taken = self._map.blocks
-        cost = self._begin.quota_cost * (CARVING_QUOTA if self._volume.config.space_carving else 1)
+        cost = self._begin.quota_cost * (_CARVING if self._volume.config.space_carving else 1)
         self._volume.quota = KeyframeQuota(cost)
         if client:
             share = int(self._begin.quota_map * self._volume.most_blocks)

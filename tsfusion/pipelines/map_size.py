@@ -4,7 +4,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core.config import BLOCK_COST, CARVING_QUOTA, SensorModel, ServerConfig, VolumeConfig
+from tsfusion.core.config import SensorModel, VolumeConfig
 from tsfusion.core.distinct_integers import distinct
 from tsfusion.core.errors import InvalidConfig
 from tsfusion.geometry.keyframe import Keyframe
@@ -12,30 +12,24 @@ from tsfusion.geometry.measured_points import points_camera
 
 _BLOCK = 8  # voxels, edge of a block
 _VOXEL_BYTES = 20  # sums and colour
-_SIZES = (0.0001, 0.0002, 0.0003, 0.0005, 0.001, 0.002, 0.003, 0.005, 0.01, 0.02, 0.03, 0.05, 0.1)  # metres
+_SIZES = tuple(digit * 10.0**power for power in range(-4, 1) for digit in (1, 2, 3, 5))  # metres
 
 
-def check_fits(keyframe: Keyframe, config: VolumeConfig, server: ServerConfig | None = None) -> None:
-    """Raise InvalidConfig when this keyframe alone needs more blocks than a keyframe may touch, or may add.
-
-    Args:
-        server: settings of the server; None = the usual ones.
-    """
-    points, model = _within_range(keyframe, config), config.model(keyframe.sensor)
-    cost = (server or ServerConfig()).quota_cost * (CARVING_QUOTA if config.space_carving else 1)
-    most = min(config.max_blocks_per_keyframe, cost // BLOCK_COST)
-    setting = "max_blocks_per_keyframe" if most == config.max_blocks_per_keyframe else "quota_cost"
+def check_fits(keyframe: Keyframe, config: VolumeConfig) -> None:
+    """Raise InvalidConfig when this keyframe alone needs more blocks than a keyframe may touch."""
+    points, most = _within_range(keyframe, config), config.max_blocks_per_keyframe
+    model = config.model(keyframe.sensor)
     blocks = _blocks(points, config.voxel_size, model)
     if blocks <= most:
         return
     fitting = next(
-        (size for size in _SIZES if 2 * _blocks(points, size, model) <= most),
+        (size for size in _SIZES if 4 * _blocks(points, size, model) <= most),
         _SIZES[-1],
     )
     gigabytes = blocks * _BLOCK**3 * _VOXEL_BYTES / 1e9
     raise InvalidConfig(
         f"voxel_size {config.voxel_size:g} m is too small here: the first keyframe alone would need "
-        f"some {gigabytes:.1f} GB ({blocks} blocks, and {setting} allows {most}); "
+        f"some {gigabytes:.1f} GB ({blocks} blocks, and max_blocks_per_keyframe is {most}); "
         f"use {fitting:g} or more"
     )
 
@@ -49,7 +43,7 @@ def _within_range(keyframe: Keyframe, config: VolumeConfig) -> NDArray[np.float6
 
 
 def _blocks(points: NDArray[np.float64], voxel_size: float, model: SensorModel) -> int:
-    """Number of blocks that hold points, times those that a ray's band crosses at the least."""
+    """Number of blocks that hold points, times those that a ray's band crosses: an estimate."""
     if not len(points):
         return 0
     x, y, z = np.floor(points / (_BLOCK * voxel_size)).astype(np.int64).T

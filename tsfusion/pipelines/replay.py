@@ -77,7 +77,7 @@ def replay(
     with results(out, overwrite=overwrite) as (work, folder), ExitStack() as watching:
         first = dataset[0]  # a dataset that cannot be read is an error before a server starts
         if connect is None:
-            map_size.check_fits(first, volume, server)
+            map_size.check_fits(first, volume)
         progress.stage(engine.STARTING if connect is None else f"connecting to {connect}")
         with (
             target_server.opened(

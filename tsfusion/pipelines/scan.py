@@ -120,7 +120,7 @@ def scan(
         if first is None:
             raise failure[0] if failure else SourceError(f"{source.name} gave no frames")
         if own and first.kind != "pair":
-            map_size.check_fits(first.keyframe(np.eye(4)), volume, server)
+            map_size.check_fits(first.keyframe(np.eye(4)), volume)
         localizer = registry.create_localizer(config, first)
         stack.callback(getattr(localizer, "close", lambda: None))
         if own:

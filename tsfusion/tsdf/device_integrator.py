@@ -7,7 +7,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core.config import BLOCK_COST, VolumeConfig
+from tsfusion.core.config import VolumeConfig
 from tsfusion.kernels.device_told import BANDS_AT, FRESH_AT, LACKING, NEW
 from tsfusion.kernels.integrate import (
     ALL,
@@ -21,7 +21,7 @@ from tsfusion.kernels.sensor_noise import WEIGHT_ONE
 from tsfusion.kernels.voxel_traversal import BAND_FIELDS, DEFERRED, UPDATES
 from tsfusion.tsdf.block_store import BlockStore
 from tsfusion.tsdf.device_blocks import DeviceBlocks
-from tsfusion.tsdf.integrator import NO_LIMIT, PART_WEIGHT, Integrator, Part
+from tsfusion.tsdf.integrator import BLOCK_COST, NO_LIMIT, PART_WEIGHT, Integrator, Part
 from tsfusion.tsdf.ray_buffers import RayBuffers
 
 

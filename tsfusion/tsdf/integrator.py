@@ -12,7 +12,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from tsfusion.core.config import BLOCK_COST, VolumeConfig
+from tsfusion.core.config import VolumeConfig
 from tsfusion.core.errors import KeyframeTooLarge, MapError, MapFull, MapQuota, WeightOverflow
 from tsfusion.kernels import integrate, ray_smoothing, runtime
 from tsfusion.kernels.integrate import (
@@ -34,6 +34,7 @@ from tsfusion.tsdf.ray_buffers import BANDS, RayBuffers
 PART_WEIGHT = WEIGHT_LIMIT  # what a lane has in reserve: no part can make one overflow unnoticed
 
 NO_LIMIT = 1 << 30  # blocks
+BLOCK_COST = 1000  # of a block that is added: it takes 9 µs where memory is touched for the first time
 
 Part = tuple[int, int]  # bands first … last - 1
 
