@@ -320,7 +320,7 @@ class Client:
         return self._outbox.is_settled
 
     def wait_meshed(self, timeout: float = 60.0) -> None:
-        """Wait until the server's mesh shows everything sent.
+        """Wait until the server's mesh, or the next one that somebody asks for, shows everything sent.
 
         Args:
             timeout: seconds.

@@ -29,24 +29,26 @@ VERBS = [
 
 
 @pytest.mark.parametrize(
-    ("sensor", "chosen", "flag", "voxel_size"),
+    ("sensor", "file", "flags", "voxel_size"),
     [
-        ("kinect", None, None, 0.02), ("lidar", None, None, 0.1), ("lidar", "scanner", None, 0.02),
-        ("scanner", "lidar", None, 0.1), ("lidar", None, 0.3, 0.3), (None, None, None, 0.02),
+        ("kinect", "", {}, 0.02), ("lidar", "", {}, 0.1), (None, "", {}, 0.02),
+        ("lidar", "", {"voxel_size": 0.3}, 0.3), ("lidar", "voxel_size = 0.05", {}, 0.05),
+        ("lidar", "", {"sensor": "scanner"}, 0.02), (None, "", {"sensor": "lidar"}, 0.1),
+        ("lidar", "sensor = 'scanner'", {}, 0.02), ("kinect", "sensor = 'lidar'", {}, 0.1),
     ],
 )  # fmt: skip
 def test_a_sensor_brings_its_usual_voxel_size(
-    sensor: str | None, chosen: str | None, flag: float | None, voxel_size: float
+    sensor: str | None,
+    file: str,
+    flags: dict[str, Any],
+    voxel_size: float,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    preset = options.sensor_preset(sensor, chosen)
-    found = options.configuration(None, preset=preset, sensor=chosen, voxel_size=flag).volume
-    assert (found.voxel_size, found.sensor) == (voxel_size, chosen or sensor or "kinect")
-
-
-def test_a_file_beats_the_usual_voxel_size(tmp_path: Path) -> None:
-    (tmp_path / "mine.toml").write_text("[volume]\nvoxel_size = 0.05\n")
-    found = options.configuration(tmp_path / "mine.toml", preset=options.sensor_preset("lidar", None))
-    assert found.volume.voxel_size == 0.05
+    (tmp_path / "mine.toml").write_text(f"[volume]\n{file}\n")
+    found = options.configuration_for(sensor, tmp_path / "mine.toml", tell=True, **flags).volume
+    assert found.voxel_size == voxel_size
+    assert ("voxels: 0.1 m, usual for a lidar" in capsys.readouterr().err) == (voxel_size == 0.1)
 
 
 def scene(folder: Path, *, pose: str | None = None, depth: bytes | None = None) -> Path:

@@ -88,13 +88,12 @@ def _settings(found: "Listed", file: Path | None, flags: dict[str, Any]) -> "Vol
     """Settings of the saved map beside the first journal, or of the file, with every flag on top."""
     from msgspec.structs import asdict
 
-    if file is None and found.config is not None:
-        # a sensor that is chosen anew brings its own settings; None = what its preset says
-        preset = {name: value for name, value in asdict(found.config).items() if value is not None}
-    else:
-        preset = options.sensor_preset(found.sensor, flags["sensor"])
-    preset["threads"] = 1  # a worker is a process on a core
-    return options.configuration(file, preset=preset, **flags).volume
+    threads = {"threads": 1}  # a worker is a process on a core
+    if file is not None or found.config is None:
+        return options.configuration_for(found.sensor, file, tell=True, preset=threads, **flags).volume
+    # a sensor that is chosen anew brings its own settings; None = what its preset says
+    preset = {name: value for name, value in asdict(found.config).items() if value is not None}
+    return options.configuration(file, preset=preset | threads, **flags).volume
 
 
 def _scheduler(workers: int, ray: str | None) -> "Scheduler":

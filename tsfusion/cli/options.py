@@ -16,7 +16,7 @@ import typer
 from tsfusion.cli import output, verbs
 
 if TYPE_CHECKING:
-    from tsfusion.core.config import ClientConfig, Config, ServerConfig, VolumeConfig
+    from tsfusion.core.config import ClientConfig, Config, ServerConfig
     from tsfusion.geometry.up_direction import Up
 
 
@@ -185,23 +185,34 @@ def configuration(file: Path | None, *, preset: dict[str, Any] | None = None, **
     return config.Config(client=loaded.client, **changed)
 
 
-def sensor_preset(sensor: str | None, chosen: str | None) -> dict[str, Any]:
-    """What a recording's sensor presets of the `volume` table, for `configuration`.
+def configuration_for(
+    recorded: str | None,
+    file: Path | None,
+    /,
+    *,
+    tell: bool = False,
+    preset: dict[str, Any] | None = None,
+    **flags: Any,
+) -> "Config":
+    """`configuration` where a recording says its sensor; that which is chosen in the end has usual voxels.
 
     Args:
-        chosen: the sensor of `--sensor`; None = not given.
+        recorded: name of the recording's sensor; None = it says none.
+        tell: say so where the sensor decides how large voxels are.
+        preset: as of `configuration`.
     """
     from tsfusion.core.config import USUAL_VOXEL_SIZES
 
-    usual = {"sensor": sensor, "voxel_size": USUAL_VOXEL_SIZES.get(chosen or sensor or "")}
-    return {name: value for name, value in usual.items() if value is not None}
-
-
-def tell_voxel_size(volume: "VolumeConfig", preset: dict[str, Any], connect: str | None) -> None:
-    """Say which voxels an own map has where that is the sensor's doing; a server's map has its own."""
-    if connect is None and preset.get("voxel_size") == volume.voxel_size:
-        text = f"voxels: {volume.voxel_size:g} m, usual for a {volume.sensor} (--voxel-size gives others)"
+    preset = (preset or {}) | ({} if recorded is None else {"sensor": recorded})
+    plain = configuration(file, preset=preset, **flags)
+    usual = USUAL_VOXEL_SIZES.get(plain.volume.sensor)
+    if usual is None:
+        return plain
+    chosen = configuration(file, preset=preset | {"voxel_size": usual}, **flags)
+    if tell and chosen.volume.voxel_size != plain.volume.voxel_size:
+        text = f"voxels: {usual:g} m, usual for a {plain.volume.sensor} (--voxel-size gives others)"
         output.text(text, err=True, indent=8)
+    return chosen
 
 
 def byte_count(text: str | None) -> int | None:

@@ -67,9 +67,7 @@ def replay(
         path, unpack=unpack, sequence=sequence, modality=modality, trajectory=trajectory,
         **options.camera(intrinsics, calibration) | options.dataset_options(option),
     )  # fmt: skip
-    preset = options.sensor_preset(dataset.sensor, settings["sensor"])
-    chosen = options.configuration(config, preset=preset, **settings)
-    options.tell_voxel_size(chosen.volume, preset, connect)
+    chosen = options.configuration_for(dataset.sensor, config, tell=connect is None, **settings)
     if start or stride > 1 or max_frames is not None:
         dataset = select(dataset, start=start, stride=stride, limit=max_frames)
     for reason, count in dataset.skipped.items():

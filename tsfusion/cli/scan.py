@@ -124,9 +124,7 @@ def scan(
         poses = settings["trajectory"] or settings["feed"] or "found from the frames"
         typer.echo(f"{waits_for}; poses: {poses}", err=True)
     with opened, _ended_by_signals(opened), progress.shown(quiet=json) as display:
-        preset = options.sensor_preset(opened.sensor, settings["sensor"])
-        chosen = options.configuration(config, preset=preset, **settings)
-        options.tell_voxel_size(chosen.volume, preset, connect)
+        chosen = options.configuration_for(opened.sensor, config, tell=connect is None, **settings)
         client = options.client_settings(
             chosen, connect, control=control, map=map_, key=key, server_key=server_key
         )

@@ -127,7 +127,7 @@ def _configuration(file: Path | None, settings: dict[str, Any]) -> "Config":
 
     sizes = {name: options.byte_count(settings[name]) for name in ("fuser_memory_bytes", "fuser_disk_bytes")}
     try:
-        chosen = options.configuration(file, **{**settings, **sizes})
+        chosen = options.configuration_for(None, file, **{**settings, **sizes})
     except InvalidConfig as error:  # of a setting that has not its flag's name
         flags = {"fuser_memory_bytes must": "--memory", "fuser_disk_bytes must": "--disk"}
         flag = next((flag for begin, flag in flags.items() if str(error).startswith(begin)), None)

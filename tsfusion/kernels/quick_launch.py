@@ -82,11 +82,11 @@ class QuickLaunch:
             runtime, primal = ti.lang.impl.get_runtime(), self._kernel._primal  # type: ignore[attr-defined]
             if self._program is not runtime.prog:
                 self._compiled.clear()
+            if not all(map(_is_known, primal.arguments)):
+                return
             kernel = primal.compiled_kernels[primal.ensure_compiled(*arguments)]
             program = runtime.prog
             code = program.compile_kernel(program.config(), program.get_device_caps(), kernel)
-            if not all(map(_is_known, primal.arguments)):
-                return
             floats = ti.types.primitive_types.real_type_ids
             self._takes_floats = [id(argument.annotation) in floats for argument in primal.arguments]
             self._compiled[kind] = kernel, code

@@ -89,7 +89,7 @@ class Engine:
             self._wait_map(lambda _, client=client: client.is_settled)  # type: ignore[misc]
 
     def wait_meshed(self, clients: Iterable[Client]) -> None:
-        """Wait until the mesh shows every keyframe: the last stamp of the ledger, which may be missing."""
+        """Wait until meshes show every keyframe: the last stamp of the ledger, which may be missing."""
         for client in clients:
             with suppress(FlushTimeout):
                 client.wait_meshed()

@@ -108,7 +108,7 @@ class PiecewiseMap:
         volume.set_pause(self._pause)
         volume.take_dirty()
         keys = np.sort(pack_keys(volume.blocks().coordinates))
-        self._stale = np.union1d(keys, np.array(sorted(self._shown), np.int64))
+        self._stale = distinct(np.append(keys, np.array(sorted(self._shown), np.int64)))
         self._unrefined = _NONE if self._is_raw else keys
 
     def _pause(self) -> None:

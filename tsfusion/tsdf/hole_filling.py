@@ -47,7 +47,7 @@ def extract_filled(store: BlockStore, min_weight: float, view: SurfaceView, voxe
     own, buffers = np.sort(store.keys), MeshBuffers()
     seen = view(own, store, min_weight)
     more, filled = _fill(own, seen, voxels)
-    union = np.union1d(own, more)
+    union = distinct(np.append(own, more))
 
     def both(
         keys: NDArray[np.int64],

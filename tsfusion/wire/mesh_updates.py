@@ -45,7 +45,7 @@ class MeshUpdate(Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class Meshed(Struct, frozen=True, tag="meshed"):
-    """The mesh has the first `count` keyframes that this process answered; its changed part may follow.
+    """Meshes have the first `count` keyframes that this process answered; viewers get the changed part.
 
     The changed part comes with the raw surface first, and again, with `blocks` = 0, once it is regularised.
     """

@@ -25,7 +25,8 @@ _STYLES = dict(zip(STAGES, ("k1", "k2", "k3", "k4", "k5", "k6"), strict=True))
 _WAY = ("encode", "wire", "journal", "queue", "fuse")  # the stages whose sum is the delay
 _MEANING = {
     "encode": "captured → sent", "wire": "sent → received", "journal": "received → on the disk",
-    "queue": "on the disk → fuse start", "fuse": "fuse start → fused", "mesh": "fused → meshed",
+    "queue": "on the disk → fuse start", "fuse": "fuse start → fused",
+    "mesh": "fused → meshed for viewers, or noted where there are none",
 }  # fmt: skip
 
 
