@@ -140,7 +140,6 @@ def take_the_place_of_volume() -> None:
     """Have this process's fuser make such maps."""
     for name, its in (
         ("tsdf.volume", {"Volume": SumMap}),
-        ("tsdf.block_store", {"cells_of": lambda blocks: blocks}),
         ("tsdf.integrator", {"KeyframeQuota": lambda *limits: limits}),
         ("kernels.runtime", {"start": lambda _: None}),
     ):

@@ -104,8 +104,6 @@ class LiveMesh:
         self._sent_until = self._volume.stamp, self._volume.drops
 
     def _update(self) -> None:
-        from tsfusion.tsdf.block_store import cells_of, distinct_blocks, unpack_keys
-
         started = time.monotonic()
         blocks = self._volume.take_dirty()
         self._on_taken(blocks)
@@ -114,6 +112,8 @@ class LiveMesh:
             self._next = started + self._interval
             self._send(self._message(time.monotonic_ns()))
             return
+        from tsfusion.tsdf.block_store import cells_of, distinct_blocks, unpack_keys
+
         found = self._volume.mesh_cells(cells_of(blocks), "raw")
         self._note_meshed()
         pause = max(self._interval, _REST_FACTOR * (time.monotonic() - started))
