@@ -131,7 +131,7 @@ def mesh(
         made = _of_server(source, map_, keys, control=control, min_weight=settings["min_weight"])
     else:
         _refuse_for_files(context, source)
-        chosen = options.configuration(config, **settings)
+        chosen = options.configuration_for(None, config, **settings)
         given = config is not None or any(
             value is not None for name, value in settings.items() if name not in options.VIEW_OPTIONS
         )

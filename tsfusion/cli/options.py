@@ -32,7 +32,7 @@ _map_option = functools.partial(option, panel="Map")
 # By name: a setting of the `volume` table, or one that `configuration` turns into some.
 MAP_OPTIONS: dict[str, Any] = {
     "voxel_size": Annotated[float | None, _map_option(
-        "--voxel-size", "METRES", "Edge of a voxel; default 0.02, with a LiDAR 0.1.")],
+        "--voxel-size", "METRES", "Edge of a voxel (0.02; LiDAR 0.1).")],
     "sensor": Annotated[str | None, _map_option(
         "--sensor", "NAME", "kinect, tof, realsense, stereo, lidar, scanner.",
         autocompletion=lambda: ["kinect", "tof", "realsense", "stereo", "lidar", "scanner"])],
