@@ -107,7 +107,13 @@ def test_kernels_of_questions_are_compiled_while_there_is_nothing_else(
         compiled.append("slices")
 
     monkeypatch.setattr(tsfusion.Volume, "warming_up", warming_up)
-    fuser, _ = opened(tmp_path)
+    position, fuser, _ = opened_with_one(tmp_path)
+    assert not fuser_main._do_some(fuser, idle=True)  # a keyframe may be near
+    assert fuser.warm_wait_ms is not None
+    assert 0 < fuser.warm_wait_ms <= 1001
+    monkeypatch.setattr("tsfusion.fuser.live_mesh._QUIET_S", 0.0)
+    fuser.handle(order(0, position))
+    fuser.mesh()
     assert not fuser_main._do_some(fuser, idle=False)
     assert compiled == ["keyframes"]
     while fuser.warm_due:

@@ -66,7 +66,8 @@ def _serve(link: sockets.AnySocket) -> int:
             continue
         if not inbox.orders:
             process.on_parent_end(signal.SIGCONT)  # a stopped process would not notice the gateway's end
-            events = dict(poller.poll(fuser.wait_ms if fuser is not None else None))
+            waits = () if fuser is None else (fuser.wait_ms, fuser.warm_wait_ms)
+            events = dict(poller.poll(min((wait for wait in waits if wait is not None), default=None)))
             if sys.stdin.fileno() in events:  # nothing is ever written there: the gateway has ended
                 return 1
             if fuser is not None:

@@ -211,11 +211,16 @@ class Fuser:
 
     @property
     def warm_due(self) -> bool:
-        """Whether kernels that no keyframe needs are not compiled yet."""
-        return self._warming is not None
+        """Whether kernels that no keyframe needs are not compiled yet, and none is near that would wait."""
+        return self._warming is not None and not self._live_mesh.quiet_wait
+
+    @property
+    def warm_wait_ms(self) -> int | None:
+        """Milliseconds until `warm` may be due; None = never."""
+        return None if self._warming is None else round(1000 * self._live_mesh.quiet_wait) + 1
 
     def warm(self) -> None:
-        """Compile some of them, which takes seconds at the first start. Call it only while nothing waits."""
+        """Compile some of them, which takes a second at the first start. Call it only while nothing waits."""
         assert self._warming is not None
         if next(self._warming, True):  # the steps yield None
             self._warming = None

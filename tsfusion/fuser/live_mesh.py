@@ -58,7 +58,8 @@ class LiveMesh:
         self._watched = False
         self._answered = self._meshed = 0  # records of this process
         self._is_behind = False
-        self._next = self._quiet_from = self._next_refined = 0.0  # time.monotonic()
+        self._next = self._next_refined = 0.0  # time.monotonic()
+        self._quiet_from = time.monotonic() + _QUIET_S
         self._unrefined = np.zeros((0, 3), np.int32)  # cells that viewers have with the raw surface
         self._refined = volume.kept_values()
 
@@ -130,6 +131,11 @@ class LiveMesh:
     def refine_waits(self) -> bool:
         """Whether viewers have cells that do not yet show the surface that the settings ask for."""
         return len(self._unrefined) > 0
+
+    @property
+    def quiet_wait(self) -> float:
+        """Seconds until no record has come for so long that the next one is not near."""
+        return max(self._quiet_from - time.monotonic(), 0.0)
 
     @property
     def refine_wait(self) -> float:
