@@ -56,7 +56,7 @@ def test_a_message_without_a_seal_is_an_older_versions(end: bytes) -> None:
 
 
 def test_random_bytes_are_not_taken_for_a_seal() -> None:
-    """Its sender would be asked for the same message again and again."""
+    """The sender of a message that is taken for a damaged one is asked for it again and again."""
     random = np.random.default_rng(0)
     assert not any(
         is_damaged(message.tobytes()) for message in random.integers(0, 256, (200_000, 12), np.uint8)

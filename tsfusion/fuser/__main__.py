@@ -49,7 +49,7 @@ def _remove_scratch_folder(endpoint: str) -> None:
 
 
 def _serve(link: sockets.AnySocket) -> int:
-    """Handle messages, mesh when it is time, and refine the mesh when there is nothing else to do.
+    """Handle messages, mesh when it is time, refine the mesh and compile when there is nothing else to do.
 
     Questions come before all that.
     """

@@ -50,9 +50,9 @@ if TYPE_CHECKING:
 _FOR_KEYFRAMES = 256 << 20  # bytes of working memory that meshes leave free
 _FOR_A_CHECKPOINT = 64 << 20  # bytes beyond both
 LOCK = "fuser.lock"  # in the map's folder
-_CARVING = 10  # times `quota_cost` where rays also vote for the free space before them
 _PATIENCE_S = 10.0  # for a record that the system refuses to read, or whose segment is not there
 _RETRY_MS = 500  # until it is tried again
+_CARVING = 10  # times `quota_cost` where rays also vote for the free space before them
 # Where keyframes leave as they come, each costs as much as another that comes: half of the time for moves
 _WINDOW_REST_FACTOR = 1.0
 _MORE_MS = 50  # milliseconds within which the next record comes, if the gateway said that one waits

@@ -2,7 +2,7 @@
 """The field carried into voxels that nobody saw, near where a surface breaks off (`tsdf/hole_filling.py`).
 
 Unseen voxels near a rim and the seen ones beside them are numbered into one list, as for the field
-regulariser, whose `bend` and `relax` then solve it: paper eq. 3 with no weight where nothing was seen.
+regulariser, whose `weigh` and `relax` then solve it: paper eq. 3 with no weight where nothing was seen.
 """
 
 import taichi as ti
