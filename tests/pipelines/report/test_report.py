@@ -20,7 +20,8 @@ from tsfusion.datasets.trajectory_files import read_poses, write_tum
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.up_direction import parse
 from tsfusion.pipelines import latency_ledger
-from tsfusion.pipelines.report import map_report, run_report, scene
+from tsfusion.pipelines.report import map_report, run_report, run_sections, scene
+from tsfusion.pipelines.report.findings import RunFindings
 from tsfusion.wire.keyframe_times import KeyframeTimes
 
 _EMPTY = frozenset(("meta", "img", "br", "input", "image", "path"))  # elements without an end
@@ -309,3 +310,13 @@ def test_a_state_folder_and_a_file_have_a_report(here: Here, tmp_path: Path) -> 
         found = Structure(page.read_text(encoding="utf-8"))
         assert run["map_hash"] in found.text
         assert all(word in found.text for word in words)
+
+
+@pytest.mark.parametrize(("server", "is_drawn"), [(0, False), (2e8, True)])
+def test_memory_that_is_not_known_is_not_drawn_as_none(server: float, is_drawn: bool) -> None:
+    """That of a server which somebody else started."""
+    columns = {"seconds": [0, 1], "map_bytes": [1e6, 2e6], "server_bytes": [server, server]}
+    growth = {name: np.array(values, float) for name, values in columns.items()}
+    drawn = run_sections.growth(RunFindings({}, [], [], growth, {}))
+    assert ("server, both processes" in drawn) == is_drawn
+    assert "Memory" in drawn

@@ -124,7 +124,11 @@ def growth(found: RunFindings) -> str:
         return page.note("Not known: the run was too short, or is of a version that did not write it down.")
     end = float(seconds.max())
     shown = []
-    memory = [(columns[name] / 1e6, style, text) for name, style, text in _MEMORY if name in columns]
+    memory = [  # of a server that is not the run's own, 0 stands for what is not known
+        (columns[name] / 1e6, style, text)
+        for name, style, text in _MEMORY
+        if name in columns and columns[name].any()
+    ]
     if memory:
         shown.append(_over_time(seconds, end, memory, "MB", "Memory"))
     if "blocks" in columns:
