@@ -10,6 +10,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any, cast
 
 import cv2
 import numpy as np
@@ -21,6 +22,7 @@ from small_recordings import first_views
 
 from tsfusion import Volume, VolumeConfig
 from tsfusion.core.output_folder import building
+from tsfusion.pipelines import replay
 
 RESULTS = {
     "mesh.ply", "mesh.glb", "preview.png", "delay.csv", "delay.png", "growth.csv", "keyframes.txt",
@@ -43,6 +45,47 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert done.returncode == 0, done.stderr
     (folder / "stdout.json").write_text(done.stdout)
     return folder
+
+
+class Clock:
+    """A recording whose reading takes time, and waits that end on the dot."""
+
+    def __init__(self, *reading: float) -> None:
+        self.now, self.reads, self._reading = 0.0, [], reading
+
+    def __len__(self) -> int:
+        return len(self._reading)
+
+    def __getitem__(self, index: int) -> int:
+        self.reads.append(round(self.now, 6))
+        self.now += self._reading[index]
+        return index
+
+    def wait_until(self, due: float) -> None:
+        self.now = max(self.now, due)
+
+
+@pytest.mark.parametrize(
+    ("reading", "rate", "reads", "yielded"),
+    [
+        ((0, 0.01, 0.01, 0.01), 4, [0, 0.47, 0.72], [0, 0.25, 0.5, 0.75]),  # when its time is near
+        ((0, 0.1, 0.1, 0.1), 4, [0, 0.25, 0.5], [0, 0.25, 0.5, 0.75]),  # a slow disk: at once
+        ((0, 0.01, 0.1, 0.01), 4, [0, 0.47, 0.57], [0, 0.25, 0.57, 0.82]),  # late once, never caught up
+        ((0, 0.1, 0.1, 0.1), None, [0, 0.1, 0.2], [0, 0.1, 0.2, 0.3]),
+    ],
+)
+def test_a_keyframe_at_a_rate_is_read_shortly_before_its_time(
+    reading: tuple[float, ...],
+    rate: float | None,
+    reads: list[float],
+    yielded: list[float],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    clock: Any = Clock(*reading)
+    monkeypatch.setattr(replay.time, "monotonic", lambda: clock.now)
+    came = [round(clock.now, 6) for _ in replay._keyframes(clock, cast(Any, 0), clock, rate)]
+    assert came == yielded
+    assert clock.reads == reads
 
 
 def test_replay_leaves_everything(run_folder: Path) -> None:
