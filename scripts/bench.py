@@ -9,7 +9,9 @@
 
 Open3D's VoxelBlockGrid runs beside, where `open3d` is installed (`pip install '.[bench]'`): in the same
 process, the same keyframes in turn, with the same range and truncation; its mesh is of voxels of weight 1 and
-of weight 2 on. `1thread` is one thread on one pinned core. Machines differ and are noisy: only `ratio` says
+of weight 2 on. In turn each finds the caches full of the other's map. `stream` are the same keyframes with
+nothing between them, first all of ours, then all of Open3D's, as a server fuses.
+`1thread` is one thread on one pinned core. Machines differ and are noisy: only `ratio` says
 who is faster. `field` meshes the default surface, `off` the raw one; `remesh` is the mesh of what a keyframe
 changed; `floor` the least time that memory traffic takes.
 With `--arch` the same keyframes go in turn to a map on that device; `ratio` has its wall time against the
@@ -195,10 +197,7 @@ def run_case(case: Case, threads: int, keyframes: int, arch: str) -> dict[str, A
     if threads == 1 and arch == "cpu":  # the process that has the device would be on the same core
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     source = Source(case.source, keyframes)
-    peer = None
-    if source.sensor == "kinect" and not unimportable("open3d"):
-        color = bool(case.settings.get("color"))
-        peer = Open3D(case.voxel_size, max_range=MAX_RANGE, truncation=TRUNCATION, color=color)
+    peer = new_peer(case) if source.sensor == "kinect" and not unimportable("open3d") else None
     ours = run(case, source, threads, peer, arch)
     row = {"case": case.name, "voxel_size": case.voxel_size, "settings": case.settings, "ratio": {}, **ours}
     if device := row.get("device"):
@@ -208,6 +207,9 @@ def run_case(case: Case, threads: int, keyframes: int, arch: str) -> dict[str, A
         beside = row["open3d"]
         spent = row["keyframe"]["cpu_ms_median"] / beside["keyframe"]["cpu_ms_median"]
         row["ratio"]["keyframe"] = round(spent, 3)
+        beside["stream"] = stream(new_peer(case), source)
+        spent = row["stream"]["cpu_ms_median"] / beside["stream"]["cpu_ms_median"]
+        row["ratio"]["stream"] = round(spent, 3)
         for weight in (1, 2):
             peer.mesh_weight = float(weight)
             mesh, cpu_ms = timed_mesh(peer.extract_mesh)
@@ -217,6 +219,17 @@ def run_case(case: Case, threads: int, keyframes: int, arch: str) -> dict[str, A
             }  # fmt: skip
             row["ratio"][f"mesh_weight_{weight}"] = round(row["mesh_cpu_ms"] / cpu_ms, 3)
     return {**row, **surroundings(threads)}
+
+
+def new_peer(case: Case) -> Open3D:
+    """Open3D's map, empty, for the same keyframes."""
+    color = bool(case.settings.get("color"))
+    return Open3D(case.voxel_size, max_range=MAX_RANGE, truncation=TRUNCATION, color=color)
+
+
+def stream(fuses: Any, source: Source) -> dict[str, float]:
+    """Figures of the keyframes that an empty map takes one after the other, with nothing between them."""
+    return figures(timed_keyframes(source.fused, fuses.integrate)[0])
 
 
 def run(case: Case, source: Source, threads: int, peer: Open3D | None, arch: str) -> dict[str, Any]:
@@ -251,7 +264,8 @@ def run(case: Case, source: Source, threads: int, peer: Open3D | None, arch: str
     mesh, mesh_cpu_ms = timed_mesh(volume.extract_mesh)
     stats = volume.stats()
     row = {
-        "keyframe": figures(spent[0]), "stages_cpu_ms": stages_cpu_ms, "start_s": round(start_s, 2),
+        "keyframe": figures(spent[0]), "stream": stream(Volume(**settings), source),
+        "stages_cpu_ms": stages_cpu_ms, "start_s": round(start_s, 2),
         "remesh": figures(spent[1]), "mesh_cpu_ms": mesh_cpu_ms, "triangles": len(mesh.faces),
         "map_bytes": stats.bytes, "blocks": stats.blocks, "bytes_per_block": stats.bytes_per_block,
         "map_hash": volume.map_hash(), "error_mm": source.error_mm(mesh.vertices, mesh.faces),
