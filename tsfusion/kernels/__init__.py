@@ -1,14 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Taichi kernels: free functions over NumPy arrays; the state they work on lives in their callers.
-
-The run loop. Taichi 1.7's CPU backend hands out a parallel loop in runs of 512 iterations, whatever
-`block_dim` says (measured: a loop of 512 heavy iterations ran on one thread). Where one unit of work is
-heavy (a band of rays, a block), a kernel gives each unit a whole run and works in its first iteration:
-
-    for run in range(count * RUN):  # run loop
-        if run % RUN == 0:
-            unit = run // RUN
-"""
+"""Taichi kernels: free functions over NumPy arrays; the state they work on lives in their callers."""
 
 import inspect
 import os

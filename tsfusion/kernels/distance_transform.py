@@ -12,7 +12,8 @@ Grids are flat arrays of (X, Y, Z), z fastest. A site is a voxel at the surface.
 import taichi as ti
 
 from tsfusion.kernels.quick_launch import QuickLaunch
-from tsfusion.kernels.voxel_traversal import RUN, vec3i
+from tsfusion.kernels.run_loop import runs, unit_of
+from tsfusion.kernels.voxel_traversal import vec3i
 
 BANDS = 64  # units of parallel work; fixed, so that nothing depends on the thread count
 FAR = 1 << 30  # squared distance where no site is near
@@ -138,9 +139,9 @@ def spread_along_lines(
     `most`, squared, is far.
     `stack` (bands, length, 2): of each parabola on the envelope its place, and where it begins to count.
     """
-    for run in range(BANDS * RUN):  # run loop: kernels/__init__.py
-        if run % RUN == 0:
-            band = run // RUN
+    for run in range(runs(BANDS)):  # run loop: kernels/run_loop.py
+        band = unit_of(run, BANDS)
+        if band < BANDS:
             count = last_line - first_line
             for line in range(first_line + count * band // BANDS, first_line + count * (band + 1) // BANDS):
                 outer, within = line // inner, line % inner

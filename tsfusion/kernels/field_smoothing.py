@@ -22,9 +22,9 @@ import taichi as ti
 
 from tsfusion.kernels.integrate import lane_weight
 from tsfusion.kernels.quick_launch import QuickLaunch
+from tsfusion.kernels.run_loop import runs, unit_of
 from tsfusion.kernels.sensor_noise import WEIGHT_ONE
 from tsfusion.kernels.surface_cells import lowest
-from tsfusion.kernels.voxel_traversal import RUN
 
 AT_ONCE = 3  # steps of a launch
 ABREAST = 4  # voxels of an iteration, whose number divides the list's: the last ones of it may be nobody
@@ -53,9 +53,9 @@ def mark_voxels(
     counts: ti.types.ndarray(dtype=ti.i32, ndim=2),
 ):
     """Mark the voxels of each block that were seen within `reach` quanta of the surface."""
-    for run in range(values.shape[0] * RUN):  # run loop: kernels/__init__.py
-        if run % RUN == 0:
-            b = run // RUN
+    for run in range(runs(values.shape[0])):  # run loop: kernels/run_loop.py
+        b = unit_of(run, values.shape[0])
+        if b < values.shape[0]:
             for word in range(planes.shape[1]):
                 plane = ti.u64(0)
                 for j in range(64):  # LLVM makes vectors of it
@@ -111,9 +111,9 @@ def list_voxels(
     x: ti.types.ndarray(dtype=ti.f32, ndim=1),
 ):
     """Fill the list: each voxel's value, its weight in full-confidence samples, and its neighbours."""
-    for run in range(values.shape[0] * RUN):  # run loop: kernels/__init__.py
-        if run % RUN == 0:
-            b = run // RUN
+    for run in range(runs(values.shape[0])):  # run loop: kernels/run_loop.py
+        b = unit_of(run, values.shape[0])
+        if b < values.shape[0]:
             for word in range(planes.shape[1]):
                 left = planes[b, word]
                 i = places[b, word]
@@ -146,9 +146,9 @@ def mark_parents(
     coarse_counts: ti.types.ndarray(dtype=ti.i32, ndim=2),
 ):
     """Mark the cells that hold a listed finer cell."""
-    for run in range(planes.shape[0] * RUN):  # run loop: kernels/__init__.py
-        if run % RUN == 0:
-            b = run // RUN
+    for run in range(runs(planes.shape[0])):  # run loop: kernels/run_loop.py
+        b = unit_of(run, planes.shape[0])
+        if b < planes.shape[0]:
             for word in range(coarse_planes.shape[1]):
                 coarse_planes[b, word] = ti.u64(0)
             for word in range(planes.shape[1]):
@@ -206,9 +206,9 @@ def list_parents(
 
     Each value is moved to the cell's centre along its own slope: ramps stay ramps where cells are missing.
     """
-    for run in range(planes.shape[0] * RUN):  # run loop: kernels/__init__.py
-        if run % RUN == 0:
-            b = run // RUN
+    for run in range(runs(planes.shape[0])):  # run loop: kernels/run_loop.py
+        b = unit_of(run, planes.shape[0])
+        if b < planes.shape[0]:
             for word in range(coarse_planes.shape[1]):
                 left = coarse_planes[b, word]
                 i = coarse_places[b, word]
@@ -252,9 +252,9 @@ def refine(
     x: ti.types.ndarray(dtype=ti.f32, ndim=1),
 ):
     """Start the finer cells from the coarse solution, linear inside each coarse cell."""
-    for run in range(planes.shape[0] * RUN):  # run loop: kernels/__init__.py
-        if run % RUN == 0:
-            b = run // RUN
+    for run in range(runs(planes.shape[0])):  # run loop: kernels/run_loop.py
+        b = unit_of(run, planes.shape[0])
+        if b < planes.shape[0]:
             for word in range(planes.shape[1]):
                 left = planes[b, word]
                 k = places[b, word]
@@ -392,9 +392,9 @@ def write_values(
     values: ti.types.ndarray(dtype=ti.f32, ndim=2),
 ):
     """The field where it was solved; other values stay."""
-    for run in range(planes.shape[0] * RUN):  # run loop: kernels/__init__.py
-        if run % RUN == 0:
-            b = run // RUN
+    for run in range(runs(planes.shape[0])):  # run loop: kernels/run_loop.py
+        b = unit_of(run, planes.shape[0])
+        if b < planes.shape[0]:
             for word in range(planes.shape[1]):
                 left = planes[b, word]
                 i = places[b, word]

@@ -10,8 +10,9 @@ import taichi as ti
 from tsfusion.kernels.field_smoothing import count_bits, link, without_lowest
 from tsfusion.kernels.integrate import CUBE
 from tsfusion.kernels.normal_smoothing import block_at, value_at
+from tsfusion.kernels.run_loop import runs, unit_of
 from tsfusion.kernels.surface_cells import case_of, corner_planes, lowest
-from tsfusion.kernels.voxel_traversal import RUN, offset_in_block, vec3i, voxel_of
+from tsfusion.kernels.voxel_traversal import offset_in_block, vec3i, voxel_of
 from tsfusion.kernels.voxel_values import BANDS
 
 UNSEEN = 1  # voxels to solve
@@ -30,9 +31,9 @@ def find_rims(
     rims: ti.types.ndarray(dtype=ti.u8, ndim=2),
 ):
     """1 for each seen voxel that the surface passes and that has an unseen one among the 26 around."""
-    for run in range(values.shape[0] * RUN):  # run loop: kernels/__init__.py
-        if run % RUN == 0:
-            b = run // RUN
+    for run in range(runs(values.shape[0])):  # run loop: kernels/run_loop.py
+        b = unit_of(run, values.shape[0])
+        if b < values.shape[0]:
             for o in range(CUBE):
                 here = values[b, o]
                 is_rim = 0
@@ -108,9 +109,9 @@ def mark_unseen(
     Threads that meet write the same.
     """
     count = values.shape[0]
-    for run in range(count * RUN):  # run loop: kernels/__init__.py
-        if run % RUN == 0:
-            b = run // RUN
+    for run in range(runs(count)):  # run loop: kernels/run_loop.py
+        b = unit_of(run, count)
+        if b < count:
             for o in range(CUBE):
                 if rims[b, o] == 1:
                     p = voxel_of(o)
@@ -144,9 +145,9 @@ def take_marked(
     counts: ti.types.ndarray(dtype=ti.i32, ndim=2),
 ):
     """Take the voxels to solve and the seen ones up to `RING` before or behind them along an axis."""
-    for run in range(values.shape[0] * RUN):  # run loop: kernels/__init__.py
-        if run % RUN == 0:
-            b = run // RUN
+    for run in range(runs(values.shape[0])):  # run loop: kernels/run_loop.py
+        b = unit_of(run, values.shape[0])
+        if b < values.shape[0]:
             for word in range(planes.shape[1]):
                 plane = ti.u64(0)
                 for j in range(64):
@@ -179,9 +180,9 @@ def list_marked(
     layer: ti.types.ndarray(dtype=ti.i32, ndim=1),
 ):
     """Fill the list: the value and weight of each seen voxel, none of the others, and the neighbours."""
-    for run in range(values.shape[0] * RUN):  # run loop: kernels/__init__.py
-        if run % RUN == 0:
-            b = run // RUN
+    for run in range(runs(values.shape[0])):  # run loop: kernels/run_loop.py
+        b = unit_of(run, values.shape[0])
+        if b < values.shape[0]:
             for word in range(planes.shape[1]):
                 left = planes[b, word]
                 i = places[b, word]
@@ -242,9 +243,9 @@ def mark_guessed_faces(
     guessed: ti.types.ndarray(dtype=ti.u8, ndim=1),
 ):
     """1 for each triangle, in the order of `emit_faces`, of a cell with a corner that nobody saw."""
-    for run in range(BANDS * RUN):  # run loop: kernels/__init__.py
-        if run % RUN == 0:
-            band = run // RUN
+    for run in range(runs(BANDS)):  # run loop: kernels/run_loop.py
+        band = unit_of(run, BANDS)
+        if band < BANDS:
             for r in range(count * band // BANDS, count * (band + 1) // BANDS):
                 face = first[r, 1]
                 if face < first[r + 1, 1]:

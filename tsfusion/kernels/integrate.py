@@ -44,12 +44,12 @@ from tsfusion.kernels.rays_abreast import (
     walk,
     window_of,
 )
+from tsfusion.kernels.run_loop import runs, unit_of
 from tsfusion.kernels.voxel_traversal import (
     ADDED,
     COUNT,
     DEFERRED,
     NEVER,
-    RUN,
     SHARED,
     START,
     UNIT,
@@ -400,10 +400,11 @@ def add_rays(
     adds to it alone, without atomics. Rays that cross blocks of other units are listed, too, for
     `add_shared_rays`. The layers are flat: slot · 512 + offset.
     """
-    for run in range(job[UNITS] * RUN):  # run loop: kernels/__init__.py
-        if run % RUN == 0:
+    for run in range(runs(job[UNITS])):  # run loop: kernels/run_loop.py
+        unit = unit_of(run, job[UNITS])
+        if unit < job[UNITS]:
             add_bands(
-                run // RUN, rays, bands, again, job, hash_keys, hash_slots, missing, scratch, owners, stamps,
+                unit, rays, bands, again, job, hash_keys, hash_slots, missing, scratch, owners, stamps,
                 places, dirty, touched, sums, color_rgn, color_b, False,
             )  # fmt: skip
 
@@ -432,10 +433,11 @@ def add_shared_rays(
 
     A kernel of its own, because one thread need not wait until it is compiled.
     """
-    for run in range(job[UNITS] * RUN):
-        if run % RUN == 0:
+    for run in range(runs(job[UNITS])):  # run loop: kernels/run_loop.py
+        unit = unit_of(run, job[UNITS])
+        if unit < job[UNITS]:
             add_bands(
-                run // RUN, rays, bands, again, job, hash_keys, hash_slots, missing, scratch, owners, stamps,
+                unit, rays, bands, again, job, hash_keys, hash_slots, missing, scratch, owners, stamps,
                 places, dirty, touched, sums, color_rgn, color_b, True,
             )  # fmt: skip
 
@@ -449,9 +451,10 @@ def largest_weights(
 ):
     """`bounds[slot]` = the largest weight lane in each touched block."""
     count = touched[TOUCHED_COUNT]
-    for run in range(count * RUN):  # run loop: kernels/__init__.py
-        if run % RUN == 0:
-            slot = touched[TOUCHED_HEADER + run // RUN]
+    for run in range(runs(count)):  # run loop: kernels/run_loop.py
+        n = unit_of(run, count)
+        if n < count:
+            slot = touched[TOUCHED_HEADER + n]
             most = 0
             for v in range(CUBE):
                 most = ti.max(most, lane_weight(sums[slot, v]))

@@ -5,7 +5,8 @@ import taichi as ti
 
 from tsfusion.kernels.block_hash import map_find
 from tsfusion.kernels.integrate import QUANTA_PER_VOXEL, lane_weight
-from tsfusion.kernels.voxel_traversal import RUN, VOXEL_LIMIT, block_key, offset_in_block, vec3i
+from tsfusion.kernels.run_loop import runs, unit_of
+from tsfusion.kernels.voxel_traversal import VOXEL_LIMIT, block_key, offset_in_block, vec3i
 from tsfusion.kernels.voxel_values import BANDS, distance_as_float
 
 vec3d = ti.types.vector(3, ti.f64)
@@ -39,9 +40,10 @@ def read_columns(
     these are `along_row`, `along_column`, `along_height` apart, in voxels, from `corner` on.
     """
     mask = map_keys.shape[0] - 1
-    for run in range(BANDS * RUN):  # run loop: kernels/__init__.py
-        if run % RUN == 0:
-            band, count = run // RUN, cells.shape[0]
+    for run in range(runs(BANDS)):  # run loop: kernels/run_loop.py
+        band = unit_of(run, BANDS)
+        if band < BANDS:
+            count = cells.shape[0]
             last, slot = vec3i(2147483647), -1
             for n in range(count * band // BANDS, count * (band + 1) // BANDS):
                 cell = cells[n]

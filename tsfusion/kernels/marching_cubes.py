@@ -9,8 +9,9 @@ the number of bits before its own.
 import taichi as ti
 
 from tsfusion.kernels.quick_launch import QuickLaunch
+from tsfusion.kernels.run_loop import runs, unit_of
 from tsfusion.kernels.surface_cells import case_of, corner_planes, lowest
-from tsfusion.kernels.voxel_traversal import RUN, unpack, vec3i
+from tsfusion.kernels.voxel_traversal import unpack, vec3i
 from tsfusion.kernels.voxel_values import BANDS
 
 PAD = 11  # a block with one voxel before and two behind
@@ -163,9 +164,9 @@ def emit_vertices(
     colors: ti.types.ndarray(dtype=ti.u8, ndim=2),
 ):
     """Position, unit normal and colour of every vertex: where the value crosses zero along its edge."""
-    for run in range(BANDS * RUN):  # run loop: kernels/__init__.py
-        if run % RUN == 0:
-            band = run // RUN
+    for run in range(runs(BANDS)):  # run loop: kernels/run_loop.py
+        band = unit_of(run, BANDS)
+        if band < BANDS:
             for r in range(count * band // BANDS, count * (band + 1) // BANDS):
                 if first[r, 0] < first[r + 1, 0]:
                     low = 8
@@ -224,9 +225,9 @@ def emit_faces(
     faces: ti.types.ndarray(dtype=ti.i32, ndim=2),
 ):
     """Triangles of each cell, as the numbers of the vertices on its edges."""
-    for run in range(BANDS * RUN):  # run loop: kernels/__init__.py
-        if run % RUN == 0:
-            band = run // RUN
+    for run in range(runs(BANDS)):  # run loop: kernels/run_loop.py
+        band = unit_of(run, BANDS)
+        if band < BANDS:
             for r in range(count * band // BANDS, count * (band + 1) // BANDS):
                 face = first[r, 1]
                 if face < first[r + 1, 1]:

@@ -9,7 +9,8 @@ import taichi as ti
 
 from tsfusion.kernels.integrate import CUBE
 from tsfusion.kernels.quick_launch import QuickLaunch
-from tsfusion.kernels.voxel_traversal import RUN, offset_in_block, vec3i, voxel_of
+from tsfusion.kernels.run_loop import runs, unit_of
+from tsfusion.kernels.voxel_traversal import offset_in_block, vec3i, voxel_of
 
 vec3f = ti.types.vector(3, ti.f32)
 
@@ -58,9 +59,9 @@ def smooth_along_normals(
     smoothed: ti.types.ndarray(dtype=ti.f32, ndim=2),
 ):
     """Replace the values within `reach` of the surface."""
-    for run in range(rows.shape[0] * RUN):  # run loop: kernels/__init__.py
-        if run % RUN == 0:
-            r = run // RUN
+    for run in range(runs(rows.shape[0])):  # run loop: kernels/run_loop.py
+        r = unit_of(run, rows.shape[0])
+        if r < rows.shape[0]:
             for o in range(CUBE):
                 here = ti.math.nan
                 if rows[r] >= 0:

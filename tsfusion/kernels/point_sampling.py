@@ -13,8 +13,9 @@ import taichi as ti
 from tsfusion.kernels.block_hash import map_find
 from tsfusion.kernels.integrate import CUBE, QUANTA_PER_VOXEL, lane_distance, lane_weight
 from tsfusion.kernels.quick_launch import QuickLaunch
+from tsfusion.kernels.run_loop import runs, unit_of
 from tsfusion.kernels.sensor_noise import WEIGHT_ONE
-from tsfusion.kernels.voxel_traversal import RUN, VOXEL_LIMIT, offset_in_block, pack, vec3i
+from tsfusion.kernels.voxel_traversal import VOXEL_LIMIT, offset_in_block, pack, vec3i
 
 ONE = 65536.0  # of a voxel
 UNKNOWN = -2  # slot of a block that was not looked up
@@ -163,9 +164,9 @@ def list_blocks(
 ):
     """Mark the slots of the blocks whose voxels `interpolate` reads."""
     count = points.shape[0]
-    for run in range((count + BAND - 1) // BAND * RUN):  # run loop: kernels/__init__.py
-        if run % RUN == 0:
-            first = run // RUN * BAND
+    for run in range(runs((count + BAND - 1) // BAND)):  # run loop: kernels/run_loop.py
+        first = unit_of(run, (count + BAND - 1) // BAND) * BAND
+        if first < count:
             last = vec3i(2147483647)
             near = corners_i(UNKNOWN)
             for n in range(first, ti.min(first + BAND, count)):
@@ -196,9 +197,10 @@ def pair(
 
     What `interpolate` reads of a point lies together then: at points in random order it waits for memory.
     """
-    for run in range(BANDS * RUN):  # run loop: kernels/__init__.py
-        if run % RUN == 0:
-            band, count = run // RUN, slots.shape[0]
+    for run in range(runs(BANDS)):  # run loop: kernels/run_loop.py
+        band = unit_of(run, BANDS)
+        if band < BANDS:
+            count = slots.shape[0]
             for n in range(count * band // BANDS, count * (band + 1) // BANDS):
                 slot = slots[n]
                 for o in range(CUBE):
@@ -225,9 +227,9 @@ def interpolate(
     """Distance in metres, weight in full samples, and gradient at every point."""
     count = points.shape[0]
     metres = ti.cast(1.0 / (per_metre * QUANTA_PER_VOXEL), ti.f32)
-    for run in range((count + BAND - 1) // BAND * RUN):  # run loop: kernels/__init__.py
-        if run % RUN == 0:
-            first = run // RUN * BAND
+    for run in range(runs((count + BAND - 1) // BAND)):  # run loop: kernels/run_loop.py
+        first = unit_of(run, (count + BAND - 1) // BAND) * BAND
+        if first < count:
             last = vec3i(2147483647)
             near = corners_i(UNKNOWN)
             for n in range(first, ti.min(first + BAND, count)):
@@ -288,10 +290,11 @@ def interpolate_within(
     count = points.shape[0]
     metres = ti.cast(1.0 / (per_metre * QUANTA_PER_VOXEL), ti.f32)
     along = vec3i(size[1] * size[2], size[2], 1)
-    for run in range((count + BAND - 1) // BAND * RUN):  # run loop: kernels/__init__.py
-        if run % RUN == 0:
+    for run in range(runs((count + BAND - 1) // BAND)):  # run loop: kernels/run_loop.py
+        band = unit_of(run, (count + BAND - 1) // BAND)
+        if band * BAND < count:
             for part in range(BAND // BATCH):
-                first = run // RUN * BAND + part * BATCH
+                first = band * BAND + part * BATCH
                 end = ti.min(first + BATCH, count)
                 for n in range(first, end):
                     place, inside = place_of(points, n, per_metre)

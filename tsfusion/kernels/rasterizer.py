@@ -9,7 +9,7 @@ Triangles whose back is turned are not drawn, so a room opens like a doll's hous
 import taichi as ti
 import taichi.math as tm
 
-from tsfusion.kernels.voxel_traversal import RUN
+from tsfusion.kernels.run_loop import runs, unit_of
 
 EMPTY = (1 << 63) - 1
 OVERLAP = 5e-4  # pixels that a triangle is wider by: where neighbours are rounded otherwise there is no gap
@@ -157,9 +157,9 @@ def look_up(
     height, width = seen.shape[0], seen.shape[1]
     per_pixel = 1.0 / focal
     is_more = normals.shape[0] + colors.shape[0] > 0
-    for run in range(BANDS * RUN):  # run loop: kernels/__init__.py
-        if run % RUN == 0:
-            band = run // RUN
+    for run in range(runs(BANDS)):  # run loop: kernels/run_loop.py
+        band = unit_of(run, BANDS)
+        if band < BANDS:
             last = -1  # triangle
             edges, towards, tints = tm.mat3(0.0), tm.mat3(0.0), tm.mat3(0.0)
             for v in range(height * band // BANDS, height * (band + 1) // BANDS):

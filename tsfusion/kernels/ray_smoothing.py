@@ -44,10 +44,10 @@ from tsfusion.kernels.rays_abreast import (
     walk,
     window_of,
 )
+from tsfusion.kernels.run_loop import runs, unit_of
 from tsfusion.kernels.voxel_traversal import (
     COUNT,
     MAX_CROSSED,
-    RUN,
     START,
     UNIT,
     pack,
@@ -224,9 +224,9 @@ def smooth_rays(
     the length of the list of voxels that have votes, then their places in `votes`, or `NO_VOXEL`; each unit
     takes `CHUNK` of its places at a time.
     """
-    for run in range(units * RUN):  # run loop: kernels/__init__.py
-        if run % RUN == 0:
-            unit = run // RUN
+    for run in range(runs(units)):  # run loop: kernels/run_loop.py
+        unit = unit_of(run, units)
+        if unit < units:
             base, at_signal = unit * UNIT_SCRATCH, unit * SIGNAL_FIELDS * SIGNAL
             at_crossed = unit * CROSSED_FIELDS * SIGNAL
             for i in range(WINDOWS):

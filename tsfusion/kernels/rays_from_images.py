@@ -12,6 +12,7 @@ One unit of parallel work is a band, a contiguous run of tiles with a region of 
 import taichi as ti
 
 from tsfusion.kernels.quick_launch import QuickLaunch
+from tsfusion.kernels.run_loop import runs, unit_of
 from tsfusion.kernels.sensor_noise import (
     CARVES_SPACE,
     DROPS_LONE_SAMPLES,
@@ -29,7 +30,7 @@ from tsfusion.kernels.sensor_noise import (
     vec3,
 )
 from tsfusion.kernels.unfused import cross, dot, norm, product, quotient
-from tsfusion.kernels.voxel_traversal import RUN, vec3i, write_band, write_ray
+from tsfusion.kernels.voxel_traversal import vec3i, write_band, write_ray
 
 TILE = 12  # divided by both sides of every cell
 TILE_SAMPLES = TILE * TILE
@@ -458,9 +459,9 @@ def rays_from_image(
     tiles = tiles_x * ((image.shape[0] + TILE - 1) // TILE)
     count = bands.shape[0]
     unit = model[VOXEL_SIZE] / 1024.0  # metres
-    for run in range(count * RUN):  # run loop: kernels/__init__.py
-        if run % RUN == 0:
-            band = run // RUN
+    for run in range(runs(count)):  # run loop: kernels/run_loop.py
+        band = unit_of(run, count)
+        if band < count:
             camera = camera_of(camera_rows)
             reading = reading_of(model, is_disparity, scale, has_confidence)
             first_tile = ti.cast(ti.cast(band, ti.i64) * tiles // count, ti.i32)

@@ -8,6 +8,7 @@ One unit of parallel work is a band, a contiguous run of points with a region of
 import taichi as ti
 
 from tsfusion.kernels.quick_launch import QuickLaunch
+from tsfusion.kernels.run_loop import runs, unit_of
 from tsfusion.kernels.sensor_noise import (
     MAX_RANGE,
     MIN_RANGE,
@@ -22,7 +23,7 @@ from tsfusion.kernels.sensor_noise import (
     vec3f,
 )
 from tsfusion.kernels.unfused import dot, norm
-from tsfusion.kernels.voxel_traversal import RUN, write_band, write_ray
+from tsfusion.kernels.voxel_traversal import write_band, write_ray
 
 
 @ti.func
@@ -112,9 +113,9 @@ def rays_from_points(
     nearest = ti.cast(model[MIN_RANGE] * model[MIN_RANGE], ti.f32)
     farthest = ti.cast(model[MAX_RANGE] * model[MAX_RANGE], ti.f32)
     spread = ti.cast(model[VOXEL_SIZE] * model[VOXEL_SIZE], ti.f32)
-    for run in range(bands.shape[0] * RUN):  # run loop: kernels/__init__.py
-        if run % RUN == 0:
-            band = run // RUN
+    for run in range(runs(bands.shape[0])):  # run loop: kernels/run_loop.py
+        band = unit_of(run, bands.shape[0])
+        if band < bands.shape[0]:
             first_point = ti.cast(ti.cast(band, ti.i64) * count // bands.shape[0], ti.i32)
             last_point = ti.cast(ti.cast(band + 1, ti.i64) * count // bands.shape[0], ti.i32)
             out, samples, total_weight, total_cost = first_point, 0, 0, ti.i64(0)

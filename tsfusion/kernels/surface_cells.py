@@ -13,7 +13,8 @@ import taichi as ti
 
 from tsfusion.kernels.block_hash import map_find
 from tsfusion.kernels.quick_launch import QuickLaunch
-from tsfusion.kernels.voxel_traversal import RUN, hash_key
+from tsfusion.kernels.run_loop import runs, unit_of
+from tsfusion.kernels.voxel_traversal import hash_key
 from tsfusion.kernels.voxel_values import BANDS
 
 AROUND = 27
@@ -285,9 +286,9 @@ def find_cells(
         state[r, 0] = 0
     for n in range(wanted_count):
         state[map_find(table, table_rows, table.shape[0] - 1, wanted[n]), 0] = 1
-    for run in range(BANDS * RUN):  # run loop: kernels/__init__.py
-        if run % RUN == 0:
-            band = run // RUN
+    for run in range(runs(BANDS)):  # run loop: kernels/run_loop.py
+        band = unit_of(run, BANDS)
+        if band < BANDS:
             for r in range(count * band // BANDS, count * (band + 1) // BANDS):
                 state[r, 1] = find_signs(r, values, seen, inside)
                 find_around(r, count, keys, table, table_rows, around)
@@ -297,18 +298,18 @@ def find_cells(
         clear_planes(active, r)
         for k in range(4):
             state[r, k] = 0
-    for run in range(BANDS * RUN):  # run loop: kernels/__init__.py
-        if run % RUN == 0:
-            band = run // RUN
+    for run in range(runs(BANDS)):  # run loop: kernels/run_loop.py
+        band = unit_of(run, BANDS)
+        if band < BANDS:
             for r in range(count * band // BANDS, count * (band + 1) // BANDS):
                 state[r, 2] = 0
                 if state[r, 0] == 1 and signs_around(state, around, r) == 3:
                     state[r, 2] = find_active(r, around, seen, inside, active, triangle_count)
                 else:
                     clear_planes(active, r)
-    for run in range(BANDS * RUN):  # run loop: kernels/__init__.py
-        if run % RUN == 0:
-            band = run // RUN
+    for run in range(runs(BANDS)):  # run loop: kernels/run_loop.py
+        band = unit_of(run, BANDS)
+        if band < BANDS:
             for r in range(count * band // BANDS, count * (band + 1) // BANDS):
                 state[r, 3] = 0
                 if triangles_around(state, around, r) > 0:

@@ -28,7 +28,6 @@ START, COUNT, SAMPLES, WEIGHT, DEFERRED, UPDATES, ADDED, COST, UNIT, SHARED = 0,
 MAX_CROSSED = 64  # voxels in one ray's band: 2 · 16 · √3 and the ends
 VOXEL_LIMIT = 1 << 20  # |voxel coordinate| < VOXEL_LIMIT − 64, so that a band stays inside 21 bits
 
-RUN = 512  # iterations that one thread takes at a time: kernels/__init__.py explains the run loop
 
 DIRECTION_ONE = 1 << 16
 FAR_COST = 5  # measured: 100 ns instead of 20 a voxel

@@ -6,7 +6,7 @@ import taichi as ti
 from tsfusion.kernels.block_hash import map_find
 from tsfusion.kernels.integrate import CUBE, WEIGHT_BITS, lane_weight
 from tsfusion.kernels.quick_launch import QuickLaunch
-from tsfusion.kernels.voxel_traversal import RUN
+from tsfusion.kernels.run_loop import runs, unit_of
 
 BANDS = 64  # units of parallel work; fixed, so that nothing depends on the thread count
 
@@ -38,9 +38,9 @@ def read_values(
 ):
     """Row r of `values`: smoothed or raw values of block `keys[r]` in quanta; NaN below `min_weight`."""
     mask = map_keys.shape[0] - 1
-    for run in range(BANDS * RUN):  # run loop: kernels/__init__.py
-        if run % RUN == 0:
-            band = run // RUN
+    for run in range(runs(BANDS)):  # run loop: kernels/run_loop.py
+        band = unit_of(run, BANDS)
+        if band < BANDS:
             for r in range(count * band // BANDS, count * (band + 1) // BANDS):
                 slot = map_find(map_keys, map_slots, mask, keys[r])
                 for start in range(CUBE // STRIDE):
