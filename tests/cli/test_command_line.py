@@ -51,6 +51,27 @@ def test_a_sensor_brings_its_usual_voxel_size(
     assert ("voxels: 0.1 m, usual for a lidar" in capsys.readouterr().err) == (voxel_size == 0.1)
 
 
+@pytest.mark.parametrize(
+    ("recorded", "file", "flags", "voxel_size"),
+    [
+        ("stereo", "", {}, 0.1), ("stereo", "", {"voxel_size": 0.3}, 0.3),
+        ("stereo", "voxel_size = 0.05", {}, 0.05), ("stereo", "", {"sensor": "kinect"}, 0.02),
+    ],
+)  # fmt: skip
+def test_a_recording_of_a_street_brings_its_usual_voxel_size(
+    recorded: str,
+    file: str,
+    flags: dict[str, Any],
+    voxel_size: float,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    (tmp_path / "mine.toml").write_text(f"[volume]\n{file}\n")
+    found = options.configuration_for(recorded, tmp_path / "mine.toml", usual=0.1, tell=True, **flags).volume
+    assert found.voxel_size == voxel_size
+    assert ("usual for this recording" in capsys.readouterr().err) == (voxel_size == 0.1)
+
+
 def scene(folder: Path, *, pose: str | None = None, depth: bytes | None = None) -> Path:
     """A one-frame dataset in the 7-Scenes layout."""
     seven_scenes(folder, 1, (48, 64))

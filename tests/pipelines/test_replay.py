@@ -121,6 +121,19 @@ def test_a_lidars_map_has_voxels_that_its_points_fill(data: Callable[[str], Path
     assert run["mesh"]["triangles"] > 50_000
 
 
+def test_a_streets_map_has_voxels_that_a_keyframe_can_fill_in_time(
+    data: Callable[[str], Path], tmp_path: Path
+) -> None:
+    """At 2 cm the first keyframes of KITTI 06 were refused: 41,000 new blocks."""
+    out = tmp_path / "out"
+    done = tsfusion("replay", data("kitti_odometry"), "--sequence", "06", "--max-frames", 2, "--out", out)
+    assert done.returncode == 0, done.stderr
+    assert "voxels: 0.1 m, usual for this recording (--voxel-size gives others)" in done.stderr
+    run = json.loads((out / "run.json").read_text())
+    assert run["config"]["volume"]["voxel_size"] == 0.1
+    assert (run["keyframes_fused"], run["keyframes_rejected"]) == (2, {})
+
+
 def test_a_replay_says_where_up_is_and_its_glb_stands(run_folder: Path) -> None:
     """The room's z is up: found by its floor, named in run.json and in the PLY, +Y in the GLB."""
     out = run_folder / "out"

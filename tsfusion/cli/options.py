@@ -32,7 +32,7 @@ _map_option = functools.partial(option, panel="Map")
 # By name: a setting of the `volume` table, or one that `configuration` turns into some.
 MAP_OPTIONS: dict[str, Any] = {
     "voxel_size": Annotated[float | None, _map_option(
-        "--voxel-size", "METRES", "Edge of a voxel (0.02; LiDAR 0.1).")],
+        "--voxel-size", "METRES", "Edge of a voxel (0.02; LiDAR, KITTI 0.1).")],
     "sensor": Annotated[str | None, _map_option(
         "--sensor", "NAME", "kinect, tof, realsense, stereo, lidar, scanner.",
         autocompletion=lambda: ["kinect", "tof", "realsense", "stereo", "lidar", "scanner"])],
@@ -190,27 +190,31 @@ def configuration_for(
     file: Path | None,
     /,
     *,
+    usual: float | None = None,
     tell: bool = False,
     preset: dict[str, Any] | None = None,
     **flags: Any,
 ) -> "Config":
-    """`configuration` where a recording says its sensor; that which is chosen in the end has usual voxels.
+    """`configuration` where a recording says its sensor, and maybe which voxels are usual for it; else those
+    of the sensor that is chosen in the end.
 
     Args:
         recorded: name of the recording's sensor; None = it says none.
-        tell: say so where the sensor decides how large voxels are.
+        usual: metres, of the recording; None = it says none.
+        tell: say so where one of them decides how large voxels are.
         preset: as of `configuration`.
     """
     from tsfusion.core.config import USUAL_VOXEL_SIZES
 
     preset = (preset or {}) | ({} if recorded is None else {"sensor": recorded})
-    plain = configuration(file, preset=preset, **flags)
-    usual = USUAL_VOXEL_SIZES.get(plain.volume.sensor)
+    plain, of = configuration(file, preset=preset, **flags), "this recording"
+    if usual is None or plain.volume.sensor != recorded:
+        usual, of = USUAL_VOXEL_SIZES.get(plain.volume.sensor), f"a {plain.volume.sensor}"
     if usual is None:
         return plain
     chosen = configuration(file, preset=preset | {"voxel_size": usual}, **flags)
     if tell and chosen.volume.voxel_size != plain.volume.voxel_size:
-        text = f"voxels: {usual:g} m, usual for a {plain.volume.sensor} (--voxel-size gives others)"
+        text = f"voxels: {usual:g} m, usual for {of} (--voxel-size gives others)"
         output.text(text, err=True, indent=8)
     return chosen
 

@@ -67,7 +67,8 @@ def replay(
         path, unpack=unpack, sequence=sequence, modality=modality, trajectory=trajectory,
         **options.camera(intrinsics, calibration) | options.dataset_options(option),
     )  # fmt: skip
-    chosen = options.configuration_for(dataset.sensor, config, tell=connect is None, **settings)
+    usual = getattr(dataset, "usual_voxel_size", None)
+    chosen = options.configuration_for(dataset.sensor, config, usual=usual, tell=connect is None, **settings)
     if start or stride > 1 or max_frames is not None:
         dataset = select(dataset, start=start, stride=stride, limit=max_frames)
     for reason, count in dataset.skipped.items():

@@ -124,7 +124,10 @@ def scan(
         poses = settings["trajectory"] or settings["feed"] or "found from the frames"
         typer.echo(f"{waits_for}; poses: {poses}", err=True)
     with opened, _ended_by_signals(opened), progress.shown(quiet=json) as display:
-        chosen = options.configuration_for(opened.sensor, config, tell=connect is None, **settings)
+        usual = getattr(opened, "usual_voxel_size", None)
+        chosen = options.configuration_for(
+            opened.sensor, config, usual=usual, tell=connect is None, **settings
+        )
         client = options.client_settings(
             chosen, connect, control=control, map=map_, key=key, server_key=server_key
         )

@@ -14,6 +14,7 @@ from tsfusion.datasets.accelerometer import Accelerometer
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Keyframe
 
+STREET_VOXEL_SIZE = 0.1  # metres, of recordings of streets: at 2 cm a stereo keyframe of one takes 1.5 s
 NOMINAL_NS = 33_333_333  # between frames of a recording without times: thirty a second
 SCAN = "`tsfusion scan PATH` finds poses by itself"
 _T = TypeVar("_T")
@@ -53,6 +54,7 @@ class Frames(ABC):
     timestamps_ns: NDArray[np.int64] | None = None
     skipped: dict[str, int]
     quaternions: bool = False  # whether rotations were recorded as quaternions; else as matrices
+    usual_voxel_size: float | None = None  # metres, where the recordings are of one kind of place
     _poses: Sequence[NDArray[np.float64] | None] = ()
     _accelerometer: Accelerometer | None = None
 
@@ -121,6 +123,7 @@ class Selection(Frames):
         self._dataset, self._indices = dataset, list(indices)
         self.camera = getattr(dataset, "camera", None)
         self.quaternions = getattr(dataset, "quaternions", False)
+        self.usual_voxel_size = getattr(dataset, "usual_voxel_size", None)
         if hasattr(dataset, "distance"):
             self.distance = dataset.distance
         if dataset.timestamps_ns is not None:

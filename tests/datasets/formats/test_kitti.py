@@ -11,9 +11,11 @@ from geometry_checks import warp_residual
 from small_recordings import P0, P1, TR, kitti, one_line, put
 
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets import KITTI, open_dataset
+from tsfusion.datasets import KITTI, open_dataset, select
+from tsfusion.datasets.given_trajectory import WithTrajectory
 from tsfusion.geometry.measured_points import depth_metres, points_world
 from tsfusion.geometry.stereo_matching import Matcher
+from tsfusion.scanner.sources.recorded import RecordedSource
 
 scipy_spatial = pytest.importorskip("scipy.spatial")
 
@@ -87,6 +89,13 @@ def test_a_tiny_sequence_in_both_modalities(tmp_path):
     assert keyframe.T_world_camera[2, 3] == 2
     assert lidar[2].T_world_camera[:3, 3] == pytest.approx([2, 0, 0])  # forward is x for the scanner
     assert list(stereo.timestamps_ns) == [0, 100_000_000, 200_000_000, 300_000_000]
+
+
+def test_a_street_has_larger_voxels_whatever_part_of_it_is_played(tmp_path):
+    kitti(tmp_path)
+    whole = open_dataset(tmp_path, modality="stereo")
+    part = select(WithTrajectory(whole, tmp_path / "poses" / "06.txt"), limit=2)
+    assert whole.usual_voxel_size == part.usual_voxel_size == RecordedSource(part).usual_voxel_size == 0.1
 
 
 def test_a_pose_belongs_to_the_frame_of_its_line(tmp_path):

@@ -26,6 +26,7 @@ class RecordedSource(LiveSource):
         super().__init__(dataset.name, dataset.sensor)
         self.skipped = dataset.skipped
         self.length = len(dataset)
+        self.usual_voxel_size: float | None = getattr(dataset, "usual_voxel_size", None)
         self._dataset, self._rate = dataset, rate
         camera = getattr(dataset, "camera", None)
         self.camera = str(camera) if isinstance(camera, RecordedCamera) else ""
