@@ -15,6 +15,7 @@ from command_processes import Here, alive, descendants, end, eventually, read_un
 from corrected_maps import fresh_map
 from keyframes_and_servers import VOLUME, pose, wall
 from silent_display import Silent
+from small_recordings import kitti
 
 from tsfusion import Volume
 from tsfusion.cluster import fusion, job_runner, jobs, keyframe_sources
@@ -218,6 +219,24 @@ def test_the_settings_of_the_saved_map_are_taken(state: Path, here: Here, expect
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["map_hash"] == expected.map_hash()
     assert here("map", "hash", "out/map.tsf").stdout.strip() == expected.map_hash()
+
+
+def test_each_place_in_a_map_names_the_saved_maps_settings(
+    state: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    segment = next((state / "journal").glob("*.mcap"))
+    places = [state, state / "journal", segment]
+    assert [keyframe_sources.saved_settings(path, None) for path in places] == [None] * 3
+    Volume(VOLUME).save(state / "map.tsf", meta={"done": {}})
+    monkeypatch.chdir(state / "journal")
+    places += [Path(), Path(segment.name)]
+    assert [keyframe_sources.saved_settings(path, None) for path in places] == [VOLUME] * 5
+
+
+def test_a_recording_of_a_street_says_which_voxels_are_usual(tmp_path: Path) -> None:
+    kitti(tmp_path)
+    found = keyframe_sources.listed([str(tmp_path)], options={"modality": "stereo"})
+    assert (found.sensor, found.usual_voxel_size) == ("stereo", 0.1)
 
 
 def test_killed_and_interrupted_commands_leave_no_worker_and_go_on(tmp_path: Path) -> None:

@@ -157,13 +157,13 @@ def test_a_journal_replays_to_the_same_map_under_a_new_name(
     run_folder: Path, here: Here, tmp_path: Path
 ) -> None:
     done = here(
-        "replay", run_folder / "state", "--voxel-size", VOXEL, "--out", tmp_path / "again", "--json",
+        "replay", run_folder / "state", "--out", tmp_path / "again", "--json",
         "--state", tmp_path / "kept", "--map", "new",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "kept" / "maps" / "new" / "map.tsf").is_file()
     first = json.loads((run_folder / "out" / "run.json").read_text())
-    assert json.loads(done.stdout)["map_hash"] == first["map_hash"]
+    assert json.loads(done.stdout)["map_hash"] == first["map_hash"], "with the voxels of the saved map"
     assert {path.name for path in (tmp_path / "again").iterdir()} == RESULTS
     assert (tmp_path / "again").stat().st_mode & 0o777 == 0o777 & ~_umask()
 

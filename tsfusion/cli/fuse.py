@@ -90,7 +90,9 @@ def _settings(found: "Listed", file: Path | None, flags: dict[str, Any]) -> "Vol
 
     threads = {"threads": 1}  # a worker is a process on a core
     if file is not None or found.config is None:
-        return options.configuration_for(found.sensor, file, tell=True, preset=threads, **flags).volume
+        return options.configuration_for(
+            found.sensor, file, usual=found.usual_voxel_size, tell=True, preset=threads, **flags
+        ).volume
     # a sensor that is chosen anew brings its own settings; None = what its preset says
     preset = {name: value for name, value in asdict(found.config).items() if value is not None}
     return options.configuration(file, preset=preset | threads, **flags).volume

@@ -32,7 +32,7 @@ _map_option = functools.partial(option, panel="Map")
 # By name: a setting of the `volume` table, or one that `configuration` turns into some.
 MAP_OPTIONS: dict[str, Any] = {
     "voxel_size": Annotated[float | None, _map_option(
-        "--voxel-size", "METRES", "Edge of a voxel (0.02; LiDAR, KITTI 0.1).")],
+        "--voxel-size", "METRES", "Edge of a voxel (0.02; LiDAR, street 0.1).")],
     "sensor": Annotated[str | None, _map_option(
         "--sensor", "NAME", "kinect, tof, realsense, stereo, lidar, scanner.",
         autocompletion=lambda: ["kinect", "tof", "realsense", "stereo", "lidar", "scanner"])],
@@ -200,7 +200,7 @@ def configuration_for(
 
     Args:
         recorded: name of the recording's sensor; None = it says none.
-        usual: metres, of the recording; None = it says none.
+        usual: metres, of the recording with its own sensor; None = it says none.
         tell: say so where one of them decides how large voxels are.
         preset: as of `configuration`.
     """

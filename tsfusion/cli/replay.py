@@ -96,13 +96,17 @@ def open_recording(path: Path, /, *, unpack: bool = False, **given: Any) -> "Dat
     from tsfusion.journal.state_folder import is_journal
 
     if is_journal(path):
+        from tsfusion.cluster.keyframe_sources import saved_settings
         from tsfusion.core.errors import DatasetError
         from tsfusion.journal.recording import JournalRecording
 
         for name, value in given.items():
             if value is not None and name != "posed":
                 raise DatasetError(f"--{name} has no effect on a journal: leave it out")
-        return JournalRecording(path)
+        journaled = JournalRecording(path)
+        if (saved := saved_settings(Path(journaled.name), None)) is not None:
+            journaled.usual_voxel_size = saved.voxel_size
+        return journaled
     from tsfusion.datasets import describe, open_dataset
 
     dataset = open_dataset(path, unpack=unpack, **given)

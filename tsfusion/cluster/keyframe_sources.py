@@ -38,6 +38,7 @@ class Listed(msgspec.Struct):
         names: of the sources.
         config: settings of the saved map beside the first journal; None = there is none.
         sensor: of the first dataset; None = there is none.
+        usual_voxel_size: metres, of the first dataset; None = it says none.
         left_out: reason → number of records without a readable header, or of a dataset's frames.
         lost: number of keyframes that damage in the journals has destroyed, at least.
     """
@@ -46,6 +47,7 @@ class Listed(msgspec.Struct):
     names: list[str] = []
     config: VolumeConfig | None = None
     sensor: str | None = None
+    usual_voxel_size: float | None = None
     left_out: dict[str, int] = {}
     lost: int = 0
 
@@ -151,16 +153,21 @@ def _journal(
     )
     found.lost += keyframes.lost
     if found.config is None:
-        found.config = _saved_settings(path, map_name)
+        found.config = saved_settings(path, map_name)
     return keyframes
 
 
-def _saved_settings(path: Path, map_name: str | None) -> VolumeConfig | None:
+def saved_settings(path: Path, map_name: str | None) -> VolumeConfig | None:
     """The settings of the saved map beside a journal; None = there is none that can be read."""
     if locations.is_url(path):
         return None
+    folder = state_folder.resolve_map(path, map_name).absolute()
+    if folder.is_file():
+        folder = folder.parent
+    if folder.name == state_folder.JOURNAL_FOLDER:
+        folder = folder.parent
     try:
-        with checkpoint.reading(state_folder.resolve_map(path, map_name) / state_folder.MAP_FILE) as opened:
+        with checkpoint.reading(folder / state_folder.MAP_FILE) as opened:
             return opened[0].config
     except CheckpointError:
         return None
@@ -217,7 +224,9 @@ def _add_dataset(found: Listed, source: str, options: dict[str, Any]) -> dict[st
     dataset = open_dataset(source, **options)
     path = source if source.startswith(SYNTHETIC) else str(Path(source).expanduser().absolute())
     found.keyframes.append(DatasetKeyframes(path, options, 0, len(dataset)))
-    found.sensor = found.sensor or dataset.sensor
+    if found.sensor is None:
+        found.sensor = dataset.sensor
+        found.usual_voxel_size = getattr(dataset, "usual_voxel_size", None)
     return dataset.skipped
 
 

@@ -32,6 +32,8 @@ class JournalRecording:
         JournalError: when there is no keyframe.
     """
 
+    usual_voxel_size: float | None = None  # metres, of the map whose journal it is; None = nobody knows
+
     def __init__(self, path: str | os.PathLike[str], map_name: str | None = None) -> None:
         place = state_folder.find_journal(Path(path), map_name)
         self.name = str(place.path)
