@@ -10,10 +10,10 @@
 Open3D's VoxelBlockGrid runs beside, where `open3d` is installed (`pip install '.[bench]'`): in the same
 process, the same keyframes in turn, with the same range and truncation; its mesh is of voxels of weight 1 and
 of weight 2 on. In turn each finds the caches full of the other's map. `stream` are the same keyframes with
-nothing between them, first all of ours, then all of Open3D's, as a server fuses.
-`1thread` is one thread on one pinned core. Machines differ and are noisy: only `ratio` says
-who is faster. `field` meshes the default surface, `off` the raw one; `remesh` is the mesh of what a keyframe
-changed; `floor` the least time that memory traffic takes.
+nothing between them, first all of ours, then all of Open3D's, as a server fuses. `1thread` is one thread on
+one pinned core. Machines differ and are noisy: only `ratio` says who is faster. `field` meshes the default
+surface, `off` the raw one; `remesh` is the mesh of what a keyframe changed; `floor` the least time that
+memory traffic takes.
 With `--arch` the same keyframes go in turn to a map on that device; `ratio` has its wall time against the
 CPU's; `device` says whether both maps are the same, and how many keyframes a second each takes by itself.
 Recorded cases need TSFUSION_DATA (default ../shared/data) and are left out, with a word, where it is missing.

@@ -28,48 +28,38 @@ VERBS = [
 ]  # fmt: skip
 
 
+STREET = {"voxel_size": 0.1, "max_range": 40.0}
+
+
 @pytest.mark.parametrize(
-    ("sensor", "file", "flags", "voxel_size"),
+    ("sensor", "usual", "file", "flags", "voxel_size", "whose"),
     [
-        ("kinect", "", {}, 0.02), ("lidar", "", {}, 0.1), (None, "", {}, 0.02),
-        ("lidar", "", {"voxel_size": 0.3}, 0.3), ("lidar", "voxel_size = 0.05", {}, 0.05),
-        ("lidar", "", {"sensor": "scanner"}, 0.02), (None, "", {"sensor": "lidar"}, 0.1),
-        ("lidar", "sensor = 'scanner'", {}, 0.02), ("kinect", "sensor = 'lidar'", {}, 0.1),
+        ("kinect", {}, "", {}, 0.02, ""), (None, {}, "", {}, 0.02, ""),
+        ("lidar", {}, "", {}, 0.1, "a lidar"), (None, {}, "", {"sensor": "lidar"}, 0.1, "a lidar"),
+        ("kinect", {}, "sensor = 'lidar'", {}, 0.1, "a lidar"),
+        ("lidar", {}, "", {"voxel_size": 0.3}, 0.3, ""), ("lidar", {}, "voxel_size = 0.05", {}, 0.05, ""),
+        ("lidar", {}, "", {"sensor": "scanner"}, 0.02, ""), ("lidar", {}, "sensor = 'scanner'", {}, 0.02, ""),
+        ("stereo", STREET, "", {}, 0.1, "this recording"),
+        ("stereo", STREET, "", {"sensor": "kinect"}, 0.1, "this recording"),
+        ("stereo", STREET, "", {"voxel_size": 0.3}, 0.3, ""),
+        ("stereo", STREET, "voxel_size = 0.05", {}, 0.05, ""),
     ],
 )  # fmt: skip
-def test_a_sensor_brings_its_usual_voxel_size(
+def test_a_recording_or_its_sensor_brings_usual_settings(
     sensor: str | None,
+    usual: dict[str, Any],
     file: str,
     flags: dict[str, Any],
     voxel_size: float,
+    whose: str,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     (tmp_path / "mine.toml").write_text(f"[volume]\n{file}\n")
-    found = options.configuration_for(sensor, tmp_path / "mine.toml", tell=True, **flags).volume
-    assert found.voxel_size == voxel_size
-    assert ("voxels: 0.1 m, usual for a lidar" in capsys.readouterr().err) == (voxel_size == 0.1)
-
-
-@pytest.mark.parametrize(
-    ("recorded", "file", "flags", "voxel_size"),
-    [
-        ("stereo", "", {}, 0.1), ("stereo", "", {"voxel_size": 0.3}, 0.3),
-        ("stereo", "voxel_size = 0.05", {}, 0.05), ("stereo", "", {"sensor": "kinect"}, 0.02),
-    ],
-)  # fmt: skip
-def test_a_recording_of_a_street_brings_its_usual_voxel_size(
-    recorded: str,
-    file: str,
-    flags: dict[str, Any],
-    voxel_size: float,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    (tmp_path / "mine.toml").write_text(f"[volume]\n{file}\n")
-    found = options.configuration_for(recorded, tmp_path / "mine.toml", usual=0.1, tell=True, **flags).volume
-    assert found.voxel_size == voxel_size
-    assert ("usual for this recording" in capsys.readouterr().err) == (voxel_size == 0.1)
+    found = options.configuration_for(sensor, tmp_path / "mine.toml", usual=usual, tell=True, **flags).volume
+    assert (found.voxel_size, found.max_range) == (voxel_size, usual.get("max_range"))
+    told = f"voxels: {voxel_size:g} m, usual for {whose} (--voxel-size gives others)"
+    assert (told in capsys.readouterr().err) == bool(whose)
 
 
 def scene(folder: Path, *, pose: str | None = None, depth: bytes | None = None) -> Path:

@@ -22,6 +22,7 @@ from tsfusion.cluster import fusion, job_runner, jobs, keyframe_sources
 from tsfusion.cluster.carrying_out import ATTEMPTS
 from tsfusion.cluster.fusion import FusedRun, Wishes
 from tsfusion.cluster.jobs import AnyJob, Lost, Message
+from tsfusion.core.config import VolumeConfig
 from tsfusion.core.errors import InvalidConfig, JournalError, MapError, OutputError, WorkerLost
 from tsfusion.journal import Journal
 from tsfusion.wire import codec, corrections
@@ -222,21 +223,26 @@ def test_the_settings_of_the_saved_map_are_taken(state: Path, here: Here, expect
 
 
 def test_each_place_in_a_map_names_the_saved_maps_settings(
-    state: Path, monkeypatch: pytest.MonkeyPatch
+    state: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     segment = next((state / "journal").glob("*.mcap"))
     places = [state, state / "journal", segment]
-    assert [keyframe_sources.saved_settings(path, None) for path in places] == [None] * 3
+    assert [keyframe_sources.saved_settings(path, None) for path in places] == [{}] * 3
     Volume(VOLUME).save(state / "map.tsf", meta={"done": {}})
     monkeypatch.chdir(state / "journal")
     places += [Path(), Path(segment.name)]
-    assert [keyframe_sources.saved_settings(path, None) for path in places] == [VOLUME] * 5
+    found = [keyframe_sources.saved_settings(path, None) for path in places]
+    assert [VolumeConfig(**each, threads=VOLUME.threads) for each in found] == [VOLUME] * 5
+    (state / "map.tsf").write_bytes(b"no map")
+    assert keyframe_sources.saved_settings(state, None) == {}
+    assert "map.tsf" in caplog.text
+    assert "its settings are not taken" in caplog.text
 
 
 def test_a_recording_of_a_street_says_which_voxels_are_usual(tmp_path: Path) -> None:
     kitti(tmp_path)
     found = keyframe_sources.listed([str(tmp_path)], options={"modality": "stereo"})
-    assert (found.sensor, found.usual_voxel_size) == ("stereo", 0.1)
+    assert (found.sensor, found.usual) == ("stereo", {"voxel_size": 0.1})
 
 
 def test_killed_and_interrupted_commands_leave_no_worker_and_go_on(tmp_path: Path) -> None:

@@ -163,7 +163,7 @@ def test_a_journal_replays_to_the_same_map_under_a_new_name(
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "kept" / "maps" / "new" / "map.tsf").is_file()
     first = json.loads((run_folder / "out" / "run.json").read_text())
-    assert json.loads(done.stdout)["map_hash"] == first["map_hash"], "with the voxels of the saved map"
+    assert json.loads(done.stdout)["map_hash"] == first["map_hash"], "with the saved map's settings"
     assert {path.name for path in (tmp_path / "again").iterdir()} == RESULTS
     assert (tmp_path / "again").stat().st_mode & 0o777 == 0o777 & ~_umask()
 

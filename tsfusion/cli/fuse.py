@@ -2,7 +2,6 @@
 """`tsfusion fuse`."""
 
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -12,9 +11,7 @@ from tsfusion.core import process
 
 if TYPE_CHECKING:
     from tsfusion.cluster.fusion import FusedRun
-    from tsfusion.cluster.keyframe_sources import Listed
     from tsfusion.cluster.schedulers import Scheduler
-    from tsfusion.core.config import VolumeConfig
 
 
 @options.takes_map_settings
@@ -70,7 +67,14 @@ def fuse(
         )
         result = fusion.fuse(
             found,
-            _settings(found, config, settings),
+            options.configuration_for(
+                found.sensor,
+                config,
+                usual=found.saved or found.usual,
+                tell=True,
+                preset={"threads": 1},  # a worker is a process on a core
+                **settings,
+            ).volume,
             out,
             partial(_scheduler, workers or len(process.cores()), ray),
             display,
@@ -82,20 +86,6 @@ def fuse(
     else:
         _print(result)
     _check(result)
-
-
-def _settings(found: "Listed", file: Path | None, flags: dict[str, Any]) -> "VolumeConfig":
-    """Settings of the saved map beside the first journal, or of the file, with every flag on top."""
-    from msgspec.structs import asdict
-
-    threads = {"threads": 1}  # a worker is a process on a core
-    if file is not None or found.config is None:
-        return options.configuration_for(
-            found.sensor, file, usual=found.usual_voxel_size, tell=True, preset=threads, **flags
-        ).volume
-    # a sensor that is chosen anew brings its own settings; None = what its preset says
-    preset = {name: value for name, value in asdict(found.config).items() if value is not None}
-    return options.configuration(file, preset=preset | threads, **flags).volume
 
 
 def _scheduler(workers: int, ray: str | None) -> "Scheduler":

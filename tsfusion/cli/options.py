@@ -7,7 +7,7 @@ default in `tsfusion.core.config`.
 
 import functools
 import inspect
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -190,31 +190,31 @@ def configuration_for(
     file: Path | None,
     /,
     *,
-    usual: float | None = None,
+    usual: Mapping[str, Any] | None = None,
     tell: bool = False,
     preset: dict[str, Any] | None = None,
     **flags: Any,
 ) -> "Config":
-    """`configuration` where a recording says its sensor, and maybe which voxels are usual for it; else those
-    of the sensor that is chosen in the end.
+    """`configuration` where a recording says its sensor, and maybe other settings that are usual for it; else
+    the voxels that are usual for the sensor that is chosen in the end.
 
     Args:
         recorded: name of the recording's sensor; None = it says none.
-        usual: metres, of the recording with its own sensor; None = it says none.
-        tell: say so where one of them decides how large voxels are.
-        preset: as of `configuration`.
+        usual: settings of the `volume` table, of the recording; empty or None = it says none.
+        tell: say so where they, or the sensor, decide how large voxels are.
+        preset: as of `configuration`; beats the recording.
     """
     from tsfusion.core.config import USUAL_VOXEL_SIZES
 
-    preset = (preset or {}) | ({} if recorded is None else {"sensor": recorded})
-    plain, of = configuration(file, preset=preset, **flags), "this recording"
-    if usual is None or plain.volume.sensor != recorded:
-        usual, of = USUAL_VOXEL_SIZES.get(plain.volume.sensor), f"a {plain.volume.sensor}"
-    if usual is None:
+    sensor, preset = ({} if recorded is None else {"sensor": recorded}), preset or {}
+    plain, of = configuration(file, preset=sensor | preset, **flags), "this recording"
+    if not usual and plain.volume.sensor in USUAL_VOXEL_SIZES:
+        usual, of = {"voxel_size": USUAL_VOXEL_SIZES[plain.volume.sensor]}, f"a {plain.volume.sensor}"
+    if not usual:
         return plain
-    chosen = configuration(file, preset=preset | {"voxel_size": usual}, **flags)
+    chosen = configuration(file, preset={**sensor, **usual, **preset}, **flags)
     if tell and chosen.volume.voxel_size != plain.volume.voxel_size:
-        text = f"voxels: {usual:g} m, usual for {of} (--voxel-size gives others)"
+        text = f"voxels: {chosen.volume.voxel_size:g} m, usual for {of} (--voxel-size gives others)"
         output.text(text, err=True, indent=8)
     return chosen
 

@@ -67,7 +67,7 @@ def replay(
         path, unpack=unpack, sequence=sequence, modality=modality, trajectory=trajectory,
         **options.camera(intrinsics, calibration) | options.dataset_options(option),
     )  # fmt: skip
-    usual = getattr(dataset, "usual_voxel_size", None)
+    usual = getattr(dataset, "usual", None)
     chosen = options.configuration_for(dataset.sensor, config, usual=usual, tell=connect is None, **settings)
     if start or stride > 1 or max_frames is not None:
         dataset = select(dataset, start=start, stride=stride, limit=max_frames)
@@ -104,8 +104,7 @@ def open_recording(path: Path, /, *, unpack: bool = False, **given: Any) -> "Dat
             if value is not None and name != "posed":
                 raise DatasetError(f"--{name} has no effect on a journal: leave it out")
         journaled = JournalRecording(path)
-        if (saved := saved_settings(Path(journaled.name), None)) is not None:
-            journaled.usual_voxel_size = saved.voxel_size
+        journaled.usual = saved_settings(Path(journaled.name), None)
         return journaled
     from tsfusion.datasets import describe, open_dataset
 

@@ -124,7 +124,7 @@ def scan(
         poses = settings["trajectory"] or settings["feed"] or "found from the frames"
         typer.echo(f"{waits_for}; poses: {poses}", err=True)
     with opened, _ended_by_signals(opened), progress.shown(quiet=json) as display:
-        usual = getattr(opened, "usual_voxel_size", None)
+        usual = getattr(opened, "usual", None)
         chosen = options.configuration_for(
             opened.sensor, config, usual=usual, tell=connect is None, **settings
         )

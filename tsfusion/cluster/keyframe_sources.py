@@ -2,6 +2,7 @@
 """Sources of a fusion: journals at their final poses, and datasets; listed by one process, read by others."""
 
 import hashlib
+import logging
 import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -29,6 +30,8 @@ from tsfusion.wire import codec
 
 SYNTHETIC = "synthetic:"
 
+log = logging.getLogger(__name__)
+
 
 class Listed(msgspec.Struct):
     """Keyframes that are to be fused.
@@ -36,18 +39,18 @@ class Listed(msgspec.Struct):
     Attributes:
         keyframes: of each source, in their order.
         names: of the sources.
-        config: settings of the saved map beside the first journal; None = there is none.
+        saved: settings of the saved map beside the first journal; empty = there is none.
         sensor: of the first dataset; None = there is none.
-        usual_voxel_size: metres, of the first dataset; None = it says none.
+        usual: settings that are usual for the first dataset.
         left_out: reason → number of records without a readable header, or of a dataset's frames.
         lost: number of keyframes that damage in the journals has destroyed, at least.
     """
 
     keyframes: list[Keyframes] = []
     names: list[str] = []
-    config: VolumeConfig | None = None
+    saved: dict[str, Any] = {}
     sensor: str | None = None
-    usual_voxel_size: float | None = None
+    usual: dict[str, Any] = {}
     left_out: dict[str, int] = {}
     lost: int = 0
 
@@ -152,15 +155,15 @@ def _journal(
         )
     )
     found.lost += keyframes.lost
-    if found.config is None:
-        found.config = saved_settings(path, map_name)
+    found.saved = found.saved or saved_settings(path, map_name)
     return keyframes
 
 
-def saved_settings(path: Path, map_name: str | None) -> VolumeConfig | None:
-    """The settings of the saved map beside a journal; None = there is none that can be read."""
+def saved_settings(path: Path, map_name: str | None) -> dict[str, Any]:
+    """The settings of the saved map beside a journal, without what its sensor's preset says; empty = there is
+    none. One that cannot be read is a warning."""
     if locations.is_url(path):
-        return None
+        return {}
     folder = state_folder.resolve_map(path, map_name).absolute()
     if folder.is_file():
         folder = folder.parent
@@ -168,9 +171,13 @@ def saved_settings(path: Path, map_name: str | None) -> VolumeConfig | None:
         folder = folder.parent
     try:
         with checkpoint.reading(folder / state_folder.MAP_FILE) as opened:
-            return opened[0].config
-    except CheckpointError:
-        return None
+            saved = msgspec.structs.asdict(opened[0].config)
+    except CheckpointError as error:
+        if (folder / state_folder.MAP_FILE).exists():
+            log.warning("%s; its settings are not taken", error)
+        return {}
+    # None = what its preset says; how many threads there were is no property of a map
+    return {name: value for name, value in saved.items() if value is not None and name != "threads"}
 
 
 def _check_once(sources: Sequence[str]) -> None:
@@ -226,7 +233,7 @@ def _add_dataset(found: Listed, source: str, options: dict[str, Any]) -> dict[st
     found.keyframes.append(DatasetKeyframes(path, options, 0, len(dataset)))
     if found.sensor is None:
         found.sensor = dataset.sensor
-        found.usual_voxel_size = getattr(dataset, "usual_voxel_size", None)
+        found.usual = getattr(dataset, "usual", {})
     return dataset.skipped
 
 

@@ -2,8 +2,9 @@
 """The `Dataset` protocol, its base for recordings, and choosing some of a dataset's frames."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
@@ -14,7 +15,7 @@ from tsfusion.datasets.accelerometer import Accelerometer
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Keyframe
 
-STREET_VOXEL_SIZE = 0.1  # metres, of recordings of streets: at 2 cm a stereo keyframe of one takes 1.5 s
+STREET = MappingProxyType({"voxel_size": 0.1})  # usual there: at 2 cm a stereo keyframe takes 1.5 s
 NOMINAL_NS = 33_333_333  # between frames of a recording without times: thirty a second
 SCAN = "`tsfusion scan PATH` finds poses by itself"
 _T = TypeVar("_T")
@@ -54,7 +55,7 @@ class Frames(ABC):
     timestamps_ns: NDArray[np.int64] | None = None
     skipped: dict[str, int]
     quaternions: bool = False  # whether rotations were recorded as quaternions; else as matrices
-    usual_voxel_size: float | None = None  # metres, where the recordings are of one kind of place
+    usual: Mapping[str, Any] = MappingProxyType({})  # settings of a map of such a place (`VolumeConfig`)
     _poses: Sequence[NDArray[np.float64] | None] = ()
     _accelerometer: Accelerometer | None = None
 
@@ -123,7 +124,7 @@ class Selection(Frames):
         self._dataset, self._indices = dataset, list(indices)
         self.camera = getattr(dataset, "camera", None)
         self.quaternions = getattr(dataset, "quaternions", False)
-        self.usual_voxel_size = getattr(dataset, "usual_voxel_size", None)
+        self.usual = getattr(dataset, "usual", {})
         if hasattr(dataset, "distance"):
             self.distance = dataset.distance
         if dataset.timestamps_ns is not None:

@@ -78,7 +78,7 @@ class WithTrajectory(Frames):
         self._dataset, self.skipped = dataset, dict(dataset.skipped)
         self.name, self.sensor = dataset.name, dataset.sensor
         self.camera = getattr(dataset, "camera", None)
-        self.usual_voxel_size = getattr(dataset, "usual_voxel_size", None)
+        self.usual = getattr(dataset, "usual", {})
         found = poses_of(path, len(dataset), dataset.timestamps_ns, posed=posed, **where)
         self._indices, self._poses = keep_posed(
             range(len(dataset)), found, posed=posed, skipped=self.skipped, reason="without a pose in time"

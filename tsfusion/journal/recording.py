@@ -3,8 +3,10 @@
 
 import logging
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +34,7 @@ class JournalRecording:
         JournalError: when there is no keyframe.
     """
 
-    usual_voxel_size: float | None = None  # metres, of the map whose journal it is; None = nobody knows
+    usual: Mapping[str, Any] = MappingProxyType({})  # settings of the map whose journal it is, if known
 
     def __init__(self, path: str | os.PathLike[str], map_name: str | None = None) -> None:
         place = state_folder.find_journal(Path(path), map_name)

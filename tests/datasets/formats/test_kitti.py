@@ -95,7 +95,7 @@ def test_a_street_has_larger_voxels_whatever_part_of_it_is_played(tmp_path):
     kitti(tmp_path)
     whole = open_dataset(tmp_path, modality="stereo")
     part = select(WithTrajectory(whole, tmp_path / "poses" / "06.txt"), limit=2)
-    assert whole.usual_voxel_size == part.usual_voxel_size == RecordedSource(part).usual_voxel_size == 0.1
+    assert whole.usual == part.usual == RecordedSource(part).usual == {"voxel_size": 0.1}
 
 
 def test_a_pose_belongs_to_the_frame_of_its_line(tmp_path):

@@ -314,7 +314,7 @@ def test_a_state_folder_and_a_file_have_a_report(here: Here, tmp_path: Path) -> 
 
 @pytest.mark.parametrize(("server", "is_drawn"), [(0, False), (2e8, True)])
 def test_memory_that_is_not_known_is_not_drawn_as_none(server: float, is_drawn: bool) -> None:
-    """That of a server which somebody else started."""
+    """A server that somebody else started does not tell how much memory it takes."""
     columns = {"seconds": [0, 1], "map_bytes": [1e6, 2e6], "server_bytes": [server, server]}
     growth = {name: np.array(values, float) for name, values in columns.items()}
     drawn = run_sections.growth(RunFindings({}, [], [], growth, {}))

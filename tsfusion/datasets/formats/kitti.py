@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.cameras import RecordedCamera
-from tsfusion.datasets.dataset import STREET_VOXEL_SIZE, Frames, keep_posed, require_folder, require_frames
+from tsfusion.datasets.dataset import STREET, Frames, keep_posed, require_folder, require_frames
 from tsfusion.datasets.readers import intrinsics_of, read_color, read_lines
 from tsfusion.datasets.trajectory_files import checked_pose, nanoseconds, read_kitti
 from tsfusion.geometry.frame import Frame
@@ -54,7 +54,7 @@ class KITTIFrames(Frames):
 
     intrinsics: Intrinsics | None
     baseline_fx: float | None
-    usual_voxel_size = STREET_VOXEL_SIZE
+    usual = STREET
     _frames: list[int]
     _poses: list[Transform | None]
     _left: dict[int, Path]  # or the scans

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets.dataset import STREET_VOXEL_SIZE, Frames
+from tsfusion.datasets.dataset import STREET, Frames
 from tsfusion.datasets.synthetic import desk_world, loop_worlds, worlds
 from tsfusion.datasets.synthetic.ray_tiles import RayTiles
 from tsfusion.geometry.frame import Frame
@@ -131,7 +131,7 @@ class Synthetic(Frames):
             )
         self.world = WORLDS[world](count) if isinstance(world, str) else world
         self.name, self.sensor, self.skipped = f"synthetic {self.world.name}", sensor, {}
-        self.usual_voxel_size = STREET_VOXEL_SIZE if self.world.name == "street" else None
+        self.usual = STREET if self.world.name == "street" else {}
         self.timestamps_ns = np.arange(count, dtype=np.int64) * FRAME_NS
         path = path or next(iter(self.world.paths))
         if path not in self.world.paths:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.cameras import RecordedCamera
-from tsfusion.datasets.dataset import STREET_VOXEL_SIZE, Frames
+from tsfusion.datasets.dataset import STREET, Frames
 from tsfusion.datasets.synthetic.road_ground import RoadGround
 from tsfusion.datasets.synthetic.roadside import roadside
 from tsfusion.datasets.synthetic.worlds import World
@@ -72,7 +72,7 @@ class StreetDrive(Frames):
     """
 
     sensor = "stereo"
-    usual_voxel_size = STREET_VOXEL_SIZE
+    usual = STREET
 
     def __init__(
         self,

@@ -3,8 +3,9 @@
 
 import dataclasses
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from itertools import islice
+from typing import Any
 
 from tsfusion.datasets.cameras import RecordedCamera
 from tsfusion.datasets.dataset import NOMINAL_NS, Dataset, frame_of
@@ -26,7 +27,7 @@ class RecordedSource(LiveSource):
         super().__init__(dataset.name, dataset.sensor)
         self.skipped = dataset.skipped
         self.length = len(dataset)
-        self.usual_voxel_size: float | None = getattr(dataset, "usual_voxel_size", None)
+        self.usual: Mapping[str, Any] = getattr(dataset, "usual", {})
         self._dataset, self._rate = dataset, rate
         camera = getattr(dataset, "camera", None)
         self.camera = str(camera) if isinstance(camera, RecordedCamera) else ""
