@@ -21,7 +21,7 @@ from tsfusion.cli import verbs
 from tsfusion.cli import view as view_command
 from tsfusion.core.errors import InvalidConfig
 from tsfusion.pipelines.viewer_child import ViewerChild
-from tsfusion.viewer.page_server import listen
+from tsfusion.viewer.page_place import listen
 from tsfusion.wire import key_folder
 from tsfusion.wire.queries import fetch_health
 

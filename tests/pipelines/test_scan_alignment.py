@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Scans that find their place in a map before they send, or go into a map of their own."""
 
+import concurrent.futures
 from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, Future
 from dataclasses import replace
@@ -66,7 +67,7 @@ def tries(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         counts.append(len(keyframes))
         return Answer(T, "") if len(keyframes) >= 14 else Answer(None, "too little")
 
-    monkeypatch.setattr(scan_alignment, "ProcessPoolExecutor", Inline)
+    monkeypatch.setattr(concurrent.futures, "ProcessPoolExecutor", Inline)
     monkeypatch.setattr(scan_alignment, "locate", locate)
     return counts
 
@@ -167,7 +168,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
 def scan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, server: Server) -> Callable[..., ScanSummary]:
     """A scan of a few frames, into a map that is said to have a surface."""
     monkeypatch.setattr(pipelines_scan, "_existing_map", lambda target: MAP._replace(name=target.link.map))
-    monkeypatch.setattr(scan_alignment, "ProcessPoolExecutor", Inline)
+    monkeypatch.setattr(concurrent.futures, "ProcessPoolExecutor", Inline)
 
     def run(map_name: str, *, align: bool) -> ScanSummary:
         return pipelines_scan.scan(

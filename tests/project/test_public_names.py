@@ -79,3 +79,13 @@ def test_a_scanner_imports_no_taichi() -> None:
         "tsfusion.Client, tsfusion.Keyframe; sys.exit('taichi' in sys.modules)"
     )
     assert python(program).returncode == 0
+
+
+def test_a_scan_loads_nothing_that_only_some_scans_need() -> None:
+    """Pages, a place in a map and worlds that are made up: ten megabytes of a robot's memory."""
+    program = (
+        "import sys, tsfusion.pipelines.scan; "
+        "sys.exit(' '.join({'asyncio', 'multiprocessing', 'numpy.random', 'ssl'} & set(sys.modules)) or None)"
+    )
+    done = python(program)
+    assert done.returncode == 0, done.stderr

@@ -19,7 +19,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
-from tsfusion.core.errors import InvalidConfig, MissingDependency, TransportError
+from tsfusion.core.errors import InvalidConfig, TransportError
 from tsfusion.viewer import page_server
 from tsfusion.viewer.page_guard import PageGuard
 from tsfusion.viewer.page_server import PageServer
@@ -208,15 +208,6 @@ def test_ipv6(page: PageServer) -> None:
         made.close()
 
 
-def test_places() -> None:
-    assert page_server.parse_place("127.0.0.1:80") == ("127.0.0.1", 80)
-    assert page_server.parse_place("[::1]:0") == ("::1", 0)
-    assert page_server.parse_place("*:80") == ("0.0.0.0", 80)
-    for bad in ("", "80", "localhost", "tcp://127.0.0.1:80", "::1:80", "a:70000", "a:b"):
-        with pytest.raises(InvalidConfig, match="HOST:PORT"):
-            page_server.parse_place(bad)
-
-
 def test_nobody_gets_a_tunnel(page: PageServer, monkeypatch: pytest.MonkeyPatch) -> None:
     def tunnel(*_: object) -> None:
         raise AssertionError("a tunnel was asked for")
@@ -324,9 +315,3 @@ def test_a_viser_that_goes_another_way_is_refused(monkeypatch: pytest.MonkeyPatc
     with pytest.raises(TransportError, match=r"cannot be guarded.*no_such_option"):
         PageServer()
     assert module.serve is real
-
-
-def test_a_missing_viser_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(page_server, "find_spec", lambda name: None)
-    with pytest.raises(MissingDependency, match=r"pip install '\.\[viewer\]'"):
-        PageServer()

@@ -71,7 +71,8 @@ def view(
     """
     from tsfusion.core import logs
     from tsfusion.viewer.live_page import LivePage
-    from tsfusion.viewer.page_server import PageServer, check_installed, parse_place
+    from tsfusion.viewer.page_place import check_installed, parse_place
+    from tsfusion.viewer.page_server import PageServer
     from tsfusion.wire.curve import client_keys
 
     logs.configure("text", "warning", "view")

@@ -8,9 +8,8 @@ import math
 import signal
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, Future
 from dataclasses import dataclass, field, replace
-from multiprocessing import get_context
 from typing import NamedTuple
 
 import numpy as np
@@ -104,6 +103,9 @@ def find_place(
         live: whether the source goes on whether or not it is read.
         tell: takes a line for a person at each try.
     """
+    from concurrent.futures import ProcessPoolExecutor  # a megabyte and more; most scans look for no place
+    from multiprocessing import get_context
+
     placing, next_try = Placing(), FIRST_TRY
     running: Future[Answer] | None = None
 

@@ -15,7 +15,7 @@ import msgspec
 from tsfusion.core import process
 from tsfusion.core.config import DEFAULT_MAP
 from tsfusion.pipelines.target_server import Target
-from tsfusion.viewer.page_server import check_installed, listen, parse_place
+from tsfusion.viewer.page_place import check_installed, listen, parse_place
 from tsfusion.wire import sockets
 from tsfusion.wire.curve import ClientKeys
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The RGB-D tracker: how far it drifts on recorded and on exact scenes, and that it knows when it is lost."""
 
+import pickle
 from dataclasses import replace
 
 import cv2
@@ -15,6 +16,7 @@ from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.scanner.localization.localizer import Lost, Pose
+from tsfusion.scanner.localization.rgbd.rgbd_frame import RGBDFrame, TrackingKeyframe
 from tsfusion.scanner.localization.rgbd.tracker import RGBDLocalizer
 
 
@@ -62,6 +64,20 @@ def test_rooms_with_exact_poses(world, bound, path):
     result = track(RGBDLocalizer(), frames(Synthetic(world, count=count, path=path)))
     assert not result.lost
     assert result.ate() < bound
+
+
+def test_a_keyframe_takes_a_third_of_the_memory_once_a_newer_one_is_followed(kitchen):
+    frame = RGBDFrame.of(kitchen.frame(0))
+    new = TrackingKeyframe.of(frame, 0, np.eye(4))
+    old = new.packed()
+    np.testing.assert_allclose(old.frame.gray, new.frame.gray, atol=12)
+    assert np.abs(old.frame.gray - new.frame.gray.astype(float)).mean() < 1
+    pickled, before = len(pickle.dumps(old)), len(pickle.dumps(frame))
+    assert pickled < before / 3
+    assert old.packed().frame is old.frame
+    # A frame at the same place is found by it, as by the new one.
+    found, expected = (len(keyframe.recall(frame)[0]) for keyframe in (old, new))
+    assert found > 0.8 * expected > 50
 
 
 @pytest.mark.slow
@@ -292,6 +308,7 @@ import cv2
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.scanner.localization.localizer import Pose
+from tsfusion.scanner.localization.rgbd.rgbd_frame import RGBDFrame, TrackingKeyframe
 from tsfusion.scanner.localization.rgbd.tracker import RGBDLocalizer
 
 def megabytes(name):

@@ -211,7 +211,7 @@ class Synthetic(Frames):
         distance: NDArray[np.float64],
         incidence: NDArray[np.float64],
         color: NDArray[np.uint8],
-        rng: np.random.Generator,
+        rng: "np.random.Generator",
     ) -> dict[str, Any]:
         keep = (distance > 0) & (distance < self.lidar.max_range)
         if self._noise:
@@ -221,7 +221,7 @@ class Synthetic(Frames):
         return {"points": points, "color": color[keep] if len(color) else None}
 
 
-def kinect(z: NDArray[np.float64], rng: np.random.Generator | None) -> NDArray[np.uint16]:
+def kinect(z: NDArray[np.float64], rng: "np.random.Generator | None") -> NDArray[np.uint16]:
     """(H, W) metres → uint16 of 0.1 mm, with axial noise (Nguyen, Izadi and Lovell 2012); 0 = no return."""
     valid = (z > 0) & (z < KINECT_RANGE)
     if rng is not None:
@@ -231,7 +231,7 @@ def kinect(z: NDArray[np.float64], rng: np.random.Generator | None) -> NDArray[n
 
 
 def time_of_flight(
-    z: NDArray[np.float64], incidence: NDArray[np.float64], rng: np.random.Generator | None
+    z: NDArray[np.float64], incidence: NDArray[np.float64], rng: "np.random.Generator | None"
 ) -> NDArray[np.uint16]:
     """(H, W) metres and |cosines| → uint16 of 0.1 mm, with a Kinect v2's errors; 0 = no return.
 
@@ -251,7 +251,9 @@ def time_of_flight(
     return np.where(valid, units, 0).astype(np.uint16)
 
 
-def stereo(z: NDArray[np.float64], baseline_fx: float, rng: np.random.Generator | None) -> NDArray[np.uint16]:
+def stereo(
+    z: NDArray[np.float64], baseline_fx: float, rng: "np.random.Generator | None"
+) -> NDArray[np.uint16]:
     """(H, W) metres → uint16 disparity × 16 with a matcher's errors; 0 = no match."""
     valid = z > 0
     disparity = np.divide(baseline_fx, z, out=np.zeros_like(z), where=valid)

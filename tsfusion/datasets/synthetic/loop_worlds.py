@@ -55,7 +55,7 @@ def rooms(*, identical: bool = True) -> World:
 
 
 def _along_a_wall(
-    rng: np.random.Generator, side: int, half: tuple[float, float], outward: int
+    rng: "np.random.Generator", side: int, half: tuple[float, float], outward: int
 ) -> list[list[float]]:
     """Things at one wall of the ring: panels, pictures, cupboards and columns, no two of equal size."""
     turn = side * np.pi / 2
@@ -81,7 +81,7 @@ def _along_a_wall(
     return solids
 
 
-def _room(rng: np.random.Generator) -> Solids:
+def _room(rng: "np.random.Generator") -> Solids:
     """One room around x = 0: floor, ceiling, walls, a doorway at its end, and furniture."""
     half = PITCH / 2
     solids = [

@@ -41,7 +41,7 @@ def roadside(ground: RoadGround, seed: int) -> Solids:
 class _Plot:
     """A street that is being furnished."""
 
-    def __init__(self, ground: RoadGround, rng: np.random.Generator) -> None:
+    def __init__(self, ground: RoadGround, rng: "np.random.Generator") -> None:
         self.rows: Rows = []
         self._ground, self._rng, self._number = ground, rng, 0
         self._taken = np.zeros(ground.shade.shape, dtype=bool)

@@ -173,7 +173,7 @@ def _drive(index: int, count: int) -> NDArray[np.float64]:
     return look_at(position, ahead)
 
 
-def _houses(rng: np.random.Generator, side: int, length: float) -> list[list[float]]:
+def _houses(rng: "np.random.Generator", side: int, length: float) -> list[list[float]]:
     """Houses side by side with an alley now and then, each with a door step and balconies."""
     solids, x, number = [], -16.0, 0
     while x < length + 60:
@@ -196,7 +196,7 @@ def _houses(rng: np.random.Generator, side: int, length: float) -> list[list[flo
     return solids
 
 
-def _kerbside(rng: np.random.Generator, side: int, length: float) -> list[list[float]]:
+def _kerbside(rng: "np.random.Generator", side: int, length: float) -> list[list[float]]:
     """Parked cars, and on the pavement posts, trees and bins in turn."""
     solids, x, number = [], -13.0, 0
     while x < length + 50:
@@ -219,7 +219,7 @@ def _kerbside(rng: np.random.Generator, side: int, length: float) -> list[list[f
     return solids
 
 
-def _car(rng: np.random.Generator, x: float, y: float, number: int) -> list[list[float]]:
+def _car(rng: "np.random.Generator", x: float, y: float, number: int) -> list[list[float]]:
     yaw = rng.normal(0, 0.025)
     long, wide = rng.uniform(1.95, 2.3), rng.uniform(0.82, 0.9)
     body = solid(BOX, (x, y, 0.53), (long, wide, 0.33), PAINT, yaw=yaw, variant=number)

@@ -26,6 +26,8 @@ _NEAREST = 0.1  # metres
 _MAX_CURVATURE = 0.006  # deviation within a block or from its plane, as a share of the depth
 _MIN_COSINE = 0.17  # between ray and normal
 _CELL = 8  # blocks a side, over which errors are averaged
+_NORMAL = np.float32(1 / 32767)  # unit of packed normals: a thirtieth of a millimetre a metre
+_STRIP = 8  # rows of blocks averaged at once: their pixels stay in the cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,21 +39,31 @@ class PlaneImage:
     points: Floats  # (3, n) float32 metres, the blocks' centres
     sigma: Floats  # (n,) float32 metres, standard deviation of a depth camera at these depths
     index: NDArray[np.intp]  # (n,) number of the point's block, row by row
-    planes: Floats  # (4, rows·columns) float32: unit normal and offset, normal · p = offset > 0; 0 = no plane
+    # (3, rows·columns) unit normals: float32, or int16 in units of `_NORMAL`
+    normals: Floats | NDArray[np.int16]
+    offsets: Floats  # (rows·columns,) float32 metres, normal · p = offset > 0; 0 = no plane
     roughness: float  # deviation of the blocks from the planes fitted around them, as a share of `sigma`
 
     @property
     def covered(self) -> float:
         """Share of the blocks that have a plane."""
-        return float(np.count_nonzero(self.planes[3]) / self.planes.shape[1])
+        return float(np.count_nonzero(self.offsets) / len(self.offsets))
+
+    def planes(self, block: NDArray[np.intp]) -> tuple[Floats, Floats]:
+        """Normals, (3, m) float32, and offsets, (m,), of blocks."""
+        normals = self.normals.take(block, axis=1)
+        is_packed = normals.dtype == np.int16
+        unpacked = normals * _NORMAL if is_packed else normals.astype(np.float32, copy=False)
+        return unpacked, self.offsets.take(block)
 
     def without_points(self) -> "PlaneImage":
-        """The planes alone: 40 % of the memory. Points of other images can be matched with them."""
+        """The planes alone: a quarter of the memory. Points of other images can be matched with them."""
         return replace(
             self,
             points=np.empty((3, 0), np.float32),
             sigma=np.empty(0, np.float32),
             index=np.empty(0, np.intp),
+            normals=np.rint(self.normals / _NORMAL).astype(np.int16),
         )
 
     def every(self, step: int) -> NDArray[np.intp]:
@@ -81,23 +93,25 @@ def fit_planes(depth: Floats, intrinsics: Intrinsics) -> PlaneImage:
     v, u = np.divmod(index, shape[1])
     z = 1 / inverse.ravel()[index]
     points = np.stack([(u - K.cx) / K.fx * z, (v - K.cy) / K.fy * z, z]).astype(np.float32)
-    planes = np.zeros((4, valid.size), np.float32)
-    planes[:3], roughness = _normals(inverse, valid, K)
+    normals, roughness = _normals(inverse, valid, K)
+    offsets = np.zeros(valid.size, np.float32)
     # Through the block's own point, not its neighbours' mean: that lies inside of what is round.
-    planes[3, index] = np.einsum("in,in->n", planes[:3, index], points)
-    return PlaneImage(K, shape, points, deviation(points[2]).astype(np.float32), index, planes, roughness)
+    offsets[index] = np.einsum("in,in->n", normals[:, index], points)
+    sigma = deviation(points[2]).astype(np.float32)
+    return PlaneImage(K, shape, points, sigma, index, normals, offsets, roughness)
 
 
 def _blocks(depth: Floats, block: int) -> tuple[Floats, NDArray[np.bool_]]:
     """Mean inverse depth of blocks, and where at least half of a block lies on one smooth surface."""
     rows, columns = depth.shape[0] // block, depth.shape[1] // block
-    depth = np.ascontiguousarray(depth[: rows * block, : columns * block])
-    there = (depth > _NEAREST).astype(np.float32)
-    inverse = there / np.maximum(depth, np.float32(_NEAREST))
-    size = (columns, rows)
-    share, mean, square = (
-        cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (there, inverse, inverse * inverse)
-    )
+    share, mean, square = (np.empty((rows, columns), np.float32) for _ in range(3))
+    for top in range(0, rows, _STRIP):
+        strip = slice(top, min(top + _STRIP, rows))
+        pixels = depth[top * block : strip.stop * block, : columns * block]
+        there = (pixels > _NEAREST).astype(np.float32)
+        inverse = there / np.maximum(pixels, np.float32(_NEAREST))
+        for image, into in ((there, share), (inverse, mean), (inverse * inverse, square)):
+            cv2.resize(image, (columns, strip.stop - top), dst=into[strip], interpolation=cv2.INTER_AREA)
     valid = share >= 0.5
     mean = np.divide(mean, share, out=np.ones_like(mean), where=valid)
     spread = np.divide(square, share, out=np.ones_like(mean), where=valid) - mean * mean
@@ -169,12 +183,12 @@ def match(
     v = moved[1] * scale * np.float32(K.fy) + np.float32(K.cy + 0.5)
     inside = (moved[2] > _NEAREST) & (u >= 0) & (v >= 0) & (u < columns) & (v < rows)
     block = np.where(inside, v, 0).astype(np.intp) * columns + np.where(inside, u, 0).astype(np.intp)
-    chosen = np.flatnonzero(inside & (there.planes[3].take(block) > 0))
+    chosen = np.flatnonzero(inside & (there.offsets.take(block) > 0))
     block = block.take(chosen)
-    moved, planes = moved.take(chosen, axis=1), there.planes.take(block, axis=1)
-    distance = planes[0] * moved[0] + planes[1] * moved[1] + planes[2] * moved[2] - planes[3]
+    moved, (normals, offsets) = moved.take(chosen, axis=1), there.planes(block)
+    distance = normals[0] * moved[0] + normals[1] * moved[1] + normals[2] * moved[2] - offsets
     which = chosen if some is None else some.take(chosen)
-    return Match(moved, planes[:3], distance, sigma.take(chosen), which, block)
+    return Match(moved, normals, distance, sigma.take(chosen), which, block)
 
 
 def correlated_blocks(found: Match, columns: int) -> float:

@@ -22,6 +22,7 @@ MAX_RATIO = 0.8  # of the best match's distance to the second best's
 MAX_DIFFERENT_BITS = 64  # of 256, in a match
 PATTERN_WINDOW = 9  # blocks a side, over which grey is normalised
 HALF_CONTRAST = 8.0  # grey levels
+JPEG_QUALITY = 95  # of kept images: a fifth of the memory; changed by less than a camera's noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +31,7 @@ class RGBDFrame:
 
     intrinsics: Intrinsics
     shape: tuple[int, ...]  # (H, W) of the image
-    gray: Gray | None  # (H, W) uint8; None = depth alone
+    image: Gray | bytes | None  # grey, (H, W) uint8, or as a JPEG; None = depth alone
     surface: point_to_plane.PlaneImage  # planes of the depth image
 
     @classmethod
@@ -51,6 +52,20 @@ class RGBDFrame:
         )
 
     @property
+    def gray(self) -> Gray | None:
+        """Grey image, (H, W) uint8; None = depth alone."""
+        if not isinstance(self.image, bytes):
+            return self.image
+        return np.asarray(cv2.imdecode(np.frombuffer(self.image, np.uint8), cv2.IMREAD_GRAYSCALE), np.uint8)
+
+    def packed(self) -> "RGBDFrame":
+        """The frame with its image as a JPEG, and without what was derived from it."""
+        if self.image is None or isinstance(self.image, bytes):
+            return self
+        _, jpeg = cv2.imencode(".jpg", self.image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+        return replace(self, image=jpeg.tobytes())
+
+    @property
     def columns(self) -> int:
         """Width of the image, pixels."""
         return self.shape[1]
@@ -58,11 +73,12 @@ class RGBDFrame:
     @cached_property
     def pattern(self) -> NDArray[np.float32] | None:
         """Normalised grey of the blocks, (rows·columns,): less mean, over contrast; None = no image."""
-        if self.gray is None:
+        gray = self.gray
+        if gray is None:
             return None
         rows, columns = self.surface.shape
         block = self.columns // columns
-        whole = self.gray[: rows * block, : columns * block]
+        whole = gray[: rows * block, : columns * block]
         small = cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA).astype(np.float32)
         around = (PATTERN_WINDOW, PATTERN_WINDOW)
         away = small - cv2.blur(small, around)
@@ -73,8 +89,9 @@ class RGBDFrame:
     @cached_property
     def orb_corners(self) -> tuple[features.Pixels, NDArray[np.uint8]]:
         """ORB corners (Rublee et al. 2011): (n, 2) pixels and (n, 32) uint8 descriptors."""
-        if self.gray is not None:
-            points, found = cv2.ORB.create(MAX_ORB_CORNERS).detectAndCompute(self.gray, None)
+        gray = self.gray
+        if gray is not None:
+            points, found = cv2.ORB.create(MAX_ORB_CORNERS).detectAndCompute(gray, None)
             if found is not None and len(points):
                 return np.array([point.pt for point in points], np.float32), found.astype(np.uint8)
         return np.empty((0, 2), np.float32), np.empty((0, 32), np.uint8)
@@ -84,11 +101,11 @@ class RGBDFrame:
         K, (rows, columns) = self.intrinsics, self.surface.shape
         column, row = ((pixels + 0.5) / (self.columns // columns)).astype(np.intp).T
         inside = (column >= 0) & (row >= 0) & (column < columns) & (row < rows)
-        plane = self.surface.planes[:, np.where(inside, row * columns + column, 0)].astype(np.float64)
+        normals, offsets = self.surface.planes(np.where(inside, row * columns + column, 0))
         rays = features.back_project(pixels, np.ones(len(pixels)), K)
-        toward = np.einsum("in,ni->n", plane[:3], rays)
-        ok = inside & (plane[3] > 0) & (toward > 1e-3)
-        z = plane[3] / np.where(ok, toward, 1)
+        toward = np.einsum("in,ni->n", normals.astype(np.float64), rays)
+        ok = inside & (offsets > 0) & (toward > 1e-3)
+        z = offsets.astype(np.float64) / np.where(ok, toward, 1)
         return rays * z[:, None], ok
 
 
@@ -112,6 +129,10 @@ class TrackingKeyframe:
         corners = corners[features.stronger_than_noise(frame.gray, corners)]
         points, ok = frame.back_project(corners)
         return cls(number, T_world_camera, kept, corners[ok], points[ok])
+
+    def packed(self) -> "TrackingKeyframe":
+        """The keyframe in little memory, to be kept once a newer one is followed."""
+        return replace(self, frame=self.frame.packed())
 
     def follow(
         self, frame: RGBDFrame, T_keyframe_camera: se3.Transform

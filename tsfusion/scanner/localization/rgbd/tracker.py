@@ -15,7 +15,7 @@ from tsfusion.scanner.localization.localizer import Localizer, Lost, Pose
 from tsfusion.scanner.localization.rgbd import point_to_plane, pose_acceptance, pose_solver
 from tsfusion.scanner.localization.rgbd.rgbd_frame import RGBDFrame, TrackingKeyframe
 
-MAX_KEYFRAMES = 40  # tracking keyframes kept, about 0.7 MB each at 640×480
+MAX_KEYFRAMES = 40  # tracking keyframes kept, about 0.3 MB each at 640×480
 KEYFRAME_DISTANCE, KEYFRAME_ANGLE = 0.1, np.radians(10)  # metres and radians to the next one
 KEYFRAME_OVERLAP = 0.6  # share of the last one's view, below which the next one begins
 MIN_PLANES = 0.03  # share of the depth image that must show planes
@@ -190,6 +190,8 @@ class RGBDLocalizer(Localizer):
         """Make the frame the newest tracking keyframe."""
         keyframe = TrackingKeyframe.of(current, self._next, T)
         self._next += 1
+        if self._kept:
+            self._kept[-1] = self._kept[-1].packed()
         self._kept.append(keyframe)
         self._remember_pose(T, frame)
         return Pose(
