@@ -90,14 +90,14 @@ replay synthetic:room --option count=0 | got count 0 | expected count >= 1
 replay synthetic:room --option focal=3 | takes no `focal` | it takes world, sensor
 replay synthetic:room --option path=spiral | got 'spiral' | path must be one of circle
 replay synthetic:room --start 99 | none after the first 99 | has 40 keyframes
-replay synthetic:room --stride 0 | '--stride' | greater than or equal to 1 | 2
-replay synthetic:room --rate 0 | '--rate' | greater than or equal to 0.001 | 2
-replay synthetic:room --rate fast | '--rate' | should be a valid number | 2
+replay synthetic:room --stride 0 | '--stride' | x>=1 | 2
+replay synthetic:room --rate 0 | '--rate' | x>=0.001 | 2
+replay synthetic:room --rate fast | '--rate' | is not a valid float | 2
 # settings of the map
 replay synthetic:room --voxel-size -1 | got -1 | voxel_size must be > 0
 replay synthetic:room --voxel-size 0 | got 0 | voxel_size must be > 0
 replay synthetic:room --voxel-size nan | got nan | voxel_size must be > 0
-replay synthetic:room --voxel-size 2cm | '--voxel-size' | should be a valid number | 2
+replay synthetic:room --voxel-size 2cm | '--voxel-size' | is not a valid float | 2
 replay synthetic:room --voxel-size 20 | 20 m is too large for max_range 5 m | 0.02 m suits a room
 replay synthetic:room --voxel-size 0.0001 | too small here: the first keyframe alone would need | use 0.005 or more
 replay synthetic:room --voxel-size 0.000001 | got 1e-06 | must be at least 1e-05 m
@@ -118,7 +118,7 @@ replay synthetic:room --min-weight nan | got nan | min_weight must be >= 0
 replay synthetic:room --min-weight 1e9 | got 1000000000.0 | min_weight must be <= 4194304
 replay synthetic:room --threads 0 | got 0 | threads must be >= 1
 replay synthetic:room --threads 1000 | got 1000 | threads must be <= 256
-TSFUSION_VOXEL_SIZE=big demo | TSFUSION_VOXEL_SIZE | should be a valid number | 2
+TSFUSION_VOXEL_SIZE=big demo | TSFUSION_VOXEL_SIZE | is not a valid float | 2
 TSFUSION_SENSOR=ear demo | got 'ear' | must be one of kinect
 TSFUSION_CONFIG=missing.toml demo | missing.toml: No such file | `tsfusion config dump` writes one
 # files of settings
@@ -165,8 +165,8 @@ mesh nonsense://x a.ply | got 'nonsense://x' | an address looks like
 mesh {nobody} a.ply --voxel-size 1 | has no effect on a live server's map | give it to `tsfusion serve`
 status --connect {nobody} --timeout 0.2 | no server answered | is the port right?
 status --connect nonsense | got 'nonsense' | an address looks like
-status --timeout 0 | '--timeout' | greater than or equal to 0.1 | 2
-status --watch 0 | '--watch' | greater than or equal to 0.1 | 2
+status --timeout 0 | '--timeout' | x>=0.1 | 2
+status --watch 0 | '--watch' | x>=0.1 | 2
 # serve
 serve --listen nonsense | got 'nonsense' | an address looks like
 serve --listen tcp://0.0.0.0:5555 | without keys | `tsfusion keys new server`
@@ -197,7 +197,7 @@ serve --max-range 0.01 | got 0.01 m | max_range must be larger than min_range
 {scan} tum --trajectory other_times.txt --connect {nobody} | not localised in any of 3 frames | are these the same clock?
 {scan} synthetic:room --feed nonsense | got 'nonsense' | an address looks like
 {scan} synthetic:room --max-gap 0 | got 0.0 | max_gap must be > 0
-{scan} synthetic:room --time-offset soon | '--time-offset' | should be a valid number | 2
+{scan} synthetic:room --time-offset soon | '--time-offset' | is not a valid float | 2
 {scan} synthetic:room --min-overlap 2 | got 2.0 | min_overlap must be <= 1
 {scan} synthetic:room --angle 0 | got 0.0 | angle must be > 0
 {scan} synthetic:room --spool s | --spool has no effect | without --connect
@@ -222,7 +222,7 @@ ate tum/groundtruth.txt other_times.txt | no two poses are within 0.01 s | one r
 ate tum/groundtruth.txt missing | missing does not exist | expected a dataset
 ate tum/groundtruth.txt tum_no_poses | has no poses to compare with | give a trajectory file
 ate tum/groundtruth.txt tum/groundtruth.txt --plot a.jpg | cannot write a.jpg | a name ending in .png
-ate tum/groundtruth.txt tum/groundtruth.txt --max-difference -1 | '--max-difference' | greater than or equal to 0 | 2
+ate tum/groundtruth.txt tum/groundtruth.txt --max-difference -1 | '--max-difference' | x>=0 | 2
 ate short.txt short.txt | got 1 and 1 | two positions or more
 download kitchen | no recording 'kitchen' is known | known are tum-fr1-xyz
 download --check --to empty | no archives of these recordings in empty | --to
@@ -255,8 +255,8 @@ keys revoke nobody --dir keys | no key is allowed under the name 'nobody' | `tsf
 keys list --dir missing | cannot read the folder missing | `tsfusion keys new server`
 doctor missing | disk | choose another folder
 demo --world cave | got 'cave' | world must be one of
-demo --count 0 | '--count' | greater than or equal to 1 | 2
-demo --seed -1 | '--seed' | greater than or equal to 0 | 2
+demo --count 0 | '--count' | x>=1 | 2
+demo --seed -1 | '--seed' | x>=0 | 2
 # mistyped
 fly | No such command 'fly' | see --help | 2
 replai synthetic:room | No such command 'replai' | Did you mean 'replay'? | 2
