@@ -7,6 +7,7 @@ import shutil
 import cv2
 import numpy as np
 import pytest
+from command_processes import python
 from geometry_checks import warp_residual
 from small_recordings import P0, P1, TR, kitti, one_line, put
 
@@ -184,3 +185,13 @@ def test_the_matcher_is_silent_where_there_is_nothing_to_match():
     left, right = (rng.integers(0, 256, (60, 200)).astype(np.uint8) for _ in range(2))
     assert (Matcher()(left, right) > 0).mean() < 0.02
     assert Matcher()(left, right).dtype == np.uint16
+
+
+def test_reading_loads_nothing_that_pykittis_package_does(data):
+    code = (
+        "import sys; from tsfusion.datasets import open_dataset; "
+        "open_dataset(sys.argv[1], sequence='06')[0]; "
+        "sys.exit(' '.join({'pykitti', 'pandas', 'matplotlib'} & set(sys.modules)) or None)"
+    )
+    done = python(code, data("kitti_odometry"))
+    assert (done.returncode, done.stderr) == (0, "")

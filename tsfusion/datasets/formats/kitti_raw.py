@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.dataset import keep_posed, require_folder, require_frames
-from tsfusion.datasets.formats.kitti import KITTIFrames, files_by_frame, read_calibration
+from tsfusion.datasets.formats.kitti import KITTIFrames, files_by_frame, pykitti_utils, read_calibration
 from tsfusion.datasets.readers import intrinsics_of, read_color, read_numbers
 from tsfusion.datasets.trajectory_files import checked_pose
 from tsfusion.geometry.keyframe import Intrinsics
@@ -160,17 +160,15 @@ def _files(
 
 def _imu_poses(place: Path, *, required: bool) -> dict[int, Transform]:
     """Frame number → T_world_imu, by pykitti's Mercator projection; the first packet is the origin."""
-    from pykitti.utils import OxtsPacket, pose_from_oxts_packet
-
     files = files_by_frame(place, ".txt")
     if required and not files:
         raise DatasetError(f"{place} has no packets (*.txt); expected {EXPECTED}")
     poses: dict[int, Transform] = {}
-    scale, origin = None, None
+    scale, origin, pykitti = None, None, pykitti_utils()
     for number, file in files.items():
-        packet = OxtsPacket(*read_numbers(file, "30 numbers of a GPS/IMU packet", columns=_PACKET)[0])
+        packet = pykitti.OxtsPacket(*read_numbers(file, "30 numbers of a GPS/IMU packet", columns=_PACKET)[0])
         scale = np.cos(np.radians(packet.lat)) if scale is None else scale
-        R, t = pose_from_oxts_packet(packet, scale)
+        R, t = pykitti.pose_from_oxts_packet(packet, scale)
         origin = t if origin is None else origin
         poses[number] = transform(R, t - origin)
     return poses
