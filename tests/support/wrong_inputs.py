@@ -80,6 +80,12 @@ check scenes_nan_pose | not finite: nan | expected a 4×4 camera-to-world matrix
 replay tum --sequence 06 | takes no `sequence` | it takes trajectory, intrinsics
 replay tum --option depth_topic=/x | takes no `depth_topic` | it takes trajectory, intrinsics
 replay tum --option speed | got 'speed' | must be KEY=VALUE, such as
+replay tum --option self=3 | takes no `self` | it takes trajectory, intrinsics
+replay tum --option posed=maybe | `posed` must be true or false, got 'maybe' | true or false
+scan tum --option posed=maybe | `posed` must be true or false, got 'maybe' | true or false
+scan camera:9 --option spec=3 | takes no `spec` | it takes calibration, intrinsics
+{scan} tum --sequence 06 --option sequence=06 | --sequence and --option sequence=… | give one of them
+check tum --trajectory x --option trajectory=y | --trajectory and --option trajectory=… | give one of them
 replay tum --option =3 | got '=3' | must be KEY=VALUE
 replay tum --trajectory missing.txt | missing.txt is missing | expected a trajectory
 replay tum --trajectory file | file is no trajectory | expected 8 numbers a line (TUM)

@@ -65,7 +65,7 @@ def _truth(reference: Path, given: dict[str, Any]) -> "Path | Dataset":
         return reference
     from tsfusion.cli.replay import open_recording
 
-    return open_recording(reference, posed=False, **given)
+    return open_recording(reference, **{"posed": False} | given)
 
 
 def table(rows: "list[tuple[str, TrajectoryError]]") -> str:

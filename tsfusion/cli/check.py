@@ -34,8 +34,11 @@ def check(
     from tsfusion.evaluation import pose_check
 
     dataset = replay.open_recording(
-        path, unpack=unpack, sequence=sequence, modality=modality, trajectory=trajectory,
-        **options.camera(intrinsics, calibration) | options.dataset_options(option),
+        path,
+        **options.dataset_options(
+            option, unpack=unpack, sequence=sequence, modality=modality, trajectory=trajectory,
+            **options.camera(intrinsics, calibration),
+        ),
     )  # fmt: skip
     report = pose_check.check(dataset)
     if json:

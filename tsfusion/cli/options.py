@@ -246,11 +246,15 @@ def up_direction(text: str | None) -> "Up | None":
     return None if text is None else up_direction.parse(text)
 
 
-def dataset_options(given: list[str] | None) -> dict[str, Any]:
-    """`KEY=VALUE` each; numbers, true, false and lists as in JSON, anything else is text.
+def dataset_options(given: list[str] | None, **flags: Any) -> dict[str, Any]:
+    """`flags`, and on top what `--option` gives: `KEY=VALUE` each; numbers, true, false and lists as in JSON,
+    anything else is text.
+
+    Args:
+        flags: what flags of their own give to the same dataset or source; None and False = not given.
 
     Raises:
-        InvalidConfig: for one that is not.
+        InvalidConfig: for one that is not `KEY=VALUE`, or is given by its flag, too.
     """
     import json
 
@@ -261,11 +265,13 @@ def dataset_options(given: list[str] | None) -> dict[str, Any]:
         key, equals, value = each.partition("=")
         if not key.isidentifier() or not equals:
             raise InvalidConfig(f"--option must be KEY=VALUE, such as time_offset_s=0.02, got {each!r}")
+        if flags.get(key) not in (None, False):
+            raise InvalidConfig(f"--{key} and --option {key}=… exclude each other: give one of them")
         try:
             found[key] = json.loads(value)
         except ValueError:
             found[key] = value
-    return found
+    return flags | found
 
 
 def camera(intrinsics: str | None, calibration: Path | None) -> dict[str, Any]:

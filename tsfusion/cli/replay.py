@@ -64,8 +64,11 @@ def replay(
     options.check_target_flags(context, connect, own=own, remote=options.only_for_kept_maps(state))
     given_up = options.up_direction(up)
     dataset = open_recording(
-        path, unpack=unpack, sequence=sequence, modality=modality, trajectory=trajectory,
-        **options.camera(intrinsics, calibration) | options.dataset_options(option),
+        path,
+        **options.dataset_options(
+            option, unpack=unpack, sequence=sequence, modality=modality, trajectory=trajectory,
+            **options.camera(intrinsics, calibration),
+        ),
     )  # fmt: skip
     usual = getattr(dataset, "usual", None)
     chosen = options.configuration_for(dataset.sensor, config, usual=usual, tell=connect is None, **settings)

@@ -115,7 +115,7 @@ def scan(
     from tsfusion.pipelines.scan import scan as run
 
     opened = _open(
-        context, source, options.dataset_options(option),
+        context, source, option,
         camera=options.camera(intrinsics, calibration), rate=rate,
         recording={"unpack": unpack, "sequence": sequence, "modality": modality},
         part={"start": start, "stride": stride, "limit": max_frames}, settings=settings,
@@ -148,7 +148,7 @@ def scan(
 def _open(
     context: typer.Context,
     spec: str,
-    given: dict[str, Any],
+    option: list[str] | None,
     *,
     camera: dict[str, Any],
     rate: float | None,
@@ -156,7 +156,7 @@ def _open(
     part: dict[str, Any],
     settings: dict[str, Any],
 ) -> "Source":
-    """The source of that name with the options `given`; of a recording, the part that is asked for.
+    """The source of that name with what `--option` gives; of a recording, the part that is asked for.
 
     Where the recording or the trajectory in `settings` has no times, its poses are made the recording's own.
     """
@@ -169,7 +169,7 @@ def _open(
             ("sequence", "modality", "unpack", "rate", "start", "stride"),
             "is for recordings, and this source is live: leave it out",
         )
-        live = open_source(spec, **camera | given)
+        live = open_source(spec, **options.dataset_options(option, **camera))
         return live if part["limit"] is None else LimitedSource(live, part["limit"])
     from tsfusion.cli.replay import open_recording
     from tsfusion.core.errors import DatasetError
@@ -183,7 +183,7 @@ def _open(
             f"{spec} does not exist; expected a dataset, synthetic:room, synthetic:street, or live: "
             "realsense, camera:0, folder:PATH (docs/sources.md)"
         )
-    dataset = open_recording(path, **recording | camera | given, posed=False)
+    dataset = open_recording(path, **options.dataset_options(option, posed=False, **recording, **camera))
     if settings["trajectory"] is not None:
         trajectory = Path(settings["trajectory"]).expanduser()
         if not pairs_by_time(trajectory, dataset):

@@ -67,7 +67,7 @@ class Found(NamedTuple):
     layout: Layout
     also: tuple[str, ...]  # names of less specific layouts that fit too
 
-    def open(self, **options: Any) -> Dataset:
+    def open(self, /, **options: Any) -> Dataset:
         """Open the dataset; options that are None are left out.
 
         Raises:

@@ -24,13 +24,12 @@ def is_live(spec: str) -> bool:
     return name in _BUILT_IN or name in entry_points(group=GROUP).names
 
 
-def open_source(spec: str, **options: object) -> Source:
+def open_source(spec: str, /, **options: object) -> Source:
     """Open `realsense[:SERIAL|FILE]`, `camera:PLACE`, `folder:PATH` or an installed package's `name[:…]`.
 
     Args:
-                    spec: name and place, as `tsfusion scan` takes them.
-            options: as the source's class takes them; for None the source has its own default.
-
+        spec: name and place, as `tsfusion scan` takes them.
+        options: as the source's class takes them; for None the source has its own default.
 
     Raises:
         InvalidConfig: no such source, it takes no such option, or not of that type.
