@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Wrong cameras, units of depth and misplaced colour are named; genuine data and crops are not."""
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -337,17 +338,22 @@ def test_replay_of_a_wrong_camera_ends_with_status_1(
 ) -> None:
     from tsfusion.cli import replay
 
-    monkeypatch.setattr(replay, "_run", lambda *_, **__: None)
     whole = data(FOLDERS["7scenes"])
     wrong = tmp_path / "wrong"
     wrong.mkdir()
     (wrong / "seq-01").symlink_to(whole / "seq-01")
     (wrong / "camera-intrinsics.txt").write_text("525 0 319.5\n0 525 239.5\n0 0 1\n")
-    assert run("replay", wrong) == 1
-    lines = capsys.readouterr().err.strip().splitlines()
-    assert "warning: camera and depth disagree: frames fit best with a focal length of about 58" in lines[-2]
-    assert lines[-1].startswith(
-        "tsfusion: the map is likely wrong (--no-check accepts it): camera and depth disagree"
+    out = tmp_path / "out"
+    assert run("replay", wrong, "--out", out, "--voxel-size", 0.1, "--max-frames", 60) == 1
+    captured = capsys.readouterr()
+    likely_wrong = "the map is likely wrong (--no-check accepts it): camera and depth disagree"
+    assert (
+        "warning: camera and depth disagree: frames fit best with a focal length of about 58" in captured.err
     )
+    assert captured.err.strip().splitlines()[-1].startswith(f"tsfusion: {likely_wrong}")
+    # Who is sent the results reads it, too.
+    assert json.loads((out / "run.json").read_text())["missed"].startswith(likely_wrong)
+    assert f'class="verdict bad">T{likely_wrong[1:]}' in (out / "report.html").read_text(encoding="utf-8")
+    monkeypatch.setattr(replay, "_run", lambda *_, **__: None)
     assert run("replay", wrong, "--no-check") == 0
     assert run("replay", whole) == 0

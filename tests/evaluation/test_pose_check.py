@@ -13,6 +13,7 @@ from support.corrupted_recordings import FOLDERS, Corrupted, genuine, opened
 
 from tsfusion import cli
 from tsfusion.datasets import Dataset, Selection, Synthetic, open_dataset, select
+from tsfusion.evaluation import pose_check
 from tsfusion.evaluation.pose_check import check
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
@@ -290,8 +291,30 @@ def test_replay_warns(data: Data, tmp_path: Path, capsys: pytest.CaptureFixture[
     from tsfusion.cli import replay
 
     wrong = inverted(data(FOLDERS["open3d"]), tmp_path)
-    replay._warn_of_disagreement(open_dataset(wrong))
-    disagree = "warning: poses and depth disagree: the poses are world-to-camera"
-    assert capsys.readouterr().err.startswith(disagree)
-    replay._warn_of_disagreement(open_dataset(data(FOLDERS["open3d"])))
+    doubt, warnings = replay._checked(open_dataset(wrong))
+    assert doubt.startswith("poses and depth disagree: the poses are world-to-camera")
+    assert capsys.readouterr().err.startswith(f"warning: {doubt}"[:70])
+    assert not warnings
+    assert replay._checked(open_dataset(data(FOLDERS["open3d"]))) == ("", [])
     assert capsys.readouterr().err == ""
+
+
+def test_a_scan_says_what_is_wrong_with_frames_without_poses(data: Data, tmp_path: Path) -> None:
+    """Colour that does not lie on the depth costs a scan its place: half of the frames are not localised."""
+    whole = data(FOLDERS["7scenes"])
+    assert pose_check.check_frames(open_dataset(whole, posed=False)) == (None, None)
+    depth, color = pose_check.check_frames(open_dataset(whole, posed=False, register=False))
+    assert depth is None
+    assert str(color).startswith("the colour is not registered to the depth: its edges lie about")
+    out, few = tmp_path / "out", ("--max-frames", "8", "--voxel-size", "0.1")
+    with pytest.raises(SystemExit):
+        cli.main(["scan", str(whole), "--option", "register=false", *few, "--out", str(out)])
+    (warning,) = json.loads((out / "run.json").read_text())["warnings"]
+    assert warning.startswith(color)
+    assert "--option color=false tracks by the depth alone" in warning
+    assert "The colour is not registered to the depth" in (out / "report.html").read_text(encoding="utf-8")
+
+
+def test_depth_in_a_wrong_unit_is_told_without_poses(data: Data) -> None:
+    depth, _ = pose_check.check_frames(open_dataset(data(FOLDERS["open3d"]), depth_scale=1.0))
+    assert str(depth).startswith("depth is unusable: it reads as")

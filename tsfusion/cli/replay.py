@@ -56,7 +56,6 @@ def replay(
     **settings: Any,
 ) -> None:
     """Fuse a recording that has poses, or a journal: mesh and figures."""
-    from tsfusion.core.errors import IncompleteRun
     from tsfusion.datasets import select
 
     # Any server makes a mesh with another `min_weight`.
@@ -76,7 +75,7 @@ def replay(
         dataset = select(dataset, start=start, stride=stride, limit=max_frames)
     for reason, count in dataset.skipped.items():
         typer.echo(f"left out {count_of(count, 'frame')} {reason}", err=True)
-    wrong = _warn_of_disagreement(dataset) if check_ and not _is_synthetic(path) else None
+    doubt, warnings = _checked(dataset) if check_ and not _is_synthetic(path) else ("", [])
     client = options.client_settings(
         chosen, connect, control=control, map=map_, key=key, server_key=server_key
     )
@@ -84,9 +83,8 @@ def replay(
         dataset, out, view=view, overwrite=overwrite, json=json, volume=chosen.volume,
         server=options.own_server(chosen, state), client=client, connect=connect, same_frame=same_frame,
         rate=rate, min_weight=settings["min_weight"], up=given_up, keep_islands=keep_islands,
+        warnings=warnings, doubt=doubt,
     )  # fmt: skip
-    if wrong is not None:
-        raise IncompleteRun(f"the map is likely wrong (--no-check accepts it): {wrong}")
 
 
 def open_recording(path: Path, /, *, unpack: bool = False, **given: Any) -> "Dataset":
@@ -122,15 +120,19 @@ def _is_synthetic(path: Path) -> bool:
     return str(path).startswith("synthetic:")
 
 
-def _warn_of_disagreement(dataset: "Dataset") -> str | None:
-    """Mistake because of which poses, camera and depth disagree, or None; printed on stderr, as colour is."""
+def _checked(dataset: "Dataset") -> tuple[str, list[str]]:
+    """Mistake because of which poses, camera and depth disagree, empty = none; and what is said of colour.
+
+    Both are printed on stderr.
+    """
     from tsfusion.evaluation import pose_check
 
     report = pose_check.check(dataset)
-    wrong = report.text if report.verdict == "disagree" else None
-    if wrong is not None or report.color is not None:
-        output.text(f"warning: {wrong or report.color}", err=True)
-    return wrong
+    doubt = report.text if report.verdict == "disagree" else ""
+    warnings = [report.color] if report.color is not None and not doubt else []
+    for line in filter(None, [doubt, *warnings]):
+        output.text(f"warning: {line}", err=True)
+    return doubt, warnings
 
 
 @options.takes_map_settings

@@ -15,6 +15,7 @@ import typer
 from tsfusion.cli import options
 
 if TYPE_CHECKING:
+    from tsfusion.datasets import Dataset
     from tsfusion.scanner.sources.source import Source
 
 _ENDING = b"\nending: what is on its way is finished (press Ctrl-C again to end at once)\n"
@@ -114,7 +115,7 @@ def scan(
     from tsfusion.cli import output, progress, run_page, run_summary
     from tsfusion.pipelines.scan import scan as run
 
-    opened = _open(
+    opened, warnings = _open(
         context, source, option,
         camera=options.camera(intrinsics, calibration), rate=rate,
         recording={"unpack": unpack, "sequence": sequence, "modality": modality},
@@ -136,6 +137,7 @@ def scan(
             server=options.own_server(chosen, state), client=client, connect=connect, spool=spool,
             same_frame=same_frame, align=align, min_weight=settings["min_weight"], up=given_up,
             keep_islands=keep_islands, viewer=run_page.beside(view, display), progress=display,
+            warnings=warnings,
         )  # fmt: skip
     if json:
         output.as_json(result)
@@ -155,8 +157,9 @@ def _open(
     recording: dict[str, Any],
     part: dict[str, Any],
     settings: dict[str, Any],
-) -> "Source":
-    """The source of that name with what `--option` gives; of a recording, the part that is asked for.
+) -> "tuple[Source, list[str]]":
+    """The source of that name with what `--option` gives, of a recording the part that is asked for; and what
+    is odd about its frames.
 
     Where the recording or the trajectory in `settings` has no times, its poses are made the recording's own.
     """
@@ -170,7 +173,7 @@ def _open(
             "is for recordings, and this source is live: leave it out",
         )
         live = open_source(spec, **options.dataset_options(option, **camera))
-        return live if part["limit"] is None else LimitedSource(live, part["limit"])
+        return live if part["limit"] is None else LimitedSource(live, part["limit"]), []
     from tsfusion.cli.replay import open_recording
     from tsfusion.core.errors import DatasetError
     from tsfusion.datasets import select
@@ -184,13 +187,32 @@ def _open(
             "realsense, camera:0, folder:PATH (docs/sources.md)"
         )
     dataset = open_recording(path, **options.dataset_options(option, posed=False, **recording, **camera))
+    warnings = [] if spec.startswith("synthetic:") else _warnings(dataset)
     if settings["trajectory"] is not None:
         trajectory = Path(settings["trajectory"]).expanduser()
         if not pairs_by_time(trajectory, dataset):
             dataset = WithTrajectory(dataset, trajectory)
             settings |= {"trajectory": None, "localizer": "given"}
             typer.echo(f"poses: {trajectory}, one a frame in order, as not both have times", err=True)
-    return RecordedSource(select(dataset, **part), rate=rate)
+    return RecordedSource(select(dataset, **part), rate=rate), warnings
+
+
+def _warnings(dataset: "Dataset") -> list[str]:
+    """What is odd about a recording's frames, printed on stderr, too."""
+    from tsfusion.cli import output
+    from tsfusion.core.errors import DatasetError
+    from tsfusion.evaluation import pose_check
+
+    try:
+        depth, color = pose_check.check_frames(dataset)
+    except DatasetError:  # the scan comes to that frame, and tells
+        return []
+    if color is not None:
+        color += "; where the sensor is lost because of it, --option color=false tracks by the depth alone"
+    found = [text for text in (depth, color) if text is not None]
+    for text in found:
+        output.text(f"warning: {text}", err=True)
+    return found
 
 
 @contextmanager

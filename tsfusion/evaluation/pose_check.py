@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.datasets.dataset import Dataset
+from tsfusion.datasets.dataset import Dataset, frame_of
 from tsfusion.evaluation.camera_check import (
     CameraMistake,
     best_camera,
@@ -25,8 +25,8 @@ from tsfusion.evaluation.camera_check import (
     is_outside,
     likely_cameras,
 )
-from tsfusion.evaluation.color_registration import misplaced_color
-from tsfusion.evaluation.depth_units import unusable_depth
+from tsfusion.evaluation.color_registration import misplaced_color, outlines
+from tsfusion.evaluation.depth_units import depth_unit, unusable_depth
 from tsfusion.evaluation.fitted_factors import (
     AS_GOOD,
     MIN_FOCAL_SIGMA,
@@ -120,6 +120,24 @@ def check(dataset: Dataset) -> PoseCheckReport:
     return replace(
         report, color=color, text=f"{report.text}; {'but' if report.verdict == 'agree' else 'also'} {color}"
     )
+
+
+def check_frames(dataset: Dataset) -> tuple[str | None, str | None]:
+    """What is wrong with the depth and with the colour, whatever the poses: a sentence each; None = nothing.
+
+    Reads the frames that `check` does, and keeps of each no more than its edges.
+
+    Raises:
+        DatasetError: a frame cannot be read.
+    """
+    units, edges = [], {}
+    for index in sorted({index for pair in wanted_pairs(len(dataset)) for index in pair} or {0}):
+        frame = frame_of(dataset, index)
+        if frame.depth_m is None:
+            return None, None
+        units.append(depth_unit(frame, None))
+        edges[index] = outlines(frame)
+    return unusable_depth(units), misplaced_color(edges)
 
 
 def _with_doubt(

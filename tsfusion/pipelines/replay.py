@@ -5,7 +5,7 @@ import dataclasses
 import logging
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 
 import numpy as np
@@ -48,6 +48,8 @@ def replay(
     up: Up | None = None,
     keep_islands: bool | None = None,
     viewer: ViewerChild | None = None,
+    warnings: Sequence[str] = (),
+    doubt: str = "",
 ) -> ReplaySummary:
     """Send every keyframe of `dataset` to a server and leave the results in the folder `out`.
 
@@ -67,6 +69,8 @@ def replay(
         up: away from the ground, in the map's frame; None = it is found.
         keep_islands: see `mesh_files.write`.
         viewer: shows the map while the run lasts.
+        warnings: what is odd about the recording, for the results.
+        doubt: why the map is likely wrong; empty = nothing is known to be. The run has then missed its end.
 
     Raises:
         OutputError: `out` cannot be written (checked first), or the mesh is empty.
@@ -126,6 +130,7 @@ def replay(
             dataset, sender, written, error_mm, folder=folder,
             seconds=seconds, rate=rate, peak_rss_bytes=peak,
             server_start_seconds=target.child.start_seconds if target.child else None,
+            warnings=warnings, doubt=doubt,
         )  # fmt: skip
         run_files.write_ledger(work, sender.records)
         growth.write_csv(work / "growth.csv")

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Figures of a replay, and the contents of its `run.json`."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -46,6 +47,8 @@ class ReplaySummary(msgspec.Struct, frozen=True, kw_only=True):
     keyframes_sent: int
     keyframes_fused: int
     keyframes_rejected: dict[str, int]
+    frames_skipped: dict[str, int]  # left out at opening, by reason
+    warnings: list[str]  # a sentence each
     missed: str  # what the run was for and did not reach; empty = it did
     seconds: float  # first keyframe handed over → last one fused
     server_start_seconds: float | None  # None: the server was there already
@@ -74,6 +77,8 @@ def summarise(
     rate: float | None,
     peak_rss_bytes: int,
     server_start_seconds: float | None,
+    warnings: Sequence[str],
+    doubt: str,
 ) -> ReplaySummary:
     """A replay in figures.
 
@@ -85,7 +90,10 @@ def summarise(
         rate: keyframes a second that were asked for; None = as fast as they are fused.
         peak_rss_bytes: of the sending process.
         server_start_seconds: of the own server; None = the server was there already.
+        warnings: what is odd about the recording, a sentence each.
+        doubt: why the map is likely wrong; empty = nothing is known to be.
     """
+    likely_wrong = f"the map is likely wrong (--no-check accepts it): {doubt}" if doubt else ""
     status, _, figures = written
     stats, delays = sender.stats, latency_ledger.summarise(sender.records)
     return ReplaySummary(
@@ -95,8 +103,15 @@ def summarise(
         keyframes_sent=stats.sent,
         keyframes_fused=stats.fused,
         keyframes_rejected={**stats.skipped, **stats.refused, **stats.rejected},
-        missed=shortfall.of_delivery(
-            stats, spool="the spool", link=sender.problem, rejection=sender.first_rejection
+        frames_skipped=dict(dataset.skipped),
+        warnings=list(warnings),
+        missed=shortfall.together(
+            (
+                shortfall.of_delivery(
+                    stats, spool="the spool", link=sender.problem, rejection=sender.first_rejection
+                ),
+                likely_wrong,
+            )
         ),
         seconds=round(seconds, 3),
         server_start_seconds=None if server_start_seconds is None else round(server_start_seconds, 3),

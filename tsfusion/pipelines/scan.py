@@ -6,7 +6,7 @@ import logging
 import os
 import time
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from functools import partial
 from itertools import chain
@@ -78,6 +78,7 @@ def scan(
     up: Up | None = None,
     keep_islands: bool | None = None,
     viewer: ViewerChild | None = None,
+    warnings: Sequence[str] = (),
 ) -> ScanSummary:
     """Take a source's frames to its end, or until it is closed, and leave the results in the folder `out`.
 
@@ -101,6 +102,7 @@ def scan(
         up: away from the ground, in the map's frame; None = it is found.
         keep_islands: see `mesh_files.write`.
         viewer: shows the map while the run lasts.
+        warnings: what is odd about the source's frames, for the results.
 
     Raises:
         SourceError: the sensor failed; what came before is in `out`.
@@ -182,6 +184,7 @@ def scan(
                 source, scanner, maps, records, folder=folder, camera=_camera(source, first),
                 localizer=registry.localizer_name(config, first), spool=spool, complete=complete,
                 seconds=seconds, peak_rss_bytes=peak, config=config, volume=volume if own else None,
+                warnings=warnings,
             )  # fmt: skip
         run_files.write_record(work, result)
         run_files.write_report(work, meshes)

@@ -2,6 +2,7 @@
 """Results of a scan: the trajectories, and the contents of `run.json`."""
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +54,7 @@ class ScanSummary(msgspec.Struct, frozen=True, kw_only=True):
     keyframes_fused: int
     keyframes_rejected: dict[str, int]
     keyframes_by_rule: dict[str, int]
+    warnings: list[str]  # what is odd about the recording, a sentence each
     missed: str  # what the scan was for and did not reach; empty = it did
     left: int  # keyframes still in the spool at the end
     link: str  # why the server took nothing at the end; empty = it did
@@ -123,6 +125,7 @@ def summarise(
     peak_rss_bytes: int,
     config: ScanConfig,
     volume: VolumeConfig | None,
+    warnings: Sequence[str],
 ) -> ScanSummary:
     """A scan in figures."""
     state = scanner.state()
@@ -142,6 +145,7 @@ def summarise(
         keyframes_fused=stats.fused,
         keyframes_rejected={**stats.skipped, **stats.refused, **stats.rejected},
         keyframes_by_rule=state.selected,
+        warnings=list(warnings),
         missed=shortfall.together(
             (
                 shortfall.of_delivery(stats, spool=spool, link=state.link, rejection=scanner.first_rejection),

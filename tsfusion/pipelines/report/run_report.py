@@ -138,7 +138,7 @@ def _tiles(found: RunFindings) -> list[tuple[str, str, str]]:
 
 def _warnings(found: RunFindings) -> list[str]:
     record = found.record
-    lines = []
+    lines = [f"{line[:1].upper()}{line[1:]}." for line in record.get("warnings") or ()]
     if rejected := record.get("keyframes_rejected"):
         lines.append(f"Not in the map: {counted(rejected)}.")
     if skipped := record.get("frames_skipped"):
