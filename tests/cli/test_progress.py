@@ -156,6 +156,21 @@ def test_a_journal_is_fused_in_lines_too(capsys: pytest.CaptureFixture[str]) -> 
     assert capsys.readouterr().err == "  read 30 of 60; fused 29\n"
 
 
+@pytest.mark.usefixtures("eager")
+def test_keyframes_are_not_counted_on_from_bytes(capsys: pytest.CaptureFixture[str], clock: Clock) -> None:
+    with progress.shown(quiet=False) as display:
+        for name in ("one journal", "the next"):
+            for done in (0, 3_000_000):
+                clock.now += 2
+                display.show_bytes(f"listing {name}", done, 3_000_000)
+        display.show_fused(0, 0, 60)
+        clock.now += 2
+        display.show_fused(30, 28, 60)
+    shown = capsys.readouterr().err
+    assert "-" not in shown
+    assert shown.splitlines()[-1] == "  read 30 of 60, 15.0/s, 2 s left; fused 28, 14.0/s"
+
+
 def test_quiet_is_silent(capsys: pytest.CaptureFixture[str]) -> None:
     with progress.shown(quiet=True) as display:
         display.stage("scanning the room")

@@ -45,7 +45,7 @@ class Quiet:
 
     def __init__(self) -> None:
         self._run = RunProgress()
-        self._rates = Rates()
+        self._fusing, self._reading = Rates(), Rates()
 
     def __enter__(self) -> "Quiet":
         return self
@@ -68,11 +68,11 @@ class Quiet:
 
     def show_fused(self, read: int, fused: int, total: int) -> None:
         """Show how many keyframes of a journal are read, and how many of those are in the map."""
-        self.show(Screen(fused_rows(read, fused, total, self._rates)))
+        self.show(Screen(fused_rows(read, fused, total, self._fusing)))
 
     def show_bytes(self, text: str, done: int, total: int) -> None:
         """Show how much is read, after `text`."""
-        self.show(Screen([byte_row(text, done, total, self._rates)]))
+        self.show(Screen([byte_row(text, done, total, self._reading)]))
 
     def show_steps(self, text: str, done: int, total: int) -> None:
         """Show how many steps are done, after `text`."""
