@@ -37,6 +37,25 @@ def test_a_held_client_waits_says_why_and_goes_on() -> None:
         assert server.numbers == [0, 1, 2]
 
 
+def test_a_hold_that_is_over_is_tried_with_one_keyframe() -> None:
+    """On a robot's radio link: 8 keyframes that waited for a full disk were sent 97 times in 10 seconds."""
+    with scripted() as server, joined(server) as client:
+        client.send(wall(0))
+        client.flush(DEADLINE)  # the window is open
+        server.hold = (0.2, "disk", "the disk is full")
+        send_all(client, range(1, 9))
+        until(lambda: client._sender._control_session.held)
+        time.sleep(0.1)  # what was under way before the hold came
+        before = server.held
+        began = time.monotonic()
+        until(lambda: server.held >= before + 3)
+        holds = (time.monotonic() - began) / 0.2 + 1
+        assert server.held <= before + holds
+        server.hold = None
+        client.flush(DEADLINE)
+        assert server.numbers == list(range(9))
+
+
 def test_a_held_client_sends_nothing() -> None:
     with scripted(hold=(60.0, "disk", "the disk is full")) as server, joined(server) as client:
         client.send(wall(0))

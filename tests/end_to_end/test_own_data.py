@@ -113,7 +113,8 @@ def test_a_scan_of_images_without_times_takes_one_pose_a_frame(
     root = own_recordings.images(tmp_path / "mine", kitchen, poses=False)
     settings = {"trajectory": str(poses_file(tmp_path / "slam.txt", poses, kitchen)), "localizer": None}
     more = {"part": {"start": 2, "stride": 2, "limit": None}, "settings": settings}
-    with _open(None, str(root), {}, camera={}, rate=None, recording={}, **more) as source:
+    source, _ = _open(None, str(root), None, camera={}, rate=None, recording={}, **more)
+    with source:
         found = [frame.T_world_camera for frame in source]
     assert settings == {"trajectory": None, "localizer": "given"}
     np.testing.assert_allclose(found, [kitchen[2].T_world_camera, kitchen[4].T_world_camera], atol=1e-6)

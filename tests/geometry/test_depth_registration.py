@@ -111,8 +111,11 @@ def test_what_lies_behind_the_colour_camera_is_not_drawn() -> None:
 def test_wrong_sizes_and_poses_are_named(registration: Registration) -> None:
     with pytest.raises(InvalidConfig, match=r"depth must be of size \(240, 320\), got \(10, 10\)"):
         registration.depth_of_color(np.zeros((10, 10), np.float32))
-    with pytest.raises(InvalidConfig, match="color must be of size"):
+    with pytest.raises(InvalidConfig, match=r"color must be \(240, 320, 3\) uint8, got"):
         registration.color_of_depth(np.zeros((10, 10, 3), np.uint8), np.zeros(SIZE, np.float32))
+    for wrong in (np.zeros(SIZE, np.uint8), np.zeros((*SIZE, 4), np.uint8), np.zeros((*SIZE, 3), np.uint16)):
+        with pytest.raises(InvalidConfig, match=r"color must be \(240, 320, 3\) uint8, got"):
+            registration.color_of_depth(wrong, np.zeros(SIZE, np.float32))
     with pytest.raises(InvalidKeyframe):
         Registration(DEPTH, COLOR, 2 * np.eye(4), SIZE)
 

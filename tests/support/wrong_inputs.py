@@ -85,6 +85,8 @@ replay tum --option posed=maybe | `posed` must be true or false, got 'maybe' | t
 scan tum --option posed=maybe | `posed` must be true or false, got 'maybe' | true or false
 scan camera:9 --option spec=3 | takes no `spec` | it takes calibration, intrinsics
 {scan} tum --sequence 06 --option sequence=06 | --sequence and --option sequence=… | give one of them
+{scan} tum --trajectory x --option trajectory=y | --trajectory and --option trajectory=… | give one of them
+replay tum --option unpack=no | `unpack` must be true or false, got 'no' | true or false
 check tum --trajectory x --option trajectory=y | --trajectory and --option trajectory=… | give one of them
 replay tum --option =3 | got '=3' | must be KEY=VALUE
 replay tum --trajectory missing.txt | missing.txt is missing | expected a trajectory

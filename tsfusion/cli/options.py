@@ -271,7 +271,7 @@ def dataset_options(given: list[str] | None, **flags: Any) -> dict[str, Any]:
             found[key] = json.loads(value)
         except ValueError:
             found[key] = value
-    return flags | found
+    return flags | {key: value for key, value in found.items() if value is not None}
 
 
 def camera(intrinsics: str | None, calibration: Path | None) -> dict[str, Any]:

@@ -186,7 +186,9 @@ def _open(
             f"{spec} does not exist; expected a dataset, synthetic:room, synthetic:street, or live: "
             "realsense, camera:0, folder:PATH (docs/sources.md)"
         )
-    dataset = open_recording(path, **options.dataset_options(option, posed=False, **recording, **camera))
+    flag = settings["trajectory"]
+    given = options.dataset_options(option, posed=False, trajectory=flag, **recording, **camera)
+    dataset = open_recording(path, **given | ({} if flag is None else {"trajectory": None}))
     warnings = [] if spec.startswith("synthetic:") else _warnings(dataset)
     if settings["trajectory"] is not None:
         trajectory = Path(settings["trajectory"]).expanduser()

@@ -72,6 +72,8 @@ def open_dataset(path: str | Path, /, *, unpack: bool = False, **options: Any) -
         >>> len(room), room[0].kind, room[0].shape
         (3, 'depth', (240, 320))
     """
+    if not isinstance(unpack, bool):
+        raise DatasetError(f"`unpack` must be true or false, got {unpack!r}")
     if not str(path).startswith(_SYNTHETIC):
         return find(path, unpack=unpack).open(**options)
     words = str(path)[len(_SYNTHETIC) :].split(":")

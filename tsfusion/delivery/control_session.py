@@ -6,6 +6,8 @@ import math
 import time
 from collections.abc import Callable
 
+from msgspec.structs import replace
+
 from tsfusion.core.counts import count_of
 from tsfusion.core.errors import DecodeError
 from tsfusion.delivery.link_state import LinkState
@@ -63,6 +65,7 @@ class ControlSession:
         self._hello_due = self._ping_due = self._rewound = self._held_until = 0.0
         self._hello_interval = _HELLO_INTERVAL[0]
         self._asked_again = False
+        self._tries = False  # since a hold: one record, until the server says what became of it
         self._warning_due = 0.0  # when rejected records may be named again
         self._unsaid = 0  # records that were rejected since they were
         self._is_lost = False  # whether it was said that the server is gone or silent
@@ -72,7 +75,9 @@ class ControlSession:
     @property
     def terms(self) -> messages.Welcome | None:
         """The server's terms while records may be sent: it let us in, and its answers fit our clock."""
-        return self.welcome if self.clock.count and not self._held_until else None
+        if self.welcome is None or not self.clock.count or self._held_until:
+            return None
+        return replace(self.welcome, window_keyframes=1) if self._tries else self.welcome
 
     @property
     def held(self) -> bool:
@@ -101,7 +106,7 @@ class ControlSession:
             self._ping(now)
         if self._held_until and now >= self._held_until:
             self._held_until = self._rewound = 0.0
-            self._asked_again = True
+            self._asked_again = self._tries = True
         if self._asked_again and now - self._rewound > _REWIND_INTERVAL:
             self.rewind()
 
@@ -217,6 +222,7 @@ class ControlSession:
             self.welcome = welcome
             self._hops = 0
             self._ping_due = self._held_until = 0.0
+            self._tries = False
             self._outbox.welcome(welcome.durable, welcome.window_keyframes)
             self._on_progress(welcome.durable, welcome.fused)
             self._outbox.note_meshed(welcome.fused)  # a new server stamps only what it fuses from here on
@@ -308,6 +314,7 @@ class ControlSession:
         moved = self._outbox.acknowledge(durable, fused, stamps, offset_ns=offset_ns, bound_ns=bound_ns)
         if moved:
             self._outbox.change_link_state(self._outbox.link_state.moved())
+            self._tries = False
             self.last_moved = self.last_progress = self.last_heard
         return moved
 
@@ -323,6 +330,7 @@ class ControlSession:
 
     def _on_nack(self, nack: messages.Nack) -> None:
         self.last_moved = self.last_progress = self.last_heard
+        self._tries = False
         if nack.stage == "map":
             self._on_rejected(nack)
         elif (entry := self._outbox.find_sent(nack.seq)) is not None:

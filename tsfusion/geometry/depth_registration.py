@@ -54,12 +54,13 @@ class Registration:
         A pixel without depth (0) gets the colour far away there; one outside of the colour image, the colour
         of its border; one hidden from the colour camera, the colour of what hides it.
         """
-        if color.shape[:2] != self.color_size:
-            raise InvalidConfig(f"color must be of size {self.color_size}, got {color.shape[:2]}")
+        expected = (*self.color_size, 3)
+        if color.shape != expected or color.dtype != np.uint8:
+            raise InvalidConfig(f"color must be {expected} uint8, got {color.shape} {color.dtype}")
         seen = np.empty((*self.size, 3), np.uint8)
         for rows, z in self._strips(depth_m):
             u, v, _ = self._pixels(np.where(z > 0, z, _FAR), rows)
-            cv2.remap(color, u, v, cv2.INTER_LINEAR, dst=seen[rows], borderMode=cv2.BORDER_REPLICATE)
+            seen[rows] = cv2.remap(color, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return seen
 
     def depth_of_color(self, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:

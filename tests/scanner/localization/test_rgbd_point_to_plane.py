@@ -37,6 +37,19 @@ def test_planes_are_those_of_the_surface():
     assert seen.roughness < 1e-3
 
 
+def test_the_last_rows_have_planes_whatever_their_number():
+    shape = (424, 512)  # a Kinect v2's: 141 rows of blocks, which is no number of whole strips
+    seen = fit_planes(corner_of_a_room(np.eye(4), K, shape), K)
+    assert seen.shape == (141, 170)
+    offsets = seen.offsets.reshape(seen.shape)
+    assert (offsets[-9:-1, 2:-2] > 0).mean() > 0.9
+    np.testing.assert_allclose(
+        fit_planes(np.full(shape, 2.0), K).offsets.max(),
+        2.0,
+        rtol=1e-5,  # of float64, too
+    )
+
+
 def test_the_centre_of_a_block_lies_on_its_ray():
     seen = fit_planes(np.full((480, 640), 2.0, np.float32), K)
     u, v = seen.points[0] / seen.points[2] * K.fx + K.cx, seen.points[1] / seen.points[2] * K.fy + K.cy
@@ -85,6 +98,7 @@ def test_planes_without_points_are_matched_as_before_in_a_quarter_of_the_memory(
     arrays = ("points", "sigma", "index", "normals", "offsets")
     whole, packed = (sum(getattr(image, name).nbytes for name in arrays) for image in (there, kept))
     assert packed < 0.27 * whole
+    assert kept.without_points() is kept
 
 
 def test_the_step_is_the_gradient_of_the_distances():

@@ -308,7 +308,6 @@ import cv2
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.scanner.localization.localizer import Pose
-from tsfusion.scanner.localization.rgbd.rgbd_frame import RGBDFrame, TrackingKeyframe
 from tsfusion.scanner.localization.rgbd.tracker import RGBDLocalizer
 
 def megabytes(name):
@@ -322,6 +321,8 @@ for name in names + names[::-1]:
     assert isinstance(answer, Pose), answer
     sizes.append(megabytes("VmRSS"))
 assert answer.anchor > 50
+kept = localizer._kept
+assert [isinstance(one.frame.image, bytes) for one in kept] == [True] * (len(kept) - 1) + [False]
 assert "taichi" not in sys.modules
 print(megabytes("VmHWM"), max(sizes[200:]) - max(sizes[:200]))
 """

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core.errors import DatasetError
+from tsfusion.core.errors import DatasetError, MissingDependency
 from tsfusion.datasets.cameras import RecordedCamera
 from tsfusion.datasets.dataset import STREET, Frames, keep_posed, require_folder, require_frames
 from tsfusion.datasets.readers import intrinsics_of, read_color, read_lines
@@ -217,7 +217,7 @@ def pykitti_utils() -> Any:
     folders = None if package is None else package.submodule_search_locations
     spec = None if folders is None else PathFinder.find_spec("pykitti.utils", folders)
     if spec is None or spec.loader is None:
-        raise ModuleNotFoundError("KITTI's layouts need pykitti, which is not installed", name="pykitti")
+        raise MissingDependency("KITTI's layouts are read with pykitti; install it with: pip install pykitti")
     module = module_from_spec(spec)
     spec.loader.exec_module(module)
     return module

@@ -173,6 +173,7 @@ def _drive(index: int, count: int) -> NDArray[np.float64]:
     return look_at(position, ahead)
 
 
+# `np.random` is quoted wherever worlds name it: the name alone loads it, 2 MB that few need.
 def _houses(rng: "np.random.Generator", side: int, length: float) -> list[list[float]]:
     """Houses side by side with an alley now and then, each with a door step and balconies."""
     solids, x, number = [], -16.0, 0

@@ -57,7 +57,12 @@ class PlaneImage:
         return unpacked, self.offsets.take(block)
 
     def without_points(self) -> "PlaneImage":
-        """The planes alone: a quarter of the memory. Points of other images can be matched with them."""
+        """The planes alone, their normals in 16 bits: a quarter of the memory.
+
+        Points of other images can be matched with them.
+        """
+        if self.normals.dtype == np.int16:
+            return self
         return replace(
             self,
             points=np.empty((3, 0), np.float32),
@@ -111,7 +116,7 @@ def _blocks(depth: Floats, block: int) -> tuple[Floats, NDArray[np.bool_]]:
         there = (pixels > _NEAREST).astype(np.float32)
         inverse = there / np.maximum(pixels, np.float32(_NEAREST))
         for image, into in ((there, share), (inverse, mean), (inverse * inverse, square)):
-            cv2.resize(image, (columns, strip.stop - top), dst=into[strip], interpolation=cv2.INTER_AREA)
+            into[strip] = cv2.resize(image, (columns, strip.stop - top), interpolation=cv2.INTER_AREA)
     valid = share >= 0.5
     mean = np.divide(mean, share, out=np.ones_like(mean), where=valid)
     spread = np.divide(square, share, out=np.ones_like(mean), where=valid) - mean * mean

@@ -62,8 +62,8 @@ class RGBDFrame:
         """The frame with its image as a JPEG, and without what was derived from it."""
         if self.image is None or isinstance(self.image, bytes):
             return self
-        _, jpeg = cv2.imencode(".jpg", self.image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-        return replace(self, image=jpeg.tobytes())
+        done, jpeg = cv2.imencode(".jpg", self.image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+        return replace(self, image=jpeg.tobytes()) if done else self  # wider than a JPEG may be
 
     @property
     def columns(self) -> int:
