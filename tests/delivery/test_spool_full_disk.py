@@ -9,6 +9,7 @@ import signal
 import socket
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from scripted_server import scripted
 
 from tsfusion import Client, Keyframe, journal
 from tsfusion.core.config import ClientConfig
-from tsfusion.core.errors import FlushTimeout, JournalError, TransportError
+from tsfusion.core.errors import FlushTimeout, JournalError, KeyframeRefused, TransportError
 from tsfusion.delivery import backpressure
 from tsfusion.delivery.spool import Spool
 
@@ -90,6 +91,8 @@ def test_what_is_acknowledged_makes_room(full_disk: Path) -> None:
         assert len([i for i in range(60) if client.send(noise(i)) is not None]) < 30
     with scripted() as server, joined(server, spool=full_disk, config=ALL) as client:
         until(lambda: client.send(noise(100)) is not None)
+        with suppress(KeyframeRefused):  # attempts before there was room
+            client.flush(DEADLINE)
         client.flush(DEADLINE)
         assert client.stats.state == "ok"
         assert server.numbers[-1] == 100
@@ -119,7 +122,8 @@ def test_a_read_only_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
         assert client.stats.state == "disk"
         assert "Read-only file system" in client.problem
         server.taking = True
-        client.flush(DEADLINE)
+        with pytest.raises(KeyframeRefused, match=r"Read-only file system \(and 2 more\)$"):
+            client.flush(DEADLINE)
         read_only[0] = False
         assert client.send(noise(7)) == 8
         assert "cannot keep" not in client.problem

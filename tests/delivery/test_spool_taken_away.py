@@ -14,7 +14,7 @@ from scripted_server import scripted
 
 from tsfusion import Client, journal
 from tsfusion.core.config import ClientConfig
-from tsfusion.core.errors import JournalError
+from tsfusion.core.errors import JournalError, KeyframeRefused
 from tsfusion.delivery import backpressure, sender
 from tsfusion.delivery.spool import Spool
 from tsfusion.delivery.tombstones import NAME, Tombstones
@@ -41,7 +41,9 @@ def test_a_spool_that_is_deleted_is_told_by_the_next_send_and_what_it_had_is_sti
         assert f"keyframes are lost: the spool {spool} cannot keep them" in client.problem
         assert "No such file" in client.problem
         server.taking = True
-        client.flush(DEADLINE)
+        with pytest.raises(KeyframeRefused, match=r"^a keyframe was never sent; keyframes are lost"):
+            client.flush(DEADLINE)
+        client.flush(DEADLINE)  # it is told once
         assert server.numbers == taken == [*range(24)]
         assert (client.stats.durable, client.stats.refused) == (24, {})
         assert not spool.exists()
@@ -62,7 +64,8 @@ def test_a_spool_that_is_away_for_a_while_costs_what_comes_meanwhile_and_no_more
         assert client.send(wall(4)) is not None
         assert client.problem == ""
         server.taking = True
-        client.flush(DEADLINE)
+        with pytest.raises(KeyframeRefused, match="a keyframe was never sent"):
+            client.flush(DEADLINE)
         assert server.numbers == [0, 1, 2, 4]
 
 

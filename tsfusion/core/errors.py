@@ -144,7 +144,7 @@ class FlushTimeout(TransportError):
 
 
 class KeyframeRefused(TransportError):
-    """The server will never take this keyframe, and said why."""
+    """The server will never take this keyframe, and said why; or the spool could not keep it."""
 
 
 class WorkerLost(TsfusionError):

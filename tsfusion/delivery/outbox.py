@@ -150,7 +150,8 @@ class Outbox:
     def skip(self, reason: str, *, is_correction: bool = False) -> None:
         """Count a record that is not sent."""
         with self._lock:
-            self._outcomes.skip(reason, is_correction=is_correction)
+            problem = self.spool_problem if reason in ("spool", "disk") else ""
+            self._outcomes.skip(reason, problem, is_correction=is_correction)
 
     @property
     def spool_is_away(self) -> bool:
@@ -186,7 +187,7 @@ class Outbox:
                         return False
                     self._spool.remove(place)
                     self._times.remove(entry.seq)
-                    self._outcomes.skip("dropped")
+                    self._outcomes.skip("dropped", "")
                     self._changed.notify_all()
                     return True
         return False
@@ -425,7 +426,7 @@ class Outbox:
         return " and ".join([*counts, *([count_of(corrections, "correction")] if corrections else [])])
 
     def take_refusals(self) -> str:
-        """The records given up since the last call, in words; empty = none."""
+        """The records given up, or not kept, since the last call, in words; empty = none."""
         with self._lock:
             return self._outcomes.take_refusals()
 

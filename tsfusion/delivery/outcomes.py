@@ -77,19 +77,27 @@ class Outcomes:
         self._refusal_count = 0  # of which `take_refusals` has not told yet
         self._first_refusal = ""  # of those, in words
 
-    def skip(self, reason: str, *, is_correction: bool = False) -> None:
-        """Count a record that is not sent."""
+    def skip(self, reason: str, problem: str, *, is_correction: bool = False) -> None:
+        """Count a record that is not sent.
+
+        Args:
+            problem: why the spool cannot keep it; empty = it is a policy's choice.
+        """
         (self._corrections_refused if is_correction else self._skipped)[reason] += 1
+        if problem:
+            self._note_refusal(f"a {'correction' if is_correction else 'keyframe'} was never sent; {problem}")
 
     def refuse(self, entry: Waiting, reason: str, message: str) -> None:
         """Count a record that was given up."""
         (self._corrections_refused if entry.is_correction else self._refused)[reason] += 1
-        if not self._refusal_count:
-            self._first_refusal = f"{entry.kind} {entry.seq} was refused ({reason}): {message}"
+        self._note_refusal(f"{entry.kind} {entry.seq} was refused ({reason}): {message}")
+
+    def _note_refusal(self, text: str) -> None:
+        self._first_refusal = text if not self._refusal_count else self._first_refusal
         self._refusal_count += 1
 
     def take_refusals(self) -> str:
-        """The records given up since the last call, in words; empty = none."""
+        """The records given up, or not kept, since the last call, in words; empty = none."""
         count, self._refusal_count = self._refusal_count, 0
         more = f" (and {count - 1} more)" if count > 1 else ""
         return f"{self._first_refusal}{more}" if count else ""
