@@ -3,11 +3,15 @@
 
 import os
 import signal
+import sys
 from typing import NoReturn
 
 
 def main(arguments: list[str] | None = None) -> NoReturn:
     """Run a command line (default: this process's) and exit; Ctrl-C while modules load ends it silently."""
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:  # closed by who started us; the lowest descriptor takes its place
+            setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # its errors are told once, in our own words

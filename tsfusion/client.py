@@ -273,8 +273,8 @@ class Client:
         Raises:
             WorldRefused: as soon as the map turns out to have keyframes of another world.
             FlushTimeout: after `timeout` seconds; the rest stays in the spool and is still being sent.
-            KeyframeRefused: when since the last flush the server turned some away for good, or the spool could
-                not keep some.
+            KeyframeRefused: when the server turned some away for good since the last flush, or the spool had
+                no room for them.
         """
         done = self._wait(lambda: self._outbox.is_durable or self.is_of_other_world, timeout)
         if not self._outbox.is_durable:

@@ -3,6 +3,7 @@
 
 import json
 import os
+import shlex
 import signal
 import socket
 import subprocess
@@ -11,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from command_processes import Here, python, tsfusion
+from command_processes import COMMAND, Here, python, tsfusion
 from small_recordings import seven_scenes
 
 from tsfusion import __version__
@@ -437,3 +438,40 @@ def test_a_wrong_option_of_a_dataset(here: Here, given: str, words: str) -> None
 def test_options_of_a_dataset() -> None:
     parsed = options.dataset_options(["noise=maybe", "seed=3", "color=false", "poses=a=b"])
     assert parsed == {"noise": "maybe", "seed": 3, "color": False, "poses": "a=b"}
+
+
+def test_a_file_has_settings_for_each_map(tmp_path: Path) -> None:
+    file = tmp_path / "maps.toml"
+    text = "[volume]\nvoxel_size = 0.05\n[maps.hall]\nvoxel_size = 0.1\n[client]\nmap = 'hall'\n"
+    file.write_bytes(b"\xef\xbb\xbf" + text.encode())  # as Windows' Notepad writes it
+    for chosen in (options.configuration(file), options.configuration_for("tof", file, max_range=3.0)):
+        assert chosen.volumes()["hall"].voxel_size == 0.1
+        assert (chosen.volume.voxel_size, chosen.client.map) == (0.05, "hall")
+        assert options.own_volume(chosen, chosen.client).voxel_size == 0.1
+
+
+@pytest.mark.parametrize("closed", ["<&-", ">&-", "2>&-", "<&- >&- 2>&-"])
+def test_a_stream_that_is_closed_is_no_traceback(closed: str, tmp_path: Path) -> None:
+    said = tmp_path / "said"
+    line = f"{shlex.join(map(str, COMMAND))} datasets 2> {said} {closed}"
+    done = subprocess.run(["sh", "-c", line], timeout=60, check=False, capture_output=True)
+    assert done.returncode == 0
+    assert not done.stderr
+    assert "Traceback" not in (said.read_text() if said.exists() else "")
+
+
+def test_the_sensor_of_a_flag_beats_the_recordings(here: Here) -> None:
+    """Its noise decides weights and bands, so that the map is another one."""
+    hashes = []
+    for flags in ([], ["--sensor", "kinect"], ["--sensor", "tof"]):
+        arguments = ["synthetic:room", "--option", "count=1", "--voxel-size", 0.1, "--json", *flags]
+        done = here("replay", *arguments, "--out", f"out{len(hashes)}")
+        hashes.append(json.loads(done.stdout)["map_hash"])
+    assert hashes[0] == hashes[1] != hashes[2]
+    assert "sensor tof" in here("map", "info", "out2/map.tsf").stdout
+    hashes = []
+    for flags in ([], ["--sensor", "tof"]):
+        arguments = ["synthetic:room", "--option", "count=1", "--voxel-size", 0.1, "--json", *flags]
+        done = here("fuse", *arguments, "--workers", 1, "--out", f"fused{len(hashes)}")
+        hashes.append(json.loads(done.stdout)["map_hash"])
+    assert hashes[0] != hashes[1]

@@ -335,3 +335,21 @@ def test_a_slice_beside_the_map_is_refused(here: Here) -> None:
     done = here("map", "convert", "map.tsf", "yard.yaml", "--heights", 100, 101, "--up", "-y")
     assert (done.returncode, Path("yard.yaml").exists()) == (1, False)
     assert "nothing of the map lies between 100 and 101 m" in done.stderr
+
+
+def test_no_map_takes_the_place_of_a_servers(here: Here, state: Path) -> None:
+    saved = file_of(state, "yard")
+    before = saved.read_bytes()
+    box = ("--box", -1, -1, 0, 1, 1, 3)
+    done = here("map", "crop", saved, *box, "--out", saved)
+    assert done.returncode == 1
+    assert "a server keeps its map there, beside the journal; choose another name" in done.stderr
+    assert saved.read_bytes() == before
+
+
+def test_a_mesh_of_a_journal_has_the_saved_maps_settings_and_flags_on_top(here: Here, state: Path) -> None:
+    """With one flag of the map all others were the defaults: voxels of 2 cm in place of 8."""
+    journal = state_folder.map_folder(state, "yard")
+    known = json.loads(here("mesh", journal, "known.ply", "--json").stdout)["vertices"]
+    nearer = json.loads(here("mesh", journal, "nearer.ply", "--max-range", 20, "--json").stdout)["vertices"]
+    assert nearer == pytest.approx(known, rel=0.1)

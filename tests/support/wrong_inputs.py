@@ -99,6 +99,10 @@ replay synthetic:room --option focal=3 | takes no `focal` | it takes world, sens
 replay synthetic:room --option path=spiral | got 'spiral' | path must be one of circle
 replay synthetic:room --start 99 | none after the first 99 | has 40 keyframes
 replay synthetic:room --stride 0 | '--stride' | x>=1 | 2
+replay synthetic:room --rate nan | '--rate': a number is expected, got nan | see --help | 2
+fuse tum --tiles nan | --tiles must be a number of metres above 0 | got nan
+fuse tum --tiles 0 | --tiles must be a number of metres above 0 | got 0
+map forget left --since -5 --yes | a time must be seconds before the last record | got '-5'
 replay synthetic:room --rate 0 | '--rate' | x>=0.001 | 2
 replay synthetic:room --rate fast | '--rate' | is not a valid float | 2
 # settings of the map
@@ -184,6 +188,7 @@ serve --metrics nonsense | got 'nonsense' | must be HOST:PORT
 serve --metrics 0.0.0.0:9464 | got '0.0.0.0:9464' | on this machine, such as 127.0.0.1:9464
 serve --log-level loud | got 'loud' | must be one of debug, info
 serve --keys missing | server.key_secret does not exist | `tsfusion keys new server --dir missing`
+serve --directory tum | cannot use the directory of maps tum: unable to open | expected a file
 serve --voxel-size 20 | too large for max_range | suits a room
 serve --max-range 0.01 | got 0.01 m | max_range must be larger than min_range
 # scan

@@ -52,10 +52,17 @@ def fuse(
     """
     from tsfusion.cli import output, progress
     from tsfusion.cluster import fusion, keyframe_sources
+    from tsfusion.core.errors import InvalidConfig
 
     memory = options.byte_count(worker_memory)
+    if tile_size is not None and not 0 < tile_size < float("inf"):
+        raise InvalidConfig(f"--tiles must be a number of metres above 0, got {tile_size:g}")
     wishes = fusion.Wishes(
-        up=options.up_direction(up), keep_islands=keep_islands, worker_memory=memory, tile_size=tile_size
+        up=options.up_direction(up),
+        keep_islands=keep_islands,
+        worker_memory=memory,
+        tile_size=tile_size,
+        sensor=settings["sensor"],
     )
     with progress.shown(quiet=json) as display:
         found = keyframe_sources.listed(

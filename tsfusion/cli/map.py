@@ -102,9 +102,11 @@ def merge(
     from tsfusion.cli import output
     from tsfusion.core.errors import InvalidConfig
     from tsfusion.core.output_folder import check_writable
+    from tsfusion.journal.state_folder import check_no_map_of_a_server
     from tsfusion.tsdf import map_history
 
     check_writable(out, (".tsf",))
+    check_no_map_of_a_server(out)
     if len(maps) < 2:
         raise InvalidConfig(f"merging takes two maps or more, got {len(maps)}")
     merged = _load(maps[0], quiet=json)
@@ -150,8 +152,10 @@ def crop(
     from tsfusion.cli import output
     from tsfusion.core.errors import InvalidConfig
     from tsfusion.core.output_folder import check_writable
+    from tsfusion.journal.state_folder import check_no_map_of_a_server
 
     check_writable(out, (".tsf",))
+    check_no_map_of_a_server(out)
     cropped = _load(path, map_, quiet=json).crop(box)
     if not cropped.stats().blocks:
         raise InvalidConfig("nothing of the map lies in this box; `tsfusion map info` has the map's own")

@@ -49,10 +49,12 @@ def align(
     from tsfusion.cli import output, progress
     from tsfusion.core.output_folder import check_writable
     from tsfusion.evaluation.surface_registration import check_installed
+    from tsfusion.journal.state_folder import check_no_map_of_a_server
     from tsfusion.pipelines import map_alignment
 
     if out is not None:
         check_writable(out, (".tsf",))
+        check_no_map_of_a_server(out)
     check_installed()
     with progress.shown(quiet=json) as display:
         maps = []

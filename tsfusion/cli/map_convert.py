@@ -53,11 +53,13 @@ def check(
     from tsfusion.core.output_folder import check_writable
     from tsfusion.geometry.map_grids import SLICE_FORMATS
     from tsfusion.geometry.mesh import FORMATS
+    from tsfusion.journal.state_folder import check_no_map_of_a_server
     from tsfusion.tsdf.voxel_arrays import FORMATS as VOXELS
 
     suffix, is_slice = out.suffix.lower(), given["heights"] is not None
     if not (suffix == ".zarr" and out.is_dir()):  # one that is there is replaced
         check_writable(out, SLICE_FORMATS if is_slice else (*VOXELS, ".tsf", *FORMATS))
+        check_no_map_of_a_server(out)
     if dense and (is_slice or suffix not in (".npz", ".zarr")):
         raise InvalidConfig(
             f"--dense has no effect on {out}: only a .npz or .zarr file has arrays of the map"

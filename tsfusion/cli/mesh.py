@@ -131,7 +131,7 @@ def mesh(
         made = _of_server(source, map_, keys, control=control, min_weight=settings["min_weight"])
     else:
         _refuse_for_files(context, source)
-        chosen = options.configuration_for(None, config, **settings)
+        chosen = options.configuration_for(None, config, usual=_saved_settings(source, map_), **settings)
         given = config is not None or any(
             value is not None for name, value in settings.items() if name not in options.VIEW_OPTIONS
         )
@@ -198,6 +198,14 @@ def _refuse_for_files(context: typer.Context, source: str) -> None:
             context, options.MAP_OPTIONS.keys() - options.VIEW_OPTIONS,
             "has no effect on a saved map: give the state folder or the journal to fuse it anew",
         )  # fmt: skip
+
+
+def _saved_settings(source: str, map_: str | None) -> dict[str, Any]:
+    """Settings of the map that a server has saved of a journal; flags and the file are on top of them."""
+    from tsfusion.cluster.keyframe_sources import saved_settings
+
+    is_journal = not source.endswith(".tsf") and Path(source).exists()
+    return saved_settings(Path(source), map_) if is_journal else {}
 
 
 def _of_server(

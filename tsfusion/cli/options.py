@@ -16,7 +16,7 @@ import typer
 from tsfusion.cli import output, verbs
 
 if TYPE_CHECKING:
-    from tsfusion.core.config import ClientConfig, Config, ServerConfig
+    from tsfusion.core.config import ClientConfig, Config, ServerConfig, VolumeConfig
     from tsfusion.geometry.up_direction import Up
 
 
@@ -170,6 +170,8 @@ def configuration(file: Path | None, *, preset: dict[str, Any] | None = None, **
     Raises:
         InvalidConfig: for a bad file or value.
     """
+    from msgspec.structs import replace
+
     from tsfusion.core import config
 
     loaded = config.load(file, **(preset or {}))
@@ -182,7 +184,7 @@ def configuration(file: Path | None, *, preset: dict[str, Any] | None = None, **
     }
     changed = {name: config.override(getattr(loaded, name), **given) for name, given in tables.items()}
     changed["volume"].checked_model()
-    return config.Config(client=loaded.client, **changed)
+    return replace(loaded, **changed)
 
 
 def configuration_for(
@@ -217,6 +219,11 @@ def configuration_for(
         text = f"voxels: {chosen.volume.voxel_size:g} m, usual for {of} (--voxel-size gives others)"
         output.text(text, err=True, indent=8)
     return chosen
+
+
+def own_volume(chosen: "Config", client: "ClientConfig") -> "VolumeConfig":
+    """Settings of the map of a run with a server of its own: those of `[maps.NAME]`, where it has some."""
+    return chosen.volumes().get(client.map, chosen.volume)
 
 
 def byte_count(text: str | None) -> int | None:

@@ -80,10 +80,11 @@ def replay(
         chosen, connect, control=control, map=map_, key=key, server_key=server_key
     )
     _run(
-        dataset, out, view=view, overwrite=overwrite, json=json, volume=chosen.volume,
-        server=options.own_server(chosen, state), client=client, connect=connect, same_frame=same_frame,
+        dataset, out, view=view, overwrite=overwrite, json=json,
+        volume=options.own_volume(chosen, client), server=options.own_server(chosen, state),
+        client=client, connect=connect, same_frame=same_frame,
         rate=rate, min_weight=settings["min_weight"], up=given_up, keep_islands=keep_islands,
-        warnings=warnings, doubt=doubt,
+        warnings=warnings, doubt=doubt, sensor=settings["sensor"],
     )  # fmt: skip
 
 

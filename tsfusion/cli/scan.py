@@ -133,11 +133,12 @@ def scan(
             chosen, connect, control=control, map=map_, key=key, server_key=server_key
         )
         result = run(
-            opened, out, overwrite=overwrite, config=chosen.scan, volume=chosen.volume,
+            opened, out, overwrite=overwrite, config=chosen.scan,
+            volume=options.own_volume(chosen, client),
             server=options.own_server(chosen, state), client=client, connect=connect, spool=spool,
             same_frame=same_frame, align=align, min_weight=settings["min_weight"], up=given_up,
             keep_islands=keep_islands, viewer=run_page.beside(view, display), progress=display,
-            warnings=warnings,
+            warnings=warnings, sensor=settings["sensor"],
         )  # fmt: skip
     if json:
         output.as_json(result)

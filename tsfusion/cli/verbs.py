@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Parts that all verbs have in common: short help, examples, environment variables, renamed flags."""
 
+import math
 import re
 from collections.abc import Callable
 from typing import Annotated, Any, TypeVar
@@ -62,7 +63,13 @@ class Verb(_ShortHelp, TyperCommand):
         for flag, (place, usual) in _PLACES.items():
             if any(param.opts == [flag] and param.nargs == 1 for param in self.params):
                 words = _with_places(words, flag, place, usual)
-        return super().parse_args(ctx, words)
+        rest = super().parse_args(ctx, words)
+        for param in self.params:  # a range lets nan through, which is neither below nor above
+            value = ctx.params.get(param.name)
+            is_ranged = hasattr(param.type, "min") or hasattr(param.type, "max")
+            if is_ranged and isinstance(value, float) and math.isnan(value):
+                raise typer.BadParameter("a number is expected, got nan", ctx=ctx, param=param)
+        return rest
 
 
 def variable(flag: str) -> str:

@@ -58,12 +58,14 @@ class Wishes:
         worker_memory: bytes that each worker may take; None = no limit.
         tile_size: metres, edge of a tile of the mesh; None = tiles are made, of a size that suits them, only
             where the map does not fit into a worker's memory.
+        sensor: preset that all keyframes are taken to be of; None = each as it says.
     """
 
     up: Up | None = None
     keep_islands: bool | None = None
     worker_memory: int | None = None
     tile_size: float | None = None
+    sensor: str | None = None
 
 
 class FusedRun(msgspec.Struct, frozen=True, kw_only=True):
@@ -282,6 +284,7 @@ class _Run:
                 name=f"fuse-{number}-of-{shares}",
                 config=self._config,
                 keyframes=keyframes,
+                sensor=self._wishes.sensor,
                 **self._common,
             )
             for number, keyframes in enumerate(self._found.shares(shares))

@@ -103,6 +103,8 @@ class _Parts:
 
     def add(self, keyframe: Any) -> None:
         """Integrate a keyframe; raises MapError as `Volume.integrate`."""
+        if self._job.sensor is not None:
+            keyframe = replace(keyframe, sensor=self._job.sensor)
         before = self._volume.keyframes
         try:
             self._volume.integrate(keyframe)

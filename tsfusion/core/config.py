@@ -424,7 +424,7 @@ def load(path: str | Path | None, **volume: Any) -> Config:
             f"cannot read the configuration {path}: {error.strerror}; `tsfusion config dump` writes one"
         ) from error
     try:
-        tables = tomllib.loads(content.decode("utf-8"))
+        tables = tomllib.loads(content.decode("utf-8-sig"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InvalidConfig(
             f"{path} is not TOML: {error}; `tsfusion config dump` shows what one looks like"

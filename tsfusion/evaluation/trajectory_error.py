@@ -151,7 +151,7 @@ def paired(
     of_reference = read_poses(reference) if isinstance(reference, Path) else dataset_trajectory(reference)
     reference_stamps, references = of_reference
     if stamps is not None and reference_stamps is not None:
-        a, b = associate(stamps, reference_stamps, round(max_difference_s * 1e9))
+        a, b = associate(stamps, reference_stamps, round(min(max_difference_s, 1e9) * 1e9))
         return poses[a], references[b]
     if len(poses) != len(references):
         name = reference if isinstance(reference, Path) else reference.name

@@ -28,6 +28,11 @@ class MapDirectory:
     def __init__(self, path: str) -> None:
         self._path = path
 
+    def check(self) -> None:
+        """Raise JournalError as `claim`, before clients come."""
+        with self._open():
+            pass
+
     def place_of(self, name: str) -> Place | None:
         """The server that has a map; None = no server has it. Raises JournalError as `claim`."""
         with self._open() as database:
@@ -59,4 +64,7 @@ class MapDirectory:
                 database.execute(_TABLE)
                 yield database
         except sqlite3.Error as error:
-            raise JournalError(f"cannot use the directory of maps {self._path}: {error}") from error
+            raise JournalError(
+                f"cannot use the directory of maps {self._path}: {error}; expected a file, on a disk "
+                "that all servers reach"
+            ) from error

@@ -61,6 +61,8 @@ class MapRegistry:
         self.arriving: set[str] = set()  # maps that are being copied from another server
         self._spares = SpareFusers(context, server)
         self._directory = MapDirectory(server.directory) if server.directory else None
+        if self._directory is not None:
+            self._directory.check()
         self._started = False
 
     def __iter__(self) -> Iterator[HostedMap]:

@@ -36,10 +36,10 @@ def moment_ns(text: str, last_ns: int) -> int:
         InvalidConfig: for anything else.
     """
     try:
-        seconds = abs(float(text))
+        seconds = float(text)
     except ValueError:
         seconds = math.nan
-    if math.isfinite(seconds):
+    if 0 <= seconds < math.inf:
         return last_ns - round(seconds * 1e9)
     try:
         moment = datetime.datetime.fromisoformat(text.strip().replace("Z", "+00:00"))

@@ -10,7 +10,7 @@ from msgspec import Struct
 
 from tsfusion.core.config import MAP_NAME
 from tsfusion.core.durable_files import size_of
-from tsfusion.core.errors import JournalError
+from tsfusion.core.errors import JournalError, OutputError
 from tsfusion.journal.mcap_layout import Position, Record
 from tsfusion.journal.quarantine import quarantined_files
 from tsfusion.journal.record_scan import Damage, journal_error, scan_records, segment_number
@@ -85,6 +85,14 @@ def _fail(error: OSError) -> None:
 def is_state_folder(path: Path) -> bool:
     """Whether a folder is a server's state folder."""
     return (path / MAPS_FOLDER).is_dir()
+
+
+def check_no_map_of_a_server(path: Path) -> None:
+    """Raise OutputError where a file would take the place of a map that a server has saved of its journal."""
+    if path.name == MAP_FILE and (path.absolute().parent / JOURNAL_FOLDER).is_dir():
+        raise OutputError(
+            f"cannot write {path}: a server keeps its map there, beside the journal; choose another name"
+        )
 
 
 def resolve_map(path: Path, name: str | None = None) -> Path:

@@ -50,6 +50,7 @@ def replay(
     viewer: ViewerChild | None = None,
     warnings: Sequence[str] = (),
     doubt: str = "",
+    sensor: str | None = None,
 ) -> ReplaySummary:
     """Send every keyframe of `dataset` to a server and leave the results in the folder `out`.
 
@@ -71,6 +72,8 @@ def replay(
         viewer: shows the map while the run lasts.
         warnings: what is odd about the recording, for the results.
         doubt: why the map is likely wrong; empty = nothing is known to be. The run has then missed its end.
+
+        sensor: preset that all keyframes are taken to be of; None = each as it says.
 
     Raises:
         OutputError: `out` cannot be written (checked first), or the mesh is empty.
@@ -109,7 +112,8 @@ def replay(
             growth = watching.enter_context(map_growth.watch(target, target.link.map))
             for index, keyframe in enumerate(_keyframes(dataset, first, running, rate)):
                 running.wait_turn(AHEAD if rate is None else target.link.backlog)
-                sender.send(dataclasses.replace(keyframe, captured_ns=time.monotonic_ns()))
+                of = sensor or keyframe.sensor
+                sender.send(dataclasses.replace(keyframe, captured_ns=time.monotonic_ns(), sensor=of))
                 held.add(keyframe.T_world_camera, dataset.sensor, force_of(dataset, index))
                 stamps.append(keyframe.timestamp_ns)
                 poses.append(keyframe.T_world_camera)

@@ -79,6 +79,7 @@ def scan(
     keep_islands: bool | None = None,
     viewer: ViewerChild | None = None,
     warnings: Sequence[str] = (),
+    sensor: str | None = None,
 ) -> ScanSummary:
     """Take a source's frames to its end, or until it is closed, and leave the results in the folder `out`.
 
@@ -103,6 +104,7 @@ def scan(
         keep_islands: see `mesh_files.write`.
         viewer: shows the map while the run lasts.
         warnings: what is odd about the source's frames, for the results.
+        sensor: preset that all frames are taken to be of; None = each as it says.
 
     Raises:
         SourceError: the sensor failed; what came before is in `out`.
@@ -118,6 +120,8 @@ def scan(
     own = connect is None
     with results(out, overwrite=overwrite) as (work, folder), ExitStack() as stack:
         frames = _until_failure(iter(source), failure)
+        if sensor is not None:
+            frames = (dataclasses.replace(frame, sensor=sensor) for frame in frames)
         first = next(frames, None)
         if first is None:
             raise failure[0] if failure else SourceError(f"{source.name} gave no frames")

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from tsfusion.core import process
+from tsfusion.core.config import DEFAULT_MAP
 from tsfusion.core.errors import CheckpointError, TsfusionError
 from tsfusion.core.folder_lock import owner_of
 from tsfusion.core.output_folder import RECORD
@@ -71,8 +72,9 @@ def find(path: Path, name: str | None) -> Source:
 
 
 def _usual_map(state: Path) -> str | None:
-    """The first map that has been saved; None = none has."""
-    saved = (state_folder.map_folder(state, name) for name in state_folder.map_names(state))
+    """The map `default`, else the first one, of those that have been saved; None = none has."""
+    names = sorted(state_folder.map_names(state), key=lambda name: (name != DEFAULT_MAP, name))
+    saved = (state_folder.map_folder(state, name) for name in names)
     return next((one.name for one in saved if (one / state_folder.MAP_FILE).is_file()), None)
 
 

@@ -33,7 +33,8 @@ def open_feed(path: Path, *, map_name: str | None = None) -> "SavedMapFeed":
 
     Args:
         path: `MAP.tsf`, the folder of a run, a state folder, or the folder of one of its maps.
-        map_name: of the map, where the state folder has several; None = the first that has been saved.
+        map_name: of the map, where the state folder has several; None = `default`, else the first, of those
+            that have been saved.
 
     Raises:
         CheckpointError, JournalError: when there is no such map, or it cannot be read.
