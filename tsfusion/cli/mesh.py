@@ -110,6 +110,10 @@ def mesh(
         raise InvalidConfig("--texture shows what the cameras saw, --color-by who saw it: give one of them")
     if texture_size is not None and not texture:
         raise InvalidConfig("--texture-size goes with --texture")
+    if texture:
+        from tsfusion.geometry import texture_atlas
+
+        texture_atlas.check_installed()
     given_up = options.up_direction(up)
     check_writable(out, mesh_files.SURFACES)
     if preview is not None:

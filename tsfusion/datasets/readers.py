@@ -106,7 +106,8 @@ def read_color(path: Path, shape: tuple[int, ...] | None) -> NDArray[np.uint8]:
     if shape is not None and color.shape[:2] != shape:
         raise DatasetError(
             f"{path} is {color.shape[1]}×{color.shape[0]}, its depth image {shape[1]}×{shape[0]}; "
-            "expected equal sizes"
+            "expected equal sizes: register colour and depth before, or leave the colour out (--option "
+            "color=false)"
         )
     return color
 

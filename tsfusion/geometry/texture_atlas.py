@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Charts laid side by side on the pages of a texture, by xatlas."""
 
+from importlib.util import find_spec
 from typing import NamedTuple
 
 import numpy as np
@@ -27,6 +28,14 @@ class Layout(NamedTuple):
     sizes: list[tuple[int, int]]
 
 
+def check_installed() -> None:
+    """Raise MissingDependency without xatlas, before the work that needs it at the end."""
+    if find_spec("xatlas") is None:
+        raise MissingDependency(
+            "a texture needs xatlas, which is not installed (pip install xatlas, or '.[texture]')"
+        )
+
+
 def pack(charts: Charts, faces: NDArray[np.int32], *, texel: float, side: int) -> Layout:
     """Lay charts out.
 
@@ -37,12 +46,9 @@ def pack(charts: Charts, faces: NDArray[np.int32], *, texel: float, side: int) -
     Raises:
         MissingDependency: without xatlas.
     """
-    try:
-        import xatlas
-    except ImportError as error:
-        raise MissingDependency(
-            "a texture needs xatlas, which is not installed (pip install xatlas, or '.[texture]')"
-        ) from error
+    check_installed()
+    import xatlas
+
     # A vertex of each chart that it belongs to.
     key = charts.number[:, None].astype(np.int64) * (int(faces.max()) + 1) + faces
     _, first, place = np.unique(key.ravel(), return_index=True, return_inverse=True)

@@ -464,7 +464,7 @@ def test_it_says_what_it_waits_for(tmp_path: Path) -> None:
     root = tmp_path / "in"
     root.mkdir()
     said = WatchedFolder(root, idle=10).waits_for()
-    assert "no frames yet; waits for depth/NAME.png|tiff|exr|npy with color/, rgb/" in said
+    assert "no frames yet; waits for depth/NAME.png|tiff|exr|npy with color/, colour/, rgb/" in said
     assert "and for a camera: camera-intrinsics.txt, K.txt" in said
     assert said.endswith(
         "after 10 s without a new frame, when a file DONE or .end appears there, or with Ctrl-C"

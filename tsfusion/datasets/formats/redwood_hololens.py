@@ -22,12 +22,12 @@ from tsfusion.geometry.se3 import Transform
 
 HOLOLENS_EXPECTED = "K.txt, poses.txt, depth/*.png and images/*.png"
 REDWOOD_EXPECTED = (
-    "depth/*.png, .tiff, .exr or .npy, image/, color/ or rgb/, camera-intrinsics.txt or "
+    "depth/*.png, .tiff, .exr or .npy, image/, color/, colour/ or rgb/, camera-intrinsics.txt or "
     "camera_intrinsic.json, and trajectory.log, odometry.log or *-traj.txt"
 )
 PLAIN_EXPECTED = (
-    "depth/*.png, .tiff, .exr or .npy and image/, color/ or rgb/, of equal names, and camera-intrinsics.txt "
-    "or camera_intrinsic.json; without poses, so for a scan only"
+    "depth/*.png, .tiff, .exr or .npy and image/, color/, colour/ or rgb/, of equal names, and "
+    "camera-intrinsics.txt or camera_intrinsic.json; without poses, so for a scan, or with --trajectory"
 )
 # Open3D's PrimeSenseDefault, for the recordings that Redwood and Open3D distribute
 _PRIMESENSE = PublishedCamera("Redwood's recordings", Intrinsics(525.0, 525.0, 319.5, 239.5))
@@ -38,7 +38,7 @@ _REDWOODS_NAMES = re.compile(
 _REDWOODS_FILES = ("livingroom[12]-traj.txt", "office[12]-traj.txt")
 _LOGS = ("trajectory.log", "scene/trajectory.log", "odometry.log")  # by preference
 _LOG_NAMES = ("*traj*.log", "*-traj.txt")
-_COLOR = ("image", "color", "rgb")
+_COLOR = ("image", "color", "colour", "rgb")
 
 
 def recognises_hololens(path: Path) -> bool:

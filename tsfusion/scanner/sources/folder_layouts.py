@@ -17,10 +17,10 @@ LayoutKind = Literal["depth", "pair", "points"]
 SortKey = tuple[tuple[int, Decimal, str], ...]
 
 EXPECTED = (
-    "depth/NAME.png|tiff|exr|npy with color/, rgb/, image/ or images/NAME.png|jpg; frame-*.depth.png with "
-    "frame-*.color.png|jpg; left/ and right/NAME.png|jpg; NAME.bin, there or in velodyne/"
+    "depth/NAME.png|tiff|exr|npy with color/, colour/, rgb/, image/ or images/NAME.png|jpg; "
+    "frame-*.depth.png with frame-*.color.png|jpg; left/ and right/NAME.png|jpg; NAME.bin, there or in velodyne/"
 )
-COLOR = ("color", "rgb", "image", "images")
+COLOR = ("color", "colour", "rgb", "image", "images")
 
 _NOT_MEASURED = 65535  # 7-Scenes' value for pixels without depth
 _IMAGES = r"\.(?:png|jpe?g)"
