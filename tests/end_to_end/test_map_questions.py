@@ -366,7 +366,7 @@ def test_keys_say_whose_map_may_be_asked(tmp_path: Path) -> None:
     keys = secured(tmp_path)
     with serving(tmp_path / "state", **keys.server) as running:
         scan(running, **keys.client)
-        with MapClient(running.address, keys=keys.keys, timeout=EASY) as asked:
+        with MapClient(running.address, **keys.client, timeout=EASY) as asked:
             assert asked.sample(points()).state.keyframes == COUNT
         guest = key_folder.create_pair(tmp_path / "guest", "guest").public
         key_folder.allow(tmp_path / "server", "guest", guest, maps=("theirs",))

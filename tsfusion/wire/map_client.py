@@ -18,7 +18,7 @@ from tsfusion.geometry.map_answers import Samples, View, checked_camera, checked
 from tsfusion.geometry.map_grids import DistanceField, DistanceSlice, OccupancySlice, SliceGrid
 from tsfusion.geometry.up_direction import Up
 from tsfusion.wire import messages, questions, sockets
-from tsfusion.wire.curve import ClientKeys
+from tsfusion.wire.curve import ClientKeys, client_keys
 from tsfusion.wire.messages import Command, Reply
 from tsfusion.wire.queries import CommandRefused, Exchange, open_connection, place_of
 from tsfusion.wire.questions import Answer, Field, MapState, Question, Raycast, Sample, Slice
@@ -58,7 +58,9 @@ class MapClient:
         map_: which of its maps.
         control: its control address; None = the port after the other.
         timeout: seconds that a question may take, unless it says otherwise.
-        keys: of `wire.curve.client_keys`, for a server with keys.
+        key, server_key: for a server with keys: one's own secret key, a file, and the server's public key, a
+            file or its 40 characters, as `Client` takes them.
+        keys: of `wire.curve.client_keys`, in place of the two.
         compress: large answers, for a slow link; None = unless the server is on this machine.
 
     Raises:
@@ -78,6 +80,8 @@ class MapClient:
         *,
         control: str | None = None,
         timeout: float = 1.0,
+        key: str | None = None,
+        server_key: str | None = None,
         keys: ClientKeys | None = None,
         compress: bool | None = None,
     ) -> None:
@@ -86,6 +90,7 @@ class MapClient:
         host, _ = sockets.parse_address(address)
         self._compress = not sockets.is_loopback(host) if compress is None else compress
         self._context = sockets.open_context()
+        keys = client_keys(key, server_key) if keys is None else keys
         place = sockets.control_address(self.address, control)
         self._connection = open_connection(self._context, sockets.connect_address(place), keys)
         self._keys = keys

@@ -114,7 +114,11 @@ class TUM(DepthImages):
         chosen, poses = keep_posed(
             range(len(poses)), poses, posed=posed, skipped=skipped, reason="without a pose in time"
         )
-        require_frames(len(chosen), root, EXPECTED, skipped)
+        gap = (
+            f"poses at most {max_gap_s:g} s apart around the images' times (--option max_gap_s=SECONDS takes "
+            "longer gaps, time_offset_s=SECONDS is added to these times)"
+        )
+        require_frames(len(chosen), root, gap if skipped else EXPECTED, skipped)
         depth = [listed.depth[i] for i in chosen]
         camera = find_camera(
             root, first_size(depth), intrinsics=intrinsics, calibration=calibration,

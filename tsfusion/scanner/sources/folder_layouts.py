@@ -18,7 +18,8 @@ SortKey = tuple[tuple[int, Decimal, str], ...]
 
 EXPECTED = (
     "depth/NAME.png|tiff|exr|npy with color/, colour/, rgb/, image/ or images/NAME.png|jpg; "
-    "frame-*.depth.png with frame-*.color.png|jpg; left/ and right/NAME.png|jpg; NAME.bin, there or in velodyne/"
+    "frame-*.depth.png with frame-*.color.png|jpg; left/ and right/NAME.png|jpg; "
+    "NAME.bin, there or in velodyne/"
 )
 COLOR = ("color", "colour", "rgb", "image", "images")
 
