@@ -175,6 +175,8 @@ def saved_settings(path: Path, map_name: str | None) -> dict[str, Any]:
     except CheckpointError as error:
         if (folder / state_folder.MAP_FILE).exists():
             log.warning("%s; its settings are not taken", error)
+        elif (folder / state_folder.JOURNAL_FOLDER).is_dir():
+            log.warning("no map is saved in %s yet that says its settings: flags and defaults count", folder)
         return {}
     # None = what its preset says; how many threads there were is no property of a map
     return {name: value for name, value in saved.items() if value is not None and name != "threads"}

@@ -195,6 +195,7 @@ def scan(
     if unplaced and not failure:
         raise AlignmentRefused(f"the scan is in the map {map_name}, as its place was not found: {unplaced}")
     if failure:
+        log.warning("the scan ended early: what came before is in %s", folder)
         raise failure[0]
     return result
 
