@@ -203,6 +203,7 @@ def _open(
 def _warnings(dataset: "Dataset") -> list[str]:
     """What is odd about a recording's frames, printed on stderr, too."""
     from tsfusion.cli import output
+    from tsfusion.core import process
     from tsfusion.core.errors import DatasetError
     from tsfusion.evaluation import pose_check
 
@@ -210,6 +211,7 @@ def _warnings(dataset: "Dataset") -> list[str]:
         depth, color = pose_check.check_frames(dataset)
     except DatasetError:  # the scan comes to that frame, and tells
         return []
+    process.give_back_memory()
     if color is not None:
         color += "; where the sensor is lost because of it, --option color=false tracks by the depth alone"
     found = [text for text in (depth, color) if text is not None]
