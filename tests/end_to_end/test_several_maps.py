@@ -58,7 +58,7 @@ def test_two_scanners_two_maps(tmp_path: Path) -> None:
             fetch_status(server.address, map_name="attic")
         assert server.terminate() == 0
     assert state_folder.map_names(tmp_path) == ["default", "yard-2"]
-    with pytest.raises(JournalError, match=r"has several maps \(default, yard-2\): choose one with --map"):
+    with pytest.raises(JournalError, match=r"has several maps \(default, yard-2\): choose one, .*--map NAME"):
         JournalRecording(tmp_path)
     assert len(JournalRecording(tmp_path, "yard-2")) == len(JournalRecording(tmp_path / "maps/yard-2")) == 8
     with serving(tmp_path) as server:  # both are taken up again, without anybody asking

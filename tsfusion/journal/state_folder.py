@@ -116,8 +116,8 @@ def resolve_map(path: Path, name: str | None = None) -> Path:
     there = ", ".join(found) or "none"
     if name is None and found:
         raise JournalError(
-            f"{path} has several maps ({there}): choose one with --map NAME, or give "
-            f"{path / MAPS_FOLDER}/NAME"
+            f"{path} has several maps ({there}): choose one, {path / MAPS_FOLDER}/NAME (or --map NAME, of "
+            "verbs that have it)"
         )
     missing = f"no map {name}" if name else "no map with a journal"
     raise JournalError(f"{path} has {missing}; it has: {there}")
