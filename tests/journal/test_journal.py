@@ -17,7 +17,7 @@ from mcap.reader import make_reader
 from tsfusion import journal
 from tsfusion.core.errors import JournalError
 from tsfusion.delivery.spool import Spool
-from tsfusion.journal import Journal, Position, Unwritten, quarantine, segment_path
+from tsfusion.journal import Journal, Position, Unwritten, mcap_layout, quarantine, segment_path
 from tsfusion.journal.quarantine import Quarantine
 from tsfusion.journal.recording import JournalRecording
 from tsfusion.wire import codec
@@ -201,6 +201,17 @@ def test_a_journal_is_a_dataset_of_its_keyframes(tmp_path: Path) -> None:
         assert np.array_equal(keyframe.depth, wall(i).depth)
     assert len(JournalRecording(tmp_path / "journal")) == 6
     assert 0 < len(JournalRecording(segment_path(tmp_path / "journal", 1))) < 6
+
+
+def test_a_recording_says_how_many_keyframes_damage_cost(tmp_path: Path) -> None:
+    record(tmp_path / "journal", 6)
+    assert JournalRecording(tmp_path).skipped == {}
+    last = max((tmp_path / "journal").glob("*.mcap"))
+    content = bytearray(last.read_bytes())
+    content[mcap_layout.segment_start_bytes() + 200] ^= 1  # of the first keyframe there
+    last.write_bytes(content)
+    recording = JournalRecording(tmp_path)
+    assert (len(recording), recording.skipped) == (5, {"lost to damage": 1})
 
 
 def test_an_empty_recording_is_one_clear_error(tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ class JournalRecording:
 
     Each once and in journal order, also when a crash left a second copy. Keyframes the map had to reject
     are among them; corrections are left out, so poses are those that the keyframes came with. Keyframes that
-    the server was told to forget are left out, too, and counted in `skipped`.
+    the server was told to forget are left out, too, and counted in `skipped`, as are those that damage cost.
 
     Raises:
         JournalError: when there is no keyframe.
@@ -39,7 +39,7 @@ class JournalRecording:
     def __init__(self, path: str | os.PathLike[str], map_name: str | None = None) -> None:
         place = state_folder.find_journal(Path(path), map_name)
         self.name = str(place.path)
-        self._places, forgotten = _places(place)
+        self._places, self.skipped = _places(place)
         if not self._places:
             raise JournalError(
                 f"no keyframes in {place.path}; expected a state folder, a spool folder or an .mcap file"
@@ -47,7 +47,6 @@ class JournalRecording:
         first = self[0]
         self.sensor = first.sensor or VolumeConfig().sensor
         self.timestamps_ns: NDArray[np.int64] | None = None
-        self.skipped: dict[str, int] = {"forgotten": forgotten} if forgotten else {}
 
     def __len__(self) -> int:
         return len(self._places)
@@ -64,15 +63,17 @@ class JournalRecording:
         return (self[index] for index in range(len(self)))
 
 
-def _places(place: state_folder.JournalPlace) -> tuple[list[tuple[Path, int]], int]:
-    """Segment file and offset of each keyframe, and how many were forgotten."""
+def _places(place: state_folder.JournalPlace) -> tuple[list[tuple[Path, int]], dict[str, int]]:
+    """Segment file and offset of each keyframe; how many are left out, by reason."""
     found: list[tuple[bytes, int, Path, int]] = []
+    lost = 0
     last, forgotten = dict[bytes, int](), ForgottenNumbers()
     for file, step in place.steps():
         if isinstance(step, journal.Erased):
             last[step.session] = max(step.seq, last.get(step.session, 0))
         elif isinstance(step, journal.Damage):
             log.log(logging.WARNING if step.torn else logging.ERROR, "%s: %s", file, step.what)
+            lost += step.lost
         elif step.seq > last.get(step.session, 0):
             last[step.session] = step.seq
             if not step.is_correction:
@@ -80,4 +81,5 @@ def _places(place: state_folder.JournalPlace) -> tuple[list[tuple[Path, int]], i
             else:
                 forgotten.note(step)
     kept = [(file, at) for session, seq, file, at in found if (session, seq) not in forgotten]
-    return kept, len(found) - len(kept)
+    skipped = {"forgotten": len(found) - len(kept), "lost to damage": lost}
+    return kept, {reason: count for reason, count in skipped.items() if count}
