@@ -447,7 +447,8 @@ def test_a_file_has_settings_for_each_map(tmp_path: Path) -> None:
     for chosen in (options.configuration(file), options.configuration_for("tof", file, max_range=3.0)):
         assert chosen.volumes()["hall"].voxel_size == 0.1
         assert (chosen.volume.voxel_size, chosen.client.map) == (0.05, "hall")
-        assert options.own_volume(chosen, chosen.client).voxel_size == 0.1
+        assert options.own_volume(chosen, chosen.client, {"voxel_size": None}).voxel_size == 0.1
+        assert options.own_volume(chosen, chosen.client, {"voxel_size": 0.07}).voxel_size == 0.07
 
 
 @pytest.mark.parametrize("closed", ["<&-", ">&-", "2>&-", "<&- >&- 2>&-"])
@@ -461,7 +462,7 @@ def test_a_stream_that_is_closed_is_no_traceback(closed: str, tmp_path: Path) ->
 
 
 def test_the_sensor_of_a_flag_beats_the_recordings(here: Here) -> None:
-    """Its noise decides weights and bands, so that the map is another one."""
+    """A sensor's noise decides weights and bands, so that the map is another one."""
     hashes = []
     for flags in ([], ["--sensor", "kinect"], ["--sensor", "tof"]):
         arguments = ["synthetic:room", "--option", "count=1", "--voxel-size", 0.1, "--json", *flags]

@@ -93,7 +93,9 @@ def expected(state: Path) -> Volume:
 
 def fuse(source: Path | str, out: Path, scheduler: Any = None, **more: Any) -> FusedRun:
     found = keyframe_sources.listed([str(source)])
-    wishes = Wishes(**{name: more.pop(name) for name in ("worker_memory", "tile_size") if name in more})
+    wishes = Wishes(
+        **{name: more.pop(name) for name in ("worker_memory", "tile_size", "sensor") if name in more}
+    )
     made, display = scheduler or InThisProcess(3), Silent()
     run = fusion.fuse(found, more.pop("config", VOLUME), out, lambda: made, display, wishes=wishes, **more)
     assert display.shown[-1] == (found.count, run.keyframes_fused, found.count)
@@ -151,6 +153,11 @@ def test_other_keyframes_or_settings_begin_anew(state: Path, tmp_path: Path) -> 
     run = fuse(state, tmp_path / "out", config=coarse)
     assert run.jobs_found == 0
     assert run.map_hash == fresh_map(state / "journal", 0.08).map_hash()
+    with pytest.raises(WorkerLost):
+        fuse(state, tmp_path / "other", InThisProcess(lose={"mesh": ATTEMPTS}))
+    other = fuse(state, tmp_path / "other", sensor="scanner")  # which all keyframes are taken to be of
+    assert other.jobs_found == 0
+    assert other.map_hash != fresh_map(state / "journal", VOLUME.voxel_size).map_hash()
 
 
 def test_a_map_larger_than_a_workers_memory_goes_out_in_parts(

@@ -9,7 +9,7 @@ import functools
 import inspect
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
@@ -175,16 +175,20 @@ def configuration(file: Path | None, *, preset: dict[str, Any] | None = None, **
     from tsfusion.core import config
 
     loaded = config.load(file, **(preset or {}))
-    flags |= _band(flags.pop("truncation", None), flags.pop("support", None))
-    if (smoothness := flags.pop("lambda_", None)) is not None:
-        flags |= {"smoothness": smoothness, "field_smoothness": smoothness}
-    tables = {
-        name: {key: value for key, value in flags.items() if key in getattr(loaded, name).__struct_fields__}
-        for name in ("volume", "server", "scan")
-    }
-    changed = {name: config.override(getattr(loaded, name), **given) for name, given in tables.items()}
+    changed = {name: _with_flags(getattr(loaded, name), flags) for name in ("volume", "server", "scan")}
     changed["volume"].checked_model()
     return replace(loaded, **changed)
+
+
+def _with_flags(table: Any, flags: Mapping[str, Any]) -> Any:
+    """A table of settings with the flags on top that are its own; None = not given."""
+    from tsfusion.core import config
+
+    settings = {**flags, **_band(flags.get("truncation"), flags.get("support"))}
+    if (smoothness := flags.get("lambda_")) is not None:
+        settings |= {"smoothness": smoothness, "field_smoothness": smoothness}
+    own = {key: value for key, value in settings.items() if key in table.__struct_fields__}
+    return config.override(table, **own)
 
 
 def configuration_for(
@@ -221,9 +225,14 @@ def configuration_for(
     return chosen
 
 
-def own_volume(chosen: "Config", client: "ClientConfig") -> "VolumeConfig":
-    """Settings of the map of a run with a server of its own: those of `[maps.NAME]`, where it has some."""
-    return chosen.volumes().get(client.map, chosen.volume)
+def own_volume(chosen: "Config", client: "ClientConfig", flags: Mapping[str, Any]) -> "VolumeConfig":
+    """Settings of the map of a run with a server of its own: those of `[maps.NAME]`, where it has some.
+
+    Args:
+        flags: of the command line, which beat them.
+    """
+    own = chosen.volumes().get(client.map)
+    return chosen.volume if own is None else cast("VolumeConfig", _with_flags(own, flags))
 
 
 def byte_count(text: str | None) -> int | None:

@@ -81,7 +81,7 @@ def replay(
     )
     _run(
         dataset, out, view=view, overwrite=overwrite, json=json,
-        volume=options.own_volume(chosen, client), server=options.own_server(chosen, state),
+        volume=options.own_volume(chosen, client, settings), server=options.own_server(chosen, state),
         client=client, connect=connect, same_frame=same_frame,
         rate=rate, min_weight=settings["min_weight"], up=given_up, keep_islands=keep_islands,
         warnings=warnings, doubt=doubt, sensor=settings["sensor"],

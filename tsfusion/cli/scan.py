@@ -134,7 +134,7 @@ def scan(
         )
         result = run(
             opened, out, overwrite=overwrite, config=chosen.scan,
-            volume=options.own_volume(chosen, client),
+            volume=options.own_volume(chosen, client, settings),
             server=options.own_server(chosen, state), client=client, connect=connect, spool=spool,
             same_frame=same_frame, align=align, min_weight=settings["min_weight"], up=given_up,
             keep_islands=keep_islands, viewer=run_page.beside(view, display), progress=display,
@@ -201,7 +201,7 @@ def _open(
 
 
 def _warnings(dataset: "Dataset") -> list[str]:
-    """What is odd about a recording's frames, printed on stderr, too."""
+    """Oddities of a recording's frames, a sentence each; they are printed on stderr, too."""
     from tsfusion.cli import output
     from tsfusion.core import process
     from tsfusion.core.errors import DatasetError

@@ -167,8 +167,9 @@ def fuse(
     check(config)
     with output_folder.results(out, overwrite=overwrite) as (results, folder):
         place = (results if out is None else folder).absolute()  # a dated folder is not found again
-        with _workplace(place / WORK, found.fingerprint(config)) as work:
-            run = _Run(found, config, work, display, wishes or Wishes())
+        wishes = wishes or Wishes()
+        with _workplace(place / WORK, found.fingerprint(config, wishes.sensor)) as work:
+            run = _Run(found, config, work, display, wishes)
             with _closing(make_scheduler()) as scheduler:
                 made = run.carry_out(scheduler, results, folder)
             run_files.write_record(results, made)

@@ -73,10 +73,10 @@ class Listed(msgspec.Struct):
             found.append(parts)
         return found
 
-    def fingerprint(self, config: VolumeConfig) -> str:
-        """Equal for the same keyframes at the same poses, with the same settings."""
+    def fingerprint(self, config: VolumeConfig, sensor: str | None) -> str:
+        """Digest of keyframes, their poses, settings and the sensor that they are taken to be of."""
         digest = hashlib.blake2b(digest_size=16)
-        digest.update(msgspec.msgpack.encode((config, self.keyframes)))
+        digest.update(msgspec.msgpack.encode((config, sensor, self.keyframes)))
         for one in self.keyframes:
             if isinstance(one, JournalKeyframes):
                 digest.update(repr([size_of(locations.location(name)) for name in one.files]).encode())

@@ -123,7 +123,7 @@ def check(dataset: Dataset) -> PoseCheckReport:
 
 
 def check_frames(dataset: Dataset) -> tuple[str | None, str | None]:
-    """What is wrong with the depth and with the colour, whatever the poses: a sentence each; None = nothing.
+    """Mistakes that show whatever the poses, of the depth and of the colour: a sentence each; None = none.
 
     Reads the frames that `check` does, and keeps of each no more than its edges.
 
