@@ -185,6 +185,18 @@ def test_a_file_that_grew_before_its_bytes_came_is_torn(tmp_path: Path) -> None:
     assert [(damage.torn, damage.lost) for damage in damages] == [(True, 0)]
 
 
+@pytest.mark.parametrize("junk", [b"garbage!", b"\xff", bytes(3) + b"\x01"])
+def test_what_no_write_leaves_is_no_torn_one(tmp_path: Path, junk: bytes) -> None:
+    segment = Segment(tmp_path, closed=False)
+    found, damages = segment.read(segment.whole + junk)
+    assert found == segment.places
+    assert [(damage.torn, damage.lost, damage.nbytes) for damage in damages] == [(False, 1, len(junk))]
+    found, damages = segment.read(junk)
+    assert [(damage.torn, damage.lost, damage.what) for damage in damages] == [
+        (False, 1, "no segment of tsfusion")
+    ]
+
+
 # --- lengths that lie, disks that fail ---
 
 

@@ -26,6 +26,9 @@ _PATIENCE = 64
 # The head of a keyframe's chunk, with lengths under 2^40 (see `mcap_layout.ChunkHead`).
 _HEAD_SHAPE = re.compile(rb"(?s)\x06(?=.{5}\0{3}.{16}.{5}\0{3}.{4}\0{4}.{5}\0{3}\x05.{5}\0{3}\x01\0)")
 
+# Of what is written behind a record: the next one, an index, the mark after the last.
+_FIRST_BYTES = (b"\x06", mcap_layout.INDEX_START[:1], mcap_layout.END_OF_DATA[:1])
+
 
 class Damage(Struct, frozen=True):
     """A stretch of a segment that is not as it was written."""
@@ -158,8 +161,10 @@ class _Scan:
         expected, size = mcap_layout.OPENING, self._source.size
         opening = self._source.read(0, len(expected))
         if self._segment_end.state == "open" and size < mcap_layout.segment_start_bytes():
-            if size:
+            if size and (expected.startswith(opening) or opening.startswith(expected) or self._is_zero(0)):
                 yield self._note(0, size, "its first write was cut off", torn=True)
+            elif size:
+                yield self._note(0, size, "no segment of tsfusion", lost=1)
             return size
         known = mcap_layout.parse_segment_chunk(self._source.read(0, _MAX_SEGMENT_CHUNK_BYTES, self._end))
         if known is not None and not known.is_ours:
@@ -196,7 +201,8 @@ class _Scan:
         stop = self._end if following is None else following
         if stop - at == mcap_layout.INDEX_BYTES and (stop < self._source.size or _was_index(raw)):
             return self._note(at, stop - at, "the index of the keyframe before it is damaged")
-        if is_open and following is None and (stop - at < mcap_layout.HEAD_BYTES or self._is_zero(at)):
+        begins = stop - at < mcap_layout.HEAD_BYTES and raw[:1] in _FIRST_BYTES
+        if is_open and following is None and (begins or self._is_zero(at)):
             return self._torn(at)
         what = "nothing can be read here"
         if head is not None and end is not None and end <= stop:
