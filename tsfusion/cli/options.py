@@ -322,18 +322,21 @@ def client_settings(config: "Config", connect: str | None = None, **flags: str |
     return client if connect is not None else replace(client, key=None, server_key=None)
 
 
-def own_server(config: "Config", state: Path | None) -> "ServerConfig | None":
-    """Settings of a run's own server that keeps its journals and maps; None = they are thrown away."""
-    if state is None:
-        return None
+def own_server(config: "Config", state: Path | None) -> "ServerConfig":
+    """Settings of a run's own server, which only this machine reaches, and whose errors are shown here.
+
+    Args:
+        state: where it keeps its journals and maps; None = they are thrown away.
+    """
     from msgspec.structs import replace
 
-    from tsfusion.core.config import override
-    from tsfusion.pipelines.target_server import MAPS
+    from tsfusion.pipelines.target_server import MAPS, THROWN_AWAY
 
-    server = override(config.server, listen="tcp://127.0.0.1:0", state=str(state))
-    # Only this machine reaches it; its errors are shown here.
-    return replace(server, keys=None, metrics=None, log_format="text", max_maps=max(MAPS, server.max_maps))
+    return replace(
+        config.server, listen="tcp://127.0.0.1:0", state=THROWN_AWAY if state is None else str(state),
+        max_maps=max(MAPS, config.server.max_maps), log_format="text",
+        control=None, keys=None, metrics=None, directory=None, advertise=None,
+    )  # fmt: skip
 
 
 def only_for_kept_maps(state: Path | None) -> set[str]:

@@ -46,6 +46,7 @@ _ERRORS_TOLD = 3
 _NAME_TIMEOUT = 1.0  # seconds for a server to name a free map: a sensor waits
 NEW_MAP = "auto"  # as the name of a map: the next one that nobody has
 log = logging.getLogger(__name__)
+THROWN_AWAY = ""  # instead of a state folder: one in the run's scratch folder
 MAPS = 16  # that a run's own server may have open: its default one, and one for each submap
 
 
@@ -266,7 +267,7 @@ def opened(
         client: settings of the connection; `auto` as its map is the next name that no map of the server has.
         scratch: a folder that does not exist yet, removed at the end of the block.
         volume: the map of the server started here.
-        server: settings of the server started here; None = a free port, and a state folder in `scratch`.
+        server: settings of the server started here; None = a free port, and `THROWN_AWAY`.
         spools: with `connect`, the folder of spools; None = one in `scratch`.
 
     Raises:
@@ -276,10 +277,11 @@ def opened(
     scratch.mkdir()
     link, child = client or ClientConfig(), None
     kept: dict[str, Path] = {}
-    state = Path(server.state) if server else scratch / "state"
+    server = server or ServerConfig(listen="tcp://127.0.0.1:0", state=THROWN_AWAY, max_maps=MAPS)
+    state = scratch / "state" if server.state == THROWN_AWAY else Path(server.state)
     with ExitStack() as stack:
         if connect is None:
-            server = server or ServerConfig(listen="tcp://127.0.0.1:0", state=str(state), max_maps=MAPS)
+            server = override(server, state=str(state))
             child = stack.enter_context(serving(server, volume, scratch))
             link, spools = override(link, address=child.listen, control=child.control), None
         else:
