@@ -189,7 +189,9 @@ def test_what_is_no_sum_is_refused(state: Path, tmp_path: Path) -> None:
         fuse(state, tmp_path / "out", config=smoothing)
 
 
-def test_sources_that_do_not_add_up_are_refused(state: Path, tmp_path: Path) -> None:
+def test_sources_that_do_not_add_up_are_refused(
+    state: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     for twice in (str(state), f"{state}/."), ("synthetic:room", "synthetic:room"):
         with pytest.raises(MapError, match="is given 2 times"):
             keyframe_sources.listed(twice)
@@ -212,6 +214,13 @@ def test_sources_that_do_not_add_up_are_refused(state: Path, tmp_path: Path) -> 
     )
     with pytest.raises(MapError, match="coordinate frame of its own"):
         keyframe_sources.listed([str(one), str(other)])
+    given = str(write_journal(tmp_path / "given", 5, bytes([3] * 16)))
+    keyframe_sources.listed([given])
+    assert "one coordinate frame" not in caplog.text
+    keyframe_sources.listed([given, "synthetic:room"], options={"count": 3}, same_frame=True)
+    assert "one coordinate frame" not in caplog.text
+    keyframe_sources.listed([given, "synthetic:room"], options={"count": 3})
+    assert "the poses of these 2 sources are taken to be in one coordinate frame" in caplog.text
     found = keyframe_sources.listed([str(one), str(other)], same_frame=True)
     assert [len(part) for part in found.keyframes] == [4, 4]
     assert [sum(map(len, share)) for share in found.shares(3)] == [3, 2, 3]

@@ -130,6 +130,12 @@ def listed(
         raise JournalError(f"no keyframes in {', '.join(sources)}{lost}")
     if options and found.sensor is None:
         raise InvalidConfig("--option has no effect on a journal: leave it out")
+    if len(sources) > 1 and not same_frame and "" in (worlds or ()):  # poses that were given
+        log.warning(
+            "the poses of these %d sources are taken to be in one coordinate frame "
+            "(--same-frame says that they are)",
+            len(sources),
+        )
     found.left_out = dict(left_out)
     return found
 
