@@ -153,6 +153,7 @@ mesh garbage.tsf a.xyz | cannot write a.xyz | a name ending in .ply, .glb, .obj,
 mesh garbage.tsf a | cannot write a | a name ending in .ply
 mesh garbage.tsf missing/a.ply | missing/a.ply: No such file | choose another place
 mesh garbage.tsf /proc/a.ply | cannot write /proc/a.ply | choose another place
+mesh garbage.tsf a.ply --map yard | --map has no effect on a saved map | give the state folder
 mesh garbage.tsf folder.ply | it is a folder | choose another name
 mesh garbage.tsf a.ply --preview a.gif | cannot write a.gif | a name ending in .png
 # servers that are not there, or are no servers
@@ -210,6 +211,12 @@ serve --max-range 0.01 | got 0.01 m | max_range must be larger than min_range
 {scan} tum --trajectory other_times.txt --connect {nobody} | not localised in any of 3 frames | are these the same clock?
 {scan} synthetic:room --feed nonsense | got 'nonsense' | an address looks like
 {scan} synthetic:room --max-gap 0 | got 0.0 | max_gap must be > 0
+{scan} synthetic:room --time-offset 1 | --time-offset is for poses that are looked up by time | --trajectory, --feed
+{scan} synthetic:room --max-gap 1 --localizer given | --max-gap is for poses that are looked up by time | these are not
+{scan} tum --trajectory other_times.txt --feed tcp://127.0.0.1:5 | two are given | leave one out
+{scan} synthetic:room --feed tcp://127.0.0.1:5 --localizer rgbd | --feed has no effect | --localizer rgbd
+{scan} synthetic:room --trajectory x.txt --localizer rgbd | --trajectory has no effect | --localizer rgbd
+{scan} synthetic:room --localizer given --loop-closure | --loop-closure needs poses | found from images
 {scan} synthetic:room --time-offset soon | '--time-offset' | is not a valid float | 2
 {scan} synthetic:room --min-overlap 2 | got 2.0 | min_overlap must be <= 1
 {scan} synthetic:room --angle 0 | got 0.0 | angle must be > 0

@@ -15,6 +15,7 @@ import typer
 from tsfusion.cli import options
 
 if TYPE_CHECKING:
+    from tsfusion.core.config import ScanConfig
     from tsfusion.datasets import Dataset
     from tsfusion.scanner.sources.source import Source
 
@@ -115,6 +116,8 @@ def scan(
     from tsfusion.cli import output, progress, run_page, run_summary
     from tsfusion.pipelines.scan import scan as run
 
+    if settings["localizer"] not in (None, "trajectory", "given"):
+        options.refuse(context, ("trajectory",), f"has no effect with --localizer {settings['localizer']}")
     opened, warnings = _open(
         context, source, option,
         camera=options.camera(intrinsics, calibration), rate=rate,
@@ -129,6 +132,7 @@ def scan(
         chosen = options.configuration_for(
             opened.sensor, config, usual=usual, tell=connect is None, **settings
         )
+        _refuse_ignored(context, chosen.scan, opened.sensor)
         client = options.client_settings(
             chosen, connect, control=control, map=map_, key=key, server_key=server_key
         )
@@ -146,6 +150,24 @@ def scan(
         run_summary.print_scan(result, spool, connect)
         run_page.print_again(view, result.folder, connect)
     run_summary.check(result)
+
+
+def _refuse_ignored(context: typer.Context, chosen: "ScanConfig", sensor: str) -> None:
+    """Raise InvalidConfig for flags about poses that the localizer does not ask for."""
+    name: str = chosen.localizer
+    if chosen.trajectory is not None and chosen.feed is not None:
+        options.refuse(
+            context, ("trajectory", "feed"), "is one source of poses, and two are given: leave one out"
+        )
+    if name == "auto":
+        by_sensor = "lidar" if sensor == "lidar" else "images"
+        name = "trajectory" if chosen.trajectory else "feed" if chosen.feed else by_sensor
+    if name not in ("trajectory", "feed"):
+        no_lookup = "is for poses that are looked up by time (--trajectory, --feed), and these are not"
+        options.refuse(context, ("time_offset", "max_gap"), no_lookup)
+        options.refuse(context, ("trajectory", "feed"), f"has no effect with --localizer {name}")
+    if chosen.loop_closure and name in ("trajectory", "feed", "given", "lidar"):
+        options.refuse(context, ("loop_closure",), "needs poses that are found from images (rgbd, stereo)")
 
 
 def _open(
