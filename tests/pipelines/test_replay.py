@@ -9,11 +9,13 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
 import cv2
 import numpy as np
+import own_recordings
 import pytest
 import trimesh
 from command_processes import Here, alive, descendants, end, eventually, read_until, started, tsfusion
@@ -83,7 +85,7 @@ def test_a_keyframe_at_a_rate_is_read_shortly_before_its_time(
 ) -> None:
     clock: Any = Clock(*reading)
     monkeypatch.setattr(replay.time, "monotonic", lambda: clock.now)
-    came = [round(clock.now, 6) for _ in replay._keyframes(clock, cast(Any, 0), clock, rate)]
+    came = [round(clock.now, 6) for _ in replay._keyframes(clock, cast(Any, 0), clock, rate, [])]
     assert came == yielded
     assert clock.reads == reads
 
@@ -166,6 +168,59 @@ def test_a_journal_replays_to_the_same_map_under_a_new_name(
     assert json.loads(done.stdout)["map_hash"] == first["map_hash"], "with the saved map's settings"
     assert {path.name for path in (tmp_path / "again").iterdir()} == RESULTS
     assert (tmp_path / "again").stat().st_mode & 0o777 == 0o777 & ~_umask()
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("quick_servers")
+def test_the_server_table_of_a_file_counts_for_a_runs_own_server(here: Here, tmp_path: Path) -> None:
+    (tmp_path / "settings.toml").write_text('[server]\nquota_cost = 1000\ncontrol = "tcp://127.0.0.1:1"\n')
+    settings = ("--config", tmp_path / "settings.toml", "--voxel-size", VOXEL)
+    done = here("replay", "synthetic:room", "--max-frames", 1, "--out", tmp_path / "out", *settings)
+    assert done.returncode == 1, done.stderr
+    assert "quota_cost = 1000, these cost" in done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("quick_servers")
+@pytest.mark.parametrize("command", ["replay", "mesh"])
+def test_a_damaged_journal_leaves_its_results_and_status_1(
+    run_folder: Path, here: Here, tmp_path: Path, command: str
+) -> None:
+    shutil.copytree(run_folder / "state" / "maps" / "default" / "journal", tmp_path / "journal")
+    file = next((tmp_path / "journal").glob("*.mcap"))
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 16
+    file.write_bytes(content)
+    out = {"replay": ("--out", tmp_path / "again", "--voxel-size", VOXEL), "mesh": (tmp_path / "again.ply",)}
+    done = here(command, tmp_path / "journal", *out[command])
+    assert done.returncode == 1, done.stderr
+    assert "the map lacks 1 keyframe or more, which the journal cannot give back" in done.stderr
+    if command == "mesh":
+        assert (tmp_path / "again.ply").is_file()
+    else:
+        assert {path.name for path in (tmp_path / "again").iterdir()} == RESULTS
+        record = json.loads((tmp_path / "again" / "run.json").read_text())
+        assert record["keyframes_fused"] == 5
+        assert "tsfusion journal verify" in record["missed"]
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("quick_servers")
+def test_an_image_that_cannot_be_read_ends_a_replay_with_its_results(here: Here, tmp_path: Path) -> None:
+    views = [
+        replace(one, depth=(one.measurement * one.depth_scale * 1000).astype(np.uint16), depth_scale=1e-3)
+        for one in first_views(5)
+    ]
+    folder = own_recordings.images(tmp_path / "room", views)
+    image = folder / "depth" / "000003.png"
+    image.write_bytes(image.read_bytes()[:60])
+    done = here("replay", folder, "--out", tmp_path / "out", "--no-check", "--voxel-size", VOXEL)
+    assert done.returncode == 1, done.stderr
+    assert "keyframe 3 of 5 cannot be read, and ended the replay" in done.stderr
+    assert image.name in done.stderr
+    record = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert (record["keyframes_fused"], record["missed"].startswith("keyframe 3 of 5")) == (3, True)
+    assert (tmp_path / "out" / "mesh.ply").is_file()
 
 
 @pytest.mark.slow

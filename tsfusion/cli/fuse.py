@@ -52,7 +52,8 @@ def fuse(
     """
     from tsfusion.cli import output, progress
     from tsfusion.cluster import fusion, keyframe_sources
-    from tsfusion.core.errors import InvalidConfig
+    from tsfusion.core.errors import IncompleteRun, InvalidConfig
+    from tsfusion.pipelines import shortfall
 
     memory = options.byte_count(worker_memory)
     if tile_size is not None and not 0 < tile_size < float("inf"):
@@ -92,7 +93,8 @@ def fuse(
         output.as_json(result)
     else:
         _print(result)
-    _check(result)
+    if missed := shortfall.of_damage(result.keyframes_lost):
+        raise IncompleteRun(missed)
 
 
 def _scheduler(workers: int, ray: str | None) -> "Scheduler":
@@ -123,16 +125,3 @@ def _print(result: "FusedRun") -> None:
         f"{count_of(result.blocks, 'block')}, in {took:.1f} s by {count_of(result.workers, 'worker')}\n"
         f"hash {result.map_hash}\nmesh: {summarise(figures)}{tiles}"
     )
-
-
-def _check(result: "FusedRun") -> None:
-    """Raise IncompleteRun where keyframes are missing that somebody has taken."""
-    from tsfusion.core.counts import count_of
-    from tsfusion.core.errors import IncompleteRun
-
-    if result.keyframes_lost:
-        lost = count_of(result.keyframes_lost, "keyframe")
-        raise IncompleteRun(
-            f"the map lacks {lost} or more, which the journal cannot give back: `tsfusion journal verify` "
-            "says where it is damaged"
-        )

@@ -127,6 +127,7 @@ def mesh(
             "--min-component says which pieces go: leave out --keep-islands or --drop-islands"
         )
     legend: list[dict[str, Any]] = []
+    lost = 0
     if "://" in source:
         from tsfusion.wire.curve import client_keys
 
@@ -154,12 +155,13 @@ def mesh(
             if keep_islands is False:
                 raise InvalidConfig("--drop-islands needs all of the mesh, which is too large for memory")
             _write_tiles(found, source, out, given_up, min_component=min_component, json=json)
+            _check(found.lost)
             return
         found.volume = mesh_finishing.fitting(
             found.volume, crop, most, fill_holes=fill_holes is not None, simplify=simplify is not None,
             texture=texture,
         )  # fmt: skip
-        made, legend = _extracted(found.volume, source, fill_holes, json), found.legend
+        made, legend, lost = _extracted(found.volume, source, fill_holes, json), found.legend, found.lost
     if given_up is not None:
         made = replace(made, known_up=given_up)
     with _stage(f"finishing the mesh of {source}", json or finishing.is_nothing):
@@ -175,6 +177,16 @@ def mesh(
         else {**dropped, "min_extent_m": min_component, "files": [file.name for file in files]}
     )
     _print_result(out, {**written.figures, "left_out": left_out}, [*legend, *finishing.legend(made)], json)
+    _check(lost)
+
+
+def _check(lost: int) -> None:
+    """Raise IncompleteRun where damage has cost keyframes: the last line, and status 1."""
+    from tsfusion.core.errors import IncompleteRun
+    from tsfusion.pipelines import shortfall
+
+    if missed := shortfall.of_damage(lost):
+        raise IncompleteRun(missed)
 
 
 def _refuse_for_server(context: typer.Context) -> None:
@@ -195,7 +207,7 @@ def _refuse_for_files(context: typer.Context, source: str) -> None:
     )  # fmt: skip
     if source.endswith(".tsf"):
         options.refuse(
-            context, _OF_A_JOURNAL,
+            context, ("map_", *_OF_A_JOURNAL),
             "has no effect on a saved map: give the state folder or the journal that has its keyframes",
         )  # fmt: skip
         options.refuse(

@@ -19,6 +19,8 @@ from tsfusion.journal import state_folder
 from tsfusion.journal.forgotten_numbers import ForgottenNumbers
 from tsfusion.wire import codec
 
+LOST = "lost to damage"  # reason of `JournalRecording.skipped`
+
 log = logging.getLogger(__name__)
 
 
@@ -81,5 +83,5 @@ def _places(place: state_folder.JournalPlace) -> tuple[list[tuple[Path, int]], d
             else:
                 forgotten.note(step)
     kept = [(file, at) for session, seq, file, at in found if (session, seq) not in forgotten]
-    skipped = {"forgotten": len(found) - len(kept), "lost to damage": lost}
+    skipped = {"forgotten": len(found) - len(kept), LOST: lost}
     return kept, {reason: count for reason, count in skipped.items() if count}

@@ -67,12 +67,14 @@ class JournalMap(msgspec.Struct):
         left_out: reason → number of keyframes that it could not take.
         legend: of its colours, as `Painter` gives it; empty = the cameras'.
         missing: number of keyframes of the saved map that the journal does not have.
+        lost: number of keyframes that damage in the journal has cost this map, at least.
     """
 
     volume: Volume
     left_out: dict[str, int]
     legend: list[dict[str, Any]] = []
     missing: int = 0
+    lost: int = 0
 
 
 def fuse(
@@ -190,7 +192,7 @@ def map_of(
         config = override(config, color=True)
     volume = Volume(config, memory_bytes=memory_for(None))
     made = fuse(keyframes, volume, paint=None if color_by is None else Painter(color_by), watch=watch)
-    made.missing = missing
+    made.missing, made.lost = missing, keyframes.lost
     return made
 
 

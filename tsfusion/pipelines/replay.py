@@ -15,7 +15,7 @@ from tsfusion.client import ClientStats
 from tsfusion.core import process
 from tsfusion.core.config import ClientConfig, ServerConfig, VolumeConfig
 from tsfusion.core.counts import count_of
-from tsfusion.core.errors import OutputError
+from tsfusion.core.errors import DatasetError, JournalError, OutputError
 from tsfusion.core.output_folder import results
 from tsfusion.datasets import Dataset
 from tsfusion.datasets.dataset import force_of
@@ -56,7 +56,8 @@ def replay(
 
     `mesh.ply`, `mesh.glb`, `preview.png`, `keyframes.txt`, `delay.csv`, `delay.png`, `growth.csv`, `run.json`
     and `report.html` with its pictures, with a server of its own also `map.tsf`, and of a world whose surface
-    is known `error.npy`, appear together when all of it went well, and not at all otherwise.
+    is known `error.npy`, appear together when all of it went well, and not at all otherwise. A keyframe that
+    cannot be read ends the replay: what came before it is in the results, which say so.
 
     Args:
         out: None = a new folder `out/DATE_TIME`; see `output_folder.results`.
@@ -72,15 +73,15 @@ def replay(
         viewer: shows the map while the run lasts.
         warnings: what is odd about the recording, for the results.
         doubt: why the map is likely wrong; empty = nothing is known to be. The run has then missed its end.
-
         sensor: preset that all keyframes are taken to be of; None = each as it says.
 
     Raises:
         OutputError: `out` cannot be written (checked first), or the mesh is empty.
         TransportError: the server cannot be reached, ended, or stopped fusing; WorldRefused: the map has
             keyframes of another world.
-        DatasetError: a keyframe cannot be read.
+        DatasetError, JournalError: the first keyframe cannot be read.
     """
+    unread: list[str] = []
     stamps: list[int] = []
     poses: list[NDArray[np.float64]] = []
     with results(out, overwrite=overwrite) as (work, folder), ExitStack() as watching:
@@ -110,7 +111,7 @@ def replay(
             )
             held, started = HeldSensor(), time.monotonic()
             growth = watching.enter_context(map_growth.watch(target, target.link.map))
-            for index, keyframe in enumerate(_keyframes(dataset, first, running, rate)):
+            for index, keyframe in enumerate(_keyframes(dataset, first, running, rate, unread)):
                 running.wait_turn(AHEAD if rate is None else target.link.backlog)
                 of = sensor or keyframe.sensor
                 sender.send(dataclasses.replace(keyframe, captured_ns=time.monotonic_ns(), sensor=of))
@@ -134,7 +135,7 @@ def replay(
             dataset, sender, written, error_mm, folder=folder,
             seconds=seconds, rate=rate, peak_rss_bytes=peak,
             server_start_seconds=target.child.start_seconds if target.child else None,
-            warnings=warnings, doubt=doubt,
+            warnings=warnings, unread=unread, doubt=doubt,
         )  # fmt: skip
         run_files.write_ledger(work, sender.records)
         growth.write_csv(work / "growth.csv")
@@ -158,8 +159,10 @@ def _warn_of_keyframes_there(target: Target, *, same_frame: bool) -> None:
         )  # fmt: skip
 
 
-def _keyframes(dataset: Dataset, first: Keyframe, running: Engine, rate: float | None) -> Iterator[Keyframe]:
-    """Yield each keyframe at its time; a sensor that was late does not catch up.
+def _keyframes(
+    dataset: Dataset, first: Keyframe, running: Engine, rate: float | None, unread: list[str]
+) -> Iterator[Keyframe]:
+    """Yield each keyframe at its time, up to one that is `unread`; a sensor that was late does not catch up.
 
     One that waits for its time is read when that is near: a sensor's next image does not take a core while
     the server fuses the last one, and read at once it added a third to the delay on two cores.
@@ -170,7 +173,11 @@ def _keyframes(dataset: Dataset, first: Keyframe, running: Engine, rate: float |
         if rate is not None:
             running.wait_until(due + 1 / rate - ahead)
         began = time.monotonic()
-        keyframe = dataset[index]
+        try:
+            keyframe = dataset[index]
+        except (DatasetError, JournalError) as error:
+            unread.append(f"keyframe {index} of {len(dataset)} cannot be read, and ended the replay: {error}")
+            return
         if rate is not None:
             ahead = _READ_AHEAD * (time.monotonic() - began)
             due = max(due + 1 / rate, time.monotonic())

@@ -13,6 +13,7 @@ from tsfusion.client import Client
 from tsfusion.datasets import Dataset
 from tsfusion.datasets.cameras import camera_line
 from tsfusion.geometry.mesh import Mesh
+from tsfusion.journal.recording import LOST
 from tsfusion.pipelines import latency_ledger, run_files, shortfall
 from tsfusion.pipelines.run_files import Circumstances, WrittenMap
 from tsfusion.wire.health import Status
@@ -78,6 +79,7 @@ def summarise(
     peak_rss_bytes: int,
     server_start_seconds: float | None,
     warnings: Sequence[str],
+    unread: Sequence[str],
     doubt: str,
 ) -> ReplaySummary:
     """A replay in figures.
@@ -91,6 +93,7 @@ def summarise(
         peak_rss_bytes: of the sending process.
         server_start_seconds: of the own server; None = the server was there already.
         warnings: what is odd about the recording, a sentence each.
+        unread: why a keyframe could not be read, which ended the replay; empty = all were.
         doubt: why the map is likely wrong; empty = nothing is known to be.
     """
     likely_wrong = f"the map is likely wrong (--no-check accepts it): {doubt}" if doubt else ""
@@ -110,6 +113,8 @@ def summarise(
                 shortfall.of_delivery(
                     stats, spool="the spool", link=sender.problem, rejection=sender.first_rejection
                 ),
+                *unread,
+                shortfall.of_damage(dataset.skipped.get(LOST, 0)),
                 likely_wrong,
             )
         ),

@@ -52,6 +52,16 @@ def of_disk(stats: ClientStats) -> str:
     )
 
 
+def of_damage(lost: int) -> str:
+    """Say that damage in journals has cost so many keyframes, or more; empty = none."""
+    if not lost:
+        return ""
+    return (
+        f"the map lacks {count_of(lost, 'keyframe')} or more, which the journal cannot give back: "
+        "`tsfusion journal verify` says where it is damaged"
+    )
+
+
 def cure_of_tracking(localizer: str) -> str:
     """Advice when frames are lost, by the name of the localizer."""
     if localizer == "trajectory":
