@@ -251,7 +251,11 @@ def _umask() -> int:
 @pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
 @pytest.mark.parametrize(
     ("number", "word"),
-    [(signal.SIGINT, "interrupted"), pytest.param(signal.SIGTERM, "terminated", marks=pytest.mark.slow)],
+    [
+        (signal.SIGINT, "interrupted"),
+        pytest.param(signal.SIGTERM, "terminated", marks=pytest.mark.slow),
+        pytest.param(signal.SIGHUP, "terminated", marks=pytest.mark.slow),
+    ],
 )
 def test_interrupted_replay_leaves_nothing(number: signal.Signals, word: str, tmp_path: Path) -> None:
     process = slow_replay(tmp_path / "new" / "out")
@@ -260,7 +264,7 @@ def test_interrupted_replay_leaves_nothing(number: signal.Signals, word: str, tm
     assert len(below) == 2  # gateway and fuser
     process.send_signal(number)
     printed = process.communicate(timeout=60)[0]
-    assert process.returncode == 128 + number
+    assert process.returncode == 128 + (number if number == signal.SIGINT else signal.SIGTERM)
     assert printed.strip().splitlines()[-1] == f"tsfusion: {word}"
     assert eventually(lambda: not any(map(alive, below)))
     assert list(tmp_path.iterdir()) == []

@@ -52,6 +52,13 @@ def test_most_frames_lost() -> None:
     assert shortfall.together(["", found, "", "more"]) == f"{found}; more"
 
 
+def test_most_frames_without_a_pose() -> None:
+    assert shortfall.of_poses(20, {"without a pose in time": 20, "without depth": 90}) == ""
+    found = shortfall.of_poses(20, {"without a pose in time": 20, "without a pose": 1})
+    assert found.startswith("only 20 of 41 frames have a pose")
+    assert "--trajectory FILE" in found
+
+
 def test_a_voxel_size_that_a_keyframe_cannot_have_is_refused_with_a_proposal() -> None:
     v, u = np.mgrid[:480, :640]
     depth = (1500 + u // 4 + v // 3).astype(np.uint16)

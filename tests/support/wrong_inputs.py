@@ -122,7 +122,7 @@ replay synthetic:room --support 3-6 | got '3-6' | must be LEAST:MOST, such as 3:
 replay synthetic:room --support 6:3 | got 3 | max_support must be at least min_support, 6 voxels
 replay synthetic:room --support 3:99 | got 99 | max_support must be <= 16
 replay synthetic:room --truncation 4 --support 3:6 | exclude each other | give one of them
-replay synthetic:room --truncation 0 | got 0.0 | min_support must be >= 1
+replay synthetic:room --truncation 0 | got 0 | --truncation must be from 1 to 16 voxels
 replay synthetic:room --max-range 0.05 | got 0.05 m | max_range must be larger than min_range, 0.1 m
 replay synthetic:room --max-range -3 | got -3.0 | max_range must be > 0
 replay synthetic:room --min-weight -1 | got -1.0 | min_weight must be >= 0

@@ -7,7 +7,9 @@ Each verb imports what it needs when it runs, so that `--help` and `status` answ
 import errno
 import os
 import signal
+import stat
 import sys
+from contextlib import suppress
 from types import FrameType
 from typing import Annotated, NoReturn
 
@@ -126,11 +128,13 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     """Run a command line (default: this process's) and exit.
 
     Every error raised on purpose becomes one line on stderr and status 1; a wrong flag status 2; Ctrl-C 130;
-    SIGTERM 143.
+    SIGTERM 143. A terminal that goes away ends it as SIGTERM does.
     """
     if signal.getsignal(signal.SIGINT) == signal.SIG_DFL:  # as `__main__` leaves it
         signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGTERM, _terminated)
+    if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) == signal.SIG_DFL:  # else nohup's
+        signal.signal(signal.SIGHUP, _hung_up)
     try:
         code = app(arguments, prog_name="tsfusion", standalone_mode=False)
     except TsfusionError as error:
@@ -178,3 +182,13 @@ def _variable(error: Exception) -> str:
 def _terminated(signum: int, frame: FrameType | None) -> NoReturn:
     """Unwind as Ctrl-C does: half-written results are removed, and child processes end."""
     sys.exit(TERMINATED)
+
+
+def _hung_up(signum: int, frame: FrameType | None) -> None:
+    """Nobody reads the terminal any more, and it refuses what is written; all else is as by SIGTERM."""
+    nowhere = os.open(os.devnull, os.O_RDWR)
+    for stream in range(3):
+        with suppress(OSError):
+            if stat.S_ISCHR(os.fstat(stream).st_mode):
+                os.dup2(nowhere, stream)
+    os.kill(os.getpid(), signal.SIGTERM)

@@ -99,6 +99,7 @@ def _found(path: Path, depth: int) -> Iterator[dict[str, Any]]:
     from tsfusion.core.errors import DatasetError, MissingDependency
     from tsfusion.datasets import open_dataset
     from tsfusion.datasets.cameras import UnknownCamera, camera_line
+    from tsfusion.datasets.dataset import SeveralRecordings
 
     for posed in (True, False):
         try:
@@ -116,7 +117,8 @@ def _found(path: Path, depth: int) -> Iterator[dict[str, Any]]:
             "keyframes": len(dataset), "posed": posed, "camera": camera_line(dataset),
         }  # fmt: skip
         return
-    if depth == _DEPTH and (not path.is_dir() or _is_one(path)):
+    has_more = path.is_dir() and (isinstance(failure, SeveralRecordings) or not _is_one(path))
+    if depth == _DEPTH and not has_more:
         raise failure
     for child in _folders_in(path) if depth else []:
         yield from _found(child, depth - 1)

@@ -370,6 +370,8 @@ def _band(truncation: float | None, support: str | None) -> dict[str, float]:
             "--truncation and --support exclude each other (the band is fixed, or bounded): give one of them"
         )
     if truncation is not None:
+        if not 1 <= truncation <= 16:
+            raise InvalidConfig(f"--truncation must be from 1 to 16 voxels, got {truncation:g}")
         return {"min_support": truncation, "max_support": truncation}
     if support is None:
         return {}

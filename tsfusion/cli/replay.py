@@ -57,6 +57,7 @@ def replay(
 ) -> None:
     """Fuse a recording that has poses, or a journal: mesh and figures."""
     from tsfusion.datasets import select
+    from tsfusion.pipelines import shortfall
 
     # Any server makes a mesh with another `min_weight`.
     own = {*options.MAP_OPTIONS, "state"} - {"min_weight"}
@@ -71,11 +72,15 @@ def replay(
     )  # fmt: skip
     usual = getattr(dataset, "usual", None)
     chosen = options.configuration_for(dataset.sensor, config, usual=usual, tell=connect is None, **settings)
+    posed = len(dataset)
     if start or stride > 1 or max_frames is not None:
         dataset = select(dataset, start=start, stride=stride, limit=max_frames)
     for reason, count in dataset.skipped.items():
         typer.echo(f"left out {count_of(count, 'frame')} {reason}", err=True)
+    missed = [shortfall.of_poses(posed, dataset.skipped)]
     doubt, warnings = _checked(dataset) if check_ and not _is_synthetic(path) else ("", [])
+    if doubt:
+        missed.append(f"the map is likely wrong (--no-check accepts it): {doubt}")
     client = options.client_settings(
         chosen, connect, control=control, map=map_, key=key, server_key=server_key
     )
@@ -84,7 +89,7 @@ def replay(
         volume=options.own_volume(chosen, client, settings), server=options.own_server(chosen, state),
         client=client, connect=connect, same_frame=same_frame,
         rate=rate, min_weight=settings["min_weight"], up=given_up, keep_islands=keep_islands,
-        warnings=warnings, doubt=doubt, sensor=settings["sensor"],
+        warnings=warnings, missed=missed, sensor=settings["sensor"],
     )  # fmt: skip
 
 

@@ -83,13 +83,14 @@ def view(
         options.refuse(
             context, ("control", "key", "server_key"), f"has no effect on {target}: it is no server"
         )
+    measures = _measures(target, truth)
     link = {"control": control, "publish": publish, "keys": keys}
     with (
         closing(PageServer(*parse_place(listen), token=token)) as page,
         closing(_feed(target, map_, link)) as feed,
         _stopped_by_signals() as stop,
     ):
-        shown = LivePage(page.server, feed, measures=_measures(target, truth))
+        shown = LivePage(page.server, feed, measures=measures)
         _announce(page.url, feed.title, json=json)
         if not no_browser:
             _open_browser(page.url)

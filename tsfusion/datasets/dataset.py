@@ -18,7 +18,12 @@ from tsfusion.geometry.keyframe import Keyframe
 STREET = MappingProxyType({"voxel_size": 0.1})  # usual there: at 2 cm a stereo keyframe takes 1.5 s
 NOMINAL_NS = 33_333_333  # between frames of a recording without times: thirty a second
 SCAN = "`tsfusion scan PATH` finds poses by itself"
+WITHOUT_POSE = "without a pose"  # how the reasons of frames that poses would have kept begin
 _T = TypeVar("_T")
+
+
+class SeveralRecordings(DatasetError):
+    """A folder holds several recordings, each of which has a path of its own below it."""
 
 
 @runtime_checkable
@@ -170,7 +175,7 @@ def keep_posed(
     *,
     posed: bool,
     skipped: dict[str, int],
-    reason: str = "without a pose",
+    reason: str = WITHOUT_POSE,
 ) -> tuple[list[_T], list[NDArray[np.float64] | None]]:
     """Leave out frames without a pose if `posed`, and count them in `skipped`: (files, poses) that remain."""
     pairs = [pair for pair in zip(files, poses, strict=True) if pair[1] is not None or not posed]

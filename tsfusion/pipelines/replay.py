@@ -49,7 +49,7 @@ def replay(
     keep_islands: bool | None = None,
     viewer: ViewerChild | None = None,
     warnings: Sequence[str] = (),
-    doubt: str = "",
+    missed: Sequence[str] = (),
     sensor: str | None = None,
 ) -> ReplaySummary:
     """Send every keyframe of `dataset` to a server and leave the results in the folder `out`.
@@ -72,7 +72,7 @@ def replay(
         keep_islands: see `mesh_files.write`.
         viewer: shows the map while the run lasts.
         warnings: what is odd about the recording, for the results.
-        doubt: why the map is likely wrong; empty = nothing is known to be. The run has then missed its end.
+        missed: what makes the map wrong or incomplete, a sentence each; empty = nothing is known to.
         sensor: preset that all keyframes are taken to be of; None = each as it says.
 
     Raises:
@@ -135,7 +135,7 @@ def replay(
             dataset, sender, written, error_mm, folder=folder,
             seconds=seconds, rate=rate, peak_rss_bytes=peak,
             server_start_seconds=target.child.start_seconds if target.child else None,
-            warnings=warnings, unread=unread, doubt=doubt,
+            warnings=warnings, missed=[*unread, *missed],
         )  # fmt: skip
         run_files.write_ledger(work, sender.records)
         growth.write_csv(work / "growth.csv")

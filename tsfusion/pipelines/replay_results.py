@@ -79,8 +79,7 @@ def summarise(
     peak_rss_bytes: int,
     server_start_seconds: float | None,
     warnings: Sequence[str],
-    unread: Sequence[str],
-    doubt: str,
+    missed: Sequence[str],
 ) -> ReplaySummary:
     """A replay in figures.
 
@@ -93,10 +92,8 @@ def summarise(
         peak_rss_bytes: of the sending process.
         server_start_seconds: of the own server; None = the server was there already.
         warnings: what is odd about the recording, a sentence each.
-        unread: why a keyframe could not be read, which ended the replay; empty = all were.
-        doubt: why the map is likely wrong; empty = nothing is known to be.
+        missed: what else the replay has missed, a sentence each.
     """
-    likely_wrong = f"the map is likely wrong (--no-check accepts it): {doubt}" if doubt else ""
     status, _, figures = written
     stats, delays = sender.stats, latency_ledger.summarise(sender.records)
     return ReplaySummary(
@@ -113,9 +110,8 @@ def summarise(
                 shortfall.of_delivery(
                     stats, spool="the spool", link=sender.problem, rejection=sender.first_rejection
                 ),
-                *unread,
                 shortfall.of_damage(dataset.skipped.get(LOST, 0)),
-                likely_wrong,
+                *missed,
             )
         ),
         seconds=round(seconds, 3),

@@ -7,10 +7,11 @@ that still leaves its results; the command ends with the line, and with status 1
 """
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 from tsfusion.client import ClientStats
 from tsfusion.core.counts import count_of
+from tsfusion.datasets.dataset import WITHOUT_POSE
 
 _LOST = ("spool", "disk")  # reasons of skipping that no policy asks for
 
@@ -74,6 +75,23 @@ def cure_of_tracking(localizer: str) -> str:
     if localizer == "given":
         return "give poses of all frames (--trajectory FILE), or let them be found (--localizer rgbd)"
     return "move more slowly, give every frame, or take poses from elsewhere (--trajectory FILE)"
+
+
+def of_poses(frames: int, left_out: Mapping[str, int]) -> str:
+    """Say that most frames of a recording have no pose; empty = at least half have.
+
+    Args:
+        frames: that are left.
+        left_out: number of others by reason, as `Dataset.skipped` has them.
+    """
+    without = sum(count for reason, count in left_out.items() if reason.startswith(WITHOUT_POSE))
+    if without <= frames:
+        return ""
+    return (
+        f"only {frames} of {frames + without} frames have a pose, and the rest is not in the map: give a "
+        "trajectory of all (--trajectory FILE, --option max_gap_s=SECONDS bridges gaps), or let "
+        "`tsfusion scan` find them"
+    )
 
 
 def of_tracking(frames: int, tracked: int, why: str, *, localizer: str = "rgbd") -> str:

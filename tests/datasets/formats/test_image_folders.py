@@ -284,6 +284,15 @@ def test_redwoods_and_open3ds_places_are_known(tmp_path, color, log, depth):
         check(open_dataset(root / log), views())
 
 
+def test_a_folder_without_a_trajectory_names_the_one_of_another_layout(tmp_path):
+    root = redwood_room(tmp_path, "image", "trajectory.log")
+    (root / "trajectory.log").rename(root / "groundtruth.txt")
+    with pytest.raises(
+        DatasetError, match=r"has no trajectory; .*, or --trajectory .*/groundtruth\.txt names"
+    ):
+        Redwood(root)
+
+
 def test_a_log_that_is_given_beats_the_one_that_is_found(tmp_path):
     root = redwood_room(tmp_path, "image", "trajectory.log")
     lines = (root / "trajectory.log").read_text().splitlines()

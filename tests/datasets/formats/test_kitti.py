@@ -2,12 +2,13 @@
 """KITTI odometry: geometry of the real pairs and scans, the stereo matcher, pykitti's traps."""
 
 import contextlib
+import json
 import shutil
 
 import cv2
 import numpy as np
 import pytest
-from command_processes import python
+from command_processes import python, tsfusion
 from geometry_checks import warp_residual
 from small_recordings import P0, P1, TR, kitti, one_line, put
 
@@ -164,6 +165,8 @@ def test_which_sequence_must_be_clear(tmp_path):
     ):
         open_dataset(root)
     assert open_dataset(root / "sequences" / "06").name == "KITTI 06 stereo"
+    listed = json.loads(tsfusion("datasets", root, "--json").stdout)
+    assert [row["path"] for row in listed] == [str(root / "sequences" / name) for name in ("06", "07")]
 
 
 def test_the_matcher_against_ground_truth(data):

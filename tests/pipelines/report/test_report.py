@@ -166,6 +166,11 @@ def test_what_is_missing_is_left_out_with_a_word(tmp_path: Path) -> None:
     assert "too short, or is of a version" in page.text
     assert "Trajectory" not in page.titles
     assert text.count("data:image/jpeg") == 4
+    (bare / "mesh.ply").unlink()
+    assert "The mesh of this run is no longer in its folder" in page_of(bare)[0].text
+    at_server = a_run(tmp_path / "scan", mesh={})
+    (at_server / "mesh.ply").unlink()
+    assert "The map is on its server" in page_of(at_server)[0].text
 
 
 def test_a_run_of_an_old_version_still_has_a_report(tmp_path: Path) -> None:

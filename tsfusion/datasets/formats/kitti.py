@@ -18,7 +18,14 @@ from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError, MissingDependency
 from tsfusion.datasets.cameras import RecordedCamera
-from tsfusion.datasets.dataset import STREET, Frames, keep_posed, require_folder, require_frames
+from tsfusion.datasets.dataset import (
+    STREET,
+    Frames,
+    SeveralRecordings,
+    keep_posed,
+    require_folder,
+    require_frames,
+)
 from tsfusion.datasets.readers import intrinsics_of, read_color, read_lines
 from tsfusion.datasets.trajectory_files import checked_pose, nanoseconds, read_kitti
 from tsfusion.geometry.frame import Frame
@@ -162,7 +169,7 @@ def _only_sequence(root: Path) -> str:
     places = sorted(path.parent for path in (root / "sequences").glob("*/calib.txt"))
     found = [path.name for path in places if (path / "image_0").is_dir() or (path / "velodyne").is_dir()]
     if len(found) != 1:
-        raise DatasetError(
+        raise (SeveralRecordings if found else DatasetError)(
             f"{root} holds {len(found)} KITTI sequences with data ({', '.join(found)}); "
             "name one with --sequence, or give its own path"
         )

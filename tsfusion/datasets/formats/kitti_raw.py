@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets.dataset import keep_posed, require_folder, require_frames
+from tsfusion.datasets.dataset import SeveralRecordings, keep_posed, require_folder, require_frames
 from tsfusion.datasets.formats.kitti import KITTIFrames, files_by_frame, pykitti_utils, read_calibration
 from tsfusion.datasets.readers import intrinsics_of, read_color, read_numbers
 from tsfusion.datasets.trajectory_files import checked_pose
@@ -129,7 +129,8 @@ def _only_drive(path: Path) -> Path:
     drives = [path] if _is_drive(path) else _drives(path)
     if len(drives) != 1:
         names = ", ".join(drive.name for drive in drives)
-        raise DatasetError(f"{path} holds {len(drives)} KITTI drives ({names}); give the path of one")
+        kind = SeveralRecordings if drives else DatasetError
+        raise kind(f"{path} holds {len(drives)} KITTI drives ({names}); give the path of one")
     if drives[0].name.endswith("_extract"):
         raise DatasetError(
             f"{drives[0]} is not rectified; expected the drive's synchronised and rectified …_sync"

@@ -150,7 +150,9 @@ class Redwood(DepthImages):
         if log is not None and not log.is_file():
             log = root / log
         if log is None and posed:
-            raise DatasetError(f"{root} has no trajectory; expected {REDWOOD_EXPECTED}; {SCAN}")
+            given = root / "groundtruth.txt"  # TUM's
+            hint = f"{SCAN}, or --trajectory {given} names them" if given.is_file() else SCAN
+            raise DatasetError(f"{root} has no trajectory; expected {REDWOOD_EXPECTED}; {hint}")
         skipped: dict[str, int] = {}
         found = _poses(files, log, posed=posed, time_offset_s=time_offset_s)
         depth, poses = keep_posed(files, found, posed=posed, skipped=skipped)

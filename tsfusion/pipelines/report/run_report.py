@@ -16,6 +16,7 @@ from tsfusion.pipelines.report.report_files import Pictures
 _MOST_MAPS = 4  # that are shown in pictures
 _REACHED = "The run reached what it was for."
 _ELSEWHERE = "The map is on its server, so there is no mesh here: `tsfusion mesh` fetches it."
+_GONE = "The mesh of this run is no longer in its folder: `tsfusion mesh` makes one of a kept map."
 
 
 def write(folder: Path, out: Path, *, meshes: dict[str, Mesh] | None = None) -> list[Path]:
@@ -73,8 +74,9 @@ def _add_map(made: Page, one: MapFindings, found: RunFindings, *, suffix: str, p
     """Add the sections of a map; its pictures."""
     errors = run_sections.trajectory_errors(one, is_given=found.record.get("localizer") == "given")
     if one.mesh is None:
+        why = _GONE if one.figures.get("mesh") else _ELSEWHERE
         made.sections += [
-            (f"Map{suffix}", page.note(_ELSEWHERE) + run_sections.map_facts(one.figures)),
+            (f"Map{suffix}", page.note(why) + run_sections.map_facts(one.figures)),
             (f"Trajectory{suffix}", map_sections.plan(None, one.paths) + errors),
         ]
         return {}
