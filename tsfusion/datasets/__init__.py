@@ -16,6 +16,7 @@ from tsfusion.datasets.formats.kitti_raw import KITTIRaw
 from tsfusion.datasets.formats.nerfstudio import Nerfstudio
 from tsfusion.datasets.formats.redwood_hololens import HoloLens, Redwood
 from tsfusion.datasets.formats.replica import Replica
+from tsfusion.datasets.formats.scan_folders import ScanFolder
 from tsfusion.datasets.formats.scannet import ScanNet
 from tsfusion.datasets.formats.sevenscenes import SevenScenes
 from tsfusion.datasets.formats.tum import TUM
@@ -38,6 +39,7 @@ __all__ = [
     "Nerfstudio",
     "Redwood",
     "Replica",
+    "ScanFolder",
     "ScanNet",
     "Selection",
     "SevenScenes",

@@ -24,6 +24,7 @@ from tsfusion.datasets.formats import (
     nerfstudio,
     redwood_hololens,
     replica,
+    scan_folders,
     scannet,
     sevenscenes,
     tum,
@@ -101,6 +102,7 @@ PLAIN = (
         redwood_hololens.recognises_plain,
         redwood_hololens.Redwood,
     ),
+    Layout("LiDAR scans", scan_folders.EXPECTED, scan_folders.recognises, scan_folders.ScanFolder),
 )
 SYNTHETIC = (
     "synthetic",

@@ -175,8 +175,13 @@ def time_of(name: str) -> int | None:
 
 def times_of(files: Sequence[Path]) -> NDArray[np.int64] | None:
     """(n,) nanoseconds from the names of a recording's images; None unless all are times, in order."""
-    stamps = [stamp for file in files if (stamp := time_of(file.stem)) is not None]
-    in_order = len(stamps) == len(files) and all(a < b for a, b in pairwise(stamps))
+    return times_of_names([file.stem for file in files])
+
+
+def times_of_names(names: Sequence[str]) -> NDArray[np.int64] | None:
+    """Likewise from the names themselves."""
+    stamps = [stamp for name in names if (stamp := time_of(name)) is not None]
+    in_order = len(stamps) == len(names) and all(a < b for a, b in pairwise(stamps))
     return np.array(stamps, dtype=np.int64) if in_order else None
 
 

@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: MIT
+"""Folders of LiDAR scans: every format gives the same points, names give order and times, errors a line."""
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from command_processes import Here
+from numpy.typing import NDArray
+from small_recordings import one_line
+
+from tsfusion import Volume, VolumeConfig
+from tsfusion.core.errors import DatasetError, MissingDependency
+from tsfusion.datasets import KITTI, ScanFolder, find, open_dataset, scan_files
+from tsfusion.datasets.trajectory_files import write_tum
+
+FORMATS = ("bin", "ply", "pcd", "laz")
+
+
+def save(path: Path, points: NDArray[np.float32], number: int = 0) -> None:
+    """Write a scan in the format of the file's ending; PCD in each of its three encodings in turn."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.suffix == ".bin":
+        np.column_stack([points, np.full(len(points), 0.5, np.float32)]).astype("<f4").tofile(path)
+    elif path.suffix == ".ply":
+        trimesh.PointCloud(points).export(path)
+    elif path.suffix == ".pcd":
+        pcd = pytest.importorskip("pypcd4")
+        encoding = (pcd.Encoding.ASCII, pcd.Encoding.BINARY, pcd.Encoding.BINARY_COMPRESSED)[number % 3]
+        pcd.PointCloud.from_xyz_points(points).save(path, encoding=encoding)
+    else:
+        laspy = pytest.importorskip("laspy")
+        made = laspy.LasData(laspy.LasHeader(point_format=0, version="1.2"))
+        made.header.scales = [1e-5] * 3
+        made.x, made.y, made.z = points.T.astype(np.float64)
+        made.write(path)
+
+
+def scan(number: int, count: int = 50) -> NDArray[np.float32]:
+    points = np.random.default_rng(number).uniform(-20, 20, (count, 3)).astype(np.float32)
+    points[0] = number
+    return points
+
+
+def folder(root: Path, names: list[str], suffix: str = "bin") -> Path:
+    for number, name in enumerate(names):
+        save(root / f"{name}.{suffix}", scan(number), number)
+    return root
+
+
+def with_poses(root: Path, count: int, name: str = "poses.txt") -> Path:
+    rows = (f"1 0 0 {number} 0 1 0 0 0 0 1 0\n" for number in range(count))
+    (root / name).write_text("".join(rows))
+    return root
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_every_format_gives_kittis_points(data, tmp_path, suffix):
+    recorded = KITTI(data("kitti_odometry"), "00", "lidar", poses="poses_estimated/00_ORB.txt")
+    for number in range(3):
+        save(tmp_path / "velodyne" / f"{number:06d}.{suffix}", recorded[number].points, number)
+    poses = [recorded[number].T_world_camera for number in range(3)]
+    write_tum(tmp_path / "seq_poses_tum.txt", [10**9 * number for number in range(3)], poses)
+    dataset = open_dataset(tmp_path)
+    assert isinstance(dataset, ScanFolder)
+    assert (len(dataset), dataset.sensor, dataset.skipped) == (3, "lidar", {})
+    for number in range(3):
+        found, expected = dataset[number], recorded[number]
+        error = np.abs(found.points - expected.points).max()
+        assert error <= {"pcd": 1e-6, "laz": 1e-4}.get(suffix, 0), "PCD's text has ten decimals"
+        assert np.abs(found.T_world_camera - expected.T_world_camera).max() < 1e-6
+    volume = Volume(VolumeConfig(voxel_size=0.1, sensor="lidar", threads=1))
+    for keyframe in dataset:
+        volume.integrate(keyframe)
+    assert volume.stats().blocks > 10_000
+
+
+def test_names_give_the_order_and_times(tmp_path):
+    numbered = with_poses(folder(tmp_path / "a", ["scan_10", "scan_9", "scan_100"]), 3)
+    assert [int(one.points[0, 0]) for one in open_dataset(numbered)] == [1, 0, 2]
+    assert open_dataset(numbered).timestamps_ns is None
+    timed = folder(tmp_path / "b", ["1700000000.100000", "1700000000.200000", "1700000000.300000"])
+    poses = np.repeat(np.eye(4)[None], 2, axis=0)
+    write_tum(timed / "run_tum.txt", [1_700_000_000_100_000_000, 1_700_000_000_250_000_000], list(poses))
+    dataset = open_dataset(timed)
+    assert dataset.timestamps_ns.tolist() == [1_700_000_000_100_000_000, 1_700_000_000_200_000_000]
+    assert dataset.skipped == {"without a pose in time": 1}
+    (timed / "run_tum.txt").unlink()
+    assert [dataset.pose(k) for dataset in [open_dataset(timed, posed=False)] for k in range(3)] == [None] * 3
+
+
+def test_a_trajectory_may_be_given_and_others_files_are_counted(tmp_path):
+    root = folder(tmp_path / "a", ["1", "2"])
+    save(root / "map.bin", scan(9))
+    with_poses(tmp_path, 2, "mine.txt")
+    dataset = open_dataset(root, trajectory=tmp_path / "mine.txt")
+    assert (len(dataset), dataset.skipped) == (2, {"of another name": 1})
+    assert dataset[1].T_world_camera[0, 3] == 1
+
+
+def test_what_is_no_recording_is_not_taken_for_one(tmp_path):
+    run = folder(tmp_path / "run", ["mesh-2", "mesh-3"], "ply")
+    (run / "run.json").write_text("{}")
+    folder(tmp_path / "one", ["1"])
+    for place in (run, tmp_path / "one"):
+        with pytest.raises(DatasetError, match="is in no layout known here"):
+            find(place)
+
+
+def test_poses_beside_kittis_calibration_may_be_the_cameras(tmp_path):
+    root = with_poses(folder(tmp_path / "00" / "velodyne", ["0", "1"]).parent, 2)
+    (root / "calib.txt").write_text("Tr: 1 0 0 0 0 1 0 0 0 0 1 0\n")
+    with pytest.raises(DatasetError, match=r"poses\.txt may be the camera's poses; open the benchmark"):
+        open_dataset(root)
+    assert len(open_dataset(root, trajectory=root / "poses.txt")) == 2
+
+
+def test_points_of_three_numbers(tmp_path):
+    root = with_poses(tmp_path, 2)
+    for number in range(2):
+        scan(number, count=4).astype("<f4").tofile(root / f"{number}.bin")
+    one_line(
+        lambda: open_dataset(root)[0], r"0\.bin has intensities below 0; expected float32 x, y, z and the"
+    )
+    assert np.array_equal(open_dataset(root, fields=3)[1].points, scan(1, count=4))
+    one_line(lambda: open_dataset(root, fields=5)[0], r"has 48 bytes; expected 20 a point: .* and 2 more")
+    one_line(lambda: open_dataset(root, fields=2), r"fields must be from 3 to 64 numbers a point, got 2")
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+@pytest.mark.parametrize("content", [b"", b"ply\nformat", b"\0" * 16 + b"junk" * 9 + b"!"])
+def test_a_broken_scan_is_one_clear_line(tmp_path, suffix, content):
+    if suffix in ("pcd", "laz"):
+        pytest.importorskip({"pcd": "pypcd4", "laz": "laspy"}[suffix])
+    root = with_poses(folder(tmp_path, ["0", "1"], suffix), 2)
+    (root / f"1.{suffix}").write_bytes(content)
+    dataset = open_dataset(root)
+    assert len(dataset[0].points) == 50
+    one_line(lambda: dataset[1], rf"1\.{suffix} (is damaged|holds no points|has \d+ bytes)")
+    (root / f"1.{suffix}").unlink()
+    one_line(lambda: dataset[1], rf"cannot read .*1\.{suffix}: No such file")
+
+
+def test_a_scan_whose_reader_is_missing_names_the_command(tmp_path, monkeypatch):
+    for module, suffix in (("pypcd4", "pcd"), ("laspy", "las")):
+        for name in {module, *(name for name in sys.modules if name.startswith(f"{module}."))}:
+            monkeypatch.setitem(sys.modules, name, None)
+        with pytest.raises(MissingDependency, match=f"pip install '?{module}"):
+            scan_files.read_scan(tmp_path / f"0.{suffix}")
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("quick_servers")
+@pytest.mark.skipif(importlib.util.find_spec("kiss_icp") is None, reason="needs '.[lidar]'")
+def test_a_folder_of_scans_is_scanned_and_replayed(data, here: Here, tmp_path):
+    recorded = KITTI(data("kitti_odometry"), "00", "lidar")
+    for number in range(5):
+        save(tmp_path / "scans" / f"{number}.ply", recorded[number].points)
+    done = here("scan", tmp_path / "scans", "--out", tmp_path / "scan")
+    assert done.returncode == 0, done.stderr
+    assert "5/5 localised by lidar" in done.stdout
+    refused = here("replay", tmp_path / "scans", "--out", tmp_path / "none")
+    assert "has no poses; expected scans numbered" in refused.stderr
+    poses = tmp_path / "scan" / "trajectory.txt"
+    done = here("replay", tmp_path / "scans", "--trajectory", poses, "--out", tmp_path / "replay")
+    assert done.returncode == 0, done.stderr
+    assert "keyframes  5/5 fused" in done.stdout
