@@ -197,6 +197,15 @@ def test_what_no_write_leaves_is_no_torn_one(tmp_path: Path, junk: bytes) -> Non
     ]
 
 
+def test_what_stands_behind_an_index_is_no_cut_in_it(tmp_path: Path) -> None:
+    segment = Segment(tmp_path, closed=True)
+    found, damages = segment.read(segment.whole + b"garbage!")
+    assert found == segment.places
+    assert [(damage.torn, damage.lost, damage.what) for damage in damages] == [
+        (False, 0, "something stands behind its index")
+    ]
+
+
 # --- lengths that lie, disks that fail ---
 
 

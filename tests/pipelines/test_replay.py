@@ -18,11 +18,23 @@ import numpy as np
 import own_recordings
 import pytest
 import trimesh
-from command_processes import Here, alive, descendants, end, eventually, read_until, started, tsfusion
+from command_processes import (
+    Here,
+    alive,
+    descendants,
+    end,
+    eventually,
+    read_until,
+    server,
+    started,
+    tsfusion,
+)
 from keyframes_and_servers import map_hash
 from small_recordings import first_views
 
 from tsfusion import Volume, VolumeConfig
+from tsfusion.cli import options
+from tsfusion.core.config import Config, ServerConfig
 from tsfusion.core.output_folder import building
 from tsfusion.pipelines import replay
 
@@ -178,6 +190,32 @@ def test_the_server_table_of_a_file_counts_for_a_runs_own_server(here: Here, tmp
     done = here("replay", "synthetic:room", "--max-frames", 1, "--out", tmp_path / "out", *settings)
     assert done.returncode == 1, done.stderr
     assert "quota_cost = 1000, these cost" in done.stderr
+    forgetful = Config(server=ServerConfig(keep_keyframes=2, journal_bytes=1 << 20))
+    assert options.own_server(forgetful, tmp_path / "state").keep_keyframes == 2
+    thrown_away = options.own_server(forgetful, None)
+    assert (thrown_away.keep_keyframes, thrown_away.journal_bytes) == (None, None), "all in one map"
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("quick_servers")
+def test_a_saved_map_lacks_what_was_damaged_before_it_was_made(
+    run_folder: Path, here: Here, tmp_path: Path
+) -> None:
+    state = shutil.copytree(run_folder / "state", tmp_path / "state")
+    file = next((state / "maps" / "default" / "journal").glob("*.mcap"))
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 16
+    file.write_bytes(content)
+    done = here("mesh", state, tmp_path / "whole.ply")
+    assert done.returncode == 0, "it was saved before"
+    (state / "maps" / "default" / "map.tsf").unlink()
+    with server(state, "--voxel-size", VOXEL) as (_, process):
+        assert end(process) == 0
+    assert (state / "maps" / "default" / "map.tsf").is_file()
+    done = here("mesh", state, tmp_path / "less.ply")
+    assert done.returncode == 1, done.stderr
+    assert "the map lacks 1 keyframe or more" in done.stderr
+    assert (tmp_path / "less.ply").is_file()
 
 
 @pytest.mark.slow
@@ -206,7 +244,10 @@ def test_a_damaged_journal_leaves_its_results_and_status_1(
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("quick_servers")
-def test_an_image_that_cannot_be_read_ends_a_replay_with_its_results(here: Here, tmp_path: Path) -> None:
+@pytest.mark.parametrize("flags", [(), ("--no-check",)])  # the check reads that image first
+def test_an_image_that_cannot_be_read_ends_a_replay_with_its_results(
+    here: Here, tmp_path: Path, flags: tuple[str, ...]
+) -> None:
     views = [
         replace(one, depth=(one.measurement * one.depth_scale * 1000).astype(np.uint16), depth_scale=1e-3)
         for one in first_views(5)
@@ -214,7 +255,7 @@ def test_an_image_that_cannot_be_read_ends_a_replay_with_its_results(here: Here,
     folder = own_recordings.images(tmp_path / "room", views)
     image = folder / "depth" / "000003.png"
     image.write_bytes(image.read_bytes()[:60])
-    done = here("replay", folder, "--out", tmp_path / "out", "--no-check", "--voxel-size", VOXEL)
+    done = here("replay", folder, "--out", tmp_path / "out", "--voxel-size", VOXEL, *flags)
     assert done.returncode == 1, done.stderr
     assert "keyframe 3 of 5 cannot be read, and ended the replay" in done.stderr
     assert image.name in done.stderr
@@ -265,7 +306,7 @@ def test_interrupted_replay_leaves_nothing(number: signal.Signals, word: str, tm
     process.send_signal(number)
     printed = process.communicate(timeout=60)[0]
     assert process.returncode == 128 + (number if number == signal.SIGINT else signal.SIGTERM)
-    assert printed.strip().splitlines()[-1] == f"tsfusion: {word}"
+    assert number == signal.SIGHUP or printed.strip().splitlines()[-1] == f"tsfusion: {word}"
     assert eventually(lambda: not any(map(alive, below)))
     assert list(tmp_path.iterdir()) == []
 

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -119,6 +120,46 @@ def test_a_scan_leaves_mesh_trajectory_and_figures(walk: Path, here: Here, tmp_p
     assert "up -y (given: 0.0000 -1.0000 0.0000)" in shown.stdout
     assert "12/12 localised by given" in shown.stdout
     assert "ATE" not in shown.stdout  # given poses have no error against themselves
+
+
+@pytest.mark.usefixtures("quick_servers")
+def test_poses_may_be_given_by_time_and_in_order(walk: Path, here: Here, tmp_path: Path) -> None:
+    poses = [keyframe.T_world_camera[:3].ravel() for keyframe in open_dataset(walk)]
+    rows = (" ".join(f"{number:.9f}" for number in pose) + "\n" for pose in poses)
+    (tmp_path / "kitti.txt").write_text("".join(rows))
+    (tmp_path / "settings.toml").write_text('[scan]\nfeed = "tcp://127.0.0.1:1"\n')
+    in_order = ("--trajectory", tmp_path / "kitti.txt")
+    by_time = ("--trajectory", walk / "groundtruth.txt", "--time-offset", 0.0)
+    settings = ("--config", tmp_path / "settings.toml")
+    for flags, by in (
+        (in_order, "given"),
+        ((*in_order, "--localizer", "given"), "given"),
+        ((*by_time, "--localizer", "auto"), "trajectory"),
+        ((*by_time, "--localizer", "trajectory", *settings), "trajectory"),
+        ((*by_time, *settings), "trajectory"),
+    ):
+        done = here(
+            "scan", walk, *COARSE, *flags, "--max-frames", 12, "--out", tmp_path / "out", "--overwrite"
+        )
+        assert f"12/12 localised by {by}" in done.stdout, done.stderr
+    done = here("scan", walk, *COARSE, *in_order, "--time-offset", 1, "--out", tmp_path / "none")
+    assert "--time-offset is for poses that are looked up by time" in done.stderr
+
+
+@pytest.mark.slow
+def test_a_terminal_that_goes_away_ends_a_scan_with_its_results(walk: Path, tmp_path: Path) -> None:
+    """The shell and the kernel may both send SIGHUP."""
+    process = started("scan", walk, "--rate", 2, *COARSE, "--out", tmp_path / "out")
+    read_until(process, "frames 6 of")
+    process.send_signal(signal.SIGHUP)
+    time.sleep(0.3)
+    process.send_signal(signal.SIGHUP)
+    process.communicate(timeout=60)
+    run = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert not run["complete"]
+    assert 1 <= run["frames"] < 12
+    assert (tmp_path / "out" / "mesh.ply").is_file()
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
 def test_without_taichi_to_a_server_elsewhere(walk: Path, here: Here, tmp_path: Path) -> None:

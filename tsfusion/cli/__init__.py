@@ -185,10 +185,15 @@ def _terminated(signum: int, frame: FrameType | None) -> NoReturn:
 
 
 def _hung_up(signum: int, frame: FrameType | None) -> None:
-    """Nobody reads the terminal any more, and it refuses what is written; all else is as by SIGTERM."""
+    """Nobody reads the terminal any more, and it refuses what is written; all else is as by SIGTERM.
+
+    The shell and the kernel may both say so, and the second SIGTERM would end a scan at once.
+    """
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
     nowhere = os.open(os.devnull, os.O_RDWR)
     for stream in range(3):
         with suppress(OSError):
-            if stat.S_ISCHR(os.fstat(stream).st_mode):
+            mode = os.fstat(stream).st_mode
+            if stat.S_ISCHR(mode) or stat.S_ISFIFO(mode):  # a pipe's other end, such as `tee`, goes too
                 os.dup2(nowhere, stream)
     os.kill(os.getpid(), signal.SIGTERM)

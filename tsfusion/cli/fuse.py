@@ -93,8 +93,11 @@ def fuse(
         output.as_json(result)
     else:
         _print(result)
-    if missed := shortfall.of_damage(result.keyframes_lost):
-        raise IncompleteRun(missed)
+    missed = (
+        shortfall.of_damage(result.keyframes_lost), shortfall.of_poses(result.keyframes, found.left_out)
+    )  # fmt: skip
+    if text := shortfall.together(missed):
+        raise IncompleteRun(text)
 
 
 def _scheduler(workers: int, ray: str | None) -> "Scheduler":

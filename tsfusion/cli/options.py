@@ -322,6 +322,12 @@ def client_settings(config: "Config", connect: str | None = None, **flags: str |
     return client if connect is not None else replace(client, key=None, server_key=None)
 
 
+# Settings that delete keyframes, or are for a disk that fills.
+_OF_KEPT_MAPS = (
+    "keep_seconds", "keep_keyframes", "keep_radius", "journal_bytes", "min_free_bytes", "cache",
+)  # fmt: skip
+
+
 def own_server(config: "Config", state: Path | None) -> "ServerConfig":
     """Settings of a run's own server, which only this machine reaches, and whose errors are shown here.
 
@@ -330,10 +336,15 @@ def own_server(config: "Config", state: Path | None) -> "ServerConfig":
     """
     from msgspec.structs import replace
 
+    from tsfusion.core.config import ServerConfig
     from tsfusion.pipelines.target_server import MAPS, THROWN_AWAY
 
+    server = config.server
+    if state is None:  # all of the recording is to be in a map that is made for it
+        usual = ServerConfig()
+        server = replace(server, **{name: getattr(usual, name) for name in _OF_KEPT_MAPS})
     return replace(
-        config.server, listen="tcp://127.0.0.1:0", state=THROWN_AWAY if state is None else str(state),
+        server, listen="tcp://127.0.0.1:0", state=THROWN_AWAY if state is None else str(state),
         max_maps=max(MAPS, config.server.max_maps), log_format="text",
         control=None, keys=None, metrics=None, directory=None, advertise=None,
     )  # fmt: skip

@@ -4,7 +4,7 @@
 import os
 import signal
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from types import FrameType
@@ -116,7 +116,8 @@ def scan(
     from tsfusion.cli import output, progress, run_page, run_summary
     from tsfusion.pipelines.scan import scan as run
 
-    if settings["localizer"] not in (None, "trajectory", "given"):
+    typed = dict(settings)
+    if settings["localizer"] not in (None, "auto", "trajectory", "given"):
         options.refuse(context, ("trajectory",), f"has no effect with --localizer {settings['localizer']}")
     opened, warnings = _open(
         context, source, option,
@@ -132,12 +133,14 @@ def scan(
         chosen = options.configuration_for(
             opened.sensor, config, usual=usual, tell=connect is None, **settings
         )
-        _refuse_ignored(context, chosen.scan, opened.sensor)
+        config_of_scan = _one_source_of_poses(
+            context, chosen.scan, typed, opened.sensor, in_order=typed["trajectory"] != settings["trajectory"]
+        )
         client = options.client_settings(
             chosen, connect, control=control, map=map_, key=key, server_key=server_key
         )
         result = run(
-            opened, out, overwrite=overwrite, config=chosen.scan,
+            opened, out, overwrite=overwrite, config=config_of_scan,
             volume=options.own_volume(chosen, client, settings),
             server=options.own_server(chosen, state), client=client, connect=connect, spool=spool,
             same_frame=same_frame, align=align, min_weight=settings["min_weight"], up=given_up,
@@ -152,22 +155,37 @@ def scan(
     run_summary.check(result)
 
 
-def _refuse_ignored(context: typer.Context, chosen: "ScanConfig", sensor: str) -> None:
-    """Raise InvalidConfig for flags about poses that the localizer does not ask for."""
-    name: str = chosen.localizer
-    if chosen.trajectory is not None and chosen.feed is not None:
-        options.refuse(
-            context, ("trajectory", "feed"), "is one source of poses, and two are given: leave one out"
-        )
+def _one_source_of_poses(
+    context: typer.Context, config: "ScanConfig", typed: dict[str, Any], sensor: str, *, in_order: bool
+) -> "ScanConfig":
+    """The settings without a source of poses that a typed one beats.
+
+    Args:
+        typed: flags as they were given; None = not given.
+        in_order: the trajectory is the recording's own by now, one pose a frame.
+
+    Raises:
+        InvalidConfig: for flags about poses that the localizer does not ask for.
+    """
+    from msgspec.structs import replace
+
+    given = [name for name in ("trajectory", "feed") if typed[name] is not None]
+    if len(given) == 2:
+        options.refuse(context, given, "is one source of poses, and two are given: leave one out")
+    if len(given) == 1:  # a file may name the other
+        config = replace(config, trajectory=None) if given == ["feed"] else replace(config, feed=None)
+    name: str = config.localizer
     if name == "auto":
         by_sensor = "lidar" if sensor == "lidar" else "images"
-        name = "trajectory" if chosen.trajectory else "feed" if chosen.feed else by_sensor
+        name = "trajectory" if config.trajectory else "feed" if config.feed else by_sensor
     if name not in ("trajectory", "feed"):
         no_lookup = "is for poses that are looked up by time (--trajectory, --feed), and these are not"
         options.refuse(context, ("time_offset", "max_gap"), no_lookup)
-        options.refuse(context, ("trajectory", "feed"), f"has no effect with --localizer {name}")
-    if chosen.loop_closure and name in ("trajectory", "feed", "given", "lidar"):
+        if not in_order:
+            options.refuse(context, ("trajectory", "feed"), f"has no effect with --localizer {name}")
+    if config.loop_closure and name in ("trajectory", "feed", "given", "lidar"):
         options.refuse(context, ("loop_closure",), "needs poses that are found from images (rgbd, stereo)")
+    return config
 
 
 def _open(
@@ -254,7 +272,8 @@ def _ended_by_signals(source: "Source") -> Iterator[None]:
         for each, handler in before.items():
             signal.signal(each, handler)
         source.close()
-        os.write(2, _ENDING)  # safe inside a handler, which `print` is not
+        with suppress(OSError):  # of a reader that went away
+            os.write(2, _ENDING)  # safe inside a handler, which `print` is not
 
     for signum in before:
         signal.signal(signum, stop)

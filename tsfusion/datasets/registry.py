@@ -102,8 +102,9 @@ PLAIN = (
         redwood_hololens.recognises_plain,
         redwood_hololens.Redwood,
     ),
-    Layout("LiDAR scans", scan_folders.EXPECTED, scan_folders.recognises, scan_folders.ScanFolder),
 )
+# Tried where nothing there is in any other: points beside a recording are often made of it.
+SCANS = (Layout("LiDAR scans", scan_folders.EXPECTED, scan_folders.recognises, scan_folders.ScanFolder),)
 SYNTHETIC = (
     "synthetic",
     "no files: synthetic:WORLD, or synthetic:WORLD:SENSOR; worlds: room (also -untextured, -plain, -bare), "
@@ -114,7 +115,7 @@ SYNTHETIC = (
 
 def layouts() -> list[Layout]:
     """Every layout, in the order in which they are tried."""
-    return [*_plugins(), *BUILT_IN, *PLAIN]
+    return [*_plugins(), *BUILT_IN, *PLAIN, *SCANS]
 
 
 def find(path: str | Path, *, unpack: bool = False) -> Found:
@@ -137,7 +138,8 @@ def find(path: str | Path, *, unpack: bool = False) -> Found:
     if not found and root.is_file():
         found = _match([root.absolute().parent]) if root.suffix.lower() in _INDEX else []
     elif not found:
-        found = _match(_folders_in(root))
+        places = _folders_in(root)
+        found = _match(places) or _match([root], SCANS) or _match(places, SCANS)
     if len(found) != 1:
         raise DatasetError(_unrecognised(root, [place.path for place in found]))
     if found[0].also:
@@ -210,12 +212,13 @@ def _unpacked(path: Path, *, unpack: bool) -> Path:
     )
 
 
-def _match(places: Iterable[Path]) -> list[Found]:
-    ranked = [*_plugins(), *BUILT_IN]
+def _match(places: Iterable[Path], only: tuple[Layout, ...] = ()) -> list[Found]:
+    """The datasets at these places, in any layout but the last, or in `only` these."""
+    ranked = [] if only else [*_plugins(), *BUILT_IN]
     found = []
     for place in places:
         fitting = [layout for layout in ranked if _recognises(layout, place)]
-        fitting = fitting or [layout for layout in PLAIN if layout.recognises(place)]
+        fitting = fitting or [layout for layout in only or PLAIN if layout.recognises(place)]
         if fitting:
             found.append(Found(place, fitting[0], tuple(layout.name for layout in fitting[1:])))
     return found

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """A LiDAR's scans from files: raw floats, PCD, PLY, LAS and LAZ."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from tsfusion.core.errors import DatasetError, MissingDependency
 
 SUFFIXES = (".bin", ".pcd", ".ply", ".las", ".laz")
+_HEADER_BYTES = 1 << 14
 USUAL_FIELDS = 4  # float32 a point of raw floats: x, y, z and the intensity
 
 
@@ -25,6 +27,8 @@ def read_scan(path: Path, *, fields: int = USUAL_FIELDS) -> NDArray[np.float32]:
     """
     suffix = path.suffix.lower()
     try:
+        if path.stat().st_size == 0:
+            raise DatasetError(f"{path} holds no points; expected x, y and z of a scan")
         points = _raw(path, fields) if suffix == ".bin" else _READERS[suffix](path)
     except OSError as error:
         raise DatasetError(f"cannot read {path}: {error.strerror or error}") from error
@@ -60,8 +64,11 @@ def _pcd(path: Path) -> NDArray[np.float32]:
     except ImportError as error:
         raise MissingDependency("to read PCD: pip install pypcd4 (or '.[lidar]')") from error
     try:
-        return np.asarray(PointCloud.from_path(path).numpy(("x", "y", "z")))
-    except OSError:
+        read = PointCloud.from_path(path)
+        points = np.asarray(read.numpy(("x", "y", "z")))
+        _check_count(path, len(points), int(read.metadata.points))
+        return points
+    except (OSError, DatasetError):
         raise
     except Exception as error:
         raise _broken(path, "PCD with the fields x, y and z", error) from error
@@ -72,9 +79,14 @@ def _ply(path: Path) -> NDArray[np.float32]:
 
     try:
         with path.open("rb") as file:
+            head = file.read(_HEADER_BYTES)
+            file.seek(0)
             read = trimesh.load(file, file_type="ply", process=False)
-        return np.asarray(read.vertices, np.float32)
-    except OSError:
+        points = np.asarray(read.vertices, np.float32)
+        if promised := re.search(rb"^element\s+vertex\s+([0-9]+)", head, re.MULTILINE):
+            _check_count(path, len(points), int(promised[1]))
+        return points
+    except (OSError, DatasetError):
         raise
     except Exception as error:
         raise _broken(path, "PLY with the vertices' x, y and z", error) from error
@@ -86,11 +98,20 @@ def _las(path: Path) -> NDArray[np.float32]:
     except ImportError as error:
         raise MissingDependency("to read LAS or LAZ: pip install 'laspy[lazrs]' (or '.[mesh]')") from error
     try:
-        return np.asarray(laspy.read(path).xyz, np.float32)
-    except OSError:
+        read = laspy.read(path)
+        points = np.asarray(read.xyz, np.float32)
+        with laspy.open(path) as opened:  # what was read has a header of its own
+            _check_count(path, len(points), opened.header.point_count)
+        return points
+    except (OSError, DatasetError):
         raise
     except Exception as error:
         raise _broken(path, "LAS or LAZ", error) from error
+
+
+def _check_count(path: Path, count: int, promised: int) -> None:
+    if count != promised:
+        raise DatasetError(f"{path} was cut off: it has {count} of the {promised} points that it names")
 
 
 def _broken(path: Path, expected: str, error: Exception) -> DatasetError:

@@ -227,6 +227,12 @@ class _Scan:
         rest = any(self._source.read(start, _WINDOW_BYTES, end).strip(b"\0") for start in starts)
         return not rest and not self._source.failed
 
+    def _ends_behind(self, at: int) -> bool:
+        """Whether the file's last bytes are behind a place: it was closed, and has grown since."""
+        magic, size = mcap_layout.MAGIC, self._source.size
+        count = _WINDOW_BYTES + len(magic) - 1
+        return any(magic in self._source.read(start, count) for start in range(at, size, _WINDOW_BYTES))
+
     def _search(self, start: int) -> int | None:
         """Offset of the next whole record, at or behind `start`."""
         if self._next is not None:
@@ -259,4 +265,6 @@ class _Scan:
         if end.state == "broken":
             yield self._note(at, size - at, "its index is damaged")
         elif end.state == "open" and at < size:
-            yield self._note(at, size - at, "its index was cut off", torn=True)
+            is_whole = self._ends_behind(at)
+            what = "something stands behind its index" if is_whole else "its index was cut off"
+            yield self._note(at, size - at, what, torn=not is_whole)

@@ -17,6 +17,7 @@ from tsfusion.fuser.journaled_keyframes import FinalKeyframe, JournaledKeyframes
 from tsfusion.geometry import color_scales
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.journal import selection, state_folder
+from tsfusion.journal.recording import LOST
 from tsfusion.journal.state_folder import Watcher
 from tsfusion.pipelines import saved_maps
 from tsfusion.tsdf import checkpoint
@@ -179,7 +180,8 @@ def map_of(
         settled = saved_maps.opened(there, lambda done, total: watch(done, done, total), reading)
         with settled as (file, left_out):
             volume = Volume.load(file, config.threads, memory_bytes=memory_for(file), **view)
-            return JournalMap(volume, dict(left_out))
+            lost = left_out.pop(LOST, 0)
+            return JournalMap(volume, dict(left_out), lost=lost)
     keyframes, missing = choose(source, until=until, only=only, watch=reading), 0
     if saved.is_file():
         if given and not is_view:

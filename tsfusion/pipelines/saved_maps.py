@@ -17,6 +17,7 @@ from tsfusion.core.durable_files import make_folder, size_of
 from tsfusion.core.errors import CheckpointError, JournalError, OutputError
 from tsfusion.core.folder_lock import lock_folder
 from tsfusion.journal import state_folder
+from tsfusion.journal.recording import LOST
 from tsfusion.pipelines import settled_maps
 from tsfusion.tsdf import checkpoint, map_history
 from tsfusion.tsdf.block_store import unpack_keys
@@ -171,7 +172,7 @@ def opened(
         watch: told the records that are fused, and all of them; `reading` the bytes of the journal.
 
     Yields:
-        The file; reason → number of the journal's keyframes that the map could not take.
+        The file; reason → number of the journal's keyframes that are not in the map.
 
     Raises:
         CheckpointError, JournalError: when the map or its journal cannot be read.
@@ -179,11 +180,16 @@ def opened(
     if saved.folder is not None:
         with checkpoint.reading(saved.path) as (header, _):
             histories, config = map_history.sessions(header.meta), header.config
-        records = settled_maps.records_after(saved.folder, histories, reading)
-        if records or any(one.waiting for one in histories):
-            with settled_maps.settled(saved.folder, records, config, watch) as found:
-                yield found
+            tail = settled_maps.records_after(saved.folder, histories, reading)
+            # what the map had before the damage it still has
+            lost = max(0, tail.lost - missing(header, tail.keyframes))
+        damage = {LOST: lost} if lost else {}
+        if tail.records or any(one.waiting for one in histories):
+            with settled_maps.settled(saved.folder, tail.records, config, watch) as (path, left_out):
+                yield path, left_out | damage
             return
+        yield saved.path, damage
+        return
     yield saved.path, {}
 
 
@@ -204,8 +210,8 @@ def summarise(saved: SavedMap, reading: state_folder.Watcher = lambda _done, _al
     histories = map_history.sessions(header.meta)
     after = None
     if saved.folder is not None:
-        records = settled_maps.records_after(saved.folder, histories, reading)
-        after = Counter(one.is_correction for one in records)
+        tail = settled_maps.records_after(saved.folder, histories, reading)
+        after = Counter(one.is_correction for one in tail.records)
     return MapSummary(
         path=str(saved.path),
         nbytes=size_of(saved.path),

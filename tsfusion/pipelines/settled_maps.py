@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from tsfusion import journal
 from tsfusion.core.config import ServerConfig, VolumeConfig
@@ -25,6 +25,20 @@ from tsfusion.tsdf import map_history
 
 Watch = Callable[[int, int], None]  # records and moves done, of how many
 _POLL_S = 0.1
+
+
+class Tail(NamedTuple):
+    """What a journal has behind a checkpoint.
+
+    Attributes:
+        records: those that the checkpoint does not have, in order.
+        keyframes: of the whole journal, erased ones too.
+        lost: keyframes of the whole journal that damage has destroyed, at least.
+    """
+
+    records: list[journal.RecordEntry]
+    keyframes: int
+    lost: int
 
 
 class _Answers:
@@ -43,8 +57,8 @@ def records_after(
     folder: Path,
     histories: list[map_history.SessionHistory],
     reading: state_folder.Watcher = lambda _done, _all: None,
-) -> list[journal.RecordEntry]:
-    """The records of a map's journal that a checkpoint with these sessions does not have, in order.
+) -> Tail:
+    """The records of a map's journal that a checkpoint with these sessions does not have.
 
     Args:
         reading: told the bytes that are read, and all of them: each record's CRC is checked.
@@ -59,14 +73,17 @@ def records_after(
         journal.segment_path(path, number) for number in (journal.segments(path) if path.is_dir() else ())
     ]
     before, total = 0, sum(map(size_of, files))
+    keyframes = lost = 0
     for file in files:
-        records, _ = journal.list_records(file, partial(_add_to, reading, before, total))
+        records, damaged = journal.list_records(file, partial(_add_to, reading, before, total))
         before += size_of(file)
+        lost += damaged
         for record in records:
+            keyframes += not record.is_correction
             if record.seq > last.get(record.session, 0) and not record.is_erased:
                 last[record.session] = record.seq
                 found.append(record)
-    return found
+    return Tail(found, keyframes, lost)
 
 
 def _add_to(reading: state_folder.Watcher, before: int, total: int, at: int, _records: int) -> None:

@@ -10,7 +10,7 @@ import pytest
 import trimesh
 from command_processes import Here
 from numpy.typing import NDArray
-from small_recordings import one_line
+from small_recordings import one_line, seven_scenes
 
 from tsfusion import Volume, VolumeConfig
 from tsfusion.core.errors import DatasetError, MissingDependency
@@ -93,12 +93,61 @@ def test_names_give_the_order_and_times(tmp_path):
 
 
 def test_a_trajectory_may_be_given_and_others_files_are_counted(tmp_path):
-    root = folder(tmp_path / "a", ["1", "2"])
+    root = folder(tmp_path / "a", ["1", "2", "3", "4"])
     save(root / "map.bin", scan(9))
-    with_poses(tmp_path, 2, "mine.txt")
+    with_poses(tmp_path, 4, "mine.txt")
     dataset = open_dataset(root, trajectory=tmp_path / "mine.txt")
-    assert (len(dataset), dataset.skipped) == (2, {"of another name": 1})
+    assert (len(dataset), dataset.skipped) == (4, {"of another name": 1})
     assert dataset[1].T_world_camera[0, 3] == 1
+    save(root / "whole.bin", scan(9))
+    one_line(lambda: open_dataset(root), r"has 4 scans named as \d\.bin, and 2 named otherwise; expected one")
+
+
+@pytest.mark.parametrize(
+    ("names", "stamps"),
+    [
+        (["cloud_1583836591_182590976", "cloud_1583836592_5"], [1583836591182590976, 1583836592000000005]),
+        (["2023-01-01-12-59-58", "2023-01-01-13-00-01"], None),
+        (["s1_9", "s1_10"], None),
+        (["1583836591182590976", "1583836592182590976"], [1583836591182590976, 1583836592182590976]),
+    ],
+)
+def test_names_of_several_numbers_are_one_series(tmp_path, names, stamps):
+    root = with_poses(folder(tmp_path, names[::-1]), 2)
+    dataset = open_dataset(root)
+    assert [int(one.points[0, 0]) for one in dataset] == [1, 0]
+    found = dataset.timestamps_ns
+    assert (None if found is None else found.tolist()) == stamps
+
+
+def test_poses_that_do_not_fit_do_not_keep_a_scan_from_its_own(tmp_path, caplog):
+    root = with_poses(folder(tmp_path, ["0", "1", "2"]), 2)
+    one_line(lambda: open_dataset(root), r"poses\.txt has 2 poses for 3 frames")
+    assert len(open_dataset(root, posed=False)) == 3
+    assert "poses.txt is not taken for the poses of these scans" in caplog.text
+    one_line(lambda: open_dataset(root, posed=False, trajectory=root / "poses.txt"), r"has 2 poses for 3")
+
+
+def test_which_scans_are_meant_must_be_clear(tmp_path):
+    root = folder(folder(tmp_path, ["0", "1"]), ["2", "3", "4"], "ply")
+    one_line(lambda: open_dataset(root), r"several series of scans \(.*/\*\.bin and .*/\*\.ply\); move the")
+    for number in (2, 3, 4):
+        (root / f"{number}.ply").unlink()
+    folder(root / "points", ["0", "1"])
+    one_line(lambda: open_dataset(root, posed=False), r"several series of scans .*points/\*\.bin\)")
+
+
+def test_points_beside_a_recording_are_made_of_it(tmp_path):
+    seven_scenes(tmp_path / "scene")
+    folder(tmp_path, ["cloud_1", "cloud_2"], "ply")
+    folder(tmp_path / "clouds", ["1", "2"], "ply")
+    assert find(tmp_path).layout.name == "7-Scenes"
+    meshes = tmp_path / "meshes"
+    meshes.mkdir()
+    for number in (1, 2):
+        trimesh.creation.box().export(meshes / f"{number}.ply")
+    with pytest.raises(DatasetError, match="is in no layout known here"):
+        find(meshes)
 
 
 def test_what_is_no_recording_is_not_taken_for_one(tmp_path):
@@ -144,10 +193,21 @@ def test_a_broken_scan_is_one_clear_line(tmp_path, suffix, content):
     one_line(lambda: dataset[1], rf"cannot read .*1\.{suffix}: No such file")
 
 
+@pytest.mark.parametrize("suffix", ["ply", "pcd", "las"])
+def test_a_scan_that_was_cut_off_is_no_smaller_one(tmp_path, suffix):
+    path = tmp_path / f"0.{suffix}"
+    save(path, scan(0), 1)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) - 12 * 20])
+    with pytest.raises(DatasetError, match=r"was cut off: it has \d+ of the 50 points|is damaged"):
+        scan_files.read_scan(path)
+
+
 def test_a_scan_whose_reader_is_missing_names_the_command(tmp_path, monkeypatch):
     for module, suffix in (("pypcd4", "pcd"), ("laspy", "las")):
         for name in {module, *(name for name in sys.modules if name.startswith(f"{module}."))}:
             monkeypatch.setitem(sys.modules, name, None)
+        (tmp_path / f"0.{suffix}").write_bytes(b"x")
         with pytest.raises(MissingDependency, match=f"pip install '?{module}"):
             scan_files.read_scan(tmp_path / f"0.{suffix}")
 

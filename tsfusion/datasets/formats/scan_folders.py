@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: MIT
 """Folders of a LiDAR's scans, one file each: what drivers record, and what other fusion programs read."""
 
+import logging
 import re
 from decimal import Decimal
 from pathlib import Path
+from typing import NamedTuple
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.dataset import SCAN, Frames, keep_posed, require_folder, require_frames
@@ -19,15 +21,20 @@ EXPECTED = (
     "with --trajectory; without, for a scan"
 )
 _PLACES = ("", "velodyne", "lidar", "scans", "points", "clouds")
-_NAME = re.compile(r"(.*?)([0-9]+(?:\.[0-9]+)?)", re.DOTALL)  # what all names begin with, a number or a time
-_POSES = ("poses.txt", "*poses_kitti.txt", "*poses_tum.txt", "*_kitti.txt", "*_tum.txt", "*poses.txt")
+_NUMBER = re.compile(r"[0-9]+(?:\.[0-9]+)?")
+_POSES = ("poses.txt", "*poses_kitti.txt", "*poses_tum.txt", "*_kitti.txt", "*_tum.txt")
 _FEWEST = 2
+_FEW_OTHERS = 4  # files of a series for each of another name, at least
 _RUN = "run.json"  # beside the meshes of a scan
+_HEADER_BYTES = 1 << 14
+_SECONDS, _NANOSECONDS = 10, 9  # digits of the two numbers of a time
+
+log = logging.getLogger(__name__)
 
 
 def recognises(path: Path) -> bool:
     """Whether the folder has scans."""
-    return bool(_scans(path)[0])
+    return bool(_all_series(path))
 
 
 class ScanFolder(Frames):
@@ -62,11 +69,11 @@ class ScanFolder(Frames):
         if not 3 <= fields <= 64:
             raise DatasetError(f"fields must be from 3 to 64 numbers a point, got {fields}")
         self.name, self.sensor, self.skipped, self._fields = f"LiDAR scans {root.name}", sensor, {}, fields
-        files, others = _scans(root)
-        require_frames(len(files), root, EXPECTED, self.skipped)
-        if others:
-            self.skipped["of another name"] = others
-        stamps = times_of_names([_number(file) for file in files])
+        series = _series(root)
+        files = series.files
+        if series.others:
+            self.skipped["of another name"] = series.others
+        stamps = times_of_names([_time(file.stem) for file in files])
         poses: list[Transform | None] = [None] * len(files)
         where = _poses(root) if trajectory is None else Path(trajectory).expanduser()
         if trajectory is None and where is not None and (root / "calib.txt").is_file():
@@ -77,9 +84,14 @@ class ScanFolder(Frames):
         if where is None and posed:
             raise DatasetError(f"{root} has no poses; expected {EXPECTED}; {SCAN}")
         if where is not None:
-            poses = poses_of(
-                where, len(files), stamps, posed=posed, max_gap_s=max_gap_s, time_offset_s=time_offset_s
-            )
+            try:
+                poses = poses_of(
+                    where, len(files), stamps, posed=posed, max_gap_s=max_gap_s, time_offset_s=time_offset_s
+                )
+            except DatasetError as error:
+                if posed or trajectory is not None:
+                    raise
+                log.warning("%s is not taken for the poses of these scans: %s", where.name, error)
         kept, self._poses = keep_posed(
             range(len(files)), poses, posed=posed, skipped=self.skipped, reason="without a pose in time"
         )
@@ -94,28 +106,73 @@ class ScanFolder(Frames):
         return self._posed_frame(index, points=read_scan(self._files[index], fields=self._fields))
 
 
-def _scans(root: Path) -> tuple[list[Path], int]:
-    """The scans of a folder in their order, and the number of files of their kind that have another name."""
-    for place in _PLACES:
-        where = root / place
+class _Series(NamedTuple):
+    """Files of a name but for its numbers, in their order; and how many of their kind have another name."""
+
+    files: list[Path]
+    others: int
+
+
+def _series(root: Path) -> _Series:
+    """The scans of a folder.
+
+    Raises:
+        DatasetError: there are none, or which ones are meant is not clear.
+    """
+    found = _all_series(root)
+    if len(found) > 1:
+        places = " and ".join(f"{one.files[0].parent}/*{one.files[0].suffix}" for one in found)
+        raise DatasetError(f"{root} holds several series of scans ({places}); move the others away")
+    if not found:
+        raise DatasetError(f"no frames in {root}; expected {EXPECTED}")
+    (series,) = found
+    if _FEW_OTHERS * series.others > len(series.files):
+        raise DatasetError(
+            f"{series.files[0].parent} has {len(series.files)} scans named as {series.files[0].name}, and "
+            f"{series.others} named otherwise; expected one series: move the others away"
+        )
+    return series
+
+
+def _all_series(root: Path) -> list[_Series]:
+    """The longest series of each kind of file in each place where scans may be."""
+    found = []
+    for where in (root / place for place in _PLACES):
         if not where.is_dir() or (where / _RUN).is_file():
             continue
-        for suffix in SUFFIXES:
-            found = [file for file in where.glob("[!.]*") if file.suffix.lower() == suffix]
-            series: dict[str, list[Path]] = {}
-            for file in found:
-                if match := _NAME.fullmatch(file.stem):
-                    series.setdefault(match[1], []).append(file)
-            longest = max(series.values(), key=len, default=[])
-            if len(longest) >= _FEWEST:
-                return sorted(longest, key=lambda file: Decimal(_number(file))), len(found) - len(longest)
-    return [], 0
+        by_suffix: dict[str, dict[str, list[Path]]] = {}
+        for file in where.glob("[!.]*"):
+            if (suffix := file.suffix.lower()) in SUFFIXES:
+                named = by_suffix.setdefault(suffix, {})
+                named.setdefault(_NUMBER.sub("0", file.stem), []).append(file)
+        for suffix in sorted(by_suffix):
+            named = by_suffix[suffix]
+            longest = max(named.values(), key=len)
+            if len(longest) < _FEWEST or _NUMBER.search(longest[0].stem) is None or _is_mesh(longest[0]):
+                continue
+            files = sorted(longest, key=lambda file: tuple(map(Decimal, _NUMBER.findall(file.stem))))
+            found.append(_Series(files, sum(map(len, named.values())) - len(files)))
+    return found
 
 
-def _number(file: Path) -> str:
-    match = _NAME.fullmatch(file.stem)
-    assert match is not None
-    return match[2]
+def _is_mesh(file: Path) -> bool:
+    """Whether a PLY file says at its start that it has faces."""
+    if file.suffix.lower() != ".ply":
+        return False
+    try:
+        with file.open("rb") as opened:
+            head = opened.read(_HEADER_BYTES).partition(b"end_header")[0]
+    except OSError:
+        return False
+    return re.search(rb"^element\s+face\s+0*[1-9]", head, re.MULTILINE) is not None
+
+
+def _time(name: str) -> str:
+    """The time in a name, as decimal seconds or nanoseconds; else anything."""
+    numbers = _NUMBER.findall(name)
+    if len(numbers) == 2 and len(numbers[0]) == _SECONDS and len(numbers[1]) <= _NANOSECONDS:
+        return f"{numbers[0]}{numbers[1]:0>{_NANOSECONDS}}" if numbers[1].isdecimal() else ""
+    return numbers[0] if len(numbers) == 1 else ""
 
 
 def _poses(root: Path) -> Path | None:
