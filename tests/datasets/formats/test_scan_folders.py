@@ -175,7 +175,10 @@ def test_points_of_three_numbers(tmp_path):
         lambda: open_dataset(root)[0], r"0\.bin has intensities below 0; expected float32 x, y, z and the"
     )
     assert np.array_equal(open_dataset(root, fields=3)[1].points, scan(1, count=4))
-    one_line(lambda: open_dataset(root, fields=5)[0], r"has 48 bytes; expected 20 a point: .* and 2 more")
+    one_line(
+        lambda: open_dataset(root, fields=5)[0],
+        r"has 48 bytes, not 20 a point; expected .* and 2 more",
+    )
     one_line(lambda: open_dataset(root, fields=2), r"fields must be from 3 to 64 numbers a point, got 2")
 
 
