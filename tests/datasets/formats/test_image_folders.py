@@ -293,6 +293,28 @@ def test_a_folder_without_a_trajectory_names_the_one_of_another_layout(tmp_path)
         Redwood(root)
 
 
+@pytest.mark.parametrize(
+    ("depth", "color"),
+    [("depth_{}", "color_{}"), ("{}-depth", "{}-rgb"), ("frame{}_Depth", "frame{}_image")],
+)
+def test_depth_and_colour_in_one_folder(tmp_path, depth, color):
+    root = redwood_room(tmp_path, "image", "trajectory.log")
+    for number, file in enumerate(sorted((root / "depth").iterdir()), 9):  # 9, 10, …: by number, not by name
+        file.rename(root / f"{depth.format(number)}.png")
+    for number, file in enumerate(sorted((root / "image").iterdir()), 9):
+        file.rename(root / f"{color.format(number)}.jpg")
+    for name in ("depth", "image"):
+        (root / name).rmdir()
+    dataset = open_dataset(root)
+    check(dataset, views())
+    assert (dataset.timestamps_ns, dataset.uncolored) == (None, 0)
+    (root / "trajectory.log").unlink()
+    assert len(open_dataset(root, posed=False)) == len(dataset)
+    (root / f"{color.format(9)}.jpg").unlink()
+    with pytest.raises(DatasetError, match="is in no layout known here"):
+        open_dataset(root, posed=False)
+
+
 def test_a_log_that_is_given_beats_the_one_that_is_found(tmp_path):
     root = redwood_room(tmp_path, "image", "trajectory.log")
     lines = (root / "trajectory.log").read_text().splitlines()

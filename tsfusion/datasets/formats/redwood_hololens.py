@@ -2,11 +2,17 @@
 """RGB-D folders with one pose file: HoloLens recordings and Redwood / Open3D reconstructions."""
 
 import re
+from decimal import Decimal
 from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.cameras import PublishedCamera, find_camera
 from tsfusion.datasets.dataset import SCAN, keep_posed, require_folder, require_frames
+from tsfusion.datasets.depth_files import SUFFIXES
+from tsfusion.datasets.formats.image_folders import SUFFIXES as COLOR_SUFFIXES
 from tsfusion.datasets.formats.image_folders import (
     DepthImages,
     color_images,
@@ -14,6 +20,7 @@ from tsfusion.datasets.formats.image_folders import (
     first_size,
     poses_by_number,
     times_of,
+    times_of_names,
 )
 from tsfusion.datasets.given_trajectory import poses_of
 from tsfusion.datasets.trajectory_files import is_log, read_log, read_matrix_rows
@@ -26,8 +33,9 @@ REDWOOD_EXPECTED = (
     "camera_intrinsic.json, and trajectory.log, odometry.log or *-traj.txt"
 )
 PLAIN_EXPECTED = (
-    "depth/*.png, .tiff, .exr or .npy and image/, color/, colour/ or rgb/, of equal names, and "
-    "camera-intrinsics.txt or camera_intrinsic.json; without poses, so for a scan, or with --trajectory"
+    "depth/*.png, .tiff, .exr or .npy and image/, color/, colour/ or rgb/, of equal names, or all in one "
+    "folder (depth_N.png and color_N.png, N-depth.png and N-rgb.jpg, …), and camera-intrinsics.txt or "
+    "camera_intrinsic.json; without poses, so for a scan, or with --trajectory"
 )
 # Open3D's PrimeSenseDefault, for the recordings that Redwood and Open3D distribute
 _PRIMESENSE = PublishedCamera("Redwood's recordings", Intrinsics(525.0, 525.0, 319.5, 239.5))
@@ -39,6 +47,8 @@ _REDWOODS_FILES = ("livingroom[12]-traj.txt", "office[12]-traj.txt")
 _LOGS = ("trajectory.log", "scene/trajectory.log", "odometry.log")  # by preference
 _LOG_NAMES = ("*traj*.log", "*-traj.txt")
 _COLOR = ("image", "color", "colour", "rgb")
+_DEPTH = re.compile("depth", re.IGNORECASE)  # in the name of an image that has its colour beside it
+_NUMBER = re.compile(r"[0-9]+(?:\.[0-9]+)?")
 
 
 def recognises_hololens(path: Path) -> bool:
@@ -56,8 +66,11 @@ def recognises_redwood(path: Path) -> bool:
 
 
 def recognises_plain(path: Path) -> bool:
-    """Whether the folder has one of depth images and one of colour images."""
-    return bool(_depth_folders(path)) and _color_folder(path) is not None
+    """Whether the folder has one of depth images and one of colour images, or both in one."""
+    if _depth_folders(path):
+        return _color_folder(path) is not None
+    beside = _beside(path)
+    return len(beside) > 1 and None not in map(_partner, beside[:2])
 
 
 class HoloLens(DepthImages):
@@ -145,7 +158,8 @@ class Redwood(DepthImages):
         if path.is_file():
             path, trajectory = _root_of(path) or path.parent, trajectory or path.absolute()
         root = require_folder(path, "Redwood")
-        files = depth_images(_depth_folder(root), REDWOOD_EXPECTED)
+        beside = [] if _depth_folders(root) else _beside(root)
+        files = beside or depth_images(_depth_folder(root), REDWOOD_EXPECTED)
         log = _log(root) if trajectory is None else Path(trajectory)
         if log is not None and not log.is_file():
             log = root / log
@@ -157,7 +171,12 @@ class Redwood(DepthImages):
         found = _poses(files, log, posed=posed, time_offset_s=time_offset_s)
         depth, poses = keep_posed(files, found, posed=posed, skipped=skipped)
         require_frames(len(depth), root, REDWOOD_EXPECTED, skipped)
-        where = _color_folder(root)
+        colored: list[Path | None] = []
+        if color and beside:
+            colored = [_partner(file) for file in depth]
+            self.uncolored = colored.count(None)
+        elif color and (where := _color_folder(root)):
+            colored = [*color_images(depth, where, REDWOOD_EXPECTED)]
         camera = find_camera(
             root, first_size(depth), intrinsics=intrinsics, calibration=calibration,
             places=(root, depth[0].parent), published=_PRIMESENSE if _is_redwoods_own(root) else None,
@@ -166,12 +185,12 @@ class Redwood(DepthImages):
             f"Redwood {root.name}",
             sensor=sensor,
             depth=depth,
-            color=color_images(depth, where, REDWOOD_EXPECTED) if color and where else [],
+            color=colored,
             poses=poses,
             camera=camera,
             skipped=skipped,
             depth_scale=depth_scale,
-            timestamps_ns=times_of(depth),
+            timestamps_ns=_times(depth),
         )
 
 
@@ -183,7 +202,35 @@ def _poses(
         return [None] * len(files)
     if is_log(path):
         return poses_by_number(files, read_log(path), path)
-    return poses_of(path, len(files), times_of(files), posed=posed, time_offset_s=time_offset_s)
+    return poses_of(path, len(files), _times(files), posed=posed, time_offset_s=time_offset_s)
+
+
+def _times(files: list[Path]) -> NDArray[np.int64] | None:
+    """Nanoseconds of images from their names, or from the only number in these; None = they have none."""
+    numbers = [_NUMBER.findall(file.stem) for file in files if _DEPTH.search(file.stem)]
+    if len(numbers) == len(files) and all(len(one) == 1 for one in numbers):
+        return times_of_names([one[0] for one in numbers])
+    return times_of(files)
+
+
+def _beside(root: Path) -> list[Path]:
+    """Depth images by their names, in the order of the numbers in these."""
+    found = [
+        file
+        for file in (root.glob("[!.]*") if root.is_dir() else ())
+        if file.suffix.lower() in SUFFIXES and _DEPTH.search(file.stem) and _NUMBER.search(file.stem)
+    ]
+    return sorted(found, key=lambda file: tuple(map(Decimal, _NUMBER.findall(file.stem))))
+
+
+def _partner(depth: Path) -> Path | None:
+    """The colour image whose name says colour where that of the depth image says depth."""
+    for word in _COLOR:
+        stem = _DEPTH.sub(word, depth.stem)
+        for suffix in COLOR_SUFFIXES:
+            if (color := depth.with_name(stem + suffix)).is_file():
+                return color
+    return None
 
 
 def _root_of(log: Path) -> Path | None:
