@@ -177,6 +177,14 @@ def quick_servers(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(target_server, "subprocess", made)
 
 
+@pytest.fixture
+def hangs_up() -> Iterator[None]:
+    """Processes notice when their terminal goes away, also where `nohup` has started the tests."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
 @pytest.fixture(scope="module")
 def shared(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     """One server for the tests of a module that leave it as it was or do not care what it holds.

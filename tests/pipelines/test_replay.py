@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import cv2
+import msgspec
 import numpy as np
 import own_recordings
 import pytest
@@ -32,11 +33,12 @@ from command_processes import (
 from keyframes_and_servers import map_hash
 from small_recordings import first_views
 
-from tsfusion import Volume, VolumeConfig
+from tsfusion import Volume, VolumeConfig, journal
 from tsfusion.cli import options
 from tsfusion.core.config import Config, ServerConfig
 from tsfusion.core.output_folder import building
-from tsfusion.pipelines import replay
+from tsfusion.pipelines import replay, settled_maps
+from tsfusion.tsdf import checkpoint, map_history
 
 RESULTS = {
     "mesh.ply", "mesh.glb", "preview.png", "delay.csv", "delay.png", "growth.csv", "keyframes.txt",
@@ -197,6 +199,25 @@ def test_the_server_table_of_a_file_counts_for_a_runs_own_server(here: Here, tmp
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("damaged", "found"), [(2, (2, 1, 0)), (5, (3, 0, 1)), (None, (3, 0, 0))])
+def test_what_damage_costs_is_told_by_where_it_is(
+    run_folder: Path, tmp_path: Path, damaged: int | None, found: tuple[int, int, int]
+) -> None:
+    folder = shutil.copytree(run_folder / "state" / "maps" / "default", tmp_path / "map")
+    (file,) = (folder / "journal").glob("*.mcap")
+    records, _ = journal.list_records(file)
+    if damaged is not None:
+        content = bytearray(file.read_bytes())
+        content[next(one for one in records if one.seq == damaged).position.offset + 700] ^= 16
+        file.write_bytes(content)
+    with checkpoint.reading(folder / "map.tsf") as (header, _):
+        (history,) = map_history.sessions(header.meta)
+    tail = settled_maps.records_after(folder, [msgspec.structs.replace(history, last=3)])
+    assert (tail.keyframes, tail.lost, tail.lost_behind) == found
+    assert [one.seq for one in tail.records] == [seq for seq in (4, 5, 6) if seq != damaged]
+
+
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick_servers")
 def test_a_saved_map_lacks_what_was_damaged_before_it_was_made(
     run_folder: Path, here: Here, tmp_path: Path
@@ -289,6 +310,7 @@ def _umask() -> int:
     return mask
 
 
+@pytest.mark.usefixtures("hangs_up")
 @pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
 @pytest.mark.parametrize(
     ("number", "word"),

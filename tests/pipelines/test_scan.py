@@ -123,11 +123,13 @@ def test_a_scan_leaves_mesh_trajectory_and_figures(walk: Path, here: Here, tmp_p
 
 
 @pytest.mark.usefixtures("quick_servers")
-def test_poses_may_be_given_by_time_and_in_order(walk: Path, here: Here, tmp_path: Path) -> None:
+def test_poses_may_be_given_by_time_and_in_order(
+    walk: Path, here: Here, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     poses = [keyframe.T_world_camera[:3].ravel() for keyframe in open_dataset(walk)]
     rows = (" ".join(f"{number:.9f}" for number in pose) + "\n" for pose in poses)
     (tmp_path / "kitti.txt").write_text("".join(rows))
-    (tmp_path / "settings.toml").write_text('[scan]\nfeed = "tcp://127.0.0.1:1"\n')
+    (tmp_path / "settings.toml").write_text('[scan]\nfeed = "tcp://127.0.0.1:1"\nlocalizer = "rgbd"\n')
     in_order = ("--trajectory", tmp_path / "kitti.txt")
     by_time = ("--trajectory", walk / "groundtruth.txt", "--time-offset", 0.0)
     settings = ("--config", tmp_path / "settings.toml")
@@ -142,10 +144,21 @@ def test_poses_may_be_given_by_time_and_in_order(walk: Path, here: Here, tmp_pat
             "scan", walk, *COARSE, *flags, "--max-frames", 12, "--out", tmp_path / "out", "--overwrite"
         )
         assert f"12/12 localised by {by}" in done.stdout, done.stderr
+    monkeypatch.setenv("TSFUSION_FEED", "tcp://127.0.0.1:1")
+    done = here("scan", walk, *COARSE, *by_time, "--out", tmp_path / "out", "--overwrite")
+    assert "12/12 localised by trajectory" in done.stdout, done.stderr
+    monkeypatch.setenv("TSFUSION_TRAJECTORY", str(tmp_path / "kitti.txt"))
+    done = here("scan", walk, *COARSE, "--localizer", "rgbd", "--out", tmp_path / "none")
+    assert "two sources of poses" in done.stderr
+    monkeypatch.delenv("TSFUSION_FEED")
+    done = here("scan", walk, *COARSE, "--localizer", "rgbd", "--out", tmp_path / "out", "--overwrite")
+    assert "12/12 localised by rgbd" in done.stdout, done.stderr
+    monkeypatch.delenv("TSFUSION_TRAJECTORY")
     done = here("scan", walk, *COARSE, *in_order, "--time-offset", 1, "--out", tmp_path / "none")
     assert "--time-offset is for poses that are looked up by time" in done.stderr
 
 
+@pytest.mark.usefixtures("hangs_up")
 @pytest.mark.slow
 def test_a_terminal_that_goes_away_ends_a_scan_with_its_results(walk: Path, tmp_path: Path) -> None:
     """The shell and the kernel may both send SIGHUP."""

@@ -213,7 +213,7 @@ serve --max-range 0.01 | got 0.01 m | max_range must be larger than min_range
 {scan} synthetic:room --max-gap 0 | got 0.0 | max_gap must be > 0
 {scan} synthetic:room --time-offset 1 | --time-offset is for poses that are looked up by time | --trajectory, --feed
 {scan} synthetic:room --max-gap 1 --localizer given | --max-gap is for poses that are looked up by time | these are not
-{scan} tum --trajectory other_times.txt --feed tcp://127.0.0.1:5 | two are given | leave one out
+{scan} tum --trajectory other_times.txt --feed tcp://127.0.0.1:5 | two sources of poses | leave one out
 {scan} synthetic:room --feed tcp://127.0.0.1:5 --localizer rgbd | --feed has no effect | --localizer rgbd
 {scan} synthetic:room --trajectory x.txt --localizer rgbd | --trajectory has no effect | --localizer rgbd
 {scan} synthetic:room --localizer given --loop-closure | --loop-closure needs poses | found from images

@@ -116,9 +116,8 @@ def scan(
     from tsfusion.cli import output, progress, run_page, run_summary
     from tsfusion.pipelines.scan import scan as run
 
+    _choose_poses(context, settings)
     typed = dict(settings)
-    if settings["localizer"] not in (None, "auto", "trajectory", "given"):
-        options.refuse(context, ("trajectory",), f"has no effect with --localizer {settings['localizer']}")
     opened, warnings = _open(
         context, source, option,
         camera=options.camera(intrinsics, calibration), rate=rate,
@@ -133,8 +132,8 @@ def scan(
         chosen = options.configuration_for(
             opened.sensor, config, usual=usual, tell=connect is None, **settings
         )
-        config_of_scan = _one_source_of_poses(
-            context, chosen.scan, typed, opened.sensor, in_order=typed["trajectory"] != settings["trajectory"]
+        config_of_scan = _check_poses(
+            context, chosen.scan, opened.sensor, is_given_late=typed["trajectory"] != settings["trajectory"]
         )
         client = options.client_settings(
             chosen, connect, control=control, map=map_, key=key, server_key=server_key
@@ -155,33 +154,57 @@ def scan(
     run_summary.check(result)
 
 
-def _one_source_of_poses(
-    context: typer.Context, config: "ScanConfig", typed: dict[str, Any], sensor: str, *, in_order: bool
+def _choose_poses(context: typer.Context, settings: dict[str, Any]) -> None:
+    """Leave one source of poses in the flags; what was typed beats the environment.
+
+    Raises:
+        InvalidConfig: where two are left, or a typed one has no effect.
+    """
+    from tsfusion.core.errors import InvalidConfig
+
+    def is_typed(name: str) -> bool:
+        source = context.get_parameter_source(name)
+        return source is not None and source.name == "COMMANDLINE"
+
+    sources = [name for name in ("trajectory", "feed") if settings[name] is not None]
+    if len(sources) == 2:
+        typed = [name for name in sources if is_typed(name)]
+        if len(typed) != 1:
+            raise InvalidConfig("--trajectory and --feed are two sources of poses: leave one out")
+        settings |= {name: None for name in sources if name not in typed}
+        sources = typed
+    wanted = settings["localizer"]
+    for name in sources:
+        if wanted is None:  # whatever a file says
+            settings["localizer"] = name
+        elif wanted not in ("auto", name) and not (name == "trajectory" and wanted == "given"):
+            options.refuse(context, (name,), f"has no effect with --localizer {wanted}")
+            settings[name] = None
+
+
+def _check_poses(
+    context: typer.Context, config: "ScanConfig", sensor: str, *, is_given_late: bool
 ) -> "ScanConfig":
-    """The settings without a source of poses that a typed one beats.
+    """The settings without a source of poses that a flag beats.
 
     Args:
-        typed: flags as they were given; None = not given.
-        in_order: the trajectory is the recording's own by now, one pose a frame.
+        is_given_late: the flag's trajectory is the recording's own by now, one pose a frame.
 
     Raises:
         InvalidConfig: for flags about poses that the localizer does not ask for.
     """
     from msgspec.structs import replace
 
-    given = [name for name in ("trajectory", "feed") if typed[name] is not None]
-    if len(given) == 2:
-        options.refuse(context, given, "is one source of poses, and two are given: leave one out")
-    if len(given) == 1:  # a file may name the other
-        config = replace(config, trajectory=None) if given == ["feed"] else replace(config, feed=None)
     name: str = config.localizer
+    if name in ("trajectory", "feed"):  # a file may name the other
+        config = replace(config, **{"feed" if name == "trajectory" else "trajectory": None})
     if name == "auto":
         by_sensor = "lidar" if sensor == "lidar" else "images"
         name = "trajectory" if config.trajectory else "feed" if config.feed else by_sensor
     if name not in ("trajectory", "feed"):
         no_lookup = "is for poses that are looked up by time (--trajectory, --feed), and these are not"
         options.refuse(context, ("time_offset", "max_gap"), no_lookup)
-        if not in_order:
+        if not is_given_late:
             options.refuse(context, ("trajectory", "feed"), f"has no effect with --localizer {name}")
     if config.loop_closure and name in ("trajectory", "feed", "given", "lidar"):
         options.refuse(context, ("loop_closure",), "needs poses that are found from images (rgbd, stereo)")

@@ -153,7 +153,9 @@ def record_at(source: SegmentFile, number: int, offset: int) -> Record:
 
 
 def list_records(
-    path: Path, watch: Callable[[int, int], None] = lambda _at, _records: None
+    path: Path,
+    watch: Callable[[int, int], None] = lambda _at, _records: None,
+    damaged: Callable[[Damage], None] = lambda _damage: None,
 ) -> tuple[list[RecordEntry], int]:
     """Every whole or erased record of a segment, and how many keyframes are lost to damage between them.
 
@@ -161,6 +163,7 @@ def list_records(
 
     Args:
         watch: called at each read with the byte that the list has come to, and its records so far.
+        damaged: called with each damaged place.
 
     Raises:
         JournalError: when the file cannot be opened or read.
@@ -180,6 +183,7 @@ def list_records(
                 log.warning("%s", describe(path, step))
         elif isinstance(step, Damage):
             lost += step.lost
+            damaged(step)
             level = logging.ERROR if step.lost else logging.WARNING
             log.log(level, "%s", describe(path, step))
         else:

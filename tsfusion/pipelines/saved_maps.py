@@ -182,7 +182,7 @@ def opened(
             histories, config = map_history.sessions(header.meta), header.config
             tail = settled_maps.records_after(saved.folder, histories, reading)
             # what the map had before the damage it still has
-            lost = max(0, tail.lost - missing(header, tail.keyframes))
+            lost = max(0, tail.lost - missing(header, tail.keyframes)) + tail.lost_behind
         damage = {LOST: lost} if lost else {}
         if tail.records or any(one.waiting for one in histories):
             with settled_maps.settled(saved.folder, tail.records, config, watch) as (path, left_out):

@@ -32,13 +32,14 @@ class Tail(NamedTuple):
 
     Attributes:
         records: those that the checkpoint does not have, in order.
-        keyframes: of the whole journal, erased ones too.
-        lost: keyframes of the whole journal that damage has destroyed, at least.
+        keyframes: that the journal has up to where the checkpoint is, erased ones too.
+        lost: keyframes up to there that damage has destroyed, at least; `lost_behind`: behind that.
     """
 
     records: list[journal.RecordEntry]
     keyframes: int
     lost: int
+    lost_behind: int
 
 
 class _Answers:
@@ -67,23 +68,29 @@ def records_after(
         JournalError: when the journal cannot be read.
     """
     last = {bytes.fromhex(one.session): one.last for one in histories}
+    checkpointed = dict(last)
     found = []
     path = folder / state_folder.JOURNAL_FOLDER
     files = [
         journal.segment_path(path, number) for number in (journal.segments(path) if path.is_dir() else ())
     ]
     before, total = 0, sum(map(size_of, files))
-    keyframes = lost = 0
+    keyframes = there = lost = all_lost = 0
     for file in files:
-        records, damaged = journal.list_records(file, partial(_add_to, reading, before, total))
+        places: list[journal.Damage] = []
+        records, _ = journal.list_records(file, partial(_add_to, reading, before, total), places.append)
         before += size_of(file)
-        lost += damaged
         for record in records:
+            while places and places[0].position < record.position:
+                all_lost += places.pop(0).lost
             keyframes += not record.is_correction
+            if record.seq <= checkpointed.get(record.session, 0):
+                there, lost = keyframes, all_lost  # the checkpoint is not before this one
             if record.seq > last.get(record.session, 0) and not record.is_erased:
                 last[record.session] = record.seq
                 found.append(record)
-    return Tail(found, keyframes, lost)
+        all_lost += sum(place.lost for place in places)
+    return Tail(found, there, lost, all_lost - lost)
 
 
 def _add_to(reading: state_folder.Watcher, before: int, total: int, at: int, _records: int) -> None:

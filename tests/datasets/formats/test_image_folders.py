@@ -308,11 +308,38 @@ def test_depth_and_colour_in_one_folder(tmp_path, depth, color):
     dataset = open_dataset(root)
     check(dataset, views())
     assert (dataset.timestamps_ns, dataset.uncolored) == (None, 0)
-    (root / "trajectory.log").unlink()
-    assert len(open_dataset(root, posed=False)) == len(dataset)
+    check(open_dataset(root / "trajectory.log"), views())
+    lines = (root / "trajectory.log").read_text().splitlines()
+    (root / "trajectory.log").write_text("\n".join(lines[:10]).replace("0\t0\t1", "11\t11\t12") + "\n")
+    by_number = open_dataset(root)
+    assert (len(by_number), by_number.skipped) == (1, {"without a pose": 3})
+    (root / "trajectory.log").write_text("1 2 x\n")
+    assert len(open_dataset(root, posed=False)) == len(dataset), "a scan finds its own poses"
     (root / f"{color.format(9)}.jpg").unlink()
-    with pytest.raises(DatasetError, match="is in no layout known here"):
-        open_dataset(root, posed=False)
+    assert open_dataset(root, posed=False).uncolored == 1
+
+
+def test_depth_in_one_folder_is_one_series_of_16_bits(tmp_path):
+    root = redwood_room(tmp_path / "room", "image", "trajectory.log")
+    for place, name in (("depth", "Depth"), ("image", "Color")):
+        for file in (root / place).iterdir():
+            file.rename(root / f"{name}_{file.stem}{file.suffix.upper()}")
+        (root / place).rmdir()
+    for number in range(4):
+        cv2.imwrite(str(root / f"depth_vis_{number}.png"), np.zeros((6, 8, 3), np.uint8))
+        cv2.imwrite(str(root / f"depth_filled_{number}.png"), np.ones((6, 8), np.uint16))
+    check(open_dataset(root), views())
+    for number in range(2):
+        cv2.imwrite(str(root / f"cam1_depth_{number}.png"), np.ones((6, 8), np.uint16))
+        cv2.imwrite(str(root / f"cam1_rgb_{number}.png"), np.zeros((6, 8, 3), np.uint8))
+    one_line(
+        lambda: open_dataset(root), r"several series of depth images \(.*cam1_depth_0.*\); move the others"
+    )
+    pictures = tmp_path / "pictures"
+    pictures.mkdir()
+    for name in ("depth_1", "depth_2", "rgb_1", "rgb_2"):
+        cv2.imwrite(str(pictures / f"{name}.png"), np.zeros((6, 8), np.uint8))
+    one_line(lambda: open_dataset(pictures), "is in no layout known here")
 
 
 def test_a_log_that_is_given_beats_the_one_that_is_found(tmp_path):

@@ -129,7 +129,9 @@ def test_poses_that_do_not_fit_do_not_keep_a_scan_from_its_own(tmp_path, caplog)
 
 
 def test_which_scans_are_meant_must_be_clear(tmp_path):
-    root = folder(folder(tmp_path, ["0", "1"]), ["2", "3", "4"], "ply")
+    two = folder(tmp_path / "two", ["lidar1_0", "lidar1_1", "lidar2_0", "lidar2_1"])
+    one_line(lambda: open_dataset(two), r"has 2 scans named as lidar1_0\.bin, and 2 named otherwise")
+    root = folder(folder(tmp_path / "kinds", ["0", "1"]), ["2", "3", "4"], "ply")
     one_line(lambda: open_dataset(root), r"several series of scans \(.*/\*\.bin and .*/\*\.ply\); move the")
     for number in (2, 3, 4):
         (root / f"{number}.ply").unlink()

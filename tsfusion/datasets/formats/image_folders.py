@@ -2,7 +2,7 @@
 """Base of layouts with depth images in one folder and colour images in another."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from decimal import Decimal
 from itertools import pairwise
 from pathlib import Path
@@ -23,6 +23,7 @@ from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.se3 import Transform
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
+_NUMBER = re.compile(r"[0-9]+(?:\.[0-9]+)?")
 _NANOSECONDS = 19  # digits of a time of this century
 
 
@@ -149,6 +150,35 @@ def _files(where: Path, expected: str, pattern: str, suffixes: tuple[str, ...]) 
     return sorted(found, key=lambda path: int(path.stem)) if _numbered(found) else found
 
 
+def numbers_in(name: str) -> list[str]:
+    """The numbers in a name, decimal ones too."""
+    return _NUMBER.findall(name)
+
+
+def series_of(files: Iterable[Path]) -> list[list[Path]]:
+    """Files of names that differ in their numbers alone, and of one kind; each series in the order of these.
+
+    A number that follows a letter names a sensor (`cam0_`, `lidar1_`), unless it is the only one or the last.
+    """
+    found: dict[tuple[str, str], list[Path]] = {}
+    for file in files:
+        if numbers_in(file.stem):
+            found.setdefault((_unnumbered(file.stem), file.suffix.lower()), []).append(file)
+    return [
+        sorted(one, key=lambda file: tuple(map(Decimal, numbers_in(file.stem)))) for one in found.values()
+    ]
+
+
+def _unnumbered(name: str) -> str:
+    last = len(numbers_in(name)) - 1
+    parts, end = [], 0
+    for index, match in enumerate(_NUMBER.finditer(name)):
+        is_sensor = index < last and match.start() > 0 and name[match.start() - 1].isalpha()
+        parts += [name[end : match.start()], match[0] if is_sensor else "#"]
+        end = match.end()
+    return "".join([*parts, name[end:]]).lower()
+
+
 def first_size(depth: Sequence[Path]) -> tuple[int, int]:
     """(height, width) of a recording's first depth image, for which its camera is looked up."""
     height, width = read_depth(depth[0]).shape
@@ -186,19 +216,19 @@ def times_of_names(names: Sequence[str]) -> NDArray[np.int64] | None:
 
 
 def poses_by_number(
-    files: list[Path], poses: list[tuple[int, Transform]], source: Path
+    names: Sequence[str], poses: list[tuple[int, Transform]], source: Path
 ) -> list[Transform | None]:
-    """The pose of each image: the k-th pose if the numbers are equal, else the one numbered as the file."""
-    if len(files) == len(poses):
+    """The pose of each image: the k-th pose if the numbers are equal, else the one numbered as its name."""
+    if len(names) == len(poses):
         return [pose for _, pose in poses]
-    if not _numbered(files):
+    if not all(name.isdecimal() for name in names):
         raise DatasetError(
-            f"{source} has {len(poses)} poses for {len(files)} depth images, "
+            f"{source} has {len(poses)} poses for {len(names)} depth images, "
             "whose names are not frame numbers; "
             "expected as many poses as images, or images named by frame number"
         )
     found = dict(poses)
-    return [found.get(int(path.stem)) for path in files]
+    return [found.get(int(name)) for name in names]
 
 
 def _numbered(files: list[Path]) -> bool:

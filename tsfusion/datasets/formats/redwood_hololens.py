@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """RGB-D folders with one pose file: HoloLens recordings and Redwood / Open3D reconstructions."""
 
+import logging
 import re
-from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +18,9 @@ from tsfusion.datasets.formats.image_folders import (
     color_images,
     depth_images,
     first_size,
+    numbers_in,
     poses_by_number,
-    times_of,
+    series_of,
     times_of_names,
 )
 from tsfusion.datasets.given_trajectory import poses_of
@@ -44,11 +45,14 @@ _REDWOODS_NAMES = re.compile(
     r"|open3d[-_]rgbd|augmented[-_]icl"
 )
 _REDWOODS_FILES = ("livingroom[12]-traj.txt", "office[12]-traj.txt")
+_IMAGES = {*SUFFIXES, *COLOR_SUFFIXES}
 _LOGS = ("trajectory.log", "scene/trajectory.log", "odometry.log")  # by preference
 _LOG_NAMES = ("*traj*.log", "*-traj.txt")
 _COLOR = ("image", "color", "colour", "rgb")
 _DEPTH = re.compile("depth", re.IGNORECASE)  # in the name of an image that has its colour beside it
-_NUMBER = re.compile(r"[0-9]+(?:\.[0-9]+)?")
+_FEWEST = 2  # images of a series
+
+logger = logging.getLogger(__name__)
 
 
 def recognises_hololens(path: Path) -> bool:
@@ -69,8 +73,7 @@ def recognises_plain(path: Path) -> bool:
     """Whether the folder has one of depth images and one of colour images, or both in one."""
     if _depth_folders(path):
         return _color_folder(path) is not None
-    beside = _beside(path)
-    return len(beside) > 1 and None not in map(_partner, beside[:2])
+    return bool(_beside(path))
 
 
 class HoloLens(DepthImages):
@@ -158,8 +161,8 @@ class Redwood(DepthImages):
         if path.is_file():
             path, trajectory = _root_of(path) or path.parent, trajectory or path.absolute()
         root = require_folder(path, "Redwood")
-        beside = [] if _depth_folders(root) else _beside(root)
-        files = beside or depth_images(_depth_folder(root), REDWOOD_EXPECTED)
+        beside = {} if _depth_folders(root) else _only_series(root)
+        files = [*beside] or depth_images(_depth_folder(root), REDWOOD_EXPECTED)
         log = _log(root) if trajectory is None else Path(trajectory)
         if log is not None and not log.is_file():
             log = root / log
@@ -168,12 +171,18 @@ class Redwood(DepthImages):
             hint = f"{SCAN}, or --trajectory {given} names them" if given.is_file() else SCAN
             raise DatasetError(f"{root} has no trajectory; expected {REDWOOD_EXPECTED}; {hint}")
         skipped: dict[str, int] = {}
-        found = _poses(files, log, posed=posed, time_offset_s=time_offset_s)
+        try:
+            found = _poses(files, log, posed=posed, time_offset_s=time_offset_s)
+        except DatasetError as error:
+            if posed or trajectory is not None or log is None:
+                raise
+            logger.warning("%s is not taken for the poses of these images: %s", log.name, error)
+            found = [None] * len(files)
         depth, poses = keep_posed(files, found, posed=posed, skipped=skipped)
         require_frames(len(depth), root, REDWOOD_EXPECTED, skipped)
         colored: list[Path | None] = []
         if color and beside:
-            colored = [_partner(file) for file in depth]
+            colored = [beside[file] for file in depth]
             self.uncolored = colored.count(None)
         elif color and (where := _color_folder(root)):
             colored = [*color_images(depth, where, REDWOOD_EXPECTED)]
@@ -201,42 +210,72 @@ def _poses(
     if path is None:
         return [None] * len(files)
     if is_log(path):
-        return poses_by_number(files, read_log(path), path)
+        return poses_by_number(_names(files), read_log(path), path)
     return poses_of(path, len(files), _times(files), posed=posed, time_offset_s=time_offset_s)
 
 
 def _times(files: list[Path]) -> NDArray[np.int64] | None:
-    """Nanoseconds of images from their names, or from the only number in these; None = they have none."""
-    numbers = [_NUMBER.findall(file.stem) for file in files if _DEPTH.search(file.stem)]
-    if len(numbers) == len(files) and all(len(one) == 1 for one in numbers):
-        return times_of_names([one[0] for one in numbers])
-    return times_of(files)
+    """Nanoseconds of images from their names; None = they have none."""
+    return times_of_names(_names(files))
 
 
-def _beside(root: Path) -> list[Path]:
-    """Depth images by their names, in the order of the numbers in these."""
-    found = [
-        file
-        for file in (root.glob("[!.]*") if root.is_dir() else ())
-        if file.suffix.lower() in SUFFIXES and _DEPTH.search(file.stem) and _NUMBER.search(file.stem)
-    ]
-    return sorted(found, key=lambda file: tuple(map(Decimal, _NUMBER.findall(file.stem))))
+def _names(files: list[Path]) -> list[str]:
+    """Names of images; of those that have their colour beside them the only number in each."""
+    numbers = [numbers_in(file.stem) for file in files if _DEPTH.search(file.stem)]
+    is_numbered = len(numbers) == len(files) and all(len(one) == 1 for one in numbers)
+    return [one[0] for one in numbers] if is_numbered else [file.stem for file in files]
 
 
-def _partner(depth: Path) -> Path | None:
+def _only_series(root: Path) -> dict[Path, Path | None]:
+    """The depth images of a folder, each with its colour image beside it, in their order.
+
+    Raises:
+        DatasetError: several series are there.
+    """
+    found = _beside(root)
+    if len(found) > 1:
+        names = " and ".join(next(iter(one)).name for one in found)
+        raise DatasetError(f"{root} holds several series of depth images ({names}, …); move the others away")
+    return found[0] if found else {}
+
+
+def _beside(root: Path) -> list[dict[Path, Path | None]]:
+    """Series of depth images that have their colour images beside them, told by the names."""
+    if not root.is_dir():
+        return []
+    files = {file.name.lower(): file for file in root.glob("[!.]*") if file.suffix.lower() in _IMAGES}
+    named = [file for file in files.values() if file.suffix.lower() in SUFFIXES and _DEPTH.search(file.stem)]
+    found = []
+    for series in series_of(named):
+        pairs = {file: _partner(file, files) for file in series}
+        if len(series) - list(pairs.values()).count(None) >= _FEWEST and _is_deep(series[0]):
+            found.append(pairs)
+    return found
+
+
+def _partner(depth: Path, files: dict[str, Path]) -> Path | None:
     """The colour image whose name says colour where that of the depth image says depth."""
-    for word in _COLOR:
-        stem = _DEPTH.sub(word, depth.stem)
-        for suffix in COLOR_SUFFIXES:
-            if (color := depth.with_name(stem + suffix)).is_file():
-                return color
-    return None
+    stems = (_DEPTH.sub(word, depth.stem).lower() for word in _COLOR)
+    names = (stem + suffix for stem in stems for suffix in COLOR_SUFFIXES)
+    return next((files[name] for name in names if name in files), None)
+
+
+def _is_deep(file: Path) -> bool:
+    """Whether a PNG image has one channel of 16 bits, by its header; others say what they hold when read."""
+    if file.suffix.lower() != ".png":
+        return True
+    try:
+        with file.open("rb") as opened:
+            return opened.read(26)[24:26] == b"\x10\0"
+    except OSError:
+        return False
 
 
 def _root_of(log: Path) -> Path | None:
     """The recording that a trajectory lies in: `scene/trajectory.log` is one folder down."""
     log = log.absolute()
-    return next((place for place in (log.parent, log.parent.parent) if _depth_folders(place)), None)
+    places = (log.parent, log.parent.parent)
+    return next((place for place in places if _depth_folders(place) or _beside(place)), None)
 
 
 def _depth_folders(root: Path) -> list[Path]:

@@ -3,13 +3,12 @@
 
 import logging
 import re
-from decimal import Decimal
 from pathlib import Path
 from typing import NamedTuple
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.dataset import SCAN, Frames, keep_posed, require_folder, require_frames
-from tsfusion.datasets.formats.image_folders import times_of_names
+from tsfusion.datasets.formats.image_folders import numbers_in, series_of, times_of_names
 from tsfusion.datasets.given_trajectory import poses_of
 from tsfusion.datasets.scan_files import SUFFIXES, USUAL_FIELDS, read_scan
 from tsfusion.geometry.frame import Frame
@@ -21,7 +20,6 @@ EXPECTED = (
     "with --trajectory; without, for a scan"
 )
 _PLACES = ("", "velodyne", "lidar", "scans", "points", "clouds")
-_NUMBER = re.compile(r"[0-9]+(?:\.[0-9]+)?")
 _POSES = ("poses.txt", "*poses_kitti.txt", "*poses_tum.txt", "*_kitti.txt", "*_tum.txt")
 _FEWEST = 2
 _FEW_OTHERS = 4  # files of a series for each of another name, at least
@@ -140,18 +138,14 @@ def _all_series(root: Path) -> list[_Series]:
     for where in (root / place for place in _PLACES):
         if not where.is_dir() or (where / _RUN).is_file():
             continue
-        by_suffix: dict[str, dict[str, list[Path]]] = {}
-        for file in where.glob("[!.]*"):
-            if (suffix := file.suffix.lower()) in SUFFIXES:
-                named = by_suffix.setdefault(suffix, {})
-                named.setdefault(_NUMBER.sub("0", file.stem), []).append(file)
-        for suffix in sorted(by_suffix):
-            named = by_suffix[suffix]
-            longest = max(named.values(), key=len)
-            if len(longest) < _FEWEST or _NUMBER.search(longest[0].stem) is None or _is_mesh(longest[0]):
-                continue
-            files = sorted(longest, key=lambda file: tuple(map(Decimal, _NUMBER.findall(file.stem))))
-            found.append(_Series(files, sum(map(len, named.values())) - len(files)))
+        files = [file for file in where.glob("[!.]*") if file.suffix.lower() in SUFFIXES]
+        series = series_of(files)
+        for suffix in SUFFIXES:
+            ours = [one for one in series if one[0].suffix.lower() == suffix]
+            longest = max(ours, key=len, default=[])
+            if len(longest) >= _FEWEST and not _is_mesh(longest[0]):
+                count = sum(file.suffix.lower() == suffix for file in files)
+                found.append(_Series(longest, count - len(longest)))
     return found
 
 
@@ -169,7 +163,7 @@ def _is_mesh(file: Path) -> bool:
 
 def _time(name: str) -> str:
     """The time in a name, as decimal seconds or nanoseconds; else anything."""
-    numbers = _NUMBER.findall(name)
+    numbers = numbers_in(name)
     if len(numbers) == 2 and len(numbers[0]) == _SECONDS and len(numbers[1]) <= _NANOSECONDS:
         return f"{numbers[0]}{numbers[1]:0>{_NANOSECONDS}}" if numbers[1].isdecimal() else ""
     return numbers[0] if len(numbers) == 1 else ""
