@@ -147,6 +147,12 @@ KeepIslands = Annotated[
 ]  # fmt: skip
 
 
+def is_typed(context: typer.Context, name: str) -> bool:
+    """Whether a parameter was typed; else it is its default, or the environment sets it."""
+    source = context.get_parameter_source(name)
+    return source is not None and source.name == "COMMANDLINE"
+
+
 def refuse(context: typer.Context, names: Collection[str], reason: str) -> None:
     """Raise InvalidConfig when one of these parameters was typed: it would be ignored.
 
@@ -155,8 +161,7 @@ def refuse(context: typer.Context, names: Collection[str], reason: str) -> None:
     from tsfusion.core.errors import InvalidConfig
 
     for parameter in context.command.params:
-        source = context.get_parameter_source(parameter.name or "")
-        if parameter.name in names and source is not None and source.name == "COMMANDLINE":
+        if parameter.name in names and is_typed(context, parameter.name or ""):
             raise InvalidConfig(f"{parameter.opts[0]} {reason}")
 
 

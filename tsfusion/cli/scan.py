@@ -117,7 +117,7 @@ def scan(
     from tsfusion.pipelines.scan import scan as run
 
     _choose_poses(context, settings)
-    typed = dict(settings)
+    trajectory = settings["trajectory"]
     opened, warnings = _open(
         context, source, option,
         camera=options.camera(intrinsics, calibration), rate=rate,
@@ -133,7 +133,7 @@ def scan(
             opened.sensor, config, usual=usual, tell=connect is None, **settings
         )
         config_of_scan = _check_poses(
-            context, chosen.scan, opened.sensor, is_given_late=typed["trajectory"] != settings["trajectory"]
+            context, chosen.scan, opened.sensor, is_given_late=trajectory != settings["trajectory"]
         )
         client = options.client_settings(
             chosen, connect, control=control, map=map_, key=key, server_key=server_key
@@ -162,13 +162,9 @@ def _choose_poses(context: typer.Context, settings: dict[str, Any]) -> None:
     """
     from tsfusion.core.errors import InvalidConfig
 
-    def is_typed(name: str) -> bool:
-        source = context.get_parameter_source(name)
-        return source is not None and source.name == "COMMANDLINE"
-
     sources = [name for name in ("trajectory", "feed") if settings[name] is not None]
     if len(sources) == 2:
-        typed = [name for name in sources if is_typed(name)]
+        typed = [name for name in sources if options.is_typed(context, name)]
         if len(typed) != 1:
             raise InvalidConfig("--trajectory and --feed are two sources of poses: leave one out")
         settings |= {name: None for name in sources if name not in typed}

@@ -28,7 +28,7 @@ _POLL_S = 0.1
 
 
 class Tail(NamedTuple):
-    """What a journal has behind a checkpoint.
+    """Records of a journal that a checkpoint does not have, and what damage has cost.
 
     Attributes:
         records: those that the checkpoint does not have, in order.

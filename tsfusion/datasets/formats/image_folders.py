@@ -1,10 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Base of layouts with depth images in one folder and colour images in another."""
 
-import re
-from collections.abc import Iterable, Sequence
-from decimal import Decimal
-from itertools import pairwise
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +20,6 @@ from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.se3 import Transform
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
-_NUMBER = re.compile(r"[0-9]+(?:\.[0-9]+)?")
-_NANOSECONDS = 19  # digits of a time of this century
 
 
 class DepthImages(Frames):
@@ -150,35 +145,6 @@ def _files(where: Path, expected: str, pattern: str, suffixes: tuple[str, ...]) 
     return sorted(found, key=lambda path: int(path.stem)) if _numbered(found) else found
 
 
-def numbers_in(name: str) -> list[str]:
-    """The numbers in a name, decimal ones too."""
-    return _NUMBER.findall(name)
-
-
-def series_of(files: Iterable[Path]) -> list[list[Path]]:
-    """Files of names that differ in their numbers alone, and of one kind; each series in the order of these.
-
-    A number that follows a letter names a sensor (`cam0_`, `lidar1_`), unless it is the only one or the last.
-    """
-    found: dict[tuple[str, str], list[Path]] = {}
-    for file in files:
-        if numbers_in(file.stem):
-            found.setdefault((_unnumbered(file.stem), file.suffix.lower()), []).append(file)
-    return [
-        sorted(one, key=lambda file: tuple(map(Decimal, numbers_in(file.stem)))) for one in found.values()
-    ]
-
-
-def _unnumbered(name: str) -> str:
-    last = len(numbers_in(name)) - 1
-    parts, end = [], 0
-    for index, match in enumerate(_NUMBER.finditer(name)):
-        is_sensor = index < last and match.start() > 0 and name[match.start() - 1].isalpha()
-        parts += [name[end : match.start()], match[0] if is_sensor else "#"]
-        end = match.end()
-    return "".join([*parts, name[end:]]).lower()
-
-
 def first_size(depth: Sequence[Path]) -> tuple[int, int]:
     """(height, width) of a recording's first depth image, for which its camera is looked up."""
     height, width = read_depth(depth[0]).shape
@@ -194,25 +160,6 @@ def color_images(depth: list[Path], where: Path, expected: str) -> list[Path]:
                 f"{where / image.stem}.png or .jpg is missing, but {image} is there; expected {expected}"
             )
     return [by_stem[image.stem] for image in depth]
-
-
-def time_of(name: str) -> int | None:
-    """Timestamp in a name, nanoseconds: of decimal seconds (TUM) or nanoseconds (EuRoC); None = neither."""
-    if re.fullmatch(r"\d+\.\d+", name, re.ASCII):
-        return int(Decimal(name) * 1_000_000_000)
-    return int(name) if re.fullmatch(rf"\d{{{_NANOSECONDS}}}", name, re.ASCII) else None
-
-
-def times_of(files: Sequence[Path]) -> NDArray[np.int64] | None:
-    """(n,) nanoseconds from the names of a recording's images; None unless all are times, in order."""
-    return times_of_names([file.stem for file in files])
-
-
-def times_of_names(names: Sequence[str]) -> NDArray[np.int64] | None:
-    """Likewise from the names themselves."""
-    stamps = [stamp for name in names if (stamp := time_of(name)) is not None]
-    in_order = len(stamps) == len(names) and all(a < b for a, b in pairwise(stamps))
-    return np.array(stamps, dtype=np.int64) if in_order else None
 
 
 def poses_by_number(

@@ -12,16 +12,14 @@ from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.cameras import PublishedCamera, find_camera
 from tsfusion.datasets.dataset import SCAN, keep_posed, require_folder, require_frames
 from tsfusion.datasets.depth_files import SUFFIXES
+from tsfusion.datasets.file_names import numbers_in, series_of, times_of_names
 from tsfusion.datasets.formats.image_folders import SUFFIXES as COLOR_SUFFIXES
 from tsfusion.datasets.formats.image_folders import (
     DepthImages,
     color_images,
     depth_images,
     first_size,
-    numbers_in,
     poses_by_number,
-    series_of,
-    times_of_names,
 )
 from tsfusion.datasets.given_trajectory import poses_of
 from tsfusion.datasets.trajectory_files import is_log, read_log, read_matrix_rows

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.dataset import SCAN, Frames, keep_posed, require_folder, require_frames
-from tsfusion.datasets.formats.image_folders import numbers_in, series_of, times_of_names
+from tsfusion.datasets.file_names import numbers_in, series_of, times_of_names
 from tsfusion.datasets.given_trajectory import poses_of
 from tsfusion.datasets.scan_files import SUFFIXES, USUAL_FIELDS, read_scan
 from tsfusion.geometry.frame import Frame

@@ -3,7 +3,6 @@
 
 import re
 from dataclasses import dataclass
-from decimal import Decimal
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,7 +13,6 @@ from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.readers import decode_image, read_numbers
 
 LayoutKind = Literal["depth", "pair", "points"]
-SortKey = tuple[tuple[int, Decimal, str], ...]
 
 EXPECTED = (
     "depth/NAME.png|tiff|exr|npy with color/, colour/, rgb/, image/ or images/NAME.png|jpg; "
@@ -76,12 +74,6 @@ def layout_of(root: Path) -> FolderLayout | None:
     if any(_SCAN.fullmatch(name) for name in names):
         return FolderLayout("points", "NAME.bin", (root, _SCAN))
     return None
-
-
-def order(name: str) -> SortKey:
-    """Sort key of names by their numbers: 9 before 10, 1.25 before 1.5."""
-    parts = re.findall(r"([0-9]+(?:\.[0-9]+)?)|([^0-9]+)", name)
-    return tuple((0, Decimal(number), "") if number else (1, Decimal(0), text) for number, text in parts)
 
 
 def whole_image(path: Path, flags: int) -> NDArray[Any] | None:

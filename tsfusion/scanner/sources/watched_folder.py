@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError, InvalidConfig, InvalidKeyframe, SourceError
+from tsfusion.datasets import file_names
 from tsfusion.datasets.cameras import (
     FILES,
     RecordedCamera,
@@ -22,7 +23,6 @@ from tsfusion.datasets.cameras import (
     find_camera,
 )
 from tsfusion.datasets.depth_files import check_metres, read_depth
-from tsfusion.datasets.formats.image_folders import time_of
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.scanner.sources import folder_layouts, stereo_pairs
@@ -95,7 +95,7 @@ class WatchedFolder(LiveSource):
         self._idle, self._deadline, self._poll = idle, deadline, poll
         self._opened_ns, self._stamp = time.time_ns(), 0
         self._handled: set[str] = set()  # names of first files
-        self._last: folder_layouts.SortKey = ()
+        self._last: file_names.SortKey = ()
         self._colored: bool | None = None  # whether frames come with colour; None = not known yet
         self._camera: Any = None  # a RecordedCamera or a PairRectifier
         self._begun: Any = None  # state of the incomplete frame's files
@@ -143,7 +143,7 @@ class WatchedFolder(LiveSource):
                     break
                 self._handled.add(first.name)
                 if isinstance(frame, Frame):
-                    self._last = folder_layouts.order(name)
+                    self._last = file_names.order(name)
                     yield frame
                 self._since = time.monotonic()
             else:
@@ -167,12 +167,12 @@ class WatchedFolder(LiveSource):
         found = []
         for file in files:
             match = pattern.fullmatch(file)
-            if match and folder_layouts.order(match[1]) < self._last:
+            if match and file_names.order(match[1]) < self._last:
                 self._handled.add(file)
                 self._skip("late")
             elif match:
                 found.append((match[1], where / file))
-        return sorted(found, key=lambda item: folder_layouts.order(item[0]))
+        return sorted(found, key=lambda item: file_names.order(item[0]))
 
     def _read(self, name: str, first: Path, *, final: bool) -> Any:
         """Read a frame; None if it is left out, or `_WAIT`."""
@@ -297,7 +297,7 @@ class WatchedFolder(LiveSource):
     def _stamps(self, name: str, first: Path) -> tuple[int, int]:
         """`timestamp_ns`, which always grows, and `captured_ns`."""
         written_ns = first.stat().st_mtime_ns
-        self._stamp = max(time_of(name) or written_ns, self._stamp + 1)
+        self._stamp = max(file_names.time_of(name) or written_ns, self._stamp + 1)
         own = written_ns >= self._opened_ns
         captured = monotonic_of(written_ns, oldest_s=_OLDEST_S) if own else time.monotonic_ns()
         return self._stamp, captured
