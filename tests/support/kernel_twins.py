@@ -36,11 +36,9 @@ def make_ray(
     color: int = 0,
     normal: Any = None,
     before: int = 0,
-    fourfold: int = 0,
 ) -> NDArray[np.int32]:
     """One ray; `end` int 2⁻¹⁰ voxel, `direction` float of any length, `half` 2⁻⁸ voxel; with the `normal` of
-    the plane it ends on, or none. Where it begins further `before` its end than its band, it carves, with
-    four votes along the first 8 · `fourfold` voxels."""
+    the plane it ends on, or none. Where it begins further `before` its end than its band, it carves."""
     before = max(before, half)
     u = np.asarray(direction, np.float64) / np.linalg.norm(direction)
     unit = [int(x) for x in np.floor(u * 65536 + 0.5)]
@@ -59,7 +57,7 @@ def make_ray(
     downward = sum(1 << a for a in range(3) if unit[a] < 0)
     loss = [-g if x < 0 else g for g, x in zip(loss, unit, strict=True)]
     packed = np.uint32(weight << 24 | color).astype(np.int32)
-    last = (distance, before + half << 8 | fourfold, before << 8 | downward, packed)
+    last = (distance, before + half << 8, before << 8 | downward, packed)
     return np.array([*voxel, *crossing, *interval, *loss, *last], np.int32)
 
 
@@ -112,13 +110,11 @@ def integrate(rays: NDArray[np.int32], quanta_per_voxel: int) -> dict[Voxel, tup
     sums: dict[Voxel, tuple[int, int]] = defaultdict(lambda: (0, 0))
     for ray in rays:
         length, end = int(ray[13]) & ~255, int(ray[14]) & ~7
-        fourfold = (int(ray[13]) & 255) << 19
         half = length - end
         for (voxel, distance), leaves in crossed_until(ray):
             w, m, (s, total) = weight_of(ray), quantize(distance, quanta_per_voxel), sums[voxel]
             if leaves < end - half:  # free space
                 w, m = max(w >> 1, 1), quantize(half, quanta_per_voxel)
-                w *= 4 if leaves < fourfold else 1
             sums[voxel] = (s + w * m, total + w)
     return dict(sums)
 
@@ -430,3 +426,57 @@ def occlusion(depth: Any, v: int, u: int, focal: float, radius: float, strength:
             if 0 < length < radius:
                 hidden += max(way @ normal / length - rasterizer.FLAT, 0.0) * (1 - length / radius)
     return max(1 - strength * hidden / rasterizer.TAPS, 0.0)
+
+
+def clear_depths(keyframe: Any, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(rows, columns) depths up to which patches of 3×3 pixels are clear, voxels; 0 = no sample."""
+    image = keyframe.measurement.astype(np.float64)
+    if keyframe.kind == "disparity":
+        with np.errstate(divide="ignore"):
+            image = keyframe.baseline_fx / (keyframe.disparity_scale * image)
+    elif keyframe.measurement.dtype == np.uint16:
+        image *= keyframe.depth_scale
+    if keyframe.confidence is not None:
+        image[keyframe.confidence == 0] = 0
+    floor, slope, z0, low, high, voxel_size = parameters[:6]
+    nearest, farthest = parameters[7:9]
+    rows, columns = image.shape[0] // 3, image.shape[1] // 3
+    K, found = keyframe.intrinsics, np.zeros((rows, columns))
+    for r, c in product(range(rows), range(columns)):
+        patch = image[3 * r : 3 * r + 3, 3 * c : 3 * c + 3].ravel()
+        depths = np.sort(patch[(patch >= nearest) & (patch <= farthest)])  # NaN is in neither
+        if not len(depths):
+            continue
+        least = depths[:2][-1]
+        half = min(max(3 * (floor + slope * (least - z0) ** 2) / voxel_size, low), high)
+        x, y = (c // 8 * 24 + 12 - K.cx) / K.fx, (3 * r + 1 - K.cy) / K.fy  # of eight patches
+        found[r, c] = max(least / voxel_size - half / np.sqrt(x * x + y * y + 1), 0)
+    return found
+
+
+def clear_voxels(keyframe: Any, parameters: NDArray[np.float64]) -> tuple[set[Voxel], set[Voxel]]:
+    """The voxels that an image looks through, beyond four voxels before the camera: those that lie there for
+    certain, and those of which rounding may decide, too."""
+    clear, voxel_size = clear_depths(keyframe, parameters), parameters[5]
+    K, T, (rows, columns) = keyframe.intrinsics, keyframe.T_world_camera, clear.shape
+    centre = T[:3, 3] / voxel_size
+    x, y = (np.array([-1, 3 * columns]) - K.cx) / K.fx, (np.array([-1, 3 * rows]) - K.cy) / K.fy
+    ends = np.array([(0, 0, 0), *((a, b, 1) for a in x for b in y)]) * clear.max() @ T[:3, :3].T + centre
+    axes = [
+        np.arange(int(low) - 2, int(high) + 3) for low, high in zip(ends.min(0), ends.max(0), strict=True)
+    ]
+    voxels = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    p = (voxels + 0.5 - centre) @ T[:3, :3]
+    voxels, p = voxels[p[:, 2] > 3.9], p[p[:, 2] > 3.9]
+    u = (p[:, 0] / p[:, 2] * K.fx + K.cx + 0.5) / 3
+    v = (p[:, 1] / p[:, 2] * K.fy + K.cy + 0.5) / 3
+    shift = 0.02 * np.array([(0, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)])  # patches
+    depths = []
+    for du, dv in shift:
+        column, row = np.floor(u + du).astype(int), np.floor(v + dv).astype(int)
+        inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+        depths.append(np.where(inside, clear[row.clip(0, rows - 1), column.clip(0, columns - 1)], 0))
+    certain = (p[:, 2] < np.min(depths, axis=0) - 0.03) & (p[:, 2] > 4.03)
+    possible = p[:, 2] < np.max(depths, axis=0) + 0.03
+    sure, maybe = (set(map(tuple, voxels[which].tolist())) for which in (certain, possible))
+    return sure, maybe

@@ -54,13 +54,12 @@ def rays_along(segments: list[Segment], seed: int = 0) -> NDArray[np.int32]:
 
 
 def carving_rays(seed: int, count: int) -> NDArray[np.int32]:
-    """Rays that begin up to 300 voxels before they end: some before their band, some with it. Some vote
-    fourfold at first."""
+    """Rays that begin up to 300 voxels before they end: some before their band, some with it."""
     random = np.random.default_rng(seed)
     rays = [
         kernel_twins.make_ray(
             end, direction, half, int(random.integers(1, 256)), int(random.integers(0, 1 << 24)),
-            before=int(random.integers(-20, 300)) << 8, fourfold=max(int(random.integers(-20, 60)), 0),
+            before=int(random.integers(-20, 300)) << 8,
         )
         for end, direction, half in random_segments(seed, count)
     ]  # fmt: skip

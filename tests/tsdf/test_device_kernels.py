@@ -285,8 +285,9 @@ def test_parts_of_limited_weight_are_added_one_after_the_other(
     assert_equal(here, there)
 
 
-def test_what_a_quota_refuses_is_taken_back(link: HereLink) -> None:
-    _, there = both()
+@pytest.mark.parametrize("settings", [{}, {"space_carving": True}])
+def test_what_a_quota_refuses_is_taken_back(link: HereLink, settings: dict[str, Any]) -> None:
+    _, there = both(**settings)
     there.integrate(VIEWS[0])
     before, blocks = there.map_hash(), there.stats().blocks
     refused = [
@@ -305,9 +306,10 @@ def test_what_a_quota_refuses_is_taken_back(link: HereLink) -> None:
     assert there.map_hash() == before
 
 
-def test_a_full_map_stays_as_it_was(link: HereLink) -> None:
-    room = Volume(0.05).integrate(VIEWS[0]).blocks
-    here, there = both(max_blocks=room)
+@pytest.mark.parametrize("settings", [{}, {"space_carving": True}])
+def test_a_full_map_stays_as_it_was(link: HereLink, settings: dict[str, Any]) -> None:
+    room = Volume(0.05, **settings).integrate(VIEWS[0]).blocks
+    here, there = both(max_blocks=room, **settings)
     for one in (here, there):
         one.integrate(VIEWS[0])
         with pytest.raises(MapFull):

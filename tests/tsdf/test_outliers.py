@@ -141,8 +141,8 @@ def test_gross_outliers_do_not_reach_the_surface() -> None:
     assert errors[1] < 3.0
 
 
-def test_rays_that_share_the_carving_leave_nothing_out() -> None:
-    """Every voxel that the view looks through is free, nowhere by less than a quarter of all rays' votes."""
+def test_carving_leaves_nothing_out() -> None:
+    """Every voxel that the view looks through is free, as sure as the pixels that see it say."""
     volume = volume_of([], voxel_size=0.02, color=False, space_carving=True, regularizer="off")
     stats = volume.integrate(WALL)
     blocks = volume.blocks()
@@ -154,14 +154,14 @@ def test_rays_that_share_the_carving_leave_nothing_out() -> None:
     sums = blocks.sums[seen]
     assert ((sums >> 27) > 0).all(), "free"
     pixels = CAMERA.fx * 0.02 * CAMERA.fy * 0.02 / z[seen] ** 2  # that a voxel covers
-    votes = (sums & ((1 << 27) - 1)) / (8 * pixels)  # a ray's pixels, at half of their weight
-    for near, far, least in ((0.4, 0.6, 0.2), (0.6, 0.9, 0.75), (0.9, 1.3, 0.75), (1.3, 1.85, 0.75)):
-        assert least < votes[(z[seen] > near) & (z[seen] < far)].mean() < 1.6
-    assert stats.updates < 0.9 * stats.rays * 2.0 / 0.02, "each ray alone would take 1.4 times its length"
+    votes = (sums & ((1 << 27) - 1)) / np.minimum(16 * pixels, 255)
+    for near, far in ((0.4, 0.6), (0.6, 0.9), (0.9, 1.3), (1.3, 1.85)):
+        assert 0.9 < votes[(z[seen] > near) & (z[seen] < far)].mean() < 1.1
+    assert stats.updates < 0.4 * stats.rays * 2.0 / 0.02, "each ray alone would take 1.4 times its length"
 
 
-def test_what_is_very_far_away_carves_what_is_before_it() -> None:
-    """Each of four rays of 3000 voxels carves its farther half at least."""
+def test_what_is_very_far_away_carves_what_is_next_to_the_camera() -> None:
+    """A view of 3000 voxels' length is carved up to 2048 from the camera."""
     camera = Intrinsics(6000.0, 6000.0, 1.5, 1.5)
     far = Keyframe(depth=np.full((4, 4), 30.0, np.float32), intrinsics=camera, T_world_camera=np.eye(4))
     volume = volume_of(
@@ -169,4 +169,6 @@ def test_what_is_very_far_away_carves_what_is_before_it() -> None:
     )
     stats = volume.integrate(far)
     assert stats.rays == 4
-    assert stats.updates > 4 * 1450
+    along = 8 * np.unique(volume.blocks().coordinates[:, 2])
+    free = along[along < 2900]
+    assert 1900 < free.max() < 2048

@@ -41,7 +41,7 @@ MAP_OPTIONS: dict[str, Any] = {
     "min_weight": Annotated[float | None, _map_option(
         "--min-weight", "COUNT", "Full-confidence samples that mesh a voxel.")],
     "space_carving": Annotated[bool | None, _map_option(
-        "--space-carving/--no-space-carving", None, "Let rays clear what they pass: no ghosts.")],
+        "--space-carving/--no-space-carving", None, "Clear what is looked through: no ghosts.")],
     "regularizer": Annotated[str | None, _map_option(
         "--regularizer", "MODE", "Smoothing along rays: off, paper or ray.", rare=True)],
     "surface": Annotated[str | None, _map_option(

@@ -147,7 +147,7 @@ class VolumeConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     field_reweightings: Annotated[int, Meta(ge=0, le=16)] | None = None
     bundle: bool = True  # rays of a neighbourhood that end in one voxel become one
     outlier_filter: bool = True  # drop pixels that no neighbour supports: flying pixels, speckle
-    space_carving: bool = False  # rays also vote for the free space before their band
+    space_carving: bool = False  # the free space before the band gets votes, too
     color: bool = True
     threads: Annotated[int, Meta(ge=1, le=256)] | None = None  # None = all cores
     arch: Arch = "cpu"  # where keyframes are fused: on a device, and on the CPU where that is not there

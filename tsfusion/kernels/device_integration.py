@@ -43,6 +43,7 @@ from tsfusion.kernels.voxel_traversal import (
     CROSSING,
     END,
     INTERVAL,
+    LENGTH,
     UPDATES,
     WEIGHT_COLOR,
     advance,
@@ -51,7 +52,6 @@ from tsfusion.kernels.voxel_traversal import (
     next_step,
     offset_in_block,
     pack,
-    ray_length,
     ray_weight,
     vec3i,
 )
@@ -60,7 +60,7 @@ from tsfusion.kernels.voxel_traversal import (
 # of which the place is −1 − number of the voxel in it.
 LISTED_FIELDS = 4
 PLACE, AMOUNT, KEY = 0, 1, 2
-WEIGHT_FIELD = 10  # bits: 255, four times
+WEIGHT_FIELD = 8  # bits
 SKIPPED = -1 - CUBE  # instead of a place
 
 # Rays in groups, by their places: voxels that they cross, and where their updates begin in the list.
@@ -134,7 +134,7 @@ def shares_place(k, places: ti.template(), claims: ti.template()):
 @ti.func
 def crossed(rays: ti.template(), r):
     """How many voxels ray `r` crosses."""
-    n, length = 1, ray_length(rays, r)[0]
+    n, length = 1, rays[r, LENGTH]
     for a in ti.static(range(3)):
         if rays[r, CROSSING + a] < length:
             n += 1 + (length - 1 - rays[r, CROSSING + a]) // rays[r, INTERVAL + a]
@@ -151,8 +151,7 @@ def list_updates(
     where the update is whose voxel takes the colour, or −1."""
     walk, weight = begin_walk(rays, r), ray_weight(rays, r)
     ends = rays[r, END]
-    length, fourfold = ray_length(rays, r)
-    end = ends & ~7
+    length, end = rays[r, LENGTH], ends & ~7
     band_begins = end - (length - end)  # before it is free space
     free_weight, free_distance = ti.max(weight >> FREE_SHIFT, 1), quantize(length - end)
     last, slot, key = vec3i(2147483647), -1, ti.i64(0)
@@ -166,7 +165,7 @@ def list_updates(
             slot = map_find(hash_keys, hash_slots, hash_keys.shape[0] - 1, key)
         step, leaves = next_step(walk.crossing)
         is_free = leaves < band_begins
-        w = ti.select(is_free, ti.select(leaves < fourfold, free_weight << 2, free_weight), weight)
+        w = ti.select(is_free, free_weight, weight)
         m = ti.select(is_free, free_distance, ti.max(quantize(walk.distance), -MAX_DISTANCE))
         offset = offset_in_block(walk.voxel)
         at = ti.select(slot >= oldest, slot * CUBE + offset, SKIPPED)

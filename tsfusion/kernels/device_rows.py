@@ -6,6 +6,7 @@ import taichi as ti
 
 from tsfusion.kernels.integrate import CUBE, lane_weight
 from tsfusion.kernels.quick_launch import QuickLaunch
+from tsfusion.kernels.space_carving import BITS
 
 
 @QuickLaunch
@@ -37,6 +38,22 @@ def largest_weights(
         for v in range(CUBE):
             most = ti.max(most, lane_weight(sums[slots[i], v]))
         found[i] = most
+
+
+@QuickLaunch
+@ti.kernel
+def add_free_blocks(
+    slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    amounts: ti.types.ndarray(dtype=ti.i64, ndim=1),
+    masks: ti.types.ndarray(dtype=ti.i64, ndim=2),
+    sign_: ti.i32,
+    sums: ti.types.ndarray(dtype=ti.i64, ndim=2),
+):
+    """Add to the clear voxels of blocks, as `space_carving.add_free_blocks`."""
+    for i in range(slots.shape[0] * CUBE):
+        n, v = i // CUBE, i % CUBE
+        if (masks[n, v // BITS] >> (v % BITS)) & 1 == 1:
+            sums[slots[n], v] += sign_ * amounts[n]
 
 
 @ti.kernel

@@ -3,7 +3,7 @@
 
 A voxel's sum is one int64, (Σ w·m) · 2²⁷ + Σ w: m = signed distance along the ray in sixtieths of a voxel,
 |m| ≤ 1023, which is beyond the widest band there can be. Voxels before the band, where the sensor looks
-through (space carving), get the band's half-width for m.
+through (space carving), get a band's half-width for m.
 Colour is (Σ R) · 2⁴⁰ + (Σ G) · 2¹⁶ + n in an int64 and Σ B in an int32, one vote a ray.
 Addition modulo 2⁶⁴ is a group: any order gives the same bytes, and subtracting restores them.
 """
@@ -26,7 +26,6 @@ from tsfusion.kernels.rays_abreast import (
     BLOCK_AT,
     COLORED,
     DISTANCE_AT,
-    FOURFOLD,
     FREE,
     LIST,
     MET,
@@ -228,7 +227,7 @@ def list_updates(
     half = walks[RAY_LENGTH + k] - ((walks[RAY_LENGTH + k] + walks[BAND + k]) >> 1)
     free = (ti.cast(quantize(half) * free_vote, ti.i64) << WEIGHT_BITS) + free_vote
     per_quantum = ti.cast(vote, ti.i64) << WEIGHT_BITS
-    before, fourfold, uncolored = walks[FREE + k], walks[FOURFOLD + k], walks[UNCOLORED + k]
+    before, uncolored = walks[FREE + k], walks[UNCOLORED + k]
     number = walks[ODD + k]
     window = window_of(walks, k, number)
     blocks = open_window(window, scratch, base)
@@ -255,8 +254,7 @@ def list_updates(
         if first >= 0:
             at = first + (place & (CUBE - 1))
             amount = ti.cast(place >> DISTANCE_AT, ti.i64) * per_quantum + vote
-            free_amount = ti.select(i < fourfold, free << 2, free)
-            voxels[count], amounts[count] = at, ti.select(i < before, free_amount, amount)
+            voxels[count], amounts[count] = at, ti.select(i < before, free, amount)
             count += 1
             if i == uncolored:
                 scratch[colors] = (ti.cast(at, ti.i64) << 32) | (weight_color & 0xFFFFFF)
@@ -297,8 +295,7 @@ def add_bands(
     walks, listed = ti.Vector([0] * WALKS), ti.Vector([0] * LIST)
     voxels, amounts = ti.Vector([0] * LISTED_UPDATES), ti.Vector([0] * LISTED_UPDATES, dt=ti.i64)
     for k in range(ABREAST):
-        walks[RAY + k], walks[FREE + k], walks[FOURFOLD + k] = NOBODY, 0, 0
-        walks[UNCOLORED + k] = NEVER
+        walks[RAY + k], walks[FREE + k], walks[UNCOLORED + k] = NOBODY, 0, NEVER
     colors, updates, carves = base + COLORS_AT, 0, 0
     for band in range(job[FIRST_BAND], job[LAST_BAND]):
         if ti.static(of_others) or bands[band, UNIT] == unit:

@@ -14,10 +14,10 @@ from tsfusion.kernels.voxel_traversal import (
     DISTANCE,
     END,
     INTERVAL,
+    LENGTH,
     LOSS,
     NEVER,
     VOXEL,
-    ray_length,
     ray_vector,
     steps,
     vec3i,
@@ -41,10 +41,10 @@ MOST_LISTED = 1023  # quanta
 # crosses it next, the interval, what a step adds to `AT` and to `OFF`, number of the window. `AT`: where in
 # the window; `OFF`: distance to the surface, 2⁻¹⁶ quantum; `ODD`: bits of the window in `WINDOW`.
 NEXT, EVERY, STEP, TURN, WINDOW = (axis * ABREAST for axis in (0, 3, 6, 9, 12))
-AT, OFF, ODD, RAY_LENGTH, BAND, CLEAR, COLORED, RAY, MET, VOXELS, FREE, FOURFOLD, UNCOLORED = (
-    field * ABREAST for field in range(15, 28)
+AT, OFF, ODD, RAY_LENGTH, BAND, COLORED, RAY, MET, VOXELS, FREE, UNCOLORED = (
+    field * ABREAST for field in range(15, 26)
 )
-WALKS = 28 * ABREAST
+WALKS = 26 * ABREAST
 NOBODY = -1  # instead of a ray
 HALF_A_QUANTUM = 1 << 15  # of `OFF`, whose upper bits are rounded so
 
@@ -53,8 +53,7 @@ HALF_A_QUANTUM = 1 << 15  # of `OFF`, whose upper bits are rounded so
 def begin(rays: ti.template(), r, per_voxel: ti.template(), colors, walks: ti.template(), k):
     """Let ray `r` begin at place `k`; `per_voxel`: units of `OFF` for one of the ray's distance."""
     ends = rays[r, END]
-    length, fourfold = ray_length(rays, r)
-    end = ends & ~7
+    length, end = rays[r, LENGTH], ends & ~7
     voxel, towards = ray_vector(rays, r, VOXEL), steps(ends)
     at = 0
     for a in ti.static(range(3)):
@@ -69,7 +68,6 @@ def begin(rays: ti.template(), r, per_voxel: ti.template(), colors, walks: ti.te
     walks[OFF + k] = rays[r, DISTANCE] * per_voxel + HALF_A_QUANTUM
     walks[RAY_LENGTH + k] = length
     walks[BAND + k] = end - (length - end)
-    walks[CLEAR + k] = ti.min(fourfold, walks[BAND + k])
     walks[COLORED + k] = ti.select(colors == 1 and end + 1 != length, end + 1, NEVER)
     walks[RAY + k] = r
     walks[MET + k] = 0
@@ -89,8 +87,8 @@ def crossed_before(walks: ti.template(), k, until):
 
 @ti.func
 def measure(walks: ti.template(), carves, colors):
-    """Count the voxels that each ray has before it: all, those in free space, those that get four votes for
-    it, those before the one that takes the colour. Returns the largest number of all."""
+    """Count the voxels that each ray has before it: all, those in free space, those before the one
+    that takes the colour. Returns the largest number of all."""
     for k in range(ABREAST):
         n = crossed_before(walks, k, walks[RAY_LENGTH + k]) + 1
         walks[VOXELS + k] = ti.select(walks[RAY + k] != NOBODY, n, 0)
@@ -101,7 +99,6 @@ def measure(walks: ti.template(), carves, colors):
     if carves == 1:
         for k in range(ABREAST):
             walks[FREE + k] = crossed_before(walks, k, walks[BAND + k])
-            walks[FOURFOLD + k] = crossed_before(walks, k, walks[CLEAR + k])
     if colors == 1:
         for k in range(ABREAST):
             walks[UNCOLORED + k] = crossed_before(walks, k, walks[COLORED + k])

@@ -14,15 +14,12 @@ import taichi as ti
 from tsfusion.kernels.quick_launch import QuickLaunch
 from tsfusion.kernels.run_loop import runs, unit_of
 from tsfusion.kernels.sensor_noise import (
-    CARVES_SPACE,
     DROPS_LONE_SAMPLES,
     MAX_RANGE,
     MIN_RANGE,
     VOXEL_SIZE,
-    before_width,
     bundle_weight,
     fixed_point,
-    fourfold_width,
     half_width,
     in_reach,
     layer_depth,
@@ -45,8 +42,6 @@ LEAST_PLANE = 9  # of these, for a plane
 PLANE_NOISE = 2.0  # the most mean squared residual of a plane, in σ² …
 PLANE_ROUGHNESS = 0.1 * 1024.0  # … and, squared, on top of it: 2⁻¹⁰ voxel
 PLANE_SIGMA = 1.0  # voxels: with more noise than that a plane says nothing about voxels
-LEAST_PASSED = 1 / 128  # NEVER_CARVED / MAX_CARVED
-LEAST_SPACING = 2 / 3  # voxels between rays: of closer ones the surface has more votes, and so has free space
 LEAST_FACING = 0.15  # cosine between plane normal and ray: what is seen more edge-on has no plane
 
 
@@ -106,12 +101,13 @@ def few(count):
 
 
 @ti.func
-def depth_of(raw, reading):
+def depth_of(raw, reading, divides: ti.template()):
     """Depth of a pixel's number in 2⁻¹⁰ voxel; 0 = no usable return. All float32, and no branch: a row of a
-    tile is read in vectors."""
+    tile is read in vectors. `divides`: whether it can be a disparity."""
     z = raw * reading.scale
-    if reading.is_disparity == 1:
-        z = quotient(reading.scale, ti.max(raw, 1e-9))
+    if ti.static(divides):
+        if reading.is_disparity == 1:
+            z = quotient(reading.scale, ti.max(raw, 1e-9))
     # False for NaN as well
     usable = (raw > 0.0) & (z >= reading.near) & (z <= reading.far)
     return ti.select(usable, ti.cast(z * reading.per_metre, ti.i32), 0)
@@ -120,7 +116,7 @@ def depth_of(raw, reading):
 @ti.func
 def depth_at(image: ti.template(), confidence: ti.template(), reading, v, u):
     """Depth of a pixel in 2⁻¹⁰ voxel; 0 = no usable return."""
-    q = depth_of(ti.cast(image[v, u], ti.f32), reading)
+    q = depth_of(ti.cast(image[v, u], ti.f32), reading, True)
     if reading.has_confidence == 1:
         if confidence[v, u] == 0:
             q = 0
@@ -137,11 +133,11 @@ def load_tile(image: ti.template(), confidence: ti.template(), reading, left, to
             depths[i] = 0
         for y in range(few(bottom)):
             for x in range(few(right)):
-                depths[y * TILE + x] = depth_of(ti.cast(image[top + y, left + x], ti.f32), reading)
+                depths[y * TILE + x] = depth_of(ti.cast(image[top + y, left + x], ti.f32), reading, True)
     else:
         for y in range(TILE):
             for x in range(TILE):
-                depths[y * TILE + x] = depth_of(ti.cast(image[top + y, left + x], ti.f32), reading)
+                depths[y * TILE + x] = depth_of(ti.cast(image[top + y, left + x], ti.f32), reading, True)
     if reading.has_confidence == 1:
         for y in range(few(bottom)):
             for x in range(few(right)):
@@ -380,22 +376,6 @@ def layer_color(
 
 
 @ti.func
-def shares_passed(cell, pixel):
-    """Shares of a ray's length next to the sensor: where it carves no space, as rays of other cells do, and
-    where it carves with four votes, for those that do not; `pixel` = voxels that one spans at the ray's end.
-
-    Rays meet at the sensor. Nearer than half of the distance those of every second column and row are dense
-    enough, nearer than a quarter those of every fourth, and so on.
-    """
-    x, y = (cell.left + cell.x) // cell.wide, (cell.top + cell.y) // cell.high
-    sparse = 0.5 / ti.max(pixel * ti.max(cell.wide, cell.high), LEAST_SPACING)
-    passed, fourfold = sparse, 0.0
-    while ((x | y) & 1) == 0 and passed > LEAST_PASSED:
-        x, y, passed, fourfold = x >> 1, y >> 1, 0.5 * passed, sparse
-    return passed, fourfold
-
-
-@ti.func
 def write_layer_ray(
     rays: ti.template(), r, first, model: ti.template(), camera, plane, unit,
     color: ti.template(), has_color, confidence: ti.template(), has_confidence, depths: ti.template(),
@@ -427,14 +407,7 @@ def write_layer_ray(
         sigma = noise_sigma(model, z)
         weight = bundle_weight(model, sigma, trust)
         half = half_width(model, sigma)
-        length, passed, fourfold = norm(direction) * z, 0.0, 0.0
-        if model[CARVES_SPACE] > 0.0:
-            passed, fourfold = shares_passed(cell, pixel_width(camera) * z)
-        before = before_width(model, half, length, passed)
-        cost = write_ray(
-            rays, r, first, fixed_point(p), direction, gradient, before, half,
-            fourfold_width(before, length, fourfold), weight, rgb,
-        )  # fmt: skip
+        cost = write_ray(rays, r, first, fixed_point(p), direction, gradient, half, half, weight, rgb)
     return weight, cost
 
 

@@ -87,8 +87,8 @@ def write_bundle_ray(rays: ti.template(), r, first, model: ti.template(), pose: 
         half = half_width(model, sigma)
         rgb = ((bundle.red // n) << 16) | ((bundle.green // n) << 8) | (bundle.blue // n)
         direction, across = end - origin, vec3(0.0)
-        before = before_width(model, half, norm(direction), 0.0)
-        cost = write_ray(rays, r, first, fixed_point(end), direction, across, before, half, 0, weight, rgb)
+        before = before_width(model, half, norm(direction))
+        cost = write_ray(rays, r, first, fixed_point(end), direction, across, before, half, weight, rgb)
     return weight, cost
 
 

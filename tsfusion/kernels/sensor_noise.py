@@ -59,20 +59,14 @@ def half_width(model: ti.template(), sigma):
 
 
 @ti.func
-def before_width(model: ti.template(), half, length, share):
-    """How far before its end a ray of `length` voxels begins, 2⁻⁸ voxel: its band, or with space carving all
-    but this `share` of it next to the sensor."""
+def before_width(model: ti.template(), half, length):
+    """How far before its end the ray of a point, of `length` voxels, begins, 2⁻⁸ voxel: its band, or with
+    space carving all but what is next to the sensor."""
     before = half
     if model[CARVES_SPACE] > 0.0:
-        carved = ti.min(length - ti.max(length * share, NEVER_CARVED), MAX_CARVED - NEVER_CARVED)
+        carved = ti.min(length, MAX_CARVED) - NEVER_CARVED
         before = ti.max(half, ti.cast(carved * 256.0, ti.i32))
     return before
-
-
-@ti.func
-def fourfold_width(before, length, share):
-    """As far as a ray that begins `before` its end votes fourfold for free space, in eights of voxels."""
-    return ti.cast(ti.max(product(length, share) - (length - before / 256.0), 0.0) / 8.0, ti.i32)
 
 
 @ti.func

@@ -13,11 +13,9 @@ from tsfusion.kernels.unfused import dot, norm, product
 
 # First voxel of the band (3), next crossing an axis (3), crossing interval an axis (3), what the distance
 # loses with a step an axis (3), signed distance of the first voxel's centre to the surface along the ray
-# (positive before it), length of the band (its low 8 bits: how many times eight voxels of it get four votes
-# for free space), where in it the end point lies (its low 3 bits: which axes go down),
-# weight << 24 | 0xRRGGBB.
+# (positive before it), length of the band, where in it the end point lies (its low 3 bits: which axes go
+# down), weight << 24 | 0xRRGGBB.
 RAY_FIELDS = 16
-MOST_FOURFOLD = 255
 VOXEL, CROSSING, INTERVAL, LOSS = 0, 3, 6, 9
 DISTANCE, LENGTH, END, WEIGHT_COLOR = 12, 13, 14, 15
 
@@ -67,9 +65,7 @@ def hash_key(key):
 
 
 @ti.func
-def write_ray(
-    rays: ti.template(), r, first, end, direction, gradient, before, behind, fourfold, weight, color
-):
+def write_ray(rays: ti.template(), r, first, end, direction, gradient, before, behind, weight, color):
     """Write ray `r` of a band that begins with ray `first`; returns what it costs to add it.
 
     That is the most voxels it can cross, `FAR_COST` times if it begins away from the ray before it: then no
@@ -79,7 +75,6 @@ def write_ray(
     end point, int32 2⁻⁸ voxel. A ray without a direction gets no weight.
     `gradient`, float64, is what the distance along the ray to the surface loses with a voxel along each axis:
     n / (n·u) for a plane of normal n; zero stands for the plane across the ray, whose gradient is u.
-    `fourfold`: how many times eight voxels are as free as four rays say.
     """
     length = norm(direction)
     usable = weight
@@ -118,7 +113,7 @@ def write_ray(
             loss = -loss
         rays[r, LOSS + a] = loss
     rays[r, DISTANCE] = ti.cast(distance >> 16, ti.i32)
-    rays[r, LENGTH] = ((before + behind) << 8) | ti.min(fourfold, MOST_FOURFOLD)
+    rays[r, LENGTH] = (before + behind) << 8
     rays[r, END] = (before << 8) | downward
     rays[r, WEIGHT_COLOR] = (usable << 24) | color
     cost = 4 + ti.cast((ti.cast(across, ti.i64) * (before + behind)) >> 24, ti.i32)
@@ -143,13 +138,6 @@ def write_band(bands: ti.template(), band, first, end, samples, weight, cost):
     bands[band, SAMPLES] = samples
     bands[band, WEIGHT] = weight
     bands[band, COST] = ti.cast(ti.min(cost, ti.i64(2147483647)), ti.i32)
-
-
-@ti.func
-def ray_length(rays: ti.template(), r):
-    """Length of the band of ray `r`, and as far as it votes fourfold for free space."""
-    packed = rays[r, LENGTH]
-    return packed & ~MOST_FOURFOLD, (packed & MOST_FOURFOLD) << 19
 
 
 @ti.func

@@ -37,12 +37,20 @@ class DeviceRayBuffers(RayBuffers):
     def note_told(self, told: NDArray[np.int32]) -> NDArray[np.int32]:
         """Take over what a launch tells of blocks; returns the slots of those that are touched for the first
         time."""
-        new, end = told[FRESH_AT + 2 * told[NEW] :], TOUCHED_HEADER + int(told[TOUCHED_COUNT])
-        self._touched.reserve(end)
+        new = told[FRESH_AT + 2 * told[NEW] :]
+        self._touched.reserve(TOUCHED_HEADER)
         self.touched[:TOUCHED_HEADER] = told[:TOUCHED_HEADER]
         self.touched[TOUCHED_OVERFLOW] = 0  # which on the CPU is said of `missing`
-        self.touched[end - len(new) : end] = new
+        self.touched[TOUCHED_COUNT] -= len(new)
+        self.note_touched(new)
         return new
+
+    def note_touched(self, slots: NDArray[np.int32]) -> None:
+        """Note blocks that are touched for the first time."""
+        first = TOUCHED_HEADER + int(self.touched[TOUCHED_COUNT])
+        self._touched.reserve(first + len(slots))
+        self.touched[first : first + len(slots)] = slots
+        self.touched[TOUCHED_COUNT] += len(slots)
 
     def share_out(self, units: int) -> None:
         """Nothing: each ray has a thread of its own."""
@@ -159,6 +167,12 @@ class DeviceIntegrator(Integrator):
                 made += _bands(told)[:, LACKING].sum()
             buffers.bands[part[0], UPDATES] += made
             buffers.bands[part[0], DEFERRED] = len(missing)
+
+    def _add_free(self, slots: NDArray[np.int32], sign: int) -> None:
+        store, carved = self._store, self._buffers.carved
+        self._device.call("add_free", slots, carved.amounts, carved.masks, sign)
+        self._buffers.note_touched(slots[store.stamps[slots] != store.stamp])
+        store.note_touched(slots)
 
     def _measure_touched(self) -> None:
         slots = self._buffers.touched_slots

@@ -216,6 +216,13 @@ class DeviceMap:
         self._listed = _at_least(self._listed, ti.i32, updates, kernels.LISTED_FIELDS)
         self._missing = _at_least(self._missing, ti.i64, updates)
 
+    def add_free(
+        self, slots: NDArray[np.int32], amounts: NDArray[np.int64], masks: NDArray[np.int64], sign: int
+    ) -> None:
+        """Add to the voxels that an image looks through."""
+        device_rows.add_free_blocks(*self._copies.given(slots, amounts, masks), sign, self._layers["sums"])
+        self._copies.finish()
+
     def insert(
         self,
         count: int,

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from tsfusion.core.config import VolumeConfig
 from tsfusion.core.errors import KeyframeTooLarge, MapError, MapFull, MapQuota, WeightOverflow
-from tsfusion.kernels import integrate, ray_smoothing, runtime
+from tsfusion.kernels import integrate, ray_smoothing, runtime, space_carving
 from tsfusion.kernels.integrate import (
     ALL,
     ONLY_ADDED,
@@ -26,7 +26,7 @@ from tsfusion.kernels.integrate import (
     TOUCHED_OVERFLOW,
     WEIGHT_LIMIT,
 )
-from tsfusion.kernels.sensor_noise import WEIGHT_ONE
+from tsfusion.kernels.sensor_noise import MAX_BUNDLE_WEIGHT, WEIGHT_ONE
 from tsfusion.kernels.voxel_traversal import COST, DEFERRED, FAR_COST, SHARED, UPDATES, WEIGHT
 from tsfusion.tsdf.block_store import BlockStore
 from tsfusion.tsdf.ray_buffers import BANDS, RayBuffers
@@ -35,6 +35,7 @@ PART_WEIGHT = WEIGHT_LIMIT  # what a lane has in reserve: no part can make one o
 
 NO_LIMIT = 1 << 30  # blocks
 BLOCK_COST = 1000  # of a block that is added: it takes 9 µs where memory is touched for the first time
+CARVED_COST = 100  # of a block that an image looks through: to find it and to add to it takes 2 µs
 
 Part = tuple[int, int]  # bands first … last - 1
 
@@ -43,7 +44,8 @@ class KeyframeQuota(Struct, frozen=True):
     """Bounds of a keyframe.
 
     Attributes:
-        cost: what its rays cost (`voxel_traversal.write_ray`), and 1000 for each block that it adds.
+        cost: what its rays cost (`voxel_traversal.write_ray`), 100 for each block that it carves, and 1000
+            for each that it adds.
         blocks: that it adds.
     """
 
@@ -63,6 +65,7 @@ class Integrator:
         self._room = 0  # blocks that the keyframe may still add to the map, for its sender's share of it
         self._affordable = 0  # blocks that it may still add, for what they cost
         self._most_cost = NO_LIMIT  # of its rays and these
+        self._has_carved = False  # its votes for free space are in the map
         self.units = min(runtime.threads(), BANDS)  # which add at the same time
 
     def apply(self, sign: int, quota: KeyframeQuota | None = None) -> int:
@@ -79,6 +82,7 @@ class Integrator:
         if quota is not None and sign > 0:
             self._room, self._most_cost = quota.blocks, quota.cost
         before = self._admitted = self._store.count
+        self._has_carved = False
         self._begin(sign)
         added: list[Part] = []
         updates = 0
@@ -89,8 +93,10 @@ class Integrator:
                 self._add(part, sign)  # Σ w·m and Σ w: paper eq. 2
                 added.append(part)
                 self._admit(part, sign)
-                self._check(part, sign)
+                self._check(int(self._buffers.bands[part[0] : part[1], WEIGHT].sum()), sign)
                 updates += int(self._buffers.bands[part[0] : part[1], UPDATES].sum())
+            if len(self._buffers.carved):
+                updates += self._carve(sign)
             if self._model.regularizer != "off":
                 self._smooth(sign)  # paper eq. 3
         except BaseException:
@@ -104,6 +110,8 @@ class Integrator:
         """Bring back the map of `before` blocks, whatever failed."""
         if self._store.count > self._admitted:  # blocks that nothing was added to yet
             self._store.drop(self._admitted)
+        if self._has_carved:
+            self._add_free(self._store.slots_of(self._buffers.carved.keys), -sign)
         for part in added:
             self._launch(part, -sign, which=ONLY_ADDED)
         self._buffers.forget_missing()
@@ -178,11 +186,12 @@ class Integrator:
     def _check_cost(self, most: int) -> int:
         """Cost of the rays; a keyframe that takes more time than one of any real sensor is refused."""
         cost = int(self._buffers.bands[:, COST].sum(dtype=np.int64))
+        cost += CARVED_COST * len(self._buffers.carved)
         if cost > most:
             raise KeyframeTooLarge(
                 f"the rays of a keyframe may cost quota_cost = {most}, these cost {cost} (voxels that they "
-                f"cross, {FAR_COST} times those of a ray away from the one before it); use bundle=True, "
-                "raise voxel_size, or send fewer points"
+                f"cross, {FAR_COST} times those of a ray away from the one before it, and {CARVED_COST} a "
+                "block that an image carves); use bundle=True, raise voxel_size, or send fewer points"
             )
         return cost
 
@@ -214,15 +223,47 @@ class Integrator:
                 "check its depth scale, or raise voxel_size"
             )
 
-    def _check(self, part: Part, sign: int) -> None:
-        """Refuse a part after which a lane has left its range.
+    def _carve(self, sign: int) -> int:
+        """Add to the voxels that the keyframe's image looks through; returns how many these are."""
+        store, buffers = self._store, self._buffers
+        carved, touched = buffers.carved, int(buffers.touched[TOUCHED_COUNT])
+        self._limit(max(len(carved), touched))
+        slots = store.slots_of(carved.keys)
+        missing = np.sort(carved.keys[slots < 0])
+        if len(missing) and sign < 0:
+            raise MapError(
+                f"cannot retract a keyframe the map does not hold ({len(missing)} blocks are missing)"
+            )
+        there = slots[slots >= 0]
+        count = touched + int(np.count_nonzero(store.stamps[there] != store.stamp)) + len(missing)
+        self._limit(count)
+        if len(missing):
+            self._check_room(len(missing))
+            self._insert(missing)
+            slots = store.slots_of(carved.keys)
+        buffers.reserve_touched(store.count)
+        self._add_free(slots, sign)
+        self._has_carved = True
+        self._note_admitted(len(missing))
+        self._check(MAX_BUNDLE_WEIGHT, sign)
+        return carved.voxels
 
-        The blocks' bounds grow by all that the part could add; only where they reach the limit are the voxels
+    def _add_free(self, slots: NDArray[np.int32], sign: int) -> None:
+        """Add what is carved to the blocks in these slots."""
+        store, buffers = self._store, self._buffers
+        space_carving.add_free_blocks(
+            slots, buffers.carved.amounts, buffers.carved.masks, sign, store.stamp, store.stamps,
+            store.places, store.dirty, buffers.touched, store.sums,
+        )  # fmt: skip
+
+    def _check(self, most: int, sign: int) -> None:
+        """Refuse a keyframe after which a lane has left its range, by no more than `most`.
+
+        The blocks' bounds grow by all that could be added; only where they reach the limit are the voxels
         themselves read.
         """
         store, slots = self._store, self._buffers.touched_slots
         if sign > 0:
-            most = int(self._buffers.bands[part[0] : part[1], WEIGHT].sum())
             bounds = store.bounds[slots]
             if int(bounds.max(initial=0)) + most < WEIGHT_LIMIT:
                 store.bounds[slots] = bounds + most

@@ -18,6 +18,7 @@ from tsfusion.kernels.integrate import (
     UNIT_SCRATCH,
 )
 from tsfusion.kernels.voxel_traversal import BAND_FIELDS, COST, RAY_FIELDS, SAMPLES, UNIT
+from tsfusion.tsdf.carved_blocks import CarvedBlocks
 from tsfusion.tsdf.growing_array import GrowingArray
 
 _FEW_MISSING = 1 << 15  # entries of the set for the blocks that a usual keyframe finds missing
@@ -27,8 +28,8 @@ _NOTHING = {len(shape): np.zeros(shape, np.uint8) for shape in ((1,), (1, 3))}
 
 
 class RayBuffers:
-    """Rays of the current keyframe (`rays`, by `bands`), the slots of the blocks they touch (`touched`), and
-    the keys of those that the map does not have (`missing`, a hash set)."""
+    """Rays of the current keyframe (`rays`, by `bands`), the slots of the blocks they touch (`touched`), the
+    keys of those that the map does not have (`missing`, a hash set), and what its image carves (`carved`)."""
 
     def __init__(self, *, color: bool, regularised: bool) -> None:
         self._modelled: tuple[Any, ...] = ()  # what `_parameters` are of
@@ -40,6 +41,7 @@ class RayBuffers:
         self.scratch = np.zeros(0, np.int64)
         self.bands = np.zeros((BANDS, BAND_FIELDS), np.int32)
         self.missing = np.zeros(_FEW_MISSING, np.int64)
+        self.carved = CarvedBlocks()
         self._touched = GrowingArray((), np.int32, 1024)
         self._owners = GrowingArray((), np.int64, 1024)
         units = BANDS * ray_smoothing.SIGNAL if regularised else 1
@@ -89,11 +91,12 @@ class RayBuffers:
         self.bands[:, UNIT] = np.minimum(before * units // int(cost.sum()), units - 1)
 
     def make_rays(self, keyframe: Keyframe, config: VolumeConfig) -> None:
-        """Fill `rays`."""
+        """Fill `rays` and `carved`."""
         voxel_size, bundle = config.voxel_size, int(config.bundle)
         parameters = self._model(config, keyframe.sensor, keyframe.baseline_fx)
         self.colored = self.color and keyframe.color is not None
         T = keyframe.T_world_camera
+        self.carved.forget()
         if keyframe.kind == "points":
             pose = np.ascontiguousarray(T[:3]) / voxel_size
             origins = keyframe.origins
@@ -107,13 +110,15 @@ class RayBuffers:
         else:
             height = keyframe.shape[0]
             color = keyframe.color if self.colored else None
+            image, confidence = self.as_read(keyframe.measurement), _optional(keyframe.confidence, 2)
+            read_as = int(keyframe.kind == "disparity"), _depth_scale(keyframe)
             self._rays_of_image(
-                self.as_read(keyframe.measurement),
-                int(keyframe.kind == "disparity"), _depth_scale(keyframe),
-                *_optional(None if color is None else color.reshape(height, -1), 2),
-                *_optional(keyframe.confidence, 2),
-                _camera(keyframe, voxel_size), parameters, bundle,
+                image, *read_as, *_optional(None if color is None else color.reshape(height, -1), 2),
+                *confidence, _camera(keyframe, voxel_size), parameters, bundle,
             )  # fmt: skip
+            if config.space_carving:
+                read = RayBuffers.as_read(image), *read_as, *confidence
+                self.carved.find(keyframe, read, parameters, config.max_blocks_per_keyframe)
 
     def _model(
         self, config: VolumeConfig, sensor: str | None, baseline_fx: float | None
@@ -184,7 +189,7 @@ class RayBuffers:
     def nbytes(self) -> int:
         arrays = [value for value in vars(self).values() if isinstance(value, np.ndarray)]
         growing = self._touched, self._owners, self._votes, self._voted
-        return sum(a.nbytes for a in arrays) + sum(g.array.nbytes for g in growing)
+        return self.carved.nbytes + sum(a.nbytes for a in arrays) + sum(g.array.nbytes for g in growing)
 
     def _reserve_rays(self, count: int) -> None:
         if len(self.rays) < count:

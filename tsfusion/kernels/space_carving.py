@@ -1,0 +1,392 @@
+# SPDX-License-Identifier: MIT
+"""Space carving by images: which voxels a depth image looks through, and their votes for free space.
+
+A ray for each cell of the image would come to a voxel four times, and more often near the camera, where rays
+meet. Here each block is projected into the image instead, once. What is looked up there are the depths up to
+which patches of 3×3 pixels are clear, and the least and the greatest of these in squares of patches, level by
+level, so that most blocks, and cubes of blocks, are known to be hidden or clear as a whole.
+
+Positions in the image are integers, linear in a voxel's coordinates: those of a block's corners bound those
+of all its voxels. Only quotients are float32, which every processor rounds alike.
+"""
+
+import taichi as ti
+
+from tsfusion.kernels.integrate import (
+    CHANGED,
+    CUBE,
+    QUANTA_PER_VOXEL,
+    TOUCHED_COUNT,
+    TOUCHED_HEADER,
+    WEIGHT_BITS,
+)
+from tsfusion.kernels.quick_launch import QuickLaunch
+from tsfusion.kernels.rays_from_images import depth_at, depth_of, reading_of
+from tsfusion.kernels.run_loop import runs, unit_of
+from tsfusion.kernels.sensor_noise import (
+    MODEL_FIELDS,
+    VOXEL_SIZE,
+    bundle_weight,
+    half_width,
+    noise_sigma,
+    vec3,
+)
+from tsfusion.kernels.unfused import dot, norm, product
+from tsfusion.kernels.voxel_traversal import pack, vec3i
+
+PATCH = 3  # pixels a side
+GROUP = 8  # patches that are read at once
+WORDS, BITS = 8, 64  # of a block's mask: bit 8 y + z of word x
+SIDE = 64  # voxels of the cubes that blocks are looked for in
+MOST_SQUARES = 5  # a side, of those that are looked up for a cube
+NEAREST = 4.0  # voxels before the camera, from where on it carves
+MARGIN = 0.1  # patches: more than a quotient of float32 can be wrong
+NO_SAMPLE = 1 << 30
+HIDDEN, PARTLY, CLEAR = 0, 1, 2
+BLOCKS, VOXELS = 0, 1  # in `counts`
+
+# `view`, float64: the camera's centre (voxels); what a place relative to it (voxels) is multiplied by to
+# become column · depth, row · depth (patches, voxels) and depth (voxels), three numbers each; the depth up to
+# which it carves (voxels); how many units these have, a power of two; fx, fy, cx, cy.
+CENTRE, COLUMN, ROW, DEPTH, FAR, SCALE, FX, FY, CX, CY = 0, 3, 6, 9, 12, 13, 14, 15, 16, 17
+VIEW_FIELDS = 18
+FINEST = 1 << 14  # units a voxel
+
+# Column · depth, row · depth and depth of a voxel, in units; what a step along each axis adds to these.
+Place = ti.types.struct(column=ti.i32, row=ti.i32, depth=ti.i32)
+Steps = ti.types.struct(column=vec3i, row=vec3i, depth=vec3i)
+# What is carved: depths from `near` to `far`, units, in an image of so many patches.
+Reach = ti.types.struct(near=ti.i32, far=ti.i32, rows=ti.i32, columns=ti.i32)
+
+
+@ti.func
+def view_row(view: ti.template(), first: ti.template()):
+    """Three neighbouring numbers of a view."""
+    return vec3(view[first], view[first + 1], view[first + 2])
+
+
+@ti.func
+def note_sample(depth, x, nearest: ti.template(), second: ti.template()):
+    """Note the depth of a pixel in column x, 2⁻¹⁰ voxel, 0 = none, if it is one of the two nearest there."""
+    q = ti.select(depth > 0, depth, NO_SAMPLE)
+    second[x] = ti.min(second[x], ti.max(nearest[x], q))
+    nearest[x] = ti.min(nearest[x], q)
+
+
+@ti.func
+def clear_up_to(model: ti.template(), nearest, second, cosine, far, scale):
+    """Depth up to which a patch is clear, units: a band's half-width before the `second` nearest of its
+    samples, because a single one may be wrong, or before its only one. Without a sample it is 0.
+
+    The samples are in 2⁻¹⁰ voxel, `cosine` is of the angle between the patch and the camera's axis. All
+    float32, and no branch: a row of patches is found in vectors.
+    """
+    unit = model[VOXEL_SIZE] / 1024.0  # metres
+    least = ti.select(second < NO_SAMPLE, second, nearest)
+    half = half_width(model, noise_sigma(model, least * unit)) * 4  # 2⁻¹⁰ voxel
+    depth = ti.max(least - ti.cast(product(half, cosine), ti.i32), 0)
+    clear = ti.cast(ti.min(product(depth, scale / 1024.0), far * scale), ti.i32)
+    return ti.select(nearest < NO_SAMPLE, clear, 0)
+
+
+@ti.func
+def fill_level(n, levels: ti.template(), clear: ti.template(), least: ti.template(), most: ti.template()):
+    """Fill the n-th level of squares from the one below it, or from the patches."""
+    for y in range(levels[n, 1]):
+        for x in range(levels[n, 2]):
+            low, high = NO_SAMPLE, 0
+            for k in ti.static(range(4)):
+                i, j = 2 * y + k // 2, 2 * x + k % 2
+                if n == 0:
+                    i, j = ti.min(i, clear.shape[0] - 1), ti.min(j, clear.shape[1] - 1)
+                    low, high = ti.min(low, clear[i, j]), ti.max(high, clear[i, j])
+                else:
+                    i, j = ti.min(i, levels[n - 1, 1] - 1), ti.min(j, levels[n - 1, 2] - 1)
+                    at = levels[n - 1, 0] + i * levels[n - 1, 2] + j
+                    low, high = ti.min(low, least[at]), ti.max(high, most[at])
+            at = levels[n, 0] + y * levels[n, 2] + x
+            least[at], most[at] = low, high
+
+
+@QuickLaunch
+@ti.kernel
+def find_clear_depths(
+    image: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    is_disparity: ti.i32,
+    scale: ti.f64,  # depth = image · scale, or scale / image
+    confidence: ti.types.ndarray(dtype=ti.u8, ndim=2),
+    has_confidence: ti.i32,
+    view: ti.types.ndarray(dtype=ti.f64, ndim=1),
+    model: ti.types.ndarray(dtype=ti.f64, ndim=1),
+    levels: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    clear: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    least: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    most: ti.types.ndarray(dtype=ti.i32, ndim=1),
+):
+    """Fill `clear`, (rows, columns) of patches, with the depths up to which these are clear, and `least` and
+    `most` with those of squares of 2×2 patches, of 4×4, and so on.
+
+    `levels`, (n, 3): where the numbers of a level begin, its rows and columns.
+    """
+    for run in range(runs(clear.shape[0])):  # run loop: kernels/run_loop.py
+        r = unit_of(run, clear.shape[0])
+        if r < clear.shape[0]:
+            reading = reading_of(model, is_disparity, scale, has_confidence)
+            nearest, second = ti.Vector([0] * (GROUP * PATCH)), ti.Vector([0] * (GROUP * PATCH))
+            found, noise = ti.Vector([0] * GROUP), ti.Vector([0.0] * MODEL_FIELDS, dt=ti.f32)
+            for i in ti.static(range(MODEL_FIELDS)):
+                noise[i] = ti.cast(model[i], ti.f32)
+            far, units = ti.cast(view[FAR], ti.f32), ti.cast(view[SCALE], ti.f32)
+            top, bottom = r * PATCH, ti.min(r * PATCH + PATCH, image.shape[0])
+            for group in range((clear.shape[1] + GROUP - 1) // GROUP):
+                left = group * GROUP * PATCH
+                right = ti.min(GROUP * PATCH, image.shape[1] - left)
+                for x in range(GROUP * PATCH):
+                    nearest[x], second[x] = NO_SAMPLE, NO_SAMPLE
+                for v in range(top, bottom):
+                    if right < GROUP * PATCH or has_confidence == 1 or is_disparity == 1:
+                        for x in range(right):
+                            note_sample(depth_at(image, confidence, reading, v, left + x), x, nearest, second)
+                    else:
+                        for x in range(GROUP * PATCH):
+                            note_sample(depth_of(image[v, left + x], reading, False), x, nearest, second)
+                across = (left + GROUP * PATCH // 2 - view[CX]) / view[FX]
+                along = (top + PATCH // 2 - view[CY]) / view[FY]
+                cosine = ti.cast(1.0 / norm(vec3(across, along, 1.0)), ti.f32)
+                for p in range(GROUP):
+                    a, b, c = nearest[p * PATCH], nearest[p * PATCH + 1], nearest[p * PATCH + 2]
+                    one = ti.min(a, b, c)
+                    two = ti.max(ti.min(a, b), ti.min(ti.max(a, b), c))
+                    for k in ti.static(range(PATCH)):
+                        two = ti.min(two, second[p * PATCH + k])
+                    found[p] = clear_up_to(noise, one, two, cosine, far, units)
+                for p in range(ti.min(GROUP, clear.shape[1] - group * GROUP)):
+                    clear[r, group * GROUP + p] = found[p]
+    for _ in range(1):  # one thread: it takes less time than a launch
+        for n in range(levels.shape[0]):
+            fill_level(n, levels, clear, least, most)
+
+
+@ti.func
+def whole(number):
+    """The nearest integer, of numbers or of each component."""
+    return ti.cast(ti.floor(number + 0.5), ti.i32)
+
+
+@ti.func
+def moved(place, steps, x, y, z):
+    """Where the voxel is that lies x, y, z voxels from another one."""
+    by = vec3i(x, y, z)
+    return Place(
+        place.column + (steps.column * by).sum(), place.row + (steps.row * by).sum(),
+        place.depth + (steps.depth * by).sum(),
+    )  # fmt: skip
+
+
+@ti.func
+def look(place, steps, side, reach, levels: ti.template(), least: ti.template(), most: ti.template()):
+    """Whether a cube of `side` voxels, the first of them at a place, is hidden, clear, or may be clear in
+    part."""
+    nearest, farthest = NO_SAMPLE, -NO_SAMPLE
+    left, right, top, bottom = 1e9, -1e9, 1e9, -1e9
+    # by how much the cube is on the inner side of each of the image's edges, if at all
+    inner_left, inner_top, inner_right, inner_bottom = -1.0, -1.0, -1.0, -1.0
+    for k in ti.static(range(8)):
+        n = side - 1
+        corner = moved(place, steps, n * (k >> 2), n * (k >> 1 & 1), n * (k & 1))
+        nearest, farthest = ti.min(nearest, corner.depth), ti.max(farthest, corner.depth)
+        column, row = ti.cast(corner.column, ti.f64), ti.cast(corner.row, ti.f64)
+        depth = ti.cast(corner.depth, ti.f64)
+        inner_left, inner_top = ti.max(inner_left, column), ti.max(inner_top, row)
+        inner_right = ti.max(inner_right, reach.columns * depth - column)
+        inner_bottom = ti.max(inner_bottom, reach.rows * depth - row)
+        inverse = 1.0 / ti.max(depth, 1.0)
+        left, right = ti.min(left, column * inverse), ti.max(right, column * inverse)
+        top, bottom = ti.min(top, row * inverse), ti.max(bottom, row * inverse)
+    found = HIDDEN
+    if (
+        ti.min(inner_left, inner_top, inner_right, inner_bottom) >= 0.0
+        and farthest >= reach.near
+        and nearest < reach.far
+    ):
+        if nearest < reach.near:
+            found = PARTLY  # it may lie anywhere in the image, or behind the camera
+        else:
+            x0 = ti.cast(ti.max(left - MARGIN, 0.0), ti.i32)
+            y0 = ti.cast(ti.max(top - MARGIN, 0.0), ti.i32)
+            x1 = ti.cast(ti.min(right + MARGIN, reach.columns - 1.0), ti.i32)
+            y1 = ti.cast(ti.min(bottom + MARGIN, reach.rows - 1.0), ti.i32)
+            n, up = 0, 1  # the level, and the power of two that its squares are wide
+            while ti.max((x1 >> up) - (x0 >> up), (y1 >> up) - (y0 >> up)) >= MOST_SQUARES:
+                n, up = n + 1, up + 1  # there are levels up to one square
+            low, high = NO_SAMPLE, 0
+            for y in range(y0 >> up, (y1 >> up) + 1):
+                for x in range(x0 >> up, (x1 >> up) + 1):
+                    at = levels[n, 0] + y * levels[n, 2] + x
+                    low, high = ti.min(low, least[at]), ti.max(high, most[at])
+            if high > nearest:
+                found = PARTLY
+                is_inside = left >= MARGIN and top >= MARGIN
+                is_inside &= right < reach.columns - MARGIN and bottom < reach.rows - MARGIN
+                if low > farthest and is_inside:
+                    found = CLEAR
+    return found
+
+
+@ti.func
+def block_in_cube(n):
+    """The n-th block of a cube, in an order in which those of every smaller cube follow each other."""
+    return vec3i(
+        (n & 1) | (n >> 2 & 2) | (n >> 4 & 4), (n >> 1 & 1) | (n >> 3 & 2) | (n >> 5 & 4),
+        (n >> 2 & 1) | (n >> 4 & 2) | (n >> 6 & 4),
+    )  # fmt: skip
+
+
+@ti.func
+def free_vote(model: ti.template(), view: ti.template(), depth):
+    """What is added to a clear voxel at such a depth (voxels): the votes of a ray through the pixels that it
+    covers, and a band's half-width as the distance."""
+    sigma = noise_sigma(model, depth * model[VOXEL_SIZE])
+    pixel = depth / ti.min(view[FX], view[FY])  # voxels that it spans
+    weight = bundle_weight(model, sigma, 255.0 / ti.max(product(pixel, pixel), 1e-3))
+    distance = (half_width(model, sigma) * QUANTA_PER_VOXEL + 128) >> 8
+    return (ti.cast(distance * weight, ti.i64) << WEIGHT_BITS) + weight
+
+
+@ti.func
+def mark_clear(
+    place, steps, reach, clear: ti.template(), columns_by: ti.template(), rows_by: ti.template(),
+    depths_by: ti.template(), depths: ti.template(), patches: ti.template(), words: ti.template(),
+):  # fmt: skip
+    """Set the mask `words` of the block whose first voxel is at `place`; returns how many of its voxels are
+    clear. The first loop has no branch, so that it becomes vectors."""
+    count = 0
+    for x in range(WORDS):
+        base = moved(place, steps, x, 0, 0)
+        for i in range(BITS):
+            column, row = base.column + columns_by[i], base.row + rows_by[i]
+            depth = base.depth + depths_by[i]
+            inverse = 1.0 / ti.cast(ti.max(depth, 1), ti.f32)
+            u = ti.cast(ti.cast(column, ti.f32) * inverse, ti.i32)
+            v = ti.cast(ti.cast(row, ti.f32) * inverse, ti.i32)
+            is_seen = (column >= 0) & (row >= 0) & (u < reach.columns) & (v < reach.rows)
+            is_seen &= depth >= reach.near
+            patches[i] = ti.select(is_seen, v * reach.columns + u, 0)
+            depths[i] = ti.select(is_seen, depth, NO_SAMPLE)
+        word = ti.i64(0)
+        for i in range(BITS):
+            word |= ti.cast(ti.select(depths[i] < clear[patches[i]], 1, 0), ti.i64) << i
+        words[x] = word
+        count += ti.math.popcnt(word)
+    return count
+
+
+@QuickLaunch
+@ti.kernel
+def list_free_blocks(
+    clear: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    rows: ti.i32,
+    columns: ti.i32,
+    levels: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    least: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    most: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    view: ti.types.ndarray(dtype=ti.f64, ndim=1),
+    model: ti.types.ndarray(dtype=ti.f64, ndim=1),
+    cubes: ti.types.ndarray(dtype=ti.i32, ndim=1),  # the first of them, and how many on each axis
+    keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
+    amounts: ti.types.ndarray(dtype=ti.i64, ndim=1),
+    masks: ti.types.ndarray(dtype=ti.i64, ndim=2),
+    counts: ti.types.ndarray(dtype=ti.i32, ndim=1),
+):
+    """List the blocks with voxels that an image looks through: their keys, which of their voxels these are,
+    and what is added to each of them. `counts`: how many blocks and voxels; if there are more blocks than the
+    list takes, it ends there."""
+    for run in range(runs(cubes[3] * cubes[4] * cubes[5])):  # run loop: kernels/run_loop.py
+        n = unit_of(run, cubes[3] * cubes[4] * cubes[5])
+        if n < cubes[3] * cubes[4] * cubes[5]:
+            first = vec3i(
+                cubes[0] + n // (cubes[4] * cubes[5]), cubes[1] + n // cubes[5] % cubes[4],
+                cubes[2] + n % cubes[5],
+            )  # fmt: skip
+            scale, away = view[SCALE], ti.cast(first * SIDE, ti.f64) + 0.5 - view_row(view, CENTRE)
+            column, row, depth = view_row(view, COLUMN), view_row(view, ROW), view_row(view, DEPTH)
+            steps = Steps(whole(column * scale), whole(row * scale), whole(depth * scale))
+            corner = Place(
+                whole(dot(column, away) * scale), whole(dot(row, away) * scale),
+                whole(dot(depth, away) * scale),
+            )  # fmt: skip
+            near, far = ti.cast(NEAREST * scale, ti.i32), ti.cast(view[FAR] * scale, ti.i32)
+            reach = Reach(near, far, rows, columns)
+            depths, patches = ti.Vector([0] * BITS), ti.Vector([0] * BITS)
+            words = ti.Vector([0] * WORDS, dt=ti.i64)
+            columns_by, rows_by = ti.Vector([0] * BITS), ti.Vector([0] * BITS)
+            depths_by = ti.Vector([0] * BITS)
+            for i in range(BITS):
+                by = moved(Place(0, 0, 0), steps, 0, i >> 3, i & 7)
+                columns_by[i], rows_by[i], depths_by[i] = by.column, by.row, by.depth
+            b = 0
+            while b < CUBE and counts[BLOCKS] <= keys.shape[0]:
+                block, side = block_in_cube(b), 8
+                for power in ti.static((1, 2, 3)):  # a larger cube begins here
+                    if b & ((1 << (3 * power)) - 1) == 0:
+                        side = 8 << power
+                place = moved(corner, steps, 8 * block[0], 8 * block[1], 8 * block[2])
+                found, passed = PARTLY, 1
+                while side >= 8 and found != HIDDEN:
+                    found = look(place, steps, side, reach, levels, least, most)
+                    if found == HIDDEN:
+                        passed = (side >> 3) ** 3
+                    side >>= 1
+                if found == PARTLY:
+                    found = mark_clear(
+                        place, steps, reach, clear, columns_by, rows_by, depths_by, depths, patches, words
+                    )
+                elif found == CLEAR:
+                    found = CUBE
+                    for x in ti.static(range(WORDS)):
+                        words[x] = ti.i64(-1)
+                if found > 0:
+                    ti.atomic_add(counts[VOXELS], found)
+                    at = ti.atomic_add(counts[BLOCKS], 1)
+                    if at < keys.shape[0]:
+                        key, middle = first * WORDS + block, moved(place, steps, 4, 4, 4)
+                        keys[at] = pack(key[0], key[1], key[2])
+                        amounts[at] = free_vote(model, view, middle.depth / scale)
+                        for x in ti.static(range(WORDS)):
+                            masks[at, x] = words[x]
+                b += passed
+
+
+@QuickLaunch
+@ti.kernel
+def add_free_blocks(
+    slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    amounts: ti.types.ndarray(dtype=ti.i64, ndim=1),
+    masks: ti.types.ndarray(dtype=ti.i64, ndim=2),
+    sign_: ti.i32,
+    stamp: ti.i32,
+    stamps: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    places: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    dirty: ti.types.ndarray(dtype=ti.u8, ndim=1),
+    touched: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    sums: ti.types.ndarray(dtype=ti.i64, ndim=2),
+):
+    """Add to the clear voxels of blocks, whose slots these are, each of them once; list those that keyframe
+    `stamp` has not touched yet."""
+    for run in range(runs(slots.shape[0])):  # run loop: kernels/run_loop.py
+        n = unit_of(run, slots.shape[0])
+        if n < slots.shape[0]:
+            slot, amount, lanes = slots[n], sign_ * amounts[n], ti.Vector([0] * BITS, dt=ti.i64)
+            if stamps[slot] != stamp:
+                place = ti.atomic_add(touched[TOUCHED_COUNT], 1)
+                touched[TOUCHED_HEADER + place] = slot
+                stamps[slot], places[slot], dirty[slot] = stamp, place, ti.u8(CHANGED)
+            for x in range(WORDS):
+                word = masks[n, x]
+                if word != 0:
+                    for i in range(BITS):  # three loops, so that each becomes vectors
+                        lanes[i] = sums[slot, x * BITS + i]
+                    for i in range(BITS):
+                        lanes[i] += amount & -((word >> i) & 1)
+                    for i in range(BITS):
+                        sums[slot, x * BITS + i] = lanes[i]
