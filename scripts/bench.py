@@ -154,12 +154,21 @@ class Stages:
 
     @contextmanager
     def watch(self) -> Iterator[None]:
-        from tsfusion.kernels import block_hash, integrate, ray_smoothing, rays_from_images, rays_from_points
+        from tsfusion.kernels import (
+            block_hash,
+            integrate,
+            ray_smoothing,
+            rays_from_images,
+            rays_from_points,
+            space_carving,
+        )
 
         watched: list[tuple[Any, str, str]] = [
             (rays_from_images, "rays_from_image", "rays"), (rays_from_points, "rays_from_points", "rays"),
             (block_hash, "insert_blocks", "allocate"), (integrate, "add_rays", "integrate"),
             (integrate, "add_shared_rays", "integrate"),
+            (space_carving, "find_clear_depths", "carve"), (space_carving, "list_free_blocks", "carve"),
+            (space_carving, "add_free_blocks", "carve"),
             (integrate, "largest_weights", "check"), (ray_smoothing, "smooth_rays", "regularise"),
             (ray_smoothing, "commit_votes", "regularise"),
         ]  # fmt: skip

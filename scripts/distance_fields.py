@@ -7,6 +7,7 @@ beside the map without space carving). CPU time, best and median of several runs
     python scripts/distance_fields.py
 """
 
+import argparse
 import json
 import time
 from collections.abc import Callable, Iterator
@@ -123,5 +124,8 @@ def free_space() -> None:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    ).parse_args()
     times()
     free_space()
