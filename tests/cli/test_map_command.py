@@ -18,8 +18,8 @@ from keyframes_and_servers import DEADLINE, pose, serving, wall
 from saved_maps import ANNA, BOB, correct, decoded, forget, make_map
 from small_recordings import first_views
 
-from tsfusion import Client, Volume
-from tsfusion.journal import state_folder
+from tsfusion import Client, Volume, journal
+from tsfusion.journal import segment_path, state_folder
 
 
 @pytest.fixture(scope="module")
@@ -69,6 +69,30 @@ def test_hash_is_a_line_and_has_all_that_the_journal_holds(here: Here, state: Pa
     fused = volume_of((decoded(wall(i)) for i in range(10, 14)), voxel_size=0.04).map_hash()
     assert (behind["map_hash"], behind["keyframes"]) == (fused, 4)
     assert {path: path.read_bytes() for path in state.rglob("*") if path.is_file()} == before
+
+
+def test_what_damage_has_cost_is_the_last_line_and_status_1(here: Here, tmp_path: Path) -> None:
+    folder = make_map(tmp_path / "state" / "maps" / "default", range(4), behind=2)
+    path = segment_path(folder / "journal", 1)
+    last = list(journal.records(path))[-1]
+    content = bytearray(path.read_bytes())
+    content[last.position.offset + 700] ^= 16
+    path.write_bytes(content)
+    left = volume_of((decoded(wall(i)) for i in range(3)), voxel_size=0.04).map_hash()
+    other = make_map(tmp_path / "other" / "maps" / "default", range(10, 12), session=BOB)
+    state, sum_, crop = tmp_path / "state", tmp_path / "sum.tsf", tmp_path / "crop.tsf"
+    hashed, merged, cropped, asked = (
+        here("map", "hash", state), here("map", "merge", state, other, "--out", sum_, "--same-frame"),
+        here("map", "crop", state, "--box", -1, -1, -1, 1, 1, 3, "--out", crop),
+        here("ask", state, "--at", 0, 0, 1),
+    )  # fmt: skip
+    for done in (hashed, merged, cropped, asked):
+        assert done.returncode == 1
+        assert "the map lacks 1 keyframe or more" in done.stderr.splitlines()[-1]
+    assert hashed.stdout == left + "\n"
+    assert (Volume.load(sum_).keyframes, Volume.load(crop).keyframes) == (5, 3)
+    refused = here("map", "crop", state, "--box", 1, 1, 1, 0, 0, 0, "--out", crop)
+    assert "damage" not in refused.stderr.splitlines()[-1], "what failed comes first"
 
 
 def test_hash_moves_what_was_corrected(here: Here, tmp_path: Path) -> None:

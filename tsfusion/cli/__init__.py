@@ -28,6 +28,7 @@ from tsfusion.cli import (
     keys,
     map,
     mesh,
+    opened_maps,
     replay,
     report,
     scan,
@@ -136,7 +137,9 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) == signal.SIG_DFL:  # else nohup's
         signal.signal(signal.SIGHUP, _hung_up)
     try:
+        opened_maps.begin()
         code = app(arguments, prog_name="tsfusion", standalone_mode=False)
+        opened_maps.end()
     except TsfusionError as error:
         _fail(str(error), 1)
     except _UsageError as error:

@@ -10,9 +10,11 @@ import typer
 
 from tsfusion.core.counts import count_of
 from tsfusion.core.durable_files import size_of
+from tsfusion.core.errors import IncompleteRun
 
 JOURNAL = "reading the journal"
 _LARGE_BYTES = 64 << 20  # of a file: reading it takes seconds
+_lost = list[int]()  # to damage: keyframes of the maps that this command has opened
 
 
 def memory_for(file: Path, memory_bytes: int | None = None, *, maps: int = 1) -> int | None:
@@ -29,8 +31,12 @@ def memory_for(file: Path, memory_bytes: int | None = None, *, maps: int = 1) ->
 
 @contextmanager
 def opened(path: Path, map_name: str | None = None, *, quiet: bool) -> Iterator[Path]:
-    """The file of a map; one of a state folder is brought up to date in a copy, with progress on stderr."""
+    """The file of a map; one of a state folder is brought up to date in a copy, with progress on stderr.
+
+    Where damage in its journal has cost keyframes, the command ends with status 1, after its results.
+    """
     from tsfusion.cli import progress
+    from tsfusion.journal.recording import LOST
     from tsfusion.pipelines import saved_maps
 
     with progress.shown(quiet=quiet) as display:
@@ -42,8 +48,22 @@ def opened(path: Path, map_name: str | None = None, *, quiet: bool) -> Iterator[
 
         read = partial(display.show_bytes, JOURNAL)
         with saved_maps.opened(saved_maps.find(path, map_name), watch, read) as (file, left_out):
+            _lost.append(left_out.pop(LOST, 0))
             for reason, count in left_out.items():
                 typer.echo(f"left out {count_of(count, 'keyframe')}: {reason}", err=True)
             if size_of(file) > _LARGE_BYTES:
                 display.stage(f"reading {path}")
             yield file
+
+
+def begin() -> None:
+    """Forget which maps were opened before this command."""
+    _lost.clear()
+
+
+def end() -> None:
+    """Raise IncompleteRun where damage has cost maps that the command has opened keyframes: its last line."""
+    if any(_lost):
+        from tsfusion.pipelines import shortfall
+
+        raise IncompleteRun(shortfall.of_damage(sum(_lost)))

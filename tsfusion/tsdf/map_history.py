@@ -99,7 +99,8 @@ def check_addable(here: Mapping[str, Any], there: Mapping[str, Any], *, same_fra
     if not same_frame and worlds[0].isdisjoint(worlds[1]):
         raise MapError(
             "the maps are of scans that found their poses themselves, each in a coordinate frame of its own; "
-            "merge them only if they are known to be in one (same_frame), or after they were aligned"
+            "merge them only if they are known to be in one (--same-frame, in Python same_frame=True), or "
+            "after they were aligned"
         )
 
 
