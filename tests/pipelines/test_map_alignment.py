@@ -2,6 +2,7 @@
 """Maps of different frames, aligned and merged, or refused with a reason."""
 
 import json
+import shutil
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -12,7 +13,15 @@ import pytest
 from command_processes import Here
 from journaled_maps import recorded, unknown_start
 
-from tsfusion import AlignmentRefused, Keyframe, MissingDependency, Volume, VolumeConfig, open_dataset
+from tsfusion import (
+    AlignmentRefused,
+    Keyframe,
+    MissingDependency,
+    Volume,
+    VolumeConfig,
+    journal,
+    open_dataset,
+)
 from tsfusion.evaluation import surface_registration
 from tsfusion.evaluation.surface_registration import Registration
 from tsfusion.geometry import se3
@@ -105,6 +114,23 @@ def test_what_is_merged_is_the_map_of_both(halves: tuple[Path, Path], here: Here
     assert (said["merged"]["exact"], said["merged"]["keyframes"]) == (True, 25)
     done = here("map", "align", "c.tsf", b, "--out", "d.tsf")
     assert (done.returncode, "was merged into that map before" in done.stderr) == (1, True)
+
+
+@pytest.mark.usefixtures("given")
+def test_what_damage_has_cost_is_told_at_the_end(
+    halves: tuple[Path, Path], here: Here, tmp_path: Path
+) -> None:
+    a, b = halves[0], tmp_path / "b"
+    shutil.copytree(halves[1], b)
+    path = next(b.rglob("000001.mcap"))
+    last = list(journal.records(path))[-1]
+    content = bytearray(path.read_bytes())
+    content[last.position.offset + 700] ^= 16
+    path.write_bytes(content)
+    done = here("map", "align", a, b, "--out", "c.tsf", "--json")
+    assert (done.returncode, "the map lacks 1 keyframe or more" in done.stderr) == (1, True)
+    said = json.loads(done.stdout)["merged"]
+    assert Volume.load(tmp_path / "c.tsf").map_hash() == said["map_hash"]
 
 
 def test_a_map_is_not_merged_with_itself(

@@ -47,10 +47,11 @@ def align(
     Needs Open3D and scipy, the extra `align` of tsfusion.
     """
     from tsfusion.cli import output, progress
+    from tsfusion.core.errors import IncompleteRun
     from tsfusion.core.output_folder import check_writable
     from tsfusion.evaluation.surface_registration import check_installed
     from tsfusion.journal.state_folder import check_no_map_of_a_server
-    from tsfusion.pipelines import map_alignment
+    from tsfusion.pipelines import map_alignment, shortfall
 
     if out is not None:
         check_writable(out, (".tsf",))
@@ -71,6 +72,8 @@ def align(
         output.as_json({"alignment": found, "merged": merged})
     else:
         typer.echo("\n".join(_lines(found, merged)))
+    if missed := shortfall.of_damage(sum(one.lost for one in maps)):
+        raise IncompleteRun(missed)
 
 
 def _merge(a: "AlignedMap", b: "AlignedMap", found: "Alignment", out: Path, display: Any) -> dict[str, Any]:

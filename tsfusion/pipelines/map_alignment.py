@@ -76,6 +76,7 @@ class AlignedMap:
         volume: what knows the free space before its surface; None = it is elsewhere.
         keyframes: of its journal; None = there is none.
         missing: number of its keyframes that the journal does not have.
+        lost: keyframes of the journal that damage has cost, at least.
     """
 
     name: str
@@ -85,6 +86,7 @@ class AlignedMap:
     volume: Volume | None = None
     keyframes: JournaledKeyframes | None = None
     missing: int = 0
+    lost: int = 0
 
 
 def map_of_volume(name: str, volume: Volume, views: Sequence[Keyframe] = ()) -> AlignedMap:
@@ -109,7 +111,8 @@ def open_map(source: Path, *, watch: Watch = lambda *_: None) -> AlignedMap:
     there = made.volume.keyframes + sum(made.left_out.values())
     views = [keyframes[index].keyframe for index in spread(len(keyframes))]
     found = map_of_volume(str(source), made.volume, views)
-    return replace(found, keyframes=keyframes, missing=max(0, there - len(keyframes)))
+    missing = max(0, there - len(keyframes))
+    return replace(found, keyframes=keyframes, missing=missing, lost=made.lost)
 
 
 def align(a: AlignedMap, b: AlignedMap) -> Alignment:
