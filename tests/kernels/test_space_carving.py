@@ -2,16 +2,18 @@
 """The blocks that an image looks through are those that a slow twin finds, voxel by voxel."""
 
 from dataclasses import replace
+from typing import Any
 
 import kernel_twins
 import numpy as np
 import pytest
 from formula_scenes import CAMERA, SHAPE, look_at, plane_keyframe
+from msgspec import structs
 from numpy.typing import NDArray
 
 from tsfusion import Intrinsics, Keyframe
 from tsfusion.core.config import SensorModel
-from tsfusion.kernels import runtime
+from tsfusion.kernels import runtime, space_carving
 from tsfusion.tsdf.block_store import unpack_keys
 from tsfusion.tsdf.carved_blocks import CarvedBlocks
 from tsfusion.tsdf.ray_buffers import _depth_scale, _optional, model_parameters
@@ -20,11 +22,13 @@ VOXEL = 0.05
 MODEL = SensorModel(sigma_floor=0.01, sigma_slope=0.004, sigma_z0=0.3, max_range=6.0)
 
 
-def parameters(voxel_size: float = VOXEL) -> NDArray[np.float64]:
-    return model_parameters(MODEL, voxel_size, None, space_carving=True)
+def parameters(voxel_size: float = VOXEL, **settings: Any) -> NDArray[np.float64]:
+    return model_parameters(MODEL, voxel_size, None, space_carving=True, **settings)
 
 
-def found(keyframe: Keyframe, voxel_size: float = VOXEL, most: int = 1 << 17) -> CarvedBlocks:
+def found(
+    keyframe: Keyframe, voxel_size: float = VOXEL, most: int = 1 << 17, **settings: Any
+) -> CarvedBlocks:
     carved = CarvedBlocks()
     image = keyframe.measurement.astype(np.float32)
     read = (
@@ -33,7 +37,7 @@ def found(keyframe: Keyframe, voxel_size: float = VOXEL, most: int = 1 << 17) ->
         _depth_scale(keyframe),
         *_optional(keyframe.confidence, 2),
     )
-    carved.find(keyframe, read, parameters(voxel_size), most)
+    carved.find(keyframe, read, parameters(voxel_size, **settings), most)
     return carved
 
 
@@ -84,6 +88,10 @@ def kinds() -> dict[str, Keyframe]:
             disparity=disparity, disparity_scale=1 / 256, baseline_fx=CAMERA.fx * 0.1, intrinsics=CAMERA,
             T_world_camera=POSES[1],
         ),
+        "upside down": replace(
+            stepped[1], intrinsics=Intrinsics(CAMERA.fx, -1.5 * CAMERA.fy, CAMERA.cx, 60.0)
+        ),
+        "two rows": replace(SCENE, depth=np.full((2, 120), 2.0, np.float32)),
         "rest of a patch": replace(stepped[1], depth=steps(1)[:118, :151].copy()),
         "a patch": replace(SCENE, depth=np.full((3, 3), 5.9, np.float32)),
         "a strip": replace(SCENE, depth=np.full((120, 3), 1.5, np.float32)),
@@ -95,11 +103,12 @@ def threads() -> None:
     runtime.start(2)
 
 
+@pytest.mark.parametrize("filters", [True, False])
 @pytest.mark.parametrize("kind", kinds())
-def test_every_clear_voxel_is_found_once(kind: str) -> None:
+def test_every_clear_voxel_is_found_once(kind: str, filters: bool) -> None:
     keyframe = kinds()[kind]
-    clear = voxels_of(found(keyframe))
-    certain, possible = kernel_twins.clear_voxels(keyframe, parameters())
+    clear = voxels_of(found(keyframe, outlier_filter=filters))
+    certain, possible = kernel_twins.clear_voxels(keyframe, parameters(outlier_filter=filters))
     assert certain <= set(clear) <= possible
     assert len(certain) > 0.8 * len(clear) > 0
 
@@ -117,23 +126,81 @@ def test_votes_are_those_of_the_pixels_that_a_voxel_covers(voxel_size: float) ->
 
 def test_nothing_to_look_through() -> None:
     nothing = replace(SCENE, depth=np.zeros(SHAPE, np.float32))
-    small = replace(SCENE, depth=np.full((2, 2), 1.0, np.float32))
     beyond = np.eye(4)
     beyond[:3, 3] = 1e6
-    for keyframe in (nothing, small, replace(SCENE, T_world_camera=beyond)):
+    for keyframe in (nothing, replace(SCENE, T_world_camera=beyond)):
         carved = found(keyframe)
         assert (len(carved), carved.voxels) == (0, 0)
 
 
-@pytest.mark.parametrize("focal", [1e3, 1e5, 1e7])
+def test_a_sample_alone_carves_only_where_lone_ones_count() -> None:
+    depth = np.zeros(SHAPE, np.float32)
+    depth[1::3, 1::3] = 2.0
+    lone = replace(SCENE, depth=depth)
+    assert found(lone).voxels == 0
+    assert found(lone, outlier_filter=False).voxels > 0.98 * found(SCENE).voxels
+
+
+@pytest.mark.parametrize("focal", [1e3, 1e5, 1e7, 200.0, 1e-3, 1e-320])
 def test_a_camera_of_any_focal_length_finds_what_lies_in_its_view(focal: float) -> None:
-    """The finer an image, the coarser are the units, until it carves no more."""
+    """A very long lens looks between all voxels' centres, and so wide an image as the others have is none."""
     depth = np.full((90, 90), 5.0, np.float32)
     far = Keyframe(depth=depth, intrinsics=Intrinsics(focal, focal, 44.5, 44.5), T_world_camera=np.eye(4))
     clear = np.array(list(voxels_of(found(far))) or np.zeros((0, 3)))
     centres = (clear + 0.5) * VOXEL
     assert (np.abs(centres[:, :2]) <= 45.5 / focal * centres[:, 2:]).all()
-    assert (len(clear) > 0) == (focal < 1e4), "others look between all centres"
+    assert (np.linalg.norm(centres, axis=1) <= 2049 * VOXEL).all()
+    assert (len(clear) > 0) == (1e-2 < focal < 1e4)
+
+
+@pytest.mark.parametrize("numbers", [(0.1, 0.1, 1e308, 30.0), (5e-324, 1e308, 1e308, -1e308)])
+def test_a_camera_of_impossible_numbers_carves_nothing(numbers: tuple[float, ...]) -> None:
+    assert found(replace(SCENE, intrinsics=Intrinsics(*numbers))).voxels == 0
+
+
+def test_no_cube_is_looked_at_in_vain_where_a_camera_is_too_wide() -> None:
+    """However wide, it carves no farther than 2048 voxels: at most 66 cubes a side."""
+    carved, cubes = CarvedBlocks(), []
+    usual = space_carving.list_free_blocks
+
+    def counted(*given: Any) -> None:
+        cubes.append(int(np.prod(given[8][3:], dtype=np.int64)))
+        usual(*given)
+
+    for focal in (0.05, 2.0, 10.0, 30.0, 100.0):
+        wide = Keyframe(
+            depth=np.full((480, 640), 100.0, np.float32), intrinsics=Intrinsics(focal, focal, 319.5, 239.5),
+            T_world_camera=np.eye(4),
+        )  # fmt: skip
+        model = model_parameters(structs.replace(MODEL, max_range=200.0), 0.02, None, space_carving=True)
+        with pytest.MonkeyPatch.context() as patched:
+            patched.setattr(space_carving, "list_free_blocks", counted)
+            carved.find(wide, (wide.measurement, 0, 1.0, *_optional(None, 2)), model, 1000)
+    assert 0 < max(cubes) < 66**3
+
+
+def test_without_memory_for_an_image_the_next_one_is_found_all_the_same(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    carved, usual, expected = CarvedBlocks(), np.zeros, voxels_of(found(SCENE))
+    read = SCENE.measurement, 0, 1.0, *_optional(None, 2)
+    small = replace(SCENE, depth=np.full((9, 9), 1.0, np.float32))
+    carved.find(small, (small.measurement, 0, 1.0, *_optional(None, 2)), parameters(), 1 << 17)
+    for failing in range(1, 4):
+        calls = []
+
+        def zeros(*given: Any, calls: list[Any] = calls, failing: int = failing) -> Any:
+            calls.append(given)
+            if len(calls) == failing:
+                raise MemoryError
+            return usual(*given)
+
+        with monkeypatch.context() as patched:
+            patched.setattr(np, "zeros", zeros)
+            with pytest.raises(MemoryError):
+                carved.find(SCENE, read, parameters(), 1 << 17)
+    carved.find(SCENE, read, parameters(), 1 << 17)
+    assert voxels_of(carved) == expected
 
 
 def test_the_list_grows_and_ends_one_block_after_the_most() -> None:

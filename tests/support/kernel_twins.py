@@ -439,17 +439,17 @@ def clear_depths(keyframe: Any, parameters: NDArray[np.float64]) -> NDArray[np.f
     if keyframe.confidence is not None:
         image[keyframe.confidence == 0] = 0
     floor, slope, z0, low, high, voxel_size = parameters[:6]
-    nearest, farthest = parameters[7:9]
-    rows, columns = image.shape[0] // 3, image.shape[1] // 3
+    nearest, farthest, filters = parameters[7:10]
+    rows, columns = -(-image.shape[0] // 3), -(-image.shape[1] // 3)
     K, found = keyframe.intrinsics, np.zeros((rows, columns))
     for r, c in product(range(rows), range(columns)):
         patch = image[3 * r : 3 * r + 3, 3 * c : 3 * c + 3].ravel()
         depths = np.sort(patch[(patch >= nearest) & (patch <= farthest)])  # NaN is in neither
-        if not len(depths):
+        if len(depths) < (2 if filters else 1):
             continue
         least = depths[:2][-1]
         half = min(max(3 * (floor + slope * (least - z0) ** 2) / voxel_size, low), high)
-        x, y = (c // 8 * 24 + 12 - K.cx) / K.fx, (3 * r + 1 - K.cy) / K.fy  # of eight patches
+        x, y = (3 * c + 1 - K.cx) / K.fx, (3 * r + 1 - K.cy) / K.fy
         found[r, c] = max(least / voxel_size - half / np.sqrt(x * x + y * y + 1), 0)
     return found
 
@@ -459,6 +459,7 @@ def clear_voxels(keyframe: Any, parameters: NDArray[np.float64]) -> tuple[set[Vo
     certain, and those of which rounding may decide, too."""
     clear, voxel_size = clear_depths(keyframe, parameters), parameters[5]
     K, T, (rows, columns) = keyframe.intrinsics, keyframe.T_world_camera, clear.shape
+    high, wide = (side / 3 for side in keyframe.shape)
     centre = T[:3, 3] / voxel_size
     x, y = (np.array([-1, 3 * columns]) - K.cx) / K.fx, (np.array([-1, 3 * rows]) - K.cy) / K.fy
     ends = np.array([(0, 0, 0), *((a, b, 1) for a in x for b in y)]) * clear.max() @ T[:3, :3].T + centre
@@ -474,7 +475,7 @@ def clear_voxels(keyframe: Any, parameters: NDArray[np.float64]) -> tuple[set[Vo
     depths = []
     for du, dv in shift:
         column, row = np.floor(u + du).astype(int), np.floor(v + dv).astype(int)
-        inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+        inside = (column >= 0) & (u + du < wide) & (row >= 0) & (v + dv < high)
         depths.append(np.where(inside, clear[row.clip(0, rows - 1), column.clip(0, columns - 1)], 0))
     certain = (p[:, 2] < np.min(depths, axis=0) - 0.03) & (p[:, 2] > 4.03)
     possible = p[:, 2] < np.max(depths, axis=0) + 0.03

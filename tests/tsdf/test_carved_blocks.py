@@ -138,3 +138,20 @@ def test_points_carve_along_their_rays() -> None:
     assert stats.updates > 10 * stats.rays
     volume.retract(scan)
     assert volume.map_hash() == map_of(WALL).map_hash()
+
+
+def test_a_keyframe_without_a_usable_sample_changes_nothing() -> None:
+    """Its few pixels stand alone; or what it sees lies beyond the edge of the world, not the way there."""
+    depth = np.zeros(WALL.measurement.shape, np.float32)
+    depth[1::5, 1::5] = 4.0
+    depth[2::5, 2::5] = 8.0
+    edge = np.eye(4)
+    edge[2, 3] = ((1 << 20) - 100) * 0.03
+    far = replace(WALL, depth=np.full(depth.shape, 4.0, np.float32), T_world_camera=edge)
+    volume = map_of(WALL)
+    before = state_of(volume)
+    for keyframe in (replace(WALL, depth=depth), far):
+        stats = volume.integrate(keyframe)
+        assert (stats.samples, stats.updates, stats.blocks, stats.new_blocks) == (0, 0, 0, 0)
+    assert state_of(volume) == before
+    assert volume.keyframes == 1

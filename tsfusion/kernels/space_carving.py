@@ -7,7 +7,9 @@ which patches of 3×3 pixels are clear, and the least and the greatest of these 
 level, so that most blocks, and cubes of blocks, are known to be hidden or clear as a whole.
 
 Positions in the image are integers, linear in a voxel's coordinates: those of a block's corners bound those
-of all its voxels. Only quotients are float32, which every processor rounds alike.
+of all its voxels. Only quotients are float32, which every processor rounds alike. With the longest lenses and
+largest images they are as coarse as a sixty-fourth of a voxel, and a voxel is up to 3 · 63 steps away from
+the one that they are counted from.
 """
 
 import taichi as ti
@@ -24,6 +26,7 @@ from tsfusion.kernels.quick_launch import QuickLaunch
 from tsfusion.kernels.rays_from_images import depth_at, depth_of, reading_of
 from tsfusion.kernels.run_loop import runs, unit_of
 from tsfusion.kernels.sensor_noise import (
+    DROPS_LONE_SAMPLES,
     MODEL_FIELDS,
     VOXEL_SIZE,
     bundle_weight,
@@ -31,7 +34,7 @@ from tsfusion.kernels.sensor_noise import (
     noise_sigma,
     vec3,
 )
-from tsfusion.kernels.unfused import dot, norm, product
+from tsfusion.kernels.unfused import dot, product
 from tsfusion.kernels.voxel_traversal import pack, vec3i
 
 PATCH = 3  # pixels a side
@@ -55,8 +58,9 @@ FINEST = 1 << 14  # units a voxel
 # Column · depth, row · depth and depth of a voxel, in units; what a step along each axis adds to these.
 Place = ti.types.struct(column=ti.i32, row=ti.i32, depth=ti.i32)
 Steps = ti.types.struct(column=vec3i, row=vec3i, depth=vec3i)
-# What is carved: depths from `near` to `far`, units, in an image of so many patches.
-Reach = ti.types.struct(near=ti.i32, far=ti.i32, rows=ti.i32, columns=ti.i32)
+# What is carved: depths from `near` to `far`, units, in an image of so many rows and columns of patches. The
+# last ones may be cut off: it is so many patches high and wide.
+Reach = ti.types.struct(near=ti.i32, far=ti.i32, rows=ti.i32, columns=ti.i32, high=ti.f32, wide=ti.f32)
 
 
 @ti.func
@@ -76,7 +80,8 @@ def note_sample(depth, x, nearest: ti.template(), second: ti.template()):
 @ti.func
 def clear_up_to(model: ti.template(), nearest, second, cosine, far, scale):
     """Depth up to which a patch is clear, units: a band's half-width before the `second` nearest of its
-    samples, because a single one may be wrong, or before its only one. Without a sample it is 0.
+    samples, because a single one may be wrong. Of its only one it is 0 with `outlier_filter`, as without a
+    sample.
 
     The samples are in 2⁻¹⁰ voxel, `cosine` is of the angle between the patch and the camera's axis. All
     float32, and no branch: a row of patches is found in vectors.
@@ -86,7 +91,8 @@ def clear_up_to(model: ti.template(), nearest, second, cosine, far, scale):
     half = half_width(model, noise_sigma(model, least * unit)) * 4  # 2⁻¹⁰ voxel
     depth = ti.max(least - ti.cast(product(half, cosine), ti.i32), 0)
     clear = ti.cast(ti.min(product(depth, scale / 1024.0), far * scale), ti.i32)
-    return ti.select(nearest < NO_SAMPLE, clear, 0)
+    is_known = ti.select(model[DROPS_LONE_SAMPLES] > 0.0, second, nearest) < NO_SAMPLE
+    return ti.select(is_known, clear, 0)
 
 
 @ti.func
@@ -150,10 +156,14 @@ def find_clear_depths(
                     else:
                         for x in range(GROUP * PATCH):
                             note_sample(depth_of(image[v, left + x], reading, False), x, nearest, second)
-                across = (left + GROUP * PATCH // 2 - view[CX]) / view[FX]
-                along = (top + PATCH // 2 - view[CY]) / view[FY]
-                cosine = ti.cast(1.0 / norm(vec3(across, along, 1.0)), ti.f32)
+                along = ti.cast((top + PATCH // 2 - view[CY]) / view[FY], ti.f32)
+                begin, step = (
+                    ti.cast((left + PATCH // 2 - view[CX]) / view[FX], ti.f32),
+                    ti.cast(PATCH / view[FX], ti.f32),
+                )
                 for p in range(GROUP):
+                    across = begin + product(step, p)
+                    cosine = 1.0 / ti.sqrt(1.0 + product(across, across) + product(along, along))
                     a, b, c = nearest[p * PATCH], nearest[p * PATCH + 1], nearest[p * PATCH + 2]
                     one = ti.min(a, b, c)
                     two = ti.max(ti.min(a, b), ti.min(ti.max(a, b), c))
@@ -227,7 +237,7 @@ def look(place, steps, side, reach, levels: ti.template(), least: ti.template(),
             if high > nearest:
                 found = PARTLY
                 is_inside = left >= MARGIN and top >= MARGIN
-                is_inside &= right < reach.columns - MARGIN and bottom < reach.rows - MARGIN
+                is_inside &= right < reach.wide - MARGIN and bottom < reach.high - MARGIN
                 if low > farthest and is_inside:
                     found = CLEAR
     return found
@@ -247,7 +257,7 @@ def free_vote(model: ti.template(), view: ti.template(), depth):
     """What is added to a clear voxel at such a depth (voxels): the votes of a ray through the pixels that it
     covers, and a band's half-width as the distance."""
     sigma = noise_sigma(model, depth * model[VOXEL_SIZE])
-    pixel = depth / ti.min(view[FX], view[FY])  # voxels that it spans
+    pixel = depth / ti.min(view[FX], ti.abs(view[FY]))  # voxels that it spans
     weight = bundle_weight(model, sigma, 255.0 / ti.max(product(pixel, pixel), 1e-3))
     distance = (half_width(model, sigma) * QUANTA_PER_VOXEL + 128) >> 8
     return (ti.cast(distance * weight, ti.i64) << WEIGHT_BITS) + weight
@@ -267,15 +277,14 @@ def mark_clear(
             column, row = base.column + columns_by[i], base.row + rows_by[i]
             depth = base.depth + depths_by[i]
             inverse = 1.0 / ti.cast(ti.max(depth, 1), ti.f32)
-            u = ti.cast(ti.cast(column, ti.f32) * inverse, ti.i32)
-            v = ti.cast(ti.cast(row, ti.f32) * inverse, ti.i32)
-            is_seen = (column >= 0) & (row >= 0) & (u < reach.columns) & (v < reach.rows)
+            u, v = ti.cast(column, ti.f32) * inverse, ti.cast(row, ti.f32) * inverse
+            is_seen = (column >= 0) & (row >= 0) & (u < reach.wide) & (v < reach.high)
             is_seen &= depth >= reach.near
-            patches[i] = ti.select(is_seen, v * reach.columns + u, 0)
+            patches[i] = ti.select(is_seen, ti.cast(v, ti.i32) * reach.columns + ti.cast(u, ti.i32), 0)
             depths[i] = ti.select(is_seen, depth, NO_SAMPLE)
         word = ti.i64(0)
         for i in range(BITS):
-            word |= ti.cast(ti.select(depths[i] < clear[patches[i]], 1, 0), ti.i64) << i
+            word |= ti.cast(ti.select(depths[i] < clear[0, patches[i]], 1, 0), ti.i64) << i
         words[x] = word
         count += ti.math.popcnt(word)
     return count
@@ -284,9 +293,9 @@ def mark_clear(
 @QuickLaunch
 @ti.kernel
 def list_free_blocks(
-    clear: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    rows: ti.i32,
-    columns: ti.i32,
+    clear: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    height: ti.i32,  # pixels
+    width: ti.i32,
     levels: ti.types.ndarray(dtype=ti.i32, ndim=2),
     least: ti.types.ndarray(dtype=ti.i32, ndim=1),
     most: ti.types.ndarray(dtype=ti.i32, ndim=1),
@@ -316,7 +325,8 @@ def list_free_blocks(
                 whole(dot(depth, away) * scale),
             )  # fmt: skip
             near, far = ti.cast(NEAREST * scale, ti.i32), ti.cast(view[FAR] * scale, ti.i32)
-            reach = Reach(near, far, rows, columns)
+            high, wide = ti.cast(height, ti.f32) / PATCH, ti.cast(width, ti.f32) / PATCH
+            reach = Reach(near, far, clear.shape[0], clear.shape[1], high, wide)
             depths, patches = ti.Vector([0] * BITS), ti.Vector([0] * BITS)
             words = ti.Vector([0] * WORDS, dt=ti.i64)
             columns_by, rows_by = ti.Vector([0] * BITS), ti.Vector([0] * BITS)

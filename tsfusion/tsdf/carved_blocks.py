@@ -68,13 +68,13 @@ class CarvedBlocks:
         directions = matrix[:, :1] * orientation[:, 0] + matrix[:, 1:2] * orientation[:, 1]
         directions += matrix[:, 2:] * orientation[:, 2]
         view = np.concatenate([centre, directions.ravel(), rest])
-        if view[FAR] <= NEAREST or not self._clear.size or np.abs(centre).max() > _FARTHEST:
+        if view[FAR] <= NEAREST or np.abs(centre).max() > _FARTHEST:
             return
         space_carving.find_clear_depths(
             *read, view, model, self._levels, self._clear, self._least, self._most
         )
         far = float(self._most[-1]) / view[SCALE]
-        ends = centre[:, None] + far * (orientation @ corners)
+        ends = centre[:, None] + far * (orientation @ corners)  # a voxel's centre is no cube's border
         low = np.minimum(centre, ends.min(axis=1)) / SIDE
         high = np.maximum(centre, ends.max(axis=1)) / SIDE
         cubes = np.clip(np.floor(np.concatenate([low, high])), -_MOST_CUBES, _MOST_CUBES).astype(np.int32)
@@ -82,8 +82,8 @@ class CarvedBlocks:
         while True:
             self._counts[:] = 0
             space_carving.list_free_blocks(
-                self._clear.reshape(-1), *self._clear.shape, self._levels, self._least, self._most, view,
-                model, cubes, *self._room, self._counts,
+                self._clear, *self._shape, self._levels, self._least, self._most, view, model, cubes,
+                *self._room, self._counts,
             )  # fmt: skip
             count, room = int(self._counts[BLOCKS]), len(self._room[0])
             if count <= room or room > most:
@@ -104,15 +104,16 @@ class CarvedBlocks:
             return
         if not len(self._room[0]):
             self._room = _list_of(_FEW)
-        self._shape = height, width
-        rows, columns = height // PATCH, width // PATCH
-        self._clear = np.zeros((rows, columns), np.int32)
+        rows, columns = -(-height // PATCH), -(-width // PATCH)
+        clear = np.zeros((rows, columns), np.int32)
         levels = [(0, -(-rows // 2), -(-columns // 2))]
-        while max(levels[-1][1:]) > 1:
+        while levels[-1][1:] != (1, 1):
             begin, rows, columns = levels[-1]
             levels.append((begin + rows * columns, -(-rows // 2), -(-columns // 2)))
-        self._levels = np.array(levels, np.int32)
-        self._least, self._most = (np.zeros(levels[-1][0] + 1, np.int32) for _ in range(2))
+        least, most = (np.zeros(levels[-1][0] + 1, np.int32) for _ in range(2))
+        # all of them, or none where there is no memory
+        self._shape, self._clear, self._levels = (height, width), clear, np.array(levels, np.int32)
+        self._least, self._most = least, most
 
     @property
     def nbytes(self) -> int:
@@ -138,6 +139,8 @@ def _camera_of(keyframe: Keyframe, model: NDArray[np.float64]) -> tuple[NDArray[
     widest = max(math.hypot(*corner) for corner in corners)
     # the most units of a place in the image, of one that lies a voxel away
     most = _MOST_UNITS / math.sqrt(3) / max(math.hypot(*row) for row in matrix)
-    far = min(MAX_CARVED, model[MAX_RANGE] / model[VOXEL_SIZE], (most / _COARSEST - SIDE) / widest)
-    scale = min(2.0 ** math.floor(math.log2(most / (max(far, 0) * widest + SIDE))), FINEST)
+    far = min(MAX_CARVED / widest, model[MAX_RANGE] / model[VOXEL_SIZE], (most / _COARSEST - SIDE) / widest)
+    if not far > NEAREST:  # as wide an image is no camera's; also where numbers are too large
+        return matrix, corners.T, np.zeros(6)
+    scale = min(2.0 ** math.floor(math.log2(most / (far * widest + SIDE))), FINEST)
     return matrix, corners.T, np.array([far, scale, K.fx, K.fy, K.cx, K.cy])

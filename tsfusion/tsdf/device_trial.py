@@ -16,7 +16,7 @@ from tsfusion.tsdf.device_link import DeviceLink
 from tsfusion.tsdf.integrator import Integrator
 from tsfusion.tsdf.ray_buffers import RayBuffers
 
-_CONFIG = VolumeConfig(voxel_size=0.05, regularizer="off")
+_CONFIG = VolumeConfig(voxel_size=0.05, regularizer="off", space_carving=True)
 _LAYERS = ("sums", "color_rgn", "color_b")
 
 

@@ -84,6 +84,8 @@ class Integrator:
         before = self._admitted = self._store.count
         self._has_carved = False
         self._begin(sign)
+        if not self._buffers.samples:  # one without a usable sample changes nothing
+            self._buffers.carved.forget()
         added: list[Part] = []
         updates = 0
         try:
