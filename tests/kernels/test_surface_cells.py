@@ -26,9 +26,10 @@ def test_the_blocks_around_equal_the_twin(wanted: int) -> None:
     assert {tuple(b) for b in unpack_keys(found).tolist()} == expected
 
 
+@pytest.mark.parametrize("limits", [(0.0, surface_cells.NEVER), (-0.8, 1.3)], ids=["all", "carved"])
 @pytest.mark.parametrize("known", [1.0, 0.9])
 @pytest.mark.parametrize("wanted", [1, 3, len(PATCH)])
-def test_cells_and_edges_equal_the_twin(known: float, wanted: int) -> None:
+def test_cells_and_edges_equal_the_twin(known: float, wanted: int, limits: tuple[float, float]) -> None:
     random = np.random.default_rng(8)
     order = np.argsort(pack_keys(PATCH))
     keys, coordinates = pack_keys(PATCH)[order], PATCH[order]
@@ -45,7 +46,7 @@ def test_cells_and_edges_equal_the_twin(known: float, wanted: int) -> None:
     table = buffers.table(count)
     block_hash.insert_blocks(keys, 0, count, 0, *table)
     surface_cells.find_cells(
-        count, keys, wanted, keys[chosen], *table, rows, marching_tables.TRIANGLE_COUNT, *s.values()
+        count, keys, wanted, keys[chosen], *table, rows, *limits, marching_tables.TRIANGLE_COUNT, *s.values()
     )  # fmt: skip
 
     voxels = (coordinates[:, None] * 8 + np.array([*np.ndindex(8, 8, 8)])).reshape(-1, 3)
@@ -53,7 +54,7 @@ def test_cells_and_edges_equal_the_twin(known: float, wanted: int) -> None:
         tuple(v): x for v, x in zip(voxels.tolist(), rows.ravel().tolist(), strict=True) if x == x
     }
     meshed = {tuple(b) for b in coordinates[chosen].tolist()}
-    active, edges, triangles = kernel_twins.crossed_cells(known_values, meshed)
+    active, edges, triangles = kernel_twins.crossed_cells(known_values, meshed, *limits)
     for r, corner in enumerate(coordinates.tolist()):
         first, end = s["first"][r], s["first"][r + 1]
         here = {v for v in active if [c >> 3 for c in v] == corner}

@@ -232,16 +232,20 @@ def marching_cubes(values: dict[Voxel, float]) -> list[tuple[tuple[float, float,
 
 
 def crossed_cells(
-    values: dict[Voxel, float], meshed: set[Voxel]
+    values: dict[Voxel, float], meshed: set[Voxel], behind: float, clear: float
 ) -> tuple[set[Voxel], set[tuple[Voxel, int]], dict[Voxel, int]]:
     """Cells of the `meshed` blocks that the surface crosses, the edges (voxel, axis) that carry their
-    vertices, and how many triangles each has: twin of `kernels.surface_cells.find_cells`."""
+    vertices, and how many triangles each has: twin of `kernels.surface_cells.find_cells`. Where a corner is
+    `clear` and another far `behind`, there are none."""
     edges, triangles = set(), {}
     for cell in values:
         corners = [tuple(int(x) for x in np.add(cell, c)) for c in marching_tables.CORNERS]
         if tuple(c >> 3 for c in cell) not in meshed or not all(c in values for c in corners):
             continue
-        case = sum(1 << i for i, c in enumerate(corners) if values[c] < 0)  # type: ignore[index]
+        found = [values[c] for c in corners]  # type: ignore[index]
+        if min(found) < behind and max(found) > clear:
+            continue
+        case = sum(1 << i for i, value in enumerate(found) if value < 0)
         if 0 < case < 255:
             triangles[cell] = int(marching_tables.TRIANGLE_COUNT[case])
             for e, (a, b) in enumerate(marching_tables.EDGES):

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from tsfusion import Intrinsics, Keyframe, Volume
 from tsfusion.datasets import Synthetic
+from tsfusion.tsdf import mesh_extraction
 from tsfusion.tsdf.block_store import unpack_keys
 
 WALL = plane_keyframe(np.eye(4), np.array([0.0, 0.0, 1.0]), 2.0)
@@ -65,6 +66,45 @@ def test_carving_removes_who_has_left_and_keeps_the_wall() -> None:
     wall = mesh_depths([WALL] * 20, regularizer="off")
     assert (carved > 1.9).sum() >= 0.98 * len(wall)
     assert np.abs(carved - 2).mean() <= np.abs(wall - 2).mean() + 0.001
+
+
+def board_view(eye: NDArray[np.float64], target: NDArray[np.float64]) -> Keyframe:
+    """A board of 60 cm at z = 1.2 before the wall."""
+    T = look_at(eye, target)
+    wall, board = (plane_keyframe(T, np.array([0.0, 0.0, 1.0]), z).measurement for z in (2.0, 1.2))
+    p = directions(T) * board[..., None] + eye
+    hits = (np.abs(p[..., :2]) < 0.3).all(axis=-1) & (board > 0)
+    keyframe = plane_keyframe(T, np.array([0.0, 0.0, 1.0]), 2.0)
+    return replace(keyframe, depth=np.where(hits, board, wall).astype(np.float32))
+
+
+@pytest.mark.parametrize("surface", ["raw", "field"])
+def test_what_is_seen_behind_a_thing_is_not_its_back(monkeypatch: pytest.MonkeyPatch, surface: str) -> None:
+    """A board, seen from its front and by somebody who looks past its edge: the band behind it ends beside
+    free space there, and nobody has measured a surface."""
+    views = [
+        board_view(np.array(eye), np.array(target))
+        for eye, target in (
+            ((0.0, 0, 0), (0.0, 0, 1)),
+            ((1.3, 0, 0.7), (0.0, 0, 1.7)),
+            ((-1.3, 0, 0.7), (0.0, 0, 1.7)),
+        )
+    ]
+    volume = volume_of(views, voxel_size=0.02, color=False, space_carving=True)
+
+    def faces() -> tuple[int, int]:
+        """Triangles behind the board, and all others."""
+        mesh = volume.extract_mesh(surface=surface)
+        z = mesh.vertices[mesh.faces][..., 2].mean(axis=1)
+        behind = (z > 1.215) & (z < 1.9)
+        return int(behind.sum()), int((~behind).sum())
+
+    behind, others = faces()
+    monkeypatch.setattr(mesh_extraction, "_CLEAR", 1e9)
+    ghosts, all_others = faces()
+    assert ghosts > 300
+    assert behind < 0.8 * ghosts
+    assert others > 0.99 * all_others
 
 
 def test_carving_is_a_sum_like_everything_else() -> None:

@@ -3,8 +3,9 @@
 
 A block's voxels are eight planes of bits, one an x; bit 8·y + z of a plane is voxel (x, y, z). Whether
 cells are crossed is then a matter of shifting and combining planes of the block and of its neighbours.
-A cell takes part when its eight corners are seen; an edge carries a vertex when its ends differ in sign
-and a cell that takes part has it: as that cell then has both signs, `active` cells say all.
+A cell takes part when its eight corners are seen, and a surface was measured there (`is_between`); an edge
+carries a vertex when its ends differ in sign and a cell that takes part has it: as that cell then has both
+signs, `active` cells say all.
 
 Blocks are rows of arrays. Row `count` stands for every block that is not there: nothing is seen in it.
 """
@@ -20,6 +21,7 @@ from tsfusion.kernels.voxel_values import BANDS
 AROUND = 27
 HERE = 13  # of the 27 blocks around: (x + 1)·9 + (y + 1)·3 + z + 1
 PLANES = 24  # of edges: 3·x + axis
+NEVER = 1e9  # quanta
 Z0 = 0x0101010101010101  # the voxels of a plane with z = 0, and all but those with z = 7
 Z06 = 0x7F7F7F7F7F7F7F7F
 
@@ -163,6 +165,22 @@ def find_around(
 
 
 @ti.func
+def is_between(r, x, j, around: ti.template(), values: ti.template(), behind, clear):
+    """Whether cell j of a plane lies between a voxel that is `clear` and one far `behind` a surface (quanta).
+
+    Sensors looked through the one, and it is known what hides the other: no surface was measured in between,
+    or its voxels would be near it.
+    """
+    least, most = 0.0, 0.0
+    for c in range(8):
+        at_x, at_y, at_z = x + (c & 1), (j >> 3) + (c >> 1 & 1), (j & 7) + (c >> 2)
+        row = around[r, HERE + 9 * (at_x >> 3) + 3 * (at_y >> 3) + (at_z >> 3)]
+        value = values[row, ((at_x & 7) << 6) | ((at_y & 7) << 3) | (at_z & 7)]
+        least, most = ti.min(least, value), ti.max(most, value)
+    return ti.cast(least < behind, ti.i32) & ti.cast(most > clear, ti.i32)
+
+
+@ti.func
 def find_active(
     r,
     around: ti.template(),
@@ -170,6 +188,9 @@ def find_active(
     inside: ti.template(),
     active: ti.template(),
     triangle_count: ti.template(),
+    values: ti.template(),
+    behind,
+    clear,
 ):
     """Fill a row's `active`; returns how many triangles it has."""
     total = 0
@@ -186,10 +207,15 @@ def find_active(
             some |= low[c] | high[c]
             every &= low[c] & high[c]
         crossed = whole & some & ~every
-        active[r, x] = crossed
+        kept = crossed
         while crossed != 0:
-            total += triangle_count[case_of(low, high, lowest(crossed))]
+            j = lowest(crossed)
+            if clear < NEVER and is_between(r, x, j, around, values, behind, clear) == 1:
+                kept &= ~(ti.u64(1) << ti.cast(j, ti.u64))
+            else:
+                total += triangle_count[case_of(low, high, j)]
             crossed &= crossed - ti.u64(1)
+        active[r, x] = kept
         seen_low = seen_high
         low = high
     return total
@@ -271,6 +297,8 @@ def find_cells(
     table: ti.types.ndarray(dtype=ti.i64, ndim=1),  # the keys' hash
     table_rows: ti.types.ndarray(dtype=ti.i32, ndim=1),
     values: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    behind: ti.f32,  # quanta, as `is_between`
+    clear: ti.f32,  # `NEVER`, where maps are not carved
     triangle_count: ti.types.ndarray(dtype=ti.i32, ndim=1),
     around: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (row, 27): rows of the blocks around
     seen: ti.types.ndarray(dtype=ti.u64, ndim=2),  # (row, 8): planes
@@ -304,7 +332,9 @@ def find_cells(
             for r in range(count * band // BANDS, count * (band + 1) // BANDS):
                 state[r, 2] = 0
                 if state[r, 0] == 1 and signs_around(state, around, r) == 3:
-                    state[r, 2] = find_active(r, around, seen, inside, active, triangle_count)
+                    state[r, 2] = find_active(
+                        r, around, seen, inside, active, triangle_count, values, behind, clear
+                    )  # fmt: skip
                 else:
                     clear_planes(active, r)
     for run in range(runs(BANDS)):  # run loop: kernels/run_loop.py

@@ -51,10 +51,12 @@ class BlockStore:
         voxel_size: float,
         color: bool,
         corrected: bool,
+        carved_band: float = 0.0,
         cache: CacheConfig | None = None,
         device: "DeviceBlocks | None" = None,
     ) -> None:
         self.voxel_size = voxel_size
+        self.carved_band = carved_band  # the least half-width of a band, voxels; 0 = nothing is carved
         self.color, self.corrected = color, corrected
         self.count = 0
         self.drops = 0  # how often blocks have gone, or moved to other slots

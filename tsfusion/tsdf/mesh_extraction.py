@@ -8,13 +8,14 @@ from numpy.typing import NDArray
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.kernels import marching_cubes, marching_tables, surface_cells
 from tsfusion.kernels.block_hash import insert_blocks
-from tsfusion.kernels.integrate import CUBE
+from tsfusion.kernels.integrate import CUBE, QUANTA_PER_VOXEL
 from tsfusion.kernels.voxel_values import BANDS
 from tsfusion.tsdf.block_store import BlockStore
 from tsfusion.tsdf.field_regularizer import around
 from tsfusion.tsdf.growing_array import GrowingArray
 from tsfusion.tsdf.surface_values import SurfaceView, values_of
 
+_BEHIND, _CLEAR = 2 / 3, 0.97  # of a band's half-width
 KEPT_BLOCKS = 1 << 14  # working memory for so many is kept for the next mesh: 45 MB
 
 
@@ -74,6 +75,15 @@ class MeshBuffers:
         )  # fmt: skip
 
 
+def _limits(store: BlockStore) -> tuple[float, float]:
+    """From where on voxels are far behind a surface, and clear: quanta. A voxel that all looked through has
+    the half-width of a band, the least of them or more."""
+    if not store.carved_band:
+        return 0.0, surface_cells.NEVER
+    band = store.carved_band * QUANTA_PER_VOXEL
+    return -_BEHIND * band, _CLEAR * band
+
+
 def extract(
     wanted: NDArray[np.int64],
     store: BlockStore,
@@ -125,8 +135,9 @@ def extract_rows(
     around, inside, active = buffers.around.array, buffers.inside.array, buffers.active.array
     edges, starts, first = buffers.edges.array, buffers.starts.array, buffers.first.array
     surface_cells.find_cells(
-        count, keys, len(wanted), wanted, table, table_rows, values, marching_tables.TRIANGLE_COUNT,
-        around, buffers.seen.array, inside, active, edges, starts, buffers.state.array, first,
+        count, keys, len(wanted), wanted, table, table_rows, values, *_limits(store),
+        marching_tables.TRIANGLE_COUNT, around, buffers.seen.array, inside, active, edges, starts,
+        buffers.state.array, first,
     )  # fmt: skip
     store.pause()
     vertices, triangles = first[count]

@@ -121,6 +121,7 @@ class Volume(AskableMap):
             voxel_size=config.voxel_size,
             color=config.color,
             corrected=smooths,
+            carved_band=config.model().min_support if config.space_carving else 0.0,
             cache=None if memory_bytes is None else checked_cache(memory_bytes, cache),
             device=device,
         )
