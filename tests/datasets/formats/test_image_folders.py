@@ -295,7 +295,14 @@ def test_a_folder_without_a_trajectory_names_the_one_of_another_layout(tmp_path)
 
 @pytest.mark.parametrize(
     ("depth", "color"),
-    [("depth_{}", "color_{}"), ("{}-depth", "{}-rgb"), ("frame{}_Depth", "frame{}_image")],
+    [
+        ("depth_{}", "color_{}"),
+        ("{}-depth", "{}-rgb"),
+        ("frame{}_Depth", "frame{}_image"),
+        ("depth16_{}", "color_{}"),
+        ("depth_raw_{}", "rgb_{}"),
+        ("depth{}", "color{}"),
+    ],
 )
 def test_depth_and_colour_in_one_folder(tmp_path, depth, color):
     root = redwood_room(tmp_path, "image", "trajectory.log")

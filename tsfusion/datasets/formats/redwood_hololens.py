@@ -47,7 +47,8 @@ _IMAGES = {*SUFFIXES, *COLOR_SUFFIXES}
 _LOGS = ("trajectory.log", "scene/trajectory.log", "odometry.log")  # by preference
 _LOG_NAMES = ("*traj*.log", "*-traj.txt")
 _COLOR = ("image", "color", "colour", "rgb")
-_DEPTH = re.compile("depth", re.IGNORECASE)  # in the name of an image that has its colour beside it
+# In the name of an image that has its colour beside it: depth_3, depth16_3, depth_raw_3
+_DEPTH = re.compile("depth(?:16(?=[_-])|[_-]?raw)?", re.IGNORECASE)
 _FEWEST = 2  # images of a series
 
 logger = logging.getLogger(__name__)
@@ -219,7 +220,7 @@ def _times(files: list[Path]) -> NDArray[np.int64] | None:
 
 def _names(files: list[Path]) -> list[str]:
     """Names of images; of those that have their colour beside them the only number in each."""
-    numbers = [numbers_in(file.stem) for file in files if _DEPTH.search(file.stem)]
+    numbers = [numbers_in(_DEPTH.sub("", file.stem)) for file in files if _DEPTH.search(file.stem)]
     is_numbered = len(numbers) == len(files) and all(len(one) == 1 for one in numbers)
     return [one[0] for one in numbers] if is_numbered else [file.stem for file in files]
 
