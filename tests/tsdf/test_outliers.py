@@ -2,6 +2,7 @@
 """Lone pixels and things that have moved on should not be in the map; thin things should."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -212,3 +213,17 @@ def test_what_is_very_far_away_carves_what_is_next_to_the_camera() -> None:
     along = 8 * np.unique(volume.blocks().coordinates[:, 2])
     free = along[along < 2900]
     assert 1900 < free.max() < 2048
+
+
+@pytest.mark.parametrize(
+    ("settings", "band"),
+    [
+        ({"sensor": "kinect"}, 3.0), ({"sensor": "kinect", "space_carving": False}, 0.0),
+        ({"sensor": "kinect", "voxel_size": 0.005}, 0.0),  # where noise is wider than the band
+        ({"sensor": "stereo", "voxel_size": 0.15}, 0.0), ({"sensor": "lidar", "voxel_size": 0.1}, 0.0),
+        ({"sensor": "kinect", "min_support": 4.0}, 4.0),
+    ],
+)  # fmt: skip
+def test_backs_are_left_out_where_bands_are_narrow(settings: dict[str, Any], band: float) -> None:
+    volume = Volume(**{"voxel_size": 0.02, "space_carving": True, **settings})
+    assert volume._store.carved_band == band

@@ -56,7 +56,7 @@ class BlockStore:
         device: "DeviceBlocks | None" = None,
     ) -> None:
         self.voxel_size = voxel_size
-        self.carved_band = carved_band  # the least half-width of a band, voxels; 0 = nothing is carved
+        self.carved_band = carved_band  # half-width of bands that end in carved space, voxels; 0 = it varies
         self.color, self.corrected = color, corrected
         self.count = 0
         self.drops = 0  # how often blocks have gone, or moved to other slots
