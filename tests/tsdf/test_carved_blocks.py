@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What an image carves is added with its rays, or not at all."""
+"""Free space that an image carves is added with the image's rays, or not at all."""
 
 from dataclasses import replace
 from typing import Any
@@ -54,7 +54,7 @@ def test_what_an_image_carves_is_taken_away_with_it() -> None:
 
 
 def test_a_keyframe_that_the_map_does_not_hold_is_not_taken_away() -> None:
-    """Its rays end in blocks of the map; what it would carve is not there, or was never voted for."""
+    """The keyframe's rays end in blocks of the map, but its free space is not there, or has no votes."""
     volume = map_of(*VIEWS, space_carving=False)
     band = state_of(volume)
     volume.config = replace_carving(volume)
@@ -141,7 +141,7 @@ def test_points_carve_along_their_rays() -> None:
 
 
 def test_a_keyframe_without_a_usable_sample_changes_nothing() -> None:
-    """Its few pixels stand alone; or what it sees lies beyond the edge of the world, not the way there."""
+    """Few pixels stand alone; or all surfaces lie beyond the edge of the world, but not the way there."""
     depth = np.zeros(WALL.measurement.shape, np.float32)
     depth[1::5, 1::5] = 4.0
     depth[2::5, 2::5] = 8.0

@@ -254,8 +254,8 @@ def block_in_cube(n):
 
 @ti.func
 def free_vote(model: ti.template(), view: ti.template(), depth):
-    """What is added to a clear voxel at such a depth (voxels): the votes of a ray through the pixels that it
-    covers, and a band's half-width as the distance."""
+    """Addition to a clear voxel at such a depth (voxels): the votes of a ray through the pixels that it
+    covers, with a band's half-width as their distance."""
     sigma = noise_sigma(model, depth * model[VOXEL_SIZE])
     pixel = depth / ti.min(view[FX], ti.abs(view[FY]))  # voxels that it spans
     weight = bundle_weight(model, sigma, 255.0 / ti.max(product(pixel, pixel), 1e-3))

@@ -5,6 +5,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from tsfusion.core.config import VolumeConfig
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.kernels import marching_cubes, marching_tables, surface_cells
 from tsfusion.kernels.block_hash import insert_blocks
@@ -73,6 +74,20 @@ class MeshBuffers:
         return self.padded.nbytes + self._table.nbytes + self._table_rows.nbytes + sum(
             array.array.nbytes for array in self._arrays()
         )  # fmt: skip
+
+
+def carved_band(config: VolumeConfig) -> float:
+    """Half-width of a carved map's bands, voxels; 0 where it varies, or nothing is carved.
+
+    Seen at a grazing angle, a street far ahead has voxels with quite different distances side by side: where
+    noise widens the bands, as of stereo pairs, and where no planes are known, as of points, whose noise does
+    not grow with their distance.
+    """
+    model = config.model()
+    away = model.max_range / 2 - model.sigma_z0
+    noise = 3 * (model.sigma_floor + model.sigma_slope * away**2) / config.voxel_size
+    is_narrow = model.sigma_slope > 0 and noise <= model.min_support
+    return model.min_support if config.space_carving and is_narrow else 0.0
 
 
 def _limits(store: BlockStore) -> tuple[float, float]:

@@ -27,7 +27,7 @@ from tsfusion.geometry.up_direction import HeldSensor
 from tsfusion.kernels import runtime
 from tsfusion.kernels.integrate import CUBE
 from tsfusion.kernels.voxel_traversal import COUNT
-from tsfusion.tsdf import checkpoint, map_addition, map_crop, map_history, saved_map
+from tsfusion.tsdf import checkpoint, map_addition, map_crop, map_history, mesh_extraction, saved_map
 from tsfusion.tsdf.askable_map import AskableMap
 from tsfusion.tsdf.block_store import MESHED, BlockStore, unpack_keys
 from tsfusion.tsdf.device_blocks import DeviceBlocks, device_for
@@ -121,7 +121,7 @@ class Volume(AskableMap):
             voxel_size=config.voxel_size,
             color=config.color,
             corrected=smooths,
-            carved_band=_carved_band(config),
+            carved_band=mesh_extraction.carved_band(config),
             cache=None if memory_bytes is None else checked_cache(memory_bytes, cache),
             device=device,
         )
@@ -471,20 +471,6 @@ class Volume(AskableMap):
         sensor = keyframe.sensor or self.config.sensor
         if keyframe.points is None or sensor == "lidar":  # of other points nobody knows the sensor's axes
             self.held.add(keyframe.T_world_camera, sensor, times=sign)
-
-
-def _carved_band(config: VolumeConfig) -> float:
-    """Half-width of a carved map's bands, voxels; 0 where it varies, or nothing is carved.
-
-    Seen at a grazing angle, a street far ahead has voxels with quite different distances side by side: where
-    noise widens the bands, as of stereo pairs, and where no planes are known, as of points, whose noise does
-    not grow with their distance.
-    """
-    model = config.model()
-    away = model.max_range / 2 - model.sigma_z0
-    noise = 3 * (model.sigma_floor + model.sigma_slope * away**2) / config.voxel_size
-    is_narrow = model.sigma_slope > 0 and noise <= model.min_support
-    return model.min_support if config.space_carving and is_narrow else 0.0
 
 
 def _writers(
