@@ -46,13 +46,14 @@ def test_info_says_what_a_map_holds(here: Here, state: Path) -> None:
     assert [(one["client"], one["world"], one["listed"]) for one in found["sessions"]] == [
         ("anna", "", 3), ("", "b" * 32, 2),
     ]  # fmt: skip
-    assert (found["keyframes_after"], found["corrections_after"]) == (0, 0)
+    assert (found["keyframes_after"], found["corrections_after"], found["keyframes_lost"]) == (0, 0, 0)
     assert found["settings"]["voxel_size"] == 0.04
     vertices = volume.extract_mesh().vertices
     assert (vertices >= found["box"][:3]).all()
     assert (vertices <= found["box"][3:]).all()
     alone = json.loads(here("map", "info", file_of(state, "yard"), "--json").stdout)
-    assert {**found, "keyframes_after": None, "corrections_after": None} == alone
+    behind = dict.fromkeys(("keyframes_after", "corrections_after", "keyframes_lost"))
+    assert {**found, **behind} == alone
     text = here("map", "info", state_folder.map_folder(state, "yard")).stdout
     assert "voxel_size 0.04, threads 1" in text
     assert "anna" in text
@@ -81,15 +82,17 @@ def test_what_damage_has_cost_is_the_last_line_and_status_1(here: Here, tmp_path
     left = volume_of((decoded(wall(i)) for i in range(3)), voxel_size=0.04).map_hash()
     other = make_map(tmp_path / "other" / "maps" / "default", range(10, 12), session=BOB)
     state, sum_, crop = tmp_path / "state", tmp_path / "sum.tsf", tmp_path / "crop.tsf"
-    hashed, merged, cropped, asked = (
-        here("map", "hash", state), here("map", "merge", state, other, "--out", sum_, "--same-frame"),
+    info, hashed, merged, cropped, asked = (
+        here("map", "info", state, "--json"), here("map", "hash", state),
+        here("map", "merge", state, other, "--out", sum_, "--same-frame"),
         here("map", "crop", state, "--box", -1, -1, -1, 1, 1, 3, "--out", crop),
         here("ask", state, "--at", 0, 0, 1),
     )  # fmt: skip
-    for done in (hashed, merged, cropped, asked):
+    for done in (info, hashed, merged, cropped, asked):
         assert done.returncode == 1
         assert "the map lacks 1 keyframe or more" in done.stderr.splitlines()[-1]
     assert hashed.stdout == left + "\n"
+    assert json.loads(info.stdout)["keyframes_lost"] == 1
     assert (Volume.load(sum_).keyframes, Volume.load(crop).keyframes) == (5, 3)
     refused = here("map", "crop", state, "--box", 1, 1, 1, 0, 0, 0, "--out", crop)
     assert "damage" not in refused.stderr.splitlines()[-1], "what failed comes first"

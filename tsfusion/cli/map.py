@@ -40,7 +40,8 @@ def info(path: Where, map_: Map = None, json: options.Json = False) -> None:
     """Describe a saved map: size, hash, extent, whose keyframes it holds, and its settings.
 
     Each byte of the file is checked. Of a state folder this is the last
-    checkpoint; what the journal has beyond it is counted.
+    checkpoint; what the journal has beyond it is counted, and what damage in
+    the journal has cost the map.
     """
     from tsfusion.cli import output, progress
     from tsfusion.pipelines import saved_maps
@@ -51,6 +52,7 @@ def info(path: Where, map_: Map = None, json: options.Json = False) -> None:
         output.as_json(found)
     else:
         typer.echo(map_view.summary(found))
+    opened_maps.note_lost(found.keyframes_lost or 0)
 
 
 @verbs.verb(app, "tsfusion map hash out/latest/map.tsf", "tsfusion map hash my-maps --map yard", name="hash")

@@ -48,12 +48,17 @@ def opened(path: Path, map_name: str | None = None, *, quiet: bool) -> Iterator[
 
         read = partial(display.show_bytes, JOURNAL)
         with saved_maps.opened(saved_maps.find(path, map_name), watch, read) as (file, left_out):
-            _lost.append(left_out.pop(LOST, 0))
+            note_lost(left_out.pop(LOST, 0))
             for reason, count in left_out.items():
                 typer.echo(f"left out {count_of(count, 'keyframe')}: {reason}", err=True)
             if size_of(file) > _LARGE_BYTES:
                 display.stage(f"reading {path}")
             yield file
+
+
+def note_lost(keyframes: int) -> None:
+    """Note how many keyframes damage has cost a map that this command reads."""
+    _lost.append(keyframes)
 
 
 def begin() -> None:

@@ -53,6 +53,7 @@ class MapSummary(Struct, frozen=True):
         corrections_waiting: keyframes whose newest pose is not fused yet.
         keyframes_after: in the journal behind this checkpoint, and `corrections_after` likewise; None =
             there is no journal.
+        keyframes_lost: to damage in the journal, at least; None likewise.
     """
 
     path: str
@@ -69,6 +70,7 @@ class MapSummary(Struct, frozen=True):
     corrections_waiting: int
     keyframes_after: int | None
     corrections_after: int | None
+    keyframes_lost: int | None
     settings: dict[str, Any]
     meta: dict[str, Any]
 
@@ -181,8 +183,7 @@ def opened(
         with checkpoint.reading(saved.path) as (header, _):
             histories, config = map_history.sessions(header.meta), header.config
             tail = settled_maps.records_after(saved.folder, histories, reading)
-            # what the map had before the damage it still has
-            lost = max(0, tail.lost - missing(header, tail.keyframes)) + tail.lost_behind
+            lost = _lost(header, tail)
         damage = {LOST: lost} if lost else {}
         if tail.records or any(one.waiting for one in histories):
             with settled_maps.settled(saved.folder, tail.records, config, watch) as (path, left_out):
@@ -191,6 +192,11 @@ def opened(
         yield saved.path, damage
         return
     yield saved.path, {}
+
+
+def _lost(header: checkpoint.CheckpointHeader, tail: settled_maps.Tail) -> int:
+    """Keyframes that damage in its journal has cost a map, at least: what it had before that it still has."""
+    return max(0, tail.lost - missing(header, tail.keyframes)) + tail.lost_behind
 
 
 def summarise(saved: SavedMap, reading: state_folder.Watcher = lambda _done, _all: None) -> MapSummary:
@@ -208,10 +214,10 @@ def summarise(saved: SavedMap, reading: state_folder.Watcher = lambda _done, _al
             chunk.fill(keys[chunk.first : chunk.first + chunk.blocks])
     voxel_bytes = sum(np.dtype(checkpoint.LAYER_DTYPES[name]).itemsize for name in header.layers)
     histories = map_history.sessions(header.meta)
-    after = None
+    after = lost = None
     if saved.folder is not None:
         tail = settled_maps.records_after(saved.folder, histories, reading)
-        after = Counter(one.is_correction for one in tail.records)
+        after, lost = Counter(one.is_correction for one in tail.records), _lost(header, tail)
     return MapSummary(
         path=str(saved.path),
         nbytes=size_of(saved.path),
@@ -230,6 +236,7 @@ def summarise(saved: SavedMap, reading: state_folder.Watcher = lambda _done, _al
         corrections_waiting=sum(one.waiting for one in histories),
         keyframes_after=None if after is None else after[False],
         corrections_after=None if after is None else after[True],
+        keyframes_lost=lost,
         settings=msgspec.to_builtins(header.config),
         meta={name: value for name, value in header.meta.items() if name not in _SERVERS},
     )
