@@ -56,9 +56,19 @@ def _raw(path: Path, fields: int) -> tuple[NDArray[Any], int]:
     if (nbytes := path.stat().st_size) % (4 * fields):
         raise DatasetError(f"{path} has {nbytes} bytes, not {4 * fields} a point; {expected}")
     points = np.fromfile(path, "<f4").reshape(-1, fields)
-    if fields == USUAL_FIELDS and (points[:, 3] < 0).any():
-        raise DatasetError(f"{path} has intensities below 0; {expected}")
+    if fields == USUAL_FIELDS:
+        check_intensities(points, path, expected)
     return points[:, :3], len(points)
+
+
+def check_intensities(points: NDArray[np.float32], path: Path, expected: str) -> None:
+    """Refuse (n, 4) numbers of a file whose points are of three or five numbers.
+
+    Raises:
+        DatasetError: an intensity is below 0.
+    """
+    if (points[:, 3] < 0).any():
+        raise DatasetError(f"{path} has intensities below 0; {expected}")
 
 
 # Each reads the points, and how many the file's header names.

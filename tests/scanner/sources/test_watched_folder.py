@@ -282,7 +282,7 @@ def settle(path: Path) -> None:
 
 def test_scans(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(watched_folder, "_SETTLED_S", 60.0)  # a loaded machine is not to reach it
-    points = np.random.default_rng(0).normal(size=(100, 4)).astype(np.float32)
+    points = np.abs(np.random.default_rng(0).normal(size=(100, 4))).astype(np.float32)
     write(tmp_path, "velodyne/000000.bin", points.tobytes())
     settle(tmp_path / "velodyne" / "000000.bin")
     with WatchedFolder(tmp_path, poll=0.01, deadline=60.0) as source:
@@ -305,6 +305,20 @@ def test_scans(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         assert list(frames) == []
     assert source.skipped == {"damaged": 1}
     assert source.sensor == "lidar"
+
+
+def test_points_of_three_numbers_are_refused(tmp_path: Path) -> None:
+    good = np.abs(np.random.default_rng(0).normal(size=(100, 4))).astype(np.float32)
+    write(tmp_path, "000000.bin", (-good).tobytes())
+    settle(tmp_path / "000000.bin")
+    with WatchedFolder(tmp_path, poll=0.01) as source, pytest.raises(SourceError, match="below 0"):
+        list(source)
+    write(tmp_path, "000000.bin", good.tobytes())
+    write(tmp_path, "000001.bin", (-good).tobytes())
+    write(tmp_path, "000002.bin", good.tobytes())
+    (tmp_path / "DONE").touch()
+    source, frames = whole(tmp_path)
+    assert (len(frames), source.skipped) == (2, {"malformed": 1})
 
 
 def test_a_lens_that_distorts(tmp_path: Path) -> None:

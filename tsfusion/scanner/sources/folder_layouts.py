@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.readers import decode_image, read_numbers
+from tsfusion.datasets.scan_files import check_intensities
 
 LayoutKind = Literal["depth", "pair", "points"]
 
@@ -85,11 +86,17 @@ def whole_image(path: Path, flags: int) -> NDArray[Any] | None:
 
 
 def whole_scan(path: Path) -> NDArray[np.float32] | None:
-    """Read (n, 3) float32 points from x, y, z, intensity; None if the file ends within a point."""
+    """Read (n, 3) float32 points from x, y, z, intensity; None if the file ends within a point.
+
+    Raises:
+        DatasetError: these are no points of four numbers.
+    """
     raw = path.read_bytes()
     if not raw or len(raw) % _POINT:
         return None
-    return np.frombuffer(raw, np.float32).reshape(-1, 4)[:, :3]
+    points = np.frombuffer(raw, np.float32).reshape(-1, 4)
+    check_intensities(points, path, "expected float32 x, y, z and the intensity of each point")
+    return points[:, :3]
 
 
 def depth_of(image: NDArray[Any]) -> NDArray[Any]:

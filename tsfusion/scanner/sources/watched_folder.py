@@ -202,6 +202,10 @@ class WatchedFolder(LiveSource):
                 images += [] if second is None else [_image(second, "pair")]
         except OSError:  # deleted meanwhile
             images = [None]
+        except DatasetError as error:
+            if not self._last:  # so it is with all of them
+                raise SourceError(str(error)) from error
+            return self._malformed(first, error)
         if any(image is None for image in images):
             return self._skip("damaged") if final else _WAIT
         if kind != "points" and self._camera is None and not self._find_camera(kind, images[0], final=final):
@@ -212,9 +216,13 @@ class WatchedFolder(LiveSource):
         except OSError:  # deleted meanwhile
             return self._skip("damaged")
         except (InvalidKeyframe, InvalidConfig, cv2.error) as error:
-            if "malformed" not in self.skipped:
-                log.warning("%s: %s is left out: %s", self.name, first.name, error)
-            return self._skip("malformed")
+            return self._malformed(first, error)
+
+    def _malformed(self, first: Path, error: Exception) -> Any:
+        """Leave a frame out; of the first one the log says why."""
+        if "malformed" not in self.skipped:
+            log.warning("%s: %s is left out: %s", self.name, first.name, error)
+        return self._skip("malformed")
 
     def _frame(self, kind: str, images: list[Any], timestamp_ns: int, captured_ns: int) -> Frame:
         if kind == "pair":
