@@ -35,6 +35,8 @@ NOBODY = "tcp://127.0.0.1:9"  # the discard port: nobody listens there, and nobo
 _COMMANDS = """
 # paths
 replay missing | missing does not exist | expected a dataset
+replay "" | an argument is empty | is a variable of the shell not set? | 2
+map info small.tsf --map= | --map is empty | is a variable of the shell not set? | 2
 replay empty | empty is in no layout known | `tsfusion datasets` says what each expects
 replay file | file is not a folder | a file that stands for a dataset
 replay photo.png | photo.png is not a folder | a file that stands for a dataset

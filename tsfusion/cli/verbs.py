@@ -59,6 +59,7 @@ class Verb(_ShortHelp, TyperCommand):
         return params
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        _refuse_empty(ctx, args)
         words = [new for old in args for new in _renamed(old)]
         for flag, (place, usual) in _PLACES.items():
             if any(param.opts == [flag] and param.nargs == 1 for param in self.params):
@@ -110,6 +111,15 @@ HelpAll = Annotated[
     bool | None,
     typer.Option("--help-all", is_eager=True, callback=_show_all, help="Show the rare flags, too, and exit."),
 ]
+
+
+def _refuse_empty(context: Any, words: list[str]) -> None:
+    """Refuse a word without content, which as a path would be the current folder."""
+    for word in words:
+        flag, equals, value = word.partition("=")
+        if not word or (flag.startswith("--") and equals and not value):
+            where = f"{flag} is" if word else "an argument is"
+            raise typer.BadParameter(f'{where} empty (""): is a variable of the shell not set?', ctx=context)
 
 
 def _with_places(words: list[str], flag: str, place: re.Pattern[str], usual: str) -> list[str]:
