@@ -299,9 +299,9 @@ def test_poses_added_to_a_map_are_said_to_be_in_its_frame(
     assert "the map default has 6 keyframes already, and these are added to them" in caplog.text
 
 
-def slow_replay(out: Path) -> "subprocess.Popen[str]":
+def slow_replay(out: Path, *flags: object) -> "subprocess.Popen[str]":
     """A replay that takes 80 s if nobody ends it."""
-    return started("replay", "synthetic:room", "--rate", 0.5, "--voxel-size", VOXEL, "--out", out)
+    return started("replay", "synthetic:room", "--rate", 0.5, "--voxel-size", VOXEL, "--out", out, *flags)
 
 
 def _umask() -> int:
@@ -331,6 +331,16 @@ def test_interrupted_replay_leaves_nothing(number: signal.Signals, word: str, tm
     assert number == signal.SIGHUP or printed.strip().splitlines()[-1] == f"tsfusion: {word}"
     assert eventually(lambda: not any(map(alive, below)))
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+def test_an_interrupted_replay_says_what_stays_in_a_kept_map(tmp_path: Path) -> None:
+    process = slow_replay(tmp_path / "out", "--state", tmp_path / "state")
+    read_until(process, "fused 1 of")
+    process.send_signal(signal.SIGINT)
+    printed = process.communicate(timeout=60)[0].strip().splitlines()
+    assert (process.returncode, printed[-1]) == (130, "tsfusion: interrupted")
+    assert "of this recording, or more, are in the map default and stay there" in printed[-2]
 
 
 @pytest.mark.slow

@@ -6,12 +6,12 @@ import logging
 import os
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager, nullcontext
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.client import ClientStats
+from tsfusion.client import Client, ClientStats
 from tsfusion.core import process
 from tsfusion.core.config import ClientConfig, ServerConfig, VolumeConfig
 from tsfusion.core.counts import count_of
@@ -111,14 +111,18 @@ def replay(
             )
             held, started = HeldSensor(), time.monotonic()
             growth = watching.enter_context(map_growth.watch(target, target.link.map))
-            for index, keyframe in enumerate(_keyframes(dataset, first, running, rate, unread)):
-                running.wait_turn(AHEAD if rate is None else target.link.backlog)
-                of = sensor or keyframe.sensor
-                sender.send(dataclasses.replace(keyframe, captured_ns=time.monotonic_ns(), sensor=of))
-                held.add(keyframe.T_world_camera, dataset.sensor, force_of(dataset, index))
-                stamps.append(keyframe.timestamp_ns)
-                poses.append(keyframe.T_world_camera)
-            running.wait_fused()
+            outlives = connect is not None or (
+                server is not None and server.state != target_server.THROWN_AWAY
+            )
+            with _saying_what_stays(sender, target.link.map) if outlives else nullcontext():
+                for index, keyframe in enumerate(_keyframes(dataset, first, running, rate, unread)):
+                    running.wait_turn(AHEAD if rate is None else target.link.backlog)
+                    of = sensor or keyframe.sensor
+                    sender.send(dataclasses.replace(keyframe, captured_ns=time.monotonic_ns(), sensor=of))
+                    held.add(keyframe.T_world_camera, dataset.sensor, force_of(dataset, index))
+                    stamps.append(keyframe.timestamp_ns)
+                    poses.append(keyframe.T_world_camera)
+                running.wait_fused()
             seconds = time.monotonic() - started
             watching.close()
             peak = process.peak_rss_bytes()  # of sending: drawing the result is not the scanner's work
@@ -157,6 +161,21 @@ def _warn_of_keyframes_there(target: Target, *, same_frame: bool) -> None:
             "same coordinate frame (--map NAME names another map, --same-frame says that they are)",
             name, count_of(there, "keyframe"),
         )  # fmt: skip
+
+
+@contextmanager
+def _saying_what_stays(sender: Client, map_name: str) -> Iterator[None]:
+    """Where sending is interrupted, warn of what stays in a map that outlives the replay."""
+    try:
+        yield
+    except (KeyboardInterrupt, SystemExit):
+        if there := sender.stats.durable:
+            log.warning(
+                "%s of this recording, or more, are in the map %s and stay there: another replay into it "
+                "adds them once more (--map NAME names another map)",
+                count_of(there, "keyframe"), map_name,
+            )  # fmt: skip
+        raise
 
 
 def _keyframes(
