@@ -84,14 +84,14 @@ def test_five_lines_reach_the_map(tmp_path: Path, offline_hash: str) -> None:
     assert (status.keyframes_durable, status.keyframes_fused, status.map_hash) == (COUNT, COUNT, offline_hash)
     assert (status.fuser, status.sessions, status.duplicates) == ("idle", 1, 0)
     assert status.delay_ms.count == COUNT
-    assert 0 < status.delay_ms.mean < 1e4
+    assert 0 < status.delay_ms.mean < 1e3 * DEADLINE
     assert len(mesh.faces) > 100
     assert mesh.colors is not None
     for times in records:
         stages = [times.captured_ns, times.sent_ns, times.received_ns, times.durable_ns, times.fuse_start_ns,
                   times.fused_ns, times.meshed_ns]  # fmt: skip
         assert all(b - a >= -2 * times.clock_bound_ns for a, b in pairwise(stages)), times
-        assert 0 < times.clock_bound_ns < 5e7
+        assert 0 < times.clock_bound_ns < 1e9 * DEADLINE
     assert list((tmp_path / "spool").glob("*.mcap")) == []
     assert [keyframe.timestamp_ns for keyframe in JournalRecording(tmp_path / "state")] == [
         10**9 + i for i in range(COUNT)
