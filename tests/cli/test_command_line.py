@@ -144,6 +144,7 @@ def test_datasets_list(here: Here, tmp_path: Path) -> None:
             "sensor": "kinect",
             "keyframes": 1,
             "posed": True,
+            "uncolored": 0,
             "camera": "fx 5 fy 5 cx 4 cy 3, 64×48, from camera-intrinsics.txt",
         }
     ]

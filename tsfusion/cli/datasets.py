@@ -61,13 +61,15 @@ def _line(
     sensor: str = "",
     keyframes: int = 0,
     posed: bool = True,
+    uncolored: int = 0,
     camera: str = "",
 ) -> str:
     if not path:
         return f"{name:<16}  {description}"
     what = "keyframes" if posed else "frames without poses, for `tsfusion scan`"
+    grey = f" ({uncolored} without colour in time)" if uncolored else ""
     seen = f"  camera {camera}" if camera else ""
-    return f"{path}  {name}  {sensor}  {keyframes} {what}{seen}"
+    return f"{path}  {name}  {sensor}  {keyframes} {what}{grey}{seen}"
 
 
 def _layouts() -> list[dict[str, Any]]:
@@ -114,7 +116,8 @@ def _found(path: Path, depth: int) -> Iterator[dict[str, Any]]:
             continue
         yield {
             "path": str(path), "name": dataset.name, "sensor": dataset.sensor,
-            "keyframes": len(dataset), "posed": posed, "camera": camera_line(dataset),
+            "keyframes": len(dataset), "posed": posed, "uncolored": getattr(dataset, "uncolored", 0),
+            "camera": camera_line(dataset),
         }  # fmt: skip
         return
     has_more = path.is_dir() and (isinstance(failure, SeveralRecordings) or not _is_one(path))

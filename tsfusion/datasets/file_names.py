@@ -22,6 +22,11 @@ def order(name: str) -> SortKey:
     return tuple((0, Decimal(number), "") if number else (1, Decimal(0), text) for number, text in parts)
 
 
+def in_order(files: Iterable[Path]) -> list[Path]:
+    """Files in the order of their folders, and in each of the numbers in their names."""
+    return sorted(files, key=lambda file: (order(str(file.parent)), order(file.stem), file.suffix))
+
+
 def numbers_in(name: str) -> list[str]:
     """The numbers in a name, decimal ones too."""
     return _NUMBER.findall(name)
@@ -36,7 +41,7 @@ def series_of(files: Iterable[Path]) -> list[list[Path]]:
     for file in files:
         if numbers_in(file.stem):
             found.setdefault((_unnumbered(file.stem), file.suffix.lower()), []).append(file)
-    return [sorted(one, key=lambda file: order(file.stem)) for one in found.values()]
+    return [in_order(one) for one in found.values()]
 
 
 def _unnumbered(name: str) -> str:

@@ -122,7 +122,8 @@ def read_log(path: Path) -> list[tuple[int, Transform]]:
 
 
 def read_poses(path: Path) -> tuple[NDArray[np.int64] | None, NDArray[np.float64]]:
-    """Read a trajectory file: TUM (8 numbers in the first line), KITTI (12) or Redwood's `.log` (3).
+    """Read a trajectory file: TUM (8 numbers in the first line), KITTI (12), 4×4 matrices (16) or Redwood's
+    `.log` (3), whose poses come in the order of their numbers.
 
     Returns:
         (n,) timestamps in nanoseconds, None where the format has none; (n, 4, 4) poses.
@@ -137,17 +138,19 @@ def read_poses(path: Path) -> tuple[NDArray[np.int64] | None, NDArray[np.float64
         return tum.timestamps_ns, np.array(poses)
     if columns == 12:
         return None, np.array(read_kitti(path))
+    if columns == 16:
+        return None, np.array(read_matrix_rows(path))
     if columns == 3:
-        return None, np.array([T for _, T in read_log(path)])
+        return None, np.array([T for _, T in sorted(read_log(path), key=lambda one: one[0])])
     raise DatasetError(
-        f"{path} is no trajectory: expected 8 numbers a line (TUM), 12 (KITTI) or a Redwood .log, "
+        f"{path} is no trajectory: expected 8 numbers a line (TUM), 12 (KITTI), 16 (4×4) or a Redwood .log, "
         f"got {columns}"
     )
 
 
 def is_log(path: Path) -> bool:
     """Whether a trajectory is a Redwood `.log`, or nothing that `read_poses` reads."""
-    return _columns(path) not in (8, 12)
+    return _columns(path) not in (8, 12, 16)
 
 
 def _columns(path: Path) -> int:

@@ -222,6 +222,39 @@ def test_redwood_poses_go_by_number_unless_there_are_as_many_images(tmp_path):
         Redwood(redwood(tmp_path / "none", [7, 8, 9], [0, 1]))
 
 
+@pytest.mark.parametrize(
+    ("stems", "log", "expected"),
+    [
+        (range(12), [3, 1, 2, 0, *range(11, 3, -1)], list(range(12))),  # entries in another order
+        ([*range(7), *range(8, 12)], [*range(3), *range(4, 12)], [0, 1, 2, 4, 5, 6, 8, 9, 10, 11]),  # holes
+        ([0, 10, 20, 30], [3, 1, 2, 0], [0, 1, 2, 3]),  # numbered anew
+        ([4, 9, 17, 31], [0, 10, 20, 30], [0, 10, 20, 30]),
+    ],
+)
+def test_as_many_poses_as_images_go_by_number_where_both_have_the_same(tmp_path, stems, log, expected):
+    found = Redwood(redwood(tmp_path, list(stems), log))
+    assert [keyframe.T_world_camera[0, 3] for keyframe in found] == expected
+
+
+@pytest.mark.parametrize("rename", [lambda n: f"frame_{n}", str, lambda n: f"{8 + 0.3 * n:.1f}"])
+def test_images_come_in_the_order_of_their_numbers(tmp_path, rename):
+    """9 before 10, as in names that are not padded with zeros."""
+    root = hololens(tmp_path, 12)
+    for image in [*root.glob("depth/*"), *root.glob("images/*")]:
+        image.rename(image.with_stem(rename(int(image.stem))))
+    assert [int(keyframe.depth[0, 0]) for keyframe in HoloLens(root)] == list(range(7, 19))
+
+
+def test_scenes_come_in_the_order_of_their_numbers(tmp_path):
+    for number in (2, 10, 1):
+        seven_scenes(tmp_path / f"seq-{number}", 12)
+        for file in (tmp_path / f"seq-{number}").glob("frame-*"):
+            start, end = file.name.split(".", 1)
+            file.rename(file.with_name(f"frame-{int(start[6:])}.{end}"))
+    found = [int(keyframe.depth[0, 0]) for keyframe in SevenScenes(tmp_path)]
+    assert found == [100 + frame for frame in range(12)] * 3
+
+
 def test_redwood_reads_open3d_cameras(tmp_path):
     redwood(tmp_path, [0], [0])
     (tmp_path / "camera-intrinsics.txt").unlink()
@@ -271,6 +304,7 @@ def redwood_room(root: Path, color: str, log: str, depth: str = "depth") -> Path
         ("image", "trajectory.log", "depth"),
         ("color", "odometry.log", "depth"),
         ("rgb", "scene/trajectory.log", "depth"),
+        ("images", "trajectory.log", "depth"),
         ("color", "lounge_trajectory.log", "depth"),
         ("livingroom1-color", "livingroom1-traj.txt", "livingroom1-depth-clean"),
     ],

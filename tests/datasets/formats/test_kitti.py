@@ -109,6 +109,15 @@ def test_a_pose_belongs_to_the_frame_of_its_line(tmp_path):
     assert list(dataset.timestamps_ns) == [0, 200_000_000, 300_000_000]
 
 
+def test_names_need_no_zeros_before_their_numbers(tmp_path):
+    root = kitti(tmp_path, 12)
+    for path in (root / "sequences" / "06").glob("*/*"):
+        path.rename(path.with_stem(str(int(path.stem))))
+    found = KITTI(root, "06")
+    assert [keyframe.T_world_camera[2, 3] for keyframe in found] == list(range(12))
+    assert found.timestamps_ns.tolist() == [frame * 10**8 for frame in range(12)]
+
+
 def test_frames_beyond_the_poses_are_skipped_and_counted(tmp_path):
     root = kitti(tmp_path)
     (root / "poses" / "06.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 3 + "\n")

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.dataset import SCAN, Frames, keep_posed, require_folder, require_frames
+from tsfusion.datasets.file_names import in_order
 from tsfusion.datasets.readers import numbers, read_lines
 from tsfusion.datasets.trajectory_files import check_quaternion
 from tsfusion.geometry.frame import Frame
@@ -41,7 +42,7 @@ class LidarDump(Frames):
     def __init__(self, path: str | Path, *, sensor: str = "lidar", posed: bool = True) -> None:
         root = require_folder(path, "LiDAR keyframes")
         self.name, self.sensor, self.skipped = f"LiDAR keyframes {root.name}", sensor, {}
-        files = [file for file in sorted(root.glob("*/points.bin")) if file.parent.name.isdecimal()]
+        files = [file for file in in_order(root.glob("*/points.bin")) if file.parent.name.isdecimal()]
         graph = _read_graph(root / "graph.txt", required=posed)
         self._files, self._poses = keep_posed(
             files, [graph.get(int(file.parent.name)) for file in files], posed=posed, skipped=self.skipped

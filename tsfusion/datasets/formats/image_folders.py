@@ -14,12 +14,14 @@ from tsfusion.datasets import depth_files
 from tsfusion.datasets.cameras import RecordedCamera
 from tsfusion.datasets.dataset import Frames
 from tsfusion.datasets.depth_files import check_metres, read_depth
+from tsfusion.datasets.file_names import in_order, numbers_in
 from tsfusion.datasets.readers import read_color
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.se3 import Transform
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
+COLOR = ("color", "colour", "rgb", "image", "images")  # folders beside depth/, by preference
 
 
 class DepthImages(Frames):
@@ -123,7 +125,7 @@ def resample_for_camera(
 
 
 def images(where: Path, expected: str, pattern: str = "[!.]*") -> list[Path]:
-    """The images in a folder, sorted by number if all names are numbers, else by name; no hidden files."""
+    """The images in a folder, in the order of the numbers in their names; no hidden files."""
     return _files(where, expected, pattern, SUFFIXES)
 
 
@@ -141,8 +143,7 @@ def depth_images(where: Path, expected: str, pattern: str = "[!.]*") -> list[Pat
 def _files(where: Path, expected: str, pattern: str, suffixes: tuple[str, ...]) -> list[Path]:
     if not where.is_dir():
         raise DatasetError(f"{where} is missing; expected {expected}")
-    found = sorted(path for path in where.glob(pattern) if path.suffix.lower() in suffixes)
-    return sorted(found, key=lambda path: int(path.stem)) if _numbered(found) else found
+    return in_order(path for path in where.glob(pattern) if path.suffix.lower() in suffixes)
 
 
 def first_size(depth: Sequence[Path]) -> tuple[int, int]:
@@ -165,18 +166,34 @@ def color_images(depth: list[Path], where: Path, expected: str) -> list[Path]:
 def poses_by_number(
     names: Sequence[str], poses: list[tuple[int, Transform]], source: Path
 ) -> list[Transform | None]:
-    """The pose of each image: the k-th pose if the numbers are equal, else the one numbered as its name."""
+    """The pose of each image: the one numbered as its name; of as many poses with other numbers the k-th.
+
+    Numbers are others where most names have none, or where both count on from different ones.
+    """
+    numbers, listed = [_number(name) for name in names], [number for number, _ in poses]
+    are_unique = None not in numbers and len(set(listed)) == len(listed)
+    found = dict(poses)
+    same = sum(number in found for number in numbers)
     if len(names) == len(poses):
-        return [pose for _, pose in poses]
-    if not all(name.isdecimal() for name in names):
+        count_on = set(numbers) != set(listed) and _counts_on(numbers) and _counts_on(listed)
+        if not are_unique or count_on or 2 * same <= len(names):
+            return [pose for _, pose in sorted(poses, key=lambda one: one[0])]
+    elif None in numbers:
         raise DatasetError(
             f"{source} has {len(poses)} poses for {len(names)} depth images, "
             "whose names are not frame numbers; "
             "expected as many poses as images, or images named by frame number"
         )
-    found = dict(poses)
-    return [found.get(int(name)) for name in names]
+    return [None if number is None else found.get(number) for number in numbers]
 
 
-def _numbered(files: list[Path]) -> bool:
-    return all(path.stem.isdecimal() for path in files)
+def _number(name: str) -> int | None:
+    """The only number in a name, if it is a whole one."""
+    found = numbers_in(name)
+    return int(found[0]) if len(found) == 1 and found[0].isdecimal() else None
+
+
+def _counts_on(numbers: Sequence[int | None]) -> bool:
+    """Whether numbers are consecutive ones, in any order."""
+    there = [number for number in numbers if number is not None]
+    return len(there) == len(numbers) == len(set(there)) == max(there) - min(there) + 1

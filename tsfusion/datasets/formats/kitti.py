@@ -26,6 +26,7 @@ from tsfusion.datasets.dataset import (
     require_folder,
     require_frames,
 )
+from tsfusion.datasets.file_names import in_order
 from tsfusion.datasets.readers import intrinsics_of, read_color, read_lines
 from tsfusion.datasets.trajectory_files import checked_pose, nanoseconds, read_kitti
 from tsfusion.geometry.frame import Frame
@@ -178,7 +179,7 @@ def _only_sequence(root: Path) -> str:
 
 def files_by_frame(place: Path, suffix: str) -> dict[int, Path]:
     """Frame number → file, in order."""
-    files = sorted(place.glob(f"*{suffix}"))
+    files = in_order(place.glob(f"*{suffix}"))
     for path in files:
         if not path.stem.isdigit():
             raise DatasetError(f"{path} is not named by a frame number; expected NNNNNN{suffix}")

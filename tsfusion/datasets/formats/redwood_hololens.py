@@ -13,14 +13,15 @@ from tsfusion.datasets.cameras import PublishedCamera, find_camera
 from tsfusion.datasets.dataset import SCAN, keep_posed, require_folder, require_frames
 from tsfusion.datasets.depth_files import SUFFIXES
 from tsfusion.datasets.file_names import numbers_in, series_of, times_of_names
-from tsfusion.datasets.formats.image_folders import SUFFIXES as COLOR_SUFFIXES
 from tsfusion.datasets.formats.image_folders import (
+    COLOR,
     DepthImages,
     color_images,
     depth_images,
     first_size,
     poses_by_number,
 )
+from tsfusion.datasets.formats.image_folders import SUFFIXES as COLOR_SUFFIXES
 from tsfusion.datasets.given_trajectory import poses_of
 from tsfusion.datasets.trajectory_files import is_log, read_log, read_matrix_rows
 from tsfusion.geometry.keyframe import Intrinsics
@@ -28,12 +29,12 @@ from tsfusion.geometry.se3 import Transform
 
 HOLOLENS_EXPECTED = "K.txt, poses.txt, depth/*.png and images/*.png"
 REDWOOD_EXPECTED = (
-    "depth/*.png, .tiff, .exr or .npy, image/, color/, colour/ or rgb/, camera-intrinsics.txt or "
+    "depth/*.png, .tiff, .exr or .npy, color/, colour/, rgb/, image/ or images/, camera-intrinsics.txt or "
     "camera_intrinsic.json, and trajectory.log, odometry.log or *-traj.txt"
 )
 PLAIN_EXPECTED = (
-    "depth/*.png, .tiff, .exr or .npy and image/, color/, colour/ or rgb/, of equal names, or all in one "
-    "folder (depth_N.png and color_N.png, N-depth.png and N-rgb.jpg, …), and camera-intrinsics.txt or "
+    "depth/*.png, .tiff, .exr or .npy and color/, colour/, rgb/, image/ or images/, of equal names, or all "
+    "in one folder (depth_N.png and color_N.png, N-depth.png and N-rgb.jpg, …), and camera-intrinsics.txt or "
     "camera_intrinsic.json; without poses, so for a scan, or with --trajectory"
 )
 # Open3D's PrimeSenseDefault, for the recordings that Redwood and Open3D distribute
@@ -46,7 +47,6 @@ _REDWOODS_FILES = ("livingroom[12]-traj.txt", "office[12]-traj.txt")
 _IMAGES = {*SUFFIXES, *COLOR_SUFFIXES}
 _LOGS = ("trajectory.log", "scene/trajectory.log", "odometry.log")  # by preference
 _LOG_NAMES = ("*traj*.log", "*-traj.txt")
-_COLOR = ("image", "color", "colour", "rgb")
 # In the name of an image that has its colour beside it: depth_3, depth16_3, depth_raw_3
 _DEPTH = re.compile("depth(?:16(?=[_-])|[_-]?raw)?", re.IGNORECASE)
 _FEWEST = 2  # images of a series
@@ -124,10 +124,10 @@ class HoloLens(DepthImages):
 class Redwood(DepthImages):
     """Redwood's data sets and Open3D's reconstructions: a `.log` of poses, depth in uint16 millimetres.
 
-    http://redwood-data.org and Open3D's reconstruction system: `depth/` beside `image/`, `color/` or `rgb/`,
-    or Redwood's own `NAME-depth-clean/`, `NAME-color/`, `NAME-traj.txt`. With as many poses as images the
-    k-th pose is the k-th image's; otherwise a pose's number is its image's file name. Poses without an image
-    are ignored. Images named by their seconds or nanoseconds have times, others none.
+    http://redwood-data.org and Open3D's reconstruction system: `depth/` beside `color/`, `image/` or others,
+    or Redwood's own `NAME-depth-clean/`, `NAME-color/`, `NAME-traj.txt`. A pose's number is the one in its
+    image's file name; of as many poses as images, with other numbers, the k-th pose is the k-th image's.
+    Poses without an image are ignored. Images named by their seconds or nanoseconds have times, others none.
 
     Args:
         path: the folder, or the `.log` in it to take the poses from.
@@ -254,7 +254,7 @@ def _beside(root: Path) -> list[dict[Path, Path | None]]:
 
 def _partner(depth: Path, files: dict[str, Path]) -> Path | None:
     """The colour image whose name says colour where that of the depth image says depth."""
-    stems = (_DEPTH.sub(word, depth.stem).lower() for word in _COLOR)
+    stems = (_DEPTH.sub(word, depth.stem).lower() for word in COLOR)
     names = (stem + suffix for stem in stems for suffix in COLOR_SUFFIXES)
     return next((files[name] for name in names if name in files), None)
 
@@ -292,7 +292,7 @@ def _depth_folder(root: Path) -> Path:
 
 
 def _color_folder(root: Path) -> Path | None:
-    places = [*(root / name for name in _COLOR), *sorted(root.glob("*-color"))]
+    places = [*(root / name for name in COLOR), *sorted(root.glob("*-color"))]
     return next((place for place in places if place.is_dir()), None)
 
 

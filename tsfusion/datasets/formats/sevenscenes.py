@@ -11,6 +11,7 @@ from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.cameras import PublishedCamera, find_camera
 from tsfusion.datasets.dataset import Frames, keep_posed, require_folder, require_frames
 from tsfusion.datasets.depth_files import read_depth
+from tsfusion.datasets.file_names import in_order
 from tsfusion.datasets.readers import read_color
 from tsfusion.datasets.trajectory_files import read_matrix
 from tsfusion.geometry.depth_registration import Registration
@@ -80,7 +81,7 @@ class SevenScenes(Frames):
                     f"{sequence / min(alone)}.depth.png is missing, but its pose.txt is there; "
                     f"expected {EXPECTED}"
                 )
-            stems += [sequence / stem for stem in sorted(depth)]
+            stems += in_order(sequence / stem for stem in depth)
         self._stems, self._poses = keep_posed(
             stems, [_pose(s) for s in stems], posed=posed, skipped=self.skipped
         )
@@ -126,7 +127,7 @@ def _sequences(root: Path) -> list[Path]:
     """The folder itself when it holds frames, else its `seq-*` folders."""
     if _frames(root, "depth.png") or _frames(root, "pose.txt"):
         return [root]
-    return sorted(path for path in root.glob("seq-*") if path.is_dir())
+    return in_order(path for path in root.glob("seq-*") if path.is_dir())
 
 
 def _frames(sequence: Path, suffix: str) -> set[str]:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
+from tsfusion.datasets.formats.image_folders import COLOR
 from tsfusion.datasets.readers import decode_image, read_numbers
 from tsfusion.datasets.scan_files import check_intensities
 
@@ -20,7 +21,6 @@ EXPECTED = (
     "frame-*.depth.png with frame-*.color.png|jpg; left/ and right/NAME.png|jpg; "
     "NAME.bin, there or in velodyne/"
 )
-COLOR = ("color", "colour", "rgb", "image", "images")
 
 _NOT_MEASURED = 65535  # 7-Scenes' value for pixels without depth
 _IMAGES = r"\.(?:png|jpe?g)"
