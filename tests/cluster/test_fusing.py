@@ -9,13 +9,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import cv2
 import msgspec
+import numpy as np
 import pytest
 from command_processes import Here, alive, descendants, end, eventually, read_until, started, tsfusion
 from corrected_maps import fresh_map
 from keyframes_and_servers import VOLUME, pose, wall
 from silent_display import Silent
-from small_recordings import kitti
+from small_recordings import corbs, kitti, redwood
 
 from tsfusion import Volume
 from tsfusion.cluster import fusion, job_runner, jobs, keyframe_sources
@@ -160,6 +162,25 @@ def test_other_keyframes_or_settings_begin_anew(state: Path, tmp_path: Path) -> 
     assert other.map_hash != fresh_map(state / "journal", VOLUME.voxel_size).map_hash()
 
 
+@pytest.mark.parametrize("change", ["trajectory.log", "depth/00001.png", "camera-intrinsics.txt"])
+def test_a_recording_that_was_mended_begins_anew(tmp_path: Path, change: str) -> None:
+    recording = redwood(tmp_path / "recording", list(range(4)), list(range(4)))
+    for image in recording.glob("depth/*"):
+        cv2.imwrite(str(image), np.full((6, 8), 1500, np.uint16))
+
+    def jobs_done() -> list[str]:
+        """Those of a run that comes to grief, whose results are not taken for a part of the recording."""
+        scheduler = InThisProcess(lose={"mesh": ATTEMPTS})
+        with pytest.raises(WorkerLost):
+            fuse(recording, recording / "out", scheduler)
+        return scheduler.done
+
+    assert jobs_done() != []
+    assert jobs_done() == []
+    os.utime(recording / change, (1, 1))
+    assert jobs_done() != []
+
+
 def test_a_map_larger_than_a_workers_memory_goes_out_in_parts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -259,6 +280,11 @@ def test_a_recording_of_a_street_says_which_voxels_are_usual(tmp_path: Path) -> 
     kitti(tmp_path)
     found = keyframe_sources.listed([str(tmp_path)], options={"modality": "stereo"})
     assert (found.sensor, found.usual) == ("stereo", {"voxel_size": 0.1})
+
+
+def test_frames_without_colour_are_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    keyframe_sources.listed([str(corbs(tmp_path))])
+    assert "1 frame without colour in time" in caplog.text
 
 
 def test_killed_and_interrupted_commands_leave_no_worker_and_go_on(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ import msgspec
 from tsfusion.cluster import jobs, mesh_runs, tiling
 from tsfusion.cluster.carrying_out import CarryingOut
 from tsfusion.cluster.jobs import Done, Progress
-from tsfusion.cluster.keyframe_sources import Listed
+from tsfusion.cluster.keyframe_sources import WORK, Listed
 from tsfusion.cluster.schedulers import Scheduler
 from tsfusion.core import folder_lock, output_folder
 from tsfusion.core.config import VIEW_SETTINGS, VolumeConfig
@@ -28,7 +28,6 @@ from tsfusion.pipelines import run_files
 from tsfusion.pipelines.run_files import Circumstances
 from tsfusion.tsdf import checkpoint
 
-WORK = ".fuse"  # folder of what is half done, in that of the results
 TILES = "tiles"  # folder of a mesh in tiles
 _MOST_KEYFRAMES = 512  # a job: what a lost worker costs
 _FAN_IN = 8  # maps that are added at once: each is read once, and takes memory for one chunk

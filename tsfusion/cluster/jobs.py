@@ -45,12 +45,16 @@ class JournalKeyframes(Struct, tag="journal", frozen=True):
 
 
 class DatasetKeyframes(Struct, tag="dataset", frozen=True):
-    """Keyframes first … stop-1 of a dataset that `open_dataset` opens with these options."""
+    """Keyframes first … stop-1 of a dataset that `open_dataset` opens with these options.
+
+    `state`: digest of its poses, and of which files it has.
+    """
 
     path: str
     options: dict[str, Any]
     first: int
     stop: int
+    state: str = ""
 
     def __len__(self) -> int:
         return self.stop - self.first

@@ -6,6 +6,7 @@ import logging
 import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -19,9 +20,10 @@ from tsfusion.cluster.jobs import DatasetKeyframes, JournalKeyframes, Keyframes
 from tsfusion.core.config import VolumeConfig
 from tsfusion.core.counts import count_of
 from tsfusion.core.durable_files import size_of
-from tsfusion.core.errors import CheckpointError, InvalidConfig, JournalError, MapError
+from tsfusion.core.errors import CheckpointError, DatasetError, InvalidConfig, JournalError, MapError
 from tsfusion.datasets import open_dataset
-from tsfusion.datasets.dataset import Dataset
+from tsfusion.datasets.cameras import camera_files
+from tsfusion.datasets.dataset import Dataset, pose_of
 from tsfusion.fuser.journaled_keyframes import JournaledKeyframes
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.journal import locations, state_folder
@@ -29,6 +31,8 @@ from tsfusion.tsdf import checkpoint
 from tsfusion.wire import codec
 
 SYNTHETIC = "synthetic:"
+WORK = ".fuse"  # folder of a run's unfinished work, in that of its results
+_LISTS = (".log", ".json")  # files that stand for the recording in whose folder they lie
 
 log = logging.getLogger(__name__)
 
@@ -238,11 +242,47 @@ def _add_dataset(found: Listed, source: str, options: dict[str, Any]) -> dict[st
     """Add a dataset; frames that it left out, by reason."""
     dataset = open_dataset(source, **options)
     path = source if source.startswith(SYNTHETIC) else str(Path(source).expanduser().absolute())
-    found.keyframes.append(DatasetKeyframes(path, options, 0, len(dataset)))
+    found.keyframes.append(DatasetKeyframes(path, options, 0, len(dataset), _state(dataset, path, options)))
     if found.sensor is None:
         found.sensor = dataset.sensor
         found.usual = getattr(dataset, "usual", {})
+    if uncolored := getattr(dataset, "uncolored", 0):
+        log.warning("%s: %s without colour in time", source, count_of(uncolored, "frame"))
     return dataset.skipped
+
+
+def _state(dataset: Dataset, path: str, options: dict[str, Any]) -> str:
+    """Digest of a dataset's poses, and of the files it may be made of: names, sizes and times."""
+    digest = hashlib.blake2b(digest_size=16)
+    if hasattr(dataset, "pose"):  # else they are part of the frames, and so in the files
+        for index in range(len(dataset)):
+            digest.update(np.asarray(pose_of(dataset, index), np.float64).tobytes())
+    for file in _files(Path(path), options):
+        with suppress(OSError, ValueError):  # gone meanwhile; no path at all
+            found = file.stat()
+            digest.update(f"{file} {found.st_size} {found.st_mtime_ns}\n".encode(errors="replace"))
+    return digest.hexdigest()
+
+
+def _files(path: Path, options: dict[str, Any]) -> Iterator[Path]:
+    """Files of a recording, of its camera beside it, and those that options name; no results of ours."""
+    yield from (Path(value) for value in options.values() if isinstance(value, str | Path))
+    if path.is_file():
+        yield path
+    root = path.parent if path.suffix in _LISTS else path
+    if not root.is_dir():
+        return
+    with suppress(DatasetError):
+        yield from camera_files(root.parent)
+    seen = set[str]()
+    for folder, names, files in os.walk(root, followlinks=True):
+        real = os.path.realpath(folder)
+        if WORK in names or real in seen:
+            names.clear()
+            continue
+        seen.add(real)
+        names.sort()
+        yield from (Path(folder, name) for name in sorted(files))
 
 
 # --- reading ---
