@@ -155,6 +155,50 @@ def test_free_space_that_was_looked_through_needs_carving() -> None:
         volume_of(VIEWS[:1], voxel_size=VOXEL).occupancy_slice(-0.1, 0.1, box=BOX, up="z", need_free=True)
 
 
+def seen_from_above(height: float, **settings: Any) -> Volume:
+    """A level plate of 1.0 × 0.8 m, seen by a camera 1.5 m above."""
+    down = np.diag([1.0, -1, -1, 1])
+    down[2, 3] = height + 1.5
+    volume = Volume(**settings)
+    volume.integrate(
+        depth=np.full((240, 300), 1500, np.uint16), intrinsics=(450, 450, 149.5, 119.5), T_world_camera=down
+    )
+    return volume
+
+
+def test_what_was_seen_from_above_alone_stands_in_the_way() -> None:
+    """Nothing was seen beside the top of a table: no surface leads down there."""
+    table = seen_from_above(0.75, voxel_size=0.02, space_carving=True)
+    ahead = np.eye(4)
+    ahead[:3] = [[1, 0, 0, 1.2], [0, 0, 1, -0.5], [0, -1, 0, 0.75]]  # a level camera looks past it
+    table.integrate(
+        depth=np.full((240, 320), 2500, np.uint16), intrinsics=(600, 600, 159.5, 119.5), T_world_camera=ahead
+    )
+    current = table.current_slice(0.6, 0.9, up="z", max_distance=2.0, box=(-1, -1, 2, 2))
+    found = current.distances()
+    x, y = np.moveaxis(found.grid.centres()[..., :2], -1, 0)
+    beside = np.hypot(np.maximum(np.abs(x) - 0.5, 0), np.maximum(np.abs(y) - 0.4, 0))
+    wall = np.hypot(np.maximum(np.abs(x - 1.2) - 0.667, 0), 2 - y)  # at which the level camera looks
+    clear = (found.cells == 0) & (beside > 0.1)
+    assert clear.sum() > 1000
+    error = found.distance - np.minimum(np.minimum(beside, wall), 2)
+    assert np.abs(error[clear]).max() < 0.04
+    inside = np.minimum(0.5 - np.abs(x), 0.4 - np.abs(y))
+    assert np.abs(found.distance + inside)[inside > 0.1].max() < 0.04
+    table.retract(
+        depth=np.full((240, 320), 2500, np.uint16), intrinsics=(600, 600, 159.5, 119.5), T_world_camera=ahead
+    )
+    current.update(table.take_dirty())
+    fresh = table.distance_slice(0.6, 0.9, up="z", max_distance=2.0, box=(-1, -1, 2, 2))
+    np.testing.assert_array_equal(current.distances().distance, fresh.distance)
+
+
+@pytest.mark.parametrize("high", [0.19, 0.239, 0.289, 0.3, 0.31])
+def test_no_layer_of_voxels_is_left_out(high: float) -> None:
+    plate = seen_from_above(0.085, voxel_size=0.1)
+    assert (plate.occupancy_slice(0.04, high, up="z", box=(-0.4, -0.3, 0.4, 0.3)).cells == 100).all()
+
+
 def test_up_is_found_or_asked_for(sphere: Volume, monkeypatch: pytest.MonkeyPatch) -> None:
     found = sphere.occupancy_slice(-0.1, 0.1, box=BOX).grid
     up = up_direction.find(sphere.extract_mesh(), sphere.held)

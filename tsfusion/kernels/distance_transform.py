@@ -18,6 +18,7 @@ from tsfusion.kernels.voxel_traversal import vec3i
 BANDS = 64  # units of parallel work; fixed, so that nothing depends on the thread count
 FAR = 1 << 30  # squared distance where no site is near
 NONE = -1  # number of no site
+_LEAD = 0.5  # gain of the distance a voxel, by which a surface lies beside
 
 vec2i = ti.types.vector(2, ti.i32)
 vec3f = ti.types.vector(3, ti.f32)
@@ -50,6 +51,29 @@ def is_site(values: ti.template(), shape, at, own):
                 if (value < 0.0) != (own < 0.0) and ti.abs(own) <= ti.abs(value):
                     found = 1
     return found
+
+
+@ti.func
+def is_rim(values: ti.template(), shape, at, own):
+    """Whether a body ends at a voxel with nothing seen beside it, and no neighbour leads to a surface.
+
+    So it is at the edge of a table in a slice through its top: its surface is above, not beside.
+    """
+    beside, lead = 0, 0.0
+    if own < -0.5:
+        for a in ti.static(range(3)):
+            most = own
+            for side in ti.static((-1, 1)):
+                other = at
+                other[a] += side
+                if other[a] >= 0 and other[a] < shape[a]:
+                    value = value_at(values, shape, other)
+                    if ti.math.isnan(value):
+                        beside = 1
+                    elif value > most:
+                        most = value
+            lead += (most - own) ** 2
+    return beside == 1 and lead < _LEAD**2
 
 
 @ti.func
@@ -93,16 +117,21 @@ def mark_sites(
     Z: ti.i32,
     first: ti.i32,
     end: ti.i32,
+    rims: ti.i32,
     squared: ti.types.ndarray(dtype=ti.i32, ndim=1),
     nearest: ti.types.ndarray(dtype=ti.i32, ndim=1),
 ):
-    """Begin a transform in the rows `first` ≤ x < `end`: sites are 0 from themselves, all else is far."""
+    """Begin a transform in the rows `first` ≤ x < `end`: sites are 0 from themselves, all else is far.
+
+    `rims`: whether the rims of bodies are sites, too.
+    """
     for row in range((end - first) * Y):
         x, y = first + row // Y, row % Y
         for z in range(Z):
             i = (x * Y + y) * Z + z
             squared[i], nearest[i] = FAR, NONE
-            if is_site(values, vec3i(X, Y, Z), vec3i(x, y, z), values[i]):
+            shape, at, own = vec3i(X, Y, Z), vec3i(x, y, z), values[i]
+            if is_site(values, shape, at, own) or (rims == 1 and is_rim(values, shape, at, own)):
                 squared[i], nearest[i] = 0, i
 
 
@@ -187,14 +216,19 @@ def place_sites(
     columns: vec2i,
     offsets: ti.types.ndarray(dtype=ti.f32, ndim=2),
 ):
-    """`offsets`: the way to the surface of the sites (`squared` is 0) in some `rows`, x, and `columns`, y."""
+    """`offsets`: the way to the surface of the sites (`squared` is 0) in some `rows`, x, and `columns`, y;
+    0 of a rim.
+    """
     width = columns[1] - columns[0]
     for n in range((rows[1] - rows[0]) * width):
         x, y = rows[0] + n // width, columns[0] + n % width
         for z in range(shape[2]):
             i = (x * shape[1] + y) * shape[2] + z
             if squared[i] == 0:
-                offset = surface_offset(values, shape, vec3i(x, y, z))
+                at = vec3i(x, y, z)
+                offset = vec3f(0.0)
+                if is_site(values, shape, at, values[i]):
+                    offset = surface_offset(values, shape, at)
                 for a in ti.static(range(3)):
                     offsets[i, a] = offset[a]
 

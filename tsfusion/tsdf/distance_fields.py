@@ -175,7 +175,7 @@ def _nearest_sites(
 ) -> Nearest:
     """The nearest sites of the voxels of a box in the grid."""
     found = np.empty(values.size, np.int32), np.empty(values.size, np.int32)
-    kernels.mark_sites(values, *shape, 0, shape[0], *found)
+    kernels.mark_sites(values, *shape, 0, shape[0], 0, *found)
     sides = list(shape)
     # First along the axis that leaves the least for the others: for a slice, across it
     for axis in sorted(range(3), key=lambda a: extent[a] / shape[a]):

@@ -73,7 +73,8 @@ class CurrentSlice:
             (rows - 2 * margin, columns - 2 * margin), low, high, axes, floor,
         )  # fmt: skip
         self._across = math.ceil(edge / store.voxel_size - 1e-9)
-        self._heights = max(1, round((high - low) / store.voxel_size))
+        # no layer of voxels lies between two samples
+        self._heights = max(1, math.ceil((high - low) / store.voxel_size - 1e-9))
         if self._across**2 * self._heights > _MOST_SAMPLES:
             raise InvalidConfig(
                 f"a cell would have {self._across**2 * self._heights} samples (at most {_MOST_SAMPLES}): "
@@ -184,7 +185,7 @@ class CurrentSlice:
         reach = self._margin
         sites = self._marked[1].reshape(self._shape)[top:bottom]
         before = sites.copy()
-        transform.mark_sites(self._values, rows, columns, 1, top, bottom, *self._marked)
+        transform.mark_sites(self._values, rows, columns, 1, top, bottom, 1, *self._marked)
         transform.place_sites(
             self._values, (rows, columns, 1), self._marked[0], (top, bottom), (left, right), self._offsets
         )
