@@ -124,6 +124,24 @@ def test_a_ply_and_a_table(saved: Path, here: Here, tmp_path: Path) -> None:
     assert distances[0] == distances[1]
 
 
+def test_a_ply_keeps_vertices_that_are_there_twice(tmp_path: Path) -> None:
+    corners = POINTS[[0, 1, 2, 2, 1, 0]]
+    trimesh.Trimesh(corners, [[0, 1, 2], [3, 4, 5]], process=False).export(tmp_path / "soup.ply")
+    np.testing.assert_allclose(answer_files.read(str(tmp_path / "soup.ply")), corners, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "id,x,y,z\n7,1,2,3\n8,4,5,6\n", "\ufeff1,2,3\n4,5,6,\n", "# ours\n\nX;Y;Z\n1; 2; 3\n4;5;6",
+        '"z" "name" "x" "y"\n3 a 1 2\n6 b 4 5\n', "first\n1, 2, 3, 9\n4\t5\t6\n",
+    ],
+)  # fmt: skip
+def test_columns_of_points(tmp_path: Path, text: str) -> None:
+    (tmp_path / "points.csv").write_text(text, encoding="utf-8")
+    assert answer_files.read(str(tmp_path / "points.csv")).tolist() == [[1, 2, 3], [4, 5, 6]]
+
+
 @pytest.mark.parametrize(
     ("arguments", "why"),
     [
@@ -164,6 +182,8 @@ def test_nobody_there_is_known_in_time(here: Here) -> None:
         ("1 2 3\n1 2 x\n", ":2: expected x, y, z"),
         ("1,2,x\n", ":1: expected x, y, z"),
         ("1 2\n", ":1: expected x, y, z"),
+        ("1,,2,3\n", ":1: expected x, y, z"),
+        ("0,5;0,3;1,0\n", ":1: expected x, y, z"),
         ("x,y,z\n", "shape"),
         ("", "shape"),
         ("1 2 inf", "not finite"),

@@ -3,6 +3,7 @@
 
 import csv
 import io
+import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -57,27 +58,34 @@ def _parsed(source: str, name: str) -> NDArray[Any]:
         import trimesh
 
         with open(source, "rb") as file:
-            return np.asarray(getattr(trimesh.load(file, file_type="ply"), "vertices", np.zeros((0, 3))))
+            found = trimesh.load(file, file_type="ply", process=False)  # which would merge vertices
+            return np.asarray(getattr(found, "vertices", np.zeros((0, 3))))
     if suffix not in POINTS:
         raise DatasetError(f"{source} must end in {', '.join(POINTS)}")
-    return _columns(Path(source).read_text(encoding="utf-8"), source)
+    return _columns(Path(source).read_text(encoding="utf-8-sig"), source)
 
 
 def _columns(text: str, source: str) -> NDArray[np.float64]:
-    """Three columns, with commas or spaces between them; a first line without a number is a title."""
+    """Three columns, with commas, semicolons or spaces between them.
+
+    A first line without a number is a title: if it names x, y and z they are there, else they come first.
+    """
     rows: list[list[float]] = []
+    places: list[int] | None = None
     for number, line in enumerate(text.splitlines(), 1):
-        words = line.partition("#")[0].replace(",", " ").replace(";", " ").split()
-        if not words:
+        content = line.partition("#")[0].strip()
+        if not content:
             continue
+        words = re.split(r"\s*;\s*" if ";" in content else r"\s*,\s*|\s+", content)
+        if places is None:
+            named = [word.strip("\"'").lower() for word in words]
+            places = [named.index(axis) for axis in "xyz"] if {*"xyz"} <= {*named} else [0, 1, 2]
+            if not any(map(_is_number, words)):
+                continue
         try:
-            rows.append([float(word) for word in words[:3]])
-        except ValueError as error:
-            if number > 1 or any(map(_is_number, words)):
-                raise DatasetError(f"{source}:{number}: expected x, y, z, got {line.strip()!r}") from error
-            continue
-        if len(rows[-1]) < 3:
-            raise DatasetError(f"{source}:{number}: expected x, y, z, got {line.strip()!r}")
+            rows.append([float(words[place]) for place in places])
+        except (ValueError, IndexError) as error:
+            raise DatasetError(f"{source}:{number}: expected x, y, z, got {line.strip()!r}") from error
     return np.array(rows, np.float64).reshape(-1, 3)
 
 
