@@ -118,6 +118,9 @@ def test_npy_and_grey_floats(tmp_path):
     save(tmp_path / "numbers.npy", (depth * 1000).astype(np.int64))
     np.testing.assert_array_equal(read_depth(tmp_path / "grey.npy"), depth)
     assert read_depth(tmp_path / "numbers.npy").dtype == np.uint16
+    for name, other in (("bytes", (depth * 1000).astype(">u2")), ("one", depth[..., None].astype(">f4"))):
+        save(tmp_path / f"{name}.npy", other)
+        np.testing.assert_array_equal(read_depth(tmp_path / f"{name}.npy"), other.reshape(6, 8))
     save(tmp_path / "far.npy", np.full((6, 8), 70_000))
     one_line(lambda: read_depth(tmp_path / "far.npy"), "must hold one 16-bit channel or floats, .* int64")
     (tmp_path / "bad.npy").write_bytes(b"\x93NUMPY")

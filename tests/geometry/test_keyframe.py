@@ -97,6 +97,21 @@ def test_what_is_wrong_is_named(fields: dict[str, Any], message: str) -> None:
         Keyframe(**given)
 
 
+def test_what_is_masked_is_no_return() -> None:
+    hidden = np.eye(4, 5, dtype=bool)
+    depth, metres = (
+        Keyframe(depth=np.ma.masked_array(one, hidden), intrinsics=CAMERA, T_world_camera=np.eye(4)).depth
+        for one in (np.full((4, 5), 7, np.uint16), np.full((4, 5), 0.5, np.float32))
+    )
+    assert depth is not None
+    assert metres is not None
+    np.testing.assert_array_equal(depth, np.where(hidden, 0, 7))
+    np.testing.assert_array_equal(metres, np.where(hidden, np.nan, 0.5).astype(np.float32))
+    cloud = Keyframe(points=np.ma.masked_equal(POINTS, POINTS[0, 0]), T_world_camera=np.eye(4)).points
+    assert cloud is not None
+    assert np.isnan(cloud[0, 0])
+
+
 def test_a_far_translation_is_refused() -> None:
     T = np.eye(4)
     T[0, 3] = 2e6

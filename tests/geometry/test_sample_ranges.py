@@ -15,7 +15,7 @@ CAMERA = Intrinsics(10.0, 10.0, 3.5, 2.5)
 
 def keyframe(**fields: Any) -> Keyframe:
     camera = {} if "points" in fields else {"intrinsics": CAMERA}
-    return Keyframe(**camera, T_world_camera=np.eye(4), **fields)
+    return Keyframe(**{"T_world_camera": np.eye(4), **camera, **fields})
 
 
 def flat(metres: float, dtype: type = np.float32) -> np.ndarray:
@@ -74,4 +74,12 @@ def test_a_wrong_unit_is_named_with_its_cure(fields: dict[str, Any], words: str)
     ],
 )
 def test_why_a_keyframe_has_no_usable_sample(fields: dict[str, Any], words: str) -> None:
-    assert words in why_no_samples(keyframe(**fields), 0.1, 5.0)
+    assert words in why_no_samples(keyframe(**fields), 0.1, 5.0, 2e4)
+
+
+def test_a_sensor_beyond_the_maps_reach_is_named() -> None:
+    T = np.eye(4)
+    T[1, 3] = -22_000.0
+    found = why_no_samples(keyframe(depth=flat(1), T_world_camera=T), 0.1, 5.0, 21_000.0)
+    assert "the sensor is 22 km from the map's origin" in found
+    assert "reach 21 km; subtract an offset" in found

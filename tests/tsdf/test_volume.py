@@ -538,7 +538,7 @@ def test_points_in_any_order_of_keyframes_and_two_sensors() -> None:
 
 def test_a_number_is_the_voxel_size() -> None:
     assert Volume(0.25).config == Volume(voxel_size=0.25).config
-    assert Volume(np.float32(0.25), color=False).config.voxel_size == 0.25
+    assert Volume(np.float32(0.05), color=False).config.voxel_size == 0.05
 
 
 def test_a_keyframe_may_be_given_by_its_fields() -> None:

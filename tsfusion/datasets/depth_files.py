@@ -23,7 +23,12 @@ def read_depth(path: Path, *, invalid: int | None = None) -> NDArray[Any]:
         MissingDependency: for EXR without the OpenEXR package.
     """
     depth = _stored(path)
-    if depth.ndim == 3 and (depth == depth[:, :, :1]).all() and depth.dtype.kind == "f":
+    depth = depth.astype(depth.dtype.newbyteorder("="), copy=False)
+    if (
+        depth.ndim == 3
+        and (depth.shape[2] == 1 or depth.dtype.kind == "f")
+        and (depth == depth[:, :, :1]).all()
+    ):
         depth = depth[:, :, 0]  # grey, as floats are often written
     if depth.dtype.kind in "iu" and depth.dtype.itemsize > 2 and (depth == depth.astype(np.uint16)).all():
         depth = depth.astype(np.uint16)

@@ -323,6 +323,8 @@ def _nearest_rotation(R: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _array(name: str, value: Any, dtypes: tuple[type, ...], shape: tuple[int | None, ...]) -> NDArray[Any]:
     expected = " or ".join(np.dtype(dtype).name for dtype in dtypes)
+    if isinstance(value, np.ma.MaskedArray):  # what is masked is no return
+        value = value.filled(np.nan if value.dtype.kind == "f" else 0)
     try:
         array = np.asarray(value)
     except ValueError as error:  # rows of unequal length

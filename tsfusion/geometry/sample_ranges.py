@@ -52,11 +52,12 @@ def wrong_unit(keyframe: Keyframe) -> str:
     )
 
 
-def why_no_samples(keyframe: Keyframe, min_range: float, max_range: float) -> str:
+def why_no_samples(keyframe: Keyframe, min_range: float, max_range: float, reach: float) -> str:
     """Why a map can use none of a keyframe's samples, and what to do, for a person.
 
     Args:
         min_range, max_range: of the sensor's model, metres.
+        reach: of the map from its origin along each axis, metres.
     """
     ranges = sample_ranges(keyframe)
     count = int(np.prod(keyframe.shape))
@@ -69,4 +70,10 @@ def why_no_samples(keyframe: Keyframe, min_range: float, max_range: float) -> st
         return start + f"{where}; {wrong_unit(keyframe) or 'use another --sensor or --max-range'}"
     if keyframe.confidence is not None and not keyframe.confidence.any():
         return start + "every one has confidence 0; 255 is full confidence"
+    away = float(np.abs(keyframe.T_world_camera[:3, 3]).max())
+    if away + float(ranges.max()) > reach:
+        return start + (
+            f"none is within the map's reach: the sensor is {away / 1000:.4g} km from the map's origin along "
+            f"an axis, and voxels of this size reach {reach / 1000:.4g} km; subtract an offset from all poses"
+        )
     return start + "the few within range stand alone, as noise does; outlier_filter = false keeps them"

@@ -26,7 +26,7 @@ from tsfusion.geometry.sample_ranges import why_no_samples
 from tsfusion.geometry.up_direction import HeldSensor
 from tsfusion.kernels import runtime
 from tsfusion.kernels.integrate import CUBE
-from tsfusion.kernels.voxel_traversal import COUNT
+from tsfusion.kernels.voxel_traversal import COUNT, VOXEL_LIMIT
 from tsfusion.tsdf import checkpoint, map_addition, map_crop, map_history, mesh_extraction, saved_map
 from tsfusion.tsdf.askable_map import AskableMap
 from tsfusion.tsdf.block_store import MESHED, BlockStore, unpack_keys
@@ -110,7 +110,7 @@ class Volume(AskableMap):
                 f"settings are given by name, such as space_carving=True; for sdf_trunc{hint}"
             )
         if not isinstance(config, VolumeConfig):
-            edge = {} if config is None else {"voxel_size": config}
+            edge = {} if config is None else {"voxel_size": _number(config)}
             config = make_settings(VolumeConfig, {**edge, **settings})
         elif settings:
             config = override(config, **settings)
@@ -167,7 +167,8 @@ class Volume(AskableMap):
     def why_no_samples(self, keyframe: Keyframe) -> str:
         """Why `integrate` found no usable sample in a keyframe, and what to do, for a person."""
         model = self.config.model(keyframe.sensor)
-        return why_no_samples(keyframe, model.min_range, model.max_range)
+        reach = VOXEL_LIMIT * self.config.voxel_size
+        return why_no_samples(keyframe, model.min_range, model.max_range, reach)
 
     def retract(self, keyframe: Keyframe | None = None, *others: object, **fields: Any) -> IntegrateStats:
         """Remove a keyframe, given as to `integrate`: the sums get back the bytes they had without it.
@@ -482,6 +483,11 @@ def _writers(
         return buffers, Integrator(store, buffers, config)
     on_device = DeviceRayBuffers(color=config.color)
     return on_device, DeviceIntegrator(store, device, on_device, config)
+
+
+def _number(value: Any) -> Any:
+    """A number of NumPy's as Python's: 0.05 in float32 is 0.05."""
+    return float(str(value)) if isinstance(value, np.floating) else value
 
 
 def _keyframe(keyframe: Any, others: tuple[object, ...], fields: dict[str, Any]) -> Keyframe:

@@ -60,7 +60,7 @@ def _read_list(path: Path) -> list[tuple[int, Path]]:
             raise DatasetError(f"{path}:{number}: {line!r}; expected {content}")
         images.append((nanoseconds(words[0], path, number), _beside(path, words[1])))
     _check(path, [image for _, image in images], content)
-    return sorted(images)
+    return sorted(set(images))  # a line may be there twice
 
 
 def _read_pairs(path: Path) -> ImageList:
@@ -75,7 +75,7 @@ def _read_pairs(path: Path) -> ImageList:
         stamp = nanoseconds(words[depth], path, number)
         rows.append((stamp, _beside(path, words[depth + 1]), _beside(path, words[color + 1])))
     _check(path, [file for row in rows for file in row[1:]], content)
-    rows.sort()
+    rows = sorted(set(rows))
     return ImageList([row[0] for row in rows], [row[1] for row in rows], [row[2] for row in rows])
 
 
