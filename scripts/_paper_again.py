@@ -27,8 +27,8 @@ from keyframes_and_servers import lasting_address
 from tsfusion.core import process
 from tsfusion.core.config import DEFAULT_MAP, ClientConfig, ServerConfig, VolumeConfig
 from tsfusion.core.errors import TransportError, TsfusionError
-from tsfusion.fuser.journaled_keyframes import JournaledKeyframes
 from tsfusion.journal import state_folder
+from tsfusion.journal.journaled_keyframes import JournaledKeyframes
 from tsfusion.pipelines import target_server
 from tsfusion.pipelines.target_server import ServerChild
 from tsfusion.wire.queries import fetch_health, fetch_status

@@ -11,11 +11,11 @@ from keyframes_and_servers import CAMERA, SHAPE, pose, wall
 
 from tsfusion.core.errors import DecodeError
 from tsfusion.fuser import watched_map
-from tsfusion.fuser.keyframe_poses import KeyframePoses
 from tsfusion.fuser.touched_by import TouchedBy
 from tsfusion.fuser.watched_map import WatchedMap
 from tsfusion.geometry.up_direction import HeldSensor
 from tsfusion.journal import Position
+from tsfusion.journal.keyframe_poses import KeyframePoses
 from tsfusion.wire import corrections
 from tsfusion.wire.corrections import Correction
 from tsfusion.wire.followed_paths import FollowedPaths

@@ -20,11 +20,11 @@ from tsfusion.fuser.current_keyframe import CurrentKeyframe
 from tsfusion.fuser.inbox import Inbox
 from tsfusion.fuser.kept_slices import KeptSlices
 from tsfusion.fuser.kept_views import KeptViews
-from tsfusion.fuser.keyframe_poses import KeyframePoses
 from tsfusion.fuser.messages import NOT_WORKING, Finish, FuserAnswer, FuserQuestion, Publish, encode
 from tsfusion.fuser.question_answers import QuestionAnswers
 from tsfusion.fuser.touched_by import TouchedBy
 from tsfusion.fuser.watched_map import WatchedMap
+from tsfusion.journal.keyframe_poses import KeyframePoses
 from tsfusion.wire import questions
 from tsfusion.wire.questions import MapState, Raycast, Sample, Slice
 

@@ -10,9 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from corrected_maps import final_keyframes
 from failures import refuse
-from keyframes_and_servers import DEADLINE, wall
+from keyframes_and_servers import DEADLINE, pose, wall
 from mcap.reader import make_reader
+from saved_maps import ANNA, correct, forget, make_map
 
 from tsfusion import journal
 from tsfusion.core.errors import JournalError
@@ -201,6 +203,17 @@ def test_a_journal_is_a_dataset_of_its_keyframes(tmp_path: Path) -> None:
         assert np.array_equal(keyframe.depth, wall(i).depth)
     assert len(JournalRecording(tmp_path / "journal")) == 6
     assert 0 < len(JournalRecording(segment_path(tmp_path / "journal", 1))) < 6
+
+
+def test_a_recording_is_at_its_final_poses(tmp_path: Path) -> None:
+    folder = make_map(tmp_path / "state" / "maps" / "default", range(6))
+    correct(folder, ANNA, 7, {1: pose(0.5), 4: pose(0.7)}, removed=(2,))
+    forget(folder, ANNA, (3,), 1)
+    recording = JournalRecording(tmp_path / "state")
+    assert recording.skipped == {"forgotten": 1, "removed by corrections": 1}
+    for keyframe, expected in zip(recording, final_keyframes(folder / "journal"), strict=True):
+        assert np.array_equal(keyframe.depth, expected.depth)
+        assert np.array_equal(keyframe.T_world_camera, expected.T_world_camera)
 
 
 def test_a_recording_says_how_many_keyframes_damage_cost(tmp_path: Path) -> None:

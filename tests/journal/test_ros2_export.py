@@ -9,10 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from corrected_maps import final_keyframes
 from failures import raising
 from keyframes_and_servers import CAMERA, pose, wall
 from mcap.reader import make_reader
 from repository import ROOT
+from saved_maps import ANNA, correct, make_map
 
 from tsfusion import Keyframe
 from tsfusion.core.errors import JournalError, MissingDependency, OutputError
@@ -334,6 +336,25 @@ def small(tmp_path: Path) -> JournalPlace:
     return journal_of(tmp_path, {"a": [wall(0)]})
 
 
+def test_keyframes_are_where_corrections_moved_them(tmp_path: Path) -> None:
+    folder = make_map(tmp_path / "map", range(4))
+    correct(folder, ANNA, 5, {1: pose(0.5), 4: pose(0.7)}, removed=(2,))
+    other = tmp_path / "other.mcap"
+    done = export(JournalPlace(folder / "journal"), other, lambda *_: None)
+    assert (done.keyframes, done.lost) == (3, 0)
+    with rosbags_highlevel.AnyReader([other]) as reader:
+        places = [
+            matrix(reader.deserialize(raw, connection.msgtype).transforms[0].transform)
+            for connection, _, raw in reader.messages()
+            if connection.topic == "/tf"
+        ]
+    expected = [one.T_world_camera for one in final_keyframes(folder / "journal")]
+    np.testing.assert_allclose(places, expected, atol=1e-9)
+    segment = segment_path(folder / "journal", 1)
+    with pytest.raises(OutputError, match="it is in a journal"):  # of another map
+        export(JournalPlace(tmp_path / "other"), segment, lambda *_: None)
+
+
 def test_nothing_half_written_is_left(small: JournalPlace, tmp_path: Path) -> None:
     before = sorted(tmp_path.iterdir())
 
@@ -348,12 +369,12 @@ def test_places_that_cannot_be_written_are_named(small: JournalPlace, tmp_path: 
     for out, message in (
         (tmp_path / "out.bag", "ending in .mcap"),
         (tmp_path / "missing" / "out.mcap", "No such file"),
-        (segment, "in the journal that is read"),
-        (small.path / "out.mcap", "in the journal that is read"),
+        (segment, "it is in a journal"),
+        (small.path / "out.mcap", "it is in a journal"),
     ):
         with pytest.raises(OutputError, match=message):
             export(small, out, lambda *_: None)
-    with pytest.raises(OutputError, match="in the journal that is read"):
+    with pytest.raises(OutputError, match="it is in a journal"):
         export(JournalPlace(segment), segment, lambda *_: None)
     assert segment.read_bytes() == content
     assert read(small.path, next(records(segment)).position).seq == 1

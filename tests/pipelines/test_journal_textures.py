@@ -16,10 +16,10 @@ from formula_scenes import volume_of
 from tsfusion import Keyframe
 from tsfusion.core.config import SERVER_SESSION
 from tsfusion.core.errors import JournalError
-from tsfusion.fuser.journaled_keyframes import JournaledKeyframes
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.textured_mesh import TexturedMesh
 from tsfusion.journal import Journal, state_folder
+from tsfusion.journal.journaled_keyframes import JournaledKeyframes
 from tsfusion.pipelines import journal_fusion, journal_textures
 from tsfusion.wire import codec, corrections
 

@@ -12,8 +12,8 @@ from watched_surfaces import Cell, Held, ordered
 
 from tsfusion import Volume, VolumeConfig
 from tsfusion.core.config import override
-from tsfusion.fuser.journaled_keyframes import JournaledKeyframes
 from tsfusion.journal import state_folder
+from tsfusion.journal.journaled_keyframes import JournaledKeyframes
 from tsfusion.pipelines import piecewise_map
 from tsfusion.pipelines.map_rewinding import RewoundMap
 from tsfusion.pipelines.piecewise_map import PiecewiseMap

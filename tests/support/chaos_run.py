@@ -275,7 +275,7 @@ class Forgetter:
     def verdict(self) -> list[str]:
         """Lies of the server: what it said of forgetting that is not so in its journal."""
         (folder,) = journals(self._daemon.state)
-        forgotten = ForgottenNumbers.in_journal(JournalPlace(folder))
+        forgotten = _forgotten(folder)
         left = set(self._walls())
         problems = list(self.problems)
         for session, numbers, erased in self.told:
@@ -289,10 +289,18 @@ class Forgetter:
     def count(self) -> int:
         """How many keyframes are forgotten."""
         (folder,) = journals(self._daemon.state)
-        forgotten = ForgottenNumbers.in_journal(JournalPlace(folder))
+        forgotten = _forgotten(folder)
         # Also where the answer was lost on its way, and nothing was left to forget when it was asked again
         sessions = {session for session, *_ in (*self.told, *self._walls())}
         return sum(len(forgotten.of(session)) for session in sessions)
+
+
+def _forgotten(folder: Path) -> ForgottenNumbers:
+    found = ForgottenNumbers()
+    for _, step in JournalPlace(folder).steps():
+        if isinstance(step, journal.Record):
+            found.note(step)
+    return found
 
 
 def run(seed: int, folder: Path, *, keyframes: int = 300, kills: int = 12, forgets: int = 5) -> Result:

@@ -15,8 +15,8 @@ from saved_maps import ANNA, BOB, decoded, make_map
 from tsfusion import Volume
 from tsfusion.core.config import SERVER_SESSION
 from tsfusion.core.errors import MapError, MapFull, WeightOverflow
-from tsfusion.fuser.keyframe_poses import KeyframePoses
 from tsfusion.journal import state_folder
+from tsfusion.journal.keyframe_poses import KeyframePoses
 from tsfusion.kernels.integrate import COLOR_LIMIT, WEIGHT_LIMIT
 from tsfusion.tsdf.map_history import of_clients, sessions
 

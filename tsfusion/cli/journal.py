@@ -125,7 +125,7 @@ def export(
     NAME is a scanner's, from its key, else `scanner`; further sessions are
     numbered. Frames: world → NAME, a camera's with z forward. Topics:
 
-    /tf, /NAME/pose                where it was
+    /tf, /NAME/pose                where it was, as corrected since
     /NAME/depth/image              16UC1 mm as sent; stereo: 32FC1 m
     /NAME/depth/camera_info        also for the colour image
     /NAME/color/image/compressed   the JPEG as sent

@@ -8,10 +8,10 @@ from typing import Any
 
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.fuser.keep_window import KeepWindow
-from tsfusion.fuser.keyframe_poses import KeyframePoses
 from tsfusion.fuser.keyframe_search import KeyframeSearch
 from tsfusion.fuser.messages import Begin, Expire, Find, SessionProgress
 from tsfusion.journal import state_folder
+from tsfusion.journal.keyframe_poses import KeyframePoses
 
 
 class Departures:

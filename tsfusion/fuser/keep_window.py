@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from tsfusion import journal
 from tsfusion.core.errors import JournalError
-from tsfusion.fuser.keyframe_poses import KeptKeyframes, KeyframePoses
 from tsfusion.fuser.messages import EXPIRED, Found, FoundKeyframes
 from tsfusion.journal import Position
+from tsfusion.journal.keyframe_poses import KeptKeyframes, KeyframePoses
 
 _INTERVAL_S = 0.5  # between two looks while keyframes come: each may write a record to the journal
 _PATIENCE_S = 5.0  # for that record to come back

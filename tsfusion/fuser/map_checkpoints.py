@@ -12,9 +12,9 @@ import msgspec
 from tsfusion.core import durable_files
 from tsfusion.core.config import LIMIT_SETTINGS, RUN_SETTINGS, VIEW_SETTINGS, VolumeConfig
 from tsfusion.core.errors import CheckpointError, DamagedCheckpoint, InvalidConfig, TsfusionError
-from tsfusion.fuser.keyframe_poses import KeyframePoses
 from tsfusion.fuser.messages import SessionProgress
 from tsfusion.journal import state_folder
+from tsfusion.journal.keyframe_poses import KeyframePoses
 
 if TYPE_CHECKING:
     from tsfusion.tsdf.volume import Volume

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 from tsfusion import journal
 from tsfusion.core.errors import JournalError, TsfusionError
-from tsfusion.fuser.keyframe_poses import KeyframePoses, Move
 from tsfusion.fuser.messages import CorrectionProgress
 from tsfusion.geometry.keyframe import Keyframe
+from tsfusion.journal.keyframe_poses import KeyframePoses, Move
 from tsfusion.wire import codec
 
 if TYPE_CHECKING:

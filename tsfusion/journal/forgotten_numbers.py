@@ -7,7 +7,6 @@ from tsfusion.core.config import SERVER_SESSION
 from tsfusion.core.errors import DecodeError
 from tsfusion.core.number_ranges import NumberRanges
 from tsfusion.journal.mcap_layout import Record
-from tsfusion.journal.state_folder import JournalPlace
 from tsfusion.wire import codec
 from tsfusion.wire.corrections import Correction
 
@@ -21,15 +20,6 @@ class ForgottenNumbers:
     def __contains__(self, keyframe: tuple[bytes, int]) -> bool:
         session, seq = keyframe
         return session in self._sessions and seq in self._sessions[session]
-
-    @classmethod
-    def in_journal(cls, place: JournalPlace) -> "ForgottenNumbers":
-        """All that the records of a journal forget; it is read from end to end."""
-        found = cls()
-        for _, step in place.steps():
-            if isinstance(step, Record):
-                found.note(step)
-        return found
 
     def note(self, record: Record) -> None:
         """Take in a record; any but those that forget keyframes, and a damaged one, are passed over."""

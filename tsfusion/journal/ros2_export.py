@@ -3,6 +3,7 @@
 
 import re
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any
 
@@ -12,11 +13,12 @@ from msgspec import Struct
 from tsfusion.core import durable_files
 from tsfusion.core.errors import DecodeError, InvalidKeyframe, JournalError, MissingDependency, OutputError
 from tsfusion.core.output_folder import check_writable
-from tsfusion.journal.forgotten_numbers import ForgottenNumbers
 from tsfusion.journal.inspection import Problem, problem
+from tsfusion.journal.journaled_keyframes import JournaledKeyframes
 from tsfusion.journal.mcap_layout import Record
 from tsfusion.journal.record_scan import Damage, Erased
 from tsfusion.journal.ros2_messages import Converter, Outgoing
+from tsfusion.journal.segments import is_segment
 from tsfusion.journal.state_folder import JournalPlace, Watcher
 from tsfusion.wire import codec
 from tsfusion.wire.record_header import unpack_keyframe
@@ -49,18 +51,22 @@ def export(place: JournalPlace, out: Path, watch: Watcher, *, clouds: bool = Fal
     """
     store = _type_store()
     check_writable(out, (".mcap",))
-    if (
-        out.resolve() in {path.resolve() for path in place.files()}
-        or out.resolve().parent == place.path.resolve()
-    ):
-        raise OutputError(f"cannot write {out}: it is in the journal that is read")
+    of_this = {path.resolve() for path in place.files()}
+    if out.resolve() in of_this or out.resolve().parent == place.path.resolve() or _is_one(out):
+        raise OutputError(f"cannot write {out}: it is in a journal; choose another name")
     try:
         with durable_files.replacing(out) as stream:
-            exporter = _Exporter(_Bag(stream, store), Converter(store.types, clouds=clouds))
+            final = JournaledKeyframes(place, tells=False)
+            exporter = _Exporter(_Bag(stream, store), Converter(store.types, clouds=clouds), final)
             exporter.run(place, watch)
     except OSError as error:
         raise OutputError(f"cannot write {out}: {error.strerror}") from error
     return exporter.result(out)
+
+
+def _is_one(path: Path) -> bool:
+    """Whether a file that is there is a journal's segment."""
+    return path.is_file() and durable_files.size_of(path) > 0 and is_segment(path)
 
 
 def _type_store() -> Any:
@@ -106,9 +112,10 @@ class _Bag:
 
 
 class _Exporter:
-    def __init__(self, bag: _Bag, converter: Converter) -> None:
+    def __init__(self, bag: _Bag, converter: Converter, final: JournaledKeyframes) -> None:
         self._bag = bag
         self._converter = converter
+        self._final = final
         self._names: dict[bytes, str] = {}
         self._has_clock: dict[bytes, bool] = {}  # by session
         self._held: dict[bytes, tuple[Path, Record]] = {}
@@ -117,13 +124,13 @@ class _Exporter:
         self._keyframes = 0
 
     def run(self, place: JournalPlace, watch: Watcher) -> None:
-        """Write everything that is whole, each keyframe once, and none that was forgotten."""
-        forgotten = ForgottenNumbers.in_journal(place)
+        """Write everything that is whole, each keyframe once, at its final pose, and none that was forgotten
+        or that corrections removed."""
         for path, step in place.steps(watch):
             if isinstance(step, Damage):
                 if not isinstance(step, Erased):
                     self._problems.append(problem(path, step))
-            elif (step.session, step.seq) in forgotten:
+            elif (step.session, step.seq) in self._final.left_out:
                 continue
             elif not step.is_correction and (step.session, step.seq) not in self._seen:
                 self._seen.add((step.session, step.seq))
@@ -160,6 +167,9 @@ class _Exporter:
         except (DecodeError, InvalidKeyframe) as error:
             self._refuse(path, record, error)
             return
+        T = self._final.pose_of(record.session, record.seq)
+        if T is not None:  # of one of which the pose alone is damaged it is not known
+            keyframe = replace(keyframe, T_world_camera=T)
         stamp_ns = keyframe.timestamp_ns if self._has_clock.get(record.session) else record.logged_ns
         if stamp_ns // 10**9 > _LAST_SECOND:
             stamp_ns = min(record.logged_ns, _LAST_SECOND * 10**9)

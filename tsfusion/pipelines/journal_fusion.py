@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from tsfusion.core.config import VIEW_SETTINGS, VolumeConfig, override
 from tsfusion.core.errors import DecodeError, InvalidKeyframe, JournalError, MapError
-from tsfusion.fuser.journaled_keyframes import FinalKeyframe, JournaledKeyframes, JournaledSession
 from tsfusion.geometry import color_scales
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.journal import selection, state_folder
+from tsfusion.journal.journaled_keyframes import FinalKeyframe, JournaledKeyframes, JournaledSession
 from tsfusion.journal.recording import LOST
 from tsfusion.journal.state_folder import Watcher
 from tsfusion.pipelines import saved_maps

@@ -5,10 +5,10 @@ from collections.abc import Collection
 from pathlib import Path
 
 from tsfusion.core.errors import DecodeError, InvalidKeyframe, JournalError
-from tsfusion.fuser.journaled_keyframes import JournaledKeyframes
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.textured_mesh import TexturedMesh
+from tsfusion.journal.journaled_keyframes import JournaledKeyframes
 from tsfusion.journal.state_folder import Watcher
 from tsfusion.pipelines import journal_fusion
 from tsfusion.tsdf import texturing

@@ -16,12 +16,12 @@ from tsfusion.core.counts import count_of
 from tsfusion.core.errors import AlignmentRefused, JournalError, MapError
 from tsfusion.evaluation.surface_fit import SampledSurface, SeenDepth, SurfaceFit, fit
 from tsfusion.evaluation.surface_registration import Registration
-from tsfusion.fuser.journaled_keyframes import JournaledKeyframes
 from tsfusion.geometry import se3
 from tsfusion.geometry.keyframe import MAX_POINTS, Keyframe
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.se3 import Transform
 from tsfusion.journal import state_folder
+from tsfusion.journal.journaled_keyframes import JournaledKeyframes
 from tsfusion.pipelines import journal_fusion
 from tsfusion.pipelines.journal_fusion import Watch
 from tsfusion.tsdf import map_history

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from tsfusion import journal
 from tsfusion.core.errors import CheckpointError, DecodeError, InvalidKeyframe, JournalError, MapError
-from tsfusion.fuser.journaled_keyframes import JournaledKeyframes, JournaledSession, KeyframePlace
 from tsfusion.fuser.touched_by import TouchedBy
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.journal import state_folder
+from tsfusion.journal.journaled_keyframes import JournaledKeyframes, JournaledSession, KeyframePlace
 from tsfusion.journal.mcap_layout import Record
 from tsfusion.tsdf import checkpoint, map_history
 from tsfusion.tsdf.volume import Volume

@@ -17,9 +17,9 @@ from tsfusion.core.config import DEFAULT_MAP
 from tsfusion.core.errors import CheckpointError, TsfusionError
 from tsfusion.core.folder_lock import owner_of
 from tsfusion.core.output_folder import RECORD
-from tsfusion.fuser.journaled_keyframes import JournaledKeyframes
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.journal import state_folder
+from tsfusion.journal.journaled_keyframes import JournaledKeyframes
 from tsfusion.pipelines import run_files, saved_maps
 from tsfusion.pipelines.map_rewinding import RewoundMap
 from tsfusion.pipelines.piecewise_map import PiecewiseMap

@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 from tsfusion.core.counts import count_of
 from tsfusion.core.readable_numbers import counted, grouped, size
-from tsfusion.fuser.journaled_keyframes import JournaledKeyframes
 from tsfusion.journal import inspection, state_folder
 from tsfusion.journal.inspection import JournalInfo
+from tsfusion.journal.journaled_keyframes import JournaledKeyframes
 from tsfusion.pipelines import run_files, saved_maps
 from tsfusion.pipelines.report import page, report_files, run_sections
 from tsfusion.pipelines.report.findings import MapFindings, Poses

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from tsfusion import journal
 from tsfusion.core.config import SERVER_SESSION
 from tsfusion.core.errors import DecodeError, InvalidKeyframe
-from tsfusion.fuser.keyframe_poses import KeyframePoses
 from tsfusion.geometry.keyframe import Keyframe
+from tsfusion.journal.keyframe_poses import KeyframePoses
 from tsfusion.journal.mcap_layout import Record
 from tsfusion.journal.state_folder import JournalPlace, Watcher
 from tsfusion.wire import codec
@@ -76,12 +76,15 @@ class JournaledKeyframes:
         until_ns: leave out all that was journaled later, also corrections; by the server's wall clock. What
             was forgotten later does not come back.
         watch: called with the bytes read and all bytes, while the headers are read.
+        tells: whether the log tells of damage.
 
     Attributes:
         sessions: of the whole journal up to `until_ns`.
         unreadable: number of records without a readable header by reason.
         recorded: number of keyframes that are, or were until they were erased, in the journal.
         lost: number of keyframes that damage has destroyed, at least.
+        left_out: session and number of those that the server was told to forget, of which `forgotten` are
+            so many, and of those that corrections removed.
         worlds: that its keyframes name: coordinate frames of scans that found their poses themselves;
             empty = poses were given.
     """
@@ -92,11 +95,13 @@ class JournaledKeyframes:
         *,
         until_ns: int | None = None,
         watch: Watcher = lambda _done, _all: None,
+        tells: bool = True,
     ) -> None:
         self.name = str(place.path)
         self.sessions: dict[bytes, JournaledSession] = {}
         self.unreadable = Counter[str]()
         self.recorded = self.lost = 0
+        self.left_out = set[tuple[bytes, int]]()
         self.worlds = set[str]()
         self._poses = KeyframePoses(None, {})
         self._places: list[KeyframePlace] = []
@@ -105,13 +110,16 @@ class JournaledKeyframes:
                 self.recorded += 1
             elif isinstance(step, journal.Damage):
                 self.lost += step.lost
-                log.log(logging.WARNING if step.torn else logging.ERROR, "%s: %s", file, step.what)
+                if tells:
+                    log.log(logging.WARNING if step.torn else logging.ERROR, "%s: %s", file, step.what)
             elif step.session == SERVER_SESSION:
                 self._forget(step)
             else:
                 self.recorded += not step.is_correction
                 if until_ns is None or step.logged_ns <= until_ns:
                     self._note(file, step)
+        self.left_out.update((one.session, one.seq) for one in self._places if self._pose(one) is None)
+        self.forgotten = sum(self._poses.is_forgotten(*key) for key in self.left_out)
         self._places = [place for place in self._places if self._pose(place) is not None]
 
     def __len__(self) -> int:
@@ -142,8 +150,12 @@ class JournaledKeyframes:
         """Leave out the keyframes of other sessions. Corrections count whoever sent them."""
         self._places = [place for place in self._places if place.session in sessions]
 
+    def pose_of(self, session: bytes, seq: int) -> NDArray[np.float64] | None:
+        """Where a keyframe was taken, (4, 4) T_world_camera; None = it is not there, or left out."""
+        return self._poses.pose_of(session, seq)
+
     def _pose(self, place: KeyframePlace) -> NDArray[np.float64] | None:
-        return self._poses.pose_of(place.session, place.seq)
+        return self.pose_of(place.session, place.seq)
 
     def _note(self, file: Path, record: Record) -> None:
         key, seq = record.session, record.seq
@@ -152,6 +164,8 @@ class JournaledKeyframes:
             return
         session.last_seq, session.last_ns = seq, record.logged_ns
         if self._poses.is_forgotten(key, seq):
+            if not record.is_correction:
+                self.left_out.add((key, seq))
             return
         try:
             if record.is_correction:
