@@ -19,6 +19,7 @@ from saved_maps import ANNA, BOB, correct, decoded, forget, make_map
 from small_recordings import first_views
 
 from tsfusion import Client, Volume, journal
+from tsfusion.gateway import moved_maps
 from tsfusion.journal import segment_path, state_folder
 
 
@@ -282,6 +283,9 @@ def test_a_resumed_map_takes_keyframes(here: Here, state: Path, tmp_path: Path) 
     done = here("map", "resume", file_of(state, "yard"), "--state", "own", "--map", "yard")
     assert done.returncode == 0
     assert "tsfusion serve --state own --voxel-size 0.04\n" in done.stdout
+    moved_maps.write_departed("own", "shed", moved_maps.Departed("1", "", "tcp://there:5", "tcp://there:6"))
+    moved = here("map", "resume", file_of(state, "yard"), "--state", "own", "--map", "shed")
+    assert (moved.returncode, "has moved to tcp://there:5: choose another name" in moved.stderr) == (1, True)
     again = here("map", "resume", file_of(state, "yard"), "--state", "own", "--map", "yard")
     assert (again.returncode, "holds a map already" in again.stderr) == (1, True)
     assert here("map", "hash", "own").stdout.strip() == hash_of(range(5))

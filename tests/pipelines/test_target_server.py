@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: MIT
 """The server that a run starts for itself."""
 
+import os
+import signal
 import sys
 from pathlib import Path
 
 import pytest
 
-from tsfusion.core.config import ServerConfig, VolumeConfig
-from tsfusion.core.errors import TransportError
+from tsfusion.core.config import ClientConfig, ServerConfig, VolumeConfig
+from tsfusion.core.errors import InvalidConfig, TransportError
+from tsfusion.gateway import moved_maps
 from tsfusion.pipelines import target_server
 
 
@@ -47,3 +50,36 @@ def test_when_a_run_fails_the_servers_errors_are_told(
         "the server says: mistake 2",
         "the server says: Fatal Python error: Segmentation fault",
     ]
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="POSIX signals")
+def test_a_map_that_the_server_could_not_save_is_told(tmp_path: Path) -> None:
+    earlier = tmp_path / "state" / "maps" / "default" / "map.tsf"
+    earlier.parent.mkdir(parents=True)
+    earlier.write_bytes(b"of an earlier run")
+    server = ServerConfig(listen="tcp://127.0.0.1:0", state=str(tmp_path / "state"))
+    with target_server.opened(
+        None, tmp_path / "scratch", volume=VolumeConfig(threads=1), server=server
+    ) as target:
+        target.keep_map("default", tmp_path / "map.tsf")
+        assert target.child is not None
+        os.kill(target.child.pid, signal.SIGKILL)
+    assert "the server could not save the map: map.tsf is missing; its keyframes are in" in target.unkept
+    assert not (tmp_path / "map.tsf").exists()
+
+
+def test_a_map_that_has_moved_is_not_scanned_into_elsewhere(tmp_path: Path) -> None:
+    state = tmp_path / "state"
+    moved_maps.write_departed(
+        state, "yard", moved_maps.Departed("1", "", "tcp://there:5555", "tcp://there:5556")
+    )
+    server = ServerConfig(listen="tcp://127.0.0.1:0", state=str(state))
+    with (
+        pytest.raises(InvalidConfig, match="has moved to tcp://there:5555: give --connect"),
+        target_server.opened(
+            None, tmp_path / "scratch", volume=VolumeConfig(threads=1), server=server,
+            client=ClientConfig(map="yard"),
+        ),
+    ):  # fmt: skip
+        pass
+    assert not (tmp_path / "scratch").exists()

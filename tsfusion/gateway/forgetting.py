@@ -23,6 +23,7 @@ from tsfusion.core.errors import JournalError
 from tsfusion.core.number_ranges import NumberRanges
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.fuser.messages import EXPIRED, Find, Found, FoundKeyframes, Saved
+from tsfusion.gateway import moved_maps
 from tsfusion.journal import Journal, Position
 from tsfusion.journal.quarantine import Quarantine
 from tsfusion.wire.corrections import MAX_KEYFRAMES
@@ -210,6 +211,7 @@ class Forgetting:
         """Files of the map that may hold something of any keyframe, and that nothing deletes."""
         for pattern in _LEFT_FILES:
             yield from (str(path) for path in sorted(self._folder.glob(pattern)))
+        yield from map(str, moved_maps.left_behind(self._folder))
 
     def _log(self, request: Request) -> None:
         for one in map(_described, request.found.sessions):

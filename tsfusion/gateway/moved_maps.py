@@ -2,13 +2,15 @@
 """The files that say which maps came from another server, and which ones another server has.
 
 `STATE/maps/NAME/arrived.json` belongs to the map. `STATE/moved/NAME.json` says where it is now; the files
-that it had here when it left are beside it, in `STATE/moved/NAME/`, and nothing reads them any more.
+that it had here when it left are beside it, in `STATE/moved/NAME/` (when it left again in `NAME.2/`, …), and
+nothing reads them any more.
 """
 
 import logging
 import os
-import shutil
+from collections.abc import Iterator
 from contextlib import suppress
+from itertools import count
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -78,7 +80,7 @@ def volume_of(folder: Path) -> VolumeConfig | None:
 
 def departed(state: str | Path, name: str) -> Departed | None:
     """Where a map is that left this server; None = it did not, or it came back."""
-    found = _read(_path(state, name), Departed)
+    found = _read(path_of(state, name), Departed)
     if found is None:
         return None
     here = arrival_of(state_folder.map_folder(state, name))
@@ -87,7 +89,7 @@ def departed(state: str | Path, name: str) -> Departed | None:
 
 def write_departed(state: str | Path, name: str, where: Departed) -> None:
     """Write down that another server has a map; raises JournalError when the disk refuses."""
-    path = _path(state, name)
+    path = path_of(state, name)
     try:
         durable_files.make_folder(path.parent)
         with durable_files.replacing(path) as file:
@@ -100,11 +102,11 @@ def write_departed(state: str | Path, name: str, where: Departed) -> None:
 
 def put_aside(state: str | Path, name: str) -> None:
     """Move the files of a map that left out of the way. What fails is logged, and tried at a start."""
-    folder, aside = state_folder.map_folder(state, name), _path(state, name).with_suffix("")
+    folder = state_folder.map_folder(state, name)
     if departed(state, name) is None or not folder.is_dir() or not state_folder.holds_a_map(folder):
         return
+    aside = next(path for path in _asides(state, name) if not path.exists())
     try:
-        shutil.rmtree(aside, ignore_errors=True)  # of an earlier move of the same map
         os.replace(folder, aside)
         durable_files.sync_folder(folder.parent)
         log.info("the map has moved; its files are kept in %s", aside, extra=logs.about(map=name))
@@ -112,10 +114,27 @@ def put_aside(state: str | Path, name: str) -> None:
         log.error("%s", journal_error("move away", folder, error), extra=logs.about(map=name))
 
 
+def left_behind(folder: Path) -> list[Path]:
+    """What a map's folder in a state folder left aside when the map moved away, at each time."""
+    where = folder.parent.parent / state_folder.MOVED_FOLDER
+    return sorted(path for path in where.glob(f"{folder.name}*") if _is_aside(path, folder.name))
+
+
+def _is_aside(path: Path, name: str) -> bool:
+    return path.name.partition(".")[0] == name and path.is_dir()
+
+
+def _asides(state: str | Path, name: str) -> Iterator[Path]:
+    """Folders for the files that a map leaves here: NAME, NAME.2, NAME.3, …"""
+    first = path_of(state, name).with_suffix("")
+    yield first
+    yield from (first.with_name(f"{name}.{number}") for number in count(2))
+
+
 def forget_departed(state: str | Path, name: str) -> None:
     """Note that a map is back."""
     with suppress(OSError):
-        _path(state, name).unlink(missing_ok=True)
+        path_of(state, name).unlink(missing_ok=True)
 
 
 def departed_names(state: str | Path) -> list[str]:
@@ -129,7 +148,8 @@ def departed_names(state: str | Path) -> list[str]:
     return []
 
 
-def _path(state: str | Path, name: str) -> Path:
+def path_of(state: str | Path, name: str) -> Path:
+    """The file that says where a map is."""
     return Path(state) / state_folder.MOVED_FOLDER / f"{name}{_SUFFIX}"
 
 

@@ -16,6 +16,7 @@ from tsfusion.core.config import ClientConfig, override
 from tsfusion.core.durable_files import make_folder, size_of
 from tsfusion.core.errors import CheckpointError, JournalError, OutputError
 from tsfusion.core.folder_lock import lock_folder
+from tsfusion.gateway import moved_maps
 from tsfusion.journal import state_folder
 from tsfusion.journal.recording import LOST
 from tsfusion.pipelines import settled_maps
@@ -142,6 +143,11 @@ def resume(path: Path, state: Path, map_name: str) -> Path:
     map_name = override(ClientConfig(), map=map_name).map
     folder = state_folder.map_folder(state, map_name)
     with lock_folder(state, "state", "server"):
+        if (where := moved_maps.departed(state, map_name)) is not None:
+            raise OutputError(
+                f"the map {map_name} of {state} has moved to {where.address}: choose another name (--map); "
+                f"if that server is gone for good, delete {moved_maps.path_of(state, map_name)} first"
+            )
         if state_folder.holds_a_map(folder):
             raise OutputError(
                 f"{folder} holds a map already: choose another name (--map), or merge the two (`tsfusion map "

@@ -22,6 +22,7 @@ from tsfusion.core.counts import count_of
 from tsfusion.core.errors import (
     AlignmentRefused,
     DatasetError,
+    IncompleteRun,
     OutputError,
     SourceError,
     TsfusionError,
@@ -118,6 +119,7 @@ def scan(
     """
     failure: list[Exception] = []
     own = connect is None
+    run_files.check_folder(out)
     with results(out, overwrite=overwrite) as (work, folder), ExitStack() as stack:
         frames = _until_failure(iter(source), failure)
         if sensor is not None:
@@ -197,6 +199,8 @@ def scan(
     if failure:
         log.warning("the scan ended early: what came before is in %s", folder)
         raise failure[0]
+    if target.unkept:
+        raise IncompleteRun(target.unkept)
     return result
 
 

@@ -13,7 +13,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
 
@@ -28,9 +28,10 @@ from tsfusion.core.config import (
     VolumeConfig,
     override,
 )
-from tsfusion.core.errors import JournalError, TransportError, TsfusionError
+from tsfusion.core.errors import InvalidConfig, JournalError, TransportError, TsfusionError
 from tsfusion.core.folder_lock import owner_of
 from tsfusion.delivery import left_spools
+from tsfusion.gateway import moved_maps
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.journal import state_folder
 from tsfusion.wire.curve import ClientKeys, client_keys
@@ -113,6 +114,11 @@ class ServerChild:
         with self._process:  # closes its pipes
             pass
 
+    @property
+    def status(self) -> int | None:
+        """Its exit status; None = it runs."""
+        return self._process.returncode
+
     def kill(self) -> None:
         """End the server and its fuser at once, if they run; what they wrote is thrown away."""
         with self._process, suppress(ProcessLookupError):  # closes its pipes and waits for it
@@ -170,6 +176,12 @@ class Target:
     child: ServerChild | None  # the server started for this run; None = the server runs elsewhere
     _clients: ExitStack
     _kept: dict[str, Path]  # maps of the server started for this run, and the files that they become
+    _unkept: list[str] = field(default_factory=list)  # why some of these did not become any
+
+    @property
+    def unkept(self) -> str:
+        """Why maps could not be kept in files; empty = they were, or the server still runs."""
+        return "; ".join(self._unkept)
 
     def client(
         self, map_name: str, *, policy: Policy | None = None, world: str = "", same_frame: bool = False
@@ -272,13 +284,18 @@ def opened(
 
     Raises:
         TransportError: when the server does not start.
-        InvalidConfig: for keys that are of no use.
+        InvalidConfig: for keys that are of no use, and where the map is another server's now.
     """
-    scratch.mkdir()
     link, child = client or ClientConfig(), None
     kept: dict[str, Path] = {}
     server = server or ServerConfig(listen="tcp://127.0.0.1:0", state=THROWN_AWAY, max_maps=MAPS)
     state = scratch / "state" if server.state == THROWN_AWAY else Path(server.state)
+    if connect is None and (where := moved_maps.departed(state, link.map)) is not None:
+        raise InvalidConfig(
+            f"the map {link.map} of {state} has moved to {where.address}: give --connect {where.address} "
+            "instead of --state, or choose another --map"
+        )
+    scratch.mkdir()
     with ExitStack() as stack:
         if connect is None:
             server = override(server, state=str(state))
@@ -288,10 +305,24 @@ def opened(
             link = override(link, address=connect)
         keys = client_keys(link.key, link.server_key)
         link = override(link, map=map_to_send_to(link, link.map, DEFAULT_MAP))
-        yield Target(link, keys, spools or scratch / "spool", child, stack, kept)
+        target = Target(link, keys, spools or scratch / "spool", child, stack, kept)
+        yield target
+    if child is not None and child.status != 0 and kept:
+        child.tell_errors()
+        kept_in = "" if server.state == THROWN_AWAY else f"; its keyframes are in the journal in {state}"
+        target._unkept.append(f"the server could not save the map: {_names(kept)} is missing{kept_in}")
+        kept.clear()
     for name, path in kept.items():
-        _copy_map(state_folder.map_folder(state, name) / state_folder.MAP_FILE, path)
+        try:
+            _copy_map(state_folder.map_folder(state, name) / state_folder.MAP_FILE, path)
+        except OSError as error:
+            path.unlink(missing_ok=True)
+            target._unkept.append(f"the map could not be kept in {path.name}: {error.strerror}")
     shutil.rmtree(scratch)
+
+
+def _names(kept: dict[str, Path]) -> str:
+    return ", ".join(path.name for path in kept.values())
 
 
 def _copy_map(saved: Path, path: Path) -> None:
@@ -299,7 +330,4 @@ def _copy_map(saved: Path, path: Path) -> None:
     try:
         os.link(saved, path)
     except OSError:  # another file system, or one without links
-        try:
-            shutil.copyfile(saved, path)
-        except OSError as error:
-            log.warning("the map could not be kept in %s: %s", path.name, error.strerror)
+        shutil.copyfile(saved, path)
