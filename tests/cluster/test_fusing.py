@@ -16,6 +16,7 @@ import pytest
 from command_processes import Here, alive, descendants, end, eventually, read_until, started, tsfusion
 from corrected_maps import fresh_map
 from keyframes_and_servers import VOLUME, pose, wall
+from saved_maps import make_map
 from silent_display import Silent
 from small_recordings import corbs, kitti, redwood
 
@@ -26,7 +27,7 @@ from tsfusion.cluster.fusion import FusedRun, Wishes
 from tsfusion.cluster.jobs import AnyJob, Lost, Message
 from tsfusion.core.config import VolumeConfig
 from tsfusion.core.errors import InvalidConfig, JournalError, MapError, OutputError, WorkerLost
-from tsfusion.journal import Journal
+from tsfusion.journal import Journal, segment_path
 from tsfusion.wire import codec, corrections
 
 SESSION, COUNT = b"\xab" * 16, 12
@@ -181,6 +182,31 @@ def test_a_recording_that_was_mended_begins_anew(tmp_path: Path, change: str) ->
     assert jobs_done() != []
 
 
+def test_keyframes_that_the_journal_no_longer_has_are_told(here: Here, tmp_path: Path) -> None:
+    folder = make_map(tmp_path / "state" / "maps" / "default", range(4))
+    make_map(folder, range(4, 8))  # in a segment of their own
+    segment_path(folder / "journal", 1).unlink()
+    for command in ("fuse", "replay"):
+        done = here(command, tmp_path / "state", "--out", tmp_path / command)
+        assert done.returncode == 1
+        assert "the journal no longer has 4 keyframes of the map" in done.stderr.splitlines()[-1]
+        assert (tmp_path / command / "mesh.ply").is_file()
+    part = here("fuse", segment_path(folder / "journal", 2), "--out", tmp_path / "part")
+    assert part.returncode == 0, part.stderr
+
+
+@pytest.mark.parametrize("command", ["fuse", "replay"])
+def test_results_never_replace_a_servers_map(here: Here, tmp_path: Path, command: str) -> None:
+    folder = make_map(tmp_path / "state" / "maps" / "default", range(2))
+    content = (folder / "map.tsf").read_bytes()
+    done = here(command, "synthetic:room", "--option", "count=2", "--out", folder, "--overwrite")
+    assert "a server keeps its map there" in done.stderr
+    again = here("replay", tmp_path / "state", "--state", tmp_path / "state", "--out", tmp_path / "again")
+    assert "its keyframes would count twice there" in again.stderr
+    assert (done.returncode, again.returncode) == (1, 1)
+    assert (folder / "map.tsf").read_bytes() == content
+
+
 def test_a_map_larger_than_a_workers_memory_goes_out_in_parts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -259,19 +285,23 @@ def test_the_settings_of_the_saved_map_are_taken(state: Path, here: Here, expect
     assert here("map", "hash", "out/map.tsf").stdout.strip() == expected.map_hash()
 
 
+def settings(path: Path) -> dict[str, Any]:
+    return keyframe_sources.settings_of(keyframe_sources.saved_beside(path, None))
+
+
 def test_each_place_in_a_map_names_the_saved_maps_settings(
     state: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     segment = next((state / "journal").glob("*.mcap"))
     places = [state, state / "journal", segment]
-    assert [keyframe_sources.saved_settings(path, None) for path in places] == [{}] * 3
+    assert [settings(path) for path in places] == [{}] * 3
     Volume(VOLUME).save(state / "map.tsf", meta={"done": {}})
     monkeypatch.chdir(state / "journal")
     places += [Path(), Path(segment.name)]
-    found = [keyframe_sources.saved_settings(path, None) for path in places]
+    found = [settings(path) for path in places]
     assert [VolumeConfig(**each, threads=VOLUME.threads) for each in found] == [VOLUME] * 5
     (state / "map.tsf").write_bytes(b"no map")
-    assert keyframe_sources.saved_settings(state, None) == {}
+    assert settings(state) == {}
     assert "map.tsf" in caplog.text
     assert "its settings are not taken" in caplog.text
 

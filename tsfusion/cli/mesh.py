@@ -218,10 +218,10 @@ def _refuse_for_files(context: typer.Context, source: str) -> None:
 
 def _saved_settings(source: str, map_: str | None) -> dict[str, Any]:
     """Settings of the map that a server has saved of a journal; flags and the file are on top of them."""
-    from tsfusion.cluster.keyframe_sources import saved_settings
+    from tsfusion.cluster.keyframe_sources import saved_beside, settings_of
 
     is_journal = not source.endswith(".tsf") and Path(source).exists()
-    return saved_settings(Path(source), map_) if is_journal else {}
+    return settings_of(saved_beside(Path(source), map_)) if is_journal else {}
 
 
 def _of_server(

@@ -70,20 +70,22 @@ def replay(
             **options.camera(intrinsics, calibration),
         ),
     )  # fmt: skip
-    usual = getattr(dataset, "usual", None)
+    opened, usual, absent = dataset, getattr(dataset, "usual", None), getattr(dataset, "absent", 0)
     chosen = options.configuration_for(dataset.sensor, config, usual=usual, tell=connect is None, **settings)
     posed = len(dataset)
     if start or stride > 1 or max_frames is not None:
         dataset = select(dataset, start=start, stride=stride, limit=max_frames)
     for reason, count in dataset.skipped.items():
         typer.echo(f"left out {count_of(count, 'frame')} {reason}", err=True)
-    missed = [shortfall.of_poses(posed, dataset.skipped)]
+    missed = [shortfall.of_poses(posed, dataset.skipped), shortfall.of_absence(absent)]
     doubt, warnings = _checked(dataset) if check_ and not _is_synthetic(path) else ("", [])
     if doubt:
         missed.append(f"the map is likely wrong (--no-check accepts it): {doubt}")
     client = options.client_settings(
         chosen, connect, control=control, map=map_, key=key, server_key=server_key
     )
+    if state is not None:
+        _refuse_own_journal(opened, state, client.map)
     _run(
         dataset, out, view=view, overwrite=overwrite, json=json,
         volume=options.own_volume(chosen, client, settings), server=options.own_server(chosen, state),
@@ -103,7 +105,7 @@ def open_recording(path: Path, /, *, unpack: bool = False, **given: Any) -> "Dat
     from tsfusion.journal.state_folder import is_journal
 
     if is_journal(path):
-        from tsfusion.cluster.keyframe_sources import saved_settings
+        from tsfusion.cluster import keyframe_sources
         from tsfusion.core.errors import DatasetError
         from tsfusion.journal.recording import JournalRecording
 
@@ -111,7 +113,9 @@ def open_recording(path: Path, /, *, unpack: bool = False, **given: Any) -> "Dat
             if value is not None and name != "posed":
                 raise DatasetError(f"--{name} has no effect on a journal: leave it out")
         journaled = JournalRecording(path)
-        journaled.usual = saved_settings(Path(journaled.name), None)
+        saved = keyframe_sources.saved_beside(Path(journaled.name), None)
+        journaled.usual = keyframe_sources.settings_of(saved)
+        journaled.absent = keyframe_sources.absent(path, saved, journaled.recorded)
         return journaled
     from tsfusion.datasets import describe, open_dataset
 
@@ -119,6 +123,20 @@ def open_recording(path: Path, /, *, unpack: bool = False, **given: Any) -> "Dat
     if not _is_synthetic(path):
         output.text(f"found: {describe(dataset)}", err=True, indent=7)
     return dataset
+
+
+def _refuse_own_journal(dataset: "Dataset", state: Path, map_name: str) -> None:
+    """Raise InvalidConfig where a journal would be replayed into the map that it is of."""
+    from tsfusion.core.errors import InvalidConfig
+    from tsfusion.journal import state_folder
+    from tsfusion.journal.recording import JournalRecording
+
+    folder = state_folder.map_folder(state, map_name).resolve()
+    if isinstance(dataset, JournalRecording) and folder in Path(dataset.name).resolve().parents:
+        raise InvalidConfig(
+            f"{dataset.name} is of the map {map_name} in {state}: its keyframes would count twice there; "
+            "choose another --state or --map"
+        )
 
 
 def _is_synthetic(path: Path) -> bool:

@@ -164,6 +164,7 @@ def fuse(
         TsfusionError: as whatever a job raises.
     """
     check(config)
+    run_files.check_folder(out)
     with output_folder.results(out, overwrite=overwrite) as (results, folder):
         place = (results if out is None else folder).absolute()  # a dated folder is not found again
         wishes = wishes or Wishes()

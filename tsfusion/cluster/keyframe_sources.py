@@ -24,10 +24,12 @@ from tsfusion.core.errors import CheckpointError, DatasetError, InvalidConfig, J
 from tsfusion.datasets import open_dataset
 from tsfusion.datasets.cameras import camera_files
 from tsfusion.datasets.dataset import Dataset, pose_of
-from tsfusion.fuser.journaled_keyframes import JournaledKeyframes
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.journal import locations, state_folder
+from tsfusion.journal.journaled_keyframes import JournaledKeyframes
+from tsfusion.pipelines import saved_maps
 from tsfusion.tsdf import checkpoint
+from tsfusion.tsdf.checkpoint import CheckpointHeader
 from tsfusion.wire import codec
 
 SYNTHETIC = "synthetic:"
@@ -48,6 +50,7 @@ class Listed(msgspec.Struct):
         usual: settings that are usual for the first dataset.
         left_out: reason → number of records without a readable header, or of a dataset's frames.
         lost: number of keyframes that damage in the journals has destroyed, at least.
+        absent: number of those of saved maps that the journals beside these no longer have.
     """
 
     keyframes: list[Keyframes] = []
@@ -57,6 +60,7 @@ class Listed(msgspec.Struct):
     usual: dict[str, Any] = {}
     left_out: dict[str, int] = {}
     lost: int = 0
+    absent: int = 0
 
     @property
     def count(self) -> int:
@@ -165,31 +169,48 @@ def _journal(
         )
     )
     found.lost += keyframes.lost
-    found.saved = found.saved or saved_settings(path, map_name)
+    saved = saved_beside(path, map_name)
+    found.saved = found.saved or settings_of(saved)
+    found.absent += absent(path, saved, keyframes.recorded + keyframes.lost)
     return keyframes
 
 
-def saved_settings(path: Path, map_name: str | None) -> dict[str, Any]:
-    """The settings of the saved map beside a journal, without what its sensor's preset says; empty = there is
-    none. One that cannot be read is a warning."""
+def saved_beside(path: Path, map_name: str | None) -> CheckpointHeader | None:
+    """The header of the saved map beside a journal; None = there is none. One that cannot be read is a
+    warning."""
     if locations.is_url(path):
-        return {}
+        return None
     folder = state_folder.resolve_map(path, map_name).absolute()
     if folder.is_file():
         folder = folder.parent
     if folder.name == state_folder.JOURNAL_FOLDER:
         folder = folder.parent
     try:
-        with checkpoint.reading(folder / state_folder.MAP_FILE) as opened:
-            saved = msgspec.structs.asdict(opened[0].config)
+        with checkpoint.reading(folder / state_folder.MAP_FILE) as (header, _):
+            return header
     except CheckpointError as error:
         if (folder / state_folder.MAP_FILE).exists():
             log.warning("%s; its settings are not taken", error)
         elif (folder / state_folder.JOURNAL_FOLDER).is_dir():
             log.warning("no map is saved in %s yet that says its settings: flags and defaults count", folder)
-        return {}
+        return None
+
+
+def settings_of(header: CheckpointHeader | None) -> dict[str, Any]:
+    """The settings of a saved map, without what its sensor's preset says; empty = there is none."""
+    saved = {} if header is None else msgspec.structs.asdict(header.config)
     # None = what its preset says; how many threads there were is no property of a map
     return {name: value for name, value in saved.items() if value is not None and name != "threads"}
+
+
+def absent(path: Path, header: CheckpointHeader | None, recorded: int) -> int:
+    """Number of a saved map's keyframes that the journal beside it, which has so many, no longer has.
+
+    None of one segment's, or of a map that is not known to be the journal's.
+    """
+    if header is None or "done" not in header.meta or journal.is_segment(path):
+        return 0
+    return saved_maps.missing(header, recorded)
 
 
 def _check_once(sources: Sequence[str]) -> None:

@@ -84,6 +84,7 @@ def replay(
     unread: list[str] = []
     stamps: list[int] = []
     poses: list[NDArray[np.float64]] = []
+    run_files.check_folder(out)
     with results(out, overwrite=overwrite) as (work, folder), ExitStack() as watching:
         first = dataset[0]  # a dataset that cannot be read is an error before a server starts
         if connect is None:
@@ -139,7 +140,7 @@ def replay(
             dataset, sender, written, error_mm, folder=folder,
             seconds=seconds, rate=rate, peak_rss_bytes=peak,
             server_start_seconds=target.child.start_seconds if target.child else None,
-            warnings=warnings, missed=[*unread, *missed],
+            warnings=warnings, missed=[*unread, target.unkept, *missed],
         )  # fmt: skip
         run_files.write_ledger(work, sender.records)
         growth.write_csv(work / "growth.csv")

@@ -26,6 +26,7 @@ from tsfusion.datasets.trajectory_files import write_tum
 from tsfusion.geometry import up_direction
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.up_direction import HeldSensor, Up
+from tsfusion.journal.state_folder import check_no_map_of_a_server
 from tsfusion.pipelines import latency_ledger, mesh_files, shortfall
 from tsfusion.pipelines.target_server import Target
 from tsfusion.wire.health import Status
@@ -40,6 +41,12 @@ MORE_SURFACE = (
 )
 log = logging.getLogger(__name__)
 _MESH_FILES = (("mesh", ".ply"), ("mesh", ".glb"), ("preview", ".png"))
+
+
+def check_folder(out: str | os.PathLike[str] | None) -> None:
+    """Raise OutputError where a run's `map.tsf` would take the place of a server's."""
+    if out is not None:
+        check_no_map_of_a_server(Path(out).expanduser() / MAP)
 
 
 class Circumstances(msgspec.Struct, frozen=True, kw_only=True):

@@ -63,6 +63,17 @@ def of_damage(lost: int) -> str:
     )
 
 
+def of_absence(absent: int) -> str:
+    """Say that journals no longer have so many keyframes of the maps saved beside them; empty = none."""
+    if not absent:
+        return ""
+    return (
+        f"the journal no longer has {count_of(absent, 'keyframe')} of the map that is saved beside it "
+        "(deleted, or they came with `tsfusion map resume`), so they are not in this one; `tsfusion mesh`, "
+        "`ask` and `map` read the saved one"
+    )
+
+
 def cure_of_tracking(localizer: str) -> str:
     """Advice when frames are lost, by the name of the localizer."""
     if localizer == "trajectory":
