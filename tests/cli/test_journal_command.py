@@ -251,11 +251,19 @@ def test_what_a_crc_does_not_see_is_found(
     assert (done[0], what in done[1]) == (status, True), done
 
 
-def test_a_missing_segment_is_noted(tmp_path: Path, run: Run) -> None:
+def test_a_missing_segment_is_damage(tmp_path: Path, run: Run) -> None:
     fill(tmp_path / "journal")
     segment_path(tmp_path / "journal", 2).unlink()
     status, out, _ = run("verify", tmp_path)
+    assert (status, "1 segment before this one is missing" in out) == (1, True)
+    assert JournalRecording(tmp_path).skipped == {"lost to damage": 1}
+    assert run("recover", tmp_path, tmp_path / "saved")[0] == 1
+    (tmp_path / "journal").rename(tmp_path / "spool")  # whose segments go as they are sent
+    status, out, _ = run("verify", tmp_path / "spool")
     assert (status, "1 numbers before this one have no file" in out) == (0, True)
+    segment_path(tmp_path / "spool", 1).unlink()
+    (tmp_path / "spool").rename(tmp_path / "journal")
+    assert run("verify", tmp_path)[0] == 0, "the oldest may be deleted"
 
 
 def test_a_file_that_cannot_be_read_does_not_hide_the_others(tmp_path: Path, run: Run) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from msgspec import Struct
 
 from tsfusion.core.config import MAP_NAME
+from tsfusion.core.counts import count_of
 from tsfusion.core.durable_files import size_of
 from tsfusion.core.errors import JournalError, OutputError
 from tsfusion.journal.mcap_layout import Position, Record
@@ -157,11 +158,20 @@ class JournalPlace(Struct, frozen=True):
         except OSError as error:
             raise journal_error("list", self.quarantine, error) from error
 
+    @property
+    def is_a_maps(self) -> bool:
+        """Whether it is a map's journal, of which segments are deleted oldest first alone."""
+        return self.quarantine is not None or self.path.name == JOURNAL_FOLDER
+
     def steps(self, watch: Watcher = lambda _done, _all: None) -> Iterator[tuple[Path, Record | Damage]]:
-        """Records and damaged places, each with its file; a file that cannot be read is a damaged place."""
+        """Records and damaged places, each with its file; a file that cannot be read is a damaged place, and
+        segments that a map's journal lacks between others are one."""
         files = [(path, size_of(path)) for path in self.files()]
-        total, before = sum(size for _, size in files), 0
+        total, before, last = sum(size for _, size in files), 0, 0
         for path, size in files:
+            if self.is_a_maps and (gap := gap_before(path, last)) is not None:
+                yield path, gap
+            last = segment_number(path)
             try:
                 for step in scan_records(path):
                     yield path, step
@@ -170,6 +180,16 @@ class JournalPlace(Struct, frozen=True):
                 yield path, Damage(Position(segment_number(path), 0), size, 1, str(error))
             before += size
             watch(before, total)
+
+
+def gap_before(path: Path, last: int) -> Damage | None:
+    """The segments that are missing before one, after number `last` (0 = it is the first); None = none is."""
+    number = segment_number(path)
+    count = number - last - 1
+    if not last or count <= 0:
+        return None
+    what = f"{count_of(count, 'segment')} before this one {'is' if count == 1 else 'are'} missing"
+    return Damage(Position(number, 0), 0, count, what)
 
 
 def find_journal(path: Path, map_name: str | None = None) -> JournalPlace:

@@ -76,7 +76,9 @@ def records_after(
     ]
     before, total = 0, sum(map(size_of, files))
     keyframes = there = lost = all_lost = 0
-    for file in files:
+    for number, file in enumerate(files):
+        if number and (gap := state_folder.gap_before(file, journal.segment_number(files[number - 1]))):
+            all_lost += gap.lost
         places: list[journal.Damage] = []
         records, _ = journal.list_records(file, partial(_add_to, reading, before, total), places.append)
         before += size_of(file)
