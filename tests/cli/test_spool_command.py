@@ -101,3 +101,23 @@ def test_what_waits_is_deleted_only_when_that_is_meant(here: Here) -> None:
     )
     assert here("spool", "drop", "default", "--yes").returncode == 0
     assert here("spool", "list").stdout == ""
+
+
+def test_what_damage_has_cost_is_told(server: Server, here: Here) -> None:
+    left("barn", map="barn", world="w1")
+    left("shed", 1, map="shed", world="w2")
+    for name in ("barn", "shed"):
+        path = Path("tsfusion-spool") / name / "000001.mcap"
+        content = bytearray(path.read_bytes())
+        content[len(content) // 2] ^= 16
+        path.write_bytes(content)
+    listed = here("spool", "list")
+    assert (listed.returncode, listed.stdout.split()[6:9]) == (1, ["barn", "barn", "w1"])
+    assert "shed: 1 keyframe is lost to damage" in listed.stderr
+    done = here("spool", "send", "--connect", server.address)
+    assert (done.returncode, "barn → map barn: all sent" in done.stdout) == (1, True)
+    assert "barn: 1 keyframe is lost to damage; " in done.stderr
+    assert fetch_health(server.address).maps["barn"].keyframes_durable == 2
+    left("shed.2", map="shed", world="w2")
+    part = here("spool", "send", "shed.2", "--connect", server.address)
+    assert part.returncode == 0, part.stderr

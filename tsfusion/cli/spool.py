@@ -37,7 +37,11 @@ _AGES = ((86400.0, "d"), (3600.0, "h"), (60.0, "min"), (1.0, "s"))
 
 @verbs.verb(app, "tsfusion spool list", "tsfusion spool list --spool /robot/spool", name="list")
 def list_(*, spool: Dir = _FOLDER, json: options.Json = False) -> None:
-    """List the spools in which keyframes wait: map, world, keyframes, bytes, age; oldest first."""
+    """List the spools in which keyframes wait: map, world, keyframes, bytes, age; oldest first.
+
+    Exit status 1 where damage has destroyed some.
+    """
+    from tsfusion.core.errors import IncompleteRun
     from tsfusion.delivery import left_spools
 
     _check_there(spool)
@@ -46,10 +50,19 @@ def list_(*, spool: Dir = _FOLDER, json: options.Json = False) -> None:
         from tsfusion.cli import output
 
         output.as_json([_record(*row) for row in rows])
-        return
-    if not rows:
+    elif rows:
+        _print(rows)
+    else:
         typer.echo(f"no keyframes wait in {spool}", err=True)
-        return
+    if damaged := left_spools.damaged(spool):
+        raise IncompleteRun("; ".join(map(_lost, damaged, damaged.values())))
+
+
+def _lost(folder: Path, count: int) -> str:
+    return f"{folder}: {count_of(count, 'keyframe is', 'keyframes are')} lost to damage"
+
+
+def _print(rows: "list[tuple[LeftSpool, int, int, int]]") -> None:
     width = max(len(left.folder.name) for left, *_ in rows)
     typer.echo(f"{'spool':<{width}}  {'map':<16}  {'world':<8}  {'keyframes':>9}  {'bytes':>8}  age")
     for left, keyframes, _, nbytes in rows:
@@ -101,8 +114,15 @@ def send(
     from tsfusion.cli import output
     from tsfusion.core.config import override
     from tsfusion.core.errors import TransportError
+    from tsfusion.delivery import left_spools
 
     chosen = _choose(spool, names)
+    folders = {one.folder for one in chosen}
+    damaged = {  # counted before: a file goes when the rest of it is sent
+        folder: count
+        for folder, count in left_spools.damaged(spool).items()
+        if folder in folders or not names
+    }
     given = {"control": control, "key": key, "server_key": server_key}
     link = override(options.configuration(config).client, address=connect, **given)
     left, reasons = 0, []
@@ -112,18 +132,19 @@ def send(
         if json:
             output.as_json({"folder": str(one.folder), "map": name, "left": waiting, "why": why})
         else:
-            typer.echo(f"{one.folder} → map {name}: {f'{waiting} not sent' if why else 'all sent'}")
+            typer.echo(f"{one.folder} → map {name}: {f'{waiting} not sent' if waiting else 'all sent'}")
         if why:
             reasons.append(f"{one.folder}: {why}")
     if not chosen:
         typer.echo(f"no keyframes wait in {spool}", err=True)
-    if reasons:
+    if reasons or damaged:
         kept = count_of(
             left,
             "keyframe did not get through and stays where it is",
             "keyframes did not get through and stay where they are",
         )
-        raise TransportError(f"{kept}: {'; '.join(reasons)}")
+        told = "; ".join([*reasons, *map(_lost, damaged, damaged.values())])
+        raise TransportError(f"{kept}: {told}" if left else told)
 
 
 def _check_there(spool: Path) -> None:
@@ -174,6 +195,9 @@ def _send(
         stats = client.stats
         if refused := sum(stats.refused.values()):
             why = why or f"the server refused {refused} for good; they are in {left.folder / 'refused'}"
+        if corrections := sum(stats.corrections_refused.values()):
+            count = count_of(corrections, "correction was", "corrections were")
+            why = "; ".join(filter(None, (why, f"{count} not taken, see the log")))
         return name, stats.waiting + refused, why
 
 

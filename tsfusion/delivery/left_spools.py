@@ -9,7 +9,7 @@ headers of its records.
 import logging
 from collections.abc import Iterator
 from contextlib import suppress
-from itertools import count
+from itertools import chain, count
 from pathlib import Path
 
 from msgspec import Struct
@@ -53,9 +53,24 @@ class LeftSpool(Struct, frozen=True):
 
 def find(root: Path) -> list[LeftSpool]:
     """The spools in a folder, or the folder itself where it is one, that hold records; oldest first."""
-    folders = [root, *(path for path in root.glob("*") if path.is_dir())] if root.is_dir() else []
-    found = (_describe(folder) for folder in folders)
+    found = (_describe(folder) for folder in _folders(root))
     return sorted((one for one in found if one is not None), key=lambda one: one.since_ns)
+
+
+def _folders(root: Path) -> list[Path]:
+    return [root, *(path for path in sorted(root.glob("*")) if path.is_dir())] if root.is_dir() else []
+
+
+def damaged(root: Path) -> dict[Path, int]:
+    """Spools in a folder, or the folder itself, of which damage has destroyed records: how many, at least."""
+    found = {}
+    for folder in _folders(root):
+        with suppress(JournalError):  # `find` tells
+            steps = chain.from_iterable(
+                scan_records(journal.segment_path(folder, number)) for number in journal.segments(folder)
+            )
+            found[folder] = sum(step.lost for step in steps if isinstance(step, Damage))
+    return {folder: count for folder, count in found.items() if count}
 
 
 def free_folder(root: Path, map_name: str) -> Path:

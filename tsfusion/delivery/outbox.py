@@ -52,6 +52,8 @@ class Outbox:
         self._corrections_waiting = 0
         self._times = KeyframeTimesTable()
         self._outcomes = Outcomes()
+        for _ in range(spool.damaged):
+            self._outcomes.skip("damaged", "")
         self._corrections = {entry.seq for entry in spool.waiting if entry.is_correction}  # not noted yet
         # Of what a dead scanner left, any may have been sent; and what a power cut took of it, too.
         self._perhaps_sent = spool.waiting[-1].seq if spool.waiting else 0

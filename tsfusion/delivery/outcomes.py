@@ -21,7 +21,8 @@ class ClientStats(Struct, frozen=True):
         rejected: keyframes on the server's disk that the map could not take: reason → count.
         skipped: keyframes that were never sent: reason → count. by the policy `thinned` (the map was too
             far behind), `room` (the spool's ran short) and `dropped` (it was taken before); `spool` (it has
-            reached `spool_bytes`), `disk` (full, failing or read-only).
+            reached `spool_bytes`), `disk` (full, failing or read-only), `damaged` (an earlier client's, which
+            its spool cannot give back).
         waiting: keyframes and corrections in the spool.
         waiting_bytes: the bytes of those.
         state: of the spool: `ok`, or the reason why it cannot keep all that comes: `spool` or `disk`.

@@ -111,6 +111,7 @@ class Spool:
     def _open(self, segment_bytes: int) -> None:
         self._journal = journal.Journal(self.folder, segment_bytes, sync=not self.temporary, keep_open=True)
         found, self._journal.found = self._journal.found, []
+        self.damaged = self._journal.damaged  # records that waited and cannot be read any more
         sessions = {record.session for record in found} or {secrets.token_bytes(_SESSION_BYTES)}
         if len(sessions) > 1:
             raise JournalError(f"{self.folder} holds keyframes of {len(sessions)} sessions: not one spool")

@@ -13,7 +13,7 @@ from tsfusion.client import ClientStats
 from tsfusion.core.counts import count_of
 from tsfusion.datasets.dataset import WITHOUT_POSE
 
-_LOST = ("spool", "disk")  # reasons of skipping that no policy asks for
+_LOST = ("spool", "disk", "damaged")  # reasons of skipping that no policy asks for
 
 
 def of_delivery(stats: ClientStats, *, spool: str | os.PathLike[str], link: str, rejection: str) -> str:
@@ -39,6 +39,10 @@ def of_delivery(stats: ClientStats, *, spool: str | os.PathLike[str], link: str,
         return f"{_never(stats.refused)}: see the log above"
     if rejected and 2 * rejected > stats.sent:
         return f"the map took {stats.sent - rejected} of {stats.sent} keyframes only: {rejection}"
+    if corrections := stats.corrections_refused:
+        reasons = ", ".join(f"{count} × {reason}" for reason, count in corrections.items())
+        count = count_of(sum(corrections.values()), "correction was", "corrections were")
+        return f"{count} not taken ({reasons}): keyframes are where they were before; see the log above"
     return ""
 
 
