@@ -63,6 +63,26 @@ def test_of_what_a_dead_scanner_left_a_windows_worth_may_be_journaled(outbox: Ou
     again.close()
 
 
+def test_what_the_server_has_no_more_is_lost(outbox: Outbox) -> None:
+    put(outbox, 2)
+    for _ in range(5):
+        send(outbox)
+    outbox.acknowledge(4, 3)
+    before = outbox.stats()
+    assert (before.durable, before.fused, before.refused) == (4, 3, {})
+    assert outbox.welcome(durable=4, window_keyframes=8) == ""
+    assert outbox.stats() == before
+    assert outbox.welcome(durable=1, window_keyframes=8)  # of a server with an older copy of its state folder
+    after = outbox.stats()
+    assert (after.durable, after.fused, after.refused, after.settled) == (1, 1, {"lost": 3}, 4)
+    assert "3 keyframes that the server had on its disk are not there any more" in outbox.take_refusals()
+    outbox.rewind()
+    send(outbox)
+    outbox.acknowledge(5, 5)
+    assert (outbox.stats().durable, outbox.stats().fused, outbox.stats().settled) == (2, 2, 5)
+    assert outbox.is_fused
+
+
 def test_only_what_was_sent_can_be_corrected(outbox: Outbox, tmp_path: Path) -> None:
     """Between what a dead scanner left and what the next one sends, numbers are skipped."""
     outbox.close()

@@ -223,7 +223,8 @@ class ControlSession:
             self._hops = 0
             self._ping_due = self._held_until = 0.0
             self._tries = False
-            self._outbox.welcome(welcome.durable, welcome.window_keyframes)
+            if lost := self._outbox.welcome(welcome.durable, welcome.window_keyframes):
+                log.error("%s", lost)
             self._on_progress(welcome.durable, welcome.fused)
             self._outbox.note_meshed(welcome.fused)  # a new server stamps only what it fuses from here on
             self.rewind()

@@ -28,6 +28,17 @@ class NumberRuns:
         while len(self._runs) > runs:
             self._count -= len(self._runs.popleft())
 
+    def cut(self, most: int) -> int:
+        """Remove the numbers above `most`; returns how many."""
+        before = self._count
+        while self._runs and self._runs[-1].stop > most + 1:
+            run = self._runs.pop()
+            self._count -= len(run)
+            if run.start <= most:
+                self._runs.append(range(run.start, most + 1))
+                self._count += most + 1 - run.start
+        return before - self._count
+
     def __len__(self) -> int:
         return self._count
 

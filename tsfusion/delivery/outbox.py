@@ -47,6 +47,7 @@ class Outbox:
         self._outstanding = 0  # of the oldest in the spool, so many are on their way
         self._unfused = NumberRuns()  # durable, and not answered by the map
         self._fused = NumberRuns()  # keyframes that were counted as fused, the newest ones
+        self._durable = NumberRuns()  # likewise those that were acknowledged
         self._last_fused = self._last_meshed = 0  # numbers
         self._settled = 0  # the map has everything up to this number, each keyframe at its newest pose
         self._corrections_waiting = 0
@@ -268,19 +269,32 @@ class Outbox:
 
     # --- at the server ---
 
-    def welcome(self, durable: int, window_keyframes: int) -> None:
+    def welcome(self, durable: int, window_keyframes: int) -> str:
         """Note how far the server is, when it lets this client in.
 
         Of what a dead scanner left, only a window's worth can have been sent and not be durable yet.
         (Were that server's window larger, one that is dropped now might be in the journal all the same.)
+        What it had acknowledged and does not have is lost: returned in words, empty = nothing is.
         """
         with self._lock:
+            told = self._lose_beyond(durable)
             if not self._welcomed and self._spool.waiting:
                 left = [entry.seq for entry in self._spool.waiting if entry.seq > durable]
                 window = left[: max(window_keyframes, 1)]
                 self._perhaps_sent = min(self._perhaps_sent, window[-1] if window else durable)
             self._welcomed = True
             self._rate.forget()  # it may be a new server, which fuses first what its last checkpoint lacks
+            return told
+
+    def _lose_beyond(self, durable: int) -> str:
+        """Count what was acknowledged beyond a number as lost, and tell it. The lock is held."""
+        lost = self._durable.cut(durable)
+        if not lost:
+            return ""
+        self._unfused.cut(durable)
+        waiting = {entry.seq for entry in self._spool.waiting}
+        self._corrections = {seq for seq in self._corrections if seq <= durable or seq in waiting}
+        return self._outcomes.lose(lost, self._fused.cut(durable))
 
     def is_foreign(self, durable: int) -> bool:
         """Whether the server has records of this session that were never sent from here."""
@@ -309,6 +323,9 @@ class Outbox:
             self._outcomes.durable += len(dropped) - corrections
             for seq in dropped:
                 self._unfused.append(seq)
+                if seq not in self._corrections:
+                    self._durable.append(seq)
+            self._durable.keep_newest(_FUSED_RUNS)
             taken = 0
             for seq in self._unfused.take(fused):
                 self._last_fused = seq

@@ -5,6 +5,7 @@ from collections import Counter, OrderedDict
 
 from msgspec import Struct
 
+from tsfusion.core.counts import count_of
 from tsfusion.delivery.spool import Waiting
 
 _MOST_REMEMBERED = 65536  # numbers of rejected records
@@ -18,6 +19,7 @@ class ClientStats(Struct, frozen=True):
         durable: keyframes on the server's disk.
         fused: keyframes in the server's map.
         refused: keyframes that the server turned away (or that are unreadable here) for good: reason → count.
+            `lost`: it had them, and has them no more.
         rejected: keyframes on the server's disk that the map could not take: reason → count.
         skipped: keyframes that were never sent: reason → count. by the policy `thinned` (the map was too
             far behind), `room` (the spool's ran short) and `dropped` (it was taken before); `spool` (it has
@@ -92,6 +94,18 @@ class Outcomes:
         """Count a record that was given up."""
         (self._corrections_refused if entry.is_correction else self._refused)[reason] += 1
         self._note_refusal(f"{entry.kind} {entry.seq} was refused ({reason}): {message}")
+
+    def lose(self, count: int, fused: int) -> str:
+        """Count keyframes that the server has no more, so many of which it had fused; returns that in words."""
+        self.durable -= count
+        self.fused -= fused
+        self._refused["lost"] += count
+        told = (
+            f"{count_of(count, 'keyframe')} that the server had on its disk are not there any more; is its "
+            "state folder another one, or an older copy?"
+        )
+        self._note_refusal(told)
+        return told
 
     def _note_refusal(self, text: str) -> None:
         self._first_refusal = text if not self._refusal_count else self._first_refusal
