@@ -3,6 +3,7 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import trimesh
@@ -13,6 +14,7 @@ from tsfusion import Volume
 from tsfusion.core.errors import InvalidConfig, OutputError
 from tsfusion.pipelines import mesh_finishing
 from tsfusion.pipelines.mesh_finishing import simplification
+from tsfusion.wire import queries
 
 
 @pytest.fixture(scope="module")
@@ -89,6 +91,20 @@ def test_flags_that_make_no_sense_are_refused(
     assert done.returncode != 0
     assert message in " ".join(done.stderr.split())
     assert not list(tmp_path.iterdir())
+
+
+def test_a_live_map_that_is_behind_is_said_to_be(
+    here: Here, saved: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    behind = SimpleNamespace(waiting=78, corrections_waiting=1)
+    health = SimpleNamespace(maps={"yard": behind, "hall": SimpleNamespace(waiting=0, corrections_waiting=0)})
+    monkeypatch.setattr(queries, "fetch_health", lambda *_, **__: health)
+    monkeypatch.setattr(queries, "fetch_mesh", lambda *_, **__: Volume.load(saved).extract_mesh())
+    done = here("mesh", "tcp://127.0.0.1:9", tmp_path / "m.ply", "--map", "yard", "--json")
+    assert "78 keyframes wait and 1 corrected pose waits to be fused" in done.stderr
+    assert json.loads(done.stdout)["keyframes_waiting"] == 78
+    done = here("mesh", "tcp://127.0.0.1:9", tmp_path / "n.ply", "--map", "hall", "--json")
+    assert (done.stderr, json.loads(done.stdout)["keyframes_waiting"]) == ("", 0)
 
 
 def test_a_live_server_closes_no_holes(here: Here, tmp_path: Path) -> None:

@@ -127,13 +127,13 @@ def mesh(
             "--min-component says which pieces go: leave out --keep-islands or --drop-islands"
         )
     legend: list[dict[str, Any]] = []
-    lost = 0
+    lost, behind = 0, dict[str, int]()
     if "://" in source:
         from tsfusion.wire.curve import client_keys
 
         _refuse_for_server(context)
         keys = client_keys(key, server_key)
-        made = _of_server(source, map_, keys, control=control, min_weight=settings["min_weight"])
+        made, behind = _of_server(source, map_, keys, control=control, min_weight=settings["min_weight"])
     else:
         _refuse_for_files(context, source)
         chosen = options.configuration_for(None, config, usual=_saved_settings(source, map_), **settings)
@@ -176,7 +176,8 @@ def mesh(
         if min_component is None
         else {**dropped, "min_extent_m": min_component, "files": [file.name for file in files]}
     )
-    _print_result(out, {**written.figures, "left_out": left_out}, [*legend, *finishing.legend(made)], json)
+    figures = {**written.figures, "left_out": left_out, **behind}
+    _print_result(out, figures, [*legend, *finishing.legend(made)], json)
     _check(lost)
 
 
@@ -231,16 +232,32 @@ def _of_server(
     *,
     control: str | None,
     min_weight: float | None,
-) -> "Mesh":
+) -> "tuple[Mesh, dict[str, int]]":
+    """The mesh of a live map, and how far that was behind when it was asked for."""
     from dataclasses import replace
 
     from tsfusion.core.config import DEFAULT_MAP
+    from tsfusion.core.counts import count_of
     from tsfusion.geometry.provenance import Provenance
-    from tsfusion.wire.queries import fetch_mesh
+    from tsfusion.wire.queries import fetch_health, fetch_mesh
 
     name = map_name or DEFAULT_MAP
+    there = fetch_health(address, control=control, keys=keys).maps.get(name)
     made = fetch_mesh(address, control=control, map_name=name, min_weight=min_weight, keys=keys)
-    return replace(made, provenance=Provenance(source=f"live map {name}"))
+    behind = {
+        "keyframes_waiting": there.waiting if there else 0,
+        "corrections_waiting": there.corrections_waiting if there else 0,
+    }
+    if any(behind.values()):
+        waiting = " and ".join(
+            count_of(count, f"{noun} waits", f"{noun}s wait")
+            for noun, count in zip(("keyframe", "corrected pose"), behind.values(), strict=True)
+            if count
+        )
+        typer.echo(
+            f"note: the map is behind, {waiting} to be fused: not all of them are in this mesh", err=True
+        )
+    return replace(made, provenance=Provenance(source=f"live map {name}")), behind
 
 
 def _extracted(volume: "Volume", source: str, fill_holes: int | None, json: bool) -> "Mesh":

@@ -96,7 +96,7 @@ class Outcomes:
         self._note_refusal(f"{entry.kind} {entry.seq} was refused ({reason}): {message}")
 
     def lose(self, count: int, fused: int) -> str:
-        """Count keyframes that the server has no more, so many of which it had fused; returns that in words."""
+        """Count keyframes that the server has no more, so many of which it had fused; tell that."""
         self.durable -= count
         self.fused -= fused
         self._refused["lost"] += count

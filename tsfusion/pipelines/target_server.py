@@ -290,7 +290,7 @@ def opened(
     kept: dict[str, Path] = {}
     server = server or ServerConfig(listen="tcp://127.0.0.1:0", state=THROWN_AWAY, max_maps=MAPS)
     state = scratch / "state" if server.state == THROWN_AWAY else Path(server.state)
-    if connect is None and (where := moved_maps.departed(state, link.map)) is not None:
+    if connect is None and state.is_dir() and (where := moved_maps.departed(state, link.map)) is not None:
         raise InvalidConfig(
             f"the map {link.map} of {state} has moved to {where.address}: give --connect {where.address} "
             "instead of --state, or choose another --map"
