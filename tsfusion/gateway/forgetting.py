@@ -57,7 +57,7 @@ class Request:
         self.found = Found(0)
         self.unavailable = 0  # keyframes that corrections could not move, before
         self.erasing: Iterator[int] | None = None
-        self.erased = 0
+        self.erased = self.quarantined = 0
 
     def is_answered(self, in_map: Callable[[bytes], int]) -> bool:
         """Whether the fuser has answered every record that was found; `in_map` as of `Forgetting.step`."""
@@ -168,6 +168,11 @@ class Forgetting:
         if saved.problem:
             self._answer(f"nothing was erased: {saved.problem}")
             return
+        # Before the records: while one of them is left, the same request finds it after a crash, and goes on.
+        request.quarantined = sum(
+            self._quarantine.drop(session.session, NumberRanges(_ranges(session)))
+            for session in request.found.sessions
+        )
         positions = [one for session in request.found.sessions for one in _positions(session)]
         request.erasing = self._journal.erase(positions)
         request.stage = "erase"
@@ -192,17 +197,13 @@ class Forgetting:
         except JournalError as error:
             self._answer(f"only {request.erased} records were erased: {error}")
             return
-        quarantined = sum(
-            self._quarantine.drop(session.session, NumberRanges(_ranges(session)))
-            for session in request.found.sessions
-        )
-        self._answer(self._result(request, quarantined))
+        self._answer(self._result(request))
 
-    def _result(self, request: Request, quarantined: int = 0) -> Forgotten:
+    def _result(self, request: Request) -> Forgotten:
         return Forgotten(
             sessions=tuple(_described(one) for one in request.found.sessions),
             erased=request.erased,
-            quarantined=quarantined,
+            quarantined=request.quarantined,
             remains=tuple(self._left_files()) if request.erase else (),
             unavailable=request.found.unavailable,
         )
