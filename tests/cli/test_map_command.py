@@ -190,13 +190,14 @@ def test_crop_and_merge_back(here: Here, state: Path) -> None:
     for name, low, high in (("left.tsf", -FAR, 0.4), ("right.tsf", 0.4, FAR)):
         done = here("map", "crop", house, "--box", low, -FAR, -FAR, high, FAR, FAR, "--out", name)
         assert done.returncode == 0
-    left = Volume.load("left.tsf")
-    assert left.map_hash() != hash_of(range(10, 14))
-    left.meta = {}  # which says that both were made of the same keyframes
-    left.merge(Volume.load("right.tsf"))
-    assert left.map_hash() == hash_of(range(10, 14))
-    refused = here("map", "merge", "left.tsf", "right.tsf", "--out", "all.tsf")
-    assert "they could count twice" in refused.stderr
+    assert Volume.load("left.tsf").map_hash() != hash_of(range(10, 14))
+    merged = here("map", "merge", "left.tsf", "right.tsf", "--out", "all.tsf", "--json")
+    found = json.loads(merged.stdout)
+    assert (found["map_hash"], found["keyframes"]) == (hash_of(range(10, 14)), 4)
+    here("map", "crop", house, "--box", 0.3, -FAR, -FAR, FAR, FAR, FAR, "--out", "overlaps.tsf")
+    for parts in (("left.tsf", "overlaps.tsf"), ("all.tsf", "right.tsf")):
+        refused = here("map", "merge", *parts, "--out", "twice.tsf")
+        assert "they could count twice" in refused.stderr
     empty = here("map", "crop", "left.tsf", "--box", 8, 8, 8, 9, 9, 9, "--out", "none.tsf")
     assert (empty.returncode, Path("none.tsf").exists()) == (1, False)
     assert "nothing of the map lies in this box" in empty.stderr

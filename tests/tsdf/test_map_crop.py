@@ -57,10 +57,30 @@ def test_boxes_side_by_side_add_up(tmp_path: Path) -> None:
     edges = (-FAR, -0.135, 0.01, FAR)  # the second lies on centres
     parts = [volume.crop((low, -FAR, -FAR, high, FAR, FAR)) for low, high in itertools.pairwise(edges)]
     parts[0].merge(parts[1])
+    assert parts[0].keyframes == volume.keyframes
     parts[0].merge(parts[2])
+    assert parts[0].keyframes == volume.keyframes
+    assert "part_of" not in parts[0].meta
     assert parts[0].map_hash() == volume.map_hash()
     assert parts[0].color_hash() == volume.color_hash()
     assert Volume.load(parts[0].save(tmp_path / "map.tsf")).map_hash() == volume.map_hash()
+
+
+def test_parts_of_parts_are_parts_and_changed_ones_are_none() -> None:
+    volume = volume_of(VIEWS[:2], voxel_size=0.03)
+    volume.meta = {"done": {"61" * 16: (2, "", "")}}  # as a server writes it: of which keyframes a map is
+    left, right = (volume.crop((low, -FAR, -FAR, high, FAR, FAR)) for low, high in ((-FAR, 0), (0, FAR)))
+    upper, lower = (left.crop((-FAR, -FAR, low, FAR, FAR, high)) for low, high in ((-FAR, 0), (0, FAR)))
+    for part in (right, lower):
+        upper.merge(part)
+    assert (upper.map_hash(), upper.keyframes) == (volume.map_hash(), 2)
+    with pytest.raises(MapError, match="could count twice"):
+        upper.merge(lower)
+    with pytest.raises(MapError, match="could count twice"):
+        left.merge(lower)
+    right.integrate(VIEWS[2])  # now it holds more than a part
+    with pytest.raises(MapError, match="could count twice"):
+        left.merge(right)
 
 
 def test_a_cut_keyframe_cannot_be_retracted_and_a_new_one_comes_in() -> None:

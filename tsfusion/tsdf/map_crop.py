@@ -1,17 +1,53 @@
 # SPDX-License-Identifier: MIT
-"""The part of a map in a box, voxel by voxel."""
+"""The part of a map in a box, voxel by voxel; and parts of one map, which may be put together again."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
+import msgspec
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import InvalidConfig
 from tsfusion.kernels.integrate import CHANGED
 from tsfusion.tsdf.block_store import BlockStore, unpack_keys
 
+PART_OF = "part_of"  # in a map's meta: `Part`
 _CHUNK = 1024  # blocks at a time
 _MOST = 1 << 24  # voxels from the origin: beyond any map
+
+
+class Part(Struct, frozen=True):
+    """Which part of another map one is, for as long as its own hash stays.
+
+    Attributes:
+        whole: hash of that map.
+        boxes: first x, y, z and last + 1 of the voxels that were taken over; those of several are disjoint.
+    """
+
+    whole: str
+    own: str
+    boxes: list[list[int]]
+
+    def within(self, first: NDArray[np.int64], end: NDArray[np.int64], own: str) -> "Part":
+        """The part of this part in another box, whose hash is `own`."""
+        cut = [[*np.maximum(box[:3], first), *np.minimum(box[3:], end)] for box in self.boxes]
+        return Part(self.whole, own, [list(map(int, box)) for box in cut if _overlap(box, box)])
+
+    def is_beside(self, other: "Part") -> bool:
+        """Whether both are of one map, and share no voxel."""
+        return self.whole == other.whole and not any(_overlap(a, b) for a in self.boxes for b in other.boxes)
+
+
+def part_of(meta: Mapping[str, Any], own: str) -> Part | None:
+    """Which part of another map one of this meta and hash is; None = of none, or it has changed since."""
+    found = msgspec.convert(meta[PART_OF], Part) if PART_OF in meta else None
+    return found if found is not None and found.own == own else None
+
+
+def _overlap(one: Sequence[int], other: Sequence[int]) -> bool:
+    return all(one[a] < other[a + 3] and other[a] < one[a + 3] for a in range(3))
 
 
 def voxel_range(box: Sequence[float], voxel_size: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -33,6 +33,7 @@ from tsfusion.tsdf.block_store import MESHED, BlockStore, unpack_keys
 from tsfusion.tsdf.device_blocks import DeviceBlocks, device_for
 from tsfusion.tsdf.device_integrator import DeviceIntegrator, DeviceRayBuffers
 from tsfusion.tsdf.integrator import Integrator, KeyframeQuota
+from tsfusion.tsdf.map_crop import Part
 from tsfusion.tsdf.ray_buffers import RayBuffers, keyframes_of_every_kind
 from tsfusion.tsdf.readable_map import HELD, begin_hash
 from tsfusion.tsdf.residency import checked_cache
@@ -197,12 +198,16 @@ class Volume(AskableMap):
 
         Raises:
             MapError: when the voxels or layers differ, when both are the same map or hold the same keyframes,
-                as far as a server wrote down which, or are of different worlds; MapFull, WeightOverflow,
+                as far as a server wrote down which, or are of different worlds. Parts of one map that share
+                no voxel (`crop`) may be merged; MapFull, WeightOverflow,
                 MemoryError: when the sum has no room. After each of them the map is as it was.
         """
         if other is self:
             raise MapError("a map cannot be merged with itself: each keyframe would count twice")
         self._check_like(other)
+        if (parts := self._parts_with(other)) is not None:
+            self._join(other, *parts)
+            return
         if self.keyframes and other.keyframes:
             map_history.check_addable(self.meta, other.meta, same_frame=same_frame)
         if self._store.count and self._has_content_of(other):
@@ -211,6 +216,23 @@ class Volume(AskableMap):
         self.keyframes += other.keyframes
         self.held.merge(other.held)
         self.meta = map_history.added(self.meta, other.meta)
+
+    def _parts_with(self, other: "Volume") -> tuple[Part, Part] | None:
+        """Which parts both are, where they are parts of one map that share no voxel."""
+        if map_crop.PART_OF not in self.meta or map_crop.PART_OF not in other.meta:
+            return None
+        one, two = (map_crop.part_of(each.meta, each.map_hash()) for each in (self, other))
+        return (one, two) if one is not None and two is not None and one.is_beside(two) else None
+
+    def _join(self, other: "Volume", one: Part, two: Part) -> None:
+        """Add another part of the same map, of whose keyframes each is in both."""
+        map_addition.add(self._store, other._store, self.config.max_blocks)
+        self.keyframes = max(self.keyframes, other.keyframes)
+        own = self.map_hash()
+        joined = Part(one.whole, own, one.boxes + two.boxes)
+        self.meta = {**self.meta, map_crop.PART_OF: msgspec.to_builtins(joined)}
+        if own == one.whole:
+            del self.meta[map_crop.PART_OF]
 
     def crop(self, box: Sequence[float], *, most_bytes: int | None = None) -> "Volume":
         """A new map of the voxels whose centres lie in a box, with their sums, colours and smoothed values.
@@ -221,7 +243,7 @@ class Volume(AskableMap):
         Args:
             box: x0, y0, z0, x1, y1, z1 in metres; a centre on the upper side is outside, so that maps of
                 boxes side by side add up to that of both.
-            most_bytes: that the part may take.
+            most_bytes: that the part may take; it does not know then which map it is a part of.
 
         Raises:
             InvalidConfig: for another box; MemoryError: when there is no room for both maps.
@@ -234,6 +256,12 @@ class Volume(AskableMap):
         cropped.keyframes = self.keyframes if cropped._store.count else 0
         cropped.held = HeldSensor(self.held.numbers)
         cropped.meta = map_history.without_journal(self.meta)
+        if most_bytes is None:  # else it is a passing one, and hashing the whole would take longer
+            whole, own = self.map_hash(), cropped.map_hash()
+            before = map_crop.part_of(self.meta, whole)
+            part = Part(whole, own, [[*first.tolist(), *end.tolist()]])
+            part = part if before is None else before.within(first, end, own)
+            cropped.meta[map_crop.PART_OF] = msgspec.to_builtins(part)
         return cropped
 
     def _has_content_of(self, other: "Volume") -> bool:
