@@ -99,6 +99,23 @@ def test_what_damage_has_cost_is_the_last_line_and_status_1(here: Here, tmp_path
     assert "damage" not in refused.stderr.splitlines()[-1], "what failed comes first"
 
 
+def test_a_checkpoint_that_is_older_than_its_journal_is_told(here: Here, tmp_path: Path) -> None:
+    """As in a backup: the checkpoint was copied, then segments were deleted that newer ones have."""
+    folder = make_map(tmp_path / "state" / "maps" / "default", range(4))
+    older = (folder / "map.tsf").read_bytes()
+    make_map(folder, range(4, 8))
+    make_map(folder, range(8, 12))
+    for number in (1, 2):
+        segment_path(folder / "journal", number).unlink()
+    assert here("map", "info", tmp_path / "state").returncode == 0, "the newest checkpoint has all of them"
+    (folder / "map.tsf").write_bytes(older)
+    for verb in ("info", "hash"):
+        done = here("map", verb, tmp_path / "state")
+        assert (done.returncode, "the map lacks 1 keyframe or more" in done.stderr) == (1, True)
+    fused = here("fuse", tmp_path / "state", "--out", "fused")
+    assert (fused.returncode, "no longer has 4 keyframes of the map" in fused.stderr) == (1, True)
+
+
 def test_hash_moves_what_was_corrected(here: Here, tmp_path: Path) -> None:
     folder = make_map(tmp_path / "state" / "maps" / "default", range(4), behind=2)
     correct(folder, ANNA, 5, {1: pose(0.5), 4: pose(0.7)}, removed=(2,))

@@ -115,7 +115,7 @@ def open_recording(path: Path, /, *, unpack: bool = False, **given: Any) -> "Dat
         journaled = JournalRecording(path)
         saved = keyframe_sources.saved_beside(Path(journaled.name), None)
         journaled.usual = keyframe_sources.settings_of(saved)
-        journaled.absent = keyframe_sources.absent(path, saved, journaled.recorded)
+        journaled.absent = keyframe_sources.absent(path, None, saved, journaled.recorded)
         return journaled
     from tsfusion.datasets import describe, open_dataset
 

@@ -28,7 +28,7 @@ from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.journal import locations, state_folder
 from tsfusion.journal.journaled_keyframes import JournaledKeyframes
 from tsfusion.pipelines import saved_maps
-from tsfusion.tsdf import checkpoint
+from tsfusion.tsdf import checkpoint, map_history
 from tsfusion.tsdf.checkpoint import CheckpointHeader
 from tsfusion.wire import codec
 
@@ -171,7 +171,7 @@ def _journal(
     found.lost += keyframes.lost
     saved = saved_beside(path, map_name)
     found.saved = found.saved or settings_of(saved)
-    found.absent += absent(path, saved, keyframes.recorded + keyframes.lost)
+    found.absent += absent(path, map_name, saved, keyframes.recorded + keyframes.lost)
     return keyframes
 
 
@@ -203,14 +203,17 @@ def settings_of(header: CheckpointHeader | None) -> dict[str, Any]:
     return {name: value for name, value in saved.items() if value is not None and name != "threads"}
 
 
-def absent(path: Path, header: CheckpointHeader | None, recorded: int) -> int:
+def absent(path: Path, map_name: str | None, header: CheckpointHeader | None, recorded: int) -> int:
     """Number of a saved map's keyframes that the journal beside it, which has so many, no longer has.
 
     None of one segment's, or of a map that is not known to be the journal's.
     """
     if header is None or "done" not in header.meta or journal.is_segment(path):
         return 0
-    return saved_maps.missing(header, recorded)
+    files = state_folder.find_journal(path, map_name).files()
+    first = journal.segment_number(files[0]) if files else 0
+    deleted = sum(int((one.positions[:, 0] < first).sum()) for one in map_history.sessions(header.meta))
+    return max(saved_maps.missing(header, recorded), deleted)
 
 
 def _check_once(sources: Sequence[str]) -> None:

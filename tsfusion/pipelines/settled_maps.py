@@ -76,6 +76,9 @@ def records_after(
     ]
     before, total = 0, sum(map(size_of, files))
     keyframes = there = lost = all_lost = 0
+    # as in a backup whose checkpoint is older than what was deleted before the journal was copied
+    gap = state_folder.gap_before(files[0], _newest_segment(histories)) if files else None
+    behind = 0 if gap is None else gap.lost
     for number, file in enumerate(files):
         if number and (gap := state_folder.gap_before(file, journal.segment_number(files[number - 1]))):
             all_lost += gap.lost
@@ -92,7 +95,17 @@ def records_after(
                 last[record.session] = record.seq
                 found.append(record)
         all_lost += sum(place.lost for place in places)
-    return Tail(found, there, lost, all_lost - lost)
+    return Tail(found, there, lost, all_lost - lost + behind)
+
+
+def _newest_segment(histories: list[map_history.SessionHistory]) -> int:
+    """The segment with the newest record that a checkpoint has; 0 = it does not say.
+
+    It says so of keyframes in the map, not of others and of corrections.
+    """
+    if not all(len(one.seqs) and one.seqs[-1] == one.last for one in histories):
+        return 0
+    return max((int(one.positions[:, 0].max()) for one in histories), default=0)
 
 
 def _add_to(reading: state_folder.Watcher, before: int, total: int, at: int, _records: int) -> None:
