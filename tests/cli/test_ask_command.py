@@ -134,7 +134,7 @@ def test_a_ply_keeps_vertices_that_are_there_twice(tmp_path: Path) -> None:
     "text",
     [
         "id,x,y,z\n7,1,2,3\n8,4,5,6\n", "\ufeff1,2,3\n4,5,6,\n", "# ours\n\nX;Y;Z\n1; 2; 3\n4;5;6",
-        '"z" "name" "x" "y"\n3 a 1 2\n6 b 4 5\n', "first\n1, 2, 3, 9\n4\t5\t6\n",
+        '"z" "name" "x" "y"\n3 a 1 2\n6 b 4 5\n', "first\n1, 2, 3, 9\n4\t5\t6\n", "1;2;3;\n;;\n4;5;6;\n,,\n",
     ],
 )  # fmt: skip
 def test_columns_of_points(tmp_path: Path, text: str) -> None:

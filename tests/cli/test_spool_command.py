@@ -113,10 +113,10 @@ def test_what_damage_has_cost_is_told(server: Server, here: Here) -> None:
         path.write_bytes(content)
     listed = here("spool", "list")
     assert (listed.returncode, listed.stdout.split()[6:9]) == (1, ["barn", "barn", "w1"])
-    assert "shed: 1 keyframe is lost to damage" in listed.stderr
+    assert "shed: 1 record is damaged: what had" in listed.stderr
     done = here("spool", "send", "--connect", server.address)
     assert (done.returncode, "barn → map barn: all sent" in done.stdout) == (1, True)
-    assert "barn: 1 keyframe is lost to damage; " in done.stderr
+    assert "barn: 1 record is damaged: what had not been sent is lost; " in done.stderr
     assert fetch_health(server.address).maps["barn"].keyframes_durable == 2
     left("shed.2", map="shed", world="w2")
     part = here("spool", "send", "shed.2", "--connect", server.address)

@@ -173,13 +173,42 @@ def test_a_recording_that_was_mended_begins_anew(tmp_path: Path, change: str) ->
         """Those of a run that comes to grief, whose results are not taken for a part of the recording."""
         scheduler = InThisProcess(lose={"mesh": ATTEMPTS})
         with pytest.raises(WorkerLost):
-            fuse(recording, recording / "out", scheduler)
+            fuse(recording, recording / "out", scheduler, overwrite=True)
         return scheduler.done
 
+    (recording / "out").mkdir()
+    for name in ("run.json", "mesh.ply", "preview.png"):  # of an earlier run
+        (recording / "out" / name).touch()
     assert jobs_done() != []
     assert jobs_done() == []
+    (recording / "fuse.log").touch()
+    assert jobs_done() == []
     os.utime(recording / change, (1, 1))
+    if change == "trajectory.log":  # of which the poses count
+        assert jobs_done() == []
+        (recording / change).write_text((recording / change).read_text().replace("0 1 0 0", "0 1 0 9"))
     assert jobs_done() != []
+
+
+def test_what_the_map_did_not_take_is_not_missed(tmp_path: Path) -> None:
+    folder = make_map(tmp_path / "state" / "maps" / "default", range(4), refused=(1, 2, 3, 4))
+    make_map(folder, range(4, 8))
+    segment_path(folder / "journal", 1).unlink()  # of which the map has nothing
+    assert keyframe_sources.listed([str(tmp_path / "state")]).absent == 0
+
+
+def test_the_folder_above_a_recording_may_be_closed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    recording = redwood(tmp_path / "home" / "recording", list(range(4)), list(range(4)))
+    real = Path.iterdir
+
+    def iterdir(path: Path) -> Any:
+        if path == recording.parent:  # as to another user, in a folder of mode 711
+            raise PermissionError(13, "Permission denied")
+        return real(path)
+
+    opened = keyframe_sources.open_dataset(recording)
+    monkeypatch.setattr(Path, "iterdir", iterdir)
+    assert len(keyframe_sources._state(opened, str(recording), {})) == 32
 
 
 def test_keyframes_that_the_journal_no_longer_has_are_told(here: Here, tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from tsfusion.delivery.number_runs import NumberRuns
 from tsfusion.delivery.outbox import Outbox
 from tsfusion.delivery.spool import Spool, Waiting
 from tsfusion.journal import Position
-from tsfusion.wire import codec
+from tsfusion.wire import codec, corrections
 
 
 def put(outbox: Outbox, count: int) -> None:
@@ -75,12 +75,34 @@ def test_what_the_server_has_no_more_is_lost(outbox: Outbox) -> None:
     assert outbox.welcome(durable=1, window_keyframes=8)  # of a server with an older copy of its state folder
     after = outbox.stats()
     assert (after.durable, after.fused, after.refused, after.settled) == (1, 1, {"lost": 3}, 4)
+    assert outbox.behind == 1
     assert "3 keyframes that the server had on its disk are not there any more" in outbox.take_refusals()
     outbox.rewind()
     send(outbox)
     outbox.acknowledge(5, 5)
     assert (outbox.stats().durable, outbox.stats().fused, outbox.stats().settled) == (2, 2, 5)
-    assert outbox.is_fused
+    outbox.note_moves(5, 0)
+    assert outbox.is_settled
+
+
+def test_lost_corrections_and_rejected_keyframes_count_once(outbox: Outbox) -> None:
+    correction = corrections.encode(
+        corrections.checked({1: np.eye(4)}), session=outbox.session, seq=outbox.next_seq
+    )
+    outbox.add(outbox.write(correction), None)
+    for _ in range(4):
+        send(outbox)
+    outbox.acknowledge(4, 2)
+    outbox.reject(2, "no_samples")  # told late, as by older servers
+    outbox.reject(3, "no_samples")
+    outbox.acknowledge(4, 4)
+    before = outbox.stats()
+    assert (before.durable, before.fused, before.rejected, before.settled) == (3, 1, {"no_samples": 2}, 3)
+    assert "3 keyframes and 1 correction that the server had" in outbox.welcome(0, window_keyframes=8)
+    after = outbox.stats()
+    assert (after.durable, after.fused, after.refused, after.settled) == (0, 0, {"lost": 1}, 3)
+    assert (after.corrections_acknowledged, after.corrections_refused) == (0, {"lost": 1})
+    assert (outbox.behind, outbox.is_fused, outbox.is_settled) == (0, True, True)
 
 
 def test_only_what_was_sent_can_be_corrected(outbox: Outbox, tmp_path: Path) -> None:

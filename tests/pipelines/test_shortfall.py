@@ -31,7 +31,7 @@ STATS = ClientStats(
             {"skipped": {"disk": 1}},
             "1 keyframe will never be at the server (1 × disk): the disk",
         ),
-        ({"skipped": {"damaged": 2}}, "2 keyframes will never be at the server (2 × damaged)"),
+        ({"skipped": {"damaged": 2}}, "2 records of an earlier scan's spool could not be read"),
         ({"corrections_refused": {"quota": 1}}, "1 correction was not taken (1 × quota): keyframes are"),
         ({"rejected": {"no_samples": 6}}, "the map took 4 of 10 keyframes only: all too far"),
     ],

@@ -7,6 +7,8 @@ import sys
 from pathlib import Path
 
 import pytest
+from keyframes_and_servers import VOLUME
+from saved_maps import make_map
 
 from tsfusion.core.config import ClientConfig, ServerConfig, VolumeConfig
 from tsfusion.core.errors import InvalidConfig, TransportError
@@ -64,8 +66,20 @@ def test_a_map_that_the_server_could_not_save_is_told(tmp_path: Path) -> None:
         target.keep_map("default", tmp_path / "map.tsf")
         assert target.child is not None
         os.kill(target.child.pid, signal.SIGKILL)
-    assert "the server could not save the map: map.tsf is missing; its keyframes are in" in target.unkept
+    assert "could not save the map default: map.tsf is missing; its keyframes are in" in target.unkept
     assert not (tmp_path / "map.tsf").exists()
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="POSIX signals")
+def test_a_saved_map_is_kept_whatever_became_of_others(tmp_path: Path) -> None:
+    saved = make_map(tmp_path / "state" / "maps" / "yard", range(2)) / "map.tsf"
+    server = ServerConfig(listen="tcp://127.0.0.1:0", state=str(tmp_path / "state"))
+    with target_server.opened(None, tmp_path / "scratch", volume=VOLUME, server=server) as target:
+        target.keep_map("yard", tmp_path / "map.tsf")
+        assert target.child is not None
+        os.kill(target.child.pid, signal.SIGKILL)
+    assert target.unkept == ""
+    assert (tmp_path / "map.tsf").read_bytes() == saved.read_bytes()
 
 
 def test_a_map_that_has_moved_is_not_scanned_into_elsewhere(tmp_path: Path) -> None:

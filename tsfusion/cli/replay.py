@@ -112,10 +112,10 @@ def open_recording(path: Path, /, *, unpack: bool = False, **given: Any) -> "Dat
         for name, value in given.items():
             if value is not None and name != "posed":
                 raise DatasetError(f"--{name} has no effect on a journal: leave it out")
+        saved = keyframe_sources.saved_beside(path, None)  # before the journal, which may grow meanwhile
         journaled = JournalRecording(path)
-        saved = keyframe_sources.saved_beside(Path(journaled.name), None)
         journaled.usual = keyframe_sources.settings_of(saved)
-        journaled.absent = keyframe_sources.absent(path, None, saved, journaled.recorded)
+        journaled.absent = keyframe_sources.absent(saved, journaled.keyframes)
         return journaled
     from tsfusion.datasets import describe, open_dataset
 

@@ -59,7 +59,7 @@ def list_(*, spool: Dir = _FOLDER, json: options.Json = False) -> None:
 
 
 def _lost(folder: Path, count: int) -> str:
-    return f"{folder}: {count_of(count, 'keyframe is', 'keyframes are')} lost to damage"
+    return f"{folder}: {count_of(count, 'record is', 'records are')} damaged: what had not been sent is lost"
 
 
 def _print(rows: "list[tuple[LeftSpool, int, int, int]]") -> None:

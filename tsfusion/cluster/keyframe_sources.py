@@ -4,6 +4,7 @@
 import hashlib
 import logging
 import os
+import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
@@ -21,13 +22,13 @@ from tsfusion.core.config import VolumeConfig
 from tsfusion.core.counts import count_of
 from tsfusion.core.durable_files import size_of
 from tsfusion.core.errors import CheckpointError, DatasetError, InvalidConfig, JournalError, MapError
+from tsfusion.core.output_folder import RECORD
 from tsfusion.datasets import open_dataset
 from tsfusion.datasets.cameras import camera_files
-from tsfusion.datasets.dataset import Dataset, pose_of
+from tsfusion.datasets.dataset import Dataset, frame_of, pose_of
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.journal import locations, state_folder
 from tsfusion.journal.journaled_keyframes import JournaledKeyframes
-from tsfusion.pipelines import saved_maps
 from tsfusion.tsdf import checkpoint, map_history
 from tsfusion.tsdf.checkpoint import CheckpointHeader
 from tsfusion.wire import codec
@@ -35,6 +36,9 @@ from tsfusion.wire import codec
 SYNTHETIC = "synthetic:"
 WORK = ".fuse"  # folder of a run's unfinished work, in that of its results
 _LISTS = (".log", ".json")  # files that stand for the recording in whose folder they lie
+_MEASURED = re.compile(
+    r"\.(?:png|jpe?g|tiff?|exr|np[yz]|pgm|bin|pcd|ply|la[sz]|bag|db3|mcap)$", re.IGNORECASE
+)  # fmt: skip
 
 log = logging.getLogger(__name__)
 
@@ -156,6 +160,7 @@ def _journal(
     found: Listed, source: str, map_name: str | None, watch: state_folder.Watcher
 ) -> JournaledKeyframes:
     path = locations.location(source)
+    saved = saved_beside(path, map_name)  # before the journal, which may grow meanwhile
     keyframes = JournaledKeyframes(state_folder.find_journal(path, map_name), watch=watch)
     places, poses = keyframes.places(), keyframes.poses()
     files = sorted({str(place.file) for place in places})
@@ -169,9 +174,8 @@ def _journal(
         )
     )
     found.lost += keyframes.lost
-    saved = saved_beside(path, map_name)
     found.saved = found.saved or settings_of(saved)
-    found.absent += absent(path, map_name, saved, keyframes.recorded + keyframes.lost)
+    found.absent += absent(saved, keyframes)
     return keyframes
 
 
@@ -203,17 +207,23 @@ def settings_of(header: CheckpointHeader | None) -> dict[str, Any]:
     return {name: value for name, value in saved.items() if value is not None and name != "threads"}
 
 
-def absent(path: Path, map_name: str | None, header: CheckpointHeader | None, recorded: int) -> int:
-    """Number of a saved map's keyframes that the journal beside it, which has so many, no longer has.
+def absent(header: CheckpointHeader | None, keyframes: JournaledKeyframes) -> int:
+    """Number of a saved map's keyframes that the journal beside it no longer has, and that damage did not
+    cost.
 
     None of one segment's, or of a map that is not known to be the journal's.
     """
-    if header is None or "done" not in header.meta or journal.is_segment(path):
+    if header is None or "done" not in header.meta or journal.is_segment(Path(keyframes.name)):
         return 0
-    files = state_folder.find_journal(path, map_name).files()
-    first = journal.segment_number(files[0]) if files else 0
-    deleted = sum(int((one.positions[:, 0] < first).sum()) for one in map_history.sessions(header.meta))
-    return max(saved_maps.missing(header, recorded), deleted)
+    there: dict[bytes, set[int]] = {}
+    for session, seq in [(one.session, one.seq) for one in keyframes.places()] + list(keyframes.left_out):
+        there.setdefault(session, set()).add(seq)
+    gone, unlisted = 0, header.keyframes
+    for one in map_history.sessions(header.meta):
+        listed, found = set(one.seqs.tolist()), there.get(bytes.fromhex(one.session), set())
+        gone += len(listed - found)
+        unlisted -= len(listed) + sum(seq <= one.unlisted for seq in found)
+    return max(0, gone + max(0, unlisted) - keyframes.lost)
 
 
 def _check_once(sources: Sequence[str]) -> None:
@@ -276,37 +286,50 @@ def _add_dataset(found: Listed, source: str, options: dict[str, Any]) -> dict[st
 
 
 def _state(dataset: Dataset, path: str, options: dict[str, Any]) -> str:
-    """Digest of a dataset's poses, and of the files it may be made of: names, sizes and times."""
-    digest = hashlib.blake2b(digest_size=16)
+    """Digest of a dataset's poses and camera, and of the files of measurements that it may be made of: names,
+    sizes and times; empty = it is computed."""
+    if path.startswith(SYNTHETIC):
+        return ""
+    digest = hashlib.blake2b(str(getattr(dataset, "camera", "")).encode(), digest_size=16)
+    with suppress(DatasetError):  # whoever reads that frame tells
+        first = frame_of(dataset, 0)
+        digest.update(f"{first.intrinsics} {first.baseline_fx} {first.depth_scale}".encode())
     if hasattr(dataset, "pose"):  # else they are part of the frames, and so in the files
         for index in range(len(dataset)):
             digest.update(np.asarray(pose_of(dataset, index), np.float64).tobytes())
-    for file in _files(Path(path), options):
+    for file in _files(dataset, Path(path), options):
         with suppress(OSError, ValueError):  # gone meanwhile; no path at all
             found = file.stat()
             digest.update(f"{file} {found.st_size} {found.st_mtime_ns}\n".encode(errors="replace"))
     return digest.hexdigest()
 
 
-def _files(path: Path, options: dict[str, Any]) -> Iterator[Path]:
-    """Files of a recording, of its camera beside it, and those that options name; no results of ours."""
+def _files(dataset: Dataset, path: Path, options: dict[str, Any]) -> Iterator[Path]:
+    """Files of measurements in a recording and in folders that are linked there, of its camera, and those
+    that options name; no results of runs."""
     yield from (Path(value) for value in options.values() if isinstance(value, str | Path))
     if path.is_file():
         yield path
-    root = path.parent if path.suffix in _LISTS else path
+    root = Path(getattr(dataset, "root", path.parent if path.suffix in _LISTS else path))
     if not root.is_dir():
         return
-    with suppress(DatasetError):
-        yield from camera_files(root.parent)
-    seen = set[str]()
-    for folder, names, files in os.walk(root, followlinks=True):
-        real = os.path.realpath(folder)
-        if WORK in names or real in seen:
-            names.clear()
-            continue
-        seen.add(real)
-        names.sort()
-        yield from (Path(folder, name) for name in sorted(files))
+    for place in (root, root.parent):
+        with suppress(DatasetError, OSError):
+            yield from camera_files(place)
+    linked = [child for child in _children(root) if child.is_symlink() and child.is_dir()]
+    for place in (root, *linked):
+        for folder, names, files in os.walk(place):
+            if WORK in names or RECORD in files:
+                names.clear()
+                continue
+            names.sort()
+            yield from (Path(folder, name) for name in sorted(files) if _MEASURED.search(name))
+
+
+def _children(folder: Path) -> list[Path]:
+    with suppress(OSError):
+        return sorted(folder.iterdir())
+    return []
 
 
 # --- reading ---

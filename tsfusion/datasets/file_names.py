@@ -23,8 +23,14 @@ def order(name: str) -> SortKey:
 
 
 def in_order(files: Iterable[Path]) -> list[Path]:
-    """Files in the order of their folders, and in each of the numbers in their names."""
-    return sorted(files, key=lambda file: (order(str(file.parent)), order(file.stem), file.suffix))
+    """Files in the order of their folders, and in each of the numbers in their names.
+
+    Names of one length are in the order of their characters: hexadecimal ones, too.
+    """
+    found = list(files)
+    if len({len(file.stem) for file in found}) == 1:
+        return sorted(found, key=lambda file: (order(str(file.parent)), file.name))
+    return sorted(found, key=lambda file: (order(str(file.parent)), order(file.stem), file.suffix))
 
 
 def numbers_in(name: str) -> list[str]:

@@ -28,16 +28,16 @@ class NumberRuns:
         while len(self._runs) > runs:
             self._count -= len(self._runs.popleft())
 
-    def cut(self, most: int) -> int:
-        """Remove the numbers above `most`; returns how many."""
-        before = self._count
+    def cut(self, most: int) -> list[int]:
+        """Remove the numbers above `most`; returns them."""
+        gone: list[int] = []
         while self._runs and self._runs[-1].stop > most + 1:
             run = self._runs.pop()
-            self._count -= len(run)
             if run.start <= most:
                 self._runs.append(range(run.start, most + 1))
-                self._count += most + 1 - run.start
-        return before - self._count
+            gone += range(max(run.start, most + 1), run.stop)
+        self._count -= len(gone)
+        return gone
 
     def __len__(self) -> int:
         return self._count

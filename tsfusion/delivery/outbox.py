@@ -48,6 +48,7 @@ class Outbox:
         self._unfused = NumberRuns()  # durable, and not answered by the map
         self._fused = NumberRuns()  # keyframes that were counted as fused, the newest ones
         self._durable = NumberRuns()  # likewise those that were acknowledged
+        self._durable_corrections = NumberRuns()  # likewise
         self._last_fused = self._last_meshed = 0  # numbers
         self._settled = 0  # the map has everything up to this number, each keyframe at its newest pose
         self._corrections_waiting = 0
@@ -288,13 +289,14 @@ class Outbox:
 
     def _lose_beyond(self, durable: int) -> str:
         """Count what was acknowledged beyond a number as lost, and tell it. The lock is held."""
-        lost = self._durable.cut(durable)
-        if not lost:
+        lost, fused = self._durable.cut(durable), self._fused.cut(durable)
+        corrections = self._durable_corrections.cut(durable)
+        if not lost and not corrections:
             return ""
         self._unfused.cut(durable)
-        waiting = {entry.seq for entry in self._spool.waiting}
-        self._corrections = {seq for seq in self._corrections if seq <= durable or seq in waiting}
-        return self._outcomes.lose(lost, self._fused.cut(durable))
+        self._corrections.difference_update(corrections)
+        self._last_fused = min(self._last_fused, durable)
+        return self._outcomes.lose(lost, fused, len(corrections))
 
     def is_foreign(self, durable: int) -> bool:
         """Whether the server has records of this session that were never sent from here."""
@@ -323,9 +325,9 @@ class Outbox:
             self._outcomes.durable += len(dropped) - corrections
             for seq in dropped:
                 self._unfused.append(seq)
-                if seq not in self._corrections:
-                    self._durable.append(seq)
+                (self._durable_corrections if seq in self._corrections else self._durable).append(seq)
             self._durable.keep_newest(_FUSED_RUNS)
+            self._durable_corrections.keep_newest(_FUSED_RUNS)
             taken = 0
             for seq in self._unfused.take(fused):
                 self._last_fused = seq

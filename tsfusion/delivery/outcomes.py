@@ -95,14 +95,25 @@ class Outcomes:
         (self._corrections_refused if entry.is_correction else self._refused)[reason] += 1
         self._note_refusal(f"{entry.kind} {entry.seq} was refused ({reason}): {message}")
 
-    def lose(self, count: int, fused: int) -> str:
-        """Count keyframes that the server has no more, so many of which it had fused; tell that."""
-        self.durable -= count
-        self.fused -= fused
-        self._refused["lost"] += count
+    def lose(self, keyframes: list[int], fused: list[int], corrections: int) -> str:
+        """Count records that the server has no more, and tell that.
+
+        Args:
+            keyframes: numbers of those that it had acknowledged; `fused`: that it had fused.
+            corrections: that it had acknowledged.
+        """
+        self.durable -= len(keyframes)
+        self.fused -= sum(not self.is_rejected(seq) for seq in fused)
+        self.corrections_durable -= corrections
+        # A rejected one was never in the map.
+        self._refused["lost"] += sum(not self.is_rejected(seq) for seq in keyframes)
+        self._corrections_refused["lost"] += corrections
+        self._refused, self._corrections_refused = +self._refused, +self._corrections_refused
+        had = [count_of(len(keyframes), "keyframe")] if keyframes else []
+        had += [count_of(corrections, "correction")] if corrections else []
         told = (
-            f"{count_of(count, 'keyframe')} that the server had on its disk are not there any more; is its "
-            "state folder another one, or an older copy?"
+            f"{' and '.join(had)} that the server had on its disk are not there any more; is its state "
+            "folder another one, or an older copy?"
         )
         self._note_refusal(told)
         return told

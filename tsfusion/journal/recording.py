@@ -26,9 +26,6 @@ class JournalRecording:
     Keyframes the map had to reject are among them. Those that the server was told to forget, that
     corrections removed, or that damage cost are left out and counted in `skipped`.
 
-    Attributes:
-        recorded: number of keyframes that are, or were until they were erased or damaged, in the journal.
-
     Raises:
         JournalError: when there is no keyframe.
     """
@@ -39,8 +36,7 @@ class JournalRecording:
     def __init__(self, path: str | os.PathLike[str], map_name: str | None = None) -> None:
         place = state_folder.find_journal(Path(path), map_name)
         self.name = str(place.path)
-        self._keyframes = found = JournaledKeyframes(place)
-        self.recorded = found.recorded + found.lost
+        self.keyframes = found = JournaledKeyframes(place)
         removed = len(found.left_out) - found.forgotten
         left_out = {"forgotten": found.forgotten, "removed by corrections": removed, LOST: found.lost}
         self.skipped = {reason: count for reason, count in {**found.unreadable, **left_out}.items() if count}
@@ -53,12 +49,12 @@ class JournalRecording:
         self.timestamps_ns: NDArray[np.int64] | None = None
 
     def __len__(self) -> int:
-        return len(self._keyframes)
+        return len(self.keyframes)
 
     def __getitem__(self, index: int) -> Keyframe:
         """A keyframe; raises JournalError when it cannot be read any more."""
         try:
-            return self._keyframes[index].keyframe
+            return self.keyframes[index].keyframe
         except (DecodeError, InvalidKeyframe) as error:
             raise JournalError(f"{self.name}: keyframe {index} cannot be used: {error}") from error
 

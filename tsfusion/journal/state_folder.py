@@ -161,7 +161,9 @@ class JournalPlace(Struct, frozen=True):
     @property
     def is_a_maps(self) -> bool:
         """Whether it is a map's journal, of which segments are deleted oldest first alone."""
-        return self.quarantine is not None or self.path.name == JOURNAL_FOLDER
+        beside = self.path.parent
+        is_there = (beside / MAP_FILE).exists() or (beside / LOCK_FILE).exists()
+        return self.quarantine is not None or (self.path.name == JOURNAL_FOLDER and is_there)
 
     def steps(self, watch: Watcher = lambda _done, _all: None) -> Iterator[tuple[Path, Record | Damage]]:
         """Records and damaged places, each with its file; a file that cannot be read is a damaged place, and

@@ -73,8 +73,8 @@ def _columns(text: str, source: str) -> NDArray[np.float64]:
     rows: list[list[float]] = []
     places: list[int] | None = None
     for number, line in enumerate(text.splitlines(), 1):
-        content = line.partition("#")[0].strip()
-        if not content:
+        content = line.partition("#")[0].strip().rstrip(",;")
+        if not content.strip(",; \t"):
             continue
         words = re.split(r"\s*;\s*" if ";" in content else r"\s*,\s*|\s+", content)
         if places is None:

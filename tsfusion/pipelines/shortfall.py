@@ -13,7 +13,7 @@ from tsfusion.client import ClientStats
 from tsfusion.core.counts import count_of
 from tsfusion.datasets.dataset import WITHOUT_POSE
 
-_LOST = ("spool", "disk", "damaged")  # reasons of skipping that no policy asks for
+_LOST = ("spool", "disk")  # reasons of skipping that no policy asks for
 
 
 def of_delivery(stats: ClientStats, *, spool: str | os.PathLike[str], link: str, rejection: str) -> str:
@@ -49,6 +49,9 @@ def of_delivery(stats: ClientStats, *, spool: str | os.PathLike[str], link: str,
 def of_disk(stats: ClientStats) -> str:
     """Say which keyframes this machine's disk could not keep; empty = it kept all."""
     lost = {reason: count for reason, count in stats.skipped.items() if reason in _LOST}
+    if damaged := stats.skipped.get("damaged", 0):
+        spool = "an earlier scan's spool"
+        return f"{count_of(damaged, 'record')} of {spool} could not be read: what had not been sent is lost"
     if not lost:
         return ""
     return (

@@ -28,12 +28,19 @@ from tsfusion.core.config import (
     VolumeConfig,
     override,
 )
-from tsfusion.core.errors import InvalidConfig, JournalError, TransportError, TsfusionError
+from tsfusion.core.errors import (
+    CheckpointError,
+    InvalidConfig,
+    JournalError,
+    TransportError,
+    TsfusionError,
+)
 from tsfusion.core.folder_lock import owner_of
 from tsfusion.delivery import left_spools
 from tsfusion.gateway import moved_maps
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.journal import state_folder
+from tsfusion.pipelines import saved_maps
 from tsfusion.wire.curve import ClientKeys, client_keys
 from tsfusion.wire.health import Health, Status
 from tsfusion.wire.queries import fetch_health, fetch_mesh, fetch_new_map, fetch_status
@@ -309,20 +316,27 @@ def opened(
         yield target
     if child is not None and child.status != 0 and kept:
         child.tell_errors()
-        kept_in = "" if server.state == THROWN_AWAY else f"; its keyframes are in the journal in {state}"
-        target._unkept.append(f"the server could not save the map: {_names(kept)} is missing{kept_in}")
-        kept.clear()
     for name, path in kept.items():
+        folder = state_folder.map_folder(state, name)
+        if child is not None and child.status != 0 and not _is_saved(folder):  # it may have been another map
+            left = "" if server.state == THROWN_AWAY else f"; its keyframes are in the journal in {folder}"
+            target._unkept.append(f"the server could not save the map {name}: {path.name} is missing{left}")
+            continue
         try:
-            _copy_map(state_folder.map_folder(state, name) / state_folder.MAP_FILE, path)
+            _copy_map(folder / state_folder.MAP_FILE, path)
         except OSError as error:
             path.unlink(missing_ok=True)
             target._unkept.append(f"the map could not be kept in {path.name}: {error.strerror}")
     shutil.rmtree(scratch)
 
 
-def _names(kept: dict[str, Path]) -> str:
-    return ", ".join(path.name for path in kept.values())
+def _is_saved(folder: Path) -> bool:
+    """Whether a map's last checkpoint has all that its journal holds."""
+    try:
+        found = saved_maps.summarise(saved_maps.find(folder))
+    except (CheckpointError, JournalError):
+        return False
+    return not (found.keyframes_after or found.corrections_after or found.corrections_waiting)
 
 
 def _copy_map(saved: Path, path: Path) -> None:

@@ -229,6 +229,9 @@ def test_redwood_poses_go_by_number_unless_there_are_as_many_images(tmp_path):
         ([*range(7), *range(8, 12)], [*range(3), *range(4, 12)], [0, 1, 2, 4, 5, 6, 8, 9, 10, 11]),  # holes
         ([0, 10, 20, 30], [3, 1, 2, 0], [0, 1, 2, 3]),  # numbered anew
         ([4, 9, 17, 31], [0, 10, 20, 30], [0, 10, 20, 30]),
+        (range(0, 14, 2), range(7), list(range(7))),  # every second image, poses counted
+        ([0, 1, 2, 4, 5, 6, 7], range(7), list(range(7))),  # one image and its pose taken out
+        (range(7), range(0, 14, 2), list(range(0, 14, 2))),  # images counted
     ],
 )
 def test_as_many_poses_as_images_go_by_number_where_both_have_the_same(tmp_path, stems, log, expected):
@@ -236,7 +239,9 @@ def test_as_many_poses_as_images_go_by_number_where_both_have_the_same(tmp_path,
     assert [keyframe.T_world_camera[0, 3] for keyframe in found] == expected
 
 
-@pytest.mark.parametrize("rename", [lambda n: f"frame_{n}", str, lambda n: f"{8 + 0.3 * n:.1f}"])
+@pytest.mark.parametrize(
+    "rename", [lambda n: f"frame_{n}", str, lambda n: f"{8 + 0.3 * n:.1f}", lambda n: f"h_{n:04x}"]
+)
 def test_images_come_in_the_order_of_their_numbers(tmp_path, rename):
     """9 before 10, as in names that are not padded with zeros."""
     root = hololens(tmp_path, 12)

@@ -168,15 +168,16 @@ def poses_by_number(
 ) -> list[Transform | None]:
     """The pose of each image: the one numbered as its name; of as many poses with other numbers the k-th.
 
-    Numbers are others where most names have none, or where both count on from different ones.
+    Numbers are others where some names have none, where images or poses are merely counted, or where a tenth
+    of them differs.
     """
     numbers, listed = [_number(name) for name in names], [number for number, _ in poses]
     are_unique = None not in numbers and len(set(listed)) == len(listed)
     found = dict(poses)
-    same = sum(number in found for number in numbers)
     if len(names) == len(poses):
-        count_on = set(numbers) != set(listed) and _counts_on(numbers) and _counts_on(listed)
-        if not are_unique or count_on or 2 * same <= len(names):
+        same = sum(number in found for number in numbers)
+        are_others = _counts_on(numbers) or _counts_on(listed) or 10 * same < 9 * len(names)
+        if not are_unique or (same < len(names) and are_others):
             return [pose for _, pose in sorted(poses, key=lambda one: one[0])]
     elif None in numbers:
         raise DatasetError(

@@ -159,7 +159,7 @@ class Redwood(DepthImages):
         path = Path(path).expanduser()
         if path.is_file():
             path, trajectory = _root_of(path) or path.parent, trajectory or path.absolute()
-        root = require_folder(path, "Redwood")
+        self.root = root = require_folder(path, "Redwood")
         beside = {} if _depth_folders(root) else _only_series(root)
         files = [*beside] or depth_images(_depth_folder(root), REDWOOD_EXPECTED)
         log = _log(root) if trajectory is None else Path(trajectory)
