@@ -40,7 +40,6 @@ from tsfusion.delivery import left_spools
 from tsfusion.gateway import moved_maps
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.journal import state_folder
-from tsfusion.pipelines import saved_maps
 from tsfusion.wire.curve import ClientKeys, client_keys
 from tsfusion.wire.health import Health, Status
 from tsfusion.wire.queries import fetch_health, fetch_mesh, fetch_new_map, fetch_status
@@ -332,6 +331,8 @@ def opened(
 
 def _is_saved(folder: Path) -> bool:
     """Whether a map's last checkpoint has all that its journal holds."""
+    from tsfusion.pipelines import saved_maps  # needs Taichi, which a scanner may lack
+
     try:
         found = saved_maps.summarise(saved_maps.find(folder))
     except (CheckpointError, JournalError):
