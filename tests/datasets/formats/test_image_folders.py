@@ -128,8 +128,10 @@ def test_scannet_frames_that_the_tracker_lost_have_no_pose(tmp_path):
         (put("color/7.jpg", None), r"color/7\.png or \.jpg is missing, but .*depth/7\.png is there"),
         (put("color/7.jpg", ""), r"color/7\.jpg cannot be decoded"),
         (put("depth/0.png", None), r"holds no usable frames"),
+        (put("intrinsic/intrinsic_color.txt", "1170 0 648\n0 1170 484\n0 0 1\n"),
+         r"with cx 648, cy 484 is of images of another size"),
     ],
-)
+)  # fmt: skip
 def test_a_broken_scannet_scene_is_one_clear_line(tmp_path, change, match):
     scannet(tmp_path, count=2)
     change(tmp_path)

@@ -103,8 +103,28 @@ def test_distorted_captures_are_undistorted(tmp_path, lens):
 
 
 @pytest.mark.parametrize(
+    ("kind", "named"),
+    [
+        ("equidistant", lambda c: [c.pop("camera_model", None), c.update(is_fisheye=True)]),  # instant-ngp's
+        ("radtan", lambda c: c.update(camera_model="PINHOLE")),  # nerfstudio applies k1 to it, too
+    ],
+)
+def test_a_lens_by_another_name_is_the_same(tmp_path, kind, named):
+    lens = Camera(Intrinsics(180, 179, 78, 61), (120, 160), kind, (-0.2, -0.01, 0.004, -0.001))
+    dataset = Nerfstudio(transforms(tmp_path, lens=lens))
+    expected = dataset[0]
+    rewrite(tmp_path, named)
+    found = Nerfstudio(tmp_path)[0]
+    np.testing.assert_array_equal(found.depth, expected.depth)
+    np.testing.assert_array_equal(found.color, expected.color)
+    assert found.intrinsics == expected.intrinsics
+
+
+@pytest.mark.parametrize(
     ("change", "match"),
     [
+        (lambda c: c.update(k4=0.3), r"frame 0: k4 is not 0, which the lens OPENCV has no use for"),
+        (lambda c: c.update(ftheta_p0=1.0), r"camera_model must be one of .*, got ftheta_p0"),
         (lambda c: [f.pop("depth_file_path") for f in c["frames"]],
          r"has 4 frames, none with depth_file_path or depth_path; expected depth images"),
         (lambda c: c.update(camera_model="EQUIRECTANGULAR"), r"camera_model must be one of PINHOLE"),

@@ -12,6 +12,7 @@ from rosbag_scenes import T0, T_BODY_OPTICAL
 from rosbag_writing import BODY, OPTICAL, WORLD, BagWriter, writing
 
 from tsfusion.core.errors import DatasetError
+from tsfusion.datasets.rosbag.cameras import RECTIFIED, REGISTERED
 from tsfusion.datasets.rosbag.dataset import Bag
 from tsfusion.datasets.rosbag.transforms import PoseSamples
 from tsfusion.geometry import se3
@@ -60,6 +61,37 @@ def test_transforms_are_chained_and_interpolated(tmp_path: Path) -> None:
     check_turning(Bag(path, world_frame="odom"))
     with pytest.raises(DatasetError, match="no transforms lead from 'moon'"):
         Bag(path, world_frame="moon")
+
+
+def test_a_static_transform_is_the_last_that_was_sent(tmp_path: Path) -> None:
+    with writing(tmp_path, "ros1") as (bag, path):
+        moments(bag)
+        for T, log_ns in ((np.eye(4), T0), (T_BODY_OPTICAL, T0 + 1)):
+            bag.transform(T, BODY, OPTICAL, T0, static=True, log_ns=log_ns)
+        for i in range(12):
+            bag.transform(turning(i * 0.1), WORLD, BODY, T0 + i * 100_000_000)
+    check_turning(Bag(path))
+
+
+def test_transforms_without_a_stamp_are_of_when_they_were_recorded(tmp_path: Path) -> None:
+    with writing(tmp_path, "ros1") as (bag, path):
+        moments(bag)
+        bag.transform(T_BODY_OPTICAL, BODY, OPTICAL, T0, static=True)
+        for i in range(12):
+            bag.transform(turning(i * 0.1), WORLD, BODY, 0, log_ns=T0 + i * 100_000_000)
+    check_turning(Bag(path))
+
+
+@pytest.mark.parametrize(
+    ("topic", "registered", "rectified"),
+    [
+        ("/camera/depth_registered/image_rect", True, True), ("/aligned_depth_to_color/image", True, False),
+        ("/camera/unregistered/image", False, False), ("/camera/unrectified/depth", False, False),
+        ("/not_aligned/depth", False, False), ("/aligned_depth_to_infra1/image_raw", False, False),
+    ],
+)  # fmt: skip
+def test_names_of_topics_are_read_by_words(topic: str, registered: bool, rectified: bool) -> None:
+    assert (bool(REGISTERED.search(topic)), bool(RECTIFIED.search(topic))) == (registered, rectified)
 
 
 def test_no_pose_is_made_up_across_a_gap(tmp_path: Path) -> None:

@@ -32,6 +32,10 @@ _MODELS = {
 }  # fmt: skip
 
 
+_COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
+_OTHER_LENSES = ("ftheta", "latlong", "equirectangular", "orthographic")  # of instant-ngp, by their keys
+
+
 @dataclass(frozen=True)
 class _ListedFrame:
     """A frame of the capture that has depth."""
@@ -198,8 +202,17 @@ def _camera(entry: _ListedFrame, size: tuple[int, ...]) -> Camera:
     """The camera that a frame's keys give for images of (height, width) `size`."""
     given, where = entry.camera, entry.where
     model = str(given.get("camera_model", "OPENCV"))
-    if model not in _MODELS:
-        raise DatasetError(f"{where}: camera_model must be one of {', '.join(_MODELS)}, got {model!r}")
+    other = next((key for key in given if key.startswith(_OTHER_LENSES) and given[key]), None)
+    if model not in _MODELS or other is not None:
+        got = repr(model) if other is None else other
+        raise DatasetError(f"{where}: camera_model must be one of {', '.join(_MODELS)}, got {got}")
+    if given.get("is_fisheye"):  # instant-ngp's
+        model = "OPENCV_FISHEYE"
+    bent = [key for key in _COEFFICIENTS if key in given and _number(given, key, where)]
+    if bent and not _MODELS[model]:  # nerfstudio applies them, whatever the model is called
+        model = "OPENCV"
+    if unused := [key for key in bent if key not in _MODELS[model]]:
+        raise DatasetError(f"{where}: {unused[0]} is not 0, which the lens {model} has no use for here")
     fx = _focal_length(given, "x", size[1], where)
     if fx is None:
         raise DatasetError(f"{where} has neither fl_x nor camera_angle_x; expected {EXPECTED}")

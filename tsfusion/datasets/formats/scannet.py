@@ -85,9 +85,15 @@ class ScanNet(DepthImages):
     def _registered(self, color: Path, depth: NDArray[Any]) -> NDArray[np.uint8]:
         if self.color_intrinsics is None:
             return super()._registered(color, depth)
-        return resample_for_camera(
-            read_color(color, None), self.color_intrinsics, self.intrinsics, depth.shape
-        )
+        image, own = read_color(color, None), self.color_intrinsics
+        height, width = image.shape[:2]
+        if not (0.25 < own.cx / width < 0.75 and 0.25 < own.cy / height < 0.75):
+            raise DatasetError(
+                f"{color} is {width}×{height}, and the colour camera's matrix with cx {own.cx:g}, "
+                f"cy {own.cy:g} is of images of another size: give that of these (intrinsic_color.txt), or "
+                "leave colour out (--option color=false)"
+            )
+        return resample_for_camera(image, own, self.intrinsics, depth.shape)
 
 
 def _camera_file(root: Path, camera: str) -> Path | None:

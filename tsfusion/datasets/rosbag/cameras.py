@@ -24,8 +24,8 @@ from tsfusion.geometry.keyframe import Intrinsics
 
 _MAX_TRIED = 20  # messages
 _TRANSPORT = re.compile(r"/(compressed|compressedDepth)$")
-RECTIFIED = re.compile(r"rect")
-REGISTERED = re.compile(r"aligned|registered")
+RECTIFIED = re.compile(r"(?<![a-z])rect")
+REGISTERED = re.compile(r"(?<![a-z])(?<!not_)(aligned(?!_depth_to_infra)|registered)")
 _NO_COLOR = re.compile(r"infra|(^|[/_])ir([/_\d]|$)|fisheye|confidence", re.IGNORECASE)
 _UNDISTORTED = 1e-6  # largest coefficient of a camera without distortion
 _NO_TURN = 1e-6

@@ -69,7 +69,8 @@ class PoseFinder:
     def add(self, message: Message) -> None:
         """Take a message of one of `streams` into account."""
         if message.stream.kind in (TF, OLD_TF):
-            self._transforms.add(message.content, static=message.stream.topic.endswith("static"))
+            is_static = message.stream.topic.endswith("static")
+            self._transforms.add(message.content, message.location.log_ns, static=is_static)
         else:
             if message.stream.kind == PATH or message.stream not in self._pose_topics:
                 self._pose_topics[message.stream] = PoseTopic()  # each path holds all that were before

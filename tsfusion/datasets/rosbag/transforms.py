@@ -43,6 +43,11 @@ class PoseSamples:
             self._stamps.append(stamp)
             self._values.extend(values.tolist())
 
+    def last(self) -> Trajectory:
+        """The pose that was added last, which counts of a static transform."""
+        table: NDArray[np.float64] = np.array(self._values[-7:]).reshape(1, 7)
+        return Trajectory(np.array(self._stamps[-1:], np.int64), table[:, :3], table[:, 3:])
+
     def trajectory(self) -> Trajectory:
         """The poses in the order of time; of equal times the first."""
         stamps, order = np.unique(np.array(self._stamps, np.int64), return_index=True)
@@ -76,12 +81,17 @@ class TransformTree:
         self._dynamic: set[tuple[str, str]] = set()
         self._edges: dict[str, _Edge] = {}
 
-    def add(self, message: Any, *, static: bool) -> None:
-        """Add the transforms of a TFMessage; those that are not finite are left out."""
+    def add(self, message: Any, log_ns: int, *, static: bool) -> None:
+        """Add the transforms of a TFMessage; those that are not finite are left out.
+
+        Args:
+            log_ns: when it was recorded: the time of those without a stamp.
+        """
         for one in message.transforms:
             key = frame_id(one), str(one.child_frame_id).strip("/")
             if key[0] != key[1]:
-                self._samples[key].add(stamp_ns(one), one.transform.translation, one.transform.rotation)
+                where = one.transform.translation, one.transform.rotation
+                self._samples[key].add(stamp_ns(one) or log_ns, *where)
                 if not static:
                     self._dynamic.add(key)
 
@@ -90,9 +100,10 @@ class TransformTree:
         for (parent, child), samples in sorted(self._samples.items(), key=lambda item: len(item[1])):
             if not samples:
                 continue
-            trajectory = samples.trajectory()
+            is_static = (parent, child) not in self._dynamic
+            trajectory = samples.last() if is_static else samples.trajectory()
             rows = np.hstack([trajectory.translations, trajectory.quaternions])
-            constant = (parent, child) not in self._dynamic or bool((np.ptp(rows, axis=0) < _SAME).all())
+            constant = is_static or bool((np.ptp(rows, axis=0) < _SAME).all())
             self._edges[child] = _Edge(parent, trajectory, constant)
         self._samples.clear()
 
