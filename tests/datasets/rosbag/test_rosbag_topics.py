@@ -44,6 +44,22 @@ def test_the_registered_depth_and_its_colour_are_chosen(tmp_path: Path) -> None:
     assert Bag(path, posed=False, color=False).frame(0).color is None
 
 
+@pytest.mark.parametrize(("zoom", "changes"), [(1.01, False), (1.15, True)])
+def test_a_camera_that_changes_is_not_taken_for_one(tmp_path: Path, zoom: float, changes: bool) -> None:
+    with writing(tmp_path, "ros1") as (bag, path):
+        for i in range(4):
+            stamp, factor = T0 + i * 10**9, zoom if i > 1 else 1.0
+            camera = Intrinsics(CAMERA.fx * factor, CAMERA.fy * factor, CAMERA.cx, CAMERA.cy)
+            bag.camera_info("/camera/camera_info", camera, SHAPE, stamp)
+            bag.image("/camera/depth", wall(i).measurement, "16UC1", stamp)
+    if not changes:
+        assert len(Bag(path, posed=False)) == 4
+        return
+    with pytest.raises(DatasetError, match=r"camera of /camera/camera_info changes 2\.0 s after its start"):
+        Bag(path, posed=False)
+    assert len(Bag(path, posed=False, intrinsics=CAMERA)) == 4
+
+
 @pytest.mark.parametrize("posed", [True, False])
 def test_colour_of_another_camera_is_registered_by_tf_static(tmp_path: Path, posed: bool) -> None:
     T_color_depth = se3.exp(np.array([0.03, 0.002, -0.001, 0.01, -0.02, 0.005]))

@@ -29,6 +29,7 @@ REGISTERED = re.compile(r"(?<![a-z])(?<!not_)(aligned(?!_depth_to_infra)|registe
 _NO_COLOR = re.compile(r"infra|(^|[/_])ir([/_\d]|$)|fisheye|confidence", re.IGNORECASE)
 _UNDISTORTED = 1e-6  # largest coefficient of a camera without distortion
 _NO_TURN = 1e-6
+_CHANGED = 0.02  # of the focal length, or of a coefficient: more than autofocus
 
 
 class ImageTopic(NamedTuple):
@@ -76,6 +77,7 @@ class CameraView(NamedTuple):
     intrinsics: Intrinsics
     undistorter: Undistorter | None
     source: str
+    info: Stream | None = None  # whose first CameraInfo it is; None = it was given
 
 
 class CameraRig(NamedTuple):
@@ -85,6 +87,34 @@ class CameraRig(NamedTuple):
     baseline_fx: float
     rectifier: Rectifier | None
     source: str
+    info: Stream | None = None  # as in `CameraView`, of the left camera
+
+
+class CameraWatch:
+    """Compares each CameraInfo of some topics with the first one, which counts for all images.
+
+    Args:
+        streams: the topics.
+    """
+
+    def __init__(self, streams: list[Stream]) -> None:
+        self.streams = streams
+        self._first: dict[tuple[Stream, str], tuple[CameraInfo, int]] = {}  # by topic and frame
+
+    def add(self, message: Message) -> None:
+        """Raise DatasetError where the camera is another one than at first."""
+        found, now = messages.camera(message.content), message.location.log_ns
+        first, began = self._first.setdefault((message.stream, frame_id(message.content)), (found, now))
+        if not (first.K[0, 0] and found.K[0, 0]):  # not calibrated
+            return
+        moved = np.abs(found.K - first.K).max() / first.K[0, 0]
+        bent = first.D.shape == found.D.shape and np.abs(found.D - first.D).max(initial=0) > _CHANGED
+        if moved > _CHANGED or bent or (found.width, found.height) != (first.width, first.height):
+            seconds, lengths = (now - began) / 1e9, f"fx {first.K[0, 0]:.5g} to {found.K[0, 0]:.5g}"
+            raise DatasetError(
+                f"the camera of {message.stream.topic} changes {seconds:.1f} s after its start ({lengths}): "
+                "cut the recording there, or give one for all its images (--intrinsics, --calibration)"
+            )
 
 
 class Cameras:
@@ -157,17 +187,18 @@ class Cameras:
     def _recorded_view(self, images: ImageTopic) -> CameraView:
         """View of an image as by `view`, with the camera of the images' CameraInfo."""
         camera = self._checked(images)
-        source = self._source(images)
+        of = self._of(images)
         if self._is_rectified(images):
-            return CameraView(self._pinhole(images, camera.P if camera.P[0, 0] else camera.K), None, source)
+            return CameraView(self._pinhole(images, camera.P if camera.P[0, 0] else camera.K), None, *of)
         if np.abs(camera.D).max(initial=0) < _UNDISTORTED:
-            return CameraView(self._pinhole(images, camera.K), None, source)
+            return CameraView(self._pinhole(images, camera.K), None, *of)
         undistorter = Undistorter(self._lens(images, camera))
-        return CameraView(undistorter.intrinsics, undistorter, source)
+        return CameraView(undistorter.intrinsics, undistorter, *of)
 
-    def _source(self, images: ImageTopic) -> str:
+    def _of(self, images: ImageTopic) -> tuple[str, Stream | None]:
+        """Where the camera of some images is from, in words and as a topic."""
         stream = self._info_stream(images)
-        return "from CameraInfo" if stream is None else f"from {stream.topic}"
+        return "from CameraInfo" if stream is None else f"from {stream.topic}", stream
 
     def own_view(self, images: ImageTopic) -> CameraView | None:
         """The view of a camera that is not the depth's; None where it has no CameraInfo of its own."""
@@ -190,7 +221,7 @@ class Cameras:
         if plain or (self._is_rectified(left) and self._is_rectified(right)):
             recorded = self._pinhole(left, cameras[0].P)
             if self._intrinsics is None:
-                return CameraRig(recorded, float(shift), None, self._source(left))
+                return CameraRig(recorded, float(shift), None, *self._of(left))
             given = checked_intrinsics(self._intrinsics, "intrinsics")
             return CameraRig(given, float(shift) * given.fx / recorded.fx, None, "as given")
         if self._intrinsics is not None:
@@ -200,7 +231,7 @@ class Cameras:
             )
         lenses = [self._lens(one, camera) for one, camera in zip((left, right), cameras, strict=True)]
         rectifier = Rectifier(StereoRig(lenses[0], lenses[1], _right_of(*cameras)))
-        return CameraRig(rectifier.intrinsics, rectifier.baseline_fx, rectifier, self._source(left))
+        return CameraRig(rectifier.intrinsics, rectifier.baseline_fx, rectifier, *self._of(left))
 
     def _rig_of_file(self, left: ImageTopic) -> CameraRig:
         """Rectification by a stereo camera's file that was given."""

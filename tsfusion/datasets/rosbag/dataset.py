@@ -18,6 +18,7 @@ from tsfusion.datasets.cameras import RecordedCamera
 from tsfusion.datasets.dataset import Frames, keep_posed, nearest_in_time, require_frames
 from tsfusion.datasets.depth_files import check_metres
 from tsfusion.datasets.rosbag import messages
+from tsfusion.datasets.rosbag.cameras import CameraWatch
 from tsfusion.datasets.rosbag.imu import ImuTopics
 from tsfusion.datasets.rosbag.messages import MILLIMETRES
 from tsfusion.datasets.rosbag.poses import PoseFinder, pose_streams
@@ -166,9 +167,13 @@ class Bag(Frames):
         check = _CHECKS.get(chosen.main.kind)
         locations: dict[str, list[MessageLocation]] = {one.topic: [] for one in used}
         broken: Counter[str] = Counter()
-        for message in self._recording.messages([*used, *poses.streams, *imu.streams]):
+        sources = [chosen.view, chosen.rig, chosen.color_camera and chosen.color_camera.view]
+        watch = CameraWatch([one.info for one in sources if one is not None and one.info is not None])
+        for message in self._recording.messages([*used, *poses.streams, *imu.streams, *watch.streams]):
             if not isinstance(message, Message):
                 broken[message.topic] += message in used
+            elif message.stream in watch.streams:
+                watch.add(message)
             elif message.stream in used:
                 try:
                     if check is not None and message.stream.kind == chosen.main.kind:
