@@ -170,7 +170,7 @@ def test_a_recording_that_was_mended_begins_anew(tmp_path: Path, change: str) ->
         cv2.imwrite(str(image), np.full((6, 8), 1500, np.uint16))
 
     def jobs_done() -> list[str]:
-        """Those of a run that comes to grief, whose results are not taken for a part of the recording."""
+        """Names of the jobs that a run does before it fails; its results lie in the recording."""
         scheduler = InThisProcess(lose={"mesh": ATTEMPTS})
         with pytest.raises(WorkerLost):
             fuse(recording, recording / "out", scheduler, overwrite=True)

@@ -101,7 +101,7 @@ def test_a_live_map_that_is_behind_is_said_to_be(
     monkeypatch.setattr(queries, "fetch_health", lambda *_, **__: health)
     monkeypatch.setattr(queries, "fetch_mesh", lambda *_, **__: Volume.load(saved).extract_mesh())
     done = here("mesh", "tcp://127.0.0.1:9", tmp_path / "m.ply", "--map", "yard", "--json")
-    assert "78 keyframes wait and 1 corrected pose waits to be fused" in done.stderr
+    assert "78 keyframes and 1 corrected pose wait to be fused" in done.stderr
     assert json.loads(done.stdout)["keyframes_waiting"] == 78
     done = here("mesh", "tcp://127.0.0.1:9", tmp_path / "n.ply", "--map", "hall", "--json")
     assert (done.stderr, json.loads(done.stdout)["keyframes_waiting"]) == ("", 0)

@@ -244,19 +244,11 @@ def _of_server(
     name = map_name or DEFAULT_MAP
     there = fetch_health(address, control=control, keys=keys).maps.get(name)
     made = fetch_mesh(address, control=control, map_name=name, min_weight=min_weight, keys=keys)
-    behind = {
-        "keyframes_waiting": there.waiting if there else 0,
-        "corrections_waiting": there.corrections_waiting if there else 0,
-    }
-    if any(behind.values()):
-        waiting = " and ".join(
-            count_of(count, f"{noun} waits", f"{noun}s wait")
-            for noun, count in zip(("keyframe", "corrected pose"), behind.values(), strict=True)
-            if count
-        )
-        typer.echo(
-            f"note: the map is behind, {waiting} to be fused: not all of them are in this mesh", err=True
-        )
+    keyframes, corrections = (there.waiting, there.corrections_waiting) if there else (0, 0)
+    behind = {"keyframes_waiting": keyframes, "corrections_waiting": corrections}
+    if keyframes or corrections:
+        waiting = f"{count_of(keyframes, 'keyframe')} and {count_of(corrections, 'corrected pose')}"
+        typer.echo(f"note: {waiting} wait to be fused: not all of them are in this mesh", err=True)
     return replace(made, provenance=Provenance(source=f"live map {name}")), behind
 
 

@@ -115,7 +115,11 @@ def put_aside(state: str | Path, name: str) -> None:
 
 
 def left_behind(folder: Path) -> list[Path]:
-    """What a map's folder in a state folder left aside when the map moved away, at each time."""
+    """Folders with the files that a map has left here, one for each time that it moved away.
+
+    Args:
+        folder: of the map in a state folder.
+    """
     where = folder.parent.parent / state_folder.MOVED_FOLDER
     return sorted(path for path in where.glob(f"{folder.name}*") if _is_aside(path, folder.name))
 

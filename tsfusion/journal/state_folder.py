@@ -170,8 +170,9 @@ class JournalPlace(Struct, frozen=True):
         segments that a map's journal lacks between others are one."""
         files = [(path, size_of(path)) for path in self.files()]
         total, before, last = sum(size for _, size in files), 0, 0
+        has_no_gaps = self.is_a_maps
         for path, size in files:
-            if self.is_a_maps and (gap := gap_before(path, last)) is not None:
+            if has_no_gaps and (gap := gap_before(path, last)) is not None:
                 yield path, gap
             last = segment_number(path)
             try:

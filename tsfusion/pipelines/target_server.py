@@ -122,7 +122,7 @@ class ServerChild:
 
     @property
     def status(self) -> int | None:
-        """Its exit status; None = it runs."""
+        """Exit status of its process; None = it runs."""
         return self._process.returncode
 
     def kill(self) -> None:

@@ -19,7 +19,7 @@ _MOST = 1 << 24  # voxels from the origin: beyond any map
 
 
 class Part(Struct, frozen=True):
-    """Which part of another map one is, for as long as its own hash stays.
+    """A map's place in another one of which it is a part, for as long as its own hash stays.
 
     Attributes:
         whole: hash of that map.
@@ -41,7 +41,7 @@ class Part(Struct, frozen=True):
 
 
 def part_of(meta: Mapping[str, Any], own: str) -> Part | None:
-    """Which part of another map one of this meta and hash is; None = of none, or it has changed since."""
+    """The place of a map of this meta and hash in another one; None = it is no part, or has changed."""
     found = msgspec.convert(meta[PART_OF], Part) if PART_OF in meta else None
     return found if found is not None and found.own == own else None
 

@@ -218,7 +218,7 @@ class Volume(AskableMap):
         self.meta = map_history.added(self.meta, other.meta)
 
     def _parts_with(self, other: "Volume") -> tuple[Part, Part] | None:
-        """Which parts both are, where they are parts of one map that share no voxel."""
+        """The places of both in one map of which they are parts that share no voxel; None = they are none."""
         if map_crop.PART_OF not in self.meta or map_crop.PART_OF not in other.meta:
             return None
         one, two = (map_crop.part_of(each.meta, each.map_hash()) for each in (self, other))
