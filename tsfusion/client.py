@@ -125,7 +125,7 @@ class Client:
         if not isinstance(spool, Spool):
             segment_bytes = min(self._config.segment_bytes, self._config.spool_bytes // _SEGMENTS)
             spool = Spool(spool, segment_bytes, map_name=self._config.map, world=world, same_frame=same_frame)
-        self._outbox = Outbox(spool)
+        self._own_outbox, self._pid = Outbox(spool), os.getpid()
         self.logs_refusal = True  # of its world; a run that ends with `check_world` says it itself
         self._pressure = Backpressure(self._outbox, self._config)
         try:
@@ -139,6 +139,13 @@ class Client:
         self._thread = threading.Thread(target=self._sender.run, name="tsfusion-client", daemon=True)
         self._thread.start()
         atexit.register(self.close)  # no temporary spool stays behind when nobody calls `close`
+
+    @property
+    def _outbox(self) -> Outbox:
+        """The records, for the process that they belong to: a forked one lacks their thread."""
+        if os.getpid() != self._pid:
+            raise TransportError("the client is of the process that this one was forked from: make another")
+        return self._own_outbox
 
     def send(self, keyframe: Keyframe) -> int | None:
         """Put a keyframe into the spool; its number there, None when it is skipped (`stats.skipped`).
@@ -196,10 +203,11 @@ class Client:
             TransportError: after `close`.
         """
         correction = corrections.checked(poses, T_map_odometry=T_map_odometry, removed=removed)
+        outbox = self._outbox
         with self._sending:
             self._check_running()
-            self._outbox.check_known(correction.seqs)
-            self._outbox.check_known(correction.removed)
+            outbox.check_known(correction.seqs)
+            outbox.check_known(correction.removed)
             seq = self._pressure.put_correction(correction)
         if seq is not None:
             self._sender.wake()
@@ -370,7 +378,12 @@ class Client:
         return "" if state.is_connected or (is_early and not state.is_refused) else self._why()
 
     def close(self) -> None:
-        """Stop sending. Call `flush` first: what a temporary spool still holds is lost (and logged)."""
+        """Stop sending. Call `flush` first: what a temporary spool still holds is lost (and logged).
+
+        In a forked process this does nothing.
+        """
+        if os.getpid() != self._pid:
+            return
         with self._sending:
             if self._closed:
                 return

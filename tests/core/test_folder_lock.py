@@ -104,3 +104,23 @@ def test_a_file_system_that_locks_no_folders_has_the_file_alone(
         lock_folder(tmp_path, "spool", "scanner")
     lock.close()
     assert owner_of(tmp_path) is None
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")
+def test_a_lock_ends_with_the_process_that_took_it_though_its_child_lives(tmp_path: Path) -> None:
+    reading, writing = os.pipe()
+    lock = lock_folder(tmp_path, "spool", "scanner")
+    child = os.fork()
+    if not child:
+        os.close(writing)
+        os.read(reading, 1)
+        os._exit(0)
+    try:
+        with pytest.raises(JournalError, match="in use by another scanner"):
+            lock_folder(tmp_path, "spool", "scanner")  # the child has not let go of its parent's
+        lock.close()
+        lock_folder(tmp_path, "spool", "scanner", wait=DEADLINE).close()
+    finally:
+        os.close(writing)
+        os.waitpid(child, 0)
+        os.close(reading)

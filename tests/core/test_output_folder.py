@@ -4,6 +4,7 @@
 import errno
 import os
 import time
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -77,6 +78,21 @@ def test_a_run_that_is_at_work_is_left_alone(tmp_path: Path) -> None:
             (second / "b.txt").write_text("second")
         assert (first / "a.txt").exists()
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"a.txt", "b.txt"}
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")
+def test_a_forked_child_that_ends_leaves_the_work_to_its_parent(tmp_path: Path) -> None:
+    with ExitStack() as stack:
+        work = stack.enter_context(building(tmp_path / "out"))
+        (work / "run.json").write_text("whole")
+        child = os.fork()
+        if not child:
+            try:
+                stack.__exit__(SystemExit, SystemExit(), None)
+            finally:
+                os._exit(0)
+        os.waitpid(child, 0)
+    assert (tmp_path / "out" / "run.json").read_text() == "whole"
 
 
 @pytest.fixture

@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: MIT
 """Laws of the map: it is a sum, whatever the order, the threads or the history."""
 
+import copy
 import os
+import pickle
 import signal
 import sys
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import kernel_twins
 import numpy as np
@@ -17,7 +20,8 @@ from failures import memory_limited
 from formula_scenes import CAMERA, SHAPE, plane_keyframe, sphere_views, volume_of
 from numpy.typing import NDArray
 
-from tsfusion import Keyframe, Volume
+from tsfusion import Keyframe, Volume, VolumeConfig
+from tsfusion.core.config import LIMIT_SETTINGS, VIEW_SETTINGS, LoadSettings, VolumeSettings
 from tsfusion.core.errors import (
     InvalidConfig,
     InvalidKeyframe,
@@ -534,6 +538,54 @@ def test_points_in_any_order_of_keyframes_and_two_sensors() -> None:
     a = volume_of([*VIEWS[:2], *keyframes])
     b = volume_of([*keyframes[::-1], *VIEWS[1::-1]])
     assert a.map_hash() == b.map_hash()
+
+
+@pytest.mark.parametrize("how", [copy.copy, copy.deepcopy, Volume.copy])
+@pytest.mark.parametrize("files", [False, True])
+def test_a_copy_shares_nothing(how: Callable[[Volume], Volume], files: bool, tmp_path: Path) -> None:
+    kept: dict[str, Any] = {"memory_bytes": 1 << 20, "cache": tmp_path} if files else {}
+    settings: dict[str, Any] = {"voxel_size": 0.02, "regularizer": "ray", **kept}
+    volume = Volume(**settings)
+    for keyframe in VIEWS[:3]:
+        volume.integrate(keyframe)
+    volume.retract(VIEWS[2])
+    volume.meta["notes"] = ["here"]
+    before, counts = bytes_of(volume), volume.stats()
+    copied = how(volume)
+    assert bytes_of(copied) == before
+    assert copied.stats().keyframes == 2
+    assert (copied.stamp, copied.drops) == (volume.stamp, volume.drops)
+    assert np.array_equal(copied.changed_blocks(), volume.changed_blocks())
+    assert copied.held.numbers == volume.held.numbers
+    copied.integrate(VIEWS[3])
+    copied.meta["notes"].append("there")
+    copied.release_empty()
+    assert bytes_of(volume) == before
+    assert volume.stats().blocks == counts.blocks
+    assert volume.keyframes == counts.keyframes
+    assert volume.meta == {"notes": ["here"]}
+    assert copied.map_hash() == volume_of([*VIEWS[:2], VIEWS[3]], voxel_size=0.02).map_hash()
+
+
+def test_a_copy_keeps_the_limits_of_its_map() -> None:
+    volume = volume_of(VIEWS[:2])
+    volume.limit_memory(100)
+    with pytest.raises(MemoryError):
+        volume.copy().integrate(VIEWS[5])
+
+
+def test_a_map_is_saved_not_pickled() -> None:
+    with pytest.raises(MapError, match=r"cannot be pickled: use save"):
+        pickle.dumps(volume_of(VIEWS[:1]))
+
+
+def test_type_checkers_know_every_setting() -> None:
+    def plain(struct: type) -> dict[str, object]:
+        words = {"sensor": str, "arch": str}  # of which the words come from a recording or an option
+        return {**get_type_hints(struct), **words}
+
+    assert get_type_hints(VolumeSettings) == plain(VolumeConfig)
+    assert set(get_type_hints(LoadSettings)) == {*VIEW_SETTINGS, *LIMIT_SETTINGS, "arch"}
 
 
 def test_a_number_is_the_voxel_size() -> None:

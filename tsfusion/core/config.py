@@ -11,7 +11,7 @@ import math
 import re
 import sys
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypedDict, TypeVar
 
 import msgspec
 import numpy as np
@@ -215,6 +215,38 @@ VIEW_SETTINGS = (
 RUN_SETTINGS = ("threads", "arch")
 # Settings of a map that limit how it grows: a saved one goes on with others.
 LIMIT_SETTINGS = ("max_blocks", "max_blocks_per_keyframe")
+
+
+class LoadSettings(TypedDict, total=False):
+    """Names and types of the settings with which a saved map is opened, for type checkers."""
+
+    min_weight: float | None
+    surface: Surface | None
+    smoothness: float | None
+    field_smoothness: float | None
+    field_edge: float | None
+    field_reweightings: int | None
+    arch: str
+    max_blocks: int
+    max_blocks_per_keyframe: int
+
+
+class VolumeSettings(LoadSettings, total=False):
+    """The same of all fields of `VolumeConfig`."""
+
+    voxel_size: float
+    sensor: str  # as of a `Dataset`
+    regularizer: Regularizer | None
+    min_support: float | None
+    max_support: float | None
+    min_range: float | None
+    max_range: float | None
+    feedback: bool | None
+    bundle: bool
+    outlier_filter: bool
+    space_carving: bool
+    color: bool
+    threads: int | None
 
 
 class CacheConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -6,11 +6,22 @@ import os
 import time
 from contextlib import ExitStack, suppress
 from pathlib import Path
+from weakref import WeakSet
 
 from tsfusion.core import durable_files
 from tsfusion.core.errors import JournalError, TsfusionError
 
 _POLL_S = 0.05
+_held: WeakSet[ExitStack] = WeakSet()
+
+
+def _let_go() -> None:
+    """Close the locks in a forked process: they are its parent's, and end with that."""
+    for lock in list(_held):
+        lock.close()
+
+
+os.register_at_fork(after_in_child=_let_go)
 
 
 def hold(folder: Path, name: str | None = None, *, wait: float = 0.0) -> ExitStack:
@@ -31,7 +42,8 @@ def hold(folder: Path, name: str | None = None, *, wait: float = 0.0) -> ExitSta
     with ExitStack() as lock:
         lock.callback(os.close, descriptor)
         _lock(descriptor, time.monotonic() + wait)
-        return lock.pop_all()
+        _held.add(made := lock.pop_all())
+        return made
 
 
 def _lock(descriptor: int, deadline: float) -> None:

@@ -113,10 +113,12 @@ def _workplace(work: Path, out: Path) -> Iterator[Path]:
         lock = folder_lock.hold(work)
     except OSError as error:
         raise OutputError(f"cannot write to {out}: {error.strerror}; choose another folder") from error
+    pid = os.getpid()
     try:
         yield work
     finally:
-        shutil.rmtree(work, ignore_errors=True)
+        if os.getpid() == pid:  # a forked process that ends in the block leaves it to its parent
+            shutil.rmtree(work, ignore_errors=True)
         lock.close()
 
 

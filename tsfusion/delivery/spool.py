@@ -89,7 +89,7 @@ class Spool:
         same_frame: bool = False,
         elsewhere: bool = False,
     ) -> None:
-        self.temporary = folder is None
+        self.temporary, self._pid = folder is None, os.getpid()
         self.map_name = map_name
         self.world, self.same_frame = world or "", same_frame
         self.folder = _temporary_folder() if folder is None else Path(folder)
@@ -267,7 +267,12 @@ class Spool:
         return True
 
     def close(self) -> None:
-        """Release the folder. An empty spool takes its files with it: the next starts a new session."""
+        """Release the folder. An empty spool takes its files with it: the next starts a new session.
+
+        In a process forked from the one that opened it this does nothing.
+        """
+        if os.getpid() != self._pid:
+            return
         try:
             self._journal.close()
         except JournalError as error:

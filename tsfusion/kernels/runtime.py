@@ -1,18 +1,59 @@
 # SPDX-License-Identifier: MIT
 """Taichi is started once, here, on the thread that will launch kernels."""
 
+import ctypes
+import os
 import textwrap
 from contextlib import redirect_stdout, suppress
 from functools import cache
 from io import StringIO
+from threading import get_ident
 from types import SimpleNamespace
 
 from tsfusion.core import process
-from tsfusion.core.errors import MissingDependency
+from tsfusion.core.errors import MapError, MissingDependency
 
 _GRID = 2048  # blocks of 128 threads of a device's task: of four times as many, most only end: 5 µs each task
 
 _started_threads: int | None = None
+_FORKED = -1
+_thread: int | None = (
+    None  # the one that kernels run in; _FORKED = it stayed in the parent; None = no one yet
+)
+
+
+def check_thread() -> None:
+    """Raise MapError in another thread than the one that started Taichi, and in a process forked from it.
+
+    Taichi asks at a kernel's first launch at most. Two threads would write to one map at the same time; in a
+    forked process the threads of kernels are missing, and a launch waits for them for ever.
+    """
+    if get_ident() == _thread or _thread is None:
+        return
+    if _thread == _FORKED:
+        raise MapError(
+            "maps cannot be used in a process forked from one that has used some: begin it anew "
+            '(multiprocessing.get_context("spawn")), or fork before the first Volume'
+        )
+    raise MapError(
+        "maps and synthetic recordings belong to the first thread of a process that used some, and this is "
+        "another thread: call them there alone (keyframes can come through a queue.Queue), or have a process "
+        "for them (tsfusion serve, tsfusion.Client)"
+    )
+
+
+def _leave_thread() -> None:
+    """Note in a forked process that it lacks the threads of kernels, for which Taichi waits at its end."""
+    global _thread  # noqa: PLW0603  as below
+    if _thread is not None:
+        from taichi.lang import impl
+
+        _thread = _FORKED
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(impl.get_runtime().prog))  # so that it has no end
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_leave_thread)
 
 
 def start(threads: int | None = None) -> None:
@@ -23,11 +64,14 @@ def start(threads: int | None = None) -> None:
 
     Raises:
         MissingDependency: where taichi has no wheel (Linux aarch64, Intel Macs).
+        MapError: in another thread than before, or in a forked process (`check_thread`).
     """
-    global _started_threads  # noqa: PLW0603  the one piece of process-wide state: Taichi itself is global
+    global _started_threads, _thread  # noqa: PLW0603  the process-wide state: Taichi itself is global
     from tsfusion.kernels import taichi as ti  # says what to do where there is none
 
+    check_thread()
     if _started_threads is None:
+        _thread = get_ident()
         _leave_out_source_lines()
         _started_threads = threads or len(process.cores())
         # `ti.init` starts the threads of kernels last, and prints; a program may be reading our stdout

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tsfusion.core.config import CacheConfig
 from tsfusion.core.distinct_integers import distinct
 from tsfusion.core.errors import MapFull
-from tsfusion.kernels import block_hash
+from tsfusion.kernels import block_hash, runtime
 from tsfusion.kernels.integrate import CHANGED, CUBE, WEIGHT_MASK
 from tsfusion.tsdf.checkpoint import LAYER_DTYPES
 from tsfusion.tsdf.growing_array import MAX_ITEMS, FileArray, GrowingArray
@@ -301,6 +301,21 @@ class BlockStore:
         block_hash.find_blocks(keys, self.hash_keys, self.hash_slots, slots)
         return slots
 
+    def copy_from(self, other: "BlockStore") -> None:
+        """Become a copy of another store with the same layers, as long as this one is empty. As `reserve`."""
+        self.most_blocks, self._memory_bytes = other.most_blocks, other._memory_bytes
+        with self.opening(other.count):
+            self.insert(other.keys)
+        other._fetch()
+        for mine, theirs in zip(self._arrays(), other._arrays(), strict=True):
+            for i in range(0, self.count, _CHUNK):
+                chunk = slice(i, min(i + _CHUNK, self.count))
+                mine.array[chunk] = theirs.array[chunk]
+                self.keep_within_memory()
+                other.keep_within_memory()
+        self.stamp, self.drops = other.stamp, other.drops
+        self.note_written(np.arange(self.count))
+
     def measure_bounds(self) -> None:
         """Set `bounds` from the sums."""
         for i in range(0, self.count, _CHUNK):
@@ -336,7 +351,8 @@ class BlockStore:
             self.rest()
 
     def _hash(self) -> None:
-        """Put the blocks into the hash that are not there yet."""
+        """Put the blocks into the hash that are not there yet. For the thread that kernels run in."""
+        runtime.check_thread()
         first, self._hashed = self._hashed, self.count
         if first < self.count:
             block_hash.insert_blocks(

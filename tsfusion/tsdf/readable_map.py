@@ -22,7 +22,7 @@ from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.mesh_parts import MeshParts, joined
 from tsfusion.geometry.provenance import Provenance
 from tsfusion.geometry.up_direction import HeldSensor, Up
-from tsfusion.kernels import integrate
+from tsfusion.kernels import integrate, runtime
 from tsfusion.kernels.sensor_noise import WEIGHT_ONE
 from tsfusion.tsdf import (
     field_regularizer,
@@ -67,8 +67,14 @@ class ReadableMap:
         self.meta: dict[str, Any] = {}
         self.keyframes = 0
         self.held = HeldSensor()
-        self._store = store
+        self._blocks = store
         self._mesh_buffers = MeshBuffers()
+
+    @property
+    def _store(self) -> BlockStore:
+        """The blocks, for the thread that they belong to. Raises MapError in another one."""
+        runtime.check_thread()
+        return self._blocks
 
     def extract_mesh(
         self,

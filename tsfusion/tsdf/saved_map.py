@@ -2,7 +2,7 @@
 """The blocks and settings of a checkpoint, checked on the way into a map."""
 
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -92,7 +92,7 @@ def _check_in(path: Path, store: BlockStore, blocks: slice, digest: "hashlib.bla
 
 
 def loaded_config(
-    header: checkpoint.CheckpointHeader, threads: int | None, changed: dict[str, Any]
+    header: checkpoint.CheckpointHeader, threads: int | None, changed: Mapping[str, Any]
 ) -> VolumeConfig:
     """The settings of a saved map, with those that may be others."""
     saved = header.config

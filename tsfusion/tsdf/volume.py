@@ -7,12 +7,13 @@ does not matter, and subtraction removes a keyframe to the last bit. Smoothed va
 the sums and never change them.
 """
 
+import copy
 import logging
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import msgspec
 import numpy as np
@@ -37,6 +38,11 @@ from tsfusion.tsdf.map_crop import Part
 from tsfusion.tsdf.ray_buffers import RayBuffers, keyframes_of_every_kind
 from tsfusion.tsdf.readable_map import HELD, begin_hash
 from tsfusion.tsdf.residency import checked_cache
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+    from tsfusion.core.config import LoadSettings, VolumeSettings
 
 log = logging.getLogger(__name__)
 
@@ -69,7 +75,8 @@ class Volume(AskableMap):
 
     Give a `VolumeConfig`, or the edge of a voxel in metres and other fields by name:
     `Volume(0.02, sensor="kinect", regularizer="ray")`.
-    Use it from one thread (Taichi's). `threads` counts for the first volume of a process: Taichi starts once.
+    It belongs to the first thread of a process that makes one, in which Taichi runs: calls from another, and
+    in a process forked from it, are MapErrors. `threads` counts for the first volume of a process.
     With `arch="cuda"` or another device, keyframes are fused there, in a process that all volumes of this one
     share; where the device is missing, a warning says why, and they are fused on the CPU.
 
@@ -103,7 +110,7 @@ class Volume(AskableMap):
         *others: object,
         memory_bytes: int | None = None,
         cache: str | os.PathLike[str] | CacheConfig | None = None,
-        **settings: Any,
+        **settings: "Unpack[VolumeSettings]",
     ) -> None:
         if others:  # VDBFusion's: sdf_trunc, space_carving
             hint = other_names.instead("sdf_trunc", other_names.SETTINGS, ())
@@ -127,6 +134,7 @@ class Volume(AskableMap):
             device=device,
         )
         super().__init__(config, store)
+        self._cache = memory_bytes, cache  # for `copy`
         self.quota: KeyframeQuota | None = None  # of the keyframes that are integrated from here on
         self._has_warned = False  # of a keyframe without
         self._has_retracted = False  # since `release_empty`
@@ -216,6 +224,30 @@ class Volume(AskableMap):
         self.keyframes += other.keyframes
         self.held.merge(other.held)
         self.meta = map_history.added(self.meta, other.meta)
+
+    def copy(self) -> "Volume":
+        """Another map of the same keyframes, settings and counts: what happens to one does not to the other.
+
+        Raises:
+            MemoryError, MapFull: when there is no room for both.
+        """
+        memory_bytes, cache = self._cache
+        made = Volume(self.config, memory_bytes=memory_bytes, cache=cache)
+        made._store.copy_from(self._store)
+        made.keyframes, made.meta = self.keyframes, copy.deepcopy(self.meta)
+        made.held, made.quota = HeldSensor(self.held.numbers), self.quota
+        made._has_warned, made._has_retracted = self._has_warned, self._has_retracted
+        made._released = list(self._released)
+        return made
+
+    def __copy__(self) -> "Volume":
+        return self.copy()
+
+    def __deepcopy__(self, _known: dict[int, Any]) -> "Volume":
+        return self.copy()
+
+    def __reduce__(self) -> NoReturn:
+        raise MapError("a Volume cannot be pickled: use save, and Volume.load where it is needed")
 
     def _parts_with(self, other: "Volume") -> tuple[Part, Part] | None:
         """The places of both in one map of which they are parts that share no voxel; None = they are none."""
@@ -379,7 +411,7 @@ class Volume(AskableMap):
         *,
         memory_bytes: int | None = None,
         cache: str | os.PathLike[str] | CacheConfig | None = None,
-        **changed: Any,
+        **changed: "Unpack[LoadSettings]",
     ) -> "Volume":
         """Read a checkpoint back, verified against its own hash.
 
@@ -416,7 +448,7 @@ class Volume(AskableMap):
         high: Sequence[int],
         *,
         is_checked: bool = False,
-        **changed: Any,
+        **changed: "Unpack[LoadSettings]",
     ) -> "Volume":
         """A part of a saved map: the blocks in a box, and those around it that its mesh depends on.
 
