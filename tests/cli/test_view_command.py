@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,9 @@ from live_pages import DEADLINE, address_of, ended, running, viewing
 from tsfusion.cli import verbs
 from tsfusion.cli import view as view_command
 from tsfusion.core.errors import InvalidConfig
+from tsfusion.pipelines import viewer_child
 from tsfusion.pipelines.viewer_child import ViewerChild
+from tsfusion.viewer.live_page import LivePage
 from tsfusion.viewer.page_place import listen
 from tsfusion.wire import key_folder
 from tsfusion.wire.queries import fetch_health
@@ -201,3 +204,60 @@ def test_a_page_that_does_not_start_is_a_warning(caplog: pytest.LogCaptureFixtur
     assert line.startswith(f"the page has ended with status 1: cannot show a page at 127.0.0.1:{port}: ")
     assert line.endswith("; everything else goes on")
     assert not told
+
+
+def test_a_page_that_the_system_ends_is_started_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    page = f"""
+import json, os, pathlib, signal, sys
+place = pathlib.Path({str(tmp_path / "times")!r})
+place.write_text(place.read_text() + "x" if place.exists() else "x")
+print(json.dumps({{"url": "page " + place.read_text()}}), flush=True)
+if len(place.read_text()) == 1:
+    os.kill(os.getpid(), signal.SIGKILL)
+sys.stdin.read()
+"""
+    monkeypatch.setattr(viewer_child, "_COMMAND", (sys.executable, "-c", page))
+    monkeypatch.setattr(viewer_child, "_LEAST_SECONDS", -1.0)
+    told: list[str] = []
+    viewer = ViewerChild("127.0.0.1:0", told.append)
+    viewer.start(NOBODY)
+    try:
+        assert eventually(lambda: told == ["page x", "page xx"], DEADLINE)
+    finally:
+        viewer.close()
+    assert not viewer._reader.is_alive()
+    assert [one.getMessage() for one in caplog.records] == [
+        "the page has ended with status -9; everything else goes on"
+    ]
+
+
+def test_a_page_with_too_much_memory_begins_again_at_its_address(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    shown: list[str] = []
+
+    def run(page: LivePage, stop: threading.Event, *, memory_bytes: int) -> None:
+        assert memory_bytes >= 2 << 30
+        place = f"http://127.0.0.1:{page._server.get_port()}"
+        shown.append(place)
+        assert status_of(place) == HTTPStatus.OK
+        if len(shown) == 2:
+            stop.set()
+        else:
+            usual(page, stop, memory_bytes=1)
+
+    usual = LivePage.run
+    monkeypatch.setattr(LivePage, "run", run)
+    monkeypatch.setattr("tsfusion.core.process.limit_memory", lambda most: None)
+    arguments: Any = (None, NOBODY)
+    options = {"listen": "127.0.0.1:0", "no_browser": True, "json": True}
+    with pytest.raises(MemoryError, match="a page may take 0 MB"):
+        view_command.view(*arguments, **options)  # it began a moment ago
+    shown.clear()
+    capsys.readouterr()
+    monkeypatch.setattr(view_command, "_LEAST_SECONDS", -1.0)
+    assert view_command.view(*arguments, **options) == 0
+    assert json.loads(capsys.readouterr().out)["url"] == shown[0] == shown[1]
+    assert "it begins again" in caplog.text

@@ -111,6 +111,7 @@ def shown() -> Iterator[Shown]:
             thread.join(DEADLINE)
             served.close()
             assert not thread.is_alive()
+            assert not served.refused, "a message of the real page"
 
 
 @pytest.fixture
@@ -183,6 +184,34 @@ def test_two_clicks_measure_a_distance(whole: Shown) -> None:
     whole.browser.wait("document.body.innerText.includes('75.0 cm')")
     panel._toggle_measuring()
     assert panel._answer.visible is False
+
+
+def test_what_a_person_does_in_the_page_gets_through(whole: Shown) -> None:
+    """Boxes, choices, buttons, sliders and clicks of the real page are messages that the page takes."""
+
+    def press(x: float, y: float) -> None:
+        for what in ("mousePressed", "mouseReleased"):
+            whole.browser.call(
+                "Input.dispatchMouseEvent", type=what, x=x, y=y, button="left", clickCount=1, buttons=1
+            )
+
+    def click(label: str, kind: str) -> None:
+        found = f"[...document.querySelectorAll('{kind}')].find(one => one.innerText.trim() == '{label}')"
+        whole.browser.wait(f"!!{found}")
+        whole.browser.evaluate(f"{found}.scrollIntoView()")
+        box = whole.browser.evaluate(
+            f"(b => [b.x + b.width / 2, b.y + b.height / 2])({found}.getBoundingClientRect())"
+        )
+        press(*box)
+
+    click("Dark", "label")
+    until(lambda: whole.control("Dark").value)
+    panel = next(iter(whole.page._browsers.values()))
+    click("Measure a distance", "button")
+    until(lambda: panel._is_measuring)
+    until(lambda: (press(160, 200), bool(panel._points))[1])
+    click("End measuring", "button")
+    until(lambda: not panel._is_measuring)
 
 
 def test_pictures_and_models_are_saved(whole: Shown, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -208,19 +208,52 @@ def test_ipv6(page: PageServer) -> None:
         made.close()
 
 
+def sent(page: PageServer, *messages: dict[str, Any]) -> None:
+    """Send messages as a browser, the last of which ends the connection."""
+    with visit(page) as link, pytest.raises(ConnectionClosed):  # noqa: PT012
+        for message in messages:
+            link.send(msgspec.msgpack.encode(message))
+        while True:
+            link.recv(DEADLINE)
+
+
 def test_nobody_gets_a_tunnel(page: PageServer, monkeypatch: pytest.MonkeyPatch) -> None:
     def tunnel(*_: object) -> None:
         raise AssertionError("a tunnel was asked for")
 
     monkeypatch.setattr("viser._viser.ViserTunnel", tunnel)
-    asked = []
-    usual = page.server.request_share_url
-    monkeypatch.setattr(page.server, "request_share_url", lambda: asked.append(usual()))
-    with visit(page) as link:
-        link.send(msgspec.msgpack.encode({"type": "ShareUrlDisconnect"}))
-        link.send(msgspec.msgpack.encode({"type": "ShareUrlRequest"}))
-        assert eventually(lambda: asked == [None])
+    before = page.refused["message"]
+    for name in ("ShareUrlDisconnect", "ShareUrlRequest"):
+        sent(page, {"type": name})
+    assert page.refused["message"] - before == 2
     assert page.server._share_tunnel is None
+
+
+def test_a_browser_changes_values_and_nothing_else(page: PageServer) -> None:
+    gui = page.server.gui
+    slider = gui.add_slider("At", 0.0, 1.0, 0.1, 0.5)
+    ends = gui.add_multi_slider("From to", 0.0, 1.0, 0.1, (0.2, 0.8))
+    kept = len(page.server._websock_server.get_message_buffer().message_from_id)
+    before = slider.min, slider.max, slider.label, ends.value
+    uuid, other = slider._impl.uuid, ends._impl.uuid
+    wrong = (
+        {"type": "GuiFormDirtyMessage", "uuid": "x" * 1000},
+        {"type": "GuiUpdateMessage", "uuid": uuid, "updates": {"props": "x"}},
+        {"type": "GuiUpdateMessage", "uuid": other, "updates": {"value": "x", "min": 3}},
+    )
+    start = {
+        "type": "FileTransferStartUpload", "source_component_uuid": uuid, "transfer_uuid": "t",
+        "filename": "f", "mime_type": "x/y", "part_count": 10**6, "size_bytes": 10**12,
+    }  # fmt: skip
+    for message in (*wrong, start):
+        sent(page, message)
+    values = [(other, []), (other, [0.1]), (uuid, []), (uuid, float("nan")), (uuid, 0.75)]
+    news = [{"type": "GuiUpdateMessage", "uuid": one, "updates": {"value": value}} for one, value in values]
+    sent(page, *news, wrong[0])
+    assert slider.value == 0.75
+    assert (slider.min, slider.max, slider.label, ends.value) == before
+    assert not gui._current_file_upload_states
+    assert len(page.server._websock_server.get_message_buffer().message_from_id) <= kept + 1  # the new value
 
 
 def test_a_message_that_is_none_ends_its_connection_alone(page: PageServer) -> None:

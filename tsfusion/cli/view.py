@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: MIT
 """`tsfusion view`."""
 
+import logging
 import os
 import re
 import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
 from functools import cache, partial
@@ -31,6 +33,10 @@ _ANSWER_SECONDS = 1.0  # for a server to say that it is there
 _SERVER = re.compile(r"[\w.-]+:\d{1,5}|\[[\da-fA-F:.]+\]:\d{1,5}", re.ASCII)
 _ERROR = "Error [m]"  # as the page names it
 _NICENESS = 10  # of a page beside a run
+_MEMORY_SHARE, _LEAST_MEMORY = 4, 2 << 30  # of the machine's that a page may take; bytes
+_LEAST_SECONDS = 60.0  # that a page lasts which may begin again
+
+log = logging.getLogger(__name__)
 
 
 def view(
@@ -69,7 +75,7 @@ def view(
 
     Beyond this machine (--listen 0.0.0.0:5558) the address has a token in it.
     """
-    from tsfusion.core import logs
+    from tsfusion.core import logs, process
     from tsfusion.viewer.live_page import LivePage
     from tsfusion.viewer.page_place import check_installed, parse_place
     from tsfusion.viewer.page_server import PageServer
@@ -85,16 +91,28 @@ def view(
         )
     measures = _measures(target, truth)
     link = {"control": control, "publish": publish, "keys": keys}
-    with (
-        closing(PageServer(*parse_place(listen), token=token)) as page,
-        closing(_feed(target, map_, link)) as feed,
-        _stopped_by_signals() as stop,
-    ):
-        shown = LivePage(page.server, feed, measures=measures)
-        _announce(page.url, feed.title, json=json)
-        if not no_browser:
-            _open_browser(page.url)
-        shown.run(stop)
+    (host, port), is_announced = parse_place(listen), False
+    memory_bytes = max(process.physical_memory_bytes() // _MEMORY_SHARE, _LEAST_MEMORY)
+    process.limit_memory(process.data_bytes() + memory_bytes)
+    with _stopped_by_signals() as stop:
+        while not stop.is_set():
+            began = time.monotonic()
+            with (
+                closing(PageServer(host, port, token=token)) as page,
+                closing(_feed(target, map_, link)) as feed,
+            ):
+                shown = LivePage(page.server, feed, measures=measures)
+                if not is_announced:
+                    _announce(page.url, feed.title, json=json)
+                    if not no_browser:
+                        _open_browser(page.url)
+                is_announced, port, token = True, page.port, page.token  # which stay if it begins again
+                try:
+                    shown.run(stop, memory_bytes=memory_bytes)
+                except MemoryError as error:
+                    if time.monotonic() < began + _LEAST_SECONDS:  # the map itself is too much
+                        raise
+                    log.warning("%s: it begins again", error)
     return 0
 
 

@@ -179,6 +179,7 @@ def main() -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)  # who started it decides
     process.end_first()
+    process.lift_memory_limit()  # which is that of the page
     _Viewing(Connection(int(sys.argv[1]))).run()
 
 

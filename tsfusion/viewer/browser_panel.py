@@ -2,6 +2,7 @@
 """Controls of one browser: its camera, measuring, pictures and downloads."""
 
 import contextlib
+import threading
 import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Protocol
@@ -29,6 +30,7 @@ _RENDER = 30.0  # seconds that a browser may take for a picture
 _UPRIGHT = 0.6
 _COVERED = 0.5
 _MARK = (213, 94, 0)
+_WAITING = 64  # messages to a browser that does not read
 
 
 class Shown(Protocol):
@@ -78,6 +80,7 @@ class BrowserPanel:
         self._has_arrived = False  # whether the browser has been where we moved its camera
         self._points: list[NDArray[np.float64]] = []
         self._marks: list[Any] = []
+        self._saving = threading.Lock()
         self._is_measuring = False
         with place():
             gui = client.gui
@@ -89,8 +92,8 @@ class BrowserPanel:
             dark = gui.add_checkbox("Dark", False)
         self._camera.on_update(calm(lambda event: self._forget_view()))
         self._measure.on_click(calm(lambda event: self._toggle_measuring()))
-        picture.on_click(calm(lambda event: self._save_picture()))
-        model.on_click(calm(lambda event: self._save_model()))
+        picture.on_click(calm(lambda event: self._save_one(self._save_picture)))
+        model.on_click(calm(lambda event: self._save_one(self._save_model)))
         dark.on_update(calm(lambda event: set_theme(client.gui, dark=dark.value)))
         client.camera.fov = map_views.FOV
         client.camera.on_update(calm(lambda event: self._note_move()))
@@ -204,6 +207,16 @@ class BrowserPanel:
 
     def _tell(self, content: str) -> None:
         self._answer.content, self._answer.visible = text(content), True
+
+    def _save_one(self, save: Callable[[], None]) -> None:
+        """Save one file at a time, when the browser has taken the last one."""
+        waiting = self._client._websock_connection.get_message_buffer().message_from_id
+        if len(waiting) > _WAITING or not self._saving.acquire(blocking=False):
+            return
+        try:
+            save()
+        finally:
+            self._saving.release()
 
     def _save_picture(self) -> None:
         import cv2

@@ -2,6 +2,7 @@
 """The live page: what a feed tells of a map, in a browser."""
 
 import logging
+import sys
 import threading
 import time
 import warnings
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from tsfusion.core import process
 from tsfusion.core.readable_numbers import grouped
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.viewer import map_tiles, map_views, pointed_surface
@@ -99,14 +101,24 @@ class LivePage:
         server.on_client_connect(calm(self._welcome))
         server.on_client_disconnect(calm(self._part))
 
-    def run(self, stop: threading.Event) -> None:
-        """Show what happens until `stop` is set. Raises what the feed raises."""
+    def run(self, stop: threading.Event, *, memory_bytes: int = sys.maxsize) -> None:
+        """Show what happens until `stop` is set.
+
+        Args:
+            memory_bytes: that this process may take.
+
+        Raises:
+            MemoryError: when it takes more.
+            TsfusionError: of the feed.
+        """
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")  # a browser that left
         try:
             while not stop.is_set():
                 for event in self._feed.events(_WAIT):
                     self._take(event)
                 self._step(time.monotonic())
+                if process.rss_bytes() > memory_bytes:
+                    raise MemoryError(f"a page may take {memory_bytes >> 20} MB, and it takes more")
         finally:
             self._colors.values.close()
 

@@ -52,6 +52,7 @@ class PageGuard:
             reach the page, else none is needed.
 
     Attributes:
+        token: the one that is needed; None = none is.
         url: address to open the page with, token included.
 
     Raises:
@@ -64,7 +65,7 @@ class PageGuard:
         is_private = is_loopback(host)
         if token is None and not is_private:
             token = secrets.token_urlsafe(18)
-        self._token = token
+        self.token = token
         self._secret = hashlib.sha256(f"tsfusion page {token}".encode()).hexdigest()
         self._cookie = f"tsfusion-{port}"  # browsers share cookies among the ports of a host
         self._is_any = host in _ANY
@@ -84,7 +85,7 @@ class PageGuard:
             )
         if (origins or is_websocket(headers)) and not _is_from(origins, hosts[0]):
             return Refusal("origin", HTTPStatus.FORBIDDEN, "another page may not use this one")
-        if self._token is not None and not (self.is_given(path) or self._has_cookie(headers)):
+        if self.token is not None and not (self.is_given(path) or self._has_cookie(headers)):
             return Refusal(
                 "token",
                 HTTPStatus.FORBIDDEN,
@@ -94,10 +95,10 @@ class PageGuard:
 
     def is_given(self, path: str) -> bool:
         """Whether a token is needed, and stands in the address that is asked for."""
-        if self._token is None:
+        if self.token is None:
             return False
         given = parse_qs(path.partition("?")[2]).get("token", [""])[0]
-        return hmac.compare_digest(given.encode(errors="surrogateescape"), self._token.encode())
+        return hmac.compare_digest(given.encode(errors="surrogateescape"), self.token.encode())
 
     def answer_headers(self, path: str, headers: Headers) -> dict[str, str]:
         """Headers of the answer to a request that is not refused: nothing is loaded from elsewhere."""

@@ -17,7 +17,10 @@ from http import HTTPStatus
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
+from msgspec import MsgspecError
+
 from tsfusion.core.errors import TransportError
+from tsfusion.viewer import page_messages
 from tsfusion.viewer.page_guard import PageGuard, Refusal, is_websocket
 from tsfusion.viewer.page_place import check_installed, listen
 
@@ -31,6 +34,7 @@ KNOCKING = 64  # connections at once that are no browser yet; the oldest makes r
 _MAX_MESSAGE = 16 << 20  # bytes: a browser sends a picture of its page
 _OPEN_SECONDS = 10.0  # for a request and its answer
 _CLOSE_SECONDS = 1.0
+_PAUSE = 0.005  # seconds between two messages of a browser: viser's page sends 50 a second at most
 _START = threading.Lock()
 _FULL = f"{BROWSERS} browsers show this page already: close one"
 _MISFITS = (TypeError, ValueError, LookupError, AttributeError, OSError, RuntimeError)
@@ -49,7 +53,8 @@ class PageServer:
     Attributes:
         server: to fill the page with.
         url: to open it with.
-        refused: requests that were turned away, by reason: host, origin, token, full.
+        port, token: the real ones; the token is None where none is needed.
+        refused: requests that were turned away, by reason: host, origin, token, full, message.
 
     Raises:
         MissingDependency: without viser.
@@ -65,8 +70,9 @@ class PageServer:
         self._problem = "it starts in another way"
         with ExitStack() as failed:
             listener = failed.enter_context(listen(host, port))
-            self._guard = PageGuard(host, listener.getsockname()[1], token)
-            self.url = self._guard.url
+            self.port = listener.getsockname()[1]
+            self._guard = PageGuard(host, self.port, token)
+            self.url, self.token = self._guard.url, self._guard.token
             self.server = self._start(listener)
             failed.pop_all()
         self.server.gui.configure_theme(show_logo=False, show_share_button=False)
@@ -83,21 +89,12 @@ class PageServer:
         import viser
         import websockets.asyncio.server as module
 
-        class Unshared(viser.ViserServer):
-            """A server that no page can ask for a tunnel to the world."""
-
-            def request_share_url(self, verbose: bool = True) -> str | None:
-                return None
-
-            def disconnect_share_url(self) -> None:
-                pass
-
         rich.reconfigure(quiet=True)  # viser prints there, and stdout is the command's own
         with _START:
             usual = module.serve
             module.serve = partial(self._serve, usual, listener)  # type: ignore[assignment, misc]
             try:
-                server = Unshared(host="127.0.0.1", port=0, verbose=False)
+                server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
             finally:
                 module.serve = usual  # type: ignore[misc]
         if self._running is None:
@@ -130,11 +127,15 @@ class PageServer:
             answer: what viser answers to a request.
         """
         from websockets.asyncio.server import ServerConnection
+        from websockets.frames import CloseCode
 
         page = self
 
         class Knocking(ServerConnection):
-            """A connection that makes room: of those that are no browser yet, the oldest is ended."""
+            """A connection that gives viser what our page sends, and makes room for others.
+
+            Of those that are no browser yet, the oldest is ended.
+            """
 
             def connection_made(self, transport: asyncio.BaseTransport) -> None:
                 super().connection_made(transport)
@@ -144,6 +145,19 @@ class PageServer:
                     self.transport.abort()
                 elif len(waiting) > KNOCKING:
                     waiting[0].transport.abort()
+
+            async def recv(self, decode: bool | None = None) -> Any:
+                while True:
+                    await asyncio.sleep(_PAUSE)
+                    message = await super().recv(decode)
+                    try:
+                        found = page_messages.checked(message, page._control)
+                    except (MsgspecError, RecursionError, TypeError) as error:
+                        page._note_refused(self, "message", f"no page of ours sends this: {error}")
+                        await self.close(CloseCode.POLICY_VIOLATION)
+                    else:
+                        if found is not None:
+                            return found
 
         return {
             "process_request": lambda one, request: self._refused(one, request) or answer(one, request),
@@ -163,14 +177,24 @@ class PageServer:
             and is_websocket(request.headers)
             and len(connection.server.connections) >= BROWSERS
         ):
-            text = f"{BROWSERS} browsers show this page already: close one"
-            refusal = Refusal("full", HTTPStatus.SERVICE_UNAVAILABLE, text)
+            refusal = Refusal("full", HTTPStatus.SERVICE_UNAVAILABLE, _FULL)
         if refusal is None:
             return None
-        self.refused[refusal.reason] += 1
-        peer = connection.remote_address or ("somewhere",)
-        log.warning("a browser at %s is turned away (%s): %s", peer[0], refusal.reason, refusal.text)
+        self._note_refused(connection, refusal.reason, refusal.text)
         return connection.respond(refusal.status, f"{refusal.text}\n")
+
+    def _note_refused(self, connection: "ServerConnection", reason: str, text: str) -> None:
+        self.refused[reason] += 1
+        peer = connection.remote_address or ("somewhere",)
+        log.warning("a browser at %s is turned away (%s): %s", peer[0], reason, text)
+
+    def _control(self, name: str) -> Any:
+        """The control of that name, of all browsers or of one; None = there is none."""
+        panels = [self.server.gui, *(client.gui for client in self.server.get_clients().values())]
+        found = [
+            one._gui_input_handle_from_uuid[name] for one in panels if name in one._gui_input_handle_from_uuid
+        ]
+        return found[0] if found else None
 
     def _with_headers(self, connection: "ServerConnection", request: "Request", response: "Response") -> None:
         if response.status_code == HTTPStatus.OK:

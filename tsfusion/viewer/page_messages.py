@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: MIT
+"""Messages of browsers that a page takes: its camera, a click, a picture, a new value of a control.
+
+viser takes more than our page uses, keeps some of it, and believes the values: so each message is read as one
+of these and written anew, and anything else ends its connection.
+"""
+
+import math
+from collections.abc import Callable
+from itertools import chain
+from typing import Annotated, Any, Literal
+
+from msgspec import Meta, Struct, ValidationError, msgpack
+
+_MOST_PIXELS = 1 << 25  # of a picture: 8K has less
+_MOST_BYTES = 4096  # of a message that is no picture
+_FAR = 1e12  # metres, and any other number
+_PNG_SIZE = slice(16, 24)  # bytes of width and height, the high one first
+
+_Pixels = Annotated[int, Meta(ge=0, le=1 << 16)]
+_Point = tuple[float, float, float]
+
+
+class _FromBrowser(Struct, tag_field="type", forbid_unknown_fields=True):
+    """A message as viser's page sends it."""
+
+
+class _Camera(_FromBrowser, tag="ViewerCameraMessage"):
+    wxyz: tuple[float, float, float, float]
+    position: _Point
+    fov: float
+    near: float
+    far: float
+    image_height: _Pixels
+    image_width: _Pixels
+    look_at: _Point
+    up_direction: _Point
+
+
+class _Click(_FromBrowser, tag="ScenePointerMessage"):
+    event_type: Literal["click"]
+    ray_origin: _Point
+    ray_direction: _Point
+    screen_pos: tuple[tuple[float, float]]
+    modifier: str | None
+
+
+class _Picture(_FromBrowser, tag="GetRenderResponseMessage"):
+    payload: bytes
+    render_uuid: str
+
+
+class _Updates(Struct, forbid_unknown_fields=True):
+    value: bool | int | float | str | list[float]  # msgspec 0.21 ends the process for bounds or a tuple here
+
+
+class _NewValue(_FromBrowser, tag="GuiUpdateMessage"):
+    uuid: str
+    updates: _Updates
+
+
+_decoder = msgpack.Decoder(_Camera | _Click | _Picture | _NewValue)
+
+
+def checked(message: str | bytes, control: Callable[[str], Any]) -> bytes | None:
+    """A browser's message as viser may have it; None = it is not to have it.
+
+    Args:
+        control: the control of a name, as it is now, or None.
+
+    Raises:
+        msgspec.MsgspecError, RecursionError, TypeError: for what no page of ours sends.
+    """
+    read = _decoder.decode(message)  # type: ignore[arg-type]  # TypeError for text
+    if len(message) > _MOST_BYTES and not isinstance(read, _Picture):
+        raise ValidationError(f"{len(message)} bytes")
+    match read:
+        case _NewValue():
+            value = _fitted(read.updates.value, control(read.uuid))
+            if value is None:
+                return None
+            read.updates.value = value
+        case _Picture():
+            width, height = (int.from_bytes(read.payload[_PNG_SIZE][i : i + 4], "big") for i in (0, 4))
+            if width * height > _MOST_PIXELS:
+                return None
+        case _Camera():
+            places = (read.wxyz, read.position, read.look_at, read.up_direction)
+            numbers = (read.fov, read.near, read.far, *chain.from_iterable(places))
+            if not _are_usual(numbers) or not 0 < read.image_height * read.image_width <= _MOST_PIXELS:
+                return None
+        case _Click():
+            if not _are_usual((*read.ray_origin, *read.ray_direction, *read.screen_pos[0])):
+                return None
+    return msgpack.encode(read)
+
+
+def _fitted(value: Any, control: Any) -> Any:
+    """The value that a control gets when a browser sends `value`: within its bounds; None = none."""
+    before = getattr(control, "value", None)
+    if isinstance(before, bool) or isinstance(value, bool):  # a box, or a button
+        return value if isinstance(before, bool) and isinstance(value, bool) else None
+    if hasattr(control, "options"):
+        return value if value in control.options else None
+    numbers, places = (tuple(one) if isinstance(one, (list, tuple)) else (one,) for one in (value, before))
+    if not (hasattr(control, "min") and len(numbers) == len(places) and _are_usual(numbers)):
+        return None
+    within = tuple(min(max(number, control.min), control.max) for number in numbers)
+    return list(within) if isinstance(before, tuple) else within[0]
+
+
+def _are_usual(numbers: tuple[Any, ...]) -> bool:
+    return all(isinstance(one, (int, float)) and math.isfinite(one) and abs(one) <= _FAR for one in numbers)
