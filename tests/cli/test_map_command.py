@@ -21,6 +21,8 @@ from small_recordings import first_views
 from tsfusion import Client, Volume, journal
 from tsfusion.gateway import moved_maps
 from tsfusion.journal import segment_path, state_folder
+from tsfusion.tsdf import checkpoint
+from tsfusion.tsdf.checkpoint import CheckpointHeader
 
 
 @pytest.fixture(scope="module")
@@ -95,8 +97,67 @@ def test_what_damage_has_cost_is_the_last_line_and_status_1(here: Here, tmp_path
     assert hashed.stdout == left + "\n"
     assert json.loads(info.stdout)["keyframes_lost"] == 1
     assert (Volume.load(sum_).keyframes, Volume.load(crop).keyframes) == (5, 3)
-    refused = here("map", "crop", state, "--box", 1, 1, 1, 0, 0, 0, "--out", crop)
+    refused = here("map", "crop", state, "--box", 1, 1, 1, 0, 0, 0, "--out", "none.tsf")
     assert "damage" not in refused.stderr.splitlines()[-1], "what failed comes first"
+
+
+@pytest.mark.parametrize("verb", ["merge", "crop", "convert", "align"])
+def test_what_is_there_already_stays(here: Here, state: Path, tmp_path: Path, verb: str) -> None:
+    one, other = file_of(state, "yard"), make_map(tmp_path / "c", range(20, 22), session=b"c" * 16)
+    given = {
+        "merge": ("map", "merge", one, other, "--out"), "align": ("map", "align", one, one, "--out"),
+        "crop": ("map", "crop", one, "--box", -9, -9, -9, 9, 9, 9, "--out"),
+        "convert": ("map", "convert", one),
+    }[verb]  # fmt: skip
+    out = tmp_path / "out.tsf"
+    for content, said in (
+        (b"another thing", "a file is there that is no .tsf"),
+        (b"TSFMAP1\n", "--overwrite"),
+    ):
+        out.write_bytes(content)
+        done = here(*given, out)
+        assert (done.returncode, done.stderr.count("\n")) == (1, 1)
+        assert said in done.stderr
+        assert out.read_bytes() == content
+    if verb != "align":  # which needs Open3D
+        assert here(*given, out, "--overwrite").returncode == 0
+        assert Volume.load(out).keyframes == (7 if verb == "merge" else 5)
+
+
+@pytest.mark.parametrize("name", ["precious.ply", "precious.glb", "precious.npz", "precious.vdb"])
+def test_a_file_of_another_kind_than_its_name_stays(here: Here, state: Path, name: str) -> None:
+    Path(name).write_text("the only copy of something else")
+    done = here("map", "convert", file_of(state, "yard"), name)
+    assert (done.returncode, Path(name).read_text()[:8]) == (1, "the only")
+    Path(name).unlink()
+    for _ in range(2):  # what it made itself it makes again
+        assert here("map", "convert", file_of(state, "yard"), name).returncode == 0
+
+
+def test_a_folder_that_is_no_zarr_stays(here: Here, state: Path) -> None:
+    Path("notes.zarr").mkdir()
+    Path("notes.zarr", "mine.txt").write_text("mine")
+    assert here("map", "convert", file_of(state, "yard"), "notes.zarr").returncode == 1
+    assert Path("notes.zarr", "mine.txt").read_text() == "mine"
+
+
+@pytest.mark.parametrize("name", ["map_hash", "keyframes", "blocks", "layers", "done", "rejected", "held"])
+def test_what_a_header_tells_is_checked(here: Here, state: Path, tmp_path: Path, name: str) -> None:
+    def change(header: CheckpointHeader) -> None:
+        wrong = {
+            "map_hash": "f" * 32, "keyframes": -1, "blocks": header.blocks - 1, "layers": ["color_b"],
+            "done": {"x": 7}, "rejected": [1], "held": [1.0, 2.0],
+        }[name]  # fmt: skip
+        if name in ("done", "rejected", "held"):
+            header.meta[name] = wrong
+        else:
+            setattr(header, name, wrong)
+
+    path = checkpoint.copy(file_of(state, "yard"), tmp_path / "forged.tsf", change)
+    for verb in ("hash", "info"):
+        done = here("map", verb, path)
+        assert (done.returncode, done.stdout, done.stderr.count("\n")) == (1, "", 1)
+        assert str(path) in done.stderr
 
 
 def test_a_checkpoint_that_is_older_than_its_journal_is_told(here: Here, tmp_path: Path) -> None:

@@ -29,6 +29,7 @@ from tsfusion.core.errors import (
     MapError,
     MapFull,
     MapQuota,
+    OutputError,
     WeightOverflow,
 )
 from tsfusion.kernels import integrate, ray_smoothing
@@ -577,6 +578,16 @@ def test_a_copy_keeps_the_limits_of_its_map() -> None:
 def test_a_map_is_saved_not_pickled() -> None:
     with pytest.raises(MapError, match=r"cannot be pickled: use save"):
         pickle.dumps(volume_of(VIEWS[:1]))
+
+
+@pytest.mark.parametrize(
+    ("name", "cure"), [("v.ply", "extract_mesh().save"), ("v.GLB", "extract_mesh"), ("v.npz", "save_voxels")]
+)
+def test_a_map_has_not_the_name_of_another_kind(name: str, cure: str, tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match=r"a map is saved as \.tsf") as refused:
+        volume_of(VIEWS[:1]).save(tmp_path / name)
+    assert cure in str(refused.value)
+    assert not (tmp_path / name).exists()
 
 
 def test_type_checkers_know_every_setting() -> None:

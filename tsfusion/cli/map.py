@@ -29,7 +29,7 @@ map_move.register(app)
 Where = Annotated[
     Path, typer.Argument(metavar="MAP", help="A .tsf file, a state folder, or a map's folder in it.")
 ]
-Out = Annotated[Path, typer.Option("--out", metavar="FILE", help="The map to write (.tsf); replaced.")]
+Out = Annotated[Path, typer.Option("--out", metavar="FILE", help="The map to write (.tsf).")]
 Map = Annotated[
     str | None, typer.Option("--map", metavar="NAME", help="Which map of a state folder with several.")
 ]
@@ -87,6 +87,7 @@ def merge(
     same_frame: Annotated[
         bool, typer.Option("--same-frame", help="The maps are in one frame; this is not checked.")
     ] = False,
+    overwrite: options.OverwriteMap = False,
     json: options.Json = False,
 ) -> None:
     """Add maps of one coordinate frame: the map of all their keyframes, to the last bit.
@@ -107,8 +108,8 @@ def merge(
     from tsfusion.journal.state_folder import check_no_map_of_a_server
     from tsfusion.tsdf import map_history
 
-    check_writable(out, (".tsf",))
     check_no_map_of_a_server(out)
+    check_writable(out, (".tsf",), overwrite=overwrite)
     if len(maps) < 2:
         raise InvalidConfig(f"merging takes two maps or more, got {len(maps)}")
     merged = _load(maps[0], quiet=json)
@@ -142,6 +143,7 @@ def crop(
     ],
     out: Out,
     map_: Map = None,
+    overwrite: options.OverwriteMap = False,
     json: options.Json = False,
 ) -> None:
     """Write the part of a map that lies in a box, as a map.
@@ -156,8 +158,8 @@ def crop(
     from tsfusion.core.output_folder import check_writable
     from tsfusion.journal.state_folder import check_no_map_of_a_server
 
-    check_writable(out, (".tsf",))
     check_no_map_of_a_server(out)
+    check_writable(out, (".tsf",), overwrite=overwrite)
     cropped = _load(path, map_, quiet=json).crop(box)
     if not cropped.stats().blocks:
         raise InvalidConfig("nothing of the map lies in this box; `tsfusion map info` has the map's own")
@@ -232,6 +234,7 @@ def convert(
     up: options.UpDirection = None,
     resolution: map_convert.Resolution = None,
     map_: Map = None,
+    overwrite: options.OverwriteMap = False,
     json: options.Json = False,
 ) -> None:
     """Write a map as voxels, as a slice, as a mesh, or as a file of its own.
@@ -248,7 +251,9 @@ def convert(
 
     suffix, files = out.suffix.lower(), [out]
     given = {"heights": heights, "above_floor": above_floor, "box": box, "up": up, "resolution": resolution}
-    map_convert.check(out, dense=dense, field=field, max_distance=max_distance, given=given)
+    map_convert.check(
+        out, dense=dense, field=field, max_distance=max_distance, given=given, overwrite=overwrite
+    )
     volume = _load(path, map_, quiet=json)
     if heights is not None:
         files = map_convert.write_slice(volume, out, field, max_distance, given)

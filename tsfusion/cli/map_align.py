@@ -30,6 +30,7 @@ def align(
     out: Annotated[
         Path | None, typer.Option(metavar="C.tsf", help="Write both as one map, in the frame of A.")
     ] = None,
+    overwrite: options.OverwriteMap = False,
     json: options.Json = False,
 ) -> None:
     """Find where map B lies in map A, without a first guess, and merge both.
@@ -54,8 +55,8 @@ def align(
     from tsfusion.pipelines import map_alignment, shortfall
 
     if out is not None:
-        check_writable(out, (".tsf",))
         check_no_map_of_a_server(out)
+        check_writable(out, (".tsf",), overwrite=overwrite)
     check_installed()
     with progress.shown(quiet=json) as display:
         maps = []

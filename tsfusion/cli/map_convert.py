@@ -42,7 +42,13 @@ Resolution = Annotated[float | None, typer.Option(metavar="METRES", help="Cell o
 
 
 def check(
-    out: Path, *, dense: bool, field: str | None, max_distance: float | None, given: dict[str, Any]
+    out: Path,
+    *,
+    dense: bool,
+    field: str | None,
+    max_distance: float | None,
+    given: dict[str, Any],
+    overwrite: bool,
 ) -> None:
     """Refuse what cannot be written, and flags without effect, before the map is read.
 
@@ -57,9 +63,10 @@ def check(
     from tsfusion.tsdf.voxel_arrays import FORMATS as VOXELS
 
     suffix, is_slice = out.suffix.lower(), given["heights"] is not None
-    if not (suffix == ".zarr" and out.is_dir()):  # one that is there is replaced
-        check_writable(out, SLICE_FORMATS if is_slice else (*VOXELS, ".tsf", *FORMATS))
+    if not (suffix == ".zarr" and any((out / one).exists() for one in ("zarr.json", ".zgroup"))):  # replaced
         check_no_map_of_a_server(out)
+        endings = SLICE_FORMATS if is_slice else (*VOXELS, ".tsf", *FORMATS)
+        check_writable(out, endings, overwrite=overwrite)
     if dense and (is_slice or suffix not in (".npz", ".zarr")):
         raise InvalidConfig(
             f"--dense has no effect on {out}: only a .npz or .zarr file has arrays of the map"

@@ -85,6 +85,7 @@ Out = Annotated[
 Overwrite = Annotated[
     bool, option("--overwrite", None, "Replace the results that --out holds already.", rare=True)
 ]
+OverwriteMap = Annotated[bool, option("--overwrite", None, "Replace the map of that name.")]
 State = Annotated[Path | None, option("--state", "DIR", "Keep the journal and the map here.")]
 Connect = Annotated[str | None, option("--connect", "ADDRESS", "Send to this server, not to its own.")]
 Control = Annotated[

@@ -36,7 +36,8 @@ from tsfusion.geometry.up_direction import HeldSensor
 from tsfusion.kernels import runtime
 from tsfusion.pipelines import mesh_files
 from tsfusion.tsdf import checkpoint, mesh_tiles
-from tsfusion.tsdf.readable_map import HELD, map_provenance
+from tsfusion.tsdf.map_history import HELD
+from tsfusion.tsdf.readable_map import map_provenance
 from tsfusion.tsdf.saved_map_addition import add_files
 from tsfusion.tsdf.volume import Volume
 

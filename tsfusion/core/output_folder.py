@@ -171,8 +171,23 @@ def _move(work: Path, out: Path) -> None:
         raise OutputError(f"cannot write to {out}: {error.strerror}; choose another folder") from error
 
 
-def check_writable(path: str | os.PathLike[str], endings: tuple[str, ...]) -> None:
-    """Raise OutputError unless a file could be made at `path` and it ends so; leaves nothing there."""
+# First bytes of files by the ending of their names; of others nobody can tell
+_BEGINNINGS = {
+    ".tsf": b"TSFMAP1\n", ".ply": b"ply", ".glb": b"glTF", ".png": b"\x89PNG", ".npz": b"PK", ".pdf": b"%PDF",
+    ".las": b"LASF", ".laz": b"LASF", ".pcd": b"# .PCD", ".pgm": b"P5", ".mcap": b"\x89MCAP", ".vdb": b" BDV",
+    ".html": b"<!doctype html>",
+}  # fmt: skip
+
+
+def check_writable(
+    path: str | os.PathLike[str], endings: tuple[str, ...], *, overwrite: bool = False
+) -> None:
+    """Raise OutputError unless a file could be made at `path` and it ends so; leaves nothing there.
+
+    Args:
+        overwrite: a map may be replaced that is there. What can be made again, such as a mesh, is replaced in
+            any case, a file that is of another kind than its name never.
+    """
     path = Path(path)
     if path.suffix.lower() not in endings:
         raise OutputError(f"cannot write {path}: expected a name ending in {', '.join(endings)}")
@@ -183,3 +198,12 @@ def check_writable(path: str | os.PathLike[str], endings: tuple[str, ...]) -> No
         raise OutputError(f"cannot write {path}: {error.strerror}; choose another place") from error
     if path.is_dir():
         raise OutputError(f"cannot write {path}: it is a folder; choose another name")
+    begins = _BEGINNINGS.get(path.suffix.lower(), b"")
+    with suppress(OSError), path.open("rb") as file:
+        there = file.read(len(begins) or 1).lower()
+        if there and begins and there != begins.lower():
+            raise OutputError(
+                f"cannot write {path}: a file is there that is no {path.suffix}; choose another name"
+            )
+        if there and path.suffix == ".tsf" and not overwrite:
+            raise OutputError(f"cannot write {path}: a map is there; choose another name, or add --overwrite")

@@ -20,7 +20,7 @@ from tsfusion.gateway import moved_maps
 from tsfusion.journal import state_folder
 from tsfusion.journal.recording import LOST
 from tsfusion.pipelines import settled_maps
-from tsfusion.tsdf import checkpoint, map_history
+from tsfusion.tsdf import checkpoint, map_history, saved_map_addition
 from tsfusion.tsdf.block_store import unpack_keys
 from tsfusion.tsdf.checkpoint import CUBE
 
@@ -206,7 +206,7 @@ def _lost(header: checkpoint.CheckpointHeader, tail: settled_maps.Tail) -> int:
 
 
 def summarise(saved: SavedMap, reading: state_folder.Watcher = lambda _done, _all: None) -> MapSummary:
-    """Describe a saved map; every byte of the file is checked, no voxel is read.
+    """Describe a saved map; every byte of the file is checked, and the hash is that of its voxels.
 
     Args:
         reading: told the bytes of the journal that are read, and all of them.
@@ -214,10 +214,7 @@ def summarise(saved: SavedMap, reading: state_folder.Watcher = lambda _done, _al
     Raises:
         CheckpointError: when the file is missing, damaged or of another version.
     """
-    with checkpoint.reading(saved.path) as (header, chunks):
-        keys = np.empty(header.blocks, np.int64)
-        for chunk in chunks:
-            chunk.fill(keys[chunk.first : chunk.first + chunk.blocks])
+    header, keys = saved_map_addition.checked_keys(saved.path)
     voxel_bytes = sum(np.dtype(checkpoint.LAYER_DTYPES[name]).itemsize for name in header.layers)
     histories = map_history.sessions(header.meta)
     after = lost = None

@@ -26,6 +26,7 @@ from tsfusion.core import durable_files
 from tsfusion.core.config import VolumeConfig
 from tsfusion.core.errors import CheckpointError, DamagedCheckpoint
 from tsfusion.core.side_thread import SideThread
+from tsfusion.tsdf import map_history
 
 MAGIC = b"TSFMAP1\n"
 CHUNK = 1024  # blocks
@@ -306,10 +307,15 @@ def _read_header(file: BinaryIO, path: Path) -> CheckpointHeader:
         raise CheckpointError(f"{path} is of another version: {error}") from error
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise DamagedCheckpoint(f"{path} is malformed: {error}") from error
-    if not set(header.layers) <= set(LAYER_DTYPES):
+    if not {"sums"} <= set(header.layers) <= set(LAYER_DTYPES):
         raise CheckpointError(f"{path} is of another version: it has layers {header.layers}")
-    if not 0 <= header.blocks <= header.config.max_blocks:
-        raise DamagedCheckpoint(f"{path} is malformed: it claims {header.blocks} blocks")
+    if not 0 <= header.blocks <= header.config.max_blocks or header.keyframes < 0:
+        claim = f"{header.blocks} blocks of {header.keyframes} keyframes"
+        raise DamagedCheckpoint(f"{path} is malformed: it claims {claim}")
+    try:
+        map_history.check_readable(header.meta)
+    except (TypeError, ValueError, LookupError, AttributeError) as error:
+        raise DamagedCheckpoint(f"{path} is malformed: its list of keyframes cannot be read") from error
     return header
 
 

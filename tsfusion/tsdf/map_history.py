@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+import msgspec
 import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
@@ -17,7 +18,9 @@ from numpy.typing import NDArray
 from tsfusion.core.config import SERVER_SESSION
 from tsfusion.core.counts import count_of
 from tsfusion.core.errors import MapError
+from tsfusion.geometry.up_direction import HeldSensor
 
+HELD = "held"  # in a checkpoint's meta: how the sensors were held, as the fuser wrote it first
 _POSE = 12  # numbers: the upper three rows
 _PLACES = ("seqs", "segments", "offsets", "fused")  # columns of a session's keyframes
 
@@ -77,6 +80,13 @@ def sessions(meta: Mapping[str, Any]) -> list[SessionHistory]:
         )
         found.append(history)
     return found
+
+
+def check_readable(meta: Mapping[str, Any]) -> None:
+    """Raise an error of Python's where what a server writes down is not as it writes it."""
+    sessions(meta)
+    msgspec.convert(meta.get("rejected", {}), dict[str, int])
+    HeldSensor(meta.get(HELD))
 
 
 def of_clients(histories: Iterable[SessionHistory]) -> list[SessionHistory]:

@@ -41,8 +41,6 @@ from tsfusion.tsdf.mesh_tiles import WholeMapValues, tiles
 from tsfusion.tsdf.surface_values import SurfaceView, values_of
 from tsfusion.tsdf.texture_images import Keyframes
 
-HELD = "held"  # in a checkpoint's meta: how the sensors were held, as the fuser wrote it first
-
 
 def begin_hash(voxel_size: float) -> "hashlib.blake2b":
     """A digest that is to take the keys and then the sums of a map's used blocks, 1024 at a time."""

@@ -24,7 +24,8 @@ from tsfusion.kernels.sensor_noise import WEIGHT_ONE
 from tsfusion.tsdf import checkpoint, map_history
 from tsfusion.tsdf.checkpoint import CHUNK, CUBE, CheckpointHeader, Chunk, Piece
 from tsfusion.tsdf.map_addition import added_colors
-from tsfusion.tsdf.readable_map import HELD, begin_hash
+from tsfusion.tsdf.map_history import HELD
+from tsfusion.tsdf.readable_map import begin_hash
 
 Rows = dict[str, NDArray[Any]]  # (n, 512) of each layer
 
@@ -49,10 +50,28 @@ def add_files(paths: Sequence[Path], target: Path) -> CheckpointHeader:
             _Stream(own, opened.enter_context(checkpoint.reading(path, is_checked=True)))
             for path, own in zip(paths, keys, strict=True)
         ]
-        digest = opened.enter_context(_Digest(header.config.voxel_size))
+        digest = opened.enter_context(MapDigest(header.config.voxel_size))
         pieces = _pieces(streams, header.layers, digest)
         checkpoint.write_pieces(target, header, blocks, pieces, map_hash=digest.hexdigest)
     return header
+
+
+def checked_keys(path: Path) -> tuple[CheckpointHeader, NDArray[np.int64]]:
+    """The header of a checkpoint whose voxels have the hash that it tells, and the keys of its blocks.
+
+    Raises:
+        CheckpointError: as `checkpoint.reading`; DamagedCheckpoint also for another hash.
+    """
+    with checkpoint.reading(path) as (header, chunks), MapDigest(header.config.voxel_size) as digest:
+        keys = np.empty(header.blocks, np.int64)
+        for chunk in chunks:
+            own = keys[chunk.first : chunk.first + chunk.blocks]
+            chunk.fill(own)
+            for name in header.layers[: header.layers.index("sums") + 1]:
+                chunk.fill(rows := np.empty((chunk.blocks, CUBE), checkpoint.LAYER_DTYPES[name]))
+            digest.add(own, rows)
+        checkpoint.verify(path, header, digest.hexdigest())
+    return header, keys
 
 
 def _header(headers: Sequence[CheckpointHeader], blocks: int) -> CheckpointHeader:
@@ -80,7 +99,7 @@ def _header(headers: Sequence[CheckpointHeader], blocks: int) -> CheckpointHeade
     )
 
 
-class _Digest:
+class MapDigest:
     """The hash of a map whose blocks come in their order, in pieces of any length."""
 
     def __init__(self, voxel_size: float) -> None:
@@ -88,7 +107,7 @@ class _Digest:
         self._waiting: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []  # keys, sums
         self._count = 0
 
-    def __enter__(self) -> "_Digest":
+    def __enter__(self) -> "MapDigest":
         self._side.__enter__()
         return self
 
@@ -154,7 +173,7 @@ class _Stream:
             self._chunk, self._rows = next(self._chunks), {}
         return self._chunk
 
-    def pass_on(self, digest: _Digest) -> Piece:
+    def pass_on(self, digest: MapDigest) -> Piece:
         """The chunk as it is."""
         chunk = self._current()
         keys, sums = np.empty(chunk.blocks, np.int64), np.empty((chunk.blocks, CUBE), np.int64)
@@ -188,7 +207,7 @@ class _Stream:
         _, self._rows = checkpoint.split(content, self._layers)
 
 
-def _pieces(streams: Sequence[_Stream], layers: Sequence[str], digest: _Digest) -> Iterator[Piece]:
+def _pieces(streams: Sequence[_Stream], layers: Sequence[str], digest: MapDigest) -> Iterator[Piece]:
     """The sum's blocks in their order."""
     while left := sorted((one for one in streams if not one.is_over), key=lambda one: one.next_key):
         first, last = left[0], left[0].last_key
@@ -201,7 +220,7 @@ def _pieces(streams: Sequence[_Stream], layers: Sequence[str], digest: _Digest) 
 
 
 def _sum(
-    keys: NDArray[np.int64], streams: Sequence[_Stream], layers: Sequence[str], digest: _Digest
+    keys: NDArray[np.int64], streams: Sequence[_Stream], layers: Sequence[str], digest: MapDigest
 ) -> Piece:
     """The sums of some blocks, whose keys are all that the streams have next."""
     content = checkpoint.array_for(len(keys), layers)

@@ -21,22 +21,32 @@ from numpy.typing import NDArray
 
 from tsfusion.core import other_names, process
 from tsfusion.core.config import Arch, CacheConfig, VolumeConfig, make_settings, override
-from tsfusion.core.errors import InvalidConfig, MapError
+from tsfusion.core.errors import InvalidConfig, MapError, OutputError
 from tsfusion.geometry.keyframe import Keyframe, keyframe_of
+from tsfusion.geometry.mesh import FORMATS as MESHES
 from tsfusion.geometry.sample_ranges import why_no_samples
 from tsfusion.geometry.up_direction import HeldSensor
 from tsfusion.kernels import runtime
 from tsfusion.kernels.integrate import CUBE
 from tsfusion.kernels.voxel_traversal import COUNT, VOXEL_LIMIT
-from tsfusion.tsdf import checkpoint, map_addition, map_crop, map_history, mesh_extraction, saved_map
+from tsfusion.tsdf import (
+    checkpoint,
+    map_addition,
+    map_crop,
+    map_history,
+    mesh_extraction,
+    saved_map,
+    voxel_arrays,
+)
 from tsfusion.tsdf.askable_map import AskableMap
 from tsfusion.tsdf.block_store import MESHED, BlockStore, unpack_keys
 from tsfusion.tsdf.device_blocks import DeviceBlocks, device_for
 from tsfusion.tsdf.device_integrator import DeviceIntegrator, DeviceRayBuffers
 from tsfusion.tsdf.integrator import Integrator, KeyframeQuota
 from tsfusion.tsdf.map_crop import Part
+from tsfusion.tsdf.map_history import HELD
 from tsfusion.tsdf.ray_buffers import RayBuffers, keyframes_of_every_kind
-from tsfusion.tsdf.readable_map import HELD, begin_hash
+from tsfusion.tsdf.readable_map import begin_hash
 from tsfusion.tsdf.residency import checked_cache
 
 if TYPE_CHECKING:
@@ -388,8 +398,12 @@ class Volume(AskableMap):
             meta: anything JSON-like to keep with it; comes back as `.meta`.
 
         Raises:
-            CheckpointError: when the file cannot be written.
+            OutputError: for the name of a mesh or of voxels; CheckpointError: when it cannot be written.
         """
+        suffix = Path(path).suffix.lower()
+        if suffix in (*MESHES, *voxel_arrays.FORMATS):
+            how = "extract_mesh().save" if suffix in MESHES else "save_voxels"
+            raise OutputError(f"a map is saved as .tsf, got {os.fspath(path)!r}: use {how}, or another name")
         layers = self._store.layers()
         header = checkpoint.CheckpointHeader(
             config=msgspec.structs.replace(self.config, arch="cpu"),  # of where it is, not of what it holds
