@@ -101,7 +101,7 @@ def open3d_rows(
     ours = volume.raycast(camera, T_world_camera, SHAPE, surface="raw").depth
     mesh = volume.extract_mesh(surface="raw").to_open3d()
     scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(o3d.t.geometry.TriangleMesh.from_legacy(mesh))
+    scene.add_triangles(mesh)
     middle = camera.matrix + np.array([(0, 0, 0.5), (0, 0, 0.5), (0, 0, 0)])  # its pixels' corners
     rays = scene.create_rays_pinhole(o3d.core.Tensor(middle), to_camera, SHAPE[1], SHAPE[0])
     cast, cpu, wall = best_of(repeats, lambda: scene.cast_rays(rays))

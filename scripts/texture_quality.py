@@ -126,7 +126,7 @@ def open3d_color_map(keyframes: Chosen, mesh: Mesh, *, rounds: int) -> Mesh:
     trajectory = o3d.camera.PinholeCameraTrajectory()
     trajectory.parameters = cameras
     found, _ = o3d.pipelines.color_map.run_rigid_optimizer(
-        mesh.to_open3d(), images, trajectory,
+        mesh.to_open3d().to_legacy(), images, trajectory,
         o3d.pipelines.color_map.RigidOptimizerOption(maximum_iteration=rounds),
     )  # fmt: skip
     return replace(mesh, colors=np.rint(np.asarray(found.vertex_colors) * 255).astype(np.uint8))
@@ -134,7 +134,7 @@ def open3d_color_map(keyframes: Chosen, mesh: Mesh, *, rounds: int) -> Mesh:
 
 def subdivided(mesh: Mesh) -> Mesh:
     """Each triangle as four: vertices half as far apart, as many as Open3D's colours are to be sharp."""
-    made = mesh.to_open3d().subdivide_midpoint(1)
+    made = mesh.to_open3d().to_legacy().subdivide_midpoint(1)
     return Mesh(
         np.asarray(made.vertices, np.float32), np.asarray(made.triangles, np.int32),
         np.asarray(made.vertex_normals, np.float32),

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pygltflib
 import pytest
 import trimesh
 from command_processes import python
@@ -57,7 +58,8 @@ def test_glb_has_y_up_and_the_others_keep_the_frame(sphere: Mesh, tmp_path: Path
     turned = loaded(mesh.save(tmp_path / "m.glb"))
     assert turned.vertices[:, 1] == pytest.approx(mesh.vertices @ up, abs=1e-5)
     (shape,) = trimesh.load(tmp_path / "m.glb", process=False).geometry.values()
-    assert shape.vertex_normals[:, 1] == pytest.approx(mesh.normals @ up, abs=1e-5)
+    assert shape.vertices == pytest.approx(mesh.vertices)  # the node turns them
+    assert shape.vertex_normals == pytest.approx(mesh.normals, abs=1e-5)
     assert turned.volume == pytest.approx(mesh.to_trimesh().volume, rel=1e-4)  # not mirrored
     for name in ("m.ply", "m.obj"):
         assert loaded(mesh.save(tmp_path / name)).vertices == pytest.approx(mesh.vertices, abs=1e-6)
@@ -71,11 +73,20 @@ def test_glb_has_y_up_and_the_others_keep_the_frame(sphere: Mesh, tmp_path: Path
 
 def test_glb_colours_are_linear_light(sphere: Mesh, tmp_path: Path) -> None:
     assert sphere.colors is not None
-    saved = loaded(sphere.save(tmp_path / "m.glb")).visual.vertex_colors
-    share = sphere.colors / 255
+    random = np.random.default_rng(0)
+    mesh = replace(sphere, colors=random.integers(0, 256, sphere.colors.shape, dtype=np.uint8))
+    gltf = pygltflib.GLTF2().load(str(mesh.save(tmp_path / "m.glb")))
+    (part,) = gltf.meshes[0].primitives
+    accessor = gltf.accessors[part.attributes.COLOR_0]
+    assert (accessor.componentType, accessor.normalized) == (pygltflib.UNSIGNED_SHORT, True)
+    start = gltf.bufferViews[accessor.bufferView].byteOffset
+    saved = np.frombuffer(gltf.binary_blob(), "<u2", 4 * accessor.count, start).reshape(-1, 4)
+    share = mesh.colors / 255
     linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
-    assert saved[:, :3] == pytest.approx(255 * linear, abs=0.51)
-    assert (saved[:, 3] == 255).all()
+    assert saved[:, :3] == pytest.approx(65535 * linear, abs=0.51)
+    assert (saved[:, 3] == 65535).all()
+    assert len(np.unique(saved[:, :3])) == 256  # the darkest levels, too
+    assert gltf.materials[part.material].pbrMetallicRoughness.metallicFactor == 0.0
 
 
 def test_a_ply_is_the_mesh_of_trimesh(sphere: Mesh, tmp_path: Path) -> None:
@@ -89,7 +100,10 @@ def test_a_ply_is_the_mesh_of_trimesh(sphere: Mesh, tmp_path: Path) -> None:
 
 def test_open3d_gets_the_mesh(sphere: Mesh, tmp_path: Path) -> None:
     open3d = pytest.importorskip("open3d")
-    made, read = sphere.to_open3d(), open3d.io.read_triangle_mesh(str(sphere.save(tmp_path / "m.ply")))
+    made, read = (
+        sphere.to_open3d().to_legacy(),
+        open3d.io.read_triangle_mesh(str(sphere.save(tmp_path / "m.ply"))),
+    )
     for name in ("vertices", "triangles", "vertex_normals", "vertex_colors"):
         assert np.asarray(getattr(made, name)) == pytest.approx(np.asarray(getattr(read, name)), abs=1e-6)
 

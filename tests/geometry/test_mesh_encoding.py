@@ -42,22 +42,18 @@ def test_ply(mesh: Mesh, tmp_path: Path) -> None:
         assert (read.point_data[name].astype(np.uint8) == mesh.colors[:, channel]).all()
 
 
-def test_ply_says_what_is_guessed(mesh: Mesh, tmp_path: Path) -> None:
-    content = mesh.save(tmp_path / "m.ply").read_bytes()
-    header, _, faces = content.partition(b"end_header\n")
-    tail = b"property list uchar int vertex_indices\nproperty uchar guessed\n"
-    assert header.endswith(tail), header
-    rows = np.frombuffer(
-        faces[-14 * len(mesh.faces) :], [("count", "u1"), ("corners", "<i4", 3), ("guessed", "u1")]
-    )
-    assert (rows["count"] == 3).all()
-    assert (rows["corners"] == mesh.faces).all()
-    assert (rows["guessed"] == mesh.guessed).all()
-    head = header.decode().splitlines()
+def test_ply_has_what_is_guessed_at_its_end_and_says_so(mesh: Mesh, tmp_path: Path) -> None:
+    path = mesh.save(tmp_path / "m.ply")
+    faces = meshio.read(path).cells_dict["triangle"]  # which knows no properties of faces but lists
+    seen = len(mesh.faces) - mesh.guessed.sum()
+    assert (faces[:seen] == mesh.faces[~mesh.guessed]).all()
+    assert (faces[seen:] == mesh.faces[mesh.guessed]).all()
+    head = path.read_bytes().partition(b"end_header\n")[0].decode().splitlines()
     for line in (
         "unit metre", f"up {mesh.up}", "source room.tsf", "keyframes 6", f"map_hash {'ab' * 16}", "world w1",
         "voxel_size_m 0.02",
-        f"guessed {mesh.guessed.sum()} of {len(mesh.faces)} triangles, where nothing was seen",
+        f"guessed {mesh.guessed.sum()} of {len(mesh.faces)} triangles, the last of a PLY, "
+        "where nothing was seen",
     ):  # fmt: skip
         assert f"comment {line}" in head
     assert any(line.startswith("comment generator tsfusion ") for line in head)
@@ -87,7 +83,7 @@ def test_stl(mesh: Mesh, tmp_path: Path) -> None:
     assert b"metre, up +z" in (tmp_path / "m.stl").read_bytes()[:80]
 
 
-_TYPES = {5121: "u1", 5125: "<u4", 5126: "<f4"}
+_TYPES = {5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 
 
@@ -113,6 +109,7 @@ def test_glb(mesh: Mesh, tmp_path: Path) -> None:
     assert gltf.asset.extras["unit"] == "metre"
     assert gltf.buffers[0].byteLength <= len(gltf.binary_blob())
     turn = mesh.up.to_y()
+    assert "the nodes' matrices turn up to +y" in gltf.asset.extras["frame"]
     names = {
         gltf.nodes[k].name: gltf.nodes[k].mesh
         for k in range(len(gltf.nodes))
@@ -122,7 +119,9 @@ def test_glb(mesh: Mesh, tmp_path: Path) -> None:
         (part,) = gltf.meshes[names[name]].primitives
         assert gltf.accessors[part.attributes.POSITION].min is not None
         corners = values(gltf, part.attributes.POSITION)[values(gltf, part.indices).reshape(-1, 3)]
-        assert corners == pytest.approx(mesh.vertices[mesh.faces[which]] @ turn.T, abs=1e-6)
+        assert (corners == mesh.vertices[mesh.faces[which]]).all()
+        (node,) = (node for node in gltf.nodes if node.name == name)
+        assert np.reshape(node.matrix, (4, 4)).T[:3, :3] == pytest.approx(turn, abs=1e-6)
         normals = values(gltf, part.attributes.NORMAL)
         assert np.linalg.norm(normals, axis=1) == pytest.approx(1, abs=1e-5)
         assert values(gltf, part.attributes.COLOR_0).shape == (len(normals), 4)

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 from formula_scenes import sphere_views, volume_of
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -77,3 +78,16 @@ def test_a_target_that_is_none_is_refused(bowl: Mesh, monkeypatch: pytest.Monkey
     monkeypatch.setitem(sys.modules, "fast_simplification", None)
     with pytest.raises(MissingDependency, match="pip install fast-simplification"):
         bowl.simplified(ratio=0.5)
+
+
+@pytest.mark.parametrize("ratio", [0.03, 0.01])
+def test_a_surface_that_folds_keeps_two_triangles_an_edge(ratio: float) -> None:
+    """A thin ring collapses onto itself: the library alone makes edges of three triangles and more."""
+    ring = trimesh.creation.torus(1.0, 0.05)
+    less = Mesh(
+        ring.vertices.astype(np.float32), ring.faces.astype(np.int32), ring.vertex_normals.astype(np.float32)
+    ).simplified(ratio=ratio)
+    edges = np.sort(less.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    assert np.unique(edges, axis=0, return_counts=True)[1].max() == 2
+    assert len(np.unique(np.sort(less.faces, axis=1), axis=0)) == len(less.faces) > 0
+    assert len(np.unique(less.faces)) == len(less.vertices) == len(less.normals)

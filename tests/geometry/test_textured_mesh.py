@@ -43,11 +43,10 @@ def test_another_library_reads_what_was_saved(suffix: str, tmp_path: Path) -> No
     scene = trimesh.load(tmp_path / f"room{suffix}", force="scene", process=False)
     found = sorted(scene.geometry.values(), key=lambda read: picture_of(read).shape)
     assert len(found) == 2
-    turn = mesh.up.to_y() if suffix == ".glb" and mesh.up is not None else np.eye(3)
     for page, read in enumerate(found):
         np.testing.assert_array_equal(picture_of(read), mesh.texture.pages[page])
         chosen = mesh.texture.page == page
-        corners = mesh.vertices[mesh.faces[chosen]] @ turn.T
+        corners = mesh.vertices[mesh.faces[chosen]]
         np.testing.assert_allclose(read.vertices[read.faces], corners, atol=1e-6)
         uv = mesh.texture.corners[chosen] * (1, -1) + (0, 1)  # trimesh counts v from below
         np.testing.assert_allclose(read.visual.uv[read.faces], uv, atol=1e-6)
@@ -57,6 +56,14 @@ def test_obj_names_its_pictures_after_itself(tmp_path: Path) -> None:
     two_squares().save(tmp_path / "room.obj")
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {"room.obj", "room.mtl", "room-0.png", "room-1.png"}
+    lines = (tmp_path / "room.mtl").read_text().splitlines()
+    for kind, light in (
+        ("Kd", 1.0),
+        ("Ka", 1.0),
+        ("Ks", 0.0),
+    ):  # times the picture: as bright as it is, no shine
+        found = [[float(word) for word in line.split()[1:]] for line in lines if line.startswith(kind)]
+        assert found == [[light] * 3] * 2
 
 
 def test_ply_has_the_colours_at_the_vertices(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The error of points against meshes, points, worlds and runs; what is no truth is named."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -55,11 +56,17 @@ def test_a_world_and_a_run_in_it(tmp_path: Path) -> None:
     assert np.isnan(error_measure(tmp_path)(POINTS)).all()
 
 
-def test_what_is_no_truth_is_named(tmp_path: Path) -> None:
-    import dataclasses
-
+def test_a_glb_whose_node_turns_it_is_a_truth_in_the_maps_frame(tmp_path: Path) -> None:
     turned = dataclasses.replace(square(), known_up=Up((0.0, 0.0, 1.0), "given"))
-    turned.save(tmp_path / "turned.glb")
+    expected = error_measure(square().save(tmp_path / "m.ply"))(POINTS)
+    assert np.allclose(error_measure(turned.save(tmp_path / "m.glb"))(POINTS), expected, atol=1e-6)
+
+
+def test_what_is_no_truth_is_named(tmp_path: Path) -> None:
+    scene = trimesh.Scene(square().to_trimesh())
+    for shape in scene.geometry.values():  # as files were written before nodes turned them
+        shape.metadata["up"] = "map's +z (given: 0.0000 0.0000 1.0000), here +y"
+    scene.export(str(tmp_path / "turned.glb"))
     (tmp_path / "torn.ply").write_bytes(square().encode(".ply")[:200])
     (tmp_path / "empty.ply").write_bytes(b"")
     for truth, message in (

@@ -32,7 +32,7 @@ def read(path: Path) -> Grid:
         begin, values, end = _numbers(file, "<qqq")
         assert file.tell() == begin
         assert _numbers(file, "<I") == (2,)  # active values alone are stored
-        assert _metadata(file) == {"class": "level set", "name": name}
+        assert _metadata(file) == {"class": "unknown", "name": name}
         assert _text(file) == "UniformScaleTranslateMap"
         shift, *scales = np.reshape(_numbers(file, "<18d"), (6, 3))
         size = scales[0][0]

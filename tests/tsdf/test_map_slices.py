@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 from formula_scenes import sphere_views, volume_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -227,6 +228,11 @@ def test_heights_count_from_the_floor(tmp_path: Path) -> None:
         f"# What stands between 0.2 and 1 m above the floor, which is {-found.grid.floor:.3f} m below the "
     )
     assert text.read_text().startswith(words)
+    command = text.read_text().splitlines()[1].split()
+    assert command[1:5] == ["ros2", "run", "tf2_ros", "static_transform_publisher"]
+    x, y, z, w = (float(command[command.index(f"--q{axis}") + 1]) for axis in "xyzw")
+    turn = trimesh.transformations.quaternion_matrix((w, x, y, z))[:3, :3]
+    assert turn == pytest.approx(found.grid.axes, abs=1e-6)  # takes the map's frame to the slice's
     (arrays,) = room.distance_slice(0.2, 1.0, above_floor=True, up="z").save(tmp_path / "room.npz")
     assert np.load(arrays)["floor"] == pytest.approx(found.grid.floor, abs=0.01)
     with pytest.raises(MapError, match=r"no floor is found in this map: .* faces up, -y"):

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from tsfusion.core import durable_files
 from tsfusion.core.errors import InvalidConfig, OutputError
+from tsfusion.geometry.trajectory import quaternion
 
 FREE, OCCUPIED, UNSEEN = 0, 100, -1  # as in ROS's nav_msgs/OccupancyGrid
 SLICE_FORMATS = (".pgm", ".yaml", ".png", ".npz")
@@ -153,8 +154,11 @@ class OccupancySlice:
     def _map_server_text(self, picture: str) -> str:
         grid = self.grid
         axes = "; ".join(" ".join(f"{one:.6f}" for one in row) for row in grid.axes.tolist())
+        turn = " ".join(f"--q{n} {q:.9f}" for n, q in zip("xyzw", quaternion(grid.axes), strict=True))
         return (
             f"# What stands between {grid.heights_in_words}; p_slice = [{axes}] p_map\n"
+            "# ros2 run tf2_ros static_transform_publisher --frame-id map --child-frame-id tsfusion_map "
+            f"{turn}\n"
             f"image: {json.dumps(picture)}\nmode: trinary\nresolution: {grid.resolution!r}\n"
             f"origin: [{grid.origin[0]!r}, {grid.origin[1]!r}, 0.0]\nnegate: 0\n"
             f"occupied_thresh: {OCCUPIED_THRESH}\nfree_thresh: {FREE_THRESH}\n"

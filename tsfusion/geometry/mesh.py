@@ -127,19 +127,18 @@ class Mesh:
         )
 
     def to_open3d(self) -> Any:
-        """Make an `open3d.geometry.TriangleMesh` in the map's frame, with normals and colours.
+        """Make an `open3d.t.geometry.TriangleMesh` in the map's frame, with `normals` and `colors` (0 to 1).
+
+        Its `to_legacy()` is an `open3d.geometry.TriangleMesh`.
 
         Raises:
             MissingDependency: without Open3D.
         """
-        open3d = import_open3d()
-        vectors = open3d.utility
-        mesh = open3d.geometry.TriangleMesh(
-            vectors.Vector3dVector(self.vertices), vectors.Vector3iVector(self.faces)
-        )
-        mesh.vertex_normals = vectors.Vector3dVector(self.normals)
+        o3d = import_open3d()
+        mesh = o3d.t.geometry.TriangleMesh(o3d.core.Tensor(self.vertices), o3d.core.Tensor(self.faces))
+        mesh.vertex.normals = o3d.core.Tensor(self.normals)
         if self.colors is not None:
-            mesh.vertex_colors = vectors.Vector3dVector(self.colors / 255)
+            mesh.vertex.colors = o3d.core.Tensor(self.colors / np.float32(255))
         return mesh
 
     def without_islands(self, min_extent: float | None = None) -> "Mesh":

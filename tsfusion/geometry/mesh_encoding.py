@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """A mesh as the content of a PLY, GLB, OBJ or STL file, and what the file says about itself.
 
-PLY, OBJ and STL keep the map's frame; GLB is turned so that up is +Y, as glTF 2.0 asks for. Guessed triangles
-have the face property `guessed` in PLY, are an object of their own in GLB and OBJ, and have 1 as their
+Vertices are in the map's frame; the nodes of a GLB turn them so that up is +Y, as glTF 2.0 asks for.
+Guessed triangles are the last ones in PLY, an object of their own in GLB and OBJ, and have 1 as their
 attribute in STL.
 """
 
@@ -22,6 +22,10 @@ if TYPE_CHECKING:
 _STL_HEADER = 80  # bytes
 _STL_FACET = np.dtype([("floats", "<f4", 12), ("attribute", "<u2")])
 _PLY_FORMAT = b"format binary_little_endian 1.0\n"
+_LINEAR = "_LINEAR"  # trimesh's name for colours of 16 bits, until they are COLOR_0
+_OPAQUE = 65535
+TURNED_BY_NODE = "turned to +y by the node"  # what an object's note ends with
+_MATTE = {"name": "matte", "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}}
 
 
 def encode(mesh: "Mesh", suffix: str) -> bytes:
@@ -30,10 +34,10 @@ def encode(mesh: "Mesh", suffix: str) -> bytes:
 
 
 def _ply(mesh: "Mesh") -> bytes:
-    shape = mesh.to_trimesh()
-    if mesh.guessed is not None:
-        shape.face_attributes["guessed"] = mesh.guessed.astype(np.uint8)
-    content = bytes(shape.export(file_type="ply", vertex_normal=True))
+    if mesh.guessed is not None:  # a property of faces ends readers that know lists alone
+        order = np.argsort(mesh.guessed, kind="stable")
+        mesh = dataclasses.replace(mesh, faces=mesh.faces[order], guessed=mesh.guessed[order])
+    content = bytes(mesh.to_trimesh().export(file_type="ply", vertex_normal=True))
     head, before, rest = content.partition(_PLY_FORMAT)
     return b"".join((head, before, comments(mesh, b"comment "), rest))
 
@@ -56,40 +60,52 @@ def _stl(mesh: "Mesh") -> bytes:
 
 
 def _glb(mesh: "Mesh") -> bytes:
-    turn = np.eye(3) if mesh.up is None else mesh.up.to_y()
-    turned = dataclasses.replace(
-        mesh,
-        vertices=(mesh.vertices @ turn.T).astype(np.float32),
-        normals=(mesh.normals @ turn.T).astype(np.float32),
-        colors=None if mesh.colors is None else _SRGB_TO_LINEAR[mesh.colors],
-    )
-    up = f"map's {described(mesh.up)}" + (", here +y" if mesh.up else "")
-    if mesh.guessed is None:
-        shape = turned.to_trimesh()
-        shape.metadata["up"] = up
-    else:
-        shape = _scene(turned)
-        for one in shape.geometry.values():
-            one.metadata["up"] = up
-    return bytes(shape.export(file_type="glb", include_normals=True, tree_postprocessor=describing(mesh)))
+    from trimesh.visual import ColorVisuals
+
+    scene = _scene(mesh)
+    if mesh.colors is not None:
+        for shape in scene.geometry.values():
+            linear = _SRGB_TO_LINEAR[shape.visual.vertex_colors[:, :3]]
+            shape.visual = ColorVisuals()
+            shape.vertex_attributes[_LINEAR] = np.pad(linear, ((0, 0), (0, 1)), constant_values=_OPAQUE)
+    return glb_of(scene, mesh)
 
 
-def describing(mesh: "Mesh") -> Callable[[dict[str, Any]], None]:
-    """Function that writes what is known about a mesh into the head of its GLB file."""
+def glb_of(scene: Any, mesh: "Mesh") -> bytes:
+    """The content of a GLB with a mesh's objects, which are in the map's frame.
+
+    Each node turns its object so that up is +Y. Objects without a picture get a material that is no metal.
+    """
+    if mesh.up is not None:
+        turn = np.eye(4)
+        turn[:3, :3] = mesh.up.to_y()
+        scene.apply_transform(turn)
+        for shape in scene.geometry.values():
+            shape.metadata["up"] = f"map's {described(mesh.up)}, {TURNED_BY_NODE}"
 
     def describe(tree: dict[str, Any]) -> None:
         facts = facts_of(mesh)
+        if mesh.up is not None:
+            facts["frame"] += "; the nodes' matrices turn up to +y"
         tree["asset"] = {"version": "2.0", "generator": facts.pop("generator"), "extras": facts}
+        for part in (part for one in tree["meshes"] for part in one["primitives"]):
+            if _LINEAR in part["attributes"]:
+                part["attributes"]["COLOR_0"] = number = part["attributes"].pop(_LINEAR)
+                tree["accessors"][number]["normalized"] = True
+            if "material" not in part:
+                tree["materials"], part["material"] = [_MATTE], 0
 
-    return describe
+    return bytes(scene.export(file_type="glb", include_normals=True, tree_postprocessor=describe))
 
 
 def _scene(mesh: "Mesh") -> Any:
-    """Seen and guessed triangles as objects of these names."""
+    """Seen and guessed triangles as objects of these names; one, `mesh`, where none is guessed."""
     import trimesh
 
-    assert mesh.guessed is not None
     scene = trimesh.Scene()
+    if mesh.guessed is None:
+        scene.add_geometry(mesh.to_trimesh(), geom_name="mesh", node_name="mesh")
+        return scene
     for name, which in (("seen", ~mesh.guessed), ("guessed", mesh.guessed)):
         if which.any():
             part = mesh.of_faces(which).to_trimesh()
@@ -111,9 +127,8 @@ def facts_of(mesh: "Mesh") -> dict[str, str]:
         **(mesh.provenance.facts if mesh.provenance else {}),
     }
     if mesh.guessed is not None:
-        facts["guessed"] = (
-            f"{int(mesh.guessed.sum())} of {len(mesh.guessed)} triangles, where nothing was seen"
-        )
+        count = f"{int(mesh.guessed.sum())} of {len(mesh.guessed)} triangles"
+        facts["guessed"] = f"{count}, the last of a PLY, where nothing was seen"
     return facts
 
 
@@ -128,10 +143,11 @@ def described(up: Up | None) -> str:
     return "unknown" if up is None else str(up)
 
 
-def _srgb_to_linear() -> NDArray[np.uint8]:
+def _srgb_to_linear() -> NDArray[np.uint16]:
+    """Linear light of each level of sRGB, 0 to 65535: in 8 bits most dark levels would be one."""
     s = np.arange(256) / 255
     linear = np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
-    return np.round(linear * 255).astype(np.uint8)
+    return np.round(linear * _OPAQUE).astype(np.uint16)
 
 
 _SRGB_TO_LINEAR = _srgb_to_linear()

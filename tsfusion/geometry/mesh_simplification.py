@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Fewer triangles by collapsing edges in the order of their quadric error (Garland and Heckbert, 1997), by
 the library `fast-simplification`. Borders stay as they are; each vertex gets the mean colour and normal of
-those that became one with it."""
+those that became one with it. No edge has more than two triangles afterwards."""
 
 import dataclasses
 from typing import TYPE_CHECKING, Any
@@ -39,7 +39,7 @@ def simplified(
         return mesh
     guessed = np.zeros(total, bool) if mesh.guessed is None else mesh.guessed
     parts = [mesh.of_faces(which) for which in (~guessed, guessed) if which.any()]
-    return _joined([_reduced(part, ratio, max_error) for part in parts], mesh)
+    return _unfolded(_joined([_reduced(part, ratio, max_error) for part in parts], mesh))
 
 
 def library() -> Any:
@@ -118,6 +118,49 @@ def _joined(parts: list["Mesh"], like: "Mesh") -> "Mesh":
         guessed=np.concatenate([part.guessed for part in parts if part.guessed is not None]),
         known_up=like.known_up,
     )
+
+
+def _unfolded(mesh: "Mesh") -> "Mesh":
+    """The mesh with at most two triangles at each edge, and none twice.
+
+    Collapsed edges can fold a surface onto itself. Two triangles with the same corners that face each other
+    both go; where more than two meet at an edge, each sheet gets vertices of its own (Guéziec et al., 2001).
+    """
+    rising = (mesh.faces < np.roll(mesh.faces, -1, axis=1)).sum(axis=1)
+    facing = np.where(rising == 2, 1, -1)  # whether the corners' order is an even one
+    _, group = np.unique(np.sort(mesh.faces, axis=1), axis=0, return_inverse=True)
+    group = group.reshape(-1)
+    left = np.flatnonzero(facing == np.sign(np.bincount(group, facing))[group])
+    mesh = mesh.of_faces(np.sort(left[np.unique(group[left], return_index=True)[1]]))
+
+    vertex = mesh.faces.reshape(-1)
+    corner = np.arange(len(vertex))
+    ahead = corner - corner % 3 + (corner + 1) % 3  # the corner at the other end of the edge that begins here
+    ends = np.sort(np.stack([vertex, vertex[ahead]], axis=1), axis=1)
+    _, edge, count = np.unique(ends, axis=0, return_inverse=True, return_counts=True)
+    edge = edge.reshape(-1)
+    is_crowded = np.zeros(len(mesh.vertices), bool)
+    is_crowded[ends[count[edge] > 2]] = True
+    order = np.argsort(edge, kind="stable")
+    a, b = order[count[edge[order]] == 2].reshape(-1, 2).T
+    turned = vertex[a] != vertex[b]
+    links = np.concatenate(
+        [(a, np.where(turned, ahead[b], b)), (ahead[a], np.where(turned, b, ahead[b]))], axis=1
+    )
+    links = links[:, is_crowded[vertex[links[0]]]]
+    sheet, before = np.where(is_crowded[vertex], corner, 0), None
+    while before is None or (sheet != before).any():  # as often as triangles meet at one vertex, at most
+        before = sheet.copy()
+        np.minimum.at(sheet, links, before[links[::-1]])
+    _, first, faces = np.unique(
+        np.stack([vertex, sheet], axis=1), axis=0, return_index=True, return_inverse=True
+    )
+    source = vertex[first]
+    return dataclasses.replace(
+        mesh, vertices=mesh.vertices[source], normals=mesh.normals[source],
+        colors=None if mesh.colors is None else mesh.colors[source],
+        faces=faces.reshape(-1, 3).astype(np.int32), known_up=mesh.known_up,
+    )  # fmt: skip
 
 
 def border_edges(faces: NDArray[np.int32]) -> NDArray[np.int32]:

@@ -3,7 +3,8 @@
 
 Format 224, as OpenVDB's `io/File.cc`, `tree/RootNode.h`, `tree/InternalNode.h` and `io/Compression.h` write
 it: a root, nodes of 32³ nodes of 16³ leaves. Values that are the background are inactive and not stored, and
-nothing is compressed otherwise. Everything is little-endian.
+nothing is compressed otherwise. Everything is little-endian. The grid's class is `unknown`, no level set: a
+map's distances end behind each surface, where readers of level sets see a second one.
 """
 
 import shutil
@@ -56,7 +57,7 @@ def write(path: Path, parts: Parts, *, name: str, voxel_size: float, background:
                 raise OutputError(f"nothing to write to {path}: the map is empty")
             blocks = np.concatenate([one[0] for one in kept])
             masks = np.concatenate([one[1] for one in kept])
-            grid = struct.pack("<I", _ACTIVE_VALUES_ONLY) + _metadata({"class": "level set", "name": name})
+            grid = struct.pack("<I", _ACTIVE_VALUES_ONLY) + _metadata({"class": "unknown", "name": name})
             grid += _transform(voxel_size) + struct.pack("<if", 1, background) + _topology(blocks, masks)
             with durable_files.replacing(path) as file:
                 _write_file(file, name, grid, buffers)

@@ -127,6 +127,9 @@ def _write_las(file: BinaryIO, rows: NDArray[Any], facts: dict[str, str], *, com
     names = rows.dtype.names or ()
     header = laspy.LasHeader(version="1.4", point_format=7 if "color" in names else 6)
     header.scales, header.offsets = np.full(3, _LAS_STEP), middle
+    header.global_encoding.wkt = (
+        True  # as formats from 6 on must have it, with a coordinate system or without
+    )
     header.generating_software = facts.get("generator", "")[:32]
     text = "".join(f"{name} {fact}\n" for name, fact in facts.items())
     header.vlrs.append(laspy.VLR("tsfusion", _RECORD, "about these points", text.encode()[:65535]))

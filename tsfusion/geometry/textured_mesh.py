@@ -16,6 +16,7 @@ from tsfusion.geometry import mesh_encoding
 from tsfusion.geometry.mesh import Mesh
 
 TEXTURED = (".glb", ".obj")
+_WHITE, _BLACK = np.array([[255] * 4, [0, 0, 0, 255]], np.uint8)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,9 +77,7 @@ class TexturedMesh(Mesh):
         """Encode as `Mesh.encode` does, a `.glb` with the texture."""
         if suffix != ".glb":
             return super().encode(suffix)
-        turn = np.eye(3) if self.up is None else self.up.to_y()
-        scene, describe = self._scene("page", turn), mesh_encoding.describing(self)
-        return bytes(scene.export(file_type="glb", include_normals=True, tree_postprocessor=describe))
+        return mesh_encoding.glb_of(self._scene("page"), self)
 
     def sample(self, face: NDArray[np.integer], weight: NDArray[np.floating]) -> NDArray[np.float32]:
         """(n, 3) float32 RGB, 0 to 255, of the texture at points of the surface.
@@ -114,11 +113,10 @@ class TexturedMesh(Mesh):
         part = super().of_faces(kept)
         return dataclasses.replace(self, **fields_of(part), texture=self.texture.of_faces(kept))
 
-    def page_mesh(self, page: int, *, turn: NDArray[np.float64] | None = None, name: str = "page") -> Any:
+    def page_mesh(self, page: int, *, name: str = "page") -> Any:
         """The faces of a page as a `trimesh.Trimesh` with texture; vertices on a seam are doubled.
 
         Args:
-            turn: (3, 3) rotation of the frame.
             name: of its material, before the page's number.
         """
         with process.uninterrupted():  # trimesh ignores exceptions while it is imported
@@ -130,28 +128,28 @@ class TexturedMesh(Mesh):
         rows = np.empty(len(faces), [("vertex", np.int32), ("u", np.float32), ("v", np.float32)])
         rows["vertex"], rows["u"], rows["v"] = faces, uv[:, 0], uv[:, 1]
         found, place = np.unique(rows, return_inverse=True)
-        turn = np.eye(3) if turn is None else turn
         material = trimesh.visual.material.PBRMaterial(
             name=f"{name}-{page}",
+            baseColorFactor=_WHITE,  # which readers multiply the picture by
             baseColorTexture=Image.fromarray(self.texture.pages[page]),
             metallicFactor=0.0,
             roughnessFactor=1.0,
         )
         return trimesh.Trimesh(
-            (self.vertices[found["vertex"]] @ turn.T).astype(np.float32),
+            self.vertices[found["vertex"]],
             place.reshape(-1, 3),
-            vertex_normals=(self.normals[found["vertex"]] @ turn.T).astype(np.float32),
+            vertex_normals=self.normals[found["vertex"]],
             visual=trimesh.visual.TextureVisuals(
                 uv=np.stack([found["u"], 1 - found["v"]], axis=1), material=material
             ),
             process=False,
         )
 
-    def _scene(self, name: str, turn: NDArray[np.float64] | None = None) -> Any:
+    def _scene(self, name: str) -> Any:
         import trimesh
 
         pages = map(int, np.unique(self.texture.page))
-        return trimesh.Scene({f"{name}-{page}": self.page_mesh(page, turn=turn, name=name) for page in pages})
+        return trimesh.Scene({f"{name}-{page}": self.page_mesh(page, name=name) for page in pages})
 
     def _as_obj(self, path: Path) -> dict[Path, bytes]:
         """Contents of the files of an OBJ, the OBJ itself last."""
@@ -159,6 +157,9 @@ class TexturedMesh(Mesh):
 
         library = path.with_suffix(".mtl").name
         scene = self._scene(path.stem)
+        for shape in scene.geometry.values():
+            shape.visual.material = shape.visual.material.to_simple()
+            shape.visual.material.ambient, shape.visual.material.specular = _WHITE, _BLACK
         text, others = export_obj(scene, include_normals=True, return_texture=True, mtl_name=library)
         return {
             **{path.with_name(name): found for name, found in others.items()},

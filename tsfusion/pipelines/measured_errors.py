@@ -14,6 +14,7 @@ from tsfusion.core.errors import DatasetError, TsfusionError
 from tsfusion.core.output_folder import RECORD
 from tsfusion.datasets.synthetic.dataset import WORLDS
 from tsfusion.evaluation.mesh_distance import MeshDistance, tree_of
+from tsfusion.geometry.mesh_encoding import TURNED_BY_NODE
 
 Measure = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 
@@ -96,8 +97,7 @@ def _read(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     try:
         loaded: Any = trimesh.load(path, process=False)
         if isinstance(loaded, trimesh.Scene):
-            _check_frame(path, loaded)
-            loaded = loaded.to_mesh()
+            loaded = _merged(path, loaded)
         vertices = np.asarray(loaded.vertices, np.float64).reshape(-1, 3)
         faces = np.asarray(getattr(loaded, "faces", np.zeros((0, 3))), np.int64).reshape(-1, 3)
     except TsfusionError:
@@ -110,10 +110,15 @@ def _read(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     return vertices, faces
 
 
-def _check_frame(path: Path, scene: Any) -> None:
-    """Refuse a GLB that tsfusion has turned: its points are not in the map's frame."""
-    notes = [one.metadata.get("up", "") for one in scene.geometry.values()]
-    if any(str(note).endswith("here +y") for note in notes):
+def _merged(path: Path, scene: Any) -> Any:
+    """The objects of a scene as one; those of a GLB of tsfusion in the map's frame, as they are stored."""
+    import trimesh
+
+    notes = [str(one.metadata.get("up", "")) for one in scene.geometry.values()]
+    if any(note.endswith("here +y") for note in notes):  # as written before nodes turned them
         raise DatasetError(
             f"{path} is turned so that up is +y, and is not in the map's frame: give the .ply instead"
         )
+    if any(note.endswith(TURNED_BY_NODE) for note in notes):
+        return trimesh.util.concatenate(list(scene.geometry.values()))
+    return scene.to_mesh()

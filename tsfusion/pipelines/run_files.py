@@ -25,6 +25,7 @@ from tsfusion.datasets.dataset import NOMINAL_NS
 from tsfusion.datasets.trajectory_files import write_tum
 from tsfusion.geometry import up_direction
 from tsfusion.geometry.mesh import Mesh
+from tsfusion.geometry.provenance import Provenance
 from tsfusion.geometry.up_direction import HeldSensor, Up
 from tsfusion.journal.state_folder import check_no_map_of_a_server
 from tsfusion.pipelines import latency_ledger, mesh_files, shortfall
@@ -92,10 +93,23 @@ def write_map(
     mesh = target.mesh(map_name, min_weight=min_weight)
     left_out: dict[str, Any] = {}
     if len(mesh.faces):
-        mesh = dataclasses.replace(mesh, known_up=up_direction.find(mesh, held, given=up))
+        mesh = dataclasses.replace(
+            mesh, known_up=up_direction.find(mesh, held, given=up), provenance=_provenance(status, target)
+        )
         files = [work / f"{name}{suffix}{ending}" for name, ending in _MESH_FILES]
         left_out = mesh_files.write(mesh, files, keep_islands=keep_islands)
     return WrittenMap(status, mesh, {**mesh.figures, "left_out": left_out})
+
+
+def _provenance(status: Status, target: Target) -> Provenance:
+    """Provenance of a run's meshes; without a hash where others may have changed the map since."""
+    is_own = target.child is not None
+    return Provenance(
+        source=f"map {status.map}",
+        keyframes=status.keyframes_fused,
+        map_hash=status.map_hash if is_own else None,
+        voxel_size=status.config["volume"]["voxel_size"],
+    )
 
 
 def write_ledger(work: Path, records: list[KeyframeTimes]) -> None:

@@ -28,6 +28,7 @@ from numpy.typing import DTypeLike, NDArray
 from tsfusion.core import durable_files
 from tsfusion.core.errors import InvalidConfig, MissingDependency, OutputError
 from tsfusion.geometry import openvdb_files
+from tsfusion.geometry.provenance import generator
 from tsfusion.kernels.integrate import MAX_DISTANCE, QUANTA_PER_VOXEL, WEIGHT_MASK
 from tsfusion.kernels.sensor_noise import WEIGHT_ONE
 from tsfusion.tsdf import distance_fields
@@ -46,16 +47,21 @@ class _Field(NamedTuple):
 
     dtype: DTypeLike
     unseen: float
+    units: str
     shape: tuple[int, ...] = ()
 
 
 _FIELDS = {
-    "tsdf": _Field(np.float32, np.nan),
-    "weight": _Field(np.float32, 0),
-    "color": _Field(np.uint8, 0, (3,)),
-    "distance": _Field(np.float32, np.nan),
+    "tsdf": _Field(np.float32, np.nan, "m"),
+    "weight": _Field(np.float32, 0, "1"),
+    "color": _Field(np.uint8, 0, "1", (3,)),
+    "distance": _Field(np.float32, np.nan, "m"),
 }
 
+_HELD = {
+    "tsdf": "signed distance along rays, at most the truncation; NaN where nothing was seen",
+    "distance": "Euclidean distance to the nearest surface, at most max_distance",
+}
 FieldName = Literal["tsdf", "distance"]
 FORMATS = (".npz", ".zarr", ".vdb")
 Watch = Callable[[int, int], None]  # bytes of the arrays written, of all
@@ -189,15 +195,21 @@ def _write_zarr(path: Path, voxels: _Voxels, progress: "_Progress") -> None:
     if path.is_dir() and any(path.iterdir()) and not (path / "zarr.json").exists():
         raise OutputError(f"cannot write {path}: it is a folder of something else; choose another name")
     with durable_files.replacing_folder(path) as folder:
-        group = zarr.open_group(folder, mode="w")
+        about: dict[str, Any] = {"generator": generator(), "unit": "metre", "field": _HELD[voxels.names[0]]}
+        about["voxel_size"] = float(voxels.plain["voxel_size"])
+        group = zarr.open_group(folder, mode="w", attributes=about)
         for name, value in voxels.plain.items():
-            group.create_array(name, data=np.asarray(value))
+            names = ("block", "axis") if np.ndim(value) == 2 else ("axis",)[: np.ndim(value)]
+            group.create_array(name, data=np.asarray(value), dimension_names=names)
+        places = ("x", "y", "z") if "origin" in voxels.plain else ("block", "i", "j", "k")
         for name in voxels.names:
             field = _FIELDS[name]
             first = min(8 if "origin" in voxels.plain else _CHUNK, voxels.shape[0])
             array = group.create_array(
                 name, shape=voxels.shape + field.shape, chunks=(first, *voxels.shape[1:], *field.shape),
                 dtype=np.dtype(field.dtype), fill_value=field.unseen,
+                dimension_names=(*places, "channel")[: len(voxels.shape + field.shape)],
+                attributes={"units": field.units},
             )  # fmt: skip
             at = 0
             for part in map(progress, voxels.parts(name)):
