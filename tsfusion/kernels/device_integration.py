@@ -27,8 +27,10 @@ from tsfusion.kernels.device_told import (
 )
 from tsfusion.kernels.integrate import (
     COLOR_LIMIT,
+    COLOR_VOTE,
     CUBE,
     FREE_SHIFT,
+    HIT_VOTE,
     MAX_DISTANCE,
     TOUCHED_COUNT,
     TOUCHED_MISMATCH,
@@ -195,10 +197,18 @@ def add_update(listed: ti.template(), i, at, sign_, sums: ti.template()):
 
 
 @ti.func
-def vote_color(at, packed, sign_, told: ti.template(), color_rgn: ti.template(), color_b: ti.template()):
-    """Add a vote 0xRRGGBB for a voxel's colour. A settled one stays, as in `integrate.vote_color`."""
+def vote_color(
+    at, packed, kind, sign_, told: ti.template(), color_rgn: ti.template(), color_b: ti.template()
+):
+    """Add a vote 0xRRGGBB for a voxel's colour, or a hit. A settled colour stays, as in
+    `integrate.vote_color`."""
     slot, o = at // CUBE, at % CUBE
-    taken = ti.cast(color_rgn[slot, o] & 65535, ti.i32)
+    taken = COLOR_LIMIT
+    if kind == HIT_VOTE:
+        if ti.atomic_add(color_b[slot, o], sign_) + sign_ < 0:
+            told[TOUCHED_MISMATCH] = 1
+    else:
+        taken = ti.cast(color_rgn[slot, o] & 65535, ti.i32)
     if taken < COLOR_LIMIT or taken >= COLOR_LIMIT + (COLOR_LIMIT >> 1):
         red, green = ti.cast((packed >> 16) & 255, ti.i64), ti.cast((packed >> 8) & 255, ti.i64)
         before = ti.atomic_add(color_rgn[slot, o], sign_ * ((red << 40) + (green << 16) + 1))
@@ -293,7 +303,7 @@ def add_listed(
 
 @ti.func
 def vote_colors(
-    votes_end, sign_, rays: ti.template(), first_ray, listed: ti.template(), marks: ti.template(),
+    votes_end, kind, sign_, rays: ti.template(), first_ray, listed: ti.template(), marks: ti.template(),
     told: ti.template(), hash_keys: ti.template(), hash_slots: ti.template(), oldest,
     color_rgn: ti.template(), color_b: ti.template(),
 ):  # fmt: skip
@@ -314,7 +324,7 @@ def vote_colors(
             at = listed[marks[i], PLACE]
             if at >= 0:
                 packed = rays[first_ray + i, WEIGHT_COLOR] & 0xFFFFFF
-                vote_color(at, packed, sign_, told, color_rgn, color_b)
+                vote_color(at, packed, kind, sign_, told, color_rgn, color_b)
 
 
 @ti.func
@@ -382,7 +392,7 @@ def add_new(
 
 @ti.func
 def add_and_admit(
-    rays: ti.template(), count, places_end, votes_end, sign_, stamp, first_slot, room: ti.template(),
+    rays: ti.template(), count, places_end, votes_end, kind, sign_, stamp, first_slot, room: ti.template(),
     hash_keys: ti.template(), hash_slots: ti.template(), winners: ti.template(), missing: ti.template(),
     places: ti.template(), claims: ti.template(), stamps: ti.template(), told: ti.template(),
     groups: ti.template(), totals: ti.template(), listed: ti.template(), marks: ti.template(),
@@ -399,8 +409,9 @@ def add_and_admit(
         stamps, told, sums,
     )  # fmt: skip
     vote_colors(
-        votes_end, sign_, rays, 0, listed, marks, told, hash_keys, hash_slots, first_slot, color_rgn, color_b
-    )
+        votes_end, kind, sign_, rays, 0, listed, marks, told, hash_keys, hash_slots, first_slot, color_rgn,
+        color_b,
+    )  # fmt: skip
 
 
 @QuickLaunch
@@ -412,7 +423,7 @@ def add_rays(
     sign_: ti.i32,
     oldest: ti.i32,
     stamp: ti.i32,
-    has_color: ti.i32,
+    kind: ti.i32,  # of votes
     hash_keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
     hash_slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
     winners: ti.types.ndarray(dtype=ti.i32, ndim=1),
@@ -453,6 +464,6 @@ def add_rays(
     end = listed_end(count, totals, listed)
     add_listed(end, sign_, stamp, listed, winners, missing, places, claims, hash_keys, stamps, told, sums)
     vote_colors(
-        1 + has_color * count, sign_, rays, first_ray, listed, marks, told, hash_keys, hash_slots, 0,
+        1 + ti.min(kind, COLOR_VOTE) * count, kind, sign_, rays, first_ray, listed, marks, told, hash_keys, hash_slots, 0,
         color_rgn, color_b,
     )  # fmt: skip

@@ -19,6 +19,7 @@ from tsfusion.kernels.device_integration import (
     whole_groups,
 )
 from tsfusion.kernels.device_told import BANDS, BEGINNERS, band_field, begin_keyframe
+from tsfusion.kernels.integrate import COLOR_VOTE
 from tsfusion.kernels.quick_launch import QuickLaunch
 from tsfusion.kernels.rays_from_images import (
     TILE,
@@ -223,6 +224,7 @@ def fuse_image(
     tiles: ti.types.ndarray(dtype=ti.i32, ndim=2),
     rays: ti.types.ndarray(dtype=ti.i32, ndim=2),
     count: ti.i32,
+    kind: ti.i32,  # of votes
     sign_: ti.i32,
     stamp: ti.i32,
     first_slot: ti.i32,
@@ -245,14 +247,15 @@ def fuse_image(
 ):
     """Make an image's rays and add the first `count` of them: all or none."""
     # Here, because each end of a loop that is found later is a task of its own
-    rays_end, places_end, votes_end = count, whole_groups(count), 1 + has_color * count
+    rays_end, places_end, votes_end = count, whole_groups(count), 1 + ti.min(kind, COLOR_VOTE) * count
     image_rays(
         image, is_disparity, scale, color, has_color, confidence, has_confidence, camera_rows, model, bundle,
         depths, tiles, rays, told, groups, totals, listed, marks, claims,
     )  # fmt: skip
     add_and_admit(
-        rays, rays_end, places_end, votes_end, sign_, stamp, first_slot, room, hash_keys, hash_slots, winners,
-        missing, places, claims, stamps, told, groups, totals, listed, marks, sums, color_rgn, color_b,
+        rays, rays_end, places_end, votes_end, kind, sign_, stamp, first_slot, room, hash_keys, hash_slots,
+        winners, missing, places, claims, stamps, told, groups, totals, listed, marks, sums, color_rgn,
+        color_b,
     )  # fmt: skip
 
 
@@ -271,6 +274,7 @@ def fuse_points(
     trusts: ti.types.ndarray(dtype=ti.i32, ndim=1),  # confidence in each point, 0 = none; < 0: begins a ray
     rays: ti.types.ndarray(dtype=ti.i32, ndim=2),
     count: ti.i32,
+    kind: ti.i32,  # of votes
     sign_: ti.i32,
     stamp: ti.i32,
     first_slot: ti.i32,
@@ -292,12 +296,13 @@ def fuse_points(
     color_b: ti.types.ndarray(dtype=ti.i32, ndim=2),
 ):
     """Make the rays of points and add the first `count` of them: all or none."""
-    rays_end, places_end, votes_end = count, whole_groups(count), 1 + has_color * count
+    rays_end, places_end, votes_end = count, whole_groups(count), 1 + ti.min(kind, COLOR_VOTE) * count
     point_rays(
         points, starts, color, has_color, confidence, has_confidence, pose, model, bundle, trusts, rays,
         told, groups, totals, listed, marks, claims,
     )  # fmt: skip
     add_and_admit(
-        rays, rays_end, places_end, votes_end, sign_, stamp, first_slot, room, hash_keys, hash_slots, winners,
-        missing, places, claims, stamps, told, groups, totals, listed, marks, sums, color_rgn, color_b,
+        rays, rays_end, places_end, votes_end, kind, sign_, stamp, first_slot, room, hash_keys, hash_slots,
+        winners, missing, places, claims, stamps, told, groups, totals, listed, marks, sums, color_rgn,
+        color_b,
     )  # fmt: skip

@@ -4,7 +4,8 @@
 A voxel's sum is one int64, (Σ w·m) · 2²⁷ + Σ w: m = signed distance along the ray in sixtieths of a voxel,
 |m| ≤ 1023, which is beyond the widest band there can be. Voxels before the band, where the sensor looks
 through (space carving), get a band's half-width for m.
-Colour is (Σ R) · 2⁴⁰ + (Σ G) · 2¹⁶ + n in an int64 and Σ B in an int32, one vote a ray.
+Colour is (Σ R) · 2⁴⁰ + (Σ G) · 2¹⁶ + n in an int64 and Σ B in an int32, one vote a ray, in the voxel where
+it ends. In maps with space carving a ray without a colour is counted there instead, in an int32.
 Addition modulo 2⁶⁴ is a group: any order gives the same bytes, and subtracting restores them.
 """
 
@@ -89,8 +90,9 @@ LISTED_UPDATES = 2 * STRETCH  # in an array of the function: one of 512 numbers 
 UNIT_SCRATCH = COLORS_AT + LISTED_COLORS  # int64 of a unit: its windows, votes for colours
 
 # What a launch does, `job`: which rays of which bands, on how many units, sign, slots from which on, how many
-# blocks may be missing, number of the keyframe, whether colours count
-WHICH, FIRST_BAND, LAST_BAND, UNITS, SIGN, OLDEST, MOST_MISSING, STAMP, HAS_COLOR = range(9)
+# blocks may be missing, number of the keyframe, what a ray leaves in the voxel where it ends (`NO_VOTE` …)
+WHICH, FIRST_BAND, LAST_BAND, UNITS, SIGN, OLDEST, MOST_MISSING, STAMP, VOTE = range(9)
+NO_VOTE, COLOR_VOTE, HIT_VOTE = 0, 1, 2  # a hit is counted in the layer that is handed in place of Σ B
 
 
 @ti.func
@@ -179,16 +181,21 @@ def add(lanes: ti.template(), at, amount, atomically: ti.template()):
 
 @ti.func
 def vote_color(
-    listed, sign_, color_rgn: ti.template(), color_b: ti.template(), touched: ti.template(),
+    listed, kind, sign_, color_rgn: ti.template(), color_b: ti.template(), touched: ti.template(),
     atomically: ti.template(),
 ):  # fmt: skip
-    """Add a listed vote for a colour.
+    """Add a listed vote for a colour, or a hit.
 
     A count just below 2¹⁶ has gone below none. A settled colour stays, whatever is added or taken away: it is
     no longer a sum.
     """
     at, packed = ti.cast(listed >> 32, ti.i32), ti.cast(listed, ti.i32)
-    votes = ti.cast(color_rgn[at] & 65535, ti.i32)
+    votes = COLOR_LIMIT
+    if kind == HIT_VOTE:
+        if add(color_b, at, sign_, atomically) + sign_ < 0:
+            touched[TOUCHED_MISMATCH] = 1
+    else:
+        votes = ti.cast(color_rgn[at] & 65535, ti.i32)
     if votes < COLOR_LIMIT or votes >= COLOR_LIMIT + (COLOR_LIMIT >> 1):
         red = ti.cast((packed >> 16) & 255, ti.i64)
         green = ti.cast((packed >> 8) & 255, ti.i64)
@@ -200,12 +207,12 @@ def vote_color(
 
 @ti.func
 def add_votes(
-    scratch: ti.template(), base, colors: ti.template(), sign_, color_rgn: ti.template(),
+    scratch: ti.template(), base, colors: ti.template(), kind, sign_, color_rgn: ti.template(),
     color_b: ti.template(), touched: ti.template(), atomically: ti.template(),
 ):  # fmt: skip
     """Add the listed votes for colours, and empty their list, which ends at `colors`."""
     for i in range(base + COLORS_AT, colors):
-        vote_color(scratch[i], sign_, color_rgn, color_b, touched, atomically)
+        vote_color(scratch[i], kind, sign_, color_rgn, color_b, touched, atomically)
     colors = base + COLORS_AT
 
 
@@ -289,7 +296,8 @@ def add_bands(
     """Add the rays of a unit's bands to its own blocks; or a share of those that cross blocks `of_others` to
     these: whoever came first to a block that two units share has it, so that one unit may have them all."""
     which, stamp = job[WHICH], job[STAMP]
-    sign_, oldest, most_missing, has_color = job[SIGN], job[OLDEST], job[MOST_MISSING], job[HAS_COLOR]
+    sign_, oldest, most_missing, kind = job[SIGN], job[OLDEST], job[MOST_MISSING], job[VOTE]
+    has_color = ti.min(kind, COLOR_VOTE)
     base, owner = unit * UNIT_SCRATCH, -1
     mark = (ti.cast(stamp, ti.i64) << 32) | unit
     walks, listed = ti.Vector([0] * WALKS), ti.Vector([0] * LIST)
@@ -330,7 +338,7 @@ def add_bands(
                 longest = measure(walks, carves, has_color)
                 walk(walks, ti.min(longest, STRETCH), listed, listed, False)
                 if colors > base + UNIT_SCRATCH - ABREAST:
-                    add_votes(scratch, base, colors, sign_, color_rgn, color_b, touched, of_others)
+                    add_votes(scratch, base, colors, kind, sign_, color_rgn, color_b, touched, of_others)
                 for k in range(ABREAST):
                     r = walks[RAY + k]
                     if r != NOBODY:
@@ -364,7 +372,7 @@ def add_bands(
                 if which == ALL:
                     bands[band, DEFERRED], bands[band, ADDED] = deferred, n
     add_updates(voxels, amounts, updates, sums, of_others)
-    add_votes(scratch, base, colors, sign_, color_rgn, color_b, touched, of_others)
+    add_votes(scratch, base, colors, kind, sign_, color_rgn, color_b, touched, of_others)
 
 
 @QuickLaunch

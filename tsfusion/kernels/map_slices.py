@@ -7,7 +7,7 @@ from tsfusion.kernels.block_hash import map_find
 from tsfusion.kernels.integrate import QUANTA_PER_VOXEL, lane_weight
 from tsfusion.kernels.run_loop import runs, unit_of
 from tsfusion.kernels.voxel_traversal import VOXEL_LIMIT, block_key, offset_in_block, vec3i
-from tsfusion.kernels.voxel_values import BANDS, distance_as_float
+from tsfusion.kernels.voxel_values import BANDS, distance_as_float, held
 
 vec3d = ti.types.vector(3, ti.f64)
 
@@ -29,11 +29,14 @@ def read_columns(
     sums: ti.types.ndarray(dtype=ti.i64, ndim=2),
     correction: ti.types.ndarray(dtype=ti.f32, ndim=2),
     corrected: ti.i32,
+    color_rgn: ti.types.ndarray(dtype=ti.i64, ndim=2),
+    hits: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    layers: ti.i32,
     min_weight: ti.i32,
     values: ti.types.ndarray(dtype=ti.f32, ndim=1),
     seen: ti.types.ndarray(dtype=ti.i32, ndim=1),
 ):
-    """`values`: the smallest signed distance in voxels among the samples of each of the `cells` that were
+    """`values`: the smallest signed distance in voxels (`held`) among the samples of each of the `cells` that were
     seen, NaN where none was; `seen`: how many were.
 
     Cell n is (`row` + n // `width`, `column` + n % `width`). It has `across`² columns of `heights` samples;
@@ -70,6 +73,7 @@ def read_columns(
                                     if corrected == 1:
                                         distance += correction[slot, o]
                                     value = distance / ti.cast(w, ti.f32) / QUANTA_PER_VOXEL
+                                    value = held(value, slot, o, color_rgn, hits, layers)
                                     number += 1
                                     if not value >= least:  # also where none was seen before
                                         least = value

@@ -33,7 +33,8 @@ class BlockStore:
     """Slots 0 … count-1, each with a key and one row of 512 voxels in every layer.
 
     Layers, (slot, 512): `sums` int64; with colour `color_rgn` int64 and `color_b` int32; when smoothing
-    `correction` float32 (see kernels/integrate.py and kernels/ray_smoothing.py). Beside them, one number a
+    `correction` float32; with space carving `hits` int32 (see kernels/integrate.py and
+    kernels/ray_smoothing.py). Beside them, one number a
     block: `dirty` uint8 (a bit for each that follows the changes), and int32 `stamps` (the last keyframe that
     touched it), `places` (where in that keyframe's list), `bounds` (no voxel has more weight than this).
     A layer the map does not have is one row of zeros, so that kernels can be handed it.
@@ -51,13 +52,14 @@ class BlockStore:
         voxel_size: float,
         color: bool,
         corrected: bool,
+        hits: bool = False,
         carved_band: float = 0.0,
         cache: CacheConfig | None = None,
         device: "DeviceBlocks | None" = None,
     ) -> None:
         self.voxel_size = voxel_size
         self.carved_band = carved_band  # half-width of bands that end in carved space, voxels; 0 = it varies
-        self.color, self.corrected = color, corrected
+        self.color, self.corrected, self.counts_hits = color, corrected, hits
         self.count = 0
         self.drops = 0  # how often blocks have gone, or moved to other slots
         self.stamp = 0  # number of the last keyframe, added or taken away; a map that is opened begins at 0
@@ -71,7 +73,7 @@ class BlockStore:
         self._keys = GrowingArray((), np.int64, self._room)
         self._dirty = GrowingArray((), np.uint8, self._room)
         self._stamps, self._places, self._bounds = (GrowingArray((), np.int32, self._room) for _ in range(3))
-        present = {"sums": True, "color_rgn": color, "color_b": color, "correction": corrected}
+        present = {"sums": True, "color_rgn": color, "color_b": color, "correction": corrected, "hits": hits}
         self._present = [name for name, there in present.items() if there]
         self._device = device
         self._layers = {name: self._layer(name, cache) for name in present}
@@ -145,6 +147,16 @@ class BlockStore:
     @property
     def correction(self) -> NDArray[np.float32]:
         return self._rows("correction")
+
+    @property
+    def hits(self) -> NDArray[np.int32]:
+        return self._rows("hits")
+
+    @property
+    def ray_ends(self) -> tuple[NDArray[np.int64], NDArray[np.int32], int]:
+        """Layers that count the rays which end in a voxel, and which of them the map has
+        (`voxel_values.held`)."""
+        return self.color_rgn, self.hits, self.color + 2 * self.counts_hits
 
     @property
     def dirty(self) -> NDArray[np.uint8]:

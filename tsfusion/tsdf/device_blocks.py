@@ -112,7 +112,7 @@ class DeviceBlocks:
         self._unsent.clear()
 
 
-def device_for(arch: Arch, *, color: bool, smooths: bool) -> DeviceBlocks | None:
+def device_for(arch: Arch, *, color: bool, carves: bool, smooths: bool) -> DeviceBlocks | None:
     """The blocks of a new map on a device; None = it is on the CPU, by its settings or because there is no
     such device, which a warning says.
 
@@ -132,4 +132,5 @@ def device_for(arch: Arch, *, color: bool, smooths: bool) -> DeviceBlocks | None
             return None
     if link is None:
         return None
-    return DeviceBlocks(link, ("sums", "color_rgn", "color_b") if color else ("sums",))
+    names = {"sums": True, "color_rgn": color, "color_b": color, "hits": carves}
+    return DeviceBlocks(link, tuple(name for name, there in names.items() if there))

@@ -110,7 +110,7 @@ class DeviceIntegrator(Integrator):
         store, buffers, config = self._store, self._buffers, self._config
         store.send()
         kind, *arguments = buffers.asked
-        job = (ALL, 0, len(buffers.bands), sign, 0, store.stamp, int(buffers.colored))
+        job = (ALL, 0, len(buffers.bands), sign, 0, store.stamp, self._vote)
         new = min(self._most_missing(), store.spare) if sign > 0 else 0
         room = new, config.max_blocks_per_keyframe, self._most_cost, BLOCK_COST
         self._ahead, self._has_inserted = None, False
@@ -148,7 +148,7 @@ class DeviceIntegrator(Integrator):
         store, buffers = self._store, self._buffers
         ahead, self._ahead = self._ahead, None
         if ahead is None:
-            job = which, *part, sign, oldest, store.stamp, int(buffers.colored)
+            job = which, *part, sign, oldest, store.stamp, self._vote
             found = self._device.call("add", job)
             told = found[0].copy()
             missing = keys_told(told, found)

@@ -34,7 +34,7 @@ from tsfusion.tsdf.checkpoint import LAYER_DTYPES
 
 _LISTED = 1 << 22  # updates, 16 bytes each, that a launch lists
 _FEW_TOUCHED = 4096  # blocks whose numbers are read at once
-_DTYPES = {"sums": ti.i64, "color_rgn": ti.i64, "color_b": ti.i32}
+_DTYPES = {"sums": ti.i64, "color_rgn": ti.i64, "color_b": ti.i32, "hits": ti.i32}
 
 
 class Job(NamedTuple):
@@ -46,7 +46,7 @@ class Job(NamedTuple):
     sign: int
     oldest: int
     stamp: int
-    has_color: int
+    kind: int  # of votes
 
 
 class Room(NamedTuple):
@@ -100,7 +100,7 @@ class DeviceMap:
         limits = Room(*room)
         spare = min(self._stamps.shape[0], self._hash_keys.shape[0] // 2) - self._count
         limits = limits._replace(new=min(limits.new, FEW_NEW, spare))
-        count, sign, stamp = (int(self._begins[-1]), *job[3:6:2]) if job else (0, 0, 0)
+        count, sign, stamp, votes = (int(self._begins[-1]), *job[3:6:2], job[6]) if job else (0, 0, 0, 0)
         arrays = [i for i, one in enumerate(arguments) if isinstance(one, np.ndarray)]
         *given, limit = self._copies.given(*(arguments[i] for i in arrays), np.array(limits, np.int64))
         handed = list(arguments)
@@ -108,10 +108,10 @@ class DeviceMap:
             handed[i] = one
         at = self._layers
         kernel(
-            *handed, *scratch, self._rays, count, sign, stamp, self._count, limit, self._hash_keys,
+            *handed, *scratch, self._rays, count, votes, sign, stamp, self._count, limit, self._hash_keys,
             self._hash_slots, self._winners, self._missing, self._places, self._claims, self._stamps,
             self._told, self._groups, self._totals, self._listed, self._marks, at["sums"], at["color_rgn"],
-            at["color_b"],
+            at[last_layer(votes)],
         )  # fmt: skip
         self._known = 0
         told, missing = self._read_results()
@@ -182,7 +182,7 @@ class DeviceMap:
         kernels.add_rays(
             self._rays, first_ray, end_ray, *job[3:], self._hash_keys, self._hash_slots, self._winners,
             self._missing, self._places, self._claims, self._stamps, self._told, self._groups, self._totals,
-            self._listed, self._marks, at["sums"], at["color_rgn"], at["color_b"],
+            self._listed, self._marks, at["sums"], at["color_rgn"], at[last_layer(job.kind)],
         )  # fmt: skip
 
     def _read_results(self) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
@@ -290,6 +290,11 @@ class DeviceMap:
 def bands_of(told: NDArray[np.int32]) -> NDArray[np.int32]:
     """The bands in what is told."""
     return told[BANDS_AT:FRESH_AT].reshape(BANDS, BAND_FIELDS)
+
+
+def last_layer(kind: int) -> str:
+    """The layer that votes of this kind need beside `color_rgn`."""
+    return "hits" if kind == integrate.HIT_VOTE else "color_b"
 
 
 def _zeros(dtype: Any, *shape: int) -> Any:

@@ -17,7 +17,7 @@ from tsfusion.tsdf.integrator import Integrator
 from tsfusion.tsdf.ray_buffers import RayBuffers
 
 _CONFIG = VolumeConfig(voxel_size=0.05, regularizer="off", space_carving=True)
-_LAYERS = ("sums", "color_rgn", "color_b")
+_LAYERS = ("sums", "color_rgn", "color_b", "hits")
 
 
 def agrees(link: DeviceLink) -> bool:
@@ -34,7 +34,7 @@ def agrees(link: DeviceLink) -> bool:
 
 
 def _store(device: DeviceBlocks | None) -> BlockStore:
-    return BlockStore(voxel_size=_CONFIG.voxel_size, color=True, corrected=False, device=device)
+    return BlockStore(voxel_size=_CONFIG.voxel_size, color=True, corrected=False, hits=True, device=device)
 
 
 def _fused(store: BlockStore, buffers: RayBuffers, integrator: Integrator) -> list[NDArray[Any]]:

@@ -18,6 +18,7 @@ from tsfusion.core.errors import InvalidConfig, MapError
 from tsfusion.geometry import openvdb_files
 from tsfusion.geometry.map_grids import FREE, OCCUPIED, UNSEEN, DistanceField
 from tsfusion.kernels import distance_transform as kernels
+from tsfusion.kernels import voxel_values
 from tsfusion.kernels.integrate import QUANTA_PER_VOXEL
 from tsfusion.tsdf.block_store import BlockStore, distinct_blocks, unpack_keys
 from tsfusion.tsdf.map_crop import voxel_range
@@ -166,6 +167,7 @@ def _read(
     for i in range(0, len(keys), _PART):
         x, y, z = places[i : i + _PART].T
         part = values_of(keys[i : i + _PART], store, min_weight) / np.float32(QUANTA_PER_VOXEL)
+        voxel_values.hold_hits(store.slots_of(keys[i : i + _PART]), *store.ray_ends, part)
         grid[x, :, y, :, z] = part.reshape(-1, 8, 8, 8)
     return grid.reshape(-1)
 

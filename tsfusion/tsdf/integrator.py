@@ -120,6 +120,13 @@ class Integrator:
         if self._store.count > before:
             self._store.drop(before)
 
+    @property
+    def _vote(self) -> int:
+        """What the keyframe's rays leave where they end."""
+        if self._buffers.colored:
+            return integrate.COLOR_VOTE
+        return integrate.HIT_VOTE if self._store.counts_hits else integrate.NO_VOTE
+
     def _begin(self, sign: int) -> None:
         """Empty the list of touched blocks; `sign` is that of what follows."""
         self._store.stamp += 1
@@ -321,12 +328,12 @@ class Integrator:
     ) -> None:
         """Add a part's rays to the blocks of slot ≥ `oldest`."""
         store, buffers = self._store, self._buffers
-        job = which, *part, self.units, sign, oldest, most_missing, store.stamp, buffers.colored
+        job = which, *part, self.units, sign, oldest, most_missing, store.stamp, self._vote
         arguments = (
             buffers.rays, buffers.bands, buffers.again, np.array(job, np.int32), store.hash_keys,
             store.hash_slots, buffers.missing, buffers.scratch, buffers.owners, store.stamps, store.places,
             store.dirty, buffers.touched, store.sums.reshape(-1), store.color_rgn.reshape(-1),
-            store.color_b.reshape(-1),
+            (store.hits if self._vote == integrate.HIT_VOTE else store.color_b).reshape(-1),
         )  # fmt: skip
         integrate.add_rays(*arguments)
         if self.units > 1 and buffers.bands[part[0] : part[1], SHARED].any():

@@ -85,6 +85,8 @@ def _add_rows(
     store.dirty[slots] = CHANGED
     if store.color:
         _add_colors(store, other, slots, theirs)
+    if store.counts_hits:
+        store.hits[slots] += other.hits[theirs]
     store.note_written(slots)
     if store.corrected:
         store.correction[slots[is_new]] = other.correction[theirs[is_new]]

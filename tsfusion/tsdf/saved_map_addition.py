@@ -266,5 +266,7 @@ def _add(sums: Rows, rows: Rows, at: NDArray[np.int64]) -> None:
         here = sums["color_rgn"][at], sums["color_b"][at]
         there = rows["color_rgn"], rows["color_b"]
         sums["color_rgn"][at], sums["color_b"][at] = added_colors(here, there)
+    if "hits" in sums:
+        sums["hits"][at] += rows["hits"]
     if "correction" in sums:  # smoothed values are no sums
         sums["correction"][at] = 0
