@@ -62,6 +62,10 @@ def both(arch: Arch, keyframes: list[Keyframe], **settings: Any) -> tuple[Volume
 def assert_equal(here: Volume, there: Volume) -> None:
     assert (here.map_hash(), here.color_hash()) == (there.map_hash(), there.color_hash())
     assert here.map_hash() != Volume(0.05).map_hash()
+    if here.config.counts_hits:
+        for one, other in zip(here._store.in_order("hits"), there._store.in_order("hits"), strict=True):
+            assert (one[0] == other[0]).all()
+            assert (one[1] == other[1]).all()
 
 
 @pytest.mark.parametrize(
@@ -72,9 +76,10 @@ def assert_equal(here: Volume, there: Volume) -> None:
         (VIEWS, {"space_carving": True}),
         (POINTS, {"sensor": "tof"}),
         (FEW_POINTS, {}),
+        (POINTS, {"sensor": "lidar", "color": False}),
         (MILLIMETRES, {}),
     ],
-    ids=["colour", "exact", "carving", "points", "few points", "millimetres"],
+    ids=["colour", "exact", "carving", "points", "few points", "hits", "millimetres"],
 )
 def test_the_map_is_that_of_the_cpu(arch: Arch, keyframes: list[Keyframe], settings: dict[str, Any]) -> None:
     here, there = both(arch, keyframes, **settings)

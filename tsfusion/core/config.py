@@ -154,6 +154,12 @@ class VolumeConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     max_blocks: Annotated[int, Meta(ge=1, le=4_000_000)] = 4_000_000
     max_blocks_per_keyframe: Annotated[int, Meta(ge=1, le=1 << 19)] = 1 << 17
 
+    @property
+    def counts_hits(self) -> bool:
+        """Whether the map counts rays without a colour in the voxels where they end: where many others may
+        pass a thin thing in its voxel, which then has the mean of free space."""
+        return self.space_carving or self.sensor == "lidar"
+
     def model(self, sensor: str | None = None) -> SensorModel:
         """The sensor model of a keyframe, changed by what this config sets.
 

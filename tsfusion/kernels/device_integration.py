@@ -205,8 +205,7 @@ def vote_color(
     slot, o = at // CUBE, at % CUBE
     taken = COLOR_LIMIT
     if kind == HIT_VOTE:
-        if ti.atomic_add(color_b[slot, o], sign_) + sign_ < 0:
-            told[TOUCHED_MISMATCH] = 1
+        ti.atomic_add(color_b[slot, o], sign_)
     else:
         taken = ti.cast(color_rgn[slot, o] & 65535, ti.i32)
     if taken < COLOR_LIMIT or taken >= COLOR_LIMIT + (COLOR_LIMIT >> 1):
@@ -464,6 +463,6 @@ def add_rays(
     end = listed_end(count, totals, listed)
     add_listed(end, sign_, stamp, listed, winners, missing, places, claims, hash_keys, stamps, told, sums)
     vote_colors(
-        1 + ti.min(kind, COLOR_VOTE) * count, kind, sign_, rays, first_ray, listed, marks, told, hash_keys, hash_slots, 0,
-        color_rgn, color_b,
+        1 + ti.min(kind, COLOR_VOTE) * count, kind, sign_, rays, first_ray, listed, marks, told, hash_keys,
+        hash_slots, 0, color_rgn, color_b,
     )  # fmt: skip

@@ -5,7 +5,7 @@ A voxel's sum is one int64, (Σ w·m) · 2²⁷ + Σ w: m = signed distance alon
 |m| ≤ 1023, which is beyond the widest band there can be. Voxels before the band, where the sensor looks
 through (space carving), get a band's half-width for m.
 Colour is (Σ R) · 2⁴⁰ + (Σ G) · 2¹⁶ + n in an int64 and Σ B in an int32, one vote a ray, in the voxel where
-it ends. In maps with space carving a ray without a colour is counted there instead, in an int32.
+it ends. In maps that count hits a ray without a colour is counted there instead, in an int32.
 Addition modulo 2⁶⁴ is a group: any order gives the same bytes, and subtracting restores them.
 """
 
@@ -187,13 +187,12 @@ def vote_color(
     """Add a listed vote for a colour, or a hit.
 
     A count just below 2¹⁶ has gone below none. A settled colour stays, whatever is added or taken away: it is
-    no longer a sum.
+    no longer a sum. Hits may go below none: a map of an earlier version has not counted those that it took.
     """
     at, packed = ti.cast(listed >> 32, ti.i32), ti.cast(listed, ti.i32)
     votes = COLOR_LIMIT
     if kind == HIT_VOTE:
-        if add(color_b, at, sign_, atomically) + sign_ < 0:
-            touched[TOUCHED_MISMATCH] = 1
+        add(color_b, at, sign_, atomically)
     else:
         votes = ti.cast(color_rgn[at] & 65535, ti.i32)
     if votes < COLOR_LIMIT or votes >= COLOR_LIMIT + (COLOR_LIMIT >> 1):

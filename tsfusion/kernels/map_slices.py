@@ -36,8 +36,8 @@ def read_columns(
     values: ti.types.ndarray(dtype=ti.f32, ndim=1),
     seen: ti.types.ndarray(dtype=ti.i32, ndim=1),
 ):
-    """`values`: the smallest signed distance in voxels (`held`) among the samples of each of the `cells` that were
-    seen, NaN where none was; `seen`: how many were.
+    """`values`: the smallest signed distance in voxels (`held`) among the samples of each of the `cells`
+    that were seen, NaN where none was; `seen`: how many were.
 
     Cell n is (`row` + n // `width`, `column` + n % `width`). It has `across`² columns of `heights` samples;
     these are `along_row`, `along_column`, `along_height` apart, in voxels, from `corner` on.

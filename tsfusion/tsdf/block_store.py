@@ -33,7 +33,7 @@ class BlockStore:
     """Slots 0 … count-1, each with a key and one row of 512 voxels in every layer.
 
     Layers, (slot, 512): `sums` int64; with colour `color_rgn` int64 and `color_b` int32; when smoothing
-    `correction` float32; with space carving `hits` int32 (see kernels/integrate.py and
+    `correction` float32; where hits are counted `hits` int32 (see kernels/integrate.py and
     kernels/ray_smoothing.py). Beside them, one number a
     block: `dirty` uint8 (a bit for each that follows the changes), and int32 `stamps` (the last keyframe that
     touched it), `places` (where in that keyframe's list), `bounds` (no voxel has more weight than this).

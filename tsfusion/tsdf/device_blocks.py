@@ -112,7 +112,7 @@ class DeviceBlocks:
         self._unsent.clear()
 
 
-def device_for(arch: Arch, *, color: bool, carves: bool, smooths: bool) -> DeviceBlocks | None:
+def device_for(arch: Arch, *, color: bool, hits: bool, smooths: bool) -> DeviceBlocks | None:
     """The blocks of a new map on a device; None = it is on the CPU, by its settings or because there is no
     such device, which a warning says.
 
@@ -132,5 +132,5 @@ def device_for(arch: Arch, *, color: bool, carves: bool, smooths: bool) -> Devic
             return None
     if link is None:
         return None
-    names = {"sums": True, "color_rgn": color, "color_b": color, "hits": carves}
+    names = {"sums": True, "color_rgn": color, "color_b": color, "hits": hits}
     return DeviceBlocks(link, tuple(name for name, there in names.items() if there))

@@ -150,8 +150,8 @@ class CurrentSlice:
             kernels.read_columns(
                 part, self._shape[1], int(self._first[0]), int(self._first[1]), n, self._heights,
                 corner, along_row, along_column, along_height, store.hash_keys, store.hash_slots,
-                store.sums, store.correction, int(store.corrected), *store.ray_ends, self._least, self._values,
-                self._seen,
+                store.sums, store.correction, int(store.corrected), *store.ray_ends, self._least,
+                self._values, self._seen,
             )  # fmt: skip
             store.rest()
             # kernel: voxels; here: cells

@@ -134,12 +134,12 @@ class Volume(AskableMap):
             config = override(config, **settings)
         runtime.start(config.threads)
         smooths = config.checked_model().regularizer != "off"
-        device = device_for(config.arch, color=config.color, carves=config.space_carving, smooths=smooths)
+        device = device_for(config.arch, color=config.color, hits=config.counts_hits, smooths=smooths)
         store = BlockStore(
             voxel_size=config.voxel_size,
             color=config.color,
             corrected=smooths,
-            hits=config.space_carving,
+            hits=config.counts_hits,
             carved_band=mesh_extraction.carved_band(config),
             cache=None if memory_bytes is None else checked_cache(memory_bytes, cache),
             device=device,

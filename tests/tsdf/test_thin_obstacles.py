@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: MIT
+"""Poles, posts and bars thinner than a voxel are never free, however many rays pass them in their voxels."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tsfusion import Intrinsics, Keyframe, Volume, VolumeConfig
+from tsfusion.geometry.map_grids import FREE, OCCUPIED
+
+Array = NDArray[np.float64]
+POSTS = [(3.03, y) for y in (-1.17, -0.36, 0.52, 1.31)]  # x, y of upright cylinders
+BAR_HEIGHT = 0.64  # of a level one, along y, in the plane of the posts
+VOXEL = 0.1
+
+
+def ranges(origin: Array, rays: Array, wall: float, radius: float, *, bar: bool) -> Array:
+    """Distances along unit rays (n, 3) to a wall across x, the posts and perhaps the bar."""
+    hit = (wall - origin[0]) / rays[:, 0]
+    lines = [((0, 1), np.array(post)) for post in POSTS]
+    lines += [((0, 2), np.array([POSTS[0][0], BAR_HEIGHT]))] if bar else []
+    for axes, place in lines:
+        across, to = rays[:, axes], place - origin[list(axes)]
+        a, b = (across**2).sum(axis=1), across @ to
+        below = b * b - a * (to @ to - radius**2)
+        near = (b - np.sqrt(np.maximum(below, 0))) / a
+        hit = np.where((below > 0) & (near > 0), np.minimum(hit, near), hit)
+    return hit
+
+
+def scans(gap: float, count: int = 20) -> list[Keyframe]:
+    """A LiDAR passes the posts of 5 cm, which stand so far before a wall."""
+    turn, rise = np.meshgrid(np.radians(np.arange(-40, 40, 0.25)), np.radians(np.arange(-12, 10, 1.0)))
+    rays = np.stack([np.cos(rise) * np.cos(turn), np.cos(rise) * np.sin(turn), np.sin(rise)], -1).reshape(
+        -1, 3
+    )
+    keyframes = []
+    for y in np.linspace(-0.9, 0.9, count):
+        pose = np.eye(4)
+        pose[:3, 3] = -0.5, y, 1.0
+        points = rays * ranges(pose[:3, 3], rays, POSTS[0][0] + gap, 0.025, bar=False)[:, None]
+        keyframes.append(Keyframe(points=points.astype(np.float32), T_world_camera=pose))
+    return keyframes
+
+
+def views(gap: float, *, color: bool) -> list[Keyframe]:
+    """A depth camera passes posts and a bar of 4 cm, which are so far before a wall."""
+    camera = Intrinsics(150.0, 150.0, 79.5, 59.5)
+    u, v = np.meshgrid(np.arange(160.0), np.arange(120.0))
+    rays = np.stack([np.ones_like(u), (79.5 - u) / 150, (59.5 - v) / 150], -1).reshape(-1, 3)
+    length = np.linalg.norm(rays, axis=1, keepdims=True)
+    keyframes = []
+    for y in np.linspace(-0.8, 0.8, 20):
+        pose = np.eye(4)
+        pose[:3] = [[0, 0, 1, 0.4], [-1, 0, 0, y], [0, -1, 0, 0.9]]
+        depth = ranges(pose[:3, 3], rays / length, POSTS[0][0] + gap, 0.02, bar=True) / length[:, 0]
+        image = np.full((120, 160, 3), 90, np.uint8) if color else None
+        depth = depth.reshape(120, 160).astype(np.float32)
+        keyframes.append(Keyframe(depth=depth, intrinsics=camera, T_world_camera=pose, color=image))
+    return keyframes
+
+
+def check_not_free(volume: Volume, folder: Path, *, bar: bool) -> None:
+    """Neither by slices, the file for map_server, nor distances: at the posts, and at the bar."""
+    box = (2.5, -1.5, 3.5, 1.5)
+    points = np.array([(x, y, 0.9) for x, y in POSTS])
+    costmap = volume.occupancy_slice(0.75, 1.05, up="z", box=box)
+    rows, columns = costmap.grid.cells_of(points).T
+    assert (costmap.cells[rows, columns] == OCCUPIED).all()
+    costmap.save(folder / "yard.yaml")
+    pixels = np.frombuffer((folder / "yard.pgm").read_bytes()[-costmap.cells.size :], np.uint8)
+    assert (pixels.reshape(costmap.cells.shape)[::-1][rows, columns] == 0).all()
+    assert (volume.distance_slice(0.75, 1.05, up="z", box=box).distance[rows, columns] < VOXEL).all()
+    if bar:
+        points = np.append(points, [(POSTS[0][0], y, BAR_HEIGHT) for y in (-0.7, 0.1, 0.9)], axis=0)
+    field = volume.distance_field((2.5, -1.5, 0.4, 3.5, 1.5, 1.4), max_distance=0.5)
+    at = tuple(np.floor((points - field.origin) / field.voxel_size).astype(int).T)
+    assert (field.occupancy[at] == OCCUPIED).all()
+    assert (field.distance[at] < VOXEL).all()
+
+
+@pytest.mark.parametrize("gap", [0.25, 3.0])
+@pytest.mark.parametrize("carves", [False, True])
+def test_poles_that_a_lidar_hits_are_never_free(tmp_path: Path, *, gap: float, carves: bool) -> None:
+    volume = Volume(VOXEL, sensor="lidar", space_carving=carves)
+    for scan in scans(gap):
+        volume.integrate(scan)
+    check_not_free(volume, tmp_path, bar=False)
+    beside = volume.occupancy_slice(0.75, 1.05, up="z", box=(1.0, -0.7, 2.5, 0.7)).cells
+    assert not carves or (beside == FREE).mean() > 0.95
+
+
+@pytest.mark.parametrize(
+    ("gap", "carves", "color"), [(0.2, False, True), (1.0, True, True), (1.0, True, False)]
+)
+def test_posts_and_bars_before_a_depth_camera_are_never_free(
+    tmp_path: Path, *, gap: float, carves: bool, color: bool
+) -> None:
+    volume = Volume(VOXEL, sensor="tof", space_carving=carves)
+    for view in views(gap, color=color):
+        volume.integrate(view)
+    check_not_free(volume, tmp_path, bar=True)
+
+
+def test_hits_are_sums_that_go_with_the_map(tmp_path: Path) -> None:
+    first, second, *others = scans(3.0, 5)
+    volume = Volume(VOXEL, sensor="lidar")
+    volume.integrate(first)
+    before = {name: layer[: volume._store.count].copy() for name, layer in volume._store.layers().items()}
+    assert before["hits"].sum() > 1000
+    volume.integrate(second)
+    volume.retract(second)
+    for name, layer in before.items():
+        np.testing.assert_array_equal(volume._store.layers()[name][: len(layer)], layer)
+    rest = Volume(VOXEL, sensor="lidar")
+    for scan in (*others, second):
+        rest.integrate(scan)
+        volume.integrate(scan)
+    alone = Volume(VOXEL, sensor="lidar")
+    alone.integrate(first)
+    alone.merge(rest)
+    assert hits(alone) == hits(volume) == hits(Volume.load(volume.save(tmp_path / "map.tsf")))
+
+
+def test_a_map_that_has_not_counted_hits_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One of an earlier version: nothing is counted of what it holds, and all of it can be taken away."""
+    one, other = scans(3.0, 2)
+    with monkeypatch.context() as earlier:
+        earlier.setattr(VolumeConfig, "counts_hits", False)
+        volume = Volume(VOXEL, sensor="lidar")
+        volume.integrate(one)
+        volume.save(tmp_path / "map.tsf")
+    opened = Volume.load(tmp_path / "map.tsf")
+    assert opened.map_hash() == volume.map_hash()
+    opened.integrate(other)
+    opened.retract(one)
+    fresh = Volume(VOXEL, sensor="lidar")
+    fresh.integrate(other)
+    assert opened.map_hash() == fresh.map_hash()
+
+
+def hits(volume: Volume) -> dict[int, bytes]:
+    """Row of each block."""
+    store = volume._store
+    return {int(store.keys[slot]): store.hits[slot].tobytes() for slot in store.used()}
