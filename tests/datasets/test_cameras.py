@@ -73,6 +73,24 @@ FILES = {
 }  # fmt: skip
 
 
+SKEWED = {
+    "K.txt": "9 2 4\n0 8 3\n0 0 1\n",
+    "calib.txt": "fx: 9\nfy: 8\ncx: 4\ncy: 3\nskew: 2\n",
+    "camera_intrinsic.json": json.dumps({"intrinsic_matrix": [9, 0, 0, 2, *COLUMNS[4:]]}),
+    "camera_info.yaml": "height: 6\nwidth: 8\nk: [9.0, 2.0, 4.0, 0.0, 8.0, 3.0, 0.0, 0.0, 1.0]\n",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SKEWED)
+def test_skew_of_a_camera_matrix_is_used(tmp_path, name):
+    root = redwood(tmp_path, [0], [0])
+    (root / "camera-intrinsics.txt").unlink()
+    (root / name).write_text(SKEWED[name])
+    camera = open_dataset(root).camera
+    assert (camera.lens.skew, camera.lens.intrinsics) == (2.0, Intrinsics(9, 8, 4, 3))
+    assert str(camera).endswith("undistorted (skew 2 px)")
+
+
 @pytest.mark.parametrize("name", FILES)
 def test_every_usual_file_of_a_camera_is_read(tmp_path, name):
     root = redwood(tmp_path, [0], [0])

@@ -2,6 +2,7 @@
 """Lens models against OpenCV's functions, rectification on a real rig, calibration files of every kind."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -26,6 +27,7 @@ KINECT = Camera(
 FISHEYE = Camera(
     Intrinsics(190.9, 190.9, 254.9, 256.8), (512, 512), "equidistant", (0.0034, 0.0007, -0.002, 0.0002)
 )
+SKEWED = Camera(Intrinsics(150, 150, 79.5, 59.5), (120, 160), skew=25.0)
 CAMERAS = {"euroc": RADTAN, "kinect": KINECT, "fisheye": FISHEYE}
 
 
@@ -103,6 +105,26 @@ def test_undistorted_depth_holds_values_that_were_there() -> None:
 def test_a_camera_without_distortion_stays_as_it_is() -> None:
     flat = Undistorter(Camera(Intrinsics(500, 500, 320, 240), (480, 640)))
     assert flat.intrinsics.fx == pytest.approx(500, rel=2 / 480)
+
+
+@pytest.mark.parametrize("camera", [SKEWED, replace(RADTAN, skew=20.0)], ids=["pinhole", "lens"])
+def test_skew_is_part_of_the_lens(camera: Camera) -> None:
+    K, matrix = camera.intrinsics, camera.intrinsics.matrix
+    matrix[0, 1] = camera.skew
+    assert Camera.named(matrix, camera.size, camera.model, camera.distortion) == camera
+    pixels = grid(camera.size)
+    ones = np.ones((len(pixels), 1))
+    rays = np.hstack([camera.rays(pixels), ones])
+    straight = replace(camera, skew=0.0).project(rays)
+    straight[:, 0] += camera.skew * (straight[:, 1] - K.cy) / K.fy
+    np.testing.assert_allclose(camera.project(rays), straight, atol=1e-9)
+    np.testing.assert_allclose(straight, pixels, atol=1e-6)
+    undistorter = Undistorter(camera)
+    v, u = np.mgrid[: camera.size[0], : camera.size[1]].astype(np.float64)
+    flat = Camera(undistorter.intrinsics, camera.size)
+    found = undistorter.image(wave(camera, u, v)).astype(int) - wave(flat, u, v)
+    assert np.abs(found).mean() < 1
+    assert camera.resized((camera.size[0] * 2, camera.size[1] * 2)).skew == 2 * camera.skew
 
 
 def test_image_of_another_size_is_refused() -> None:

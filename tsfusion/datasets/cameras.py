@@ -61,6 +61,8 @@ class RecordedCamera:
 
     def __str__(self) -> str:
         undistorted = "" if self.undistorter is None else ", undistorted"
+        if self.lens.skew:
+            undistorted += f" (skew {self.lens.skew:.4g} px)"
         return f"{described(self.intrinsics, self.size)}, {self.source}{undistorted}"
 
     @property
@@ -182,8 +184,9 @@ def _consistent(files: Sequence[Path], size: Size, root: Path) -> RecordedCamera
 
 def _agree(one: Camera, other: Camera, size: Size) -> bool:
     a, b = (
-        np.array([K.fx, K.fy, K.cx, K.cy])
-        for K in (each.intrinsics.scaled(size[1] / each.size[1]) for each in (one, other))
+        np.array([each.skew * size[1] / each.size[1], K.fx, K.fy, K.cx, K.cy])
+        for each in (one, other)
+        for K in (each.intrinsics.scaled(size[1] / each.size[1]),)
     )
     lenses = one.distortion == other.distortion or not one.distortion or not other.distortion
     return lenses and bool((abs(a - b) <= _EQUAL_PX + _EQUAL_SHARE * abs(a)).all())
@@ -198,10 +201,9 @@ def _fitted(camera: Camera, size: Size, path: Path, source: str) -> RecordedCame
                 f"another shape; {GIVE} of these images"
             )
         source += f" scaled from {_shape(camera.size)}"
-        intrinsics = camera.intrinsics.scaled(size[1] / camera.size[1])
-        camera = Camera(intrinsics, size, camera.model, camera.distortion)
+        camera = camera.resized(size)
     _check_centre(camera.intrinsics, size, path)
-    if camera.model == "pinhole":
+    if camera.is_pinhole:
         return RecordedCamera(camera.intrinsics, size, source)
     try:
         undistorter = Undistorter(camera)

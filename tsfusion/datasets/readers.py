@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError, InvalidKeyframe
+from tsfusion.geometry.calibration import MAX_NO_SKEW
 from tsfusion.geometry.calibration_files import read_text
 from tsfusion.geometry.keyframe import MAX_IMAGE_SIDE, Intrinsics, check_intrinsics
 
@@ -113,7 +114,15 @@ def read_color(path: Path, shape: tuple[int, ...] | None) -> NDArray[np.uint8]:
 
 
 def intrinsics_of(K: NDArray[np.float64], source: object) -> Intrinsics:
-    """The intrinsics in a camera or projection matrix, checked; an error names where it came from."""
+    """The intrinsics in a camera or projection matrix, checked; an error names where it came from.
+
+    Images of a camera with skew are no pinhole camera's before they are undistorted.
+    """
+    if abs(K[0, 1]) > MAX_NO_SKEW:
+        raise DatasetError(
+            f"{source}: the matrix has a skew of {K[0, 1]:.4g} px, which is not used here: rectify the "
+            "images, or give their --calibration FILE"
+        )
     return checked_intrinsics(Intrinsics(*map(float, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))), source)
 
 

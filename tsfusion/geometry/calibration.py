@@ -6,7 +6,7 @@ Lens models are OpenCV's: `radtan` (Brown-Conrady; ROS: plumb_bob, rational_poly
 the pixels that the original saw, or widened to keep all that it saw.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal
 
@@ -26,6 +26,7 @@ MODELS: dict[str, Model] = {
     "equidistant": "equidistant", "equi": "equidistant", "fisheye": "equidistant",
     "kannala_brandt4": "equidistant",
 }  # fmt: skip
+MAX_NO_SKEW = 1e-3  # pixels: less is none
 _COEFFICIENTS = {"pinhole": (0,), "radtan": (4, 5, 8, 12, 14), "equidistant": (4,)}
 _MAX_ANGLE = np.radians(60)  # from the axis: the flat image of a wider fisheye would take too many pixels
 _INSET = 0.5  # pixels of the border that interpolation could blend with the outside
@@ -47,6 +48,7 @@ class Camera:
     model: Model = "pinhole"  # lens model
     # radtan: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tx ty]]]]; equidistant: k1 k2 k3 k4
     distortion: tuple[float, ...] = ()
+    skew: float = 0.0  # pixels that a column moves by where y / z is 1: K[0, 1] of its matrix
 
     def __post_init__(self) -> None:
         expected = _COEFFICIENTS.get(self.model)
@@ -63,16 +65,28 @@ class Camera:
             raise InvalidConfig(
                 f"size of a camera must be 2 to {MAX_IMAGE_SIDE} pixels a side, got {self.size}"
             )
+        if not np.isfinite(self.skew):
+            raise InvalidConfig(f"skew of a camera must be finite pixels, got {self.skew}")
         try:
             check_intrinsics(self.intrinsics)
         except InvalidKeyframe as error:
             raise InvalidConfig(str(error)) from error
 
+    @property
+    def is_pinhole(self) -> bool:
+        """Whether its images need no undistortion."""
+        return self.model == "pinhole" and not self.skew
+
+    def resized(self, size: Size) -> "Camera":
+        """The camera of the same images in another size of the same shape."""
+        factor = size[1] / self.size[1]
+        return replace(self, intrinsics=self.intrinsics.scaled(factor), size=size, skew=self.skew * factor)
+
     @classmethod
-    def named(cls, K: Any, size: Size, model: str, distortion: Any = ()) -> "Camera":
+    def named(cls, K: Any, size: Size, model: str, distortion: Any = (), skew: float = 0.0) -> "Camera":
         """Make a camera of a 3×3 matrix (or its 9 numbers, or fx fy cx cy) and a model name of `MODELS`.
 
-        Coefficients that are all 0 make it a pinhole camera.
+        Coefficients that are all 0 make it a pinhole camera. The skew is a matrix's own.
         """
         if model.lower() not in MODELS:
             raise InvalidConfig(
@@ -80,7 +94,7 @@ class Camera:
             )
         numbers = np.asarray(K, dtype=np.float64).ravel()
         if numbers.size == 9:
-            numbers = numbers[[0, 4, 2, 5]]
+            skew, numbers = float(numbers[1]), numbers[[0, 4, 2, 5]]
         if numbers.size != 4:
             raise InvalidConfig(
                 f"camera matrix must have 9 numbers, or be fx fy cx cy; got {numbers.size} numbers"
@@ -88,9 +102,9 @@ class Camera:
         coefficients = tuple(map(float, np.asarray(distortion, dtype=np.float64).ravel()))
         chosen = MODELS[model.lower()] if any(coefficients) else "pinhole"
         intrinsics = Intrinsics(*map(float, numbers))
-        return cls(
-            intrinsics, (int(size[0]), int(size[1])), chosen, coefficients if chosen != "pinhole" else ()
-        )
+        used = coefficients if chosen != "pinhole" else ()
+        size = int(size[0]), int(size[1])
+        return cls(intrinsics, size, chosen, used, 0.0 if abs(skew) < MAX_NO_SKEW else skew)
 
     def project(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
         """Project (n, 3) points in the camera's axes, z > 0, to (n, 2) pixels."""
@@ -102,18 +116,28 @@ class Camera:
             pixels = cv2.fisheye.projectPoints(points, still, still, K, D)[0]
         else:
             pixels = cv2.projectPoints(points, still, still, K, D)[0]
-        return np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
+        found = np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
+        found[:, 0] += self._sheared(found[:, 1])
+        return found
+
+    def _sheared(self, rows: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Pixels by which the skew moves columns in these rows."""
+        return np.asarray(self.skew / self.intrinsics.fy * (rows - self.intrinsics.cy), np.float64)
 
     def rays(self, pixels: NDArray[np.floating]) -> NDArray[np.float64]:
         """Rays of (n, 2) pixels as (n, 2) x/z and y/z, limited to 60° from the axis."""
         K = self.intrinsics
-        distorted = (np.asarray(pixels, dtype=np.float64).reshape(-1, 2) - (K.cx, K.cy)) / (K.fx, K.fy)
+        pixels = np.array(pixels, dtype=np.float64).reshape(-1, 2)
+        pixels[:, 0] -= self._sheared(pixels[:, 1])
+        distorted = (pixels - (K.cx, K.cy)) / (K.fx, K.fy)
         if self.model == "equidistant":
             return _cut(_from_fisheye(distorted, self.distortion))
         rays = distorted
         for _ in range(_MAX_ITERATIONS):  # as cv2.undistortPoints does, to the end
             ones = np.ones((len(rays), 1))
-            seen = (self.project(np.hstack([rays, ones])) - (K.cx, K.cy)) / (K.fx, K.fy)
+            seen = self.project(np.hstack([rays, ones]))
+            seen[:, 0] -= self._sheared(seen[:, 1])
+            seen = (seen - (K.cx, K.cy)) / (K.fx, K.fy)
             missing = distorted - seen
             rays = _cut(rays + missing)
             if np.abs(missing).max(initial=0) < _MAX_RESIDUAL:
@@ -235,6 +259,7 @@ class _Maps:
         K, D, new = camera.intrinsics.matrix, np.array(camera.distortion), flat.matrix
         made = cv2.fisheye if camera.model == "equidistant" else cv2
         self._columns, self._rows = made.initUndistortRectifyMap(K, D, R, new, size[::-1], cv2.CV_32FC1)
+        self._columns += camera._sheared(self._rows).astype(np.float32)
         self._whole, self._fraction = cv2.convertMaps(self._columns, self._rows, cv2.CV_16SC2)
 
     @cached_property

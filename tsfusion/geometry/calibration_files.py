@@ -173,7 +173,8 @@ def _camera(tree: Tree, size: Size | None) -> tuple[Camera, Tree]:
     elif prefix is not None:  # RealSense, Replica and ORB-SLAM
         tree = {name.removeprefix(prefix): value for name, value in tree.items()}
         cx, cy = (tree[f"pp{axis}" if f"pp{axis}" in tree else f"c{axis}"] for axis in "xy")
-        K = np.array([tree["fx"], tree.get("fy", tree["fx"]), cx, cy], dtype=np.float64)
+        fx, skew = tree["fx"], tree.get("skew", 0)
+        K = np.array([fx, skew, cx, 0, tree.get("fy", fx), cy, 0, 0, 1], dtype=np.float64)
     else:
         raise InvalidConfig(f"no camera in it, only {', '.join(list(tree)[:8])}")
     coefficients = _distortion(tree)

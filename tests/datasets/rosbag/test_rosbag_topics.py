@@ -158,6 +158,27 @@ def test_a_lens_that_distorts_is_undistorted_unless_rectified(tmp_path: Path) ->
         Bag(path, posed=False)
 
 
+@pytest.mark.parametrize("name", ["depth", "image_rect"])
+def test_skew_in_a_matrix_of_a_camera_info_is_used(tmp_path: Path, name: str) -> None:
+    k = CAMERA.matrix + np.array([[0, 5, 0], [0, 0, 0], [0, 0, 0]])
+    p = np.column_stack([k, np.zeros(3)])
+    info = {"k": k.reshape(-1)} if name == "depth" else {"p": p.reshape(-1)}
+    camera = Bag(of_camera(tmp_path, name=name, **info), posed=False).camera
+    assert camera.lens == Camera.named(k, SHAPE, "none")
+    assert camera.lens.skew == 5
+
+
+def test_skew_of_a_rectified_pair_is_refused(tmp_path: Path) -> None:
+    with writing(tmp_path, "mcap") as (bag, path):
+        for side, shift in (("left", 0.0), ("right", -5.0)):
+            P = np.column_stack([CAMERA.matrix, [shift, 0, 0]])
+            P[0, 1] = 3
+            bag.image(f"/stereo/{side}/image_rect", GRAY, "mono8", T0)
+            bag.camera_info(f"/stereo/{side}/camera_info", CAMERA, SHAPE, T0, p=P.reshape(-1))
+    with pytest.raises(DatasetError, match="skew of 3 px"):
+        Bag(path, posed=False)
+
+
 def test_raw_stereo_is_rectified_as_its_camera_infos_say(tmp_path: Path) -> None:
     """Two cameras turned away from each other and their rectification, by OpenCV as image_proc uses it."""
     K, baseline = Intrinsics(40.0, 40.0, 31.5, 23.5), 0.11

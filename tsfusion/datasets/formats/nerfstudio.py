@@ -125,7 +125,7 @@ class Nerfstudio(Frames):
             own = _resized(camera, color.shape[:2], entry.where)
             color = resample_for_camera(color, own.intrinsics, fitted.intrinsics, depth.shape)
         intrinsics = fitted.intrinsics
-        if fitted.model != "pinhole":
+        if not fitted.is_pinhole:
             undistorter = self._undistorter(fitted)
             intrinsics, depth = undistorter.intrinsics, undistorter.depth(depth)
             color = None if color is None else undistorter.image(color)
@@ -222,7 +222,8 @@ def _camera(entry: _ListedFrame, size: tuple[int, ...]) -> Camera:
     distortion = [_number(given, key, where) if key in given else 0.0 for key in _MODELS[model]]
     kind = "fisheye" if model == "OPENCV_FISHEYE" else "radtan" if distortion else "pinhole"
     try:
-        return Camera.named((fx, fy, cx - 0.5, cy - 0.5), (size[0], size[1]), kind, distortion)
+        skew = _number(given, "skew", where) if "skew" in given else 0.0
+        return Camera.named((fx, fy, cx - 0.5, cy - 0.5), (size[0], size[1]), kind, distortion, skew)
     except InvalidConfig as error:
         raise DatasetError(f"{where}: {error}") from error
 
@@ -247,8 +248,7 @@ def _resized(camera: Camera, shape: tuple[int, ...], where: str) -> Camera:
             f"{where}: image {shape[1]}×{shape[0]}, but camera {camera.size[1]}×{camera.size[0]}; "
             "expected the same shape"
         )
-    intrinsics = camera.intrinsics.scaled(shape[1] / camera.size[1])
-    return Camera(intrinsics, (shape[0], shape[1]), camera.model, camera.distortion)
+    return camera.resized((shape[0], shape[1]))
 
 
 def _number(given: dict[str, Any], key: str, where: str) -> float:

@@ -17,8 +17,8 @@ from tsfusion.datasets.rosbag import messages
 from tsfusion.datasets.rosbag.messages import CAMERA, CameraInfo
 from tsfusion.datasets.rosbag.reader import BagRecording, Message, Stream, frame_id
 from tsfusion.geometry import se3
+from tsfusion.geometry.calibration import MAX_NO_SKEW, Rectifier, StereoRig, Undistorter
 from tsfusion.geometry.calibration import Camera as Lens
-from tsfusion.geometry.calibration import Rectifier, StereoRig, Undistorter
 from tsfusion.geometry.calibration_files import read_rig
 from tsfusion.geometry.keyframe import Intrinsics
 
@@ -189,8 +189,9 @@ class Cameras:
         camera = self._checked(images)
         of = self._of(images)
         if self._is_rectified(images):
-            return CameraView(self._pinhole(images, camera.P if camera.P[0, 0] else camera.K), None, *of)
-        if np.abs(camera.D).max(initial=0) < _UNDISTORTED:
+            K = camera.P[:, :3] if camera.P[0, 0] else camera.K
+            camera = camera._replace(K=K, D=np.zeros(0))
+        if _is_pinhole(camera):
             return CameraView(self._pinhole(images, camera.K), None, *of)
         undistorter = Undistorter(self._lens(images, camera))
         return CameraView(undistorter.intrinsics, undistorter, *of)
@@ -217,9 +218,9 @@ class Cameras:
             raise DatasetError(
                 f"{self._recording.path}: the CameraInfo of {right.stream.topic} has no baseline in P[0, 3]"
             )
-        plain = all(np.abs(one.D).max(initial=0) < _UNDISTORTED and _turn(one) < _NO_TURN for one in cameras)
+        plain = all(_is_pinhole(one) and _turn(one) < _NO_TURN for one in cameras)
         if plain or (self._is_rectified(left) and self._is_rectified(right)):
-            recorded = self._pinhole(left, cameras[0].P)
+            recorded, _ = (self._pinhole(left, one.P) for one in cameras)
             if self._intrinsics is None:
                 return CameraRig(recorded, float(shift), None, *self._of(left))
             given = checked_intrinsics(self._intrinsics, "intrinsics")
@@ -268,7 +269,7 @@ class Cameras:
         return intrinsics_of(matrix, f"{self._recording.path}: CameraInfo of {images.stream.topic}")
 
     def _lens(self, images: ImageTopic, camera: CameraInfo) -> Lens:
-        self._pinhole(images, camera.K)
+        self._pinhole(images, camera.K * ((1, 0, 1), (1, 1, 1), (1, 1, 1)))  # its skew is used
         try:
             return Lens.named(camera.K, images.size, camera.model, camera.D)
         except InvalidConfig as error:
@@ -282,6 +283,10 @@ def _is_beside(info_topic: str, base: str) -> bool:
     """Whether a CameraInfo is of these images alone: in their topic's own folder."""
     place = base.rpartition("/")[0]
     return info_topic.startswith((f"{place}/", f"{base}/"))
+
+
+def _is_pinhole(camera: CameraInfo) -> bool:
+    return bool(np.abs(camera.D).max(initial=0) < _UNDISTORTED and abs(camera.K[0, 1]) < MAX_NO_SKEW)
 
 
 def _turn(camera: CameraInfo) -> float:
