@@ -4,6 +4,7 @@
 import struct
 import zlib
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -14,7 +15,12 @@ from written_recordings import check, matrix, millimetres, views, write
 from tsfusion.core.errors import DatasetError, MissingDependency
 from tsfusion.datasets import open_dataset
 from tsfusion.datasets.depth_files import check_metres, read_depth
+from tsfusion.datasets.readers import read_color
+from tsfusion.datasets.rosbag import messages
 from tsfusion.geometry.measured_points import depth_metres
+from tsfusion.scanner.sources import folder_layouts
+from tsfusion.viewer.small_pictures import small_picture
+from tsfusion.wire.array_encoding import unpack_image
 
 
 def save(path: Path, depth: np.ndarray) -> None:
@@ -161,3 +167,32 @@ def test_nothing_is_printed_by_the_libraries_that_decode(tmp_path, capfd):
     put("depth/00000.png", whole[:8] + chunk(b"IHDR", b""))(root)
     one_line(lambda: dataset[0], "cannot be decoded")
     assert capfd.readouterr() == ("", "")
+
+
+def exif(image: np.ndarray, orientation: int) -> bytes:
+    """A JPEG with an EXIF orientation."""
+    data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
+    tiff = b"MM\0*" + struct.pack(">IHHHIHHI", 8, 1, 0x0112, 3, 1, orientation, 0, 0)
+    return data[:2] + b"\xff\xe1" + struct.pack(">H", len(tiff) + 8) + b"Exif\0\0" + tiff + data[2:]
+
+
+@pytest.mark.parametrize("orientation", [2, 3, 4, 6, 8])
+def test_colour_is_read_as_stored_whatever_its_exif_orientation(tmp_path, orientation):
+    image = np.zeros((24, 32, 3), np.uint8)
+    image[:12, :16] = 200
+    (tmp_path / "a.jpg").write_bytes(exif(image, orientation))
+    raw = np.fromfile(tmp_path / "a.jpg", np.uint8)
+    shown = cv2.imdecode(raw, cv2.IMREAD_COLOR)
+    assert shown.shape != image.shape or np.abs(shown.astype(int) - image).mean() > 20
+    bag = SimpleNamespace(format="jpeg", data=raw)
+    for found in (
+        read_color(tmp_path / "a.jpg", (24, 32)),
+        folder_layouts.whole_image(tmp_path / "a.jpg", cv2.IMREAD_ANYCOLOR),
+        messages.color(bag),
+        unpack_image(raw.tobytes(), np.dtype(np.uint8), (24, 32, 3)),
+        small_picture(raw.tobytes()),
+    ):
+        assert np.abs(found.astype(int) - image).mean() < 3
+    assert np.abs(messages.gray(bag).astype(int) - image[..., 0]).mean() < 3
+    if orientation > 4:
+        one_line(lambda: read_color(tmp_path / "a.jpg", (32, 24)), "EXIF orientation turns these")

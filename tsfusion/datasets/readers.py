@@ -3,6 +3,7 @@
 
 import struct
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from tsfusion.geometry.calibration_files import read_text
 from tsfusion.geometry.keyframe import MAX_IMAGE_SIDE, Intrinsics, check_intrinsics
 
 _PNG = b"\x89PNG\r\n\x1a\n"
-_PIXEL_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"eXIf", b"IDAT", b"IEND")
+_PIXEL_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")
 _HEADER = 13  # bytes of IHDR
 
 
@@ -68,6 +69,7 @@ def read_image(path: Path, what: str, flags: int = cv2.IMREAD_UNCHANGED) -> NDAr
 def decode_image(content: NDArray[np.uint8], flags: int) -> NDArray[Any] | None:
     """Decode an image file's bytes as OpenCV's `flags` say; None where that fails, or it is far too large.
 
+    Pixels come as stored, as calibrations and depth have them: an EXIF orientation is for picture viewers.
     OpenCV believes a PNG of a few bytes that claims gigabytes of pixels, and raises beyond that. libpng
     prints what it does not like: a PNG is checked here first, and freed of what is not needed for its pixels.
     """
@@ -77,7 +79,8 @@ def decode_image(content: NDArray[np.uint8], flags: int) -> NDArray[Any] | None:
             return None
         content = np.frombuffer(pixels, np.uint8)
     try:
-        image: NDArray[Any] | None = cv2.imdecode(content, flags) if len(content) else None
+        stored = flags | cv2.IMREAD_IGNORE_ORIENTATION
+        image: NDArray[Any] | None = cv2.imdecode(content, stored) if len(content) else None
     except cv2.error:
         image = None
     return image
@@ -105,12 +108,22 @@ def read_color(path: Path, shape: tuple[int, ...] | None) -> NDArray[np.uint8]:
     """(H, W, 3) uint8 BGR of the depth image's `shape`; None: of any."""
     color: NDArray[np.uint8] = read_image(path, "a colour image", cv2.IMREAD_COLOR)
     if shape is not None and color.shape[:2] != shape:
+        cure = turned_by_exif(path, color.shape, shape) or "register colour and depth before"
         raise DatasetError(
             f"{path} is {color.shape[1]}×{color.shape[0]}, its depth image {shape[1]}×{shape[0]}; "
-            "expected equal sizes: register colour and depth before, or leave the colour out (--option "
-            "color=false)"
+            f"expected equal sizes: {cure}, or leave the colour out (--option color=false)"
         )
     return color
+
+
+def turned_by_exif(path: Path, stored: Sequence[int], shape: Sequence[int]) -> str:
+    """Cure of a JPEG of the size `stored` that only its EXIF orientation turns to `shape`; else empty."""
+    if tuple(stored[:2]) != tuple(shape[1::-1]) or path.suffix.lower() == ".png":
+        return ""
+    shown = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if shown is None or shown.shape[:2] != tuple(shape[:2]):
+        return ""
+    return "pixels count as stored, and an EXIF orientation turns these: save the images turned"
 
 
 def intrinsics_of(K: NDArray[np.float64], source: object) -> Intrinsics:

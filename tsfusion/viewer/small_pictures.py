@@ -22,7 +22,7 @@ def small_picture(jpeg: bytes) -> NDArray[np.uint8] | None:
         return None
     flag = cv2.IMREAD_REDUCED_COLOR_4 if width >= 8 * _WIDTH else cv2.IMREAD_COLOR
     flag = cv2.IMREAD_REDUCED_COLOR_2 if 4 * _WIDTH <= width < 8 * _WIDTH else flag
-    image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), flag)
+    image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), flag | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:
         return None
     if image.shape[1] > _WIDTH:

@@ -76,7 +76,8 @@ def unpack_image(frame: Any, dtype: np.dtype[Any], shape: tuple[int, ...]) -> ND
     import cv2
 
     image_headers.check_unfolding(frame)
-    flags = cv2.IMREAD_COLOR if len(shape) == 3 else cv2.IMREAD_UNCHANGED
+    color = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION  # the other has no orientation either
+    flags = color if len(shape) == 3 else cv2.IMREAD_UNCHANGED
     try:
         image = cv2.imdecode(np.frombuffer(frame, np.uint8), flags)
     except cv2.error as error:

@@ -15,7 +15,7 @@ from tsfusion.datasets.cameras import RecordedCamera, given_camera
 from tsfusion.datasets.dataset import Frames, keep_posed, require_frames
 from tsfusion.datasets.depth_files import check_metres, read_depth
 from tsfusion.datasets.formats.image_folders import resample_for_camera
-from tsfusion.datasets.readers import read_color
+from tsfusion.datasets.readers import read_color, turned_by_exif
 from tsfusion.geometry.calibration import Camera, Undistorter
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics, check_pose
@@ -121,7 +121,9 @@ class Nerfstudio(Frames):
         size = entry.size or (depth if color is None else color).shape[:2]
         camera = self._given or _camera(entry, size)
         fitted = _resized(camera, depth.shape[:2], entry.where)
-        if color is not None and color.shape != (*depth.shape, 3):
+        if color is not None and entry.color is not None and color.shape != (*depth.shape, 3):
+            if turned := turned_by_exif(entry.color, color.shape, camera.size):
+                raise DatasetError(f"{entry.color}: {turned}")
             own = _resized(camera, color.shape[:2], entry.where)
             color = resample_for_camera(color, own.intrinsics, fitted.intrinsics, depth.shape)
         intrinsics = fitted.intrinsics
