@@ -1,5 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""tsfusion: depth sensors in, one exact 3-D map out.
+"""tsfusion: depth sensors in, one exact 3-D map out. What people do with it:
+
+    recording = tsfusion.open_dataset("recording")           read a recording, or "synthetic:room"
+    volume = tsfusion.Volume(0.02, sensor="kinect")          begin a map of 2 cm voxels
+    volume.integrate(recording[0])                           fuse a keyframe (tsfusion.Keyframe)
+    volume.extract_mesh().save("room.ply")                   see its surface
+    volume.distance_slice(0.1, 1.8)                          ask how far obstacles are
+    volume.save("room.tsf"); tsfusion.Volume.load("room.tsf")    keep it
+    tsfusion.Client("tcp://robot:5555").send(recording[0])   send keyframes to `tsfusion serve`
+
+All names:
 
     Send     Client, Keyframe, Intrinsics
     Fuse     Volume, with the settings of VolumeConfig; Config is a whole file of settings

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The examples do what they say, against a real server: in Python, and in C++ where a compiler is."""
 
+import json
 import re
 import shutil
 import subprocess
@@ -64,6 +65,49 @@ def test_two_robots_fill_one_map(address: str, tmp_path: Path) -> None:
     hashes = re.findall(r"[0-9a-f]{32}", example("two_robots.py", address, tmp_path))
     assert len(hashes) == 2
     assert len(set(hashes)) == 1
+
+
+NOTEBOOK = """
+import ast, json, sys
+
+def shown(source, names):
+    *body, last = ast.parse(source).body
+    if not isinstance(last, ast.Expr):
+        body, last = [*body, last], None
+    exec(compile(ast.Module(body, []), "cell", "exec"), names)
+    value = None if last is None else eval(compile(ast.Expression(last.value), "cell", "eval"), names)
+    return value._repr_html_() if hasattr(value, "_repr_html_") else ""
+
+names = {"__name__": "__main__"}
+for cell in json.load(open(sys.argv[1], encoding="utf-8"))["cells"]:
+    if cell["cell_type"] == "code":
+        print("shown", shown("".join(cell["source"]), names).count("data:image/png"))
+"""
+
+
+def test_the_notebook_runs_and_shows_pictures(tmp_path: Path) -> None:
+    path = ROOT / "examples" / "first_map.ipynb"
+    done = subprocess.run(
+        [sys.executable, "-c", NOTEBOOK, path], cwd=tmp_path, env=environment(), text=True, check=False,
+        capture_output=True, timeout=DEADLINE,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert re.findall(r"shown (\d)", done.stdout) == ["2", "2", "1", "1", "0", "0"]
+    distance = re.search(r"(\d\.\d+) m to the nearest surface", done.stdout)
+    assert distance is not None
+    assert 0.1 < float(distance[1]) < 2.0
+    assert "<Volume: 15 keyframes" in done.stdout
+    assert (tmp_path / "room.ply").exists()
+
+
+def test_the_notebook_is_one_for_every_reader() -> None:
+    book = json.loads((ROOT / "examples" / "first_map.ipynb").read_text(encoding="utf-8"))
+    assert (book["nbformat"], book["nbformat_minor"]) == (4, 5)
+    assert len({cell["id"] for cell in book["cells"]}) == len(book["cells"])
+    for cell in book["cells"]:
+        extra = {"outputs", "execution_count"} if cell["cell_type"] == "code" else set()
+        assert set(cell) == {"cell_type", "id", "metadata", "source"} | extra
+        assert not cell.get("outputs")
 
 
 @pytest.fixture(scope="module")

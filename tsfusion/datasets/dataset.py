@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
 """The `Dataset` protocol, its base for recordings, and choosing some of a dataset's frames."""
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import Any, Protocol, TypeVar, overload, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from tsfusion.core.errors import DatasetError, InvalidKeyframe
 from tsfusion.datasets.accelerometer import Accelerometer
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Keyframe
+from tsfusion.geometry.object_cards import ShownRecording
 
 STREET = MappingProxyType({"voxel_size": 0.1})  # usual there: at 2 cm a stereo keyframe takes 1.5 s
 NOMINAL_NS = 33_333_333  # between frames of a recording without times: thirty a second
@@ -51,21 +52,15 @@ class Dataset(Protocol):
     def __iter__(self) -> Iterator[Keyframe]: ...
 
 
-class Frames(ABC):
+class Frames(ShownRecording):
     """Base of recordings: indexing and iteration over `_frame(index)`, which alone opens a frame's files."""
 
-    name: str
-    sensor: str
     camera: Any = None  # `cameras.RecordedCamera` of depth images; None = points
     timestamps_ns: NDArray[np.int64] | None = None
-    skipped: dict[str, int]
     quaternions: bool = False  # whether rotations were recorded as quaternions; else as matrices
     usual: Mapping[str, Any] = MappingProxyType({})  # settings of a map of such a place (`VolumeConfig`)
     _poses: Sequence[NDArray[np.float64] | None] = ()
     _accelerometer: Accelerometer | None = None
-
-    @abstractmethod
-    def __len__(self) -> int: ...
 
     @abstractmethod
     def _frame(self, index: int) -> Frame: ...
@@ -89,11 +84,25 @@ class Frames(ABC):
             return None
         return self._accelerometer.around(self._stamp(self._checked(index)))
 
-    def __getitem__(self, index: int) -> Keyframe:
+    @overload
+    def __getitem__(self, index: int) -> Keyframe: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> "Selection": ...
+
+    def __getitem__(self, index: int | slice) -> "Keyframe | Selection":
+        if isinstance(index, slice):
+            return Selection(self, range(len(self))[index])
+        return self._keyframe(self._checked(index))
+
+    def _keyframe(self, index: int) -> Keyframe:
         frame = self.frame(index)
         if frame.T_world_camera is None:
-            raise DatasetError(f"frame {self._checked(index)} of {self.name} has no pose; {SCAN}")
+            raise DatasetError(f"frame {index} of {self.name} has no pose; {SCAN}")
         return frame.keyframe(frame.T_world_camera)
+
+    def _first(self) -> Frame:
+        return self.frame(0)
 
     def __iter__(self) -> Iterator[Keyframe]:
         return (self[index] for index in range(len(self)))
@@ -147,8 +156,8 @@ class Selection(Frames):
     def _frame(self, index: int) -> Frame:
         return frame_of(self._dataset, self._indices[index])
 
-    def __getitem__(self, index: int) -> Keyframe:
-        return self._dataset[self._indices[self._checked(index)]]
+    def _keyframe(self, index: int) -> Keyframe:
+        return self._dataset[self._indices[index]]
 
 
 def frame_of(dataset: Dataset, index: int) -> Frame:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from tsfusion.core import other_names
 from tsfusion.core.errors import InvalidKeyframe
+from tsfusion.geometry import object_cards
 
 _T = TypeVar("_T")
 Kind = Literal["depth", "disparity", "points"]
@@ -75,8 +76,8 @@ def _explains_names(cls: type[_T]) -> type[_T]:
 
 
 @_explains_names
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Keyframe:
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+class Keyframe(object_cards.Shown):
     """One measurement with a pose. Give exactly one of `depth`, `disparity` and `points`.
 
     Arrays are read, never written; they are made contiguous and native, and float64 points become float32
@@ -161,6 +162,18 @@ class Keyframe:
         if self.points is not None:
             return (len(self.points),)
         return tuple(self.measurement.shape)
+
+    def _facts(self) -> dict[str, str]:
+        x, y, z = self.T_world_camera[:3, 3]
+        what = f"{self.kind} {' × '.join(map(str, self.shape))} {self.measurement.dtype}"
+        return {
+            "measured": what + (" with colour" if self.color is not None else ""),
+            "sensor": f"sensor {self.sensor or 'as of the map'}",
+            "place": f"at ({x:.2f}, {y:.2f}, {z:.2f}) m",
+        }
+
+    def _pictures(self) -> list[object_cards.Picture | None]:
+        return object_cards.measured(self)
 
     @property
     def measurement(self) -> NDArray[Any]:

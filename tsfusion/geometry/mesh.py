@@ -19,6 +19,7 @@ from tsfusion.geometry import (
     mesh_encoding,
     mesh_islands,
     mesh_simplification,
+    object_cards,
     point_files,
     up_direction,
 )
@@ -30,8 +31,8 @@ FORMATS = tuple(mesh_encoding.FORMATS)
 GUESS_COLOR = (230, 40, 190)  # RGB, seldom seen indoors or out
 
 
-@dataclass(frozen=True, eq=False)
-class Mesh:
+@dataclass(frozen=True, eq=False, repr=False)
+class Mesh(object_cards.Shown):
     """Triangles in world coordinates; the outside is the side the normals point to.
 
     Attributes:
@@ -69,6 +70,18 @@ class Mesh:
         if self.known_up is not None or self.held is None:
             return self.known_up
         return up_direction.find(self, self.held)
+
+    def _facts(self) -> dict[str, str]:
+        colored = "grey" if self.colors is None else "coloured"
+        return {
+            "triangles": f"{len(self.faces)} triangles",
+            "vertices": f"{len(self.vertices)} vertices, {colored}",
+            "size": object_cards.extent(self.vertices),
+        }
+
+    def _pictures(self) -> list[object_cards.Picture | None]:
+        up = self.up.direction if self.up else (0.0, 0.0, 1.0)
+        return [object_cards.surface(self.vertices, self.normals, self.colors, up)]
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write PLY (binary), GLB, OBJ or STL by the file's suffix; complete or not at all.

@@ -39,7 +39,7 @@ class Texture:
         return dataclasses.replace(self, corners=self.corners[kept], page=self.page[kept])
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class TexturedMesh(Mesh):
     """A mesh whose surface shows what the cameras saw.
 

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: MIT
 """A journal, spool or segment as a dataset of keyframes: live scans can be replayed offline."""
 
+import copy
 import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,13 +14,14 @@ from numpy.typing import NDArray
 from tsfusion.core.config import VolumeConfig
 from tsfusion.core.errors import DecodeError, InvalidKeyframe, JournalError
 from tsfusion.geometry.keyframe import Keyframe
+from tsfusion.geometry.object_cards import ShownRecording
 from tsfusion.journal import state_folder
 from tsfusion.journal.journaled_keyframes import JournaledKeyframes
 
 LOST = "lost to damage"  # reason of `JournalRecording.skipped`
 
 
-class JournalRecording:
+class JournalRecording(ShownRecording):
     """The keyframes of a state folder (of one map, or of the one named), a map's folder or its `journal`, a
     spool folder or one `.mcap` segment: each once, at its final pose, in journal order.
 
@@ -37,6 +39,7 @@ class JournalRecording:
         place = state_folder.find_journal(Path(path), map_name)
         self.name = str(place.path)
         self.keyframes = found = JournaledKeyframes(place)
+        self._chosen = range(len(found))
         removed = len(found.left_out) - found.forgotten
         left_out = {"forgotten": found.forgotten, "removed by corrections": removed, LOST: found.lost}
         self.skipped = {reason: count for reason, count in {**found.unreadable, **left_out}.items() if count}
@@ -49,14 +52,27 @@ class JournalRecording:
         self.timestamps_ns: NDArray[np.int64] | None = None
 
     def __len__(self) -> int:
-        return len(self.keyframes)
+        return len(self._chosen)
 
-    def __getitem__(self, index: int) -> Keyframe:
-        """A keyframe; raises JournalError when it cannot be read any more."""
+    @overload
+    def __getitem__(self, index: int) -> Keyframe: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> "JournalRecording": ...
+
+    def __getitem__(self, index: int | slice) -> "Keyframe | JournalRecording":
+        """A keyframe, or some; raises JournalError when it cannot be read any more."""
+        if isinstance(index, slice):
+            some = copy.copy(self)
+            some._chosen = self._chosen[index]
+            return some
         try:
-            return self.keyframes[index].keyframe
+            return self.keyframes[self._chosen[index]].keyframe
         except (DecodeError, InvalidKeyframe) as error:
             raise JournalError(f"{self.name}: keyframe {index} cannot be used: {error}") from error
+
+    def _first(self) -> Keyframe:
+        return self[0]
 
     def __iter__(self) -> Iterator[Keyframe]:
         return (self[index] for index in range(len(self)))

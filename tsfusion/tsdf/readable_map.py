@@ -16,8 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.config import Surface, VolumeConfig
+from tsfusion.core.counts import count_of
 from tsfusion.core.distinct_integers import distinct
 from tsfusion.core.errors import InvalidConfig, MapError
+from tsfusion.geometry import object_cards
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.mesh_parts import MeshParts, joined
 from tsfusion.geometry.provenance import Provenance
@@ -41,6 +43,8 @@ from tsfusion.tsdf.mesh_tiles import WholeMapValues, tiles
 from tsfusion.tsdf.surface_values import SurfaceView, values_of
 from tsfusion.tsdf.texture_images import Keyframes
 
+_MOST_SHOWN = 50_000  # blocks of a map that has a picture: it is meshed for that
+
 
 def begin_hash(voxel_size: float) -> "hashlib.blake2b":
     """A digest that is to take the keys and then the sums of a map's used blocks, 1024 at a time."""
@@ -49,7 +53,7 @@ def begin_hash(voxel_size: float) -> "hashlib.blake2b":
     return digest
 
 
-class ReadableMap:
+class ReadableMap(object_cards.Shown):
     """A map as one reads it: `Volume` without the ways to change it.
 
     Attributes:
@@ -67,6 +71,19 @@ class ReadableMap:
         self.held = HeldSensor()
         self._blocks = store
         self._mesh_buffers = MeshBuffers()
+
+    def _facts(self) -> dict[str, str]:
+        count = self._blocks.count  # of any thread, as a debugger asks
+        size = object_cards.extent(unpack_keys(self._blocks.keys) * (8 * self.config.voxel_size))
+        return {
+            "keyframes": count_of(self.keyframes, "keyframe"),
+            "blocks": f"{count} blocks of 8³ voxels of {1000 * self.config.voxel_size:g} mm",
+            "sensor": f"sensor {self.config.sensor}",
+            "size": size,
+        }
+
+    def _pictures(self) -> list[object_cards.Picture | None]:
+        return self.extract_mesh(surface="raw")._pictures() if self._store.count <= _MOST_SHOWN else []
 
     @property
     def _store(self) -> BlockStore:

@@ -55,6 +55,11 @@ if TYPE_CHECKING:
     from tsfusion.core.config import LoadSettings, VolumeSettings
 
 log = logging.getLogger(__name__)
+_OF_SERVERS = {  # names that no completion shows
+    "blocks_within", "cell_stamps", "changed_blocks", "drops", "kept_values", "load_blocks", "mesh_cells",
+    "mesh_run", "most_blocks", "next_cells", "quota", "raycast_settled", "set_pause", "settle",
+    "settled_stamp", "stamp", "values_reached", "warming_up", "whole_values", "why_no_samples",
+}  # fmt: skip
 
 
 class IntegrateStats(msgspec.Struct, frozen=True):
@@ -82,6 +87,13 @@ class VolumeStats(msgspec.Struct, frozen=True):
 
 class Volume(AskableMap):
     """A sparse volume that keyframes are added to, and exactly removed from.
+
+        integrate, retract                        add a keyframe; take it out again
+        extract_mesh, point_cloud, raycast        see the surface
+        sample, distance_field, distance_slice    ask how far it is; occupancy_slice: what is free
+        save, load, save_voxels                   keep the map, or its voxels
+        merge, crop, copy, diff                   put maps together, take them apart, compare them
+        map_hash, stats                           know what is in it
 
     Give a `VolumeConfig`, or the edge of a voxel in metres and other fields by name:
     `Volume(0.02, sensor="kinect", regularizer="ray")`.
@@ -154,6 +166,9 @@ class Volume(AskableMap):
             self.limit_memory(memory_bytes)
         self._device = device
         self._ray_buffers, self._integrator = _writers(store, device, config)
+
+    def __dir__(self) -> list[str]:
+        return sorted(set(super().__dir__()) - _OF_SERVERS)
 
     if not TYPE_CHECKING:
 
