@@ -10,18 +10,21 @@ from tsfusion import AnswerLate, MapClient
 RADIUS = 0.15  # metres: half the robot's width
 address = sys.argv[1] if sys.argv[1:] else "tcp://127.0.0.1:5555"
 path = np.linspace([-1.5, 0.4, 0.85], [1.5, 0.4, 0.85], 61)  # (61, 3) metres of the map: 5 cm a step
+box = [*(path.min(axis=0) - RADIUS), *(path.max(axis=0) + RADIUS)]
 
 with MapClient(address, timeout=0.5) as live:
     try:
-        found = live.sample(path)
+        found = live.distance_field(box, max_distance=2 * RADIUS)
     except AnswerLate:
         sys.exit("the map did not answer in time: stop")
-    distance = found.result.distance  # (61,) metres to the surface; NaN = beyond what the map knows there
-    near = np.flatnonzero(distance < RADIUS)
-    if len(near):
+    distance = found.result.at(path)  # (61,) metres to the nearest surface; 0 where nothing was seen
+    blocked = np.flatnonzero(distance < RADIUS)
+    if len(blocked):
+        first = blocked[0]
         print(
-            f"{distance[near[0]]:.2f} m from a surface at {path[near[0]].round(2).tolist()}: stop before it"
+            f"{distance[first]:.2f} m from a surface, or 0 as unseen, at {path[first].round(2).tolist()}: "
+            "stop before it"
         )
     else:
-        print("the path touches nothing that the map has seen")
+        print(f"the path keeps {distance.min():.2f} m or more from all surfaces, and all of it was seen")
     print(f"answered in {1000 * found.delay_s:.0f} ms, of a map of {found.state.keyframes} keyframes")

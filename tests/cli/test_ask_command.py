@@ -88,6 +88,13 @@ def test_a_slice_for_map_server(here: Here, live: Server, tmp_path: Path) -> Non
     assert "image: " in (tmp_path / "slice.yaml").read_text()
     shares = json.loads(here("ask", live.address, *PATIENT, tmp_path / "slice.png", *SLICE, "--json").stdout)
     assert shares["free"] + shares["occupied"] + shares["unseen"] == pytest.approx(1)
+    for flags in ([], ["--unseen-is-free"]):
+        done = here("ask", live.address, *PATIENT, tmp_path / "far.npz", *SLICE, "--distances", *flags)
+        assert "horizontal distances up to 2 m" in done.stdout
+        with np.load(tmp_path / "far.npz") as found:
+            unseen = found["distance"][found["cells"] == -1]
+            assert len(unseen)
+            assert (unseen > 0).all() if flags else (unseen == 0).all()
     done = here("ask", live.address, *PATIENT, tmp_path / "no.png", "--slice", "0", "1")
     assert (done.returncode, "--up" in done.stderr) == (1, True)
 
@@ -96,9 +103,12 @@ def test_one_point_in_words_and_for_a_program(here: Here, live: Server) -> None:
     words = here("ask", live.address, *PATIENT, "--at", "0", "0", "1.2").stdout
     assert " m in front of the surface" in words or " m behind the surface" in words
     assert "a map of 3 keyframes, answered in" in words
-    assert "-9 9 9: unseen" in here("ask", live.address, *PATIENT, "--at", "-9", "9", "9").stdout
+    away = here("ask", live.address, *PATIENT, "--at", "-9", "9", "9").stdout
+    assert "-9 9 9: unseen, or farther from a surface than that: not known to be free" in away
+    assert "distances as fused, known up to 0.12 m before a surface" in away
     answer = json.loads(here("ask", live.address, *PATIENT, "--at", "-9", "9", "9", "--json").stdout)
     assert answer["samples"] == [{"point": [-9, 9, 9], "distance": None, "weight": 0, "gradient": None}]
+    assert (answer["distances"], round(answer["reach_m"], 3)) == ("as fused", 0.12)
     assert answer["delay_ms"] > 0
 
 

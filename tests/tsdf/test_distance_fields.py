@@ -35,7 +35,7 @@ def centres(field: DistanceField) -> NDArray[np.float64]:
 
 
 def test_between_voxels_the_distances_are_scipys(sphere: Volume) -> None:
-    field = sphere.distance_field(BOX, max_distance=0.5, subvoxel=False)
+    field = sphere.distance_field(BOX, max_distance=0.5, subvoxel=False, unseen_is_free=True)
     assert field.distance.dtype == np.float32
     found, sites = np.abs(field.distance), field.distance == 0
     assert 1000 < sites.sum() < 4000
@@ -46,7 +46,7 @@ def test_between_voxels_the_distances_are_scipys(sphere: Volume) -> None:
 def test_within_voxels_the_distances_are_nearer_the_truth(sphere: Volume) -> None:
     errors = {}
     for subvoxel in (False, True):
-        field = sphere.distance_field(BOX, max_distance=0.5, subvoxel=subvoxel)
+        field = sphere.distance_field(BOX, max_distance=0.5, subvoxel=subvoxel, unseen_is_free=True)
         radius = np.linalg.norm(centres(field), axis=-1)
         outside = (radius > RADIUS + 2 * VOXEL) & (radius < RADIUS + 0.4)
         errors[subvoxel] = np.abs(field.distance - (radius - RADIUS))[outside].mean()
@@ -77,7 +77,7 @@ def test_a_voxel_has_the_same_distance_in_every_box(sphere: Volume, subvoxel: bo
 
 def test_blocks_of_the_whole_map_are_its_field(sphere: Volume, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(distance_fields, "_TILE", 3)  # several tiles
-    whole = sphere.distance_field((-1.44,) * 3 + (1.44,) * 3, max_distance=0.1)
+    whole = sphere.distance_field((-1.44,) * 3 + (1.44,) * 3, max_distance=0.1, unseen_is_free=True)
     rest = np.abs(whole.distance) < np.float32(0.1)
     first = np.rint(whole.origin / VOXEL / 8).astype(int)
     seen = set()
@@ -133,11 +133,11 @@ def test_what_cannot_be_answered_is_refused(sphere: Volume) -> None:
     empty = volume_of([])
     with pytest.raises(MapError, match="the map is empty: there is no box around it"):
         empty.distance_field()
-    field = empty.distance_field((0, 0, 0, 0.1, 0.1, 0.1), max_distance=0.2)
+    field = empty.distance_field((0, 0, 0, 0.1, 0.1, 0.1), max_distance=0.2, unseen_is_free=True)
     assert (field.distance == np.float32(0.2)).all()
     assert (field.occupancy == -1).all()
     assert list(empty.distance_blocks()) == []
-    far = sphere.distance_field((900, 0, 0, 900.1, 0.1, 0.1), max_distance=0.2)
+    far = sphere.distance_field((900, 0, 0, 900.1, 0.1, 0.1), max_distance=0.2, unseen_is_free=True)
     assert (far.distance == np.float32(0.2)).all()
     for box in ((0, 0, 0, 0, 1, 1), (0, 0, 0, 1, 1), (0, 0, 0, np.nan, 1, 1)):
         with pytest.raises(InvalidConfig, match="a box must be"):

@@ -33,7 +33,7 @@ def sphere() -> Volume:
 
 @pytest.mark.parametrize("up", ["z", "-y", "x", "0.2,-0.3,0.8"])
 def test_distances_are_those_from_the_body_between_the_heights(sphere: Volume, up: str) -> None:
-    found = sphere.distance_slice(-0.1, 0.1, box=BOX, up=up, max_distance=0.5)
+    found = sphere.distance_slice(-0.1, 0.1, box=BOX, up=up, max_distance=0.5, unseen_is_free=True)
     u, v = np.moveaxis(found.grid.centres()[..., None, :] @ found.grid.axes.T, -1, 0)[:2, ..., 0]
     radius = np.hypot(u, v)
     assert found.distance.dtype == np.float32

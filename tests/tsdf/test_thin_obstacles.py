@@ -104,6 +104,43 @@ def test_posts_and_bars_before_a_depth_camera_are_never_free(
     check_not_free(volume, tmp_path, bar=True)
 
 
+def test_what_is_beside_a_wall_in_a_post_or_unseen_is_not_free_to_a_planner() -> None:
+    """For a robot of 15 cm, on paths along a wall, through a post, and behind the wall."""
+    volume = Volume(0.04, sensor="tof", space_carving=True)
+    for view in views(1.0, color=True):
+        volume.integrate(view)
+    wall = POSTS[0][0] + 1.0
+    y = np.linspace(-0.3, 0.3, 13)
+    paths = {
+        x: np.stack([np.full_like(y, x), y, np.full_like(y, 1.1)], axis=1)
+        for x in (wall - 0.1, wall - 0.6, wall + 0.4)
+    }
+    through = np.linspace([2.5, POSTS[2][1], 1.1], [3.5, POSTS[2][1], 1.1], 41)
+    field = volume.distance_field((2, -1, 0.8, wall + 0.5, 1, 1.4), max_distance=0.3)
+    assert field.reach == 0.3
+    near, free, unseen = (field.at(path) for path in paths.values())
+    assert np.abs(near - 0.1).max() < 0.04
+    assert (free > 0.2).all()
+    assert (unseen == 0).all()
+    post = field.at(through)
+    assert post.min() <= 0
+    ahead = POSTS[2][0] - through[:, 0]
+    assert (post[np.abs(ahead) < 0.12] < 0.15).all()
+    assert (post[ahead > 0.25] > 0.15).all()
+    assert (field.at(np.array([[0.0, 0, 1], [9, 9, 9]])) == 0).all()  # outside the box
+    taken = volume.distance_field((wall + 0.3, -1, 0.8, wall + 0.5, 1, 1.4), unseen_is_free=True)
+    assert (taken.at(paths[wall + 0.4]) > 0.2).all()
+    box = (2, -1, wall + 0.5, 1)
+    plane = volume.distance_slice(1.0, 1.2, up="z", box=box)
+    rows, columns = plane.grid.cells_of(paths[wall + 0.4]).T
+    assert (plane.distance[rows, columns] == 0).all()
+    other = volume.distance_slice(1.0, 1.2, up="z", box=box, unseen_is_free=True)
+    assert (other.distance[rows, columns] > 0.2).all()
+    found = volume.sample(paths[wall - 0.6])
+    assert found.reach == pytest.approx(0.12)
+    assert np.isfinite(volume.sample([[wall - 0.8 * found.reach, 0, 1.1]]).distance).all()
+
+
 def test_hits_are_sums_that_go_with_the_map(tmp_path: Path) -> None:
     first, second, *others = scans(3.0, 5)
     volume = Volume(VOXEL, sensor="lidar")

@@ -45,6 +45,9 @@ def ask(
         typer.Option("--slice", metavar="LOW HIGH", help="Obstacles between two heights, metres."),
     ] = None,
     distances: Annotated[bool, typer.Option("--distances", help="Also the distance from each cell.")] = False,
+    unseen_is_free: Annotated[
+        bool, options.option("--unseen-is-free", None, "Distances where nothing was seen; else 0.", rare=True)
+    ] = False,
     box: Annotated[
         tuple[float, float, float, float] | None,
         typer.Option(metavar="U V U V", help="Its corners; default: the whole map."),
@@ -82,7 +85,8 @@ def ask(
     """Ask a map how far its surface is, or what a camera sees of it.
 
     A live server answers between two keyframes, or status is 1 after --timeout.
-    Metres of the map; a distance is positive before a surface, nan = unseen.
+    Metres of the map; a distance is positive before a surface. nan = unseen, or
+    farther than these distances reach: nobody knows whether that is free.
 
     Points: a table on stdout, or OUT (.csv, .npz; .npy: distances alone).
     A view: OUT .png, or .npz with its depth. A slice: .pgm and .yaml for ROS's
@@ -110,6 +114,8 @@ def ask(
         )
     else:
         options.refuse(context, ("surface",), "has no effect on a slice: it is of the map as it was fused")
+    if not distances:
+        options.refuse(context, ("unseen_is_free",), "has no effect without --slice and --distances")
     how: dict[str, Any] = {"min_weight": min_weight}
     if slice_ is not None:
         file = _checked(out, "a slice", (".png", ".npz") if distances else SLICE_FORMATS)
@@ -122,6 +128,7 @@ def ask(
                 "state folder, which says where the floor is; add that height to LOW and HIGH here"
             )
         how |= {"above_floor": True} if above_floor else {}
+        how |= {"unseen_is_free": True} if unseen_is_free else {}
         with _map(where, map_, link, quiet=json) as asked:
             question = asked.distance_slice if distances else asked.occupancy_slice
             _write_slice(question(*slice_, **how), file, json=json)
@@ -171,7 +178,8 @@ def _ask_points(
         typer.echo(answer_files.csv_text(chosen, found), nl=False)
         typer.echo(f"{_counts(found)}; {_state(answers)}", err=True)
     else:
-        typer.echo("\n".join([*_sentences(chosen, found), _state(answers)]))
+        kind = f"distances as fused, {_reach(found)}"
+        typer.echo("\n".join([*_sentences(chosen, found), f"{kind}; {_state(answers)}"]))
 
 
 def _in_parts(asked: Any, chosen: "NDArray[np.float64]", how: dict[str, Any]) -> "list[Answered[Samples]]":
@@ -187,8 +195,8 @@ def _joined(answers: "list[Answered[Samples]]") -> "Samples":
     from tsfusion.geometry.map_answers import Samples
 
     names = ("distance", "weight", "gradient")
-    parts = [[getattr(one.result, name) for one in answers] for name in names]
-    return Samples(*map(np.concatenate, parts))
+    parts = {name: np.concatenate([getattr(one.result, name) for one in answers]) for name in names}
+    return Samples(**parts, reach=answers[-1].result.reach)
 
 
 @contextmanager
@@ -239,12 +247,15 @@ def _write_slice(answer: "Answered[Any]", out: Path, *, json: bool) -> None:
     shares = {name: float((found.cells == state).mean()) for name, state in names.items()}
     if json:
         figures = {"rows": rows, "columns": columns, "resolution_m": found.grid.resolution, **shares}
+        figures |= {"distances": "horizontal", "reach_m": found.reach} if hasattr(found, "reach") else {}
         figures |= {} if found.grid.floor is None else {"floor_m": found.grid.floor}
         output.as_json({"files": list(map(str, files)), **figures, **_figures([answer])})
         return
     said = ", ".join(f"{100 * share:.0f} % {name}" for name, share in shares.items())
     if not getattr(found, "knows_free_space", True):
         said += " (fused without --space-carving: free space is known near surfaces alone)"
+    if hasattr(found, "reach"):
+        said += f", horizontal distances up to {found.reach:g} m"
     cells = f"{columns}×{rows} cells of {found.grid.resolution:g} m"
     if found.grid.floor is not None:
         cells += f" between {found.grid.heights_in_words}"
@@ -307,7 +318,7 @@ def _sentences(points: "NDArray[np.float64]", found: "Samples") -> list[str]:
     for point, distance, weight in zip(points.tolist(), found.distance, found.weight, strict=True):
         place = " ".join(f"{one:g}" for one in point)
         if np.isnan(distance):
-            lines.append(f"{place}: unseen")
+            lines.append(f"{place}: unseen, or farther from a surface than that: not known to be free")
         else:
             side = "in front of" if distance >= 0 else "behind"
             lines.append(f"{place}: {abs(distance):.4f} m {side} the surface, weight {weight:.1f}")
@@ -318,7 +329,13 @@ def _counts(found: "Samples") -> str:
     import numpy as np
 
     seen = int(np.isfinite(found.distance).sum())
-    return f"{len(found.distance)} points, of which the map has seen {seen}"
+    return (
+        f"{len(found.distance)} points, of which the map has seen {seen}; distances as fused, {_reach(found)}"
+    )
+
+
+def _reach(found: "Samples") -> str:
+    return f"known up to {found.reach:.3g} m before a surface" if found.reach else "known near surfaces"
 
 
 def _state(answers: "list[Answered[Any]]") -> str:
@@ -346,12 +363,13 @@ def _figures(answers: "list[Answered[Any]]") -> dict[str, Any]:
 def _print_json(
     answers: "list[Answered[Samples]]", points: "NDArray[np.float64]", found: "Samples", out: Path | None
 ) -> None:
-    """Print what was found; unseen is null."""
+    """Print what was found; unseen, and beyond what is known, is null."""
     import numpy as np
 
     from tsfusion.cli import output
 
     figures: dict[str, Any] = {"points": len(points), "seen": int(np.isfinite(found.distance).sum())}
+    figures |= {"distances": "as fused", "reach_m": found.reach}
     if out is None:
         figures["samples"] = [
             {

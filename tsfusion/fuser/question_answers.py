@@ -185,6 +185,7 @@ class QuestionAnswers:
                 crc=questions.crc_of(packed),
                 waited_s=(began_ns - asked.asked_ns) / 1e9,
                 took_s=(now_ns - began_ns) / 1e9,
+                reach=self._volume.reach if isinstance(asked.question, Sample) else 0.0,
             )
             self._send(FuserAnswer(asked.number, answer), packed)
 
@@ -211,7 +212,7 @@ def _slice_of(current: "CurrentSlice", kind: str) -> _Arrays:
         occupancy = current.occupancy()
         own = {"cells": occupancy.cells, "knows_free_space": np.asarray(occupancy.knows_free_space)}
         return {**own, **_figures(occupancy.grid)}
-    found = current.distances()
+    found = current.distances(unseen_is_free=True)  # who asks decides
     own = {"cells": found.cells, "distance": found.distance}
     return {**own, "max_distance": np.float64(found.max_distance), **_figures(found.grid)}
 
@@ -233,6 +234,7 @@ def _field_of(volume: "Volume", asked: Field) -> _Arrays:
         max_distance=asked.max_distance,
         subvoxel=asked.subvoxel,
         min_weight=asked.min_weight,
+        unseen_is_free=True,  # who asks decides
     )
     arrays = vars(found) | {"voxel_size": np.float64(edge), "max_distance": np.float64(found.max_distance)}
     return {name: np.asarray(array) for name, array in arrays.items()}

@@ -18,12 +18,17 @@ from tsfusion.geometry.provenance import generator
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """The map's signed distance at points of the world.
+    """The map's signed distance at points of the world, which it knows near its surfaces alone.
+
+    NaN says nothing about what is there: whoever may not run into something asks a `DistanceField`.
 
     Attributes:
-        distance: (n,) float32 metres, positive in the free space in front of a surface; NaN where unseen.
+        distance: (n,) float32 metres, positive in the free space in front of a surface; NaN where unseen, and
+            beyond the band around the surface.
         weight: (n,) float32 votes in full-confidence samples; 0 where there are none.
         gradient: (n, 3) float32, how the distance grows along x, y, z; NaN where unseen.
+        reach: metres before a surface, up to which distances are known; 0 = a server of an earlier version
+            does not tell.
 
     Examples:
         >>> wall = tsfusion.Keyframe(
@@ -36,11 +41,14 @@ class Samples:
         >>> found = volume.sample([[0.0, 0.0, 1.45], [0.0, 0.0, 0.5]])
         >>> found.distance.round(2)  # 5 cm before the wall; farther than the map knows
         array([0.05,  nan], dtype=float32)
+        >>> round(found.reach, 3)
+        0.15
     """
 
     distance: NDArray[np.float32]
     weight: NDArray[np.float32]
     gradient: NDArray[np.float32]
+    reach: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,10 +8,11 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from tsfusion.core import durable_files
 from tsfusion.core.errors import InvalidConfig, OutputError
+from tsfusion.geometry.map_answers import checked_points
 from tsfusion.geometry.trajectory import quaternion
 
 FREE, OCCUPIED, UNSEEN = 0, 100, -1  # as in ROS's nav_msgs/OccupancyGrid
@@ -170,12 +171,13 @@ class DistanceSlice:
     """Horizontal distances to what stands between two heights.
 
     `distance` (rows, columns) float32 metres, at most `max_distance`: to the nearest surface, negative where
-    the map knows that a cell lies behind one. Where nothing was seen it is the distance to the nearest
-    surface that was; `cells` tells which these are, as in an `OccupancySlice`.
+    the map knows that a cell lies behind one. Where too little was seen it is 0, so that a robot does not go
+    there; with `unseen_is_free` the distance to the nearest surface that was. `cells` tells which these are,
+    as in an `OccupancySlice`.
 
     Attributes:
         grid: where the cells are.
-        max_distance: metres.
+        max_distance: metres, the `reach`: a distance of so much may be any larger one.
 
     Examples:
         >>> volume = tsfusion.Volume(0.05)
@@ -189,6 +191,11 @@ class DistanceSlice:
     distance: NDArray[np.float32]
     cells: NDArray[np.int8]
     max_distance: float
+
+    @property
+    def reach(self) -> float:
+        """How far distances are known, metres."""
+        return self.max_distance
 
     def save(self, path: str | Path) -> list[Path]:
         """Write a picture (.png) or arrays (.npz). Returns the files.
@@ -206,11 +213,10 @@ class DistanceSlice:
         return _save_arrays(path, {**arrays, **self.grid.figures})
 
     def picture(self) -> NDArray[np.uint8]:
-        """(rows, columns, 3) BGR, the last row on top: near red, far blue; occupied black, unseen paler."""
+        """(rows, columns, 3) BGR, the last row on top: near red, far blue; occupied black, unseen grey."""
         near = np.clip(1 - np.maximum(self.distance, 0) / self.max_distance, 0, 1)
         colors = cv2.applyColorMap((255 * near).astype(np.uint8), cv2.COLORMAP_TURBO)
-        unseen = self.cells == UNSEEN
-        colors[unseen] = (0.35 * colors[unseen] + 0.65 * 205).astype(np.uint8)
+        colors[self.cells == UNSEEN] = _PIXELS[UNSEEN]
         colors[self.cells == OCCUPIED] = 0
         return np.ascontiguousarray(colors[::-1])
 
@@ -220,14 +226,15 @@ class DistanceField:
     """Distances to the nearest surface in a box of voxels.
 
     `distance` (X, Y, Z) float32 metres, at most `max_distance`, negative where the map knows that a voxel
-    lies behind the surface. Where nothing was seen it is the distance to the nearest surface that was;
-    `occupancy` (X, Y, Z) int8 tells which these are: 0 free, 100 occupied, −1 unseen. The centre of voxel
-    (i, j, k) is at origin + ((i, j, k) + 0.5) · voxel_size.
+    lies behind the surface. Where nothing was seen it is 0, so that a robot does not go there; with
+    `unseen_is_free` the distance to the nearest surface that was seen. `occupancy` (X, Y, Z) int8 tells which
+    these are: 0 free, 100 occupied, −1 unseen. The centre of voxel (i, j, k) is at
+    origin + ((i, j, k) + 0.5) · voxel_size.
 
     Attributes:
         origin: (3,) float64 metres, the box's low corner.
         voxel_size: metres.
-        max_distance: metres.
+        max_distance: metres, the `reach`: a distance of so much may be any larger one.
 
     Examples:
         >>> volume = tsfusion.Volume(0.05)
@@ -235,6 +242,8 @@ class DistanceField:
         >>> field = volume.distance_field((-0.5, -0.5, 0.5, 0.5, 0.5, 1.0), max_distance=0.5)
         >>> field.distance.shape
         (20, 20, 10)
+        >>> path = np.linspace([-0.4, 0.0, 0.7], [0.4, 0.0, 0.7], 5)
+        >>> is_free = field.at(path) >= 0.15  # for a robot of this radius, metres
     """
 
     origin: NDArray[np.float64]  # (3,) metres: the box's lower corner
@@ -242,6 +251,29 @@ class DistanceField:
     distance: NDArray[np.float32]
     occupancy: NDArray[np.int8]
     max_distance: float
+
+    @property
+    def reach(self) -> float:
+        """How far distances are known, metres."""
+        return self.max_distance
+
+    def at(self, points: ArrayLike) -> NDArray[np.float32]:
+        """Distances that points keep at least, from what their voxels say: (n,) metres; 0 outside the box.
+
+        Args:
+            points: (n, 3) metres in the map's frame.
+
+        Raises:
+            InvalidConfig: for an array that holds no points.
+        """
+        places = (checked_points(points) - self.origin) / self.voxel_size
+        voxels = np.floor(places)
+        inside = ((voxels >= 0) & (voxels < self.distance.shape)).all(axis=1)
+        found = np.zeros(len(places), np.float32)
+        beside = np.linalg.norm(places - voxels - 0.5, axis=1)[inside] * self.voxel_size
+        known = self.distance[tuple(voxels[inside].astype(np.int64).T)]
+        found[inside] = np.where(known > 0, np.maximum(known - beside, 0), known)
+        return found
 
     def save(self, path: str | Path) -> list[Path]:
         """Write the arrays (.npz). Returns the files.
@@ -257,6 +289,13 @@ class DistanceField:
             "distance": self.distance, "occupancy": self.occupancy, "origin": self.origin,
             "voxel_size": np.float64(self.voxel_size), "max_distance": np.float64(self.max_distance),
         })  # fmt: skip
+
+
+def blocked(
+    distance: NDArray[np.float32], states: NDArray[np.int8], *, unseen_is_free: bool
+) -> NDArray[np.float32]:
+    """Distances as a planner may compare them: 0 where nothing was seen, unless that is to count as free."""
+    return distance if unseen_is_free else np.where(states == UNSEEN, np.float32(0), distance)
 
 
 def _checked_suffix(path: Path, known: tuple[str, ...] = SLICE_FORMATS) -> str:

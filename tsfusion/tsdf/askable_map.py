@@ -3,6 +3,7 @@
 
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -43,14 +44,21 @@ class AskableMap(ReadableMap):
     ) -> Samples:
         """The signed distance, its weight and its gradient at points, between voxel centres interpolated.
 
+        NaN beyond the band around surfaces (`reach`) does not mean free: planners ask `distance_field`.
+
         Args:
             points: (n, 3) float32 or float64 metres.
             min_weight, surface: as for `extract_mesh`.
         """
         least = self._checked_min_weight(min_weight)
-        return point_samples.sample(
-            checked_points(points), self._store, least, self._tiles_of(surface, least).values
-        )
+        view = self._tiles_of(surface, least).values
+        found = point_samples.sample(checked_points(points), self._store, least, view)
+        return replace(found, reach=self.reach)
+
+    @property
+    def reach(self) -> float:
+        """How far before a surface `sample` knows distances, metres: the least half-width of a band."""
+        return self.model.min_support * self.config.voxel_size
 
     def signed_distance(
         self, points: NDArray[np.floating], min_weight: float | None = None
@@ -157,6 +165,7 @@ class AskableMap(ReadableMap):
         max_distance: float = 2.0,
         subvoxel: bool = True,
         min_weight: float | None = None,
+        unseen_is_free: bool = False,
     ) -> DistanceField:
         """Euclidean distance to the nearest surface, of every voxel in a box.
 
@@ -168,12 +177,15 @@ class AskableMap(ReadableMap):
             subvoxel: distances to the surface where it lies in the voxels; else between voxels' centres, as
                 SciPy's `distance_transform_edt`.
             min_weight: as for `extract_mesh`.
+            unseen_is_free: where nothing was seen the distance is that to what was; else 0.
 
         Raises:
             InvalidConfig: for another box, or one of too many voxels; MapError: no box, and an empty map.
         """
         weight = self._checked_min_weight(min_weight)
-        return distance_fields.in_box(self._store, box, max_distance, weight, subvoxel=subvoxel)
+        return distance_fields.in_box(
+            self._store, box, max_distance, weight, subvoxel=subvoxel, unseen_is_free=unseen_is_free
+        )
 
     def distance_blocks(
         self, *, max_distance: float = 0.5, min_weight: float | None = None
@@ -262,11 +274,14 @@ class AskableMap(ReadableMap):
         options = {"max_distance": self.config.voxel_size, **options}  # nobody asks for distances
         return self.current_slice(low, high, **options).occupancy()
 
-    def distance_slice(self, low: float, high: float, **options: Any) -> DistanceSlice:
+    def distance_slice(
+        self, low: float, high: float, *, unseen_is_free: bool = False, **options: Any
+    ) -> DistanceSlice:
         """Horizontal distance of each cell to what stands between two heights.
 
         Args:
             low, high: metres along up from the map's origin.
+            unseen_is_free: where nothing was seen the distance is that to what was; else 0.
             options: `box`: u0, v0, u1, v1 in metres along the slice's own axes (x and y where z is up; None =
                 around the whole map); `up`: away from the ground, such as "z" or "-y" (None = it is found);
                 `resolution`: metres, edge of a cell (None = the voxel size); `max_distance`: metres (2);
@@ -276,7 +291,7 @@ class AskableMap(ReadableMap):
             InvalidConfig: for another box, or too many cells.
             MapError: for an empty map without a box, or where up or the floor cannot be found.
         """
-        return self.current_slice(low, high, **options).distances()
+        return self.current_slice(low, high, **options).distances(unseen_is_free=unseen_is_free)
 
     def mesh_cells(
         self,

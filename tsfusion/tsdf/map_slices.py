@@ -13,7 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import InvalidConfig, MapError
-from tsfusion.geometry.map_grids import FREE, OCCUPIED, UNSEEN, DistanceSlice, OccupancySlice, SliceGrid
+from tsfusion.geometry.map_grids import (
+    FREE,
+    OCCUPIED,
+    UNSEEN,
+    DistanceSlice,
+    OccupancySlice,
+    SliceGrid,
+    blocked,
+)
 from tsfusion.kernels import distance_transform as transform
 from tsfusion.kernels import map_slices as kernels
 from tsfusion.kernels.sensor_noise import WEIGHT_ONE
@@ -121,11 +129,11 @@ class CurrentSlice:
         """The slice's occupancy."""
         return OccupancySlice(self.grid, self._cells(), self._knows_free_space)
 
-    def distances(self) -> DistanceSlice:
-        """The slice's distances."""
-        return DistanceSlice(
-            self.grid, self._inside(self._distance).copy(), self._cells(), self._reach.metres
-        )
+    def distances(self, *, unseen_is_free: bool = False) -> DistanceSlice:
+        """The slice's distances; 0 where nothing was seen, unless that is to count as free."""
+        cells, distance = self._cells(), self._inside(self._distance).copy()
+        distance = blocked(distance, cells, unseen_is_free=unseen_is_free)
+        return DistanceSlice(self.grid, distance, cells, self._reach.metres)
 
     def _cells(self) -> NDArray[np.int8]:
         values, seen = self._inside(self._values), self._inside(self._seen)

@@ -15,7 +15,7 @@ from tsfusion.core.errors import AnswerLate, DecodeError, InvalidConfig, ServerU
 from tsfusion.geometry import up_direction
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.map_answers import Samples, View, checked_camera, checked_points
-from tsfusion.geometry.map_grids import DistanceField, DistanceSlice, OccupancySlice, SliceGrid
+from tsfusion.geometry.map_grids import DistanceField, DistanceSlice, OccupancySlice, SliceGrid, blocked
 from tsfusion.geometry.up_direction import Up
 from tsfusion.wire import messages, questions, sockets
 from tsfusion.wire.curve import ClientKeys, client_keys
@@ -137,7 +137,8 @@ class MapClient:
         crc = questions.crc_of(frames)
         question = Sample(points=len(rows), crc=crc, min_weight=min_weight, surface=surface)
         answer, arrays, delay = self._ask(question, frames, timeout)
-        return _answered(Samples(**_all(arrays, "distance", "weight", "gradient")), answer, delay)
+        found = Samples(**_all(arrays, "distance", "weight", "gradient"), reach=answer.reach)
+        return _answered(found, answer, delay)
 
     def raycast(
         self,
@@ -194,7 +195,9 @@ class MapClient:
         sliced = OccupancySlice(_grid(found), found["cells"], bool(found["knows_free_space"]))
         return _answered(sliced, answer, delay)
 
-    def distance_slice(self, low: float, high: float, **how: Any) -> Answered[DistanceSlice]:
+    def distance_slice(
+        self, low: float, high: float, *, unseen_is_free: bool = False, **how: Any
+    ) -> Answered[DistanceSlice]:
         """Horizontal distances to what stands between two heights; see `Volume.distance_slice`.
 
         The server keeps the slices of a `box` that were asked last, and brings them up to date: the first
@@ -202,13 +205,15 @@ class MapClient:
 
         Args:
             low, high: metres along `up`.
+            unseen_is_free: as for `Volume.distance_slice`.
             how: `up`: needed here, such as "z"; `box`, `resolution`, `max_distance`, `min_weight`: as for
                 `Volume.distance_slice`; `timeout`: seconds.
         """
         answer, arrays, delay = self._ask_slice("distance", low, high, **how)
         found = _all(arrays, "cells", "distance", "max_distance", *_GRID)
         farthest = float(found["max_distance"])
-        sliced = DistanceSlice(_grid(found), found["distance"], found["cells"], farthest)
+        distance = blocked(found["distance"], found["cells"], unseen_is_free=unseen_is_free)
+        sliced = DistanceSlice(_grid(found), distance, found["cells"], farthest)
         return _answered(sliced, answer, delay)
 
     def _ask_slice(
@@ -244,6 +249,7 @@ class MapClient:
         max_distance: float = 0.5,
         subvoxel: bool = True,
         min_weight: float | None = None,
+        unseen_is_free: bool = False,
         timeout: float | None = None,
     ) -> Answered[DistanceField]:
         """Distance of each voxel in a box to the nearest surface; see `Volume.distance_field`.
@@ -253,7 +259,7 @@ class MapClient:
         Args:
             box: x0 y0 z0 x1 y1 z1, metres in the map's frame.
             max_distance: metres; the cost grows with its cube.
-            subvoxel, min_weight: as for `Volume.distance_field`.
+            subvoxel, min_weight, unseen_is_free: as for `Volume.distance_field`.
             timeout: seconds; None = the client's.
         """
         question = Field(
@@ -265,7 +271,8 @@ class MapClient:
         answer, arrays, delay = self._ask(question, [], timeout)
         found = _all(arrays, "distance", "occupancy", "origin", "voxel_size", "max_distance")
         edge, farthest = float(found["voxel_size"]), float(found["max_distance"])
-        field = DistanceField(found["origin"], edge, found["distance"], found["occupancy"], farthest)
+        distance = blocked(found["distance"], found["occupancy"], unseen_is_free=unseen_is_free)
+        field = DistanceField(found["origin"], edge, distance, found["occupancy"], farthest)
         return _answered(field, answer, delay)
 
     def _ask(

@@ -264,6 +264,7 @@ class Answer(Struct, frozen=True, kw_only=True):
         crc: CRC-32 of all frames.
         waited_s: from when the server got the question until it was looked at.
         took_s: to answer it.
+        reach: of samples, metres before a surface up to which they are known.
     """
 
     arrays: tuple[ArrayLayout, ...]
@@ -271,6 +272,7 @@ class Answer(Struct, frozen=True, kw_only=True):
     crc: int
     waited_s: float = 0.0
     took_s: float = 0.0
+    reach: float = 0.0
 
 
 def crc_of(frames: Sequence[Any]) -> int:
