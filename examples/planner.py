@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Ask a live map whether a path is free: `python examples/planner.py [ADDRESS]`."""
+"""Ask a live map whether a path is free: `python examples/planner.py [ADDRESS [X Y Z X Y Z]]`."""
 
 import sys
 
@@ -9,7 +9,8 @@ from tsfusion import AnswerLate, MapClient
 
 RADIUS = 0.15  # metres: half the robot's width
 address = sys.argv[1] if sys.argv[1:] else "tcp://127.0.0.1:5555"
-path = np.linspace([-1.5, 0.4, 0.85], [1.5, 0.4, 0.85], 61)  # (61, 3) metres of the map: 5 cm a step
+begin, end = np.reshape(sys.argv[2:8] or [-1.5, 0.4, 0.85, 1.5, 0.4, 0.85], (2, 3)).astype(float)
+path = np.linspace(begin, end, 61)  # (61, 3) metres of the map: of 3 m 5 cm a step
 box = [*(path.min(axis=0) - RADIUS), *(path.max(axis=0) + RADIUS)]
 
 with MapClient(address, timeout=0.5) as live:

@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 from command_processes import DEADLINE, environment, server
 from repository import ROOT
+from thin_obstacles import POSTS, views
 
-from tsfusion import Keyframe, Volume, open_dataset
+from tsfusion import Client, Keyframe, Volume, open_dataset
 from tsfusion.geometry.trajectory import quaternion
 from tsfusion.wire.queries import fetch_status
 
@@ -27,21 +28,21 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         yield found
 
 
-def example(name: str, address: str, folder: Path) -> str:
+def example(name: str, address: str, folder: Path, *words: object) -> str:
     """Output of an example; it is run in a folder of its own."""
     done = subprocess.run(
-        [sys.executable, ROOT / "examples" / name, address], cwd=folder, env=environment(), text=True,
-        check=False, capture_output=True, timeout=DEADLINE,
+        [sys.executable, ROOT / "examples" / name, address, *map(str, words)],
+        cwd=folder, env=environment(), text=True, check=False, capture_output=True, timeout=DEADLINE,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
 
-def answered(address: str, folder: Path) -> str:
+def answered(address: str, folder: Path, *words: object) -> str:
     """Output of the planner; on a loaded machine half a second is too short now and then."""
     for _ in range(20):
         try:
-            return example("planner.py", address, folder)
+            return example("planner.py", address, folder, *words)
         except AssertionError as error:
             if "did not answer in time" not in str(error):
                 raise
@@ -61,6 +62,26 @@ def test_poses_of_an_own_slam_and_a_planner_that_asks(address: str, tmp_path: Pa
     expected = volume.distance_field(box, max_distance=0.3).at(np.array([[x, y, z]]))[0]
     assert abs(distance - expected) < 0.02  # printed to a centimetre
     assert "of a map of 8 keyframes" in said
+
+
+def test_the_planner_stops_at_a_wall_a_post_and_what_is_unseen(tmp_path: Path) -> None:
+    how = ("--voxel-size", 0.04, "--sensor", "tof", "--space-carving")
+    with server(tmp_path / "state", *how) as (address, _):
+        with Client(address) as client:
+            for view in views(1.0, color=True):
+                client.send(view)
+            client.wait_settled(DEADLINE)
+        wall, post = POSTS[0][0] + 1.0, POSTS[2]
+        free = answered(address, tmp_path, wall - 0.6, -0.3, 1.1, wall - 0.6, 0.3, 1.1)
+        along = answered(address, tmp_path, wall - 0.1, -0.3, 1.1, wall - 0.1, 0.3, 1.1)
+        through = answered(address, tmp_path, 2.5, post[1], 1.1, 3.5, post[1], 1.1)
+        unseen = answered(address, tmp_path, wall + 0.4, -0.3, 1.1, wall + 0.4, 0.3, 1.1)
+    assert "the path keeps 0.2" in free or "the path keeps 0.3" in free
+    assert re.match(r"0\.(0[6-9]|1[0-4]) m from a surface", along)
+    place = re.search(r"at \[(.*?),.*stop before it", through)
+    assert place is not None
+    assert abs(float(place[1]) - (post[0] - 0.15)) < 0.08
+    assert unseen.startswith("0.00 m from a surface, or 0 as unseen")
 
 
 def test_two_robots_fill_one_map(address: str, tmp_path: Path) -> None:
