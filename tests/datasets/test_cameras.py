@@ -9,8 +9,17 @@ import own_recordings
 import pytest
 from geometry_checks import warp_residual
 from own_recordings import KINECT
-from small_recordings import CAMERA, corbs, kitti, one_line, redwood, seven_scenes
-from written_recordings import check, matrix, millimetres, through_lens, transforms, views, write
+from small_recordings import CAMERA, corbs, hololens, kitti, one_line, redwood, seven_scenes
+from written_recordings import (
+    check,
+    matrix,
+    millimetres,
+    scannet,
+    through_lens,
+    transforms,
+    views,
+    write,
+)
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets import TUM, Redwood, describe, open_dataset, select
@@ -19,6 +28,7 @@ from tsfusion.datasets.formats.sevenscenes import KINECT as SEVEN_SCENES
 from tsfusion.geometry.calibration import Camera
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.scanner.sources.recorded import RecordedSource
+from tsfusion.scanner.sources.watched_folder import WatchedFolder
 
 GIVEN = Intrinsics(585, 585, 320, 240)
 PRIMESENSE = Intrinsics(525, 525, 319.5, 239.5)  # which was taken for the camera of both
@@ -71,6 +81,74 @@ FILES = {
     "Camera.yml": "%YAML:1.0\nCamera.fx: 9.0\nCamera.fy: 8.0\nCamera.cx: 4.0\nCamera.cy: 3.0\n"
     "Camera.k1: 0.0\nCamera.width: 8\nCamera.height: 6\n",
 }  # fmt: skip
+
+
+UNITS = {
+    "camera_intrinsic.json": (json.dumps({"intrinsic_matrix": COLUMNS, "depth_scale": 2000.0}), 1 / 2000),
+    "intrinsic.json": (json.dumps({"depth_scale": 0.0001, "depth": {**K, "model": "none"}}), 0.0001),
+    "cam_params.json": (json.dumps({"camera": {**K, "cx": 4, "cy": 3, "scale": 6553.5}}), 1 / 6553.5),
+    "camera.json": (json.dumps({**K, "depth": {"scale": 4000}}), 1 / 4000),
+    "camera_info.json": (json.dumps({**K, "depth_units": "mm"}), 0.001),
+    "Camera.yml": ("Camera.fx: 9.0\nCamera.cx: 4.0\nCamera.cy: 3.0\nDepthMapFactor: 5000.0\n", 1 / 5000),
+    "calibration.yaml": ("cam:\n  fx: 9\n  fy: 8\n  cx: 4\n  cy: 3\n  png_depth_scale: 6553.5\n", 1 / 6553.5),
+    "calib.txt": ("fx: 9\nfy: 8\ncx: 4\ncy: 3\ndepth_factor: 5000\n", 1 / 5000),
+    "camera_param.json": (json.dumps({**K, "scale": 1.0, "depth_trunc": 3, "depth_scale": None}), 0.001),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", UNITS)
+def test_the_unit_of_depth_in_a_file_of_the_camera_counts(tmp_path, name):
+    root = redwood(tmp_path, [0], [0])
+    (root / "camera-intrinsics.txt").unlink()
+    text, metres = UNITS[name]
+    (root / name).write_text(text)
+    source = "as usual" if name == "camera_param.json" else f"from {name}"
+    given = {"intrinsics": Intrinsics(9, 8, 4, 3)}
+    for options in ({}, given):
+        dataset = open_dataset(root, **options)
+        assert dataset[0].depth_scale == pytest.approx(metres, rel=1e-12)
+        assert (
+            f"; depth unit {1000 * metres:.4g} mm ({1 / metres:.6g} a metre), {source}; camera "
+            in describe(dataset)
+        )
+    assert open_dataset(root, depth_scale=0.01)[0].depth_scale == 0.01
+    folder = WatchedFolder(root, idle=0.1)
+    assert next(iter(folder)).depth_scale == pytest.approx(metres, rel=1e-12)
+    assert source in folder.camera
+
+
+@pytest.mark.parametrize("make", [seven_scenes, hololens, corbs, scannet])
+def test_every_layout_heeds_the_unit_of_depth_that_is_given(tmp_path, make):
+    root = make(tmp_path / "recording")
+    calibration = tmp_path / "given.json"
+    height, width = (frame := open_dataset(root, posed=False).frame(0)).shape
+    assert frame.depth_scale in (0.001, 1 / 5000)
+    K = {"fx": width, "cx": width / 2, "cy": height / 2, "width": width, "height": height}
+    calibration.write_text(json.dumps({**K, "depth_scale": 2000}))
+    assert open_dataset(root, posed=False, calibration=calibration).frame(0).depth_scale == 1 / 2000
+    assert open_dataset(root, posed=False, depth_scale=0.004).frame(0).depth_scale == 0.004
+
+
+@pytest.mark.parametrize(
+    ("stated", "message"),
+    [
+        ({"depth_scale": 0}, r"intrinsic\.json: depth_scale is no unit of depth; expected metres a unit"),
+        ({"depth_scale": "soon"}, "depth_scale is no unit of depth"),
+        ({"depth_scale": 0.5}, "depth_scale is no unit of depth"),
+        ({"depth_scale": 1e9}, "depth_scale is no unit of depth"),
+        ({"depth_scale": 1000, "depth_units": 0.0002}, "several units of depth: depth_scale, depth_units"),
+    ],
+)
+def test_a_unit_of_depth_that_is_none_is_refused(tmp_path, stated, message):
+    root = redwood(tmp_path, [0], [0])
+    (root / "camera-intrinsics.txt").unlink()
+    (root / "intrinsic.json").write_text(json.dumps({**K, **stated}))
+    one_line(lambda: open_dataset(root), message)
+    (root / "intrinsic.json").write_text(json.dumps({**K, "depth_scale": 1000}))
+    (root / "camera.json").write_text(json.dumps({**K, "depth_scale": 5000}))
+    one_line(
+        lambda: open_dataset(root), "two units of depth contradict each other: 0.0002 m of .*, 0.001 m of"
+    )
 
 
 SKEWED = {

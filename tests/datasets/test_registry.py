@@ -3,6 +3,7 @@
 
 import json
 import logging
+import re
 import shutil
 import zipfile
 from pathlib import Path
@@ -62,7 +63,7 @@ def test_a_recording_without_poses_is_there_for_a_scan(tmp_path, layout):
     assert isinstance(dataset, Dataset)
     assert (len(dataset), dataset.skipped) == (3, {})
     assert all(dataset.frame(index).T_world_camera is None for index in range(3))
-    assert ", no poses; camera fx " in describe(dataset)
+    assert re.search(r", no poses; (depth unit .*; )?camera fx ", describe(dataset))
     with pytest.raises(DatasetError, match=r"frame 2 of .* has no pose; `tsfusion scan PATH` finds"):
         dataset[2]
     one_line(lambda: open_dataset(root), "pose|trajectory|groundtruth")
@@ -74,7 +75,8 @@ def test_some_poses_are_given_where_they_are_known(tmp_path):
     dataset = open_dataset(tmp_path, posed=False)
     assert [dataset.pose(index) is None for index in range(-4, 0)] == [False, False, True, False]
     said = f"7-Scenes {tmp_path.name}, 4 RGB-D frames 8×6, poses for 3"
-    assert describe(dataset) == f"{said}; camera fx 5 fy 5 cx 4 cy 3, 8×6, from camera-intrinsics.txt"
+    unit = "depth unit 1 mm (1000 a metre), as usual"
+    assert describe(dataset) == f"{said}; {unit}; camera fx 5 fy 5 cx 4 cy 3, 8×6, from camera-intrinsics.txt"
     every_second = select(dataset, stride=2)
     assert [pose_of(every_second, index) is None for index in range(2)] == [False, True]
     assert isinstance(every_second, Selection)
@@ -257,7 +259,7 @@ def test_replay_says_what_it_found(tmp_path):
     done = tsfusion("replay", tmp_path / "scan.zip", "--unpack", "--sensor", "sonar")
     assert done.returncode == 1
     first, second = done.stderr.splitlines()
-    assert first.startswith("found: ScanNet scene0000_00, 3 RGB-D frames 160×120, all with poses; camera fx")
+    assert first.startswith("found: ScanNet scene0000_00, 3 RGB-D frames 160×120, all with poses; depth unit")
     assert "sonar" in second
     assert (tmp_path / "scan" / "scene0000_00").is_dir()
 

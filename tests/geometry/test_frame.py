@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tsfusion.core.errors import InvalidKeyframe
 from tsfusion.geometry import frame as frame_module
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
@@ -57,3 +58,17 @@ def test_other_frames_have_nothing_to_match() -> None:
     assert frame.tracking_disparity is None
     matched = dataclasses.replace(pair(), left=None, right=None, disparity=pair().matched)
     assert matched.tracking_disparity is None
+
+
+@pytest.mark.parametrize("dtype", [np.uint16, np.float32])
+def test_distances_along_rays_become_depth(dtype: type) -> None:
+    K, unit = Intrinsics(40.0, 50.0, 31.5, 20.0), 0.001 if dtype == np.uint16 else 1.0
+    v, u = np.mgrid[:48, :64]
+    length = np.linalg.norm(np.stack([(u - K.cx) / K.fx, (v - K.cy) / K.fy, np.ones(u.shape)]), axis=0)
+    z = np.where(u > 5, 2.0 + 0.01 * v, 0.0)
+    measured = (z * length / unit).round(0 if dtype == np.uint16 else 9).astype(dtype)
+    frame = Frame(sensor="kinect", depth=measured, intrinsics=K, timestamp_ns=7).along_axis()
+    assert (frame.depth.dtype, frame.timestamp_ns) == (dtype, 7)
+    np.testing.assert_allclose(frame.depth_m, z, atol=0.0011 if dtype == np.uint16 else 1e-6)
+    with pytest.raises(InvalidKeyframe, match="is for depth images, and this is one of points"):
+        Frame(sensor="lidar", points=np.ones((3, 3))).along_axis()

@@ -8,7 +8,8 @@ recordings (by their names) and its own image size alone.
 import os
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from contextlib import nullcontext, suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from tsfusion.core.errors import DatasetError, InvalidConfig
 from tsfusion.datasets.dataset import Dataset, frame_of
 from tsfusion.datasets.readers import checked_intrinsics
 from tsfusion.geometry.calibration import Camera, Size, Undistorter
-from tsfusion.geometry.calibration_files import read_camera
+from tsfusion.geometry.calibration_files import read_camera, read_depth_unit
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
 
@@ -50,6 +51,21 @@ class PublishedCamera:
     size: Size = (480, 640)
 
 
+@dataclass(frozen=True)
+class DepthUnit:
+    """The unit of a recording's integer depth, and where it comes from; `str` says both."""
+
+    metres: float
+    source: str
+    is_stated: bool = True  # else it is what such a layout usually has
+
+    def __str__(self) -> str:
+        return f"depth unit {1000 * self.metres:.4g} mm ({1 / self.metres:.6g} a metre), {self.source}"
+
+
+MILLIMETRES = DepthUnit(0.001, "as usual", is_stated=False)
+
+
 @dataclass(frozen=True, eq=False)
 class RecordedCamera:
     """The pinhole camera of a recording's depth images, and where it came from; `str` says both."""
@@ -58,6 +74,7 @@ class RecordedCamera:
     size: Size  # (height, width) of the depth images
     source: str
     undistorter: Undistorter | None = None
+    stated_unit: DepthUnit | None = None  # of depth, as a file of the camera states it
 
     def __str__(self) -> str:
         undistorted = "" if self.undistorter is None else ", undistorted"
@@ -69,6 +86,10 @@ class RecordedCamera:
     def lens(self) -> Camera:
         """The camera before its distortion is removed."""
         return Camera(self.intrinsics, self.size) if self.undistorter is None else self.undistorter.camera
+
+    def depth_unit(self, given: float | None, usual: DepthUnit = MILLIMETRES) -> DepthUnit:
+        """The unit of the depth images: as given (metres), else as stated by a file, else the usual one."""
+        return self.stated_unit or usual if given is None else DepthUnit(given, "as given")
 
     def depth(self, depth: NDArray[Any]) -> NDArray[Any]:
         """Depth without the distortion of the lens: the nearest pixel's, 0 where the camera did not see."""
@@ -92,6 +113,15 @@ def camera_line(dataset: Dataset, first: Frame | None = None) -> str:
         return str(camera)
     first = frame_of(dataset, 0) if first is None else first
     return "" if first.intrinsics is None else f"{described(first.intrinsics, first.shape)}, from its frames"
+
+
+def depth_line(dataset: Dataset, first: Frame) -> str:
+    """The unit of a dataset's depth images and where it comes from; empty where it has none."""
+    if first.depth is None:
+        return ""
+    unit = getattr(dataset, "depth_unit", None) or DepthUnit(first.depth_scale, "from its frames")
+    along = ", measured along each pixel's ray" * getattr(dataset, "along_ray", False)
+    return ("depth in metres" if first.depth.dtype == np.float32 else str(unit)) + along
 
 
 def find_camera(
@@ -122,12 +152,14 @@ def find_camera(
     """
     height_width = int(size[0]), int(size[1])
     given = given_camera(height_width, intrinsics=intrinsics, calibration=calibration)
-    if given is not None:
+    own = [*files]
+    with nullcontext() if given is None else suppress(DatasetError):
+        own = own or next(filter(None, (camera_files(place) for place in places or (root,))), [])
+    if given is not None and given.stated_unit is not None:
         return given
-    found = next(filter(None, (camera_files(place) for place in places or (root,))), [])
-    recorded = _consistent([*files] or found, height_width, root)
+    recorded = given or _consistent(own, height_width, root)
     if recorded is not None:
-        return recorded
+        return replace(recorded, stated_unit=_stated_unit(own, root))
     if published is not None and published.size == height_width:
         return RecordedCamera(published.intrinsics, height_width, f"published for {published.name}")
     raise UnknownCamera(_unknown(root, height_width, published))
@@ -146,7 +178,8 @@ def given_camera(
     if calibration is None:
         return None
     path = Path(calibration).expanduser()
-    return _fitted(read_camera(path, size=size), size, path, f"from the given {path.name}")
+    fitted = _fitted(read_camera(path, size=size), size, path, f"from the given {path.name}")
+    return replace(fitted, stated_unit=_stated_unit([path], path.parent))
 
 
 def camera_files(place: Path) -> list[Path]:
@@ -180,6 +213,20 @@ def _consistent(files: Sequence[Path], size: Size, root: Path) -> RecordedCamera
             both = "; ".join(f"{file} says {described(each.intrinsics, each.size)}" for file, each in pair)
             raise DatasetError(f"two cameras contradict each other: {both}; remove one file, or {GIVE}")
     return next((one for one in fitted if one.undistorter is not None), fitted[0] if fitted else None)
+
+
+def _stated_unit(files: Sequence[Path], root: Path) -> DepthUnit | None:
+    """The unit of depth that a camera's files state; raises DatasetError where two contradict each other."""
+    stated = [(metres, path) for path in files if (metres := read_depth_unit(path)) is not None]
+    if not stated:
+        return None
+    metres, path = stated[0]
+    if other := next((each for each in stated if abs(each[0] / metres - 1) > _EQUAL_SHARE), None):
+        raise DatasetError(
+            f"two units of depth contradict each other: {metres:.4g} m of {path}, {other[0]:.4g} m of "
+            f"{other[1]}; remove one, or give --option depth_scale=METRES"
+        )
+    return DepthUnit(metres, f"from {os.path.relpath(path, root)}")
 
 
 def _agree(one: Camera, other: Camera, size: Size) -> bool:

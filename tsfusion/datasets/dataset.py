@@ -56,6 +56,8 @@ class Frames(ShownRecording):
     """Base of recordings: indexing and iteration over `_frame(index)`, which alone opens a frame's files."""
 
     camera: Any = None  # `cameras.RecordedCamera` of depth images; None = points
+    depth_unit: Any = None  # `cameras.DepthUnit` of integer depth
+    along_ray: bool = False  # whether depth was measured along each pixel's ray; `frame` gives z all the same
     timestamps_ns: NDArray[np.int64] | None = None
     quaternions: bool = False  # whether rotations were recorded as quaternions; else as matrices
     usual: Mapping[str, Any] = MappingProxyType({})  # settings of a map of such a place (`VolumeConfig`)
@@ -69,7 +71,8 @@ class Frames(ShownRecording):
         """The measurement alone; `T_world_camera` where the recording has a pose for it."""
         index = self._checked(index)
         try:
-            return self._frame(index)
+            frame = self._frame(index)
+            return frame.along_axis() if self.along_ray else frame
         except InvalidKeyframe as error:
             raise DatasetError(f"keyframe {index} of {self.name}: {error}") from error
 
@@ -136,7 +139,7 @@ class Selection(Frames):
     def __init__(self, dataset: Dataset, indices: Sequence[int]) -> None:
         self.name, self.sensor, self.skipped = dataset.name, dataset.sensor, dataset.skipped
         self._dataset, self._indices = dataset, list(indices)
-        self.camera = getattr(dataset, "camera", None)
+        self.camera, self.depth_unit = (getattr(dataset, name, None) for name in ("camera", "depth_unit"))
         self.quaternions = getattr(dataset, "quaternions", False)
         self.usual = getattr(dataset, "usual", {})
         if hasattr(dataset, "distance"):

@@ -77,7 +77,7 @@ class WithTrajectory(Frames):
     def __init__(self, dataset: Dataset, path: Path, *, posed: bool = True, **where: float) -> None:
         self._dataset, self.skipped = dataset, dict(dataset.skipped)
         self.name, self.sensor = dataset.name, dataset.sensor
-        self.camera = getattr(dataset, "camera", None)
+        self.camera, self.depth_unit = (getattr(dataset, name, None) for name in ("camera", "depth_unit"))
         self.usual = getattr(dataset, "usual", {})
         found = poses_of(path, len(dataset), dataset.timestamps_ns, posed=posed, **where)
         self._indices, self._poses = keep_posed(

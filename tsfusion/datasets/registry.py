@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 from tsfusion.core import plugins
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets.dataset import Dataset
+from tsfusion.datasets.dataset import Dataset, Frames
 from tsfusion.datasets.download import archives
 from tsfusion.datasets.formats import (
     euroc,
@@ -153,10 +153,20 @@ def find(path: str | Path, *, unpack: bool = False) -> Found:
 def open_as(name: str, opener: Callable[..., Dataset], options: dict[str, Any]) -> Dataset:
     """Call a layout's opener; it may lack the options `posed` and `trajectory`; `poses` is the latter.
 
+    The option `depth_along_ray` is for all: depth images hold distances along rays, which become depth.
+
     Raises:
         DatasetError: an option that it does not take, or of the wrong type.
     """
     options = dict(options)
+    if (along_ray := options.pop("depth_along_ray", None)) is not None:
+        dataset = open_as(name, opener, options)
+        if not isinstance(along_ray, bool) or not isinstance(dataset, Frames):
+            raise DatasetError(
+                f"depth_along_ray is true or false, of depth images in files; got {along_ray!r} for {name}"
+            )
+        dataset.along_ray = along_ray
+        return dataset
     if not plugins.takes(opener, "posed"):
         options.pop("posed", None)
     for camera in ("intrinsics", "calibration"):
@@ -180,7 +190,7 @@ def open_as(name: str, opener: Callable[..., Dataset], options: dict[str, Any]) 
 
 def describe(dataset: Dataset) -> str:
     """One line: number and kind of frames, size, rate, how many have a pose, the camera. Reads one frame."""
-    from tsfusion.datasets.cameras import camera_line
+    from tsfusion.datasets.cameras import camera_line, depth_line
     from tsfusion.datasets.dataset import frame_of, pose_of
 
     first = frame_of(dataset, 0)
@@ -195,8 +205,9 @@ def describe(dataset: Dataset) -> str:
     poses = "no poses" if not posed else "all with poses" if posed == len(dataset) else f"poses for {posed}"
     uncolored = getattr(dataset, "uncolored", 0)
     color = f", {uncolored} without colour in time" if uncolored else ""
+    unit = depth_line(dataset, first)
     camera = camera_line(dataset, first)
-    seen = f"; camera {camera}" if camera else ""
+    seen = f"; {unit}" * bool(unit) + f"; camera {camera}" * bool(camera)
     return f"{dataset.name}, {len(dataset)} {kind}{size}{rate}, {poses}{color}{seen}"
 
 

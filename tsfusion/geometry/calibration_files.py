@@ -9,6 +9,8 @@ by OpenCV's FileStorage.
 
 import json
 import re
+from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -27,16 +29,30 @@ EXPECTED_CAMERA = (
     "Kalibr's, EuRoC's, ROS's, OpenCV's, Open3D's or RealSense's file of a camera; or in a .txt its 3×3 "
     "matrix, or fx fy cx cy"
 )
-_PARTS = ("cam0", "camera", "intrinsic", "intrinsics", "depth")  # where files with more have the camera
+_PARTS = (
+    "cam0",
+    "cam",
+    "camera",
+    "camera_params",
+    "intrinsic",
+    "intrinsics",
+    "depth",
+)  # where files with more have the camera
 _MATRICES = ("camera_matrix", "cameraMatrix", "intrinsic_matrix", "camera_intrinsics", "K", "k", "mtx")
 _COEFFICIENTS = (
     "distortion_coefficients", "distortion_coeffs", "distCoeffs", "dist_coeffs", "coeffs", "distortion",
     "dist", "D", "d",
 )  # fmt: skip
 _NAMED_COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-_SIZES = (("image_width", "image_height"), ("width", "height"), ("w", "h"), ("cols", "rows"))
+_SIZES = (("image_width", "image_height"), ("width", "height"), ("w", "h"), ("W", "H"), ("cols", "rows"))
 _ORB_SLAM = ("Camera.", "Camera1.")  # in front of its names
 _MAX_TEXT, _MAX_DEPTH, _MAX_INDENTATION = 1 << 20, 64, 256  # characters, brackets or tags, spaces
+# Of a unit of depth, in small letters: depth_scale, png_depth_scale, DepthMapFactor, depth.units, …
+_DEPTH_UNIT = re.compile(
+    r"depth.*(scal(e|ing)|factor(?!y)|unit)|unitsper(meter|metre|m)$|(^|cam|camera)scale$"
+)
+_METRES = {"m": 1.0, "meter": 1.0, "metre": 1.0, "mm": 0.001, "millimeter": 0.001, "millimetre": 0.001}
+_FINEST_UNIT, _COARSEST_UNIT = 1e-6, 0.1  # metres, of integer depth; or one metre
 Tree = dict[str, Any]
 
 
@@ -56,6 +72,55 @@ def read_camera(path: str | Path, *, size: Size | None = None) -> Camera:
         return _camera(read_tree(path), size)[0]
     except (InvalidConfig, KeyError, TypeError, ValueError, OverflowError) as error:
         raise _malformed([path], error, EXPECTED_CAMERA) from error
+
+
+def read_depth_unit(path: str | Path) -> float | None:
+    """Metres a unit of integer depth as a camera's file states it; None = it does not, or cannot be read.
+
+    A number above 1 is of units a metre, whatever its name: Open3D's `depth_scale` is 1000, others' 0.001.
+
+    Raises:
+        DatasetError: no unit of depth, or several.
+    """
+    path, tree = Path(path), {}
+    with suppress(DatasetError):
+        is_text = path.suffix.lower() in (".txt", "")
+        tree = _named_in_text(read_text(path, EXPECTED_CAMERA)) if is_text else read_tree(path)
+    stated = {name: _metres(value) for name, value in _leaves(tree) if _is_depth_unit(name, value)}
+    for name, metres in stated.items():
+        if metres is None:
+            raise DatasetError(
+                f"{path}: {name} is no unit of depth; expected metres a unit (0.001) or units a metre (1000)"
+            )
+    if len({f"{metres:.4g}" for metres in stated.values()}) > 1:
+        raise DatasetError(f"{path} states several units of depth: {', '.join(stated)}; leave one of them")
+    return next(iter(stated.values()), None)
+
+
+def _leaves(tree: Tree, above: str = "") -> Iterator[tuple[str, Any]]:
+    """Values of a file by their names, with the names above them: `depth.scale`."""
+    for name, value in tree.items():
+        if isinstance(value, dict):
+            yield from _leaves(value, f"{above}{name}.")
+        else:
+            yield f"{above}{name}", value
+
+
+def _is_depth_unit(name: str, value: Any) -> bool:
+    plain = re.sub(r"[^a-z]", "", name.lower())
+    match = None if isinstance(value, bool | list) or value is None else _DEPTH_UNIT.search(plain)
+    # `scale` alone may be that of the images
+    return match is not None and ("depth" in plain or "unit" in plain or _metres(value) not in (None, 1.0))
+
+
+def _metres(value: Any) -> float | None:
+    """Metres a unit in a value that states them or units a metre; None = it states neither."""
+    try:
+        number = _METRES.get(str(value).strip().lower().removesuffix("s")) or float(value)
+    except ValueError:
+        return None
+    metres = 1 / number if number > 1 else number
+    return metres if metres == 1 or _FINEST_UNIT <= metres <= _COARSEST_UNIT else None
 
 
 def read_rig(*paths: str | Path, size: Size | None = None) -> StereoRig:
@@ -157,7 +222,7 @@ def _plain(node: Any) -> Any:
 def _camera(tree: Tree, size: Size | None) -> tuple[Camera, Tree]:
     """Read the camera; also return its part of the file."""
     while (part := next((name for name in _PARTS if isinstance(tree.get(name), dict)), None)) is not None:
-        if "data" in tree[part]:  # a matrix of OpenCV's
+        if "data" in tree[part] or "fx" in tree:  # a matrix of OpenCV's, or other things beside the camera
             break
         tree = tree[part]
     size = _stated_size(tree) or size
@@ -233,10 +298,10 @@ def _is_fisheye(tree: Tree) -> bool:
 
 def _camera_in_text(text: str, size: Size | None) -> Camera:
     """`fx: 585` a line; or a matrix, or fx fy cx cy [k1 k2 p1 p2 [k3]] [width height] in any lines."""
-    lines = [line.split("#")[0].strip() for line in text.splitlines()]
-    found = [re.fullmatch(r"([\w.]+)\s*[:=]\s*(\S+)", line) for line in lines]
-    if named := {match[1]: float(match[2]) for match in found if match}:
-        return _camera(named, size)[0]
+    if named := _named_in_text(text):
+        numbers = {name: float(word) for name, word in named.items() if not _is_depth_unit(name, word)}
+        return _camera(numbers, size)[0]
+    lines = (line.split("#")[0] for line in text.splitlines())
     values = _numbers(re.sub(r"[\[\],;()]", " ", " ".join(lines)).split())
     if not np.isfinite(values).all():
         raise InvalidConfig("the numbers must be finite")
@@ -247,6 +312,12 @@ def _camera_in_text(text: str, size: Size | None) -> Camera:
     if values.size not in (4, 8, 9):
         raise InvalidConfig(f"{values.size} numbers")
     return Camera.named(values[:4], _given(size), "plumb_bob", values[4:])
+
+
+def _named_in_text(text: str) -> Tree:
+    lines = (line.split("#")[0].strip() for line in text.splitlines())
+    found = (re.fullmatch(r"([\w.]+)\s*[:=]\s*(\S+)", line) for line in lines)
+    return {match[1]: match[2] for match in found if match}
 
 
 def _rig(trees: list[Tree], size: Size | None) -> StereoRig:

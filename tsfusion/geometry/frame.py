@@ -90,6 +90,18 @@ class Frame:
         fields = {name: getattr(keyframe, name) for name in names}
         return cls(**{**fields, "sensor": keyframe.sensor or sensor})
 
+    def along_axis(self) -> "Frame":
+        """The frame with depth along the optical axis, where it was measured along each pixel's ray.
+
+        Raises:
+            InvalidKeyframe: it has no depth image.
+        """
+        if self.depth is None or self.intrinsics is None:
+            raise InvalidKeyframe(f"depth_along_ray is for depth images, and this is one of {self.kind}")
+        z = self.depth / self.intrinsics.ray_lengths(self.depth.shape)
+        z = np.rint(z).astype(np.uint16) if self.depth.dtype == np.uint16 else z
+        return dataclasses.replace(self, depth=z)
+
     def keyframe(self, T_world_camera: NDArray[np.float64]) -> Keyframe:
         """Make a keyframe of the frame; a stereo pair is matched for it."""
         if self.kind != "pair":

@@ -2,7 +2,7 @@
 """Keyframes: measurements of any sensor with a pose, checked once at construction."""
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any, Literal, TypeVar
@@ -47,6 +47,12 @@ class Intrinsics(msgspec.Struct, frozen=True, array_like=True):
     def matrix(self) -> NDArray[np.float64]:
         """Camera matrix K, (3, 3) float64."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    def ray_lengths(self, shape: Sequence[int]) -> NDArray[np.float32]:
+        """(H, W) float32 length of each pixel's ray where its depth along the optical axis is 1."""
+        x = (np.arange(shape[1]) - self.cx) / self.fx
+        y = (np.arange(shape[0]) - self.cy) / self.fy
+        return np.sqrt(1 + x**2 + y[:, None] ** 2).astype(np.float32)
 
     def scaled(self, factor: float) -> "Intrinsics":
         """Intrinsics of the image resized by `factor` (pixel centres at integers)."""

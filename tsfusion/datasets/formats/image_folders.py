@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets import depth_files
-from tsfusion.datasets.cameras import RecordedCamera
+from tsfusion.datasets.cameras import MILLIMETRES, DepthUnit, RecordedCamera
 from tsfusion.datasets.dataset import Frames
 from tsfusion.datasets.depth_files import check_metres, read_depth
 from tsfusion.datasets.file_names import in_order, numbers_in
@@ -32,7 +32,8 @@ class DepthImages(Frames):
         color: as many files, None where there is no colour; or an empty list.
         poses: as many (4, 4), None where there is no pose.
         camera: of the depth images; distortion is removed from depth and colour.
-        depth_scale: metres per unit; None = `usual_scale` for 16 bits, and floats are metres.
+        depth_scale: metres per unit; None = for 16 bits as the camera's file states, else `usual_unit`, and
+            floats are metres.
     """
 
     camera: RecordedCamera
@@ -48,12 +49,13 @@ class DepthImages(Frames):
         camera: RecordedCamera,
         skipped: dict[str, int],
         depth_scale: float | None = None,
-        usual_scale: float = 0.001,
+        usual_unit: DepthUnit = MILLIMETRES,
         timestamps_ns: NDArray[np.int64] | None = None,
     ) -> None:
         self.name, self.sensor, self.skipped, self.camera = name, sensor, skipped, camera
         self.intrinsics, self.timestamps_ns = camera.intrinsics, timestamps_ns
-        self.depth_scale = usual_scale if depth_scale is None else depth_scale
+        self.depth_unit = camera.depth_unit(depth_scale, usual_unit)
+        self.depth_scale = self.depth_unit.metres
         self._float_scale = 1.0 if depth_scale is None else depth_scale
         self._depth, self._color, self._poses = depth, color, poses
         self._kind: np.dtype[Any] | None = None  # of the first depth image that was read

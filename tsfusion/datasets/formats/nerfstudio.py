@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError, InvalidConfig, InvalidKeyframe
-from tsfusion.datasets.cameras import RecordedCamera, given_camera
+from tsfusion.datasets.cameras import MILLIMETRES, DepthUnit, RecordedCamera, given_camera
 from tsfusion.datasets.dataset import Frames, keep_posed, require_frames
 from tsfusion.datasets.depth_files import check_metres, read_depth
 from tsfusion.datasets.formats.image_folders import resample_for_camera
@@ -22,7 +22,6 @@ from tsfusion.geometry.keyframe import Intrinsics, check_pose
 from tsfusion.geometry.se3 import Transform
 
 EXPECTED = "transforms.json with fl_x, cx, … and frames of file_path, depth_file_path, transform_matrix"
-DEPTH_SCALE = 0.001  # metres per unit, where the file does not say
 _LARGEST = 1e15
 _OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # camera axes: OpenGL's y up, z back → OpenCV's
 _MODELS = {
@@ -89,7 +88,8 @@ class Nerfstudio(Frames):
         file = path if path.is_file() else path / "transforms.json"
         capture = _read(file)
         self.name, self.sensor, self.skipped = f"nerfstudio {file.absolute().parent.name}", sensor, {}
-        self.depth_scale = _depth_scale(capture, file) if depth_scale is None else depth_scale
+        own = _depth_unit(capture, file)
+        self.depth_scale = own.metres if depth_scale is None else depth_scale
         applied = _scale(capture, "applied_scale", file) if "applied_scale" in capture else 1.0
         listed, poses = [], []
         for number, frame in enumerate(capture["frames"]):
@@ -110,6 +110,8 @@ class Nerfstudio(Frames):
         self._undistorters: dict[Camera, Undistorter] = {}
         self._given: Camera | None = None  # instead of the file's
         self.camera = self._camera_of_first(file, intrinsics, calibration)
+        self.depth_unit = self.camera.depth_unit(depth_scale, own)
+        self.depth_scale = self.depth_unit.metres
 
     def __len__(self) -> int:
         return len(self._listed)
@@ -260,11 +262,11 @@ def _number(given: dict[str, Any], key: str, where: str) -> float:
     return float(value)
 
 
-def _depth_scale(capture: dict[str, Any], file: Path) -> float:
+def _depth_unit(capture: dict[str, Any], file: Path) -> DepthUnit:
     for key in ("depth_unit_scale_factor", "integer_depth_scale"):
         if key in capture:
-            return _scale(capture, key, file)
-    return DEPTH_SCALE
+            return DepthUnit(_scale(capture, key, file), f"from {file.name}")
+    return MILLIMETRES
 
 
 def _scale(capture: dict[str, Any], key: str, file: Path) -> float:

@@ -83,6 +83,7 @@ class HoloLens(DepthImages):
 
     Args:
         intrinsics, calibration: instead of `K.txt`.
+        depth_scale: metres per unit; default as a file of the camera states, else 0.001.
         posed: `poses.txt` must be there; else frames come without a pose where it is not.
 
     Raises:
@@ -95,6 +96,7 @@ class HoloLens(DepthImages):
         *,
         intrinsics: Intrinsics | None = None,
         calibration: str | Path | None = None,
+        depth_scale: float | None = None,
         sensor: str = "tof",
         color: bool = True,
         posed: bool = True,
@@ -118,6 +120,7 @@ class HoloLens(DepthImages):
             poses=poses,
             camera=find_camera(root, first_size(depth), intrinsics=intrinsics, calibration=calibration),
             skipped={},
+            depth_scale=depth_scale,
         )
 
 
@@ -135,7 +138,7 @@ class Redwood(DepthImages):
             `*traj*.log` or `*-traj.txt`; a file of another SLAM in TUM's or KITTI's format too.
         intrinsics, calibration: default a file of the camera in the folder (`cameras.FILES`); for recordings
             that Redwood and Open3D distribute, known by their names, at 640×480 else 525, 525, 319.5, 239.5.
-        depth_scale: metres per unit; default 0.001, and 1 for floats.
+        depth_scale: metres per unit; default as a file of the camera states, else 0.001, and 1 for floats.
         time_offset_s: added to an image's time before its pose is looked up, seconds.
         posed: leave out frames without a pose; else they are kept, with `T_world_camera` None.
 

@@ -4,18 +4,17 @@
 from pathlib import Path
 
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets.cameras import PublishedCamera, find_camera
+from tsfusion.datasets.cameras import DepthUnit, PublishedCamera, find_camera
 from tsfusion.datasets.dataset import SCAN, keep_posed, require_folder, require_frames
 from tsfusion.datasets.formats.image_folders import DepthImages, depth_images, first_size, images
 from tsfusion.datasets.readers import numbers
 from tsfusion.datasets.trajectory_files import read_matrix_rows
-from tsfusion.geometry.calibration_files import read_tree
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.se3 import Transform
 
 EXPECTED = "traj.txt, results/depthN.png and results/frameN.jpg, with cam_params.json there or one folder up"
 _CAMERA = PublishedCamera("NICE-SLAM's Replica", Intrinsics(600.0, 600.0, 599.5, 339.5), (680, 1200))
-DEPTH_SCALE = 1 / 6553.5  # metres per unit
+_UNIT = DepthUnit(1 / 6553.5, "usual for NICE-SLAM's Replica", is_stated=False)
 
 
 def recognises(path: Path) -> bool:
@@ -32,6 +31,7 @@ class Replica(DepthImages):
 
     Args:
         intrinsics, calibration: instead of that camera.
+        depth_scale: metres per unit, instead of those.
         posed: leave out frames without a pose; else they are kept, with `T_world_camera` None.
 
     Raises:
@@ -44,6 +44,7 @@ class Replica(DepthImages):
         *,
         intrinsics: Intrinsics | None = None,
         calibration: str | Path | None = None,
+        depth_scale: float | None = None,
         sensor: str = "kinect",
         color: bool = True,
         posed: bool = True,
@@ -54,7 +55,6 @@ class Replica(DepthImages):
         depth, poses = keep_posed(files, _poses(root, files, posed=posed), posed=posed, skipped=skipped)
         require_frames(len(depth), root / "results", EXPECTED, skipped)
         file = _camera_file(root)
-        usual_scale = _scale(file)
         super().__init__(
             f"Replica {root.name}",
             sensor=sensor,
@@ -70,7 +70,8 @@ class Replica(DepthImages):
                 published=_CAMERA,
             ),
             skipped=skipped,
-            usual_scale=usual_scale,
+            depth_scale=depth_scale,
+            usual_unit=_UNIT,
         )
 
 
@@ -102,15 +103,3 @@ def _poses(root: Path, files: list[Path], *, posed: bool) -> list[Transform | No
 def _camera_file(root: Path) -> Path | None:
     places = (up / "cam_params.json" for up in (root, root.absolute().parent))
     return next((path for path in places if path.exists()), None)
-
-
-def _scale(path: Path | None) -> float:
-    """Metres per unit, as `camera.scale` says."""
-    if path is None:
-        return DEPTH_SCALE
-    try:
-        return 1 / float(read_tree(path)["camera"]["scale"])
-    except (ValueError, LookupError, TypeError, ArithmeticError) as error:
-        raise DatasetError(
-            f"{path} must hold camera: w, h, fx, fy, cx, cy, scale; {type(error).__name__}: {error}"
-        ) from error

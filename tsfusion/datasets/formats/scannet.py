@@ -42,6 +42,7 @@ class ScanNet(DepthImages):
 
     Args:
         intrinsics, calibration: of the depth camera, instead of its file.
+        depth_scale: metres per unit; default 0.001.
         posed: leave out frames without a pose; else they are kept, with `T_world_camera` None.
 
     Raises:
@@ -54,6 +55,7 @@ class ScanNet(DepthImages):
         *,
         intrinsics: Intrinsics | None = None,
         calibration: str | Path | None = None,
+        depth_scale: float | None = None,
         sensor: str = "kinect",
         color: bool = True,
         posed: bool = True,
@@ -80,6 +82,7 @@ class ScanNet(DepthImages):
                 files=filter(None, [_camera_file(root, "depth")]),
             ),
             skipped=skipped,
+            depth_scale=depth_scale,
         )
 
     def _registered(self, color: Path, depth: NDArray[Any]) -> NDArray[np.uint8]:

@@ -65,6 +65,7 @@ class SevenScenes(Frames):
         *,
         intrinsics: Intrinsics | None = None,
         calibration: str | Path | None = None,
+        depth_scale: float | None = None,
         sensor: str = "kinect",
         color: bool = True,
         register: bool | None = None,
@@ -94,6 +95,7 @@ class SevenScenes(Frames):
             published=PublishedCamera("7-Scenes", KINECT) if own else None,
         )  # fmt: skip
         self.intrinsics = self.camera.intrinsics
+        self.depth_unit = self.camera.depth_unit(depth_scale)
         self._register = own and self.intrinsics == KINECT if register is None else register
 
     def __len__(self) -> int:
@@ -108,11 +110,11 @@ class SevenScenes(Frames):
         color = None if self._suffix is None else read_color(_file(stem, self._suffix), depth.shape)
         if color is not None and self._register:
             registration = _registration(self.intrinsics, depth.shape)
-            color = registration.color_of_depth(color, depth * np.float32(0.001))
+            color = registration.color_of_depth(color, depth * np.float32(self.depth_unit.metres))
         elif color is not None:
             color = np.asarray(self.camera.color(color), np.uint8)
         return self._posed_frame(
-            index, depth=depth, depth_scale=0.001, color=color, intrinsics=self.intrinsics
+            index, depth=depth, depth_scale=self.depth_unit.metres, color=color, intrinsics=self.intrinsics
         )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.accelerometer import read_table
-from tsfusion.datasets.cameras import PublishedCamera, find_camera
+from tsfusion.datasets.cameras import DepthUnit, PublishedCamera, find_camera
 from tsfusion.datasets.dataset import SCAN, keep_posed, require_folder, require_frames
 from tsfusion.datasets.formats.image_folders import DepthImages, first_size
 from tsfusion.datasets.formats.tum_lists import ASSOCIATIONS, read_recording
@@ -22,6 +22,7 @@ EXPECTED = (
     "camera-intrinsics.txt unless it is a recording of TUM, CoRBS or ICL-NUIM"
 )
 DEPTH_SCALE = 1 / 5000  # metres per unit
+_UNIT = DepthUnit(DEPTH_SCALE, "usual for TUM RGB-D", is_stated=False)
 # A Kinect's accelerometer is turned by half around the camera's axis.
 _R_CAMERA_KINECT = np.diag((-1.0, -1.0, 1.0))
 
@@ -73,7 +74,7 @@ class TUM(DepthImages):
             or `*.gt.freiburg` in the folder, or beside it under ICL-NUIM's own name.
         intrinsics, calibration: default a file of the camera in the folder (`cameras.FILES`); else the
             benchmark's, by the folder's name (freiburg1-3, CoRBS, ICL-NUIM), at 640×480 alone.
-        depth_scale: metres per unit; default 1/5000, and 1 for floats.
+        depth_scale: metres per unit; default as a file of the camera states, else 1/5000, and 1 for floats.
         max_difference_s: between a depth image and its colour image, seconds.
         max_gap_s: between the two poses interpolated, seconds; across a longer gap there is no pose.
         time_offset_s: added to an image's stamp before its pose is looked up, seconds.
@@ -134,7 +135,7 @@ class TUM(DepthImages):
             camera=camera,
             skipped=skipped,
             depth_scale=depth_scale,
-            usual_scale=DEPTH_SCALE,
+            usual_unit=DepthUnit(DEPTH_SCALE, f"published for {benchmark.source}") if benchmark else _UNIT,
             timestamps_ns=np.array([listed.timestamps_ns[i] for i in chosen], dtype=np.int64),
         )
         self.uncolored = list(self._color).count(None)

@@ -14,17 +14,17 @@ from typing import Any
 import numpy as np
 
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets.cameras import RecordedCamera
+from tsfusion.datasets.cameras import DepthUnit, RecordedCamera
 from tsfusion.datasets.dataset import Frames, keep_posed, nearest_in_time, require_frames
 from tsfusion.datasets.depth_files import check_metres
 from tsfusion.datasets.rosbag import messages
 from tsfusion.datasets.rosbag.cameras import CameraWatch
 from tsfusion.datasets.rosbag.imu import ImuTopics
-from tsfusion.datasets.rosbag.messages import MILLIMETRES
 from tsfusion.datasets.rosbag.poses import PoseFinder, pose_streams
 from tsfusion.datasets.rosbag.reader import ENDINGS, BagRecording, Message, MessageLocation, recording
 from tsfusion.datasets.rosbag.topics import Modality, TopicChooser, recorded_scale
 from tsfusion.geometry import se3
+from tsfusion.geometry.calibration_files import read_depth_unit
 from tsfusion.geometry.depth_registration import Registration
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
@@ -133,7 +133,8 @@ class Bag(Frames):
         self._float_scale = depth_scale or 1.0
         self.name, self.sensor, self.skipped = f"ROS {path.name}", sensor or chosen.sensor, {}
         self._with_color = color
-        self.depth_scale = depth_scale or recorded_scale(self._recording, chosen.main) or MILLIMETRES
+        self.depth_unit = self._unit(depth_scale, calibration)
+        self.depth_scale = self.depth_unit.metres
         self.uncolored = 0
         poses = PoseFinder(
             path,
@@ -155,6 +156,15 @@ class Bag(Frames):
 
     def __len__(self) -> int:
         return len(self._mains)
+
+    def _unit(self, given: float | None, calibration: str | Path | None) -> DepthUnit:
+        if given is not None:
+            return DepthUnit(given, "as given")
+        stated = None if calibration is None else read_depth_unit(calibration)
+        if stated is not None:
+            return DepthUnit(stated, f"from {Path(str(calibration)).name}")
+        recorded = recorded_scale(self._recording, self._chosen.main)
+        return DepthUnit(recorded or 0.001, "as ROS has it" if recorded is None else "as recorded")
 
     def _index(
         self, poses: PoseFinder, imu: ImuTopics

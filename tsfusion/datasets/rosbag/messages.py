@@ -22,7 +22,6 @@ CAMERA = "sensor_msgs/msg/CameraInfo"
 CLOUD = "sensor_msgs/msg/PointCloud2"
 
 DEPTH_ENCODINGS = ("16UC1", "mono16", "32FC1")
-MILLIMETRES = 0.001
 _QUANTISATION = struct.Struct("<iff")  # compressed_depth_image_transport's ConfigHeader
 
 # Encoding → what it is stored as, channels, and how OpenCV makes BGR of it (None = it is). ROS names a Bayer

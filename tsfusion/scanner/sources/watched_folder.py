@@ -56,7 +56,8 @@ class WatchedFolder(LiveSource):
             `stereo_pairs.read_rectifier` reads it, by default from the folder; without one the images are
             taken as rectified, with intrinsics and `baseline.txt`.
         baseline: metres, of rectified images in left/ and right/.
-        depth_scale: metres per unit; default 0.001, and 1 for floats.
+        depth_scale: metres per unit; default as a file of the camera states, else 0.001, and 1 for floats.
+        depth_along_ray: depth images hold distances along each pixel's ray, instead of z.
         idle: seconds; None = wait for ever.
         deadline: seconds to wait for an incomplete frame or a missing camera.
         poll: seconds between two listings of the folder, at least.
@@ -75,6 +76,7 @@ class WatchedFolder(LiveSource):
         calibration: str | Path | None = None,
         baseline: float | None = None,
         depth_scale: float | None = None,
+        depth_along_ray: bool = False,
         idle: float | None = None,
         deadline: float = 5.0,
         poll: float = 0.05,
@@ -91,7 +93,7 @@ class WatchedFolder(LiveSource):
         self._sensor = sensor
         self._name_sensor()
         self._intrinsics, self._calibration, self._baseline = intrinsics, calibration, baseline
-        self._depth_scale, self._float_scale = depth_scale or 0.001, depth_scale or 1.0
+        self._depth_scale, self._along_ray = depth_scale, depth_along_ray
         self._idle, self._deadline, self._poll = idle, deadline, poll
         self._opened_ns, self._stamp = time.time_ns(), 0
         self._handled: set[str] = set()  # names of first files
@@ -240,23 +242,24 @@ class WatchedFolder(LiveSource):
             depth, color, K = self._undistorted(
                 folder_layouts.depth_of(images[0]), images[1] if images[1:] else None
             )
-        return Frame(
+        frame = Frame(
             sensor=self.sensor,
             depth=depth,
-            depth_scale=self._depth_scale,
+            depth_scale=self._camera.depth_unit(self._depth_scale).metres if kind == "depth" else 0.001,
             points=images[0] if kind == "points" else None,
             color=color,
             intrinsics=K,
             timestamp_ns=timestamp_ns,
             captured_ns=captured_ns,
         )
+        return frame.along_axis() if self._along_ray else frame
 
     def _undistorted(self, depth: NDArray[Any], color: Any) -> tuple[NDArray[Any], Any, Intrinsics]:
         """Undistort depth and colour by the calibration; also return the intrinsics."""
         if depth.shape != self._camera.size:
             raise InvalidKeyframe(f"depth has shape {depth.shape}, others {self._camera.size}")
         if depth.dtype == np.float32:
-            depth = depth * np.float32(self._float_scale)
+            depth = depth * np.float32(self._depth_scale or 1.0)
             try:
                 check_metres(depth, self._root)
             except DatasetError as error:  # so it is with all of them
@@ -284,7 +287,7 @@ class WatchedFolder(LiveSource):
             self._root, image.shape, intrinsics=self._intrinsics, calibration=self._calibration,
             places=self._places,
         )  # fmt: skip
-        self.camera = str(found)
+        self.camera = f"{found}; {found.depth_unit(self._depth_scale)}"
         return found
 
     def _pairs(self, image: NDArray[np.generic]) -> stereo_pairs.PairRectifier:
