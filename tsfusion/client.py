@@ -263,6 +263,11 @@ class Client:
         return self._outbox.link_state
 
     @property
+    def world(self) -> str:
+        """Name of the coordinate frame of the poses; empty = that of poses given from elsewhere."""
+        return self._outbox.world
+
+    @property
     def is_of_other_world(self) -> bool:
         """Whether the server said that the map has keyframes of another world; nothing is sent then."""
         return self.link_state.kind == "other_world"

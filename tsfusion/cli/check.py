@@ -16,6 +16,7 @@ def check(
     ],
     *,
     trajectory: options.Trajectory = None,
+    origin: options.Origin = None,
     sequence: options.Sequence = None,
     modality: options.Modality = None,
     calibration: options.Calibration = None,
@@ -37,6 +38,7 @@ def check(
         path,
         **options.dataset_options(
             option, unpack=unpack, sequence=sequence, modality=modality, trajectory=trajectory,
+            origin=origin,
             **options.camera(intrinsics, calibration),
         ),
     )  # fmt: skip

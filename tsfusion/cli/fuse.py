@@ -38,6 +38,7 @@ def fuse(
     same_frame: Annotated[
         bool, options.option("--same-frame", None, "The sources' poses are in one frame.", rare=True)
     ] = False,
+    origin: options.Origin = None,
     option: options.DatasetOptions = None,
     up: options.UpDirection = None,
     keep_islands: options.KeepIslands = None,
@@ -70,7 +71,7 @@ def fuse(
             sources,
             map_name=map_,
             same_frame=same_frame,
-            options=options.dataset_options(option),
+            options=options.dataset_options(option, **({} if origin is None else {"origin": origin})),
             watch=partial(display.show_bytes, "reading the journal"),
         )
         result = fusion.fuse(

@@ -84,7 +84,7 @@ def summary(found: "MapSummary") -> str:
         f"sessions   {len(found.sessions)}",
         *(
             f"  {one.session[:8]}  {one.client or 'no key':<12} up to number {one.last}, {_listed(one)}, "
-            + (f"world {one.world[:8]}" if one.world else "poses given")
+            + _poses(one.world)
             for one in found.sessions[:_MOST_LINES]
         ),
     ]
@@ -97,6 +97,15 @@ def summary(found: "MapSummary") -> str:
     defaults = to_builtins(VolumeConfig())
     changed = [f"{name} {value}" for name, value in config.items() if value != defaults[name]]
     return "\n".join([*lines, f"settings   {', '.join(changed) or 'defaults'}"])
+
+
+def _poses(world: str) -> str:
+    """Where a session's poses come from, by its world."""
+    from tsfusion.geometry.origin import Origin
+
+    if origin := Origin.of_world(world):
+        return f"poses given, from the origin {origin}"
+    return f"world {world[:8]}" if world else "poses given"
 
 
 def _box(box: list[float] | None) -> str:

@@ -124,6 +124,9 @@ Rate = Annotated[
 Trajectory = Annotated[
     Path | None, option("--trajectory", "FILE", "Poses of another SLAM: TUM's or KITTI's.")
 ]
+Origin = Annotated[
+    str | None, _rare_option("--origin", "X,Y,Z|auto", "Whole metres to take off UTM or grid positions.")
+]
 Sequence = Annotated[str | None, _rare_option("--sequence", "NN", "KITTI: which sequence.")]
 Modality = Annotated[str | None, _rare_option("--modality", "KIND", "KITTI: stereo or lidar.")]
 DatasetOptions = Annotated[

@@ -32,6 +32,7 @@ def replay(
     key: options.Key = None,
     server_key: options.ServerKey = None,
     trajectory: options.Trajectory = None,
+    origin: options.Origin = None,
     rate: options.Rate = None,
     max_frames: options.MaxFrames = None,
     start: options.Start = 0,
@@ -67,6 +68,7 @@ def replay(
         path,
         **options.dataset_options(
             option, unpack=unpack, sequence=sequence, modality=modality, trajectory=trajectory,
+            origin=origin,
             **options.camera(intrinsics, calibration),
         ),
     )  # fmt: skip

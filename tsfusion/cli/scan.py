@@ -29,6 +29,7 @@ SCAN_OPTIONS: dict[str, Any] = {
         "--localizer", "NAME", "rgbd, stereo, lidar; given: its poses.")],
     "trajectory": Annotated[str | None, options.option(
         "--trajectory", "FILE", "Poses of another SLAM: TUM's or KITTI's.")],
+    "origin": options.Origin,
     "feed": Annotated[str | None, options.option(
         "--feed", "ADDRESS", "Live poses of a SLAM: tcp://HOST:PORT.")],
     "time_offset": Annotated[float | None, _pose_option(
@@ -247,13 +248,17 @@ def _open(
             "realsense, camera:0, folder:PATH (docs/sources.md)"
         )
     flag = settings["trajectory"]
-    given = options.dataset_options(option, posed=False, trajectory=flag, **recording, **camera)
+    origin = settings["origin"]
+    given = options.dataset_options(
+        option, posed=False, trajectory=flag, origin=origin, **recording, **camera
+    )
     dataset = open_recording(path, **given | ({} if flag is None else {"trajectory": None}))
     warnings = [] if spec.startswith("synthetic:") else _warnings(dataset)
     if settings["trajectory"] is not None:
         trajectory = Path(settings["trajectory"]).expanduser()
         if not pairs_by_time(trajectory, dataset):
             dataset = WithTrajectory(dataset, trajectory)
+            dataset.take_off_origin(origin)
             settings |= {"trajectory": None, "localizer": "given"}
             typer.echo(f"poses: {trajectory}, one a frame in order, as not both have times", err=True)
     return RecordedSource(select(dataset, **part), rate=rate), warnings

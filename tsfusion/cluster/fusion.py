@@ -286,6 +286,7 @@ class _Run:
                 config=self._config,
                 keyframes=keyframes,
                 sensor=self._wishes.sensor,
+                world=self._found.world,
                 **self._common,
             )
             for number, keyframes in enumerate(self._found.shares(shares))

@@ -125,7 +125,7 @@ class _Parts:
         if not self._volume.stats().blocks and self.files:
             return  # nothing came after the last one
         path = _new(self._folder, self._job.name, ".tsf")
-        self._volume.save(path)
+        self._volume.save(path, {"world": self._job.world} if self._job.world else None)
         self.files.append(path.name)
         if not is_last:
             del self._volume

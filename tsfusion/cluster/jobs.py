@@ -89,6 +89,7 @@ class Fuse(Job, tag="fuse", frozen=True, kw_only=True):
     config: VolumeConfig
     keyframes: list[Keyframes]
     sensor: str | None = None  # preset that all keyframes are taken to be of; None = each as it says
+    world: str = ""  # name of the keyframes' coordinate frame
 
 
 class Add(Job, tag="add", frozen=True, kw_only=True):

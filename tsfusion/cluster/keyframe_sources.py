@@ -27,6 +27,7 @@ from tsfusion.datasets import open_dataset
 from tsfusion.datasets.cameras import camera_files
 from tsfusion.datasets.dataset import Dataset, frame_of, pose_of
 from tsfusion.geometry.keyframe import Keyframe
+from tsfusion.geometry.origin import Origin, world_of
 from tsfusion.journal import locations, state_folder
 from tsfusion.journal.journaled_keyframes import JournaledKeyframes
 from tsfusion.tsdf import checkpoint, map_history
@@ -65,6 +66,12 @@ class Listed(msgspec.Struct):
     left_out: dict[str, int] = {}
     lost: int = 0
     absent: int = 0
+    worlds: frozenset[str] = frozenset()
+
+    @property
+    def world(self) -> str:
+        """Name of the one coordinate frame of all sources; empty = poses were given, or there are several."""
+        return next(iter(self.worlds)) if len(self.worlds) == 1 else ""
 
     @property
     def count(self) -> int:
@@ -122,8 +129,8 @@ def listed(
     _check_once(sources)
     for source in sources:
         if source.startswith(SYNTHETIC) or not _is_journal(source):
-            here = {""}
-            left_out.update(_add_dataset(found, source, options or {}))
+            here, skipped = _add_dataset(found, source, options or {})
+            left_out.update(skipped)
         else:
             keyframes = _journal(found, source, map_name, watch)
             if len(sources) > 1:
@@ -131,11 +138,14 @@ def listed(
             left_out.update(keyframes.unreadable)
             here = keyframes.worlds or {""}
         if worlds is not None and not same_frame and worlds.isdisjoint(here):
+            origin = next(filter(None, map(Origin.of_world, here)), None)
+            own = "another scan that found its poses itself, in a coordinate frame of its own"
             raise MapError(
-                f"{source} is of another scan that found its poses itself, in a coordinate frame of its own: "
-                "they fuse only if they are known to be in one frame (--same-frame)"
+                f"{source} is of {own if origin is None else f'another origin, {origin}'}: they fuse only if "
+                "they are known to be in one frame (--same-frame)"
             )
         worlds = here | (worlds or set())
+        found.worlds = frozenset(worlds)
         found.names.append(source)
     if not found.count:
         lost = f"; {found.lost} or more are damaged or cannot be read (see above)" if found.lost else ""
@@ -272,8 +282,8 @@ def _check_distinct(seen: dict[tuple[bytes, int], str], keyframes: JournaledKeyf
         )
 
 
-def _add_dataset(found: Listed, source: str, options: dict[str, Any]) -> dict[str, int]:
-    """Add a dataset; frames that it left out, by reason."""
+def _add_dataset(found: Listed, source: str, options: dict[str, Any]) -> tuple[set[str], dict[str, int]]:
+    """Add a dataset; its world, and the frames that it left out, by reason."""
     dataset = open_dataset(source, **options)
     path = source if source.startswith(SYNTHETIC) else str(Path(source).expanduser().absolute())
     found.keyframes.append(DatasetKeyframes(path, options, 0, len(dataset), _state(dataset, path, options)))
@@ -282,7 +292,7 @@ def _add_dataset(found: Listed, source: str, options: dict[str, Any]) -> dict[st
         found.usual = getattr(dataset, "usual", {})
     if uncolored := getattr(dataset, "uncolored", 0):
         log.warning("%s: %s without colour in time", source, count_of(uncolored, "frame"))
-    return dataset.skipped
+    return {world_of(dataset)}, dataset.skipped
 
 
 def _state(dataset: Dataset, path: str, options: dict[str, Any]) -> str:

@@ -336,6 +336,7 @@ class ScanConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True
 
     localizer: LocalizerName = "auto"  # auto: by what the source gives
     trajectory: str | None = None  # for the localizer `trajectory`: a TUM or KITTI file
+    origin: str | None = None  # what is taken off positions in a national grid: X,Y,Z; None = as needed
     feed: str | None = None  # for the localizer `feed`: address where another process publishes poses
     max_gap: Positive = 0.2  # seconds between two given poses; across a longer gap there is none
     time_offset: float = 0.0  # seconds to add to a frame's time before its pose is looked up

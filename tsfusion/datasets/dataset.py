@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError, InvalidKeyframe
 from tsfusion.datasets.accelerometer import Accelerometer
+from tsfusion.geometry import origin
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.geometry.object_cards import ShownRecording
+from tsfusion.geometry.origin import Origin
 
 STREET = MappingProxyType({"voxel_size": 0.1})  # usual there: at 2 cm a stereo keyframe takes 1.5 s
 NOMINAL_NS = 33_333_333  # between frames of a recording without times: thirty a second
@@ -61,6 +63,7 @@ class Frames(ShownRecording):
     timestamps_ns: NDArray[np.int64] | None = None
     quaternions: bool = False  # whether rotations were recorded as quaternions; else as matrices
     usual: Mapping[str, Any] = MappingProxyType({})  # settings of a map of such a place (`VolumeConfig`)
+    origin: Origin | None = None  # what was taken off the poses' positions
     _poses: Sequence[NDArray[np.float64] | None] = ()
     _accelerometer: Accelerometer | None = None
 
@@ -80,6 +83,19 @@ class Frames(ShownRecording):
         """(4, 4) T_world_camera as recorded, None where it is not; no image is read where that can be."""
         index = self._checked(index)
         return self._poses[index] if self._poses else self.frame(index).T_world_camera
+
+    def take_off_origin(self, wanted: object = None, crs: str | None = None) -> None:
+        """Let positions count from an origin, as `origin.found` chooses it.
+
+        Raises:
+            InvalidConfig: for an origin or a reference system that cannot be.
+        """
+        there = [T for T in self._poses if T is not None]
+        self.origin = origin.found([T[:3, 3] for T in there], wanted, crs)
+        if self.origin is not None:
+            shift = np.zeros((4, 4))
+            shift[:3, 3] = self.origin.position
+            self._poses = [None if T is None else T - shift for T in self._poses]
 
     def specific_force(self, index: int) -> NDArray[np.float64] | None:
         """(3,) m/s² in the frame's axes, as an accelerometer measured it; None where there is none."""
@@ -142,6 +158,7 @@ class Selection(Frames):
         self.camera, self.depth_unit = (getattr(dataset, name, None) for name in ("camera", "depth_unit"))
         self.quaternions = getattr(dataset, "quaternions", False)
         self.usual = getattr(dataset, "usual", {})
+        self.origin = getattr(dataset, "origin", None)
         if hasattr(dataset, "distance"):
             self.distance = dataset.distance
         if dataset.timestamps_ns is not None:

@@ -153,20 +153,29 @@ def find(path: str | Path, *, unpack: bool = False) -> Found:
 def open_as(name: str, opener: Callable[..., Dataset], options: dict[str, Any]) -> Dataset:
     """Call a layout's opener; it may lack the options `posed` and `trajectory`; `poses` is the latter.
 
-    The option `depth_along_ray` is for all: depth images hold distances along rays, which become depth.
+    Options of any layout: `origin` and `crs`, see `Frames.take_off_origin`; `depth_along_ray`: depth images
+    hold distances along rays, which become depth.
 
     Raises:
         DatasetError: an option that it does not take, or of the wrong type.
     """
     options = dict(options)
-    if (along_ray := options.pop("depth_along_ray", None)) is not None:
-        dataset = open_as(name, opener, options)
+    origin, crs, along_ray = (options.pop(each, None) for each in ("origin", "crs", "depth_along_ray"))
+    dataset = _open_as(name, opener, options)
+    if along_ray is not None:
         if not isinstance(along_ray, bool) or not isinstance(dataset, Frames):
             raise DatasetError(
                 f"depth_along_ray is true or false, of depth images in files; got {along_ray!r} for {name}"
             )
         dataset.along_ray = along_ray
-        return dataset
+    if isinstance(dataset, Frames):
+        dataset.take_off_origin(origin, crs)
+    elif origin is not None or crs is not None:
+        raise DatasetError(f"a {name} dataset has poses of its own: leave out the options origin and crs")
+    return dataset
+
+
+def _open_as(name: str, opener: Callable[..., Dataset], options: dict[str, Any]) -> Dataset:
     if not plugins.takes(opener, "posed"):
         options.pop("posed", None)
     for camera in ("intrinsics", "calibration"):
@@ -208,6 +217,8 @@ def describe(dataset: Dataset) -> str:
     unit = depth_line(dataset, first)
     camera = camera_line(dataset, first)
     seen = f"; {unit}" * bool(unit) + f"; camera {camera}" * bool(camera)
+    if origin := getattr(dataset, "origin", None):
+        seen += f"; positions count from the origin {origin}"
     return f"{dataset.name}, {len(dataset)} {kind}{size}{rate}, {poses}{color}{seen}"
 
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from tsfusion.core.errors import DatasetError, InvalidKeyframe
 from tsfusion.datasets.readers import numbers, read_lines, read_numbers
 from tsfusion.geometry.keyframe import check_pose
+from tsfusion.geometry.origin import FARTHEST
 from tsfusion.geometry.se3 import Transform
 from tsfusion.geometry.trajectory import Trajectory, quaternion, rigid
 
@@ -163,6 +164,6 @@ def checked_pose(matrix: NDArray[np.float64], source: object) -> Transform:
     T = np.eye(4)
     T[: len(matrix)] = matrix
     try:
-        return check_pose(T)
+        return check_pose(T, farthest=FARTHEST)
     except InvalidKeyframe as error:
         raise DatasetError(f"{source}: {error}") from error

@@ -21,6 +21,7 @@ Kind = Literal["depth", "disparity", "points"]
 MAX_IMAGE_SIDE = 8192
 MAX_POINTS = 2_000_000
 MAX_TRANSLATION = 1e6
+_FARTHEST_SCAN = 1e4  # metres
 MAX_SENSOR_NAME = 32
 _LEAST = np.finfo(np.float64).tiny  # smaller numbers stop LAPACK where a library has the processor flush them
 _ROTATION_TOLERANCE = 1e-3
@@ -225,6 +226,11 @@ class Keyframe(object_cards.Shown):
         object.__setattr__(self, "points", points)
         if len(points) > MAX_POINTS:
             raise InvalidKeyframe(f"points must be at most {MAX_POINTS}, got {len(points)}")
+        if len(points) and np.abs(points[0]).max() > _FARTHEST_SCAN and _nearest(points) > _FARTHEST_SCAN:
+            raise InvalidKeyframe(
+                f"all points are more than {_FARTHEST_SCAN / 1000:g} km from the sensor, as in a grid: "
+                "give them in the sensor's frame, and where the sensor was in T_world_camera"
+            )
         if self.origins is not None:
             one = np.ndim(self.origins) == 1
             shape = (3,) if one else (len(points), 3)
@@ -296,7 +302,7 @@ def check_intrinsics(intrinsics: Intrinsics) -> Intrinsics:
     return Intrinsics(fx, fy, cx, cy)
 
 
-def check_pose(pose: Any) -> NDArray[np.float64]:
+def check_pose(pose: Any, *, farthest: float = MAX_TRANSLATION) -> NDArray[np.float64]:
     """Check a rigid transform and return it as (4, 4) float64; a rotation within 1e-3 is made exact.
 
     Idempotent to the bit, so that a keyframe checked at both ends of a wire keeps its map.
@@ -322,14 +328,22 @@ def check_pose(pose: Any) -> NDArray[np.float64]:
         )
     if np.abs(T[3] - (0, 0, 0, 1)).max() > 1e-9:
         raise InvalidKeyframe(f"T_world_camera must end with the row 0 0 0 1, got {T[3].tolist()}")
-    if np.abs(t).max() > MAX_TRANSLATION:
+    if np.abs(t).max() > farthest:
         raise InvalidKeyframe(
-            f"T_world_camera must translate by at most {MAX_TRANSLATION:.0e} m, got {t.tolist()}"
+            f"T_world_camera must translate by at most {farthest:.0e} m, got {t.tolist()}: "
+            "take an origin off positions in a national grid or UTM (--origin X,Y,Z)"
         )
     if deviation > _ROTATION_EXACT:
         T[:3, :3] = _nearest_rotation(R)
     T[3] = (0, 0, 0, 1)
     return T
+
+
+def _nearest(points: NDArray[np.float32]) -> float:
+    """Metres along an axis to the nearest of the (n, 3) points; 0 where none is a return."""
+    away = np.abs(points).max(axis=1)
+    away = away[np.isfinite(away)]
+    return float(away.min()) if len(away) else 0.0
 
 
 def _nearest_rotation(R: NDArray[np.float64]) -> NDArray[np.float64]:

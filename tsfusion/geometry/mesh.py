@@ -119,8 +119,11 @@ class Mesh(object_cards.Shown):
             OutputError: for another suffix, an empty mesh, or a path that cannot be written.
             MissingDependency: for LAS and LAZ without laspy.
         """
-        facts = mesh_encoding.facts_of(self)
-        return point_files.save(path, self.vertices, normals=self.normals, colors=self.colors, facts=facts)
+        origins = self.provenance.origins if self.provenance else []
+        return point_files.save(
+            path, self.vertices, normals=self.normals, colors=self.colors,
+            facts=mesh_encoding.facts_of(self), origin=origins[0] if len(origins) == 1 else None,
+        )  # fmt: skip
 
     def encode(self, suffix: str) -> bytes:
         """Encode the mesh as the content of a file.

@@ -2,7 +2,8 @@
 """Points with normals and colours as PLY, PCD, LAS or LAZ files, in the map's frame.
 
 PLY and PCD are binary and hold float32 as it is. LAS and LAZ (laspy) hold integers of `_LAS_STEP` metres,
-normals as extra dimensions, and what is known about the points in a record of their own.
+normals as extra dimensions, and what is known about the points in a record of their own; the map's origin is
+in their coordinates.
 """
 
 import os
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from tsfusion.core import durable_files
 from tsfusion.core.errors import MissingDependency, OutputError
+from tsfusion.geometry.origin import Origin
 
 FORMATS = (".ply", ".pcd", ".las", ".laz")
 ONLY_POINTS = (".pcd", ".las", ".laz")  # formats that hold no triangles
@@ -30,6 +32,7 @@ def save(
     normals: NDArray[np.float32] | None = None,
     colors: NDArray[np.uint8] | None = None,
     facts: dict[str, str] | None = None,
+    origin: Origin | None = None,
 ) -> Path:
     """Write points by the file's suffix; complete or not at all.
 
@@ -38,6 +41,7 @@ def save(
         normals: (n, 3) float32.
         colors: (n, 3) uint8 RGB.
         facts: what the file says about them, by name.
+        origin: of the map; LAS and LAZ have the coordinates that its poses came with, and their system.
 
     Raises:
         OutputError: for another suffix, no points, or a path that cannot be written.
@@ -56,7 +60,7 @@ def save(
             elif suffix == ".pcd":
                 _write_pcd(file, rows, facts)
             else:
-                _write_las(file, rows, facts, compressed=suffix == ".laz")
+                _write_las(file, rows, facts, origin or Origin((0, 0, 0)), compressed=suffix == ".laz")
     except OSError as error:
         raise OutputError(f"cannot write {path}: {error.strerror}") from error
     return path
@@ -110,7 +114,9 @@ def _write_pcd(file: BinaryIO, rows: NDArray[Any], facts: dict[str, str]) -> Non
     file.write(packed.data)
 
 
-def _write_las(file: BinaryIO, rows: NDArray[Any], facts: dict[str, str], *, compressed: bool) -> None:
+def _write_las(
+    file: BinaryIO, rows: NDArray[Any], facts: dict[str, str], origin: Origin, *, compressed: bool
+) -> None:
     """LAS 1.4."""
     try:
         import laspy
@@ -118,7 +124,7 @@ def _write_las(file: BinaryIO, rows: NDArray[Any], facts: dict[str, str], *, com
         raise MissingDependency(_INSTALL) from error
     if compressed and not laspy.LazBackend.detect_available():
         raise MissingDependency(_INSTALL)
-    points = rows["point"].astype(np.float64)
+    points = rows["point"].astype(np.float64) + origin.position
     middle = np.round((points.min(axis=0) + points.max(axis=0)) / 2)
     if np.abs(points - middle).max() >= _LAS_FARTHEST:
         raise OutputError(
@@ -131,6 +137,8 @@ def _write_las(file: BinaryIO, rows: NDArray[Any], facts: dict[str, str], *, com
         True  # as formats from 6 on must have it, with a coordinate system or without
     )
     header.generating_software = facts.get("generator", "")[:32]
+    if origin.crs:
+        header.add_crs(_system(origin.crs))
     text = "".join(f"{name} {fact}\n" for name, fact in facts.items())
     header.vlrs.append(laspy.VLR("tsfusion", _RECORD, "about these points", text.encode()[:65535]))
     if "normal" in names:
@@ -143,3 +151,15 @@ def _write_las(file: BinaryIO, rows: NDArray[Any], facts: dict[str, str], *, com
         for axis, column in zip("xyz", rows["normal"].T, strict=True):
             cloud[f"normal_{axis}"] = column
     cloud.write(file, do_compress=compressed)
+
+
+def _system(crs: str) -> Any:
+    """A coordinate reference system by its code; raises MissingDependency without pyproj."""
+    try:
+        import pyproj
+    except ImportError as error:
+        raise MissingDependency("to write a coordinate reference system: pip install pyproj") from error
+    try:
+        return pyproj.CRS.from_user_input(crs)
+    except pyproj.exceptions.CRSError as error:
+        raise OutputError(f"{crs} is no coordinate reference system that pyproj knows") from error

@@ -3,6 +3,8 @@
 
 from dataclasses import dataclass
 
+from tsfusion.geometry.origin import Origin
+
 GENERATOR = "tsfusion"
 
 
@@ -25,6 +27,11 @@ class Provenance:
     voxel_size: float | None = None
 
     @property
+    def origins(self) -> list[Origin]:
+        """Origins of its worlds, in the frame of the poses that their scans came with."""
+        return [one for world in (self.world or "").split() if (one := Origin.of_world(world))]
+
+    @property
     def facts(self) -> dict[str, str]:
         """Known facts, by name, as text of one line each."""
         facts = {
@@ -32,6 +39,7 @@ class Provenance:
             "keyframes": self.keyframes,
             "map_hash": self.map_hash,
             "world": self.world or None,
+            "origin_m": " and ".join(map(str, self.origins)) or None,
             "voxel_size_m": self.voxel_size,
         }
         return {name: " ".join(str(value).split()) for name, value in facts.items() if value is not None}

@@ -15,6 +15,7 @@ from tsfusion.core.config import VolumeConfig
 from tsfusion.core.errors import DecodeError, InvalidKeyframe, JournalError
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.geometry.object_cards import ShownRecording
+from tsfusion.geometry.origin import Origin
 from tsfusion.journal import state_folder
 from tsfusion.journal.journaled_keyframes import JournaledKeyframes
 
@@ -50,6 +51,8 @@ class JournalRecording(ShownRecording):
         first = self[0]
         self.sensor = first.sensor or VolumeConfig().sensor
         self.timestamps_ns: NDArray[np.int64] | None = None
+        worlds = [*found.worlds]
+        self.origin = Origin.of_world(worlds[0]) if len(worlds) == 1 else None
 
     def __len__(self) -> int:
         return len(self._chosen)

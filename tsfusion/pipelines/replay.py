@@ -20,6 +20,7 @@ from tsfusion.core.output_folder import results
 from tsfusion.datasets import Dataset
 from tsfusion.datasets.dataset import force_of
 from tsfusion.geometry.keyframe import Keyframe
+from tsfusion.geometry.origin import world_of
 from tsfusion.geometry.up_direction import HeldSensor, Up
 from tsfusion.pipelines import engine, map_growth, map_size, replay_results, run_files, target_server
 from tsfusion.pipelines.engine import AHEAD, Engine, Progress
@@ -97,7 +98,8 @@ def replay(
             showing(viewer, target),
         ):
             # A recording leaves nothing out: `wait_turn` keeps the spool short, not the policy.
-            sender = target.client(target.link.map, policy="spool_all", same_frame=same_frame)
+            world = world_of(dataset)
+            sender = target.client(target.link.map, policy="spool_all", world=world, same_frame=same_frame)
             sender.connect()
             _warn_of_keyframes_there(target, same_frame=same_frame)
 
@@ -131,8 +133,9 @@ def replay(
             running.wait_meshed([sender])
             target.keep_map(target.link.map, work / run_files.MAP)
             written = run_files.write_map(
-                work, target, target.link.map, held, up=up, min_weight=min_weight, keep_islands=keep_islands
-            )
+                work, target, target.link.map, held,
+                world=world, up=up, min_weight=min_weight, keep_islands=keep_islands,
+            )  # fmt: skip
         if not len(written.mesh.faces):
             raise OutputError(run_files.no_surface(sender.stats, sender.first_rejection))
         error_mm = replay_results.error_of(dataset, written.mesh)

@@ -13,6 +13,7 @@ from tsfusion.client import Client
 from tsfusion.datasets import Dataset
 from tsfusion.datasets.cameras import camera_line
 from tsfusion.geometry.mesh import Mesh
+from tsfusion.geometry.origin import position_of, world_of
 from tsfusion.journal.recording import LOST
 from tsfusion.pipelines import latency_ledger, run_files, shortfall
 from tsfusion.pipelines.run_files import Circumstances, WrittenMap
@@ -59,6 +60,7 @@ class ReplaySummary(msgspec.Struct, frozen=True, kw_only=True):
     delay_slope_ms_per_keyframe: float
     stages_ms: dict[str, Spread]
     clock_bound_ms: float
+    origin_m: tuple[int, int, int] | None = None  # what was taken off the positions; None = nothing
     mesh: dict[str, Any]  # `Mesh.figures`, and what `mesh_files.write` left out
     accuracy: Accuracy | None
     peak_rss_bytes: dict[str, int]
@@ -122,6 +124,7 @@ def summarise(
         delay_slope_ms_per_keyframe=delays.slope_ms_per_keyframe,
         stages_ms=delays.stages_ms,
         clock_bound_ms=delays.clock_bound_ms,
+        origin_m=position_of(world_of(dataset)),
         mesh=figures,
         accuracy=None if error_mm is None else measure(error_mm),
         peak_rss_bytes={**server_rss(status), "client": peak_rss_bytes},

@@ -76,6 +76,7 @@ def write_map(
     held: HeldSensor,
     *,
     suffix: str = "",
+    world: str = "",
     up: Up | None = None,
     min_weight: float | None = None,
     keep_islands: bool | None = None,
@@ -85,6 +86,7 @@ def write_map(
     Args:
         held: how the sensor was held.
         suffix: stands before the endings.
+        world: name of the coordinate frame of the poses; empty = that of poses given from elsewhere.
         up: away from the ground, in the map's frame; None = it is found.
         min_weight: full-confidence samples a voxel needs to be meshed; None = the sensor's.
         keep_islands: see `mesh_files.write`.
@@ -94,20 +96,23 @@ def write_map(
     left_out: dict[str, Any] = {}
     if len(mesh.faces):
         mesh = dataclasses.replace(
-            mesh, known_up=up_direction.find(mesh, held, given=up), provenance=_provenance(status, target)
+            mesh,
+            known_up=up_direction.find(mesh, held, given=up),
+            provenance=_provenance(status, target, world),
         )
         files = [work / f"{name}{suffix}{ending}" for name, ending in _MESH_FILES]
         left_out = mesh_files.write(mesh, files, keep_islands=keep_islands)
     return WrittenMap(status, mesh, {**mesh.figures, "left_out": left_out})
 
 
-def _provenance(status: Status, target: Target) -> Provenance:
+def _provenance(status: Status, target: Target, world: str) -> Provenance:
     """Provenance of a run's meshes; without a hash where others may have changed the map since."""
     is_own = target.child is not None
     return Provenance(
         source=f"map {status.map}",
         keyframes=status.keyframes_fused,
         map_hash=status.map_hash if is_own else None,
+        world=world,
         voxel_size=status.config["volume"]["voxel_size"],
     )
 

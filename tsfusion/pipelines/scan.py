@@ -32,6 +32,7 @@ from tsfusion.core.output_folder import results
 from tsfusion.datasets.cameras import described
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.mesh import Mesh
+from tsfusion.geometry.origin import world_of
 from tsfusion.geometry.sample_ranges import wrong_unit
 from tsfusion.geometry.up_direction import HeldSensor, Up
 from tsfusion.pipelines import (
@@ -266,7 +267,7 @@ def _open_scanner(
             name,
             # A recording waits, so nothing of it is left out; what a live source gives is thinned.
             policy=None if source.live else "spool_all",
-            world="" if localizer.absolute else uuid.uuid4().hex,
+            world=_given_world(localizer, source) if localizer.absolute else uuid.uuid4().hex,
             same_frame=same_frame and name == target.link.map,
         )
 
@@ -282,6 +283,11 @@ def _open_scanner(
         leftovers.finish()
         client.check_world()
     return scanner
+
+
+def _given_world(localizer: Localizer, source: Source) -> str:
+    """The world of poses that a localizer with its own origin, or the source, gives."""
+    return world_of(localizer if hasattr(localizer, "origin") else source)
 
 
 def _settle(
@@ -402,7 +408,9 @@ def _write(
     poses = submap.located.poses(submap.corrections)
     for T, force in zip(poses, submap.located.forces(), strict=True):
         held.add(T, sensor, force)
-    written = run_files.write_map(work, target, submap.name, held, suffix=suffix, **options)
+    written = run_files.write_map(
+        work, target, submap.name, held, suffix=suffix, world=submap.client.world, **options
+    )
     if len(written.mesh.faces):
         meshes[f"mesh{suffix}.ply"] = written.mesh
     return scan_results.describe(submap, written)

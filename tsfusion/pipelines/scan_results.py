@@ -12,6 +12,7 @@ import numpy as np
 from tsfusion.core.config import ScanConfig, VolumeConfig
 from tsfusion.datasets.trajectory_files import write_tum
 from tsfusion.evaluation.trajectory_error import TrajectoryError, absolute_error
+from tsfusion.geometry.origin import position_of
 from tsfusion.pipelines import latency_ledger, run_files, shortfall
 from tsfusion.pipelines.run_files import Circumstances, WrittenMap
 from tsfusion.scanner.localization.localizer import PoseCorrections
@@ -61,6 +62,7 @@ class ScanSummary(msgspec.Struct, frozen=True, kw_only=True):
     seconds: float  # from the first frame until the last keyframe was fused (or acknowledged, elsewhere)
     tracking_cpu_ms: float  # CPU milliseconds of the localizer a frame
     maps: list[MapResult]
+    origin_m: tuple[int, int, int] | None = None  # what was taken off given positions; None = nothing
     delay_ms: Spread
     peak_rss_bytes: dict[str, int]
     config: dict[str, Any]
@@ -157,6 +159,7 @@ def summarise(
         seconds=round(seconds, 3),
         tracking_cpu_ms=round(scanner.tracking_cpu_ms, 3),
         maps=maps,
+        origin_m=position_of(scanner.submaps[0].client.world),
         delay_ms=latency_ledger.summarise(times).delay_ms,
         peak_rss_bytes={"client": peak_rss_bytes},
         config={name: msgspec.to_builtins(each) for name, each in settings.items()},

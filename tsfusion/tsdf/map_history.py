@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from tsfusion.core.config import SERVER_SESSION
 from tsfusion.core.counts import count_of
 from tsfusion.core.errors import MapError
+from tsfusion.geometry.origin import Origin
 from tsfusion.geometry.up_direction import HeldSensor
 
 HELD = "held"  # in a checkpoint's meta: how the sensors were held, as the fuser wrote it first
@@ -94,6 +95,14 @@ def of_clients(histories: Iterable[SessionHistory]) -> list[SessionHistory]:
     return [one for one in histories if one.session != SERVER_SESSION.hex()]
 
 
+def worlds(meta: Mapping[str, Any]) -> set[str]:
+    """Coordinate frames of a map's keyframes; empty text = that of poses given from elsewhere.
+
+    A map that no server made says its own as `world`.
+    """
+    return {one.world for one in of_clients(sessions(meta))} or {str(meta.get("world", ""))}
+
+
 def check_addable(here: Mapping[str, Any], there: Mapping[str, Any], *, same_frame: bool) -> None:
     """Raise MapError where two maps hold the same keyframes, or are not known to be in one coordinate frame.
 
@@ -105,8 +114,11 @@ def check_addable(here: Mapping[str, Any], there: Mapping[str, Any], *, same_fra
     for name in ours:
         if name in theirs:
             _check_distinct(ours[name], theirs[name])
-    worlds = [{one.world for one in each.values()} or {""} for each in (ours, theirs)]
-    if not same_frame and worlds[0].isdisjoint(worlds[1]):
+    if not same_frame and worlds(here).isdisjoint(worlds(there)):
+        origins = [one for each in (here, there) for name in worlds(each) if (one := Origin.of_world(name))]
+        if origins:
+            places = " and ".join(map(str, origins))
+            raise MapError(f"the maps count from other origins ({places}): make them with one --origin")
         raise MapError(
             "the maps are of scans that found their poses themselves, each in a coordinate frame of its own; "
             "merge them only if they are known to be in one (--same-frame, in Python same_frame=True), or "

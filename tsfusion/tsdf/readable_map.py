@@ -340,11 +340,10 @@ def _provenance(
     config: VolumeConfig,
     source: str | None,
 ) -> Provenance:
-    worlds = {one.world for one in map_history.of_clients(map_history.sessions(meta)) if one.world}
     return Provenance(
         source=None if source is None else Path(source).resolve().name,
         keyframes=keyframes,
         map_hash=map_hash,
-        world=" ".join(sorted(worlds)),
+        world=" ".join(sorted(filter(None, map_history.worlds(meta)))),
         voxel_size=config.voxel_size,
     )

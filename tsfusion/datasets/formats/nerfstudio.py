@@ -19,6 +19,7 @@ from tsfusion.datasets.readers import read_color, turned_by_exif
 from tsfusion.geometry.calibration import Camera, Undistorter
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics, check_pose
+from tsfusion.geometry.origin import FARTHEST
 from tsfusion.geometry.se3 import Transform
 
 EXPECTED = "transforms.json with fl_x, cx, … and frames of file_path, depth_file_path, transform_matrix"
@@ -197,7 +198,7 @@ def _pose(frame: dict[str, Any], applied_scale: float, where: str) -> Transform 
         T = np.eye(4)
         T[: len(matrix)] = matrix
         T[:3, 3] /= applied_scale
-        return check_pose(T @ _OPENCV)
+        return check_pose(T @ _OPENCV, farthest=FARTHEST)
     except (ValueError, TypeError, InvalidKeyframe) as error:
         raise DatasetError(f"{where}: transform_matrix: {error}") from error
 

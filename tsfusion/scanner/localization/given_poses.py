@@ -2,6 +2,7 @@
 """Localizers that take known poses: those of a trajectory file (TUM or KITTI), or those of the source."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.readers import read_lines
 from tsfusion.datasets.trajectory_files import nanoseconds, read_kitti, read_tum
+from tsfusion.geometry import origin as origins
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.trajectory import Trajectory, quaternion
 from tsfusion.scanner.localization.localizer import Localizer, Lost, Pose
@@ -29,6 +31,7 @@ class TrajectoryFilePoses(Localizer):
             followed (not of a robot's body).
         max_gap_s: seconds between two poses at most; there is no pose in longer gaps.
         time_offset_s: seconds to add to a frame's stamp before its pose is looked up.
+        origin: as of `origin.found`.
 
     Raises:
         DatasetError: for a file that is missing, malformed, or without times.
@@ -36,8 +39,19 @@ class TrajectoryFilePoses(Localizer):
 
     absolute = True
 
-    def __init__(self, path: str | Path, *, max_gap_s: float, time_offset_s: float = 0.0) -> None:
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        max_gap_s: float,
+        time_offset_s: float = 0.0,
+        origin: object = None,
+    ) -> None:
         self._trajectory = read_trajectory(Path(path).expanduser())
+        self.origin = origins.found([*self._trajectory.translations[:1]], origin)
+        if self.origin is not None:
+            moved = self._trajectory.translations - self.origin.position
+            self._trajectory = replace(self._trajectory, translations=moved)
         self._max_gap_ns = round(max_gap_s * 1e9)
         self._offset_ns = round(time_offset_s * 1e9)
         self._anchors = TrackingKeyframes()

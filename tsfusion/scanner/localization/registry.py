@@ -66,6 +66,7 @@ def create_localizer(config: ScanConfig, first: Frame) -> Localizer:
             _required(config.trajectory, "--trajectory FILE"),
             max_gap_s=config.max_gap,
             time_offset_s=config.time_offset,
+            origin=config.origin,
         )
     if name == "feed":
         from tsfusion.scanner.localization.pose_feed.feed import PoseFeed

@@ -28,6 +28,7 @@ class RecordedSource(LiveSource):
         self.skipped = dataset.skipped
         self.length = len(dataset)
         self.usual: Mapping[str, Any] = getattr(dataset, "usual", {})
+        self.origin = getattr(dataset, "origin", None)
         self._dataset, self._rate = dataset, rate
         camera = getattr(dataset, "camera", None)
         self.camera = str(camera) if isinstance(camera, RecordedCamera) else ""
@@ -54,6 +55,7 @@ class LimitedSource(LiveSource):
     def __init__(self, source: Source, limit: int) -> None:
         super().__init__(source.name, source.sensor)
         self.live, self.skipped = source.live, source.skipped
+        self.origin = getattr(source, "origin", None)
         self.length = None if source.length is None else min(source.length, limit)
         self._source, self._limit = source, limit
 

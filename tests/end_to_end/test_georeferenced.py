@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: MIT
+"""Poses in UTM make the map of poses near zero; the origin goes into every result, and comes back in LAS."""
+
+import json
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pytest
+from command_processes import tsfusion
+from numpy.typing import NDArray
+
+from tsfusion import Volume, open_dataset
+from tsfusion.datasets import Synthetic
+from tsfusion.datasets.trajectory_files import write_tum
+from tsfusion.geometry.frame import Frame
+
+ORIGIN = np.array([447_800, 5_411_400, 300])
+COUNT = 4
+
+
+def recorded(root: Path, shift: NDArray[np.integer], *, poses: bool = True) -> Path:
+    """Scans of the synthetic room, whose poses are shifted."""
+    root.mkdir(parents=True)
+    rows = []
+    for number, view in enumerate(Synthetic("room", sensor="lidar", count=COUNT)):
+        points = np.asarray(view.measurement, "<f4")
+        np.column_stack([points, np.ones(len(points), "<f4")]).tofile(root / f"{number:03d}.bin")
+        T = view.T_world_camera.copy()
+        T[:3, 3] += shift
+        rows.append(" ".join(f"{value:.9f}" for value in T[:3].ravel()))
+    (root / ("poses.txt" if poses else "other.kitti")).write_text("\n".join(rows) + "\n")
+    return root
+
+
+def replayed(tmp_path: Path, *arguments: object) -> tuple[Path, str]:
+    out = tmp_path / "run"
+    done = tsfusion("replay", *arguments, "--voxel-size", "0.05", "--no-check", "--out", out)
+    assert done.returncode == 0, done.stderr
+    return out, done.stderr
+
+
+@pytest.mark.slow
+def test_a_map_in_utm(tmp_path: Path) -> None:
+    utm = recorded(tmp_path / "utm", ORIGIN)
+    out, said = replayed(tmp_path, utm, "--option", "crs=EPSG:25832", "--state", tmp_path / "state")
+    assert "positions count from the origin 447800 5411400 300 EPSG:25832" in said
+    record = json.loads((out / "run.json").read_text())
+    assert record["origin_m"] == ORIGIN.tolist()
+    plain = Volume(0.05, sensor="lidar")
+    for keyframe in open_dataset(recorded(tmp_path / "plain", 0 * ORIGIN)):
+        plain.integrate(keyframe)
+    assert record["map_hash"] == plain.map_hash()
+    assert b"comment origin_m 447800 5411400 300 EPSG:25832\n" in (out / "mesh.ply").read_bytes()[:800]
+    info = tsfusion("map", "info", out / "map.tsf")
+    assert "poses given, from the origin 447800 5411400 300 EPSG:25832" in info.stdout
+
+    made = tsfusion("mesh", out / "map.tsf", tmp_path / "room.las")
+    assert made.returncode == 0, made.stderr
+    cloud, mesh = laspy.read(tmp_path / "room.las"), plain.extract_mesh()
+    low = np.array(cloud.xyz).min(axis=0) - ORIGIN
+    assert low == pytest.approx(mesh.vertices.min(axis=0), abs=1e-4)
+    assert cloud.header.parse_crs().to_epsg() == 25832
+
+    # The journal knows it, and so do maps that are made of it.
+    again, _ = replayed(tmp_path / "again", tmp_path / "state")
+    assert json.loads((again / "run.json").read_text())["origin_m"] == ORIGIN.tolist()
+    fused = tsfusion("fuse", utm, "--voxel-size", "0.05", "--workers", "1", "--out", tmp_path / "fused")
+    assert fused.returncode == 0, fused.stderr
+    assert b"comment origin_m 447800 5411400 300\n" in (tmp_path / "fused" / "mesh.ply").read_bytes()[:800]
+
+    # A map from another origin is another frame.
+    other, _ = replayed(tmp_path / "other", utm, "--origin", "447000,5411000,0")
+    refused = tsfusion("map", "merge", out / "map.tsf", other / "map.tsf", "--out", tmp_path / "sum.tsf")
+    assert refused.returncode == 1
+    assert "count from other origins" in refused.stderr
+    refused = tsfusion("fuse", utm, tmp_path / "state", "--out", tmp_path / "none")
+    assert (refused.returncode, "another origin" in refused.stderr) == (1, True)
+
+
+def test_every_way_of_giving_poses_has_one_origin(tmp_path: Path) -> None:
+    views = list(Synthetic("room", sensor="lidar", count=COUNT))
+    inside = recorded(tmp_path / "inside", ORIGIN)
+    beside = recorded(tmp_path / "beside", ORIGIN, poses=False)
+    for dataset in (open_dataset(inside), open_dataset(beside, trajectory=beside / "other.kitti")):
+        assert dataset.origin.position == tuple(ORIGIN)
+        for view, read in zip(views, dataset, strict=True):
+            assert read.T_world_camera == pytest.approx(view.T_world_camera, abs=1e-8)
+    assert open_dataset(inside, origin="447800,5411400,0")[0].T_world_camera[2, 3] == pytest.approx(
+        views[0].T_world_camera[2, 3] + 300
+    )
+
+
+def test_a_scan_by_a_trajectory_in_utm(tmp_path: Path) -> None:
+    from tsfusion.core.config import ScanConfig
+    from tsfusion.scanner.localization import registry
+
+    poses = [view.T_world_camera.copy() for view in Synthetic("room", sensor="lidar", count=COUNT)]
+    for T in poses:
+        T[:3, 3] += ORIGIN
+    stamps = [10**9 * (1 + number) for number in range(COUNT)]
+    write_tum(tmp_path / "poses.txt", stamps, poses)
+    for given, height in ((None, 0.0), ("447800,5411400,0", 300.0)):
+        config = ScanConfig(localizer="trajectory", trajectory=str(tmp_path / "poses.txt"), origin=given)
+        first = Frame.of(Synthetic("room", sensor="lidar", count=1)[0], "lidar")
+        localizer = registry.create_localizer(config, first)
+        assert localizer.origin.position == (447_800, 5_411_400, 0 if given else 300)
+        assert localizer._trajectory.translations[0][2] == pytest.approx(poses[0][2, 3] - 300 + height)
