@@ -114,8 +114,12 @@ def test_segments_rotate_and_can_be_forgotten(tmp_path: Path) -> None:
 def test_closed_segments_open_in_mcap_tools(tmp_path: Path) -> None:
     write(tmp_path, 4)
     with segment_path(tmp_path, 1).open("rb") as file:
-        messages = list(make_reader(file, validate_crcs=True).iter_messages("/keyframes"))
+        reader = make_reader(file, validate_crcs=True)
+        messages, summary = list(reader.iter_messages("/keyframes")), reader.get_summary()
     assert [message.sequence for _, _, message in messages] == [1, 2, 3, 4]
+    assert summary is not None
+    assert all(schema.encoding for schema in summary.schemas.values() if schema.data)  # `mcap doctor`'s rule
+    assert mcap_layout.segment_start_bytes() == 681  # as of the journals that earlier versions left
 
 
 @pytest.mark.parametrize(

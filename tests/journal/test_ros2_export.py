@@ -190,6 +190,7 @@ def test_points_keep_their_colours(tmp_path: Path) -> None:
         ([5, 7, 9], [5, 7, 9]),
         ([0, 0, 9], [NOW + 1, NOW + 2, NOW + 3]),  # no clock
         ([0], [NOW + 1]),
+        ([5, 5, 6, 6], [5, 6, 7, 8]),  # a reader takes two of one time for one
         ([2**62], [NOW + 1]),  # more seconds than a ROS stamp holds
     ],
 )

@@ -28,11 +28,12 @@ ENCODING = "x-tsfusion"
 IDENTITY_BYTES = 8
 CLIENT_BYTES = 32
 _SESSION_BYTES = 16
-_LAYOUT = b"""tsfusion journal record, little-endian:
+# What a segment begins with is as long as in the journals that earlier versions left
+_LAYOUT = b"""journal record, little-endian:
 segment: 8 bytes, the identity of the segment; session: 16 bytes; seq: u64;
 client: 32 bytes, the name its key is allowed under, UTF-8, zeros after it;
-frame count: u8; length of each frame: u32; the frames of the wire message."""
-_SEGMENT_LAYOUT = b"tsfusion journal segment: TSFSEG1 and a zero, then the identity of the segment, 8 bytes"
+frame count: u8; length of each frame: u32; the frames of the wire message"""
+_SEGMENT_LAYOUT = b"journal segment: TSFSEG1 and a zero then the identity of the segment, 8 bytes"
 _SEGMENT_MAGIC = b"TSFSEG1\0"
 _KEYFRAMES, _SEGMENT = 1, 2  # channels
 KEYFRAMES_CHANNEL = _KEYFRAMES
@@ -155,9 +156,9 @@ def begin_segment(stream: IO[bytes], identity: bytes, now_ns: int) -> Any:
 
     writer = Writer(stream, chunk_size=1, compression=CompressionType.NONE)
     writer.start(library=LIBRARY.decode())
-    schema = writer.register_schema("tsfusion.keyframe", "", _LAYOUT)
+    schema = writer.register_schema("tsfusion.keyframe", ENCODING, _LAYOUT)
     writer.register_channel(TOPIC, ENCODING, schema)
-    schema = writer.register_schema("tsfusion.segment", "", _SEGMENT_LAYOUT)
+    schema = writer.register_schema("tsfusion.segment", ENCODING, _SEGMENT_LAYOUT)
     writer.register_channel("/segment", ENCODING, schema)
     writer.add_message(_SEGMENT, now_ns, _IDENTITY.pack(_SEGMENT_MAGIC, identity), now_ns)
     return writer

@@ -120,6 +120,7 @@ class _Exporter:
         self._has_clock: dict[bytes, bool] = {}  # by session
         self._held: dict[bytes, tuple[Path, Record]] = {}
         self._seen: set[tuple[bytes, int]] = set()
+        self._stamps: set[tuple[bytes, int]] = set()
         self._problems: list[Problem] = []
         self._keyframes = 0
 
@@ -173,6 +174,9 @@ class _Exporter:
         stamp_ns = keyframe.timestamp_ns if self._has_clock.get(record.session) else record.logged_ns
         if stamp_ns // 10**9 > _LAST_SECOND:
             stamp_ns = min(record.logged_ns, _LAST_SECOND * 10**9)
+        while (record.session, stamp_ns) in self._stamps:  # a reader takes two of one time for one
+            stamp_ns += 1
+        self._stamps.add((record.session, stamp_ns))
         header = unpack_keyframe(record.frames[0])
         for message in self._converter.convert(keyframe, header, record, self._name(record), stamp_ns):
             self._bag.write(message, stamp_ns)
