@@ -159,15 +159,17 @@ def writing(folder: Path, form: str) -> Iterator[tuple[BagWriter, Path]]:
         path = folder / "recorded.bag"
         bag = rosbag1.Writer(path)
         if form != "ros1":
-            bag.set_compression(rosbag1.Writer.CompressionFormat.LZ4)
+            bag.set_compression(rosbag1.Writer.CompressionFormat[form[len("ros1-") :].upper()])
         store = get_typestore(Stores.ROS1_NOETIC)
         store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TF))
     else:
         path = folder / "recorded"
-        plugin = rosbag2.StoragePlugin.SQLITE3 if form == "sqlite3" else rosbag2.StoragePlugin.MCAP
+        is_sqlite = form.startswith("sqlite3")
+        plugin = rosbag2.StoragePlugin.SQLITE3 if is_sqlite else rosbag2.StoragePlugin.MCAP
         bag = rosbag2.Writer(path, version=9, storage_plugin=plugin)
-        if form == "mcap-zstd":
-            bag.set_compression(rosbag2.CompressionMode.MESSAGE, rosbag2.CompressionFormat.ZSTD)
+        modes = {"zstd": "MESSAGE", "file": "FILE", "storage": "STORAGE"}
+        if (mode := form.partition("-")[2]) in modes:
+            bag.set_compression(rosbag2.CompressionMode[modes[mode]], rosbag2.CompressionFormat.ZSTD)
         store = get_typestore(Stores.ROS2_HUMBLE)
     with bag:
         yield BagWriter(bag, store, is2=not form.startswith("ros1")), path

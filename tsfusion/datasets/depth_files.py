@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tsfusion.core import read_limits
 from tsfusion.core.errors import DatasetError, MissingDependency
 from tsfusion.datasets.readers import read_image
 from tsfusion.geometry.sample_ranges import FARTHEST_M, NEAREST_M
@@ -59,7 +60,9 @@ def check_metres(depth: NDArray[np.float32], source: object) -> None:
 def read_npy(path: Path) -> NDArray[Any]:
     """The array of a `.npy` file; raises DatasetError."""
     try:  # its size is compared with what is there
-        return np.array(np.lib.format.open_memmap(path, mode="r"))
+        found = np.lib.format.open_memmap(path, mode="r")
+        read_limits.check(path, found.nbytes)
+        return np.array(found)
     except FileNotFoundError as error:
         raise DatasetError(f"{path} is missing; expected an (H, W) array of depth") from error
     except (OSError, ValueError, EOFError) as error:
@@ -82,6 +85,11 @@ def _read_exr(path: Path) -> NDArray[Any]:
     except ImportError as error:
         raise MissingDependency(f"{path}: to read EXR: pip install '.[exr]'") from error
     try:
+        with OpenEXR.File(str(path), header_only=True) as file:
+            for part in file.parts:
+                low, high = part.header["dataWindow"]
+                pixels = np.prod(np.subtract(high, low, dtype=float) + 1)
+                read_limits.check(path, 4 * len(part.header["channels"]) * pixels)
         with OpenEXR.File(str(path), separate_channels=True) as file:
             channels = [channel.pixels for name, channel in file.channels().items() if name != "A"]
         return channels[0] if len(channels) == 1 else np.dstack(channels)

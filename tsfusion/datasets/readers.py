@@ -4,21 +4,27 @@
 import struct
 import zlib
 from collections.abc import Sequence
+from contextlib import suppress
+from os import SEEK_CUR, SEEK_END
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tsfusion.core import read_limits
 from tsfusion.core.errors import DatasetError, InvalidKeyframe
 from tsfusion.geometry.calibration import MAX_NO_SKEW
 from tsfusion.geometry.calibration_files import read_text
 from tsfusion.geometry.keyframe import MAX_IMAGE_SIDE, Intrinsics, check_intrinsics
+from tsfusion.wire import image_headers
+from tsfusion.wire.record_header import Refused
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _PIXEL_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")
 _HEADER = 13  # bytes of IHDR
+_PIXEL, _FEW = 9, 1 << 20  # bytes of a pixel that is not compressed, and of all that is no pixel
 
 
 def read_lines(path: Path, content: str) -> list[tuple[int, str]]:
@@ -58,49 +64,69 @@ def read_image(path: Path, what: str, flags: int = cv2.IMREAD_UNCHANGED) -> NDAr
     if not path.is_file():
         raise DatasetError(f"{path} is missing; expected {what}")
     try:
-        image = decode_image(np.fromfile(path, np.uint8), flags)
+        with path.open("rb") as file:
+            image = decode_image(file, flags)
     except OSError as error:
         raise DatasetError(f"cannot read {path}: {error.strerror}") from error
     if image is None:
-        raise DatasetError(f"{path} cannot be decoded; expected {what}")
+        side = MAX_IMAGE_SIDE
+        raise DatasetError(f"{path} cannot be decoded; expected {what} of at most {side}×{side} pixels")
     return image
 
 
-def decode_image(content: NDArray[np.uint8], flags: int) -> NDArray[Any] | None:
-    """Decode an image file's bytes as OpenCV's `flags` say; None where that fails, or it is far too large.
+def decode_image(file: BinaryIO, flags: int) -> NDArray[Any] | None:
+    """Decode an image file as OpenCV's `flags` say; None where that fails, or it is far too large.
 
     Pixels come as stored, as calibrations and depth have them: an EXIF orientation is for picture viewers.
-    OpenCV believes a PNG of a few bytes that claims gigabytes of pixels, and raises beyond that. libpng
-    prints what it does not like: a PNG is checked here first, and freed of what is not needed for its pixels.
+    OpenCV believes an image of a few bytes that claims gigabytes of pixels (but for PNG and JPEG, `tsfusion`
+    bounds that as it is imported). libpng prints what it does not like: a PNG is checked here first, and what
+    its pixels do not need is not even read.
     """
-    if content[:8].tobytes() == _PNG:
-        pixels = _png_of_pixels(content.tobytes())
-        if pixels is None:
-            return None
-        content = np.frombuffer(pixels, np.uint8)
+    is_png = file.read(len(_PNG)) == _PNG
+    content = _png_of_pixels(file) if is_png else _whole(file)
+    if not content:
+        return None
     try:
         stored = flags | cv2.IMREAD_IGNORE_ORIENTATION
-        image: NDArray[Any] | None = cv2.imdecode(content, stored) if len(content) else None
+        image: NDArray[Any] | None = cv2.imdecode(np.frombuffer(content, np.uint8), stored)
     except cv2.error:
         image = None
     return image
 
 
-def _png_of_pixels(content: bytes) -> bytes | None:
+def _whole(file: BinaryIO) -> bytes | None:
+    """The bytes of an image that is no PNG; None where it is far too large."""
+    nbytes = file.seek(0, SEEK_END)
+    file.seek(0)
+    content = file.read() if nbytes <= read_limits.MAX_FILE_BYTES else b""
+    with suppress(Refused):  # neither a JPEG, nor one that can be read in one way alone
+        if max(image_headers.size(content)) > MAX_IMAGE_SIDE:
+            return None
+    return content
+
+
+def _png_of_pixels(file: BinaryIO) -> bytes | None:
     """A PNG without the chunks that do not change its pixels; None where it is damaged or far too large."""
-    kept, place = [_PNG], len(_PNG)
-    while place < len(content):
-        length, name = struct.unpack(">I4s", content[place : place + 8].ljust(8, b"\0"))
-        chunk = content[place : place + 12 + length]
+    kept, left = [_PNG], _FEW
+    while len(head := file.read(8)) == 8:
+        length, name = struct.unpack(">I4s", head)
+        if name not in _PIXEL_CHUNKS:
+            if not name.isalpha():
+                break
+            file.seek(length + 4, SEEK_CUR)
+            continue
+        chunk = head + file.read(length + 4) if length <= left else b""
         if len(chunk) < 12 + length or zlib.crc32(chunk[4:-4]) != int.from_bytes(chunk[-4:], "big"):
-            return None
-        if name == b"IHDR" and (length != _HEADER or max(struct.unpack(">2I", chunk[8:16])) > MAX_IMAGE_SIDE):
-            return None
-        if name in _PIXEL_CHUNKS:
-            kept.append(chunk)
+            break
+        if name == b"IHDR":
+            width, height = struct.unpack(">2I", chunk[8:16]) if length == _HEADER else (0, 0)
+            if not 0 < max(width, height) <= MAX_IMAGE_SIDE:
+                break
+            left += width * height * _PIXEL
+        kept.append(chunk)
+        left -= length
         if name == b"IEND":
             return b"".join(kept)
-        place += len(chunk)
     return None
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tsfusion.core import read_limits
 from tsfusion.core.errors import DatasetError, MissingDependency, TsfusionError
 
 SUFFIXES = (".bin", ".pcd", ".ply", ".las", ".laz")
@@ -29,6 +30,7 @@ def read_scan(path: Path, *, fields: int = USUAL_FIELDS) -> NDArray[np.float32]:
     suffix = path.suffix.lower()
     points: NDArray[Any]
     try:
+        read_limits.check(path, path.stat().st_size)
         if path.stat().st_size == 0:
             points, promised = np.zeros((0, 3)), 0
         elif suffix == ".bin":
@@ -52,7 +54,8 @@ def read_scan(path: Path, *, fields: int = USUAL_FIELDS) -> NDArray[np.float32]:
 
 def _raw(path: Path, fields: int) -> tuple[NDArray[Any], int]:
     more = {3: "", 4: " and the intensity"}.get(fields, f" and {fields - 3} more")
-    expected = f"expected float32 x, y, z{more} (--option fields=3 for x, y, z alone)"
+    hint = "" if fields == 3 else " (--option fields=3 for x, y, z alone)"
+    expected = f"expected float32 x, y, z{more}{hint}"
     if (nbytes := path.stat().st_size) % (4 * fields):
         raise DatasetError(f"{path} has {nbytes} bytes, not {4 * fields} a point; {expected}")
     points = np.fromfile(path, "<f4").reshape(-1, fields)
@@ -79,6 +82,10 @@ def _pcd(path: Path) -> tuple[NDArray[Any], int]:
         from pypcd4.pypcd4 import PointCloud
     except ImportError as error:
         raise MissingDependency("to read PCD: pip install pypcd4 (or '.[lidar]')") from error
+    with path.open("rb") as file:
+        head = file.read(_HEADER_BYTES)
+    sizes = re.search(rb"^DATA binary_?s?compressed\r?\n....(.{4})", head, re.MULTILINE | re.DOTALL)
+    read_limits.check(path, int.from_bytes(sizes[1], "little") if sizes else 0)
     read = PointCloud.from_path(path)
     return np.asarray(read.numpy(("x", "y", "z"))), int(read.metadata.points)
 
@@ -100,6 +107,7 @@ def _las(path: Path) -> tuple[NDArray[Any], int]:
         raise MissingDependency("to read LAS or LAZ: pip install 'laspy[lazrs]' (or '.[mesh]')") from error
     with laspy.open(path) as opened:
         named = opened.header.point_count  # before it is told what was found
+        read_limits.check(path, named * opened.header.point_format.size)
         return np.asarray(opened.read().xyz), named
 
 

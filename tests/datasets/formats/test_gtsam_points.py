@@ -51,7 +51,7 @@ def test_clouds_go_by_their_number(tmp_path):
         (put("graph.txt", "v0 0 0 0 0 0 0\n"), r"graph\.txt:1: 6 numbers, expected 7"),
         (put("graph.txt", "v0 0 0 0 0 0 0 2\n"), r"graph\.txt:1: quaternion must have length 1, got 2"),
         (put("graph.txt", "vertex 0 0 0 0 0 0 1\n"), r"graph\.txt:1: 'vertex'; expected `vK tx"),
-        (put("000000/points.bin", "x"), r"points\.bin has 1 bytes; expected 12 a point"),
+        (put("000000/points.bin", "x"), r"points\.bin has 1 bytes, not 12 a point"),
     ],
 )
 def test_a_broken_dump_is_one_clear_line(tmp_path, change, match):

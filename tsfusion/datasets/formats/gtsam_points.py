@@ -4,19 +4,18 @@
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.dataset import SCAN, Frames, keep_posed, require_folder, require_frames
 from tsfusion.datasets.file_names import in_order
 from tsfusion.datasets.readers import numbers, read_lines
+from tsfusion.datasets.scan_files import read_scan
 from tsfusion.datasets.trajectory_files import check_quaternion
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.se3 import Transform
 from tsfusion.geometry.trajectory import rigid
 
 EXPECTED = "NNNNNN/points.bin (float32 x, y, z) and graph.txt (`vK tx ty tz qx qy qz qw` a line)"
-_BYTES = 12  # a point
 
 
 def recognises(path: Path) -> bool:
@@ -53,7 +52,7 @@ class LidarDump(Frames):
         return len(self._files)
 
     def _frame(self, index: int) -> Frame:
-        return self._posed_frame(index, points=_read_points(self._files[index]))
+        return self._posed_frame(index, points=read_scan(self._files[index], fields=3))
 
 
 def _read_graph(path: Path, *, required: bool) -> dict[int, Transform]:
@@ -73,13 +72,3 @@ def _read_graph(path: Path, *, required: bool) -> dict[int, Transform]:
         check_quaternion(values[3:], path, number)
         poses[int(name[1:])] = rigid(values[3:] / np.linalg.norm(values[3:]), values[:3])
     return poses
-
-
-def _read_points(path: Path) -> NDArray[np.float32]:
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise DatasetError(f"cannot read {path}: {error.strerror}") from error
-    if not content or len(content) % _BYTES:
-        raise DatasetError(f"{path} has {len(content)} bytes; expected 12 a point: float32 x, y, z")
-    return np.frombuffer(content, dtype="<f4").reshape(-1, 3).astype(np.float32)

@@ -17,6 +17,7 @@ from tsfusion.datasets.depth_files import check_metres, read_depth
 from tsfusion.datasets.formats.image_folders import resample_for_camera
 from tsfusion.datasets.readers import read_color, turned_by_exif
 from tsfusion.geometry.calibration import Camera, Undistorter
+from tsfusion.geometry.calibration_files import read_text
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics, check_pose
 from tsfusion.geometry.origin import FARTHEST
@@ -159,10 +160,8 @@ class Nerfstudio(Frames):
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        capture = json.loads(path.read_text(encoding="utf-8-sig"))
-    except FileNotFoundError as error:
-        raise DatasetError(f"{path} is missing; expected {EXPECTED}") from error
-    except (OSError, ValueError, RecursionError) as error:
+        capture = json.loads(read_text(path, EXPECTED))
+    except (ValueError, RecursionError) as error:
         raise DatasetError(f"{path} cannot be read: {error}; expected {EXPECTED}") from error
     frames = capture.get("frames") if isinstance(capture, dict) else None
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):

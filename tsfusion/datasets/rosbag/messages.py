@@ -6,6 +6,7 @@ itself raises DatasetError; the caller adds which message it was.
 """
 
 import struct
+from io import BytesIO
 from typing import Any, NamedTuple
 
 import cv2
@@ -147,7 +148,7 @@ def _stored(message: Any) -> NDArray[Any]:
 
 def _decoded(message: Any, flags: int, start: int = 0) -> NDArray[Any]:
     content = np.ascontiguousarray(message.data, np.uint8)[start:]
-    image = decode_image(content, flags)
+    image = decode_image(BytesIO(content.data), flags)
     if image is None:
         raise DatasetError(f"of {len(message.data)} bytes cannot be decoded as {message.format!r}")
     return image

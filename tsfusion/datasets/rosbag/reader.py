@@ -4,14 +4,19 @@
 A recording is a `.bag`, a ROS 2 folder (`metadata.yaml` beside `.db3` or `.mcap` files), or one such file.
 """
 
+import bz2
 import logging
 import threading
 import weakref
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
+from functools import cache, partial
+from itertools import chain
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
+from tsfusion.core import read_limits
 from tsfusion.core.errors import DatasetError, MissingDependency
 from tsfusion.journal import is_segment
 from tsfusion.journal.mcap_layout import MAGIC
@@ -22,11 +27,21 @@ ENDINGS = (".bag", ".db3", ".mcap")
 _SQLITE = b"SQLite format 3"
 METADATA = "metadata.yaml"
 _INSTALL = "ROS recordings are read by rosbags; install: pip install '.[ros]' in your clone of tsfusion"
+_UNCLOSED = "it was not closed when recording ended, or was cut: `{}` repairs it"
+_REINDEX, _RECOVER = _UNCLOSED.format("rosbag reindex FILE"), _UNCLOSED.format("mcap recover FILE -o NEW")
+_CHUNKS = "`mcap compress FILE -o NEW` or `rosbag compress FILE` writes smaller ones, if it is genuine"
 _HINTS = {
-    "not indexed": "it was not closed when recording ended: `rosbag reindex FILE` repairs it",
-    "File end magic": "it was not closed when recording ended: `mcap recover FILE -o NEW` repairs it",
+    "not indexed": _REINDEX,
+    "index looks damaged": _REINDEX,
+    "could not be read from file": _REINDEX,
+    "Invalid argument": _RECOVER,  # to read a footer from a few bytes
+    "File end magic": _RECOVER,
+    "malformed": _UNCLOSED.format("sqlite3 FILE .recover | sqlite3 NEW"),
     "Profile is not ros2": "only MCAP files of the profile ros2 are read",
+    "larger than": _CHUNKS,
+    "unpacks to": _CHUNKS,
 }
+_FILE_ORDER = -1  # connection of rosbags' index of a ROS 1 bag: all that are wanted
 
 
 class Stream(NamedTuple):
@@ -43,6 +58,7 @@ class MessageLocation(NamedTuple):
     connection: int
     log_ns: int
     stamp_ns: int  # of its header; 0 = the header has none
+    earlier: int = 0  # messages of the same connection and times before it in the file
 
 
 class Message(NamedTuple):
@@ -138,7 +154,7 @@ class BagRecording:
         if not numbers:
             return
         with self._errors():
-            for connection, log_ns, raw in self._reader.messages([self._connections[i] for i in numbers]):
+            for connection, log_ns, raw in self._raw([self._connections[i] for i in numbers]):
                 number = by_id[id(connection.owner)][connection.id]
                 stream = numbers[number]
                 content = self._content(raw, stream.kind)
@@ -160,15 +176,37 @@ class BagRecording:
         Raises:
             DatasetError: the recording has changed, and the message is no longer there.
         """
-        connection = self._connections[location.connection]
+        connection, left = self._connections[location.connection], location.earlier
         with self._lock, self._errors():
             for _, _, raw in self._reader.messages([connection], location.log_ns, location.log_ns + 1):
                 content = self._content(raw, connection.msgtype)
                 if content is not None and stamp_ns(content) == location.stamp_ns:
-                    return content
+                    if not left:
+                        return content
+                    left -= 1
         raise DatasetError(
             f"{self.path}: the message of {connection.topic} at {location.log_ns} ns is no longer there"
         )
+
+    def _raw(self, connections: list[Any]) -> Iterator[tuple[Any, int, bytes]]:
+        """Messages as they lie in the file: rosbags sorts them by a clock that may have stepped back."""
+        (reader,) = self._reader.readers
+        if not self._is2:
+            entries = chain.from_iterable(reader.indexes[one.id] for one in connections)
+            reader.indexes[_FILE_ORDER] = sorted(entries, key=lambda entry: (entry.chunk_pos, entry.offset))
+            yield from reader.messages([SimpleNamespace(id=_FILE_ORDER)])
+            return
+        is_packed = reader.storage.metadata.compression_mode == "message"
+        unpack = _bound_unpacking() if is_packed else bytes
+        for part in _files(reader):
+            own = {
+                one.id: named
+                for one in part.connections
+                for named in connections
+                if (named.topic, named.msgtype, named.ext) == (one.topic, one.msgtype, one.ext)
+            }
+            for number, log_ns, raw in _rows(part, own):
+                yield own[number], log_ns, unpack(raw)
 
     def _content(self, raw: bytes, kind: str) -> Any:
         """The message of some bytes, by the recording's own definition or else the usual one."""
@@ -182,15 +220,13 @@ class BagRecording:
             return None
 
     def _warn_if_unindexed(self) -> None:
-        for reader in self._reader.readers if self._is2 else ():
-            storage = reader.storage
-            for one in getattr(storage, "storages", [storage]):
-                if hasattr(one, "chunks") and not one.chunks and self.streams:
-                    log.warning(
-                        "%s has no index: each frame is looked for from its start; "
-                        "`mcap recover FILE -o NEW` makes one",
-                        one.path,
-                    )
+        for one in _files(self._reader.readers[0]) if self._is2 else ():
+            if hasattr(one, "chunks") and not one.chunks and self.streams:
+                log.warning(
+                    "%s has no index: each frame is looked for from its start; "
+                    "`mcap recover FILE -o NEW` makes one",
+                    one.path,
+                )
 
     @contextmanager
     def _errors(self) -> Iterator[None]:
@@ -223,7 +259,50 @@ def _reader(path: Path) -> Any:
         from rosbags.highlevel import AnyReader
     except ImportError as error:
         raise MissingDependency(_INSTALL) from error
-    return AnyReader([path], default_typestore=_usual_types(path.suffix != ".bag"))
+    _bound_unpacking()
+    bounded = read_limits.BoundedPath(path)
+    return AnyReader([bounded], default_typestore=_usual_types(path.suffix != ".bag"))
+
+
+@cache
+def _bound_unpacking() -> Callable[[bytes], bytes]:
+    """Have rosbags unpack within `read_limits`, by its tables of unpackers; returns that of zstd."""
+    import apsw
+    import lz4.frame
+    from rosbags.rosbag1 import reader as ros1
+    from rosbags.rosbag2 import reader as ros2
+    from rosbags.rosbag2 import storage_mcap
+
+    openers = {"bz2": bz2.open, "lz4": lz4.frame.open, "zstd": storage_mcap.zstd.open}
+    bounded = {name: partial(read_limits.unpack, opener) for name, opener in openers.items()}
+    ros1.decompressors.update((name, bounded[name]) for name in ("bz2", "lz4"))
+    storage_mcap.DECOMPRESSORS.update((name, bounded[name]) for name in ("lz4", "zstd"))
+
+    def whole_zstd(file: Any, mode: str) -> read_limits.BoundedFile:
+        return read_limits.BoundedFile(openers["zstd"](file, mode), Path(file.raw.name).stat().st_size)
+
+    ros2.Path = read_limits.BoundedPath
+    ros2.zstd = SimpleNamespace(decompress=bounded["zstd"], open=whole_zstd)
+    hooks: list[Any] = apsw.connection_hooks
+    longest = apsw.SQLITE_LIMIT_LENGTH, read_limits.MAX_PIECE_BYTES
+    hooks.append(lambda connection: connection.limit(*longest))
+    return bounded["zstd"]
+
+
+def _files(reader: Any) -> list[Any]:
+    """The storages of a ROS 2 recording, in the order of its parts."""
+    return list(getattr(reader.storage, "storages", [reader.storage]))
+
+
+def _rows(storage: Any, connections: Collection[int]) -> Iterator[tuple[int, int, bytes]]:
+    """Connection, time and bytes of the messages in one file, as they lie there."""
+    if hasattr(storage, "messages_scan"):
+        named = [one for one in storage.connections if one.id in connections]
+        yield from ((one.id, log_ns, raw) for one, log_ns, raw in storage.messages_scan(named))
+    elif connections:
+        places = ",".join("?" * len(connections))
+        query = f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({places}) ORDER BY id"
+        yield from storage.dbconn.execute(query, tuple(connections))
 
 
 def _usual_types(is2: bool) -> Any:

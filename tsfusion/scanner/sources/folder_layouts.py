@@ -3,12 +3,14 @@
 
 import re
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tsfusion.core import read_limits
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.formats.image_folders import COLOR
 from tsfusion.datasets.readers import decode_image, read_numbers
@@ -79,10 +81,10 @@ def layout_of(root: Path) -> FolderLayout | None:
 
 def whole_image(path: Path, flags: int) -> NDArray[Any] | None:
     """Decode an image with OpenCV's `flags`; None while it is incomplete, or if it is damaged."""
-    raw = path.read_bytes()
+    raw = path.read_bytes() if path.stat().st_size <= read_limits.MAX_FILE_BYTES else b""
     if not raw.endswith(_PNG_END if path.suffix == ".png" else _JPEG_END):
         return None
-    return decode_image(np.frombuffer(raw, np.uint8), flags)
+    return decode_image(BytesIO(raw), flags)
 
 
 def whole_scan(path: Path) -> NDArray[np.float32] | None:
@@ -91,6 +93,7 @@ def whole_scan(path: Path) -> NDArray[np.float32] | None:
     Raises:
         DatasetError: these are no points of four numbers.
     """
+    read_limits.check(path, path.stat().st_size)
     raw = path.read_bytes()
     if not raw or len(raw) % _POINT:
         return None

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: MIT
+"""Bounds on the memory that somebody else's file may take, checked before it is spent.
+
+A container of a few kilobytes can unpack to gigabytes, and a file with a hole has any size: whoever reads a
+file whole, or unpacks a part of one, asks here.
+"""
+
+import io
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import IO, Any
+
+from tsfusion.core.errors import DatasetError
+from tsfusion.core.readable_numbers import size
+
+MAX_PIECE_BYTES = 1 << 27  # of a chunk, record or message, unpacked: more than 2 million points of 48 bytes
+MAX_FILE_BYTES = 1 << 28  # of a file that is read whole: floats of the largest image of a keyframe
+_FEW_BYTES, _WORST_RATIO = 1 << 29, 100  # of a compressed recording; sensors' data reaches 10 or 20
+
+
+def check(source: object, nbytes: float) -> None:
+    """Raise DatasetError where something that is read whole needs more than `MAX_FILE_BYTES`."""
+    if nbytes > MAX_FILE_BYTES:
+        raise DatasetError(
+            f"{source} needs {size(nbytes)} of memory; expected at most {size(MAX_FILE_BYTES)}"
+        )
+
+
+def unpack(opener: Callable[[Any, str], Any], packed: bytes, *_: Any) -> bytes:
+    """Unpack a chunk or a message by `bz2.open` or its likes; raises ValueError beyond `MAX_PIECE_BYTES`."""
+    with opener(io.BytesIO(packed), "rb") as file:
+        found: bytes = file.read(MAX_PIECE_BYTES + 1)
+    if len(found) > MAX_PIECE_BYTES:
+        raise ValueError(f"a part of {size(len(packed))} unpacks to more than {size(MAX_PIECE_BYTES)}")
+    return found
+
+
+class BoundedFile(io.BufferedReader):
+    """A file that gives at most `MAX_PIECE_BYTES` at once, and a compressed one not far more than it has."""
+
+    def __init__(self, raw: Any, packed: float = math.inf) -> None:
+        super().__init__(raw)
+        self._left = max(_FEW_BYTES, _WORST_RATIO * packed)
+
+    def read(self, nbytes: int | None = -1, /) -> bytes:
+        """Read as from any file; raises ValueError beyond the bounds."""
+        if nbytes is not None and nbytes > MAX_PIECE_BYTES:
+            raise ValueError(f"a part of {size(nbytes)} is larger than {size(MAX_PIECE_BYTES)}")
+        found = super().read(nbytes)
+        self._left -= len(found)
+        if self._left < 0:
+            raise ValueError("it unpacks to far more than it has")
+        return found
+
+
+class BoundedPath(type(Path())):  # type: ignore[misc]  # which class it is depends on the system
+    """A path whose binary file is a `BoundedFile`."""
+
+    def open(self, mode: str = "r", *args: Any, **kwargs: Any) -> IO[Any]:
+        """Open the file."""
+        opened: IO[Any] = (
+            BoundedFile(io.FileIO(self)) if mode == "rb" else super().open(mode, *args, **kwargs)
+        )
+        return opened
