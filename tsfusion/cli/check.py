@@ -28,11 +28,13 @@ def check(
 ) -> None:
     """Check that poses, camera and depth agree, and say what is wrong.
 
-    Exit status 1 when they disagree; 0 when they agree, and when nobody can tell.
+    Exit status 1 when they disagree, or the clock steps back; 0 when they agree, and when nobody can tell.
     """
     from tsfusion.cli import output
+    from tsfusion.core.errors import IncompleteRun
     from tsfusion.datasets.cameras import camera_line
     from tsfusion.evaluation import pose_check
+    from tsfusion.pipelines import shortfall
 
     dataset = replay.open_recording(
         path,
@@ -55,5 +57,7 @@ def check(
                 typer.echo(f"focal length {used:.4g} px used, {fitted:.0f} ± {sigma:.0f} fits best")
             for name, fit in sorted(report.tried.items(), key=lambda item: -item[1]):
                 typer.echo(f"  if {name:<16} {fit:.2f}")
+    if late := shortfall.of_clock(dataset.skipped):
+        raise IncompleteRun(late)
     if report.verdict == "disagree":
         raise typer.Exit(1)

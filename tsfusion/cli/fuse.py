@@ -96,7 +96,7 @@ def fuse(
         _print(result)
     missed = (
         shortfall.of_damage(result.keyframes_lost), shortfall.of_absence(found.absent),
-        shortfall.of_poses(result.keyframes, found.left_out)
+        shortfall.of_poses(result.keyframes, found.left_out), shortfall.of_clock(found.left_out),
     )  # fmt: skip
     if text := shortfall.together(missed):
         raise IncompleteRun(text)

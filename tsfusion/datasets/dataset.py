@@ -8,7 +8,7 @@ from types import MappingProxyType
 from typing import Any, Protocol, TypeVar, overload, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from tsfusion.core.errors import DatasetError, InvalidKeyframe
 from tsfusion.datasets.accelerometer import Accelerometer
@@ -22,6 +22,9 @@ STREET = MappingProxyType({"voxel_size": 0.1})  # usual there: at 2 cm a stereo 
 NOMINAL_NS = 33_333_333  # between frames of a recording without times: thirty a second
 SCAN = "`tsfusion scan PATH` finds poses by itself"
 WITHOUT_POSE = "without a pose"  # how the reasons of frames that poses would have kept begin
+CLOCK = "after the clock"  # how the reason of those begins that came when it had stepped back
+_LATE_NS = 50_000_000  # a stamp may come late: from another thread, or with exposure
+_FEWEST_TIMES = 10  # of each part on average; more parts are a series without an order
 _T = TypeVar("_T")
 
 
@@ -238,6 +241,36 @@ def nearest_in_time(sorted_ns: NDArray[np.int64], stamps_ns: NDArray[np.int64]) 
     left = np.maximum(right - 1, 0)
     nearer = np.abs(sorted_ns[left] - stamps_ns) <= np.abs(sorted_ns[right] - stamps_ns)
     return np.searchsorted(sorted_ns, sorted_ns[np.where(nearer, left, right)])
+
+
+def clock_parts(stamps_ns: ArrayLike) -> list[slice]:
+    """Parts of a series of times, (n,) nanoseconds as they were recorded, between which its clock steps back.
+
+    No step is: one late time among others, times before all of the part, a series that has no order.
+    """
+    stamps, begin = np.asarray(stamps_ns, np.int64), 0
+    parts: list[slice] = []
+    while len(stamps) and len(parts) < max(2, len(stamps) // _FEWEST_TIMES):
+        rest = stamps[begin:]
+        late = rest < np.maximum.accumulate(rest) - _LATE_NS
+        step = int(np.argmax(late & np.append(late[1:], late[-1:])))
+        if not step or rest[step:].max() < rest[:step].min():
+            return [*parts, slice(begin, None)]
+        parts.append(slice(begin, begin + step))
+        begin += step
+    return [slice(None)]
+
+
+def require_one_clock(stamps_ns: Sequence[int], path: Path) -> None:
+    """Raise DatasetError where the times of a list, in its order, step back into those before."""
+    parts = clock_parts(stamps_ns)
+    if len(parts) > 1:
+        begin = parts[1].start
+        back_s = (max(stamps_ns[:begin]) - stamps_ns[begin]) / 1e9
+        raise DatasetError(
+            f"{path}: the clock steps back by {back_s:.2f} s at entry {begin + 1}, so that times before and "
+            "after are mixed; cut the list there, and read each part alone"
+        )
 
 
 def require_folder(path: str | Path, layout: str) -> Path:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError, InvalidKeyframe
+from tsfusion.datasets.dataset import require_one_clock
 from tsfusion.datasets.readers import numbers, read_lines, read_numbers
 from tsfusion.geometry.keyframe import check_pose
 from tsfusion.geometry.origin import FARTHEST
@@ -78,6 +79,7 @@ def check_quaternion(quaternion: Sequence[float] | NDArray[np.float64], path: Pa
 def _in_order(stamps: list[int], rows: list[list[float]], path: Path, content: str) -> Trajectory:
     if not rows:
         raise DatasetError(f"{path} holds no poses; expected {content}")
+    require_one_clock(stamps, path)
     order = np.unique(np.array(stamps, dtype=np.int64), return_index=True)[1]
     table = np.array(rows)[order]
     quaternions = table[:, 3:] / np.linalg.norm(table[:, 3:], axis=1, keepdims=True)

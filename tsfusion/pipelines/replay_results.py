@@ -113,6 +113,7 @@ def summarise(
                     stats, spool="the spool", link=sender.problem, rejection=sender.first_rejection
                 ),
                 shortfall.of_damage(dataset.skipped.get(LOST, 0)),
+                shortfall.of_clock(dataset.skipped),
                 *missed,
             )
         ),

@@ -152,6 +152,7 @@ def summarise(
             (
                 shortfall.of_delivery(stats, spool=spool, link=state.link, rejection=scanner.first_rejection),
                 shortfall.of_tracking(state.frames, state.tracked, scanner.last_loss, localizer=localizer),
+                shortfall.of_clock(source.skipped),
             )
         ),
         left=stats.waiting,

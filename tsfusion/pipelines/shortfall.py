@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping
 
 from tsfusion.client import ClientStats
 from tsfusion.core.counts import count_of
-from tsfusion.datasets.dataset import WITHOUT_POSE
+from tsfusion.datasets.dataset import CLOCK, WITHOUT_POSE
 
 _LOST = ("spool", "disk")  # reasons of skipping that no policy asks for
 
@@ -93,6 +93,12 @@ def cure_of_tracking(localizer: str) -> str:
     if localizer == "given":
         return "give poses of all frames (--trajectory FILE), or let them be found (--localizer rgbd)"
     return "move more slowly, give every frame, or take poses from elsewhere (--trajectory FILE)"
+
+
+def of_clock(left_out: Mapping[str, int]) -> str:
+    """Say which frames came when their clock had stepped back; empty = none. `left_out` as of `of_poses`."""
+    late = ((reason, count) for reason, count in left_out.items() if reason.startswith(CLOCK))
+    return together(f"{count_of(n, 'frame is', 'frames are')} not in the map: {reason}" for reason, n in late)
 
 
 def of_poses(frames: int, left_out: Mapping[str, int]) -> str:

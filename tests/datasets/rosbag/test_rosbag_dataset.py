@@ -6,7 +6,7 @@ import random
 import sqlite3
 import sys
 import tracemalloc
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +20,14 @@ from rosbag_writing import BODY, FORMS, OPTICAL, WORLD, BagWriter, writing
 from tsfusion.cli import replay
 from tsfusion.core.errors import DatasetError, MissingDependency
 from tsfusion.datasets import open_dataset
+from tsfusion.datasets.dataset import clock_parts
 from tsfusion.datasets.rosbag.dataset import Bag, recognises
 from tsfusion.geometry import se3
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.journal import segment_path
 from tsfusion.journal.recording import JournalRecording
 from tsfusion.journal.ros2_export import export
+from tsfusion.pipelines import shortfall
 
 pytest.importorskip("rosbags")
 
@@ -316,3 +318,76 @@ def test_without_rosbags_the_error_names_the_command(tmp_path: Path, monkeypatch
     monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
     with pytest.raises(MissingDependency, match=r"pip install '.\[ros\]'"):
         open_dataset(path)
+
+
+# --- a clock that steps back ---
+
+
+def walk(folder: Path, form: str, back_ns: int) -> Path:
+    """20 walls a frame apart, each at its place; from the eleventh on all stamps are earlier."""
+    with writing(folder, form) as (bag, path):
+        bag.transform(T_BODY_OPTICAL, BODY, OPTICAL, T0, static=True)
+        for index in range(20):
+            back = back_ns if index >= 10 else 0
+            keyframe, stamp = wall(index), T0 + index * FRAME_NS - back
+            infos(bag, stamp)
+            bag.transform(keyframe.T_world_camera @ se3.inverse(T_BODY_OPTICAL), WORLD, BODY, stamp)
+            bag.image(DEPTH, keyframe.measurement, "16UC1", stamp)
+    return path
+
+
+@pytest.mark.parametrize("form", ["ros1", "ros1-lz4", "sqlite3", "mcap", "mcap-storage"])
+def test_a_clock_that_steps_back_cuts_the_recording(tmp_path: Path, form: str) -> None:
+    path = walk(tmp_path, form, 5 * FRAME_NS)
+    first, second = open_dataset(path), open_dataset(path, part=2)
+    reason = f"after the clock of {DEPTH} stepped back by 0.13 s (--option part=2 reads them instead)"
+    assert first.skipped == {reason: 10}
+    assert shortfall.of_clock(first.skipped) == f"10 frames are not in the map: {reason}"
+    assert second.skipped == {"of other parts": 10}
+    assert shortfall.of_clock(second.skipped) == ""
+    for index in range(10):
+        for found, number in ((first, index), (second, 10 + index)):
+            np.testing.assert_array_equal(found[index].measurement, wall(number).measurement)
+            np.testing.assert_allclose(found[index].T_world_camera, wall(number).T_world_camera, atol=1e-9)
+    with pytest.raises(DatasetError, match="has 2 parts, got part=3"):
+        open_dataset(path, part=3)
+
+
+def test_a_clock_set_back_by_a_day_mixes_nothing(tmp_path: Path) -> None:
+    found = open_dataset(walk(tmp_path, "ros1", 86_400 * 10**9))
+    assert (len(found), found.skipped) == (20, {})
+
+
+@pytest.mark.parametrize(
+    ("order", "parts"),
+    [
+        (range(40), 1),
+        ([*range(20), 18, *range(20, 40)], 1),  # one that came late
+        ([*range(20), *range(10, 30)], 2),
+        ([*range(20), *range(10, 30), *range(25, 35)], 3),
+        ([*range(20, 40), *range(20)], 1),  # sorted as text, for instance
+        (np.random.default_rng(1).permutation(40), 1),
+        ([], 1),
+    ],
+)
+def test_parts_of_a_series(order: Sequence[int], parts: int) -> None:
+    found = clock_parts([100_000_000 * number for number in order])
+    assert len(found) == parts
+    assert [number for part in found for number in list(order)[part]] == list(order)
+
+
+# --- files that end early ---
+
+
+@pytest.mark.parametrize(
+    ("form", "cure"),
+    [("ros1", "rosbag reindex"), ("mcap", "mcap recover"), ("sqlite3", "sqlite3 FILE .recover")],
+)
+def test_a_recording_that_was_cut_names_its_cure(tmp_path: Path, form: str, cure: str) -> None:
+    path = walk(tmp_path, form, 0)
+    file = path if path.is_file() else next(path.glob("*.[dm]*[!l]"))
+    whole = file.read_bytes()
+    for share in (0.1, 0.4, 0.7, 0.95, 0.999):
+        file.write_bytes(whole[: int(share * len(whole))])
+        with pytest.raises(DatasetError, match=cure):
+            open_dataset(path)

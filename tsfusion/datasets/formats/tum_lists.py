@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets.dataset import nearest_in_time
+from tsfusion.datasets.dataset import nearest_in_time, require_one_clock
 from tsfusion.datasets.readers import read_lines
 from tsfusion.datasets.trajectory_files import nanoseconds
 
@@ -60,6 +60,7 @@ def _read_list(path: Path) -> list[tuple[int, Path]]:
             raise DatasetError(f"{path}:{number}: {line!r}; expected {content}")
         images.append((nanoseconds(words[0], path, number), _beside(path, words[1])))
     _check(path, [image for _, image in images], content)
+    require_one_clock([stamp for stamp, _ in images], path)
     return sorted(set(images))  # a line may be there twice
 
 
@@ -75,6 +76,7 @@ def _read_pairs(path: Path) -> ImageList:
         stamp = nanoseconds(words[depth], path, number)
         rows.append((stamp, _beside(path, words[depth + 1]), _beside(path, words[color + 1])))
     _check(path, [file for row in rows for file in row[1:]], content)
+    require_one_clock([row[0] for row in rows], path)
     rows = sorted(set(rows))
     return ImageList([row[0] for row in rows], [row[1] for row in rows], [row[2] for row in rows])
 

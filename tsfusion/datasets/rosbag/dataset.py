@@ -15,7 +15,14 @@ import numpy as np
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.cameras import DepthUnit, RecordedCamera
-from tsfusion.datasets.dataset import Frames, keep_posed, nearest_in_time, require_frames
+from tsfusion.datasets.dataset import (
+    CLOCK,
+    Frames,
+    clock_parts,
+    keep_posed,
+    nearest_in_time,
+    require_frames,
+)
 from tsfusion.datasets.depth_files import check_metres
 from tsfusion.datasets.rosbag import messages
 from tsfusion.datasets.rosbag.cameras import CameraWatch
@@ -69,6 +76,8 @@ class Bag(Frames):
             and of floats 1.
         rectified: whether the images are rectified, so that `P` is theirs; default where the topic's name
             has `rect`. Others are undistorted or rectified here (colour by its depth's camera).
+        part: where the clock stepped back, the part to read, from 1; default the first, and the others are
+            counted in `skipped`.
         max_difference_s: between a depth image and its colour (default 20 ms), or left and right (5 ms).
         max_gap_s: between the two poses interpolated, seconds.
         time_offset_s: added to a frame's stamp before its pose is looked up, seconds.
@@ -99,6 +108,7 @@ class Bag(Frames):
         calibration: str | Path | None = None,
         depth_scale: float | None = None,
         rectified: bool | None = None,
+        part: int | None = None,
         max_difference_s: float | None = None,
         max_gap_s: float = 0.25,
         time_offset_s: float = 0.0,
@@ -146,10 +156,10 @@ class Bag(Frames):
             max_gap_s=max_gap_s,
         )
         imu = ImuTopics(self._recording)
-        mains, others = self._index(poses, imu)
+        mains, others, cut = self._index(poses, imu, part)
         difference_s = _DIFFERENCE_S[chosen.modality] if max_difference_s is None else max_difference_s
         self._pair(mains, others, round(difference_s * 1e9))
-        self._pose(poses.finish(required=posed), round(time_offset_s * 1e9), posed)
+        self._pose(poses.finish(required=posed, part=cut), round(time_offset_s * 1e9), posed)
         self._registration = self._register(poses)
         require_frames(len(self._mains), path, EXPECTED, self.skipped)
         self._accelerometer = imu.accelerometer(partial(self._from_frame, poses))
@@ -167,9 +177,12 @@ class Bag(Frames):
         return DepthUnit(recorded or 0.001, "as ROS has it" if recorded is None else "as recorded")
 
     def _index(
-        self, poses: PoseFinder, imu: ImuTopics
-    ) -> tuple[dict[int, MessageLocation], dict[int, MessageLocation]]:
-        """Locations by time of the main and the other messages, from one pass over the recording."""
+        self, poses: PoseFinder, imu: ImuTopics, part: int | None
+    ) -> tuple[dict[int, MessageLocation], dict[int, MessageLocation], int | None]:
+        """Locations by time of the main and the other messages, from one pass over the recording.
+
+        The last is the number of the part that they are of, None where the clock never stepped back.
+        """
         chosen = self._chosen
         used = [chosen.main]
         if chosen.other and (self._with_color or chosen.modality == "stereo"):
@@ -200,11 +213,34 @@ class Bag(Frames):
         for topic, count in broken.items():
             if count:
                 self.skipped[f"of {topic} that are broken"] = count
+        cut = self._cut(locations, part)
         # Messages by their header's stamp, or by the recorder's clock where a header says nothing
         found = [{each.stamp_ns or each.log_ns: each for each in locations[one.topic]} for one in used]
         if repeated := len(locations[chosen.main.topic]) - len(found[0]):
             self.skipped[f"of {chosen.main.topic} with another's time"] = repeated
-        return found[0], found[1] if len(found) > 1 else {}
+        return found[0], found[1] if len(found) > 1 else {}, cut
+
+    def _cut(self, locations: dict[str, list[MessageLocation]], part: int | None) -> int | None:
+        """Keep one part of messages whose clock stepped back; returns its number, None = it never did."""
+        main = self._chosen.main.topic
+        stamps = {topic: [one.stamp_ns or one.log_ns for one in own] for topic, own in locations.items()}
+        parts = {topic: clock_parts(own) for topic, own in stamps.items()}
+        if not 1 <= (part or 1) <= len(parts[main]):
+            raise DatasetError(f"{self._recording.path} has {len(parts[main])} parts, got part={part}")
+        if len(parts[main]) == 1:
+            return None
+        begin, count = parts[main][1].start, len(locations[main])
+        back_s = (max(stamps[main][:begin]) - stamps[main][begin]) / 1e9
+        for topic, own in parts.items():
+            same: Counter[MessageLocation] = Counter()
+            for number, one in enumerate(locations[topic]):
+                locations[topic][number] = one._replace(earlier=same[one])
+                same[one] += 1
+            locations[topic] = locations[topic][own[: part or 1][-1]]
+        reason = f"{CLOCK} of {main} stepped back by {back_s:.2f} s (--option part=2 reads them instead)"
+        reason = reason if part is None else "of other parts"
+        self.skipped[reason] = count - len(locations[main])
+        return part or 1
 
     def _pair(
         self, mains: dict[int, MessageLocation], others: dict[int, MessageLocation], max_difference_ns: int

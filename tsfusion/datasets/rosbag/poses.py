@@ -76,16 +76,19 @@ class PoseFinder:
                 self._pose_topics[message.stream] = PoseTopic()  # each path holds all that were before
             self._pose_topics[message.stream].add(message.content, message.stream.kind)
 
-    def finish(self, *, required: bool) -> Callable[[int], Transform | None]:
+    def finish(self, *, required: bool, part: int | None = None) -> Callable[[int], Transform | None]:
         """A function from nanoseconds to `T_world_sensor`, None where the pose is not known.
+
+        Args:
+            part: number of the part that counts of poses whose clock stepped back, from 1; None = all.
 
         Raises:
             DatasetError: `required` and there are no poses; or no transforms connect the named frames.
         """
-        self._transforms.finish()
+        self._transforms.finish(part)
         if not self._topic_named and self._transforms.moves(self._frame):
             return self._by_transforms()
-        found = self._track()
+        found = self._track(part)
         if found is not None:
             return self._by_track(found)
         if self._transforms.is_dynamic(self._frame):
@@ -110,13 +113,13 @@ class PoseFinder:
             )
         return lambda stamp: self._transforms.at(world, self._frame, stamp)
 
-    def _track(self) -> TransformTrack | None:
+    def _track(self, part: int | None) -> TransformTrack | None:
         """The poses of the first kind in `POSE_KINDS` that leads to the sensor."""
         for kind in POSE_KINDS:
             tracks = {
                 stream.topic: found
                 for stream, topic in self._pose_topics.items()
-                if stream.kind == kind and (found := topic.track()) is not None
+                if stream.kind == kind and (found := topic.track(part)) is not None
             }
             fitting = {topic: one for topic, one in tracks.items() if self._leads(one)}
             if len(fitting) == 1:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tsfusion.datasets.dataset import clock_parts
 from tsfusion.datasets.rosbag.reader import frame_id, stamp_ns
 from tsfusion.geometry import se3
 from tsfusion.geometry.se3 import Transform
@@ -48,10 +49,15 @@ class PoseSamples:
         table: NDArray[np.float64] = np.array(self._values[-7:]).reshape(1, 7)
         return Trajectory(np.array(self._stamps[-1:], np.int64), table[:, :3], table[:, 3:])
 
-    def trajectory(self) -> Trajectory:
-        """The poses in the order of time; of equal times the first."""
-        stamps, order = np.unique(np.array(self._stamps, np.int64), return_index=True)
-        table: NDArray[np.float64] = np.array(self._values).reshape(-1, 7)[order]
+    def trajectory(self, part: int | None = None) -> Trajectory:
+        """The poses in the order of time; of equal times the first.
+
+        Args:
+            part: number of the part to take where their clock stepped back, from 1; None = all.
+        """
+        own = slice(None) if part is None else clock_parts(self._stamps)[:part][-1]
+        stamps, order = np.unique(np.array(self._stamps[own], np.int64), return_index=True)
+        table: NDArray[np.float64] = np.array(self._values).reshape(-1, 7)[own][order]
         return Trajectory(stamps, table[:, :3], table[:, 3:])
 
 
@@ -95,13 +101,13 @@ class TransformTree:
                 if not static:
                     self._dynamic.add(key)
 
-    def finish(self) -> None:
-        """Build the tree, after the last `add`."""
+    def finish(self, part: int | None) -> None:
+        """Build the tree, after the last `add`; `part` as of `PoseSamples.trajectory`."""
         for (parent, child), samples in sorted(self._samples.items(), key=lambda item: len(item[1])):
             if not samples:
                 continue
             is_static = (parent, child) not in self._dynamic
-            trajectory = samples.last() if is_static else samples.trajectory()
+            trajectory = samples.last() if is_static else samples.trajectory(part)
             rows = np.hstack([trajectory.translations, trajectory.quaternions])
             constant = is_static or bool((np.ptp(rows, axis=0) < _SAME).all())
             self._edges[child] = _Edge(parent, trajectory, constant)
@@ -180,6 +186,8 @@ class PoseTopic:
                 where = pose.position, pose.orientation
             self._samples.add(stamp_ns(one), *where)
 
-    def track(self) -> TransformTrack | None:
-        """The poses so far; None = there is none."""
-        return TransformTrack(self.world, self.body, self._samples.trajectory()) if self._samples else None
+    def track(self, part: int | None) -> TransformTrack | None:
+        """The poses so far, `part` as of `PoseSamples.trajectory`; None = there is none."""
+        return (
+            TransformTrack(self.world, self.body, self._samples.trajectory(part)) if self._samples else None
+        )
