@@ -42,6 +42,7 @@ from tsfusion.delivery.sender import Sender
 from tsfusion.delivery.spool import Spool
 from tsfusion.geometry.keyframe import Keyframe, keyframe_of
 from tsfusion.geometry.sample_ranges import wrong_unit
+from tsfusion.geometry.sweeps import skewed
 from tsfusion.wire import corrections, sockets
 from tsfusion.wire.curve import client_keys
 from tsfusion.wire.keyframe_times import KeyframeTimes
@@ -135,6 +136,7 @@ class Client:
             raise TransportError(f"cannot open a socket: {error.strerror}") from error
         self._sending = threading.Lock()
         self._closed = self._began_sending = False
+        self.skewed = 0  # keyframes sent whose points have times, and no motion
         self._began = time.monotonic()
         self._thread = threading.Thread(target=self._sender.run, name="tsfusion-client", daemon=True)
         self._thread.start()
@@ -159,17 +161,22 @@ class Client:
         Raises:
             TransportError: after `close`, also when that happens while this waits.
         """
+        keyframe = keyframe_of(keyframe)
         if not self._began_sending:
             self._began_sending = True
-            if wrong := wrong_unit(keyframe_of(keyframe)):
+            if wrong := wrong_unit(keyframe):
                 log.warning("the first keyframe has %s", wrong)
+        if keyframe.point_times_s is not None:
+            self.skewed += 1
+            if self.skewed == 1:
+                log.warning(skewed("points have times, and no motion is known"))
         while True:
             self._outbox.wait(lambda: not self._pressure.must_wait, None, self._check_running)
             with self._sending:
                 self._check_running()
                 if self._pressure.must_wait:  # another thread took the turn
                     continue
-                seq = self._pressure.put(keyframe_of(keyframe))
+                seq = self._pressure.put(keyframe)
             if seq is not None:
                 self._sender.wake()
             if self.logs_refusal and self.is_of_other_world:

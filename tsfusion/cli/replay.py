@@ -147,22 +147,23 @@ def _is_synthetic(path: Path) -> bool:
 
 
 def _checked(dataset: "Dataset") -> tuple[str, list[str]]:
-    """Mistake because of which poses, camera and depth disagree, empty = none; and what is said of colour.
+    """Mistake because of which poses, camera and depth disagree, empty = none; and other oddities.
 
-    Both are printed on stderr.
+    What was not said when the recording was found is printed on stderr.
     """
     from tsfusion.core.errors import DatasetError, JournalError
+    from tsfusion.datasets.dataset import frame_of
     from tsfusion.evaluation import pose_check
 
     try:
-        report = pose_check.check(dataset)
+        report, untimed = pose_check.check(dataset), frame_of(dataset, 0).untimed
     except (DatasetError, JournalError):  # the replay comes to that frame, and tells
         return "", []
     doubt = report.text if report.verdict == "disagree" else ""
     warnings = [report.color] if report.color is not None and not doubt else []
     for line in filter(None, [doubt, *warnings]):
         output.text(f"warning: {line}", err=True)
-    return doubt, warnings
+    return doubt, warnings + [untimed] * bool(untimed)
 
 
 @options.takes_map_settings

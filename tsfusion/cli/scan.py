@@ -265,14 +265,15 @@ def _open(
 
 
 def _warnings(dataset: "Dataset") -> list[str]:
-    """Oddities of a recording's frames, a sentence each; they are printed on stderr, too."""
+    """Oddities of a recording's frames, a sentence each; new ones are printed on stderr, too."""
     from tsfusion.cli import output
     from tsfusion.core import process
     from tsfusion.core.errors import DatasetError
+    from tsfusion.datasets.dataset import frame_of
     from tsfusion.evaluation import pose_check
 
     try:
-        depth, color = pose_check.check_frames(dataset)
+        (depth, color), untimed = pose_check.check_frames(dataset), frame_of(dataset, 0).untimed
     except DatasetError:  # the scan comes to that frame, and tells
         return []
     process.give_back_memory()
@@ -281,7 +282,7 @@ def _warnings(dataset: "Dataset") -> list[str]:
     found = [text for text in (depth, color) if text is not None]
     for text in found:
         output.text(f"warning: {text}", err=True)
-    return found
+    return found + [untimed] * bool(untimed)
 
 
 @contextmanager

@@ -26,6 +26,7 @@ from tsfusion.core.output_folder import RECORD
 from tsfusion.datasets import open_dataset
 from tsfusion.datasets.cameras import camera_files
 from tsfusion.datasets.dataset import Dataset, frame_of, pose_of
+from tsfusion.datasets.registry import sweep_doubt
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.geometry.origin import Origin, world_of
 from tsfusion.journal import locations, state_folder
@@ -303,7 +304,9 @@ def _state(dataset: Dataset, path: str, options: dict[str, Any]) -> str:
     digest = hashlib.blake2b(str(getattr(dataset, "camera", "")).encode(), digest_size=16)
     with suppress(DatasetError):  # whoever reads that frame tells
         first = frame_of(dataset, 0)
-        digest.update(f"{first.intrinsics} {first.baseline_fx} {first.depth_scale}".encode())
+        digest.update(f"{first.intrinsics} {first.baseline_fx} {first.depth_scale} {first.motion}".encode())
+        if doubt := sweep_doubt(first):
+            log.warning("%s: %s", path, doubt)
     if hasattr(dataset, "pose"):  # else they are part of the frames, and so in the files
         for index in range(len(dataset)):
             digest.update(np.asarray(pose_of(dataset, index), np.float64).tobytes())

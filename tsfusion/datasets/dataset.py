@@ -3,6 +3,7 @@
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Protocol, TypeVar, overload, runtime_checkable
@@ -12,11 +13,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from tsfusion.core.errors import DatasetError, InvalidKeyframe
 from tsfusion.datasets.accelerometer import Accelerometer
+from tsfusion.datasets.point_times import PointTimes, Scan, point_times
 from tsfusion.geometry import origin
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.geometry.object_cards import ShownRecording
 from tsfusion.geometry.origin import Origin
+from tsfusion.geometry.sweeps import Motion, motion_about
+from tsfusion.geometry.trajectory import PoseAt
 
 STREET = MappingProxyType({"voxel_size": 0.1})  # usual there: at 2 cm a stereo keyframe takes 1.5 s
 NOMINAL_NS = 33_333_333  # between frames of a recording without times: thirty a second
@@ -68,6 +72,8 @@ class Frames(ShownRecording):
     usual: Mapping[str, Any] = MappingProxyType({})  # settings of a map of such a place (`VolumeConfig`)
     origin: Origin | None = None  # what was taken off the poses' positions
     _poses: Sequence[NDArray[np.float64] | None] = ()
+    _deskew = True  # whether times of points count
+    _between: Callable[[], PoseAt] | None = None  # makes `_pose_at`; None = there are poses of frames alone
     _accelerometer: Accelerometer | None = None
 
     @abstractmethod
@@ -121,7 +127,7 @@ class Frames(ShownRecording):
         frame = self.frame(index)
         if frame.T_world_camera is None:
             raise DatasetError(f"frame {index} of {self.name} has no pose; {SCAN}")
-        return frame.keyframe(frame.T_world_camera)
+        return frame.keyframe(frame.T_world_camera, frame.motion)
 
     def _first(self) -> Frame:
         return self.frame(0)
@@ -142,6 +148,27 @@ class Frames(ShownRecording):
         return Frame(
             T_world_camera=T, sensor=self.sensor, timestamp_ns=stamp, specific_force=force, **measurement
         )
+
+    def _sweep(self, index: int, scan: Scan) -> Frame:
+        """A `_posed_frame` of points, with their times and the recorded motion where there are some."""
+        stamps = self.timestamps_ns
+        between_s = 1.0 if stamps is None or len(stamps) < 2 else float(np.median(np.diff(stamps))) / 1e9
+        found = point_times(scan, self._stamp(index), between_s) if self._deskew else PointTimes()
+        motion = self._motion(index, found.point_times_s)
+        return self._posed_frame(
+            index, points=scan.points, color=scan.color, motion=motion, **found._asdict()
+        )
+
+    @cached_property
+    def _pose_at(self) -> PoseAt:
+        """The pose at a time of the frames' clock, also between frames."""
+        return (lambda _: None) if self._between is None else self._between()
+
+    def _motion(self, index: int, times_s: NDArray[np.float32] | None) -> Motion | None:
+        """Motion of the sensor during a frame's sweep, by the recorded poses; None = not known."""
+        if times_s is None or self.timestamps_ns is None:
+            return None
+        return motion_about(self._pose_at, self._stamp(index), times_s)
 
     def _stamp(self, index: int) -> int:
         return 0 if self.timestamps_ns is None else int(self.timestamps_ns[index])

@@ -3,6 +3,7 @@
 
 import dataclasses
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from tsfusion.datasets.dataset import Dataset, Frames, force_of, frame_of, keep_
 from tsfusion.datasets.trajectory_files import read_poses, read_tum
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.se3 import Transform
+from tsfusion.geometry.trajectory import PoseAt, Trajectory, quaternion
 
 EXPECTED = "poses at the times of its frames"
 
@@ -57,6 +59,24 @@ def poses_of(
     return found
 
 
+def poses_between(
+    path: Path, stamps_ns: NDArray[np.int64] | None, *, max_gap_s: float = 0.2, time_offset_s: float = 0.0
+) -> PoseAt:
+    """Make the function that gives T_world_camera at a time of the frames' clock, also between frames.
+
+    Args:
+        stamps_ns: times of the frames, for poses without times; other arguments are as of `poses_of`.
+    """
+    times, poses = read_poses(path)
+    offset = 0 if times is None else round(time_offset_s * 1e9)
+    times = stamps_ns if times is None else times
+    if times is None or len(times) != len(poses) or (np.diff(times) <= 0).any():
+        return lambda _: None
+    rotations = np.array([quaternion(T[:3, :3]) for T in poses])
+    trajectory, max_gap_ns = Trajectory(times, poses[:, :3, 3], rotations), round(max_gap_s * 1e9)
+    return lambda stamp_ns: trajectory.at(stamp_ns + offset, max_gap_ns=max_gap_ns)
+
+
 def pairs_by_time(path: Path, dataset: Dataset) -> bool:
     """Whether a scan pairs poses and frames by their times: both have them.
 
@@ -86,6 +106,7 @@ class WithTrajectory(Frames):
         require_frames(len(self._indices), path, EXPECTED, self.skipped)
         if dataset.timestamps_ns is not None:
             self.timestamps_ns = dataset.timestamps_ns[self._indices]
+        self._between = partial(poses_between, path, dataset.timestamps_ns, **where)
 
     def __len__(self) -> int:
         return len(self._indices)
@@ -95,7 +116,8 @@ class WithTrajectory(Frames):
 
     def _frame(self, index: int) -> Frame:
         measured = frame_of(self._dataset, self._indices[index])
-        return dataclasses.replace(measured, T_world_camera=self._poses[index])
+        motion = self._motion(index, measured.point_times_s)
+        return dataclasses.replace(measured, T_world_camera=self._poses[index], motion=motion)
 
 
 def _span(stamps_ns: Sequence[int] | NDArray[np.int64]) -> str:

@@ -12,6 +12,8 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from tsfusion.core import plugins
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.dataset import Dataset, Frames
@@ -32,6 +34,7 @@ from tsfusion.datasets.formats import (
 from tsfusion.datasets.given_trajectory import WithTrajectory
 from tsfusion.datasets.rosbag import dataset as rosbag_dataset
 from tsfusion.datasets.rosbag.reader import ENDINGS
+from tsfusion.geometry.frame import Frame
 
 GROUP = "tsfusion.datasets"
 
@@ -219,7 +222,20 @@ def describe(dataset: Dataset) -> str:
     seen = f"; {unit}" * bool(unit) + f"; camera {camera}" * bool(camera)
     if origin := getattr(dataset, "origin", None):
         seen += f"; positions count from the origin {origin}"
+    if doubt := sweep_doubt(first):
+        seen += f"; {doubt}"
+    elif first.point_times_s is not None:
+        seconds = np.ptp(first.point_times_s)
+        seen += f"; motion is taken out of sweeps of {seconds:.2g} s (--option deskew=false leaves it)"
     return f"{dataset.name}, {len(dataset)} {kind}{size}{rate}, {poses}{color}{seen}"
+
+
+def sweep_doubt(first: Frame) -> str:
+    """Why the recording tells no motion within its sweeps; empty = it does, or its points have no times."""
+    if first.untimed:
+        return first.untimed
+    lacks = first.motion is None and first.T_world_camera is not None and first.point_times_s is not None
+    return "its poses tell no motion within sweeps" if lacks else ""
 
 
 def _unpacked(path: Path, *, unpack: bool) -> Path:

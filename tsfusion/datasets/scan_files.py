@@ -2,7 +2,7 @@
 """A LiDAR's scans from files: raw floats, PCD, PLY, LAS and LAZ."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -11,14 +11,15 @@ from numpy.typing import NDArray
 
 from tsfusion.core import read_limits
 from tsfusion.core.errors import DatasetError, MissingDependency, TsfusionError
+from tsfusion.datasets.point_times import Scan, time_field
 
 SUFFIXES = (".bin", ".pcd", ".ply", ".las", ".laz")
 USUAL_FIELDS = 4  # float32 a point of raw floats: x, y, z and the intensity
 _HEADER_BYTES = 1 << 14
 
 
-def read_scan(path: Path, *, fields: int = USUAL_FIELDS) -> NDArray[np.float32]:
-    """(n, 3) metres in the LiDAR's axes, in the order of the file.
+def read_scan(path: Path, *, fields: int = USUAL_FIELDS) -> Scan:
+    """Read a scan, in the order of the file.
 
     Args:
         fields: float32 numbers a point in a `.bin` file, x, y and z first; other formats say it themselves.
@@ -28,15 +29,14 @@ def read_scan(path: Path, *, fields: int = USUAL_FIELDS) -> NDArray[np.float32]:
         MissingDependency: for PCD without pypcd4, for LAS and LAZ without laspy.
     """
     suffix = path.suffix.lower()
-    points: NDArray[Any]
     try:
         read_limits.check(path, path.stat().st_size)
         if path.stat().st_size == 0:
-            points, promised = np.zeros((0, 3)), 0
+            scan, promised = Scan(np.zeros((0, 3), np.float32)), 0
         elif suffix == ".bin":
-            points, promised = _raw(path, fields)
+            scan, promised = _raw(path, fields)
         else:
-            points, promised = _READERS[suffix](path)
+            scan, promised = _READERS[suffix](path)
     except TsfusionError:
         raise
     except OSError as error:
@@ -45,14 +45,15 @@ def read_scan(path: Path, *, fields: int = USUAL_FIELDS) -> NDArray[np.float32]:
         first = (str(error) or type(error).__name__).splitlines()[0]
         expected = f"{suffix[1:].upper()} with x, y and z of each point"
         raise DatasetError(f"{path} is damaged ({first}); expected {expected}") from error
+    points = scan.points
     if points.ndim != 2 or points.shape[1] != 3 or not len(points):
         raise DatasetError(f"{path} holds no points; expected x, y and z of a scan")
     if len(points) != promised:
         raise DatasetError(f"{path} was cut off: it has {len(points)} of the {promised} points that it names")
-    return np.ascontiguousarray(points, np.float32)
+    return scan._replace(points=np.ascontiguousarray(points, np.float32))
 
 
-def _raw(path: Path, fields: int) -> tuple[NDArray[Any], int]:
+def _raw(path: Path, fields: int) -> tuple[Scan, int]:
     more = {3: "", 4: " and the intensity"}.get(fields, f" and {fields - 3} more")
     hint = "" if fields == 3 else " (--option fields=3 for x, y, z alone)"
     expected = f"expected float32 x, y, z{more}{hint}"
@@ -61,7 +62,7 @@ def _raw(path: Path, fields: int) -> tuple[NDArray[Any], int]:
     points = np.fromfile(path, "<f4").reshape(-1, fields)
     if fields == USUAL_FIELDS:
         check_intensities(points, path, expected)
-    return points[:, :3], len(points)
+    return Scan(points[:, :3]), len(points)
 
 
 def check_intensities(points: NDArray[np.float32], path: Path, expected: str) -> None:
@@ -77,7 +78,7 @@ def check_intensities(points: NDArray[np.float32], path: Path, expected: str) ->
 # Each reads the points, and how many the file's header names.
 
 
-def _pcd(path: Path) -> tuple[NDArray[Any], int]:
+def _pcd(path: Path) -> tuple[Scan, int]:
     try:
         from pypcd4.pypcd4 import PointCloud
     except ImportError as error:
@@ -87,20 +88,23 @@ def _pcd(path: Path) -> tuple[NDArray[Any], int]:
     sizes = re.search(rb"^DATA binary_?s?compressed\r?\n....(.{4})", head, re.MULTILINE | re.DOTALL)
     read_limits.check(path, int.from_bytes(sizes[1], "little") if sizes else 0)
     read = PointCloud.from_path(path)
-    return np.asarray(read.numpy(("x", "y", "z"))), int(read.metadata.points)
+    points = np.asarray(read.numpy(("x", "y", "z")))
+    return _timed(points, read.fields, read.pc_data), int(read.metadata.points)
 
 
-def _ply(path: Path) -> tuple[NDArray[Any], int]:
+def _ply(path: Path) -> tuple[Scan, int]:
     import trimesh
 
     with path.open("rb") as file:
         named = re.search(rb"^element\s+vertex\s+([0-9]+)", file.read(_HEADER_BYTES), re.MULTILINE)
         file.seek(0)
-        points = np.asarray(trimesh.load(file, file_type="ply", process=False).vertices)
-    return points, len(points) if named is None else int(named[1])
+        read = trimesh.load(file, file_type="ply", process=False)
+    vertices = read.metadata["_ply_raw"]["vertex"]
+    scan = _timed(np.asarray(read.vertices), vertices["properties"], vertices["data"])
+    return scan, len(scan.points) if named is None else int(named[1])
 
 
-def _las(path: Path) -> tuple[NDArray[Any], int]:
+def _las(path: Path) -> tuple[Scan, int]:
     try:
         import laspy
     except ImportError as error:
@@ -108,9 +112,16 @@ def _las(path: Path) -> tuple[NDArray[Any], int]:
     with laspy.open(path) as opened:
         named = opened.header.point_count  # before it is told what was found
         read_limits.check(path, named * opened.header.point_format.size)
-        return np.asarray(opened.read().xyz), named
+        read = opened.read()
+        return _timed(np.asarray(read.xyz), read.point_format.dimension_names, read), named
 
 
-_READERS: dict[str, Callable[[Path], tuple[NDArray[Any], int]]] = {
+def _timed(points: NDArray[Any], names: Iterable[str], values: Any) -> Scan:
+    """A scan with the times among named values, where there are some."""
+    field = time_field(names)
+    return Scan(points) if field is None else Scan(points, field, np.asarray(values[field]))
+
+
+_READERS: dict[str, Callable[[Path], tuple[Scan, int]]] = {
     ".pcd": _pcd, ".ply": _ply, ".las": _las, ".laz": _las,
 }  # fmt: skip

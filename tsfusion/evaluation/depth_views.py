@@ -75,7 +75,7 @@ def depth_view(frame: Frame) -> DepthView | None:
     """The view of a frame; None when too little was measured."""
     made: DepthView
     if frame.points is not None:
-        made = _ScanView(frame.points)
+        made = _ScanView(frame.keyframe(np.eye(4), frame.motion).measurement)
     elif frame.kind == "pair":
         made = _stereo_view(frame)
     else:

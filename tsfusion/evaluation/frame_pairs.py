@@ -38,6 +38,7 @@ class SeenFrame:
         depth: its unit, as far as the measurement shows it.
         view: the measured surface; None when too little was measured.
         outlines: edges of depth and image; None without both.
+        skewed: the surface with the motion left in that the frame's sweep is rid of; None = there is none.
     """
 
     kind: FrameKind
@@ -45,6 +46,7 @@ class SeenFrame:
     T_world_camera: Transform | None
     view: DepthView | None
     outlines: Outlines | None
+    skewed: DepthView | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +100,9 @@ def seen_frames(dataset: Dataset, wanted: Sequence[tuple[int, int]]) -> dict[int
 def _seen(dataset: Dataset, index: int) -> SeenFrame:
     frame = frame_of(dataset, index)
     view = depth_view(frame)
-    return SeenFrame(frame.kind, depth_unit(frame, view), frame.T_world_camera, view, outlines(frame))
+    skewed = None if frame.motion is None else depth_view(replace(frame, motion=None))
+    unit = depth_unit(frame, view)
+    return SeenFrame(frame.kind, unit, frame.T_world_camera, view, outlines(frame), skewed)
 
 
 def pairs_of(frames: dict[int, SeenFrame], wanted: Sequence[tuple[int, int]]) -> list[FramePair]:

@@ -70,6 +70,10 @@ MIN_SHARE_OF_BEST = 0.8  # fit over the best fit near it: less is a disagreement
 TIME_SHIFT_BELOW = 0.97  # share of the best fit below which shifted times are tried
 AS_LIKELY = 0.8  # of the gain by the best explanation: another one is named too
 _DISAGREE, _CAMERA = "poses and depth disagree", "camera and depth disagree"
+_PUT_RIGHT = (
+    "points and their times disagree: scans fit better where the sensor's motion is left in, as it was taken "
+    "out before; --option deskew=false leaves the points as they are"
+)
 _UNEXPLAINED = (
     f"{_DISAGREE}, and none of the usual mistakes explains it: small corrections make frames fit "
     "much better than the poses do; the poses may be wrong, of another sensor or body, or badly timed"
@@ -82,8 +86,8 @@ class PoseCheckReport:
 
     verdict: Verdict  # `disagree` only when it is sure
     text: str  # one or two sentences: what is wrong and what to do
-    # What is wrong: a name in `MISTAKES`, `scale`, `time`, `depth unit`, of the camera (`focal length`,
-    # `image size`, `exchanged centre`, `principal point`, `exchanged focal lengths`,
+    # What is wrong: a name in `MISTAKES`, `scale`, `time`, `point times`, `depth unit`, of the camera
+    # (`focal length`, `image size`, `exchanged centre`, `principal point`, `exchanged focal lengths`,
     # `unequal focal lengths`) or `unexplained`; None when they agree
     mistake: str | None = None
     alternatives: tuple[str, ...] = ()  # other mistakes whose correction fits as well
@@ -201,6 +205,13 @@ def _of_fits(dataset: Dataset, frames: Mapping[int, SeenFrame], pairs: list[Fram
         return PoseCheckReport("cannot tell", text)
     motions = [pair.motion() for pair in pairs]
     given = fits_of(pairs, motions)
+    skewed = [
+        replace(pair, first_view=first, second_view=second)
+        for pair in pairs
+        if (first := frames[pair.first].skewed) and (second := frames[pair.second].skewed)
+    ]
+    if len(skewed) == len(pairs) and mean_gain(fits_of(skewed, motions), given) > 0:
+        return PoseCheckReport("disagree", _PUT_RIGHT, "point times", pairs=len(pairs))
     seen = _Comparison(
         dataset,
         _content(dataset, next(frame for frame in frames.values() if frame.view is not None)),

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from tsfusion.core.errors import InvalidKeyframe
 from tsfusion.geometry.keyframe import Intrinsics, Keyframe
 from tsfusion.geometry.stereo_matching import UNITS, Matcher, quick_disparity
+from tsfusion.geometry.sweeps import Motion
 
 FrameKind = Literal["depth", "disparity", "points", "pair"]
 
@@ -31,7 +32,8 @@ class Frame:
             none. Only the localizer `given` uses it.
         left, right: (H, W) uint8 grey, rectified, with `intrinsics` of both and `baseline_fx`.
         color: (H, W, 3) uint8 BGR of the depth or of the left image, or (N, 3) of the points.
-        point_times_s: (N,) float32 seconds of each point after `timestamp_ns`; None = all at once.
+        motion: of the sensor in the time of its points by the source's own poses; None = not known.
+        untimed: why times that the points came with are of no use; empty = they had none, or these are used.
         specific_force: (3,) m/s², what an accelerometer measured, in the axes of the camera or LiDAR (at rest
             it points away from the ground); None = nothing.
 
@@ -52,6 +54,8 @@ class Frame:
     right: NDArray[np.uint8] | None = None
     points: NDArray[np.float32] | None = None
     point_times_s: NDArray[np.float32] | None = None
+    motion: Motion | None = None
+    untimed: str = ""
     color: NDArray[np.uint8] | None = None
     confidence: NDArray[np.uint8] | None = None
     intrinsics: Intrinsics | None = None
@@ -65,16 +69,11 @@ class Frame:
             self._check_pair()
         checked = self._at(np.eye(4) if self.T_world_camera is None else self.T_world_camera)
         put(self, "kind", "pair" if pair else checked.kind)
-        for name in ("depth", "disparity", "points", "color", "confidence", "intrinsics"):
+        for name in ("depth", "disparity", "points", "point_times_s", "color", "confidence", "intrinsics"):
             if not (pair and name == "disparity"):
                 put(self, name, getattr(checked, name))
         if self.T_world_camera is not None:
             put(self, "T_world_camera", checked.T_world_camera)
-        if self.point_times_s is not None:
-            times = np.asarray(self.point_times_s, dtype=np.float32)
-            if self.points is None or times.shape != (len(self.points),) or not np.isfinite(times).all():
-                raise InvalidKeyframe(f"point_times_s must be finite, one a point, got shape {times.shape}")
-            put(self, "point_times_s", times)
         if self.specific_force is not None:
             force = np.asarray(self.specific_force, dtype=np.float64)
             if force.shape != (3,) or not np.isfinite(force).all():
@@ -102,10 +101,14 @@ class Frame:
         z = np.rint(z).astype(np.uint16) if self.depth.dtype == np.uint16 else z
         return dataclasses.replace(self, depth=z)
 
-    def keyframe(self, T_world_camera: NDArray[np.float64]) -> Keyframe:
-        """Make a keyframe of the frame; a stereo pair is matched for it."""
+    def keyframe(self, T_world_camera: NDArray[np.float64], motion: Motion | None = None) -> Keyframe:
+        """Make a keyframe of the frame; a stereo pair is matched for it.
+
+        Args:
+            motion: of the sensor, by which points that have times are put right; None = not known.
+        """
         if self.kind != "pair":
-            return self._at(T_world_camera)
+            return self._at(T_world_camera, motion=motion)
         return self._at(T_world_camera, disparity=self.matched)
 
     @cached_property
@@ -180,7 +183,7 @@ class Frame:
                     f"{image.dtype} beside {self.left.shape}"
                 )
 
-    def _at(self, T: NDArray[np.float64], disparity: NDArray[np.uint16] | None = None) -> Keyframe:
+    def _at(self, T: NDArray[np.float64], disparity: Any = None, motion: Motion | None = None) -> Keyframe:
         if self.left is not None and disparity is None:  # stands for the one that is matched when needed
             disparity = np.broadcast_to(np.uint16(0), self.left.shape)
         return Keyframe(
@@ -191,6 +194,8 @@ class Frame:
             disparity_scale=self.disparity_scale,
             baseline_fx=self.baseline_fx,
             points=self.points,
+            point_times_s=self.point_times_s,
+            motion=motion,
             color=self.color,
             confidence=self.confidence,
             intrinsics=self.intrinsics,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from tsfusion.core import other_names
 from tsfusion.core.errors import InvalidKeyframe
-from tsfusion.geometry import object_cards
+from tsfusion.geometry import object_cards, sweeps
 
 _T = TypeVar("_T")
 Kind = Literal["depth", "disparity", "points"]
@@ -101,6 +101,13 @@ class Keyframe(object_cards.Shown):
         baseline_fx: stereo baseline times fx, metre · pixels. Also allowed with `depth` from a stereo
             camera, where it drives the noise model.
         points: (N, 3) float32 metres in the sensor frame.
+        point_times_s: (N,) seconds of each point after `timestamp_ns`, of a sensor that moves while it
+            measures them; each point is in the sensor frame of its own time. Without `motion` that moves
+            nothing, and a `Client` says so.
+        motion: `(times_s, poses)` of the sensor in the time of its points: (k,) seconds after `timestamp_ns`,
+            rising, and (k, 4, 4) in the sensor frame at `timestamp_ns`
+            (`np.linalg.inv(T_world_camera) @ T_world_then`). The keyframe puts its points where they were
+            at their times and forgets both: they are None.
         origins: where each ray starts, in the sensor frame: (3,) or (N, 3) float32 metres; default the
             frame's origin. For scanners whose rays do not meet in one point.
         color: (H, W, 3) uint8 BGR, registered to the depth image, or (N, 3) uint8 BGR for points.
@@ -131,6 +138,8 @@ class Keyframe(object_cards.Shown):
     disparity_scale: float = 1 / 16
     baseline_fx: float | None = None
     points: NDArray[np.float32] | None = None
+    point_times_s: NDArray[np.float32] | None = None
+    motion: sweeps.Motion | None = None
     origins: NDArray[np.float32] | None = None
     color: NDArray[np.uint8] | None = None
     confidence: NDArray[np.uint8] | None = None
@@ -238,10 +247,30 @@ class Keyframe(object_cards.Shown):
             if not np.isfinite(origins).all():
                 raise InvalidKeyframe("origins must be finite, got NaN or infinity")
             object.__setattr__(self, "origins", origins)
+        if self.point_times_s is not None:
+            times = _single("point_times_s", self.point_times_s, (len(points),))
+            if not np.isfinite(times).all():
+                raise InvalidKeyframe("point_times_s must be finite, got NaN or infinity")
+            object.__setattr__(self, "point_times_s", times)
+            if self.motion is not None:
+                self._put_at_stamp(times, *self.motion)
+
+    def _put_at_stamp(self, point_times_s: NDArray[np.float32], times_s: Any, poses: Any) -> None:
+        kinds = np.float32, np.float64
+        times = _array("motion's times_s", times_s, kinds, (None,))
+        motion = sweeps.Motion(times, _array("motion's poses", poses, kinds, (len(times), 4, 4)))
+        for name in ("points", "origins"):
+            if (array := getattr(self, name)) is not None:
+                array = np.broadcast_to(array, (len(point_times_s), 3))
+                object.__setattr__(self, name, sweeps.at_stamp(array, point_times_s, motion))
+        object.__setattr__(self, "point_times_s", None)
+        object.__setattr__(self, "motion", None)
 
     def _check_camera(self) -> None:
         if self.origins is not None:
             raise InvalidKeyframe("origins go with points only: the rays of an image start at the camera")
+        if self.point_times_s is not None:
+            raise InvalidKeyframe("point_times_s go with points only")
         if max(self.shape) > MAX_IMAGE_SIDE:
             raise InvalidKeyframe(
                 f"{self.kind} must be at most {MAX_IMAGE_SIDE} pixels a side, got {self.shape}"

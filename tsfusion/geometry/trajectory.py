@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Poses over time, interpolated, and rotations as quaternions."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,6 +9,7 @@ from numpy.typing import NDArray
 
 from tsfusion.geometry.se3 import Transform, transform
 
+PoseAt = Callable[[int], Transform | None]  # (4, 4) at a time in nanoseconds; None = not known
 _EXACT_NS = 1_000_000  # nanoseconds within which a pose is taken as it is
 
 

@@ -106,7 +106,7 @@ def summarise(
         keyframes_fused=stats.fused,
         keyframes_rejected={**stats.skipped, **stats.refused, **stats.rejected},
         frames_skipped=dict(dataset.skipped),
-        warnings=list(warnings),
+        warnings=[*warnings, *shortfall.of_sweeps([sender])],
         missed=shortfall.together(
             (
                 shortfall.of_delivery(

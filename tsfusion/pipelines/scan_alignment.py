@@ -138,7 +138,7 @@ def _take(frame: Frame, localizer: Localizer, selector: KeyframeSelector, placin
     is_lost = isinstance(found, Lost)
     if not isinstance(found, Lost) and selector.reason(frame, found.T_world_camera) is not None:
         selector.accept(frame, found.T_world_camera)
-        placing.keyframes.append(frame.keyframe(found.T_world_camera))
+        placing.keyframes.append(frame.keyframe(found.T_world_camera, found.motion))
     else:
         frame = Frame(
             sensor=frame.sensor, timestamp_ns=frame.timestamp_ns, captured_ns=frame.captured_ns,

@@ -147,7 +147,7 @@ def summarise(
         keyframes_fused=stats.fused,
         keyframes_rejected={**stats.skipped, **stats.refused, **stats.rejected},
         keyframes_by_rule=state.selected,
-        warnings=list(warnings),
+        warnings=[*warnings, *shortfall.of_sweeps([submap.client for submap in scanner.submaps])],
         missed=shortfall.together(
             (
                 shortfall.of_delivery(stats, spool=spool, link=state.link, rejection=scanner.first_rejection),

@@ -9,9 +9,10 @@ that still leaves its results; the command ends with the line, and with status 1
 import os
 from collections.abc import Iterable, Mapping
 
-from tsfusion.client import ClientStats
+from tsfusion.client import Client, ClientStats
 from tsfusion.core.counts import count_of
 from tsfusion.datasets.dataset import CLOCK, WITHOUT_POSE
+from tsfusion.geometry.sweeps import skewed
 
 _LOST = ("spool", "disk")  # reasons of skipping that no policy asks for
 
@@ -44,6 +45,13 @@ def of_delivery(stats: ClientStats, *, spool: str | os.PathLike[str], link: str,
         count = count_of(sum(corrections.values()), "correction was", "corrections were")
         return f"{count} not taken ({reasons}): keyframes are where they were before; see the log above"
     return ""
+
+
+def of_sweeps(clients: Iterable[Client]) -> list[str]:
+    """Say in how many keyframes the motion within the sweep stays; empty = in none."""
+    count = sum(client.skewed for client in clients)
+    text = skewed(f"{count_of(count, 'keyframe has', 'keyframes have')} point times without a motion")
+    return [text] if count else []
 
 
 def of_disk(stats: ClientStats) -> str:

@@ -4,6 +4,7 @@
 It runs on the robot, without Taichi.
 """
 
+import dataclasses
 import logging
 import time
 from collections import Counter
@@ -19,6 +20,7 @@ from tsfusion.core.config import MAP_NAME_LENGTH, ScanConfig
 from tsfusion.core.counts import count_of
 from tsfusion.delivery.outcomes import ClientStats
 from tsfusion.geometry.frame import Frame
+from tsfusion.geometry.sweeps import Motion
 from tsfusion.scanner.keyframe_selection import KeyframeSelector, Selector
 from tsfusion.scanner.localization.localizer import Localizer, Lost, Pose, PoseCorrections
 from tsfusion.scanner.tracked_trajectory import TrackedTrajectory
@@ -102,6 +104,8 @@ class Scanner:
         self._connect, self._map_name, self._taken = connect, map_name, {map_name, *taken}
         self._free_name = free_name
         self._selector = selector or KeyframeSelector(config, outdoors=outdoors)
+        # The first frame of a world whose motion in its sweep only the next pose tells
+        self._waiting: tuple[Pose, Frame] | None = None
         self._next: str | None = None  # the map of the submap that begins with the next pose
         self._lost_since: int | None = None
         self._why = ""
@@ -117,6 +121,7 @@ class Scanner:
         for frame in frames:
             self.process(frame)
             watch(self)
+        self._take_waiting(None)
 
     def process(self, frame: Frame) -> None:
         """Localize a frame, and send it if it is a keyframe; then prepare for the next."""
@@ -135,6 +140,7 @@ class Scanner:
 
     def finish(self) -> None:
         """Correct the keyframes since the last loop closure too. Call it after the last frame."""
+        self._take_waiting(None)
         self._localizer.settle()
         self._correct_if_known()
         for submap in self.submaps:
@@ -176,13 +182,28 @@ class Scanner:
         if self._next is not None:
             self.submaps.append(Submap(self._next, self._connect(self._next)))
             self._next = None
+        follows = self._localizer.absolute or self.submaps[-1].located or self._waiting is not None
+        if frame.point_times_s is not None and pose.motion is None and not follows:
+            self._waiting = pose, frame
+        else:
+            self._take_waiting(pose.motion)
+            self._take(pose, frame)
+
+    def _take_waiting(self, motion: Motion | None) -> None:
+        """Take the frame that waits for a motion, where one does."""
+        if self._waiting is not None:
+            (pose, frame), self._waiting = self._waiting, None
+            self._take(dataclasses.replace(pose, motion=motion), frame)
+
+    def _take(self, pose: Pose, frame: Frame) -> None:
+        """Note where a frame is, and send it if it is a keyframe."""
         submap, T = self.submaps[-1], pose.T_world_camera
         reason = self._selector.reason(frame, T)
         seq = None
         if reason is not None:
             self._selected[reason] += 1
             self._selector.accept(frame, T)
-            seq = submap.client.send(frame.keyframe(T))
+            seq = submap.client.send(frame.keyframe(T, pose.motion))
         submap.located.add(pose, frame.T_world_camera, seq, frame.specific_force)
 
     def _handle_lost(self, lost: Lost, frame: Frame) -> None:
@@ -202,6 +223,7 @@ class Scanner:
         names = filter(None, chain([self._free_name()], map(self._name, count(2))))
         name = next(name for name in names if name not in self._taken)
         self._taken.add(name)
+        self._take_waiting(None)
         self._localizer.settle()
         self._correct_if_known()
         log.warning("lost for %.1f s (%s): later keyframes go into a new map, %s", seconds, self._why, name)

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any
 
@@ -25,7 +26,7 @@ from tsfusion.datasets import open_dataset
 from tsfusion.datasets.dataset import frame_of
 from tsfusion.datasets.synthetic.dataset import Synthetic
 from tsfusion.datasets.trajectory_files import write_tum
-from tsfusion.geometry import se3
+from tsfusion.geometry import se3, sweeps
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.trajectory import quaternion, rigid, slerp
 from tsfusion.scanner.localization.given_poses import GivenPoses, TrajectoryFilePoses
@@ -295,6 +296,23 @@ def test_a_frame_waits_for_the_pose_after_it() -> None:
         finally:
             later.kill()
             later.wait()
+
+
+def test_poses_between_frames_tell_the_motion_in_a_sweep(feed: PoseFeed) -> None:
+    with publisher(feed.address) as send:
+        wait_until_received(feed, lambda count: send(posed(-100 + count)))
+        for k in range(40):
+            send(posed(k / 100))
+        times = np.linspace(-0.05, 0.1, 5, dtype=np.float32)
+        sweep = replace(frame(START + SECOND // 5), points=np.ones((5, 3), np.float32), point_times_s=times)
+        until = time.monotonic() + DEADLINE
+        while isinstance(found := feed.track(sweep), Lost):
+            assert time.monotonic() < until, found.reason
+    put_right = sweeps.at_stamp(sweep.points, times, found.motion)
+    for point, t in zip(put_right, times.tolist(), strict=True):
+        np.testing.assert_allclose(
+            point, se3.apply(se3.inverse(way(0.2)) @ way(0.2 + t), np.ones(3)), atol=1e-4
+        )
 
 
 def test_matrices_and_messagepack_are_understood(feed: PoseFeed) -> None:

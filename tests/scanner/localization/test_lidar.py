@@ -14,7 +14,7 @@ from tsfusion.datasets import open_dataset
 from tsfusion.datasets.dataset import frame_of
 from tsfusion.datasets.synthetic.dataset import Synthetic
 from tsfusion.evaluation.trajectory_error import absolute_error
-from tsfusion.geometry import se3
+from tsfusion.geometry import se3, sweeps
 from tsfusion.geometry.frame import Frame
 from tsfusion.scanner.localization.localizer import Lost, Pose
 
@@ -166,10 +166,33 @@ def test_deskewed_scans_are_placed_where_they_began(street: list[Frame]) -> None
     frames = drive(street, 9)
     worst = {}
     for deskew in (True, False):
-        lidar = LidarLocalizer(deskew=deskew)
-        worst[deskew] = max(away([lidar.track(frame) for frame in frames], frames))
+        lidar = LidarLocalizer()
+        given = frames if deskew else [replace(frame, point_times_s=None) for frame in frames]
+        worst[deskew] = max(away([lidar.track(frame) for frame in given], frames))
     assert worst[True] < 0.3
     assert 2 * worst[True] < worst[False]
+
+
+@pytest.mark.parametrize("every", [1, 2])  # a sweep lasts from scan to scan, or half as long
+@pytest.mark.parametrize("are_stamped", [True, False])
+def test_the_motion_in_a_sweep_is_told(street: list[Frame], every: int, are_stamped: bool) -> None:
+    if not are_stamped and every == 2:
+        pytest.skip("nothing tells that scans are missing")
+    lidar, slow = LidarLocalizer(), drive(street, 9)[::every]
+    for number, frame in enumerate(slow):
+        stamp = frame.timestamp_ns if are_stamped else (number + 1) * 33_333_333
+        found = lidar.track(replace(frame, timestamp_ns=stamp))
+        assert isinstance(found, Pose)
+        if number == 0:
+            assert found.motion is None
+            continue
+        step = np.array([1.0, 0, 0, 0, 0, np.radians(1.5)]) * (1 + number * every / 4)
+        true = sweeps.at_stamp(
+            frame.points, frame.point_times_s, sweeps.steady(step * 10, frame.point_times_s)
+        )
+        put_right = sweeps.at_stamp(frame.points, frame.point_times_s, found.motion)
+        off = [np.median(np.linalg.norm(points - true, axis=1)) for points in (put_right, frame.points)]
+        assert off[0] < 0.25 * off[1]
 
 
 def test_images_are_refused() -> None:

@@ -3,14 +3,18 @@
 
 import logging
 import re
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
+
+import numpy as np
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.dataset import SCAN, Frames, keep_posed, require_folder, require_frames
 from tsfusion.datasets.file_names import numbers_in, series_of, times_of_names
-from tsfusion.datasets.given_trajectory import poses_of
+from tsfusion.datasets.given_trajectory import poses_between, poses_of
 from tsfusion.datasets.scan_files import SUFFIXES, USUAL_FIELDS, read_scan
+from tsfusion.datasets.trajectory_files import read_poses
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.se3 import Transform
 
@@ -39,13 +43,14 @@ class ScanFolder(Frames):
     """Scans in the LiDAR's axes, each with the LiDAR's pose in the world's where one is known.
 
     The layout of KITTI's `velodyne/`, and of the folders that KISS-ICP's generic reader takes, with the poses
-    that it writes. Scans are as recorded, not corrected for the sensor's motion. Names that are decimal
-    seconds or nanoseconds are times; others only give the order.
+    that it writes. Names that are decimal seconds or nanoseconds are times; others only give the order, and
+    scans have the times of as many poses. Points of PCD, PLY and LAS with times are put where they were then.
 
     Args:
         trajectory: default `poses.txt`, `*_kitti.txt` or `*_tum.txt` in the folder.
         fields: float32 numbers a point in `.bin` files, x, y and z first.
         max_gap_s, time_offset_s: as of `given_trajectory.poses_of`.
+        deskew: False for points that are put right already, though they have times.
         posed: leave out scans without a pose; else they are kept, with `T_world_camera` None.
 
     Raises:
@@ -61,12 +66,14 @@ class ScanFolder(Frames):
         fields: int = USUAL_FIELDS,
         max_gap_s: float = 0.2,
         time_offset_s: float = 0.0,
+        deskew: bool = True,
         posed: bool = True,
     ) -> None:
         root = require_folder(path, "LiDAR scans")
         if not 3 <= fields <= 64:
             raise DatasetError(f"fields must be from 3 to 64 numbers a point, got {fields}")
         self.name, self.sensor, self.skipped, self._fields = f"LiDAR scans {root.name}", sensor, {}, fields
+        self._deskew = deskew
         series = _series(root)
         files = series.files
         if series.others:
@@ -90,6 +97,13 @@ class ScanFolder(Frames):
                 if posed or trajectory is not None:
                     raise
                 log.warning("%s is not taken for the poses of these scans: %s", where.name, error)
+            else:
+                times = read_poses(where)[0] if stamps is None else None
+                if times is not None and (np.diff(times) > 0).all():  # one pose a scan, in order
+                    stamps, time_offset_s = times, 0.0
+                self._between = partial(
+                    poses_between, where, stamps, max_gap_s=max_gap_s, time_offset_s=time_offset_s
+                )
         kept, self._poses = keep_posed(
             range(len(files)), poses, posed=posed, skipped=self.skipped, reason="without a pose in time"
         )
@@ -101,7 +115,7 @@ class ScanFolder(Frames):
         return len(self._files)
 
     def _frame(self, index: int) -> Frame:
-        return self._posed_frame(index, points=read_scan(self._files[index], fields=self._fields))
+        return self._sweep(index, read_scan(self._files[index], fields=self._fields))
 
 
 class _Series(NamedTuple):

@@ -81,6 +81,7 @@ class Bag(Frames):
         max_difference_s: between a depth image and its colour (default 20 ms), or left and right (5 ms).
         max_gap_s: between the two poses interpolated, seconds.
         time_offset_s: added to a frame's stamp before its pose is looked up, seconds.
+        deskew: put points that have times where they were then; False for those that are put right already.
         posed: leave out frames without a pose; otherwise they have `T_world_camera` None.
 
     Raises:
@@ -114,6 +115,7 @@ class Bag(Frames):
         time_offset_s: float = 0.0,
         sensor: str | None = None,
         color: bool = True,
+        deskew: bool = True,
         posed: bool = True,
     ) -> None:
         path = _recording_path(Path(path).expanduser())
@@ -142,7 +144,7 @@ class Bag(Frames):
             self.camera = RecordedCamera(chosen.rig.intrinsics, chosen.size, chosen.rig.source)
         self._float_scale = depth_scale or 1.0
         self.name, self.sensor, self.skipped = f"ROS {path.name}", sensor or chosen.sensor, {}
-        self._with_color = color
+        self._with_color, self._deskew = color, deskew
         self.depth_unit = self._unit(depth_scale, calibration)
         self.depth_scale = self.depth_unit.metres
         self.uncolored = 0
@@ -275,6 +277,7 @@ class Bag(Frames):
             skipped=self.skipped,
             reason="without a pose in time",
         )
+        self._between = lambda: lambda stamp: at(stamp + offset_ns)
         self.timestamps_ns = self.timestamps_ns[chosen]
         self._mains = [self._mains[i] for i in chosen]
         self._others = [self._others[i] for i in chosen]
@@ -315,13 +318,8 @@ class Bag(Frames):
         content = self._recording.read(location)
         try:
             if chosen.modality == "lidar":
-                found = messages.cloud(content, self._stamp(index))
-                return self._posed_frame(
-                    index,
-                    points=found.points,
-                    point_times_s=found.times_s,
-                    color=found.color if self._with_color else None,
-                )
+                found = messages.cloud(content)
+                return self._sweep(index, found if self._with_color else found._replace(color=None))
             other = self._others[index]
             beside = None if other is None else self._recording.read(other)
             if chosen.modality == "stereo":

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
+from tsfusion.datasets.point_times import Scan, time_field
 from tsfusion.datasets.readers import decode_image
 from tsfusion.geometry.keyframe import MAX_IMAGE_SIDE
 
@@ -49,18 +50,6 @@ _PIXELS: dict[str, tuple[str, int, int | None]] = {
     "32FC1": ("f4", 1, None),
 }
 _FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-_TIME_FIELDS = ("t", "time", "timestamp", "offset_time", "time_stamp", "timeStamp", "timeoffset")
-_LONGEST_SWEEP_S = 0.5
-_UNITS_S = (1.0, 1e-3, 1e-6, 1e-9)
-
-
-class Cloud(NamedTuple):
-    """Points of one sweep."""
-
-    points: NDArray[np.float32]  # (N, 3) float32 metres; NaN where there was no return
-    color: NDArray[np.uint8] | None  # (N, 3) uint8 BGR
-    # (N,) float32 seconds from the header's stamp; None = all at once, or unknown
-    times_s: NDArray[np.float32] | None
 
 
 class CameraInfo(NamedTuple):
@@ -176,7 +165,7 @@ def check_cloud(message: Any) -> None:
     _records(message)
 
 
-def cloud(message: Any, stamp_ns: int) -> Cloud:
+def cloud(message: Any) -> Scan:
     """Points with their colours and times, where they have some; (0, 0, 0) is no return."""
     records = _records(message)
     points = np.column_stack([records[axis].ravel().astype(np.float32) for axis in "xyz"])
@@ -186,8 +175,8 @@ def cloud(message: Any, stamp_ns: int) -> Cloud:
     bgr = None
     if packed is not None and packed.dtype.kind == "u":
         bgr = np.stack([packed >> shift & 255 for shift in (0, 8, 16)], axis=1).astype(np.uint8)
-    moments = next((records[name].ravel() for name in _TIME_FIELDS if name in names), None)
-    return Cloud(points, bgr, None if moments is None else point_times(moments, stamp_ns))
+    field = time_field(names)
+    return Scan(points, field, None if field is None else records[field].ravel(), bgr)
 
 
 def _records(message: Any) -> NDArray[Any]:
@@ -221,33 +210,6 @@ def _records(message: Any) -> NDArray[Any]:
         return np.empty((0, 0), layout)
     records: NDArray[Any] = np.ndarray(shape, layout, np.ascontiguousarray(message.data), 0, strides)
     return records
-
-
-def point_times(moments: NDArray[Any], stamp_ns: int) -> NDArray[np.float32] | None:
-    """Seconds from the sweep's stamp, of a field whose unit no message states.
-
-    The unit is the largest of s, ms, µs and ns that keeps the sweep within half a second (drivers write
-    Ouster `t`: ns, Velodyne `time`: s, Hesai `timestamp`: absolute s, Livox `timestamp`: absolute ns). Times
-    that are neither of the sweep nor of the stamp's clock count from the sweep's first point.
-
-    Returns:
-        (N,) float32; None where all points have one time, or times make no sense.
-    """
-    values = moments.astype(np.float64 if moments.dtype.kind == "f" else np.int64)
-    known = np.isfinite(values)
-    if not known.any():
-        return None
-    first = values[known].min()
-    span = float(values[known].max() - first)
-    unit = next((unit for unit in _UNITS_S if span * unit <= _LONGEST_SWEEP_S), None)
-    if span <= 0 or unit is None:
-        return None
-    start_s = float(first) * unit
-    if abs(start_s) > _LONGEST_SWEEP_S * 2:
-        start_s -= stamp_ns * 1e-9
-    if abs(start_s) > _LONGEST_SWEEP_S * 2:
-        start_s = 0.0
-    return np.where(known, start_s + (values - first) * unit, 0).astype(np.float32)
 
 
 def camera(message: Any) -> CameraInfo:

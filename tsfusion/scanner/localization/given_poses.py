@@ -3,6 +3,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from tsfusion.datasets.readers import read_lines
 from tsfusion.datasets.trajectory_files import nanoseconds, read_kitti, read_tum
 from tsfusion.geometry import origin as origins
 from tsfusion.geometry.frame import Frame
+from tsfusion.geometry.sweeps import motion_about
 from tsfusion.geometry.trajectory import Trajectory, quaternion
 from tsfusion.scanner.localization.localizer import Localizer, Lost, Pose
 from tsfusion.scanner.localization.tracking_keyframes import TrackingKeyframes
@@ -63,10 +65,12 @@ class TrajectoryFilePoses(Localizer):
         # A recording's first frame may be its time 0; 0 again is a source without times.
         known = bool(frame.timestamp_ns) or not self._begun
         self._begun = True
-        T = self._trajectory.at(stamp, max_gap_ns=self._max_gap_ns) if known else None
+        at = partial(self._trajectory.at, max_gap_ns=self._max_gap_ns)
+        T = at(stamp) if known else None
         if T is None:
             return Lost(reason=self._missing(frame.timestamp_ns, stamp), timestamp_ns=frame.timestamp_ns)
-        return self._anchors.pose(T, frame.timestamp_ns)
+        motion = motion_about(at, stamp, frame.point_times_s)
+        return self._anchors.pose(T, frame.timestamp_ns, motion=motion)
 
     def reset(self) -> None:
         """Begin a new tracking keyframe; the world stays the trajectory's."""
@@ -144,7 +148,7 @@ class GivenPoses(Localizer):
         """Return the frame's own pose; Lost where it has none."""
         if frame.T_world_camera is None:
             return Lost(reason="the source gives no pose for this frame", timestamp_ns=frame.timestamp_ns)
-        return self._anchors.pose(frame.T_world_camera, frame.timestamp_ns)
+        return self._anchors.pose(frame.T_world_camera, frame.timestamp_ns, motion=frame.motion)
 
     def reset(self) -> None:
         """Begin a new tracking keyframe; the world stays the source's."""

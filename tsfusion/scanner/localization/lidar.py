@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tsfusion.core.distinct_integers import distinct
 from tsfusion.core.errors import InvalidKeyframe, MissingDependency
-from tsfusion.geometry import se3
+from tsfusion.geometry import se3, sweeps
 from tsfusion.geometry.frame import Frame
 from tsfusion.scanner.localization.localizer import Localizer, Lost, Pose
 from tsfusion.scanner.localization.tracking_keyframes import TrackingKeyframes
@@ -44,7 +44,6 @@ class LidarLocalizer(Localizer):
         max_range: metres; farther points are left out. None = 100 outdoors, by the first scan indoors.
         voxel_size: metres, of the local map. None = by the first scan: 1 outdoors, a tenth of the median
             distance indoors.
-        deskew: whether to take the sensor's motion out of scans whose points have times.
         threads: 1 gives equal poses for equal scans.
     """
 
@@ -55,7 +54,6 @@ class LidarLocalizer(Localizer):
         *,
         max_range: float | None = None,
         voxel_size: float | None = None,
-        deskew: bool = True,
         threads: int = 1,
     ) -> None:
         try:
@@ -64,7 +62,7 @@ class LidarLocalizer(Localizer):
             raise MissingDependency(_INSTALL) from error
         self._make: Any = kiss_icp.kiss_icp.KissICP
         self._max_range, self._voxel_size = max_range, voxel_size
-        self._deskew, self._threads = deskew, threads
+        self._threads = threads
         self._anchors = TrackingKeyframes()
         self.reset()
 
@@ -77,6 +75,7 @@ class LidarLocalizer(Localizer):
                 return _lost(frame, f"only {len(frame.points)} points to begin with")
             self._begin(frame.points)
         icp = self._icp
+        self._note_period(frame)
         thin, map_points = icp.voxelize(self._straightened(frame, icp.last_delta))
         if len(thin) < MIN_POINTS:
             return self._fail(frame, f"only {len(thin)} points after thinning")
@@ -89,8 +88,12 @@ class LidarLocalizer(Localizer):
             problem = self._problem(T, quality)
             if problem:
                 return self._fail(frame, problem)
+        begins = icp.local_map.empty()
         T = se3.nearest(self._accept(T, map_points, frame))
-        return self._anchors.pose(T, frame.timestamp_ns, quality=quality)
+        motion = None
+        if len(times := self._times(frame)) and not begins:
+            motion = sweeps.steady(se3.log(icp.last_delta) / self._period_s, times)
+        return self._anchors.pose(T, frame.timestamp_ns, quality=quality, motion=motion)
 
     def reset(self) -> None:
         """Begin a new world at the next frame."""
@@ -98,6 +101,7 @@ class LidarLocalizer(Localizer):
         self._first: Frame | None = None
         self._T_first_map = np.eye(4)
         self._settling, self._missed = SETTLING_SCANS, 0
+        self._last_ns, self._period_s = 0, 0.0
         self._anchors.reset()
 
     def _begin(self, points: NDArray[np.float32]) -> None:
@@ -115,7 +119,7 @@ class LidarLocalizer(Localizer):
         max_range = self._max_range or (float(2 * far) if indoors else OUTDOOR_RANGE)
         self._icp = self._make(
             KISSConfig(
-                data=DataConfig(max_range=max_range, min_range=0.0, deskew=self._deskew),
+                data=DataConfig(max_range=max_range, min_range=0.0, deskew=True),
                 mapping=MappingConfig(voxel_size=voxel, max_points_per_voxel=POINTS_A_VOXEL),
                 registration=RegistrationConfig(max_num_threads=self._threads),
                 adaptive_threshold=AdaptiveThresholdConfig(
@@ -166,26 +170,33 @@ class LidarLocalizer(Localizer):
             )
         return ""
 
+    def _note_period(self, frame: Frame) -> None:
+        """Seconds from scan to scan: as stamped, at least a sweep; a recording may have no times."""
+        times = self._times(frame)
+        stamped_s = (frame.timestamp_ns - self._last_ns) / 1e9 / (self._missed + 1) if self._last_ns else 0.0
+        self._period_s = max(stamped_s, float(np.ptp(times)) if len(times) else 0.0)
+
     def _straightened(self, frame: Frame, motion: se3.Transform) -> Points:
         """Points in range, in the sensor's axes at the scan's end."""
         assert frame.points is not None
-        scan: Points = self._icp.preprocessor.preprocess(
-            frame.points.astype(np.float64), self._times(frame), motion
-        )
+        times = self._times(frame)
+        if len(times):
+            motion = se3.exp(float(np.ptp(times)) / self._period_s * se3.log(motion))
+        scan: Points = self._icp.preprocessor.preprocess(frame.points.astype(np.float64), times, motion)
         return scan
 
     def _times(self, frame: Frame) -> NDArray[np.float64]:
-        """Times of the points, (N,) seconds; (0,) where the scan is not to be deskewed."""
+        """Times of the points, (N,) seconds; (0,) where they are all of one time."""
         times = frame.point_times_s
-        if not self._deskew or times is None or np.ptp(times) <= 0:
+        if times is None or np.ptp(times) <= 0:
             return np.zeros(0)
         return times.astype(np.float64)
 
     def _from_stamp(self, frame: Frame) -> se3.Transform:
         """Pose of the sensor at the scan's end, in its axes at the frame's timestamp."""
         times = self._times(frame)
-        share = float(np.clip(-times.min() / np.ptp(times), 0, 1)) if len(times) else 1.0
-        return se3.exp((1 - share) * se3.log(self._icp.last_delta))
+        end = float(times.max()) / self._period_s if len(times) else 0.0
+        return se3.exp(end * se3.log(self._icp.last_delta))
 
     def _accept(self, T: se3.Transform, map_points: Points, frame: Frame) -> se3.Transform:
         """Put the scan into the map; return the sensor's pose at the frame's timestamp."""
@@ -205,6 +216,7 @@ class LidarLocalizer(Localizer):
             self._first = None
         icp.local_map.update(map_points, T)
         self._missed, self._settling = 0, max(0, self._settling - 1)
+        self._last_ns = frame.timestamp_ns
         return self._T_first_map @ T @ se3.inverse(self._from_stamp(frame))
 
     def _fail(self, frame: Frame, reason: str) -> Lost:

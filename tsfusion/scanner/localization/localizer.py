@@ -6,6 +6,7 @@ from typing import Protocol
 
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.se3 import Transform
+from tsfusion.geometry.sweeps import Motion
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -20,6 +21,7 @@ class Pose:
         T_anchor_camera: (4, 4); the corrected pose is the corrected anchor times this.
         starts_anchor: whether this frame is that tracking keyframe.
         quality: 0 to 1, the share of what was compared that agrees; 1 where poses are given.
+        motion: of the sensor in the time of the frame's points; None = not known, or all are of one time.
     """
 
     T_world_camera: Transform
@@ -28,6 +30,7 @@ class Pose:
     T_anchor_camera: Transform
     starts_anchor: bool = False
     quality: float = 1.0
+    motion: Motion | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,6 +2,7 @@
 """Choice of tracking keyframes by distance and angle, for localizers that keep no map of their own."""
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -22,8 +23,12 @@ class TrackingKeyframes:
         self._number = -1
         self._T_world_anchor: se3.Transform | None = None
 
-    def pose(self, T_world_camera: se3.Transform, timestamp_ns: int, *, quality: float = 1.0) -> Pose:
-        """Make a localizer's answer of (4, 4) `T_world_camera`, relative to the tracking keyframe."""
+    def pose(self, T_world_camera: se3.Transform, timestamp_ns: int, **known: Any) -> Pose:
+        """Make a localizer's answer of (4, 4) `T_world_camera`, relative to the tracking keyframe.
+
+        Args:
+            known: quality and motion, as of a `Pose`.
+        """
         T = np.eye(4) if self._T_world_anchor is None else se3.inverse(self._T_world_anchor) @ T_world_camera
         moved = se3.distance(T) > self.distance or se3.angle(T) > self._angle
         starts = self._T_world_anchor is None or moved
@@ -36,7 +41,7 @@ class TrackingKeyframes:
             anchor=self._number,
             T_anchor_camera=T,
             starts_anchor=starts,
-            quality=quality,
+            **known,
         )
 
     def reset(self) -> None:

@@ -13,20 +13,21 @@ from numpy.typing import NDArray
 from tsfusion.core import read_limits
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.formats.image_folders import COLOR
+from tsfusion.datasets.point_times import Scan
 from tsfusion.datasets.readers import decode_image, read_numbers
-from tsfusion.datasets.scan_files import check_intensities
+from tsfusion.datasets.scan_files import SUFFIXES, check_intensities, read_scan
 
 LayoutKind = Literal["depth", "pair", "points"]
 
 EXPECTED = (
     "depth/NAME.png|tiff|exr|npy with color/, colour/, rgb/, image/ or images/NAME.png|jpg; "
     "frame-*.depth.png with frame-*.color.png|jpg; left/ and right/NAME.png|jpg; "
-    "NAME.bin, there or in velodyne/"
+    "NAME.bin|pcd|ply|las|laz, there or in velodyne/"
 )
 
 _NOT_MEASURED = 65535  # 7-Scenes' value for pixels without depth
 _IMAGES = r"\.(?:png|jpe?g)"
-_ENDINGS = (_IMAGES, r"\.(?:png|tiff?|exr|npy)", r"\.bin")
+_ENDINGS = (_IMAGES, r"\.(?:png|tiff?|exr|npy)", r"\.(?:bin|pcd|ply|las|laz)")
 _ANY_IMAGE, _DEPTH, _SCAN = (re.compile(rf"([^.].*){ending}") for ending in _ENDINGS)
 _FLAT_DEPTH, _FLAT_COLOR = re.compile(r"(frame-.+)\.depth\.png"), re.compile(rf"(frame-.+)\.color{_IMAGES}")
 _PNG_END, _JPEG_END = b"\0\0\0\0IEND\xaeB`\x82", b"\xff\xd9"
@@ -68,14 +69,15 @@ def layout_of(root: Path) -> FolderLayout | None:
             "pair", "left/ and right/NAME.png|jpg", (root / "left", _ANY_IMAGE), (root / "right", _ANY_IMAGE)
         )
     if (root / "velodyne").is_dir():
-        return FolderLayout("points", "velodyne/NAME.bin", (root / "velodyne", _SCAN))
+        return FolderLayout("points", "velodyne/NAME.bin|pcd|ply|las|laz", (root / "velodyne", _SCAN))
     names = [path.name for path in root.iterdir()]
     if any(_FLAT_DEPTH.fullmatch(name) for name in names):
         return FolderLayout(
             "depth", "frame-*.depth.png with frame-*.color.png|jpg", (root, _FLAT_DEPTH), (root, _FLAT_COLOR)
         )
-    if any(_SCAN.fullmatch(name) for name in names):
-        return FolderLayout("points", "NAME.bin", (root, _SCAN))
+    for ending in SUFFIXES:  # a file of another may be no scan, such as a mesh
+        if any(_SCAN.fullmatch(name) and name.endswith(ending) for name in names):
+            return FolderLayout("points", f"NAME{ending}", (root, re.compile(rf"([^.].*)\{ending}")))
     return None
 
 
@@ -87,19 +89,24 @@ def whole_image(path: Path, flags: int) -> NDArray[Any] | None:
     return decode_image(BytesIO(raw), flags)
 
 
-def whole_scan(path: Path) -> NDArray[np.float32] | None:
-    """Read (n, 3) float32 points from x, y, z, intensity; None if the file ends within a point.
+def whole_scan(path: Path) -> Scan | None:
+    """Read points; None while the file is incomplete, or if it is damaged.
 
     Raises:
-        DatasetError: these are no points of four numbers.
+        DatasetError: a `.bin` file holds no points of four numbers.
     """
+    if path.suffix != ".bin":
+        try:
+            return read_scan(path)
+        except DatasetError:
+            return None
     read_limits.check(path, path.stat().st_size)
     raw = path.read_bytes()
     if not raw or len(raw) % _POINT:
         return None
     points = np.frombuffer(raw, np.float32).reshape(-1, 4)
     check_intensities(points, path, "expected float32 x, y, z and the intensity of each point")
-    return points[:, :3]
+    return Scan(points[:, :3])
 
 
 def depth_of(image: NDArray[Any]) -> NDArray[Any]:

@@ -23,6 +23,7 @@ from tsfusion.datasets.cameras import (
     find_camera,
 )
 from tsfusion.datasets.depth_files import check_metres, read_depth
+from tsfusion.datasets.point_times import PointTimes, point_times
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.scanner.sources import folder_layouts, stereo_pairs
@@ -58,6 +59,7 @@ class WatchedFolder(LiveSource):
         baseline: metres, of rectified images in left/ and right/.
         depth_scale: metres per unit; default as a file of the camera states, else 0.001, and 1 for floats.
         depth_along_ray: depth images hold distances along each pixel's ray, instead of z.
+        deskew: False for points that are put right already, though they have times.
         idle: seconds; None = wait for ever.
         deadline: seconds to wait for an incomplete frame or a missing camera.
         poll: seconds between two listings of the folder, at least.
@@ -77,6 +79,7 @@ class WatchedFolder(LiveSource):
         baseline: float | None = None,
         depth_scale: float | None = None,
         depth_along_ray: bool = False,
+        deskew: bool = True,
         idle: float | None = None,
         deadline: float = 5.0,
         poll: float = 0.05,
@@ -93,6 +96,7 @@ class WatchedFolder(LiveSource):
         self._sensor = sensor
         self._name_sensor()
         self._intrinsics, self._calibration, self._baseline = intrinsics, calibration, baseline
+        self._deskew, self._untimed = deskew, ""
         self._depth_scale, self._along_ray = depth_scale, depth_along_ray
         self._idle, self._deadline, self._poll = idle, deadline, poll
         self._opened_ns, self._stamp = time.time_ns(), 0
@@ -237,16 +241,22 @@ class WatchedFolder(LiveSource):
                 timestamp_ns=timestamp_ns,
                 captured_ns=captured_ns,
             )
-        depth = color = K = None
-        if kind == "depth":
-            depth, color, K = self._undistorted(
-                folder_layouts.depth_of(images[0]), images[1] if images[1:] else None
-            )
+        if kind == "points":
+            found = point_times(images[0], timestamp_ns) if self._deskew else PointTimes()
+            if found.untimed and found.untimed != self._untimed:
+                log.warning("%s: %s", self.name, found.untimed)
+                self._untimed = found.untimed
+            return Frame(
+                sensor=self.sensor, points=images[0].points, timestamp_ns=timestamp_ns,
+                captured_ns=captured_ns, **found._asdict(),
+            )  # fmt: skip
+        depth, color, K = self._undistorted(
+            folder_layouts.depth_of(images[0]), images[1] if images[1:] else None
+        )
         frame = Frame(
             sensor=self.sensor,
             depth=depth,
-            depth_scale=self._camera.depth_unit(self._depth_scale).metres if kind == "depth" else 0.001,
-            points=images[0] if kind == "points" else None,
+            depth_scale=self._camera.depth_unit(self._depth_scale).metres,
             color=color,
             intrinsics=K,
             timestamp_ns=timestamp_ns,

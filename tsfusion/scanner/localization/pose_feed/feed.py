@@ -9,9 +9,11 @@ import re
 import time
 import weakref
 from collections import Counter
+from functools import partial
 
 from tsfusion.core.errors import DecodeError, InvalidConfig, TransportError
 from tsfusion.geometry.frame import Frame
+from tsfusion.geometry.sweeps import motion_about
 from tsfusion.scanner.localization.localizer import Lost, Pose, PoseCorrections
 from tsfusion.scanner.localization.pose_feed.map_deformation import MapDeformation
 from tsfusion.scanner.localization.pose_feed.messages import MAX_BYTES, decode
@@ -78,21 +80,26 @@ class PoseFeed:
         self.close()
 
     def track(self, frame: Frame) -> Pose | Lost:
-        """Interpolate the feed's poses at the frame's timestamp; wait up to `wait_s` for the next one."""
+        """Interpolate the feed's poses at the frame's timestamp; wait up to `wait_s` for the next one.
+
+        Of a frame with point times the one after its last point is waited for.
+        """
         if not frame.timestamp_ns:
             return Lost(reason="the frame has no time, so that no pose can be looked up", timestamp_ns=0)
-        stamp = frame.timestamp_ns + self._offset_ns
+        stamp, times = frame.timestamp_ns + self._offset_ns, frame.point_times_s
+        last = stamp if times is None else stamp + max(0, round(float(times.max()) * _NS))
         deadline = time.monotonic() + self._wait
         self._receive(0)
-        while not self._history.decided(stamp, max_gap_ns=self._max_gap_ns):
+        while not self._history.decided(last, max_gap_ns=self._max_gap_ns):
             left = deadline - time.monotonic()
             if left <= 0:
                 break
             self._receive(left)
-        T = self._history.at(stamp, max_gap_ns=self._max_gap_ns)
+        at = partial(self._history.at, max_gap_ns=self._max_gap_ns)
+        T = at(stamp)
         if T is None:
             return Lost(reason=self._missing(stamp), timestamp_ns=frame.timestamp_ns)
-        pose = self._anchors.pose(T, frame.timestamp_ns)
+        pose = self._anchors.pose(T, frame.timestamp_ns, motion=motion_about(at, stamp, times))
         if pose.starts_anchor:
             self._deformation.add(pose.anchor, stamp, T)
         return pose
