@@ -97,6 +97,25 @@ def test_halves_from_unknown_starts_are_one_room(maps: tuple[AlignedMap, Aligned
 
 
 @pytest.mark.usefixtures("given")
+@pytest.mark.parametrize(("drift_mm", "least", "most"), [(0, 0, 12), (60, 25, 120), (120, 50, 240)])
+def test_the_error_covers_a_drift_that_a_robust_fit_leaves_out(
+    drift_mm: float, least: float, most: float
+) -> None:
+    """The fit's own residual is bounded by what counts as one surface, whatever the drift."""
+    maps = []
+    for name, moving in (("a", 0.0), ("b", drift_mm / 1000)):
+        volume = Volume(CONFIG)
+        for i, keyframe in enumerate(room()):
+            T = keyframe.T_world_camera.copy()
+            T[:3, 3] += moving * i / len(room()) * np.array((0.8, 0.6, 0))
+            volume.integrate(replace(keyframe, T_world_camera=T if name == "a" else START @ T))
+        maps.append(map_alignment.map_of_volume(name, volume))
+    found = map_alignment.align(*maps)
+    assert least <= found.error_mm <= most
+    assert found.rmse_mm < max(12, 0.7 * found.error_mm)
+
+
+@pytest.mark.usefixtures("given")
 def test_what_is_merged_is_the_map_of_both(halves: tuple[Path, Path], here: Here, tmp_path: Path) -> None:
     a, b = halves
     done = here("map", "align", a, b, "--out", "c.tsf", "--json")

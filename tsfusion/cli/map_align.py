@@ -103,6 +103,7 @@ def _lines(found: "Alignment", merged: dict[str, Any] | None) -> list[str]:
     lines = [
         f"T_a_b      {rows[0]}",
         *(f"           {row}" for row in rows[1:]),
+        f"error      up to {found.error_mm:.0f} mm: so far apart parts of the common surface want B",
         f"overlap    {found.overlap:.1%} of the smaller surface, {found.rmse_mm:.1f} mm apart (RMSE)",
         f"against it {found.contradicted:.1%} of {found.looks} looks went through the other's surface, and "
         f"{found.contradicted_alone:.1%} through its own{tilt}",

@@ -14,6 +14,8 @@ from tsfusion.geometry.se3 import Transform
 
 _AGREE = 0.8  # least cosine between normals of one surface
 _REACH = 2.0  # cells within which the other surface is looked for
+_PARALLEL = 0.95  # least cosine between normals of one surface, of which places are compared
+_LEAST_PART, _HALVINGS = 50, 3  # cells
 _DEPTH_MARGIN = 0.02  # of the depth, by which a point lies before a measurement at least to be seen through
 
 
@@ -84,6 +86,44 @@ def _constraint(points: NDArray[np.float64], normals: NDArray[np.float64]) -> fl
     arms /= max(float(np.sqrt((arms**2).sum(axis=1).mean())), 1e-9)
     J = np.hstack([normals, np.cross(arms, normals)])
     return max(0.0, float(np.linalg.eigvalsh(J.T @ J / len(J))[0]))
+
+
+def parts_spread(a: SampledSurface, b: SampledSurface, T_a_b: Transform, reach: float) -> float:
+    """How far the parts of the common surface want surface `b` in different places, metres.
+
+    Along each of three directions, parts whose normals lie along it say by the median of their offsets where
+    `b` should be. Where a map has drifted they disagree, though what is left after the fit is small: a robust
+    fit leaves out what does not fit.
+
+    Args:
+        reach: metres within which the other surface is looked for.
+
+    Raises:
+        MissingDependency: without scipy.
+    """
+    points, normals = b.moved(T_a_b)
+    distance, index = nearest(points, a.points)
+    toward = a.normals[index]
+    near = (distance < reach) & ((normals * toward).sum(axis=1) > _PARALLEL)
+    offset = ((a.points[index] - points) * toward).sum(axis=1)[near]
+    toward, points = toward[near], points[near]
+    along = toward @ np.linalg.eigh(toward.T @ toward)[1]
+    spreads = []
+    for cosine in along.T:
+        parts = _split(points, np.flatnonzero(np.abs(cosine) > _AGREE), _HALVINGS)
+        wanted = [0.0, *(float(np.median(offset[part] * np.sign(cosine[part]))) for part in parts)]
+        spreads.append(max(wanted) - min(wanted))
+    return float(np.linalg.norm(spreads))
+
+
+def _split(points: NDArray[np.float64], part: NDArray[np.intp], halvings: int) -> list[NDArray[np.intp]]:
+    """Some points in parts of equal size, each cut across its longest side; none of fewer than 50."""
+    if len(part) < _LEAST_PART:
+        return []
+    if not halvings or len(part) < 2 * _LEAST_PART:
+        return [part]
+    order = np.argsort(points[part, np.argmax(np.ptp(points[part], axis=0))])
+    return [one for half in np.array_split(part[order], 2) for one in _split(points, half, halvings - 1)]
 
 
 class SeenDepth:

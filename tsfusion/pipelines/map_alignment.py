@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tsfusion.core.config import VolumeConfig
 from tsfusion.core.counts import count_of
 from tsfusion.core.errors import AlignmentRefused, JournalError, MapError
-from tsfusion.evaluation.surface_fit import SampledSurface, SeenDepth, SurfaceFit, fit
+from tsfusion.evaluation.surface_fit import SampledSurface, SeenDepth, SurfaceFit, fit, parts_spread
 from tsfusion.evaluation.surface_registration import Registration
 from tsfusion.geometry import se3
 from tsfusion.geometry.keyframe import MAX_POINTS, Keyframe
@@ -35,6 +35,7 @@ _CELL = 2.5  # voxels, at least
 _CELLS = 100  # along the diagonal of the smaller map, at most
 _SCALES = (1.0, 1.6)  # of the cell, at which features are looked for
 _LAST_REACHES = (2.0, 1.0, 0.5)  # voxels, of the last refinement
+_PART_REACH = 6.0  # voxels within which a part looks for the other surface
 _TOLERANCE = 1.5  # voxels within which two surfaces are one
 _TILT = {"given": 10.0, "imu": 10.0, "floor": 20.0, "cameras": 30.0}  # degrees: how well up is known
 _VIEWS = 24  # keyframes of each journal that are asked what they saw
@@ -48,6 +49,8 @@ class Alignment(msgspec.Struct, kw_only=True):
 
     Attributes:
         T_a_b: (4, 4) rows; p_a = T_a_b @ p_b.
+        error_mm: about how far T_a_b may be off: so far apart the parts of the common surface want B, over
+            the share of the smaller surface that they are; a map that has drifted lies nowhere exactly.
         overlap, rmse_mm, constraint: as `SurfaceFit` has them, the second in millimetres.
         contradicted: share of what the sensors of one map saw of the other's surface where they looked
             through it; of maps without keyframes, where it lies in the free space before their surface.
@@ -57,6 +60,7 @@ class Alignment(msgspec.Struct, kw_only=True):
     """
 
     T_a_b: list[list[float]]
+    error_mm: float
     overlap: float
     rmse_mm: float
     constraint: float
@@ -141,7 +145,7 @@ def align(a: AlignedMap, b: AlignedMap) -> Alignment:
         )
     best = pair.judged(pair.finished(best.T), fine=True)
     pair.check(best)
-    return best.described(pair.contradicted_alone)
+    return best.described(pair.contradicted_alone, pair.spread(best.T) / best.fit.overlap)
 
 
 class _Looks(NamedTuple):
@@ -172,9 +176,10 @@ class _Answer:
     def score(self) -> float:
         return self.fit.overlap * (1 - self.looks.contradicted) ** 2
 
-    def described(self, contradicted_alone: float) -> Alignment:
+    def described(self, contradicted_alone: float, error: float) -> Alignment:
         return Alignment(
             T_a_b=self.T.tolist(),
+            error_mm=round(1e3 * error, 1),
             overlap=round(self.fit.overlap, 4),
             rmse_mm=round(1e3 * self.fit.rmse_m, 3),
             constraint=round(self.fit.constraint, 4),
@@ -235,6 +240,10 @@ class _Pair:
         moved = self._coarse[0].moved(se3.inverse(T))[0], self._coarse[1].moved(T)[0]
         looks = self._looks_at(moved[1], moved[0])
         return _Answer(T, fit(*surfaces, T, _TOLERANCE * self._voxel), looks, self._tilt(T))
+
+    def spread(self, T: Transform) -> float:
+        """How far apart the parts of the common surface want the second map, metres."""
+        return parts_spread(*self._sampled(self._voxel), T, _PART_REACH * self._voxel)
 
     def _looks_at(self, for_a: NDArray[np.float64], for_b: NDArray[np.float64]) -> _Looks:
         """How map `a` sees some points, and map `b` others, (n, 3) in the world of each."""
