@@ -15,7 +15,7 @@ from tsfusion.core.errors import MapError
 from tsfusion.geometry import up_direction
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.map_answers import PointCloud, Samples, View, checked_camera, checked_points
-from tsfusion.geometry.map_grids import DistanceField, DistanceSlice, OccupancySlice
+from tsfusion.geometry.map_grids import DistanceField, DistanceSlice, OccupancySlice, blocked
 from tsfusion.geometry.up_direction import Up
 from tsfusion.tsdf import camera_views, distance_fields, map_blocks, map_cells, map_slices, point_samples
 from tsfusion.tsdf.block_store import ASKED, BlockStore, pack_keys, unpack_keys
@@ -183,9 +183,9 @@ class AskableMap(ReadableMap):
             InvalidConfig: for another box, or one of too many voxels; MapError: no box, and an empty map.
         """
         weight = self._checked_min_weight(min_weight)
-        return distance_fields.in_box(
-            self._store, box, max_distance, weight, subvoxel=subvoxel, unseen_is_free=unseen_is_free
-        )
+        found = distance_fields.in_box(self._store, box, max_distance, weight, subvoxel=subvoxel)
+        distance = blocked(found.distance, found.occupancy, unseen_is_free=unseen_is_free)
+        return replace(found, distance=distance)
 
     def distance_blocks(
         self, *, max_distance: float = 0.5, min_weight: float | None = None

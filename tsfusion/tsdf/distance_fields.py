@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from tsfusion.core.errors import InvalidConfig, MapError
 from tsfusion.geometry import openvdb_files
-from tsfusion.geometry.map_grids import FREE, OCCUPIED, UNSEEN, DistanceField, blocked
+from tsfusion.geometry.map_grids import FREE, OCCUPIED, UNSEEN, DistanceField
 from tsfusion.kernels import distance_transform as kernels
 from tsfusion.kernels import voxel_values
 from tsfusion.kernels.integrate import QUANTA_PER_VOXEL
@@ -57,15 +57,9 @@ class Reach:
 
 
 def in_box(
-    store: BlockStore,
-    box: Sequence[float] | None,
-    max_distance: float,
-    min_weight: float,
-    *,
-    subvoxel: bool,
-    unseen_is_free: bool,
+    store: BlockStore, box: Sequence[float] | None, max_distance: float, min_weight: float, *, subvoxel: bool
 ) -> DistanceField:
-    """Distances in a box, or around the whole map: see `AskableMap.distance_field`."""
+    """Distances in a box, or around the whole map, also where unseen: see `AskableMap.distance_field`."""
     size = store.voxel_size
     reach = Reach(max_distance, size)
     first, end = _bounds(store) if box is None else voxel_range(box, size)
@@ -81,12 +75,11 @@ def in_box(
         0, np.empty((1, 3), np.float32), size, reach.metres, distance,
     )  # fmt: skip
     inside = tuple(slice(a, a + n) for a, n in zip(low, extent, strict=True))
-    states = occupancy_of(values.reshape(shape)[inside])
     return DistanceField(
         origin=first.astype(np.float64) * size,
         voxel_size=size,
-        distance=blocked(distance.reshape(extent), states, unseen_is_free=unseen_is_free),
-        occupancy=states,
+        distance=distance.reshape(extent),
+        occupancy=occupancy_of(values.reshape(shape)[inside]),
         max_distance=reach.metres,
     )
 
@@ -115,7 +108,7 @@ def _near(
 ) -> Iterator[FieldBlocks]:
     """The blocks in a box of blocks in which a distance is less than the largest."""
     edges = 8 * store.voxel_size * np.concatenate([first, end])
-    field = in_box(store, edges.tolist(), reach.metres, min_weight, subvoxel=True, unseen_is_free=True)
+    field = in_box(store, edges.tolist(), reach.metres, min_weight, subvoxel=True)
     sides = (end - first).tolist()
     cells = field.distance.reshape(sides[0], 8, sides[1], 8, sides[2], 8).transpose(0, 2, 4, 1, 3, 5)
     places = np.argwhere((np.abs(cells) < np.float32(reach.metres)).any(axis=(3, 4, 5)))

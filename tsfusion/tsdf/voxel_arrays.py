@@ -144,7 +144,7 @@ def _fused(store: BlockStore, used: NDArray[np.int64], *, dense: bool) -> _Voxel
 
 def _dense_distances(store: BlockStore, max_distance: float, min_weight: float) -> _Voxels:
     """The distance field around a map."""
-    found = distance_fields.in_box(store, None, max_distance, min_weight, subvoxel=True, unseen_is_free=True)
+    found = distance_fields.in_box(store, None, max_distance, min_weight, subvoxel=True)
     plain = {"voxel_size": np.float64(store.voxel_size), "origin": found.origin}
     plain["max_distance"] = np.float64(max_distance)
     slabs = np.array_split(found.distance, found.distance.shape[0] // 8)
