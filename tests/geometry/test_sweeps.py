@@ -79,6 +79,14 @@ def test_a_point_without_a_return_stays_one() -> None:
     assert not np.isfinite(found[1:]).all(axis=1).any()
 
 
+def test_nothing_measured_does_not_become_a_point() -> None:
+    points = np.array([[0, 0, 0], [5, 0, 0]], np.float32)
+    motion = sweeps.steady(np.array([20.0, 0, 0, 0, 0, 0]), np.array([0.0, 0.1]))
+    made = Keyframe(points=points, T_world_camera=np.eye(4), point_times_s=np.full(2, 0.1), motion=motion)
+    np.testing.assert_allclose(made.points, [[np.nan] * 3, [7, 0, 0]], atol=1e-5)
+    np.testing.assert_array_equal(points[0], 0)
+
+
 @pytest.mark.parametrize(
     ("motion", "reason"),
     [

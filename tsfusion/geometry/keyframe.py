@@ -259,10 +259,12 @@ class Keyframe(object_cards.Shown):
         kinds = np.float32, np.float64
         times = _array("motion's times_s", times_s, kinds, (None,))
         motion = sweeps.Motion(times, _array("motion's poses", poses, kinds, (len(times), 4, 4)))
+        no_return = ~np.any(self.points, axis=1)
         for name in ("points", "origins"):
             if (array := getattr(self, name)) is not None:
                 array = np.broadcast_to(array, (len(point_times_s), 3))
                 object.__setattr__(self, name, sweeps.at_stamp(array, point_times_s, motion))
+        self.measurement[no_return] = np.nan  # drivers write 0, 0, 0, which must not become a point
         object.__setattr__(self, "point_times_s", None)
         object.__setattr__(self, "motion", None)
 
