@@ -52,7 +52,7 @@ class LidarDump(Frames):
         return len(self._files)
 
     def _frame(self, index: int) -> Frame:
-        return self._posed_frame(index, points=read_scan(self._files[index], fields=3))
+        return self._posed_frame(index, points=read_scan(self._files[index], fields=3).points)
 
 
 def _read_graph(path: Path, *, required: bool) -> dict[int, Transform]:
