@@ -2,10 +2,12 @@
 """Wrong cameras, units of depth and misplaced colour are named; genuine data and crops are not."""
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -14,11 +16,12 @@ from support.corrupted_recordings import FOLDERS, Corrupted, genuine, opened
 from tsfusion import cli
 from tsfusion.datasets import Dataset, open_dataset, select
 from tsfusion.datasets.dataset import Frames
-from tsfusion.evaluation.pose_check import PoseCheckReport, check
+from tsfusion.evaluation.pose_check import PoseCheckReport, check, check_frames
 from tsfusion.evaluation.pose_mistakes import MISTAKES, SCALES, Content, scale_text
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
+from tsfusion.geometry.trajectory import quaternion
 
 Data = Callable[[str], Path]
 Change = Callable[[Frame], dict[str, object]]
@@ -79,6 +82,70 @@ def test_depth_scale_is_not_taken_for_the_camera(name: str, factor: float, data:
     report = checked(name, lambda frame: {"depth_scale": frame.depth_scale * factor}, data)
     assert report.mistake == "scale"
     assert report.factor == pytest.approx(factor, rel=0.02)
+
+
+def along_ray(frame: Frame) -> dict[str, object]:
+    lengths = frame.depth * frame.intrinsics.ray_lengths(frame.depth.shape)
+    return {"depth": np.rint(np.minimum(lengths, 65535)).astype(np.uint16)}
+
+
+@pytest.mark.parametrize("name", ["7scenes", "hololens", "redwood", "open3d", "room"])
+def test_depth_along_rays_is_named_and_the_option_mends_it(name: str, data: Data) -> None:
+    whole = open_dataset("synthetic:room", count=40) if name == "room" else opened(data(FOLDERS[name]))
+    wrong = Corrupted(whole, frame=along_ray)
+    report = check(wrong)
+    assert (report.verdict, report.mistake, report.fitting_camera) == ("disagree", "depth along rays", None)
+    assert "along each pixel's ray instead of z" in report.text
+    assert "--option depth_along_ray=true" in report.text
+    wrong.along_ray = True
+    assert check(wrong).verdict == "agree"
+
+
+def room_in(folder: Path, unit: float, *, posed: bool = True) -> Path:
+    """A TUM layout of the synthetic room; depth in some unit."""
+    lists: dict[str, list[str]] = {"depth": [], "rgb": [], "groundtruth": []}
+    for i, frame in enumerate(open_dataset("synthetic:room", count=20)):
+        depth = np.minimum(frame.depth * (frame.depth_scale / unit), 65535).astype(np.uint16)
+        for kind, image in (("depth", depth), ("rgb", frame.color)):
+            (folder / kind).mkdir(parents=True, exist_ok=True)
+            assert cv2.imwrite(str(folder / kind / f"{i}.png"), image)
+            lists[kind].append(f"{i}.0 {kind}/{i}.png")
+        T = frame.T_world_camera
+        lists["groundtruth"].append(" ".join(map(str, [float(i), *T[:3, 3], *quaternion(T[:3, :3])])))
+    for kind in lists if posed else ("depth", "rgb"):
+        (folder / f"{kind}.txt").write_text("\n".join(lists[kind]))
+    (folder / "K.txt").write_text(" ".join(map(str, msgspec.structs.astuple(frame.intrinsics))))
+    return folder
+
+
+def test_a_room_of_half_a_metre_is_doubted_where_nothing_states_its_unit(tmp_path: Path) -> None:
+    root = room_in(tmp_path / "mine", 0.001, posed=False)
+    words = r"all depth is within 0\.\d+ m, which no room is.*0\.2 mm \(5000 a metre\).*depth_scale=0\.001"
+    assert run("scan", root, "--out", tmp_path / "out") == 1
+    report = check(open_dataset(root, posed=False))
+    assert (report.verdict, report.mistake) == ("disagree", "depth unit")
+    assert re.search(words, report.text)
+    for scale in (0.001, 0.0002):
+        assert check_frames(open_dataset(root, posed=False, depth_scale=scale))[0] is None
+    (root / "K.txt").rename(root / "calib.txt")
+    K = open_dataset("synthetic:room", count=1)[0].intrinsics
+    (root / "calib.txt").write_text(f"fx: {K.fx}\ncx: {K.cx}\ncy: {K.cy}\ndepth_scale: 1000\n")
+    assert check_frames(open_dataset(root, posed=False))[0] is None
+    assert check(open_dataset(room_in(tmp_path / "posed", 0.001))).mistake == "scale"
+
+
+def test_a_room_that_no_kinect_sees_is_doubted(tmp_path: Path) -> None:
+    root = room_in(tmp_path, 1 / 5000, posed=False)
+    for name in ("depth.txt", "rgb.txt"):
+        (root / name).unlink()
+    assert "on average, which no room is" in str(check_frames(open_dataset(root, posed=False))[0])
+
+
+def test_exchanged_stereo_cameras_are_named(data: Data) -> None:
+    pairs = open_dataset(data("euroc_V1_01"), posed=False)
+    report = check(Corrupted(pairs, np.asarray, lambda frame: {"left": frame.right, "right": frame.left}))
+    assert (report.verdict, report.mistake) == ("disagree", "depth unit")
+    assert "the left and right images are exchanged" in report.text
 
 
 class SidewaysRelief(Frames):
@@ -276,11 +343,19 @@ def test_color_of_another_time_is_named(name: str, late: int, words: str, data: 
 
 
 @pytest.mark.parametrize("name", ["7scenes", "hololens"])
-def test_poses_that_fit_nowhere_give_no_verdict(name: str, data: Data) -> None:
+def test_poses_that_see_nothing_twice_give_no_verdict(name: str, data: Data) -> None:
     rng = np.random.default_rng(1)
     report = check(Corrupted(opened(data(FOLDERS[name])), lambda T: se3.exp(rng.normal(size=6)) @ T))
     assert (report.verdict, report.mistake) == ("cannot tell", None)
     assert "fit neither as given nor after any usual correction" in report.text
+
+
+@pytest.mark.parametrize("name", ["7scenes", "hololens", "room"])
+def test_poses_that_see_one_place_and_fit_nowhere_disagree(name: str, data: Data) -> None:
+    rng = np.random.default_rng(1)
+    whole = open_dataset("synthetic:room", count=40) if name == "room" else opened(data(FOLDERS[name]))
+    report = check(Corrupted(whole, lambda T: se3.exp(0.25 * rng.normal(size=6)) @ T))
+    assert (report.verdict, report.mistake) == ("disagree", "unexplained")
 
 
 @pytest.mark.nightly

@@ -7,10 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tsfusion.core.errors import InvalidKeyframe
+from tsfusion.core.errors import InvalidConfig, InvalidKeyframe
 from tsfusion.geometry import frame as frame_module
+from tsfusion.geometry import se3
+from tsfusion.geometry.calibration import Camera, StereoRig
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
+from tsfusion.geometry.stereo_matching import exchanged
 
 SHIFT = 8  # pixels of disparity
 
@@ -72,3 +75,15 @@ def test_distances_along_rays_become_depth(dtype: type) -> None:
     np.testing.assert_allclose(frame.depth_m, z, atol=0.0011 if dtype == np.uint16 else 1e-6)
     with pytest.raises(InvalidKeyframe, match="is for depth images, and this is one of points"):
         Frame(sensor="lidar", points=np.ones((3, 3))).along_axis()
+
+
+def test_exchanged_images_of_a_pair_and_a_baseline_in_millimetres_are_noticed() -> None:
+    right_way = pair()
+    assert not exchanged(right_way.left, right_way.right)
+    assert exchanged(right_way.right, right_way.left)
+    assert not exchanged(*np.zeros((2, 64, 256), np.uint8))
+    with pytest.raises(InvalidKeyframe, match=r"120 m of baseline: are these millimetres\?"):
+        dataclasses.replace(right_way, baseline_fx=120 * 200.0)
+    camera = Camera(right_way.intrinsics, (64, 256))
+    with pytest.raises(InvalidConfig, match="baseline in metres, got 120: are these millimetres"):
+        StereoRig(camera, camera, se3.exp(np.array([-120.0, 0, 0, 0, 0, 0])))

@@ -48,7 +48,8 @@ class Corrupted(Frames):
         seen = self._frame_of(index + max(0, self._late))
         posed = self._frame_of(index + max(0, -self._late))
         fields = {field.name: getattr(seen, field.name) for field in dataclasses.fields(seen) if field.init}
-        changed = {"T_world_camera": self._pose(posed.T_world_camera), **self._change(seen)}
+        T = None if posed.T_world_camera is None else self._pose(posed.T_world_camera)
+        changed = {"T_world_camera": T, **self._change(seen)}
         return Frame(**{**fields, **changed})
 
 

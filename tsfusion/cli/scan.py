@@ -265,7 +265,11 @@ def _open(
 
 
 def _warnings(dataset: "Dataset") -> list[str]:
-    """Oddities of a recording's frames, a sentence each; new ones are printed on stderr, too."""
+    """What is odd about a recording's frames, a sentence each; new ones are printed on stderr, too.
+
+    Raises:
+        DatasetError: their depth cannot be used, or nobody knows its unit.
+    """
     from tsfusion.cli import output
     from tsfusion.core import process
     from tsfusion.core.errors import DatasetError
@@ -277,12 +281,12 @@ def _warnings(dataset: "Dataset") -> list[str]:
     except DatasetError:  # the scan comes to that frame, and tells
         return []
     process.give_back_memory()
+    if depth is not None:
+        raise DatasetError(f"{dataset.name}: {depth}")
     if color is not None:
         color += "; where the sensor is lost because of it, --option color=false tracks by the depth alone"
-    found = [text for text in (depth, color) if text is not None]
-    for text in found:
-        output.text(f"warning: {text}", err=True)
-    return found + [untimed] * bool(untimed)
+        output.text(f"warning: {color}", err=True)
+    return [text for text in (color, untimed) if text]
 
 
 @contextmanager

@@ -23,6 +23,10 @@ USUAL_SIZES = (0.25, 1 / 3, 0.5, 2 / 3, 1.5, 2.0, 3.0, 4.0)
 UNEQUAL_FOCAL = 0.03  # difference of fx and fy, of fx, above which they may have been exchanged
 MIN_SHARE_OF_BEST = 0.8  # fit over the best fit near it, with the camera found
 OUTSIDE = 0.45  # of the image's side, from its centre: a principal point there belongs to another image
+_ALONG_RAY = (
+    "depth is measured along each pixel's ray instead of z, along the optical axis: give --option "
+    "depth_along_ray=true"
+)
 GIVE = "check the intrinsics, or give --intrinsics fx,fy,cx,cy or --calibration FILE"
 
 
@@ -34,11 +38,13 @@ class CameraMistake:
         name: short, for programs.
         camera: the intrinsics meant.
         text: what was wrong and what to do.
+        along_ray: whether depth was measured along each pixel's ray, not along the optical axis.
     """
 
     name: str
     camera: Intrinsics
     text: str
+    along_ray: bool = False
 
 
 def centre_doubt(K: Intrinsics | None, shape: tuple[int, ...]) -> str | None:
@@ -60,7 +66,7 @@ def centre_fits(pairs: Sequence[FramePair], motions: Sequence[Motion], given: Fi
     view = pairs[0].first_view
     if view.camera is None:
         return True
-    likely = [_fits_with(each.camera, pairs, motions) for each in likely_cameras(view.camera, view.shape)]
+    likely = [_fits_with(each, pairs, motions) for each in likely_cameras(view.camera, view.shape)]
     return all(fits.mean() < given.mean() - AS_GOOD for fits in likely)
 
 
@@ -129,8 +135,10 @@ def best_camera(
     if K is None:
         return nothing
     tried = [nothing]
-    for mistake in likely_cameras(K, view.shape):
-        fits = _fits_with(mistake.camera, pairs, motions)
+    likely = likely_cameras(K, view.shape)
+    likely += [] if view.stereo else [CameraMistake("depth along rays", K, _ALONG_RAY, along_ray=True)]
+    for mistake in likely:
+        fits = _fits_with(mistake, pairs, motions)
         tried.append((sure_gain(fits, given), mistake, fits))
     if focal is not None:
         tried.append((focal.gain, _focal_mistake(K, focal), focal.fits))
@@ -140,13 +148,13 @@ def best_camera(
     )
     if camera is None:
         return nothing
-    seen = [pair.seen_by(camera.camera) for pair in pairs]
+    seen = [pair.seen_by(camera.camera, along_ray=camera.along_ray) for pair in pairs]
     explained = share_of_best(fits, best_fits_near(seen, motions)) >= MIN_SHARE_OF_BEST
     return (gain, camera, fits) if explained else nothing
 
 
-def _fits_with(camera: Intrinsics, pairs: Sequence[FramePair], motions: Sequence[Motion]) -> Fits:
-    return fits_of([pair.seen_by(camera) for pair in pairs], motions)
+def _fits_with(meant: CameraMistake, pairs: Sequence[FramePair], motions: Sequence[Motion]) -> Fits:
+    return fits_of([pair.seen_by(meant.camera, along_ray=meant.along_ray) for pair in pairs], motions)
 
 
 def _focal_mistake(K: Intrinsics, found: FittedFactor) -> CameraMistake:

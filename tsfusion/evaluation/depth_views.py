@@ -66,8 +66,8 @@ class DepthView(Protocol):
         """
         ...
 
-    def seen_by(self, camera: Intrinsics) -> "DepthView":
-        """The surface if another camera had measured it; a scan is the same."""
+    def seen_by(self, camera: Intrinsics, *, along_ray: bool = False) -> "DepthView":
+        """The surface if another camera had measured it, or along each pixel's ray; a scan is the same."""
         ...
 
 
@@ -127,8 +127,14 @@ class _ImageView:
         self.range_m = float(np.median(self._z)) if len(self._z) else 0.0
         self._take(camera)
 
-    def seen_by(self, camera: Intrinsics) -> "_ImageView":
+    def seen_by(self, camera: Intrinsics, *, along_ray: bool = False) -> "_ImageView":
         other = copy(self)
+        if along_ray:
+            height, width = (side - 2 for side in self._depth.shape)
+            lengths = self._K.ray_lengths((height, width))
+            column, row = self._pixels.astype(np.intp)
+            other._depth = np.asarray(self._depth / np.pad(lengths, 1, mode="edge"), np.float32)
+            other._z = self._z / lengths[row, column]
         if self._baseline_fx is not None:
             factor = camera.fx * self._scale / self._K.fx
             other._depth, other._z = self._depth * np.float32(factor), self._z * factor
@@ -189,8 +195,8 @@ class _ScanView:
         self._box = (kept.min(axis=0), kept.max(axis=0)) if len(kept) else (np.zeros(3), np.zeros(3))
         self.points = np.ascontiguousarray(_evenly_chosen(kept, MAX_POINTS // 2).T)
 
-    def seen_by(self, camera: Intrinsics) -> "_ScanView":
-        del camera
+    def seen_by(self, camera: Intrinsics, *, along_ray: bool = False) -> "_ScanView":
+        del camera, along_ray
         return self
 
     def deviation(self, points: NDArray[np.float64]) -> NDArray[np.float64]:

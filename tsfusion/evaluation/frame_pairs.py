@@ -66,18 +66,23 @@ class FramePair:
 
     def fit(self, motion: Motion) -> float:
         """Fit of the first frame's points to the second's surface, 0 to 1; 0 if too few can be compared."""
+        return self.fit_of_shared(motion) or 0.0
+
+    def fit_of_shared(self, motion: Motion) -> float | None:
+        """The fit of the first frame's points to the second's surface; None if too few can be compared."""
         points = motion[:3, :3] @ self.first_view.points
         points += motion[:3, 3:]
         deviation = self.second_view.deviation(points)
         compared = np.count_nonzero(np.isfinite(deviation))
         if compared < MIN_COMPARED * len(deviation):
-            return 0.0
+            return None
         fits = 1 - deviation * deviation
         return float(np.maximum(fits, 0, out=fits).sum()) / compared
 
-    def seen_by(self, camera: Intrinsics) -> "FramePair":
-        """The pair if another camera had measured it."""
-        first, second = self.first_view.seen_by(camera), self.second_view.seen_by(camera)
+    def seen_by(self, camera: Intrinsics, *, along_ray: bool = False) -> "FramePair":
+        """The pair if another camera had measured it, or along each pixel's ray."""
+        views = self.first_view, self.second_view
+        first, second = (view.seen_by(camera, along_ray=along_ray) for view in views)
         return replace(self, first_view=first, second_view=second)
 
 

@@ -26,7 +26,7 @@ from tsfusion.evaluation.camera_check import (
     likely_cameras,
 )
 from tsfusion.evaluation.color_registration import misplaced_color, outlines
-from tsfusion.evaluation.depth_units import depth_unit, unusable_depth
+from tsfusion.evaluation.depth_units import depth_unit, doubtful_depth, unusable_depth
 from tsfusion.evaluation.fitted_factors import (
     AS_GOOD,
     MIN_FOCAL_SIGMA,
@@ -65,6 +65,7 @@ Verdict = Literal["agree", "disagree", "cannot tell"]
 MIN_LEAD = 0.05  # by which the poses must fit better than the median mistake, or nobody can tell
 MIN_EVIDENCE = 0.2  # share of the pairs that must fit, or nobody can tell
 MIN_UNEXPLAINED_PAIRS = 2  # which small corrections make fit
+MIN_MISFIT_PAIRS, MAX_MISFIT = 3, 0.3  # pairs that see one place, and the fit that none of them reaches
 MAX_FOCAL_SIGMA = 0.1  # of the focal length, beyond which nobody can tell it
 MIN_SHARE_OF_BEST = 0.8  # fit over the best fit near it: less is a disagreement
 TIME_SHIFT_BELOW = 0.97  # share of the best fit below which shifted times are tried
@@ -88,7 +89,7 @@ class PoseCheckReport:
     text: str  # one or two sentences: what is wrong and what to do
     # What is wrong: a name in `MISTAKES`, `scale`, `time`, `point times`, `depth unit`, of the camera
     # (`focal length`, `image size`, `exchanged centre`, `principal point`, `exchanged focal lengths`,
-    # `unequal focal lengths`) or `unexplained`; None when they agree
+    # `unequal focal lengths`, `depth along rays`) or `unexplained`; None when they agree
     mistake: str | None = None
     alternatives: tuple[str, ...] = ()  # other mistakes whose correction fits as well
     fitting_camera: tuple[float, float, float, float] | None = None  # that fits, where it is wrong
@@ -116,6 +117,9 @@ def check(dataset: Dataset) -> PoseCheckReport:
     frames = seen_frames(dataset, wanted)
     pairs = pairs_of(frames, wanted)
     report = _of_depth(frames) or _of_fits(dataset, frames, pairs)
+    doubt = doubtful_depth([frame.depth for frame in frames.values()], getattr(dataset, "depth_unit", None))
+    if report.verdict == "cannot tell" and doubt is not None:
+        return replace(report, verdict="disagree", text=doubt, mistake="depth unit")
     if report.verdict != "disagree":
         report = _with_doubt(report, frames, pairs)
     color = misplaced_color({index: frame.outlines for index, frame in frames.items()})
@@ -137,11 +141,12 @@ def check_frames(dataset: Dataset) -> tuple[str | None, str | None]:
     units, edges = [], {}
     for index in sorted({index for pair in wanted_pairs(len(dataset)) for index in pair} or {0}):
         frame = frame_of(dataset, index)
-        if frame.depth_m is None:
+        if frame.kind == "points":
             return None, None
         units.append(depth_unit(frame, None))
         edges[index] = outlines(frame)
-    return unusable_depth(units), misplaced_color(edges)
+    doubt = doubtful_depth(units, getattr(dataset, "depth_unit", None))
+    return unusable_depth(units) or doubt, misplaced_color(edges)
 
 
 def _with_doubt(
@@ -303,7 +308,7 @@ def _camera_report(
         camera.name,
         ("scale",) if either else (),
         factor=round(scale.factor, 4) if either else None,
-        fitting_camera=msgspec.structs.astuple(camera.camera),
+        fitting_camera=None if camera.along_ray else msgspec.structs.astuple(camera.camera),
     )
 
 
@@ -323,6 +328,12 @@ def _agreement(seen: _Comparison, tried: Mapping[str, Fits]) -> PoseCheckReport:
     given, report = seen.given, partial(PoseCheckReport, "cannot tell")
     fitting = int((given >= MIN_FIT).sum())
     if fitting < MIN_EVIDENCE * len(given):
+        shared = [each.fit_of_shared(motion) for each, motion in zip(seen.pairs, seen.motions, strict=True)]
+        fits = [fit for fit in shared if fit is not None]
+        is_image = seen.pairs[0].first_view.camera is not None  # sparse scans may miss each other
+        if is_image and len(fits) >= MIN_MISFIT_PAIRS and max(fits) < MAX_MISFIT:
+            text = f"{_DISAGREE}: all {len(fits)} pairs of frames that see one place fit nowhere there"
+            return PoseCheckReport("disagree", f"{text} ({np.mean(fits):.2f} of 1)", "unexplained")
         return report(
             f"nobody can tell: {len(given) - fitting} of {len(given)} pairs of frames fit neither as given "
             "nor after any usual correction: they share too little, or poses, camera and depth are not of "

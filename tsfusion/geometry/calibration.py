@@ -15,7 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import InvalidConfig, InvalidKeyframe
-from tsfusion.geometry.keyframe import MAX_IMAGE_SIDE, Intrinsics, check_intrinsics, check_pose
+from tsfusion.geometry.keyframe import (
+    MAX_BASELINE_M,
+    MAX_IMAGE_SIDE,
+    Intrinsics,
+    check_intrinsics,
+    check_pose,
+)
 
 Model = Literal["pinhole", "radtan", "equidistant"]
 Size = tuple[int, int]  # height, width
@@ -207,8 +213,10 @@ class StereoRig:
             object.__setattr__(self, "T_right_left", check_pose(self.T_right_left))
         except InvalidKeyframe as error:
             raise InvalidConfig(f"T_right_left: {str(error).removeprefix('T_world_camera ')}") from error
-        if not np.any(self.T_right_left[:3, 3]):
-            raise InvalidConfig("T_right_left must hold the baseline, got no translation")
+        baseline = float(np.linalg.norm(self.T_right_left[:3, 3]))
+        if not 0 < baseline <= MAX_BASELINE_M:
+            got = f"{baseline:.4g}: are these millimetres?" if baseline else "no translation"
+            raise InvalidConfig(f"T_right_left must hold the baseline in metres, got {got}")
 
 
 class Rectifier:

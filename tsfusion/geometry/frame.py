@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import InvalidKeyframe
-from tsfusion.geometry.keyframe import Intrinsics, Keyframe
+from tsfusion.geometry.keyframe import MAX_BASELINE_M, Intrinsics, Keyframe
 from tsfusion.geometry.stereo_matching import UNITS, Matcher, quick_disparity
 from tsfusion.geometry.sweeps import Motion
 
@@ -182,6 +182,9 @@ class Frame:
                     f"{name} must be a grey (H, W) uint8 image of the other's size, got {image.shape} of "
                     f"{image.dtype} beside {self.left.shape}"
                 )
+        if self.intrinsics and (self.baseline_fx or 0) > MAX_BASELINE_M * self.intrinsics.fx:
+            metres = (self.baseline_fx or 0) / self.intrinsics.fx
+            raise InvalidKeyframe(f"baseline_fx says {metres:.4g} m of baseline: are these millimetres?")
 
     def _at(self, T: NDArray[np.float64], disparity: Any = None, motion: Motion | None = None) -> Keyframe:
         if self.left is not None and disparity is None:  # stands for the one that is matched when needed

@@ -20,6 +20,7 @@ Kind = Literal["depth", "disparity", "points"]
 
 MAX_IMAGE_SIDE = 8192
 MAX_POINTS = 2_000_000
+MAX_BASELINE_M = 5.0  # of a stereo camera; more are millimetres
 MAX_TRANSLATION = 1e6
 _FARTHEST_SCAN = 1e4  # metres
 MAX_SENSOR_NAME = 32

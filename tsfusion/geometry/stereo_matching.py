@@ -13,6 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 UNITS = 16  # units of OpenCV's disparity in a pixel
+_SURE_DISPARITY = 2.0  # pixels: less may be an error of the rows, or of the rectification
+_MIN_MATCHED, _MIN_MORE = 0.5, 2.0  # share of the pixels, and times as many as the other way round
+EXCHANGED = "the left and right images are exchanged: they match the other way round; exchange them"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,6 +64,14 @@ def quick_disparity(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArra
     )
     whole: NDArray[np.float32] = cv2.resize(disparity, left.shape[::-1], interpolation=cv2.INTER_NEAREST)
     return whole
+
+
+def exchanged(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> bool:
+    """Whether a rectified pair's images are surely each other's: far more pixels match when exchanged."""
+    as_given, swapped = (
+        np.mean(quick_disparity(*pair) > _SURE_DISPARITY) for pair in ((left, right), (right, left))
+    )
+    return bool(swapped > _MIN_MATCHED and swapped > _MIN_MORE * as_given)
 
 
 def _semi_global(search: int, *, block: int = 5, uniqueness: int = 10, **more: int) -> Any:

@@ -34,6 +34,7 @@ from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.origin import world_of
 from tsfusion.geometry.sample_ranges import wrong_unit
+from tsfusion.geometry.stereo_matching import EXCHANGED, exchanged
 from tsfusion.geometry.up_direction import HeldSensor, Up
 from tsfusion.pipelines import (
     engine,
@@ -128,6 +129,8 @@ def scan(
         first = next(frames, None)
         if first is None:
             raise failure[0] if failure else SourceError(f"{source.name} gave no frames")
+        if first.left is not None and first.right is not None and exchanged(first.left, first.right):
+            raise SourceError(f"{source.name}: {EXCHANGED}")
         if own and first.kind != "pair":
             map_size.check_fits(first.keyframe(np.eye(4)), volume)
         localizer = registry.create_localizer(config, first)

@@ -257,6 +257,11 @@ def test_rectified_pairs(tmp_path: Path) -> None:
     assert (frame.right == color(2)[:, :, 0]).all()
     assert frame.baseline_fx == pytest.approx(0.12 * 40)
     assert frame.timestamp_ns == 1403715273262142976
+    (tmp_path / "baseline.txt").write_text("120\n")
+    with pytest.raises(
+        SourceError, match=r"baseline\.txt must hold .* metres, .* 120: are these millimetres"
+    ):
+        whole(tmp_path)
 
 
 def test_raw_pairs_with_their_calibration(data: Callable[[str], Path], tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from tsfusion.datasets.formats.image_folders import COLOR
 from tsfusion.datasets.point_times import Scan
 from tsfusion.datasets.readers import decode_image, read_numbers
 from tsfusion.datasets.scan_files import SUFFIXES, check_intensities, read_scan
+from tsfusion.geometry.keyframe import MAX_BASELINE_M
 
 LayoutKind = Literal["depth", "pair", "points"]
 
@@ -126,6 +127,7 @@ def baseline_of(root: Path) -> float | None:
     if not path.is_file():
         return None
     baseline = float(read_numbers(path, "the baseline in metres", columns=1)[0, 0])
-    if baseline <= 0:
-        raise DatasetError(f"{path} must hold the baseline in metres, > 0, got {baseline}")
+    if not 0 < baseline <= MAX_BASELINE_M:
+        unit = ": are these millimetres?" * (baseline > 0)
+        raise DatasetError(f"{path} must hold the baseline in metres, > 0, got {baseline:g}{unit}")
     return baseline

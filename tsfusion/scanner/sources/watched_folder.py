@@ -282,7 +282,11 @@ class WatchedFolder(LiveSource):
     def _find_camera(self, kind: str, image: NDArray[np.generic], *, final: bool) -> bool:
         """Read the camera, for which the size of an image is needed; return whether it is there."""
         try:
-            self._camera = self._pairs(image) if kind == "pair" else self._one_camera(image)
+            if kind == "pair":
+                self._camera = self._pairs(image)
+            else:
+                self._camera = found = self._one_camera(image)
+                self.camera += f"; {found.depth_unit(self._depth_scale)}"
         except UnknownCamera as error:
             if final:
                 need = " (of a stereo camera FILE, or intrinsics and baseline.txt)" if kind == "pair" else ""
@@ -297,7 +301,7 @@ class WatchedFolder(LiveSource):
             self._root, image.shape, intrinsics=self._intrinsics, calibration=self._calibration,
             places=self._places,
         )  # fmt: skip
-        self.camera = f"{found}; {found.depth_unit(self._depth_scale)}"
+        self.camera = str(found)
         return found
 
     def _pairs(self, image: NDArray[np.generic]) -> stereo_pairs.PairRectifier:
