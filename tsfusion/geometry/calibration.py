@@ -134,16 +134,16 @@ class Camera:
         """Rays of (n, 2) pixels as (n, 2) x/z and y/z, limited to 60° from the axis."""
         K = self.intrinsics
         pixels = np.array(pixels, dtype=np.float64).reshape(-1, 2)
-        pixels[:, 0] -= self._sheared(pixels[:, 1])
+        if self.skew:
+            pixels[:, 0] -= self._sheared(pixels[:, 1])
+            return replace(self, skew=0.0).rays(pixels)
         distorted = (pixels - (K.cx, K.cy)) / (K.fx, K.fy)
         if self.model == "equidistant":
             return _cut(_from_fisheye(distorted, self.distortion))
         rays = distorted
         for _ in range(_MAX_ITERATIONS):  # as cv2.undistortPoints does, to the end
             ones = np.ones((len(rays), 1))
-            seen = self.project(np.hstack([rays, ones]))
-            seen[:, 0] -= self._sheared(seen[:, 1])
-            seen = (seen - (K.cx, K.cy)) / (K.fx, K.fy)
+            seen = (self.project(np.hstack([rays, ones])) - (K.cx, K.cy)) / (K.fx, K.fy)
             missing = distorted - seen
             rays = _cut(rays + missing)
             if np.abs(missing).max(initial=0) < _MAX_RESIDUAL:

@@ -51,7 +51,7 @@ class Intrinsics(msgspec.Struct, frozen=True, array_like=True):
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def ray_lengths(self, shape: Sequence[int]) -> NDArray[np.float32]:
-        """(H, W) float32 length of each pixel's ray where its depth along the optical axis is 1."""
+        """Length of each pixel's ray where its depth along the axis is 1: (H, W) float32, of `shape`."""
         x = (np.arange(shape[1]) - self.cx) / self.fx
         y = (np.arange(shape[0]) - self.cy) / self.fy
         return np.sqrt(1 + x**2 + y[:, None] ** 2).astype(np.float32)
