@@ -18,7 +18,7 @@ from keyframes_and_servers import DEADLINE, pose, serving, wall
 from saved_maps import ANNA, BOB, correct, decoded, forget, make_map
 from small_recordings import first_views
 
-from tsfusion import Client, Volume, journal
+from tsfusion import Client, Intrinsics, Keyframe, Volume, journal
 from tsfusion.gateway import moved_maps
 from tsfusion.journal import segment_path, state_folder
 from tsfusion.tsdf import checkpoint
@@ -261,6 +261,49 @@ def test_a_file_with_waiting_corrections_says_that_they_stay(here: Here, tmp_pat
     assert "1 keyframe stays where fused, though corrected" in done.stderr
     (one,) = Volume.load("all.tsf").meta["poses"]["sessions"].values()
     assert one["missed"] == [2]
+
+
+def room(sides: tuple[float, float], numbers: Iterable[int], offset: float = 0.0) -> Volume:
+    """Map of an empty room of vertical walls around the origin, seen by a camera in its middle."""
+    u, v = np.meshgrid((np.arange(80) - 39.5) / 40, (np.arange(60) - 29.5) / 40)
+    volume = Volume(0.05, sensor="tof")
+    for number in numbers:
+        turn = np.radians(15 * number)
+        T = np.eye(4)
+        T[:3, :3] = np.stack(
+            [(np.sin(turn), -np.cos(turn), 0), (0, 0, -1), (np.cos(turn), np.sin(turn), 0)], 1
+        )
+        rays = np.stack([u, v, np.ones_like(u)], -1) @ T[:3, :3].T
+        with np.errstate(divide="ignore"):
+            walls = [np.abs(side / rays[..., axis]) for axis, side in enumerate(sides)]
+            depth = np.minimum.reduce([*walls, np.abs(1.2 / rays[..., 2])])
+        T[0, 3] = offset
+        camera = Intrinsics(40.0, 40.0, 39.5, 29.5)
+        volume.integrate(Keyframe(depth=depth.astype(np.float32), intrinsics=camera, T_world_camera=T))
+    return volume
+
+
+def test_merge_asks_whether_maps_of_given_poses_are_in_one_frame(here: Here) -> None:
+    """Floors and ceilings agree in any two places."""
+    maps = {
+        "a": room((2.0, 1.6), range(16)), "b": room((2.0, 1.6), range(8, 24)),
+        "hall": room((1.2, 3.0), range(24)), "far": room((2.0, 1.6), range(24), offset=30.0),
+    }  # fmt: skip
+    for name, volume in maps.items():
+        volume.save(f"{name}.tsf")
+    done = here("map", "merge", "a.tsf", "b.tsf", "--out", "ab.tsf")
+    assert (done.returncode, done.stderr) == (0, "")
+    for other, why in (("hall", "contradict each other"), ("far", "share too little to show")):
+        done = here("map", "merge", "a.tsf", f"{other}.tsf", "--out", "no.tsf")
+        assert (done.returncode, done.stderr.count("\n"), Path("no.tsf").exists()) == (1, 1, False)
+        assert why in done.stderr
+        assert "--same-frame" in done.stderr
+        assert (
+            here(
+                "map", "merge", "a.tsf", f"{other}.tsf", "--out", f"{other}-too.tsf", "--same-frame"
+            ).returncode
+            == 0
+        )
 
 
 def test_crop_and_merge_back(here: Here, state: Path) -> None:

@@ -4,6 +4,7 @@
 import copy
 import os
 import pickle
+import re
 import signal
 import sys
 from collections.abc import Callable
@@ -263,8 +264,10 @@ def test_full_voxels_refuse_more_and_lose_nothing() -> None:
     volume._store.sums[slot, voxel] = (1 << 26) - 1
     volume._store.bounds[slot] = (1 << 26) - 1
     before, blocks = bytes_of(volume), volume.stats().blocks
-    with pytest.raises(WeightOverflow):
+    with pytest.raises(WeightOverflow) as refused:
         volume.integrate(VIEWS[0])
+    said = {"bundle" in str(refused.value), *re.findall(r"(\w+) (--[\w-]+)", str(refused.value))}
+    assert said == {False, ("replay", "--stride"), ("scan", "--max-rate")}  # a bundle is what it is already
     moved = VIEWS[0].T_world_camera.copy()
     moved[:3, 3] += 0.1  # needs blocks that must not stay either
     with pytest.raises(WeightOverflow):

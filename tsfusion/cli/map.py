@@ -75,7 +75,7 @@ def hash_(path: Where, map_: Map = None, json: options.Json = False) -> None:
 
 
 @verbs.verb(
-    app, "tsfusion map merge ground.tsf upstairs.tsf --out house.tsf",
+    app, "tsfusion map merge hall.tsf kitchen.tsf --out ground-floor.tsf",
     "tsfusion map merge monday-maps tuesday.tsf --out both.tsf --same-frame",
 )  # fmt: skip
 def merge(
@@ -93,10 +93,10 @@ def merge(
     """Add maps of one coordinate frame: the map of all their keyframes, to the last bit.
 
     Voxel size and layers must be the same. Refused: maps that hold the same
-    keyframes, as far as a server wrote down which, and maps of scans that
-    found their poses themselves, each in a frame of its own, unless
-    --same-frame. A recording that was sent twice counts twice; equal poses
-    are noted.
+    keyframes, as far as a server wrote down which, and, unless --same-frame,
+    maps of scans that found their poses themselves, and maps of given poses
+    that contradict each other or share too little to tell. A recording that
+    was sent twice counts twice; equal poses are noted.
 
     What is lost: journals stay where they are. In the merged map keyframes
     can be neither corrected nor removed, and mesh --until and --only know
@@ -106,7 +106,8 @@ def merge(
     from tsfusion.core.errors import InvalidConfig
     from tsfusion.core.output_folder import check_writable
     from tsfusion.journal.state_folder import check_no_map_of_a_server
-    from tsfusion.tsdf import map_history
+    from tsfusion.pipelines import map_alignment
+    from tsfusion.tsdf import map_crop, map_history
 
     check_no_map_of_a_server(out)
     check_writable(out, (".tsf",), overwrite=overwrite)
@@ -117,6 +118,9 @@ def merge(
     for path in maps[1:]:
         other = _load(path, quiet=json)
         theirs = map_history.poses(other.meta)
+        is_part = map_crop.PART_OF in merged.meta and map_crop.PART_OF in other.meta
+        if not (same_frame or is_part) and map_history.are_given(merged.meta, other.meta):
+            map_alignment.check_one_frame(merged, other, (maps[0], path))
         merged.merge(other, same_frame=same_frame)
         if count := len(poses & theirs):
             have = count_of(count, "keyframe has", "keyframes have")

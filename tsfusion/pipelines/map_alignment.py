@@ -25,6 +25,7 @@ from tsfusion.journal.journaled_keyframes import JournaledKeyframes
 from tsfusion.pipelines import journal_fusion
 from tsfusion.pipelines.journal_fusion import Watch
 from tsfusion.tsdf import map_history
+from tsfusion.tsdf.block_store import pack_keys, unpack_keys
 from tsfusion.tsdf.volume import Volume
 
 MIN_OVERLAP = 0.15  # of the smaller surface
@@ -35,6 +36,8 @@ _CELL = 2.5  # voxels, at least
 _CELLS = 100  # along the diagonal of the smaller map, at most
 _SCALES = (1.0, 1.6)  # of the cell, at which features are looked for
 _LAST_REACHES = (2.0, 1.0, 0.5)  # voxels, of the last refinement
+_MOST_COMPARED, _MIN_COMPARED = 4096, 100  # blocks; points along a direction
+_MOST_THROUGH = 0.16  # of a surface in the other's free space; of true pairs up to 0.13 (hand-held, kitchen)
 _PART_REACH = 6.0  # voxels within which a part looks for the other surface
 _TOLERANCE = 1.5  # voxels within which two surfaces are one
 _TILT = {"given": 10.0, "imu": 10.0, "floor": 20.0, "cameras": 30.0}  # degrees: how well up is known
@@ -146,6 +149,41 @@ def align(a: AlignedMap, b: AlignedMap) -> Alignment:
     best = pair.judged(pair.finished(best.T), fine=True)
     pair.check(best)
     return best.described(pair.contradicted_alone, pair.spread(best.T) / best.fit.overlap)
+
+
+def check_one_frame(a: Volume, b: Volume, names: Sequence[object]) -> None:
+    """Raise MapError unless what two maps both have shows that they are in one frame.
+
+    Where both saw, the surface of one must not lie in the free space before that of the other; of each
+    direction of normals alone, for the floors of two places agree.
+
+    Args:
+        names: of both, for the message.
+    """
+    if a.config.voxel_size != b.config.voxel_size:
+        return  # they are not added in any case
+    cure = "merge them only if they are known to be in one frame (--same-frame), or after `map align`"
+    ours, theirs = (pack_keys(one.blocks().coordinates) for one in (a, b))
+    shared = unpack_keys(np.intersect1d(ours, theirs))
+    chosen = shared[:: -(-len(shared) // _MOST_COMPARED) or 1]
+    near, through, on, count = 1.5 * a.config.voxel_size, np.zeros(3), np.zeros(3), 1
+    for one, other in ((a, b), (b, a)):
+        mesh = one.extract_mesh(surface="raw", blocks=chosen)
+        distance, direction = other.signed_distance(mesh.vertices), np.abs(mesh.normals).argmax(axis=1)
+        through += np.bincount(direction[distance > near], minlength=3)
+        on += np.bincount(direction[np.abs(distance) <= near], minlength=3)
+        count += len(mesh.vertices)
+    enough = through + on >= _MIN_COMPARED
+    if (worst := float((through / np.maximum(through + on, 1))[enough].max(initial=0.0))) > _MOST_THROUGH:
+        raise MapError(
+            f"{names[0]} and {names[1]} contradict each other: {worst:.0%} of the surface of one lies in "
+            f"free space before that of the other, as of two places or frames; {cure}"
+        )
+    if on.sum() / count * len(shared) < MIN_OVERLAP * min(len(ours), len(theirs)):
+        raise MapError(
+            f"{names[0]} and {names[1]} share too little to show that they are in one frame: less than "
+            f"{MIN_OVERLAP:.0%} of the smaller one lies on the other; {cure}"
+        )
 
 
 class _Looks(NamedTuple):

@@ -285,7 +285,9 @@ class Integrator:
         if bad:
             raise WeightOverflow(
                 f"{bad} blocks hold voxels that have taken all the votes their integers hold "
-                f"({WEIGHT_LIMIT / WEIGHT_ONE:.0f} full samples); use bundle=True or a smaller voxel_size"
+                f"({WEIGHT_LIMIT / WEIGHT_ONE:.0f} full samples), as after standing still: leave out "
+                "keyframes of one place (replay --stride, scan --max-rate), or make a map of smaller voxels "
+                "(--voxel-size)" + ("" if self._config.bundle else ", or with bundle=True")
             )
 
     def _measure_touched(self) -> None:

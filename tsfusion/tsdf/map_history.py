@@ -126,6 +126,14 @@ def check_addable(here: Mapping[str, Any], there: Mapping[str, Any], *, same_fra
         )
 
 
+def are_given(here: Mapping[str, Any], there: Mapping[str, Any]) -> bool:
+    """Whether nothing but poses that were given says that two maps are in one frame: no world, no session."""
+    ours, theirs = (of_clients(sessions(meta)) for meta in (here, there))
+    worlds = [{one.world for one in each} or {""} for each in (ours, theirs)]
+    names = [{one.session for one in each} for each in (ours, theirs)]
+    return worlds[0] & worlds[1] == {""} and names[0].isdisjoint(names[1])
+
+
 def _check_distinct(ours: SessionHistory, theirs: SessionHistory) -> None:
     name = f"session {ours.session[:8]}" + (f" of {ours.client}" if ours.client else "")
     if ours.unlisted or theirs.unlisted:
