@@ -6,13 +6,15 @@ import os
 import shlex
 import signal
 import socket
+import struct
 import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from command_processes import COMMAND, Here, python, tsfusion
+from command_processes import COMMAND, DEADLINE, Here, python, tsfusion
 from small_recordings import seven_scenes
 
 from tsfusion import __version__
@@ -353,6 +355,9 @@ def test_flags_of_the_environment_are_not_refused(here: Here, monkeypatch: pytes
         ("[volume]\nspeed = 1\n", "unknown setting volume.speed"),
         ("speed = 1\n", "unknown setting speed"),
         ("volume = 1\n", "volume must be a table, got 1"),
+        (f"[volume]\nmax_blocks = {'9' * 5000}\n", "a.toml is not TOML: "),
+        (f"[volume]\nvoxel_size = {'[' * 20_000}{']' * 20_000}\n", "a.toml is not TOML: "),
+        (f"[{'.'.join(['a'] * 5000)}]\nb = 1\n", "a.toml: "),
     ],
 )
 def test_a_bad_setting_is_named_once(here: Here, tmp_path: Path, toml: str, words: str) -> None:
@@ -360,6 +365,16 @@ def test_a_bad_setting_is_named_once(here: Here, tmp_path: Path, toml: str, word
     said = one_line(here("config", "dump", "--config", "a.toml"))
     assert words in said
     assert said.count("got") <= 1
+
+
+def test_what_is_no_job_ends_a_worker_in_one_line() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "tsfusion.cluster"],
+        input=struct.pack("<I", 5000) + b"\x93" * 5000, capture_output=True, timeout=DEADLINE, check=False,
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert b"what came on stdin is no job" in done.stderr
+    assert b"Traceback" not in done.stderr
 
 
 def test_settings_may_be_numpy_scalars() -> None:

@@ -54,7 +54,7 @@ def test_serve_answers_and_ends_well(tmp_path: Path) -> None:
         assert (status["keyframes_durable"], status["keyframes_fused"]) == (2, 2)
         assert status["blocks"] > 10
         assert len(status["map_hash"]) == 32
-        assert " 2/2 " in tsfusion("status", "--connect", address).stdout
+        assert " 2/2 " in tsfusion("status", address).stdout
         done = tsfusion("mesh", address, tmp_path / "live.obj", "--min-weight", 0.5)
         assert done.returncode == 0, done.stderr
         assert "up +z (floor: " in done.stdout

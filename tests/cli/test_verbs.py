@@ -53,6 +53,14 @@ def test_help_fits_a_screen(here: Here, words: tuple[str, ...]) -> None:
         assert [line.split()[:2] for line in lines[-3:]] == [["Examples:"], *[["$", "tsfusion"]] * 2]
 
 
+@pytest.mark.usefixtures("wide")
+@pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
+def test_every_command_knows_help_all(here: Here, words: tuple[str, ...]) -> None:
+    done = here(*words, "--help-all")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert f"Usage: {' '.join(('tsfusion', *words))}" in done.stdout
+
+
 @pytest.mark.parametrize("words", VERBS, ids=" ".join)
 def test_examples_are_commands(words: tuple[str, ...]) -> None:
     command = COMMANDS[words]

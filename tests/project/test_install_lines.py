@@ -45,6 +45,23 @@ def test_install_lines_name_a_clone_and_its_extras() -> None:
     assert named <= extras()
 
 
+def test_the_client_needs_less_of_the_same() -> None:
+    """A robot's distribution has the whole one's versions, without what servers and plots need."""
+    whole, client = (requirements(path) for path in ("pyproject.toml", "packaging/client/pyproject.toml"))
+    assert set(client) - {"packaging"} < set(whole)
+    assert all(client[name] == whole[name] for name in set(client) - {"packaging"})
+    assert not {"taichi", "matplotlib", "pykitti", "prometheus-client"} & set(client)
+
+
+def requirements(path: str) -> dict[str, str]:
+    """Version and marker by the name of each package that a distribution needs without extras."""
+    text = (ROOT / path).read_text(encoding="utf-8")
+    listed = re.search(r"^dependencies = \[\n(.*?)^\]", text, re.MULTILINE | re.DOTALL)
+    assert listed is not None
+    lines = re.findall(r'"((?:[^"\\]|\\.)+)"', re.sub(r"#.*", "", listed[1]))
+    return {line.partition(">")[0]: line.partition(">")[2] for line in lines}
+
+
 @pytest.mark.slow
 def test_pip_finds_all_that_the_lines_need(tmp_path: Path) -> None:
     named = {extra for line in installed() for extra in re.findall(r"\w+", line)}

@@ -124,6 +124,9 @@ def _root(
 # A run writes in many places: that a disk refuses is the user's to mend in all of them.
 _DISK_REFUSES = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
 
+# Packages that a robot's light installation does not have.
+_NOT_OF_THE_CLIENT = ("matplotlib", "prometheus_client", "pykitti", "taichi")
+
 
 def main(arguments: list[str] | None = None) -> NoReturn:
     """Run a command line (default: this process's) and exit.
@@ -153,6 +156,10 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     except BrokenPipeError:  # the reader of our output went away
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
+    except ModuleNotFoundError as error:
+        if error.name not in _NOT_OF_THE_CLIENT:
+            raise
+        _fail(f"this needs {error.name}, which tsfusion-client leaves out: pip install . in your clone", 1)
     except MemoryError as error:
         _fail(f"not enough memory: {error}", 1)
     except OSError as error:

@@ -8,6 +8,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module, metadata
 from pathlib import Path
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 
 PYTHONS = ((3, 10), (3, 13))
 DISK_BYTES = 2_000_000_000
+_CLIENT = "tsfusion-client"
 # `tsfusion.kernels` imports taichi without its banner.
 _MODULES = {
     "opencv-python-headless": "cv2", "prometheus-client": "prometheus_client", "pyzmq": "zmq",
@@ -81,7 +83,10 @@ def check(path: Path) -> Iterator[Finding]:
     yield _python()
     yield from _packages()
     yield from map(_extra, _EXTRAS)
-    yield _guarded(_kernels, "kernels", "pip install --force-reinstall taichi")
+    if _installed() == _CLIENT:
+        yield Finding("kernels", True, f"left out: {_CLIENT} sends to a server that fuses", optional=True)
+    else:
+        yield _guarded(_kernels, "kernels", "pip install --force-reinstall taichi")
     yield _guarded(_port, "loopback", "let this user listen on 127.0.0.1")
     yield _disk(path)
 
@@ -105,7 +110,7 @@ def _packages() -> Iterator[Finding]:
     try:
         from packaging.requirements import Requirement
 
-        requirements = [Requirement(line) for line in metadata.requires("tsfusion") or []]
+        requirements = [Requirement(line) for line in metadata.requires(_installed()) or []]
     except (ImportError, metadata.PackageNotFoundError) as error:
         yield Finding(
             "packages",
@@ -120,6 +125,17 @@ def _packages() -> Iterator[Finding]:
         elif requirement.name == "taichi":
             advice = "this machine can send keyframes, not fuse them: run `tsfusion serve` on x86-64"
             yield Finding("taichi", False, f"no build for {platform.machine()}", advice)
+
+
+def _installed() -> str:
+    """Name of the distribution that this installation is of: the whole, or a robot's."""
+    try:
+        metadata.version("tsfusion")
+    except metadata.PackageNotFoundError:
+        with suppress(metadata.PackageNotFoundError):
+            metadata.version(_CLIENT)
+            return _CLIENT
+    return "tsfusion"
 
 
 def _package(requirement: "Requirement") -> Finding:

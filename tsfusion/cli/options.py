@@ -294,7 +294,7 @@ def dataset_options(given: list[str] | None, **flags: Any) -> dict[str, Any]:
             raise InvalidConfig(f"--{key} and --option {key}=… exclude each other: give one of them")
         try:
             found[key] = json.loads(value)
-        except ValueError:
+        except (ValueError, RecursionError):
             found[key] = value
     return flags | {key: value for key, value in found.items() if value is not None}
 

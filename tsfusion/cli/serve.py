@@ -60,6 +60,9 @@ SERVER_OPTIONS: dict[str, Any] = {
 
 @partial(options.takes_map_settings, also=SERVER_OPTIONS)
 def serve(
+    folder: Annotated[
+        str | None, typer.Argument(metavar="[DIR]", help="The same as --state.", hidden=True)
+    ] = None,
     *,
     config: options.ConfigFile = None,
     view: options.View = None,
@@ -76,6 +79,7 @@ def serve(
     from tsfusion.core import logs
     from tsfusion.core.errors import TsfusionError
 
+    settings["state"] = folder or settings["state"]
     chosen = _configuration(config, settings)
     logs.configure(chosen.server.log_format, chosen.server.log_level)
     if until_eof:

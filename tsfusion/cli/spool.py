@@ -35,8 +35,13 @@ _POLL = 0.05  # seconds
 _AGES = ((86400.0, "d"), (3600.0, "h"), (60.0, "min"), (1.0, "s"))
 
 
-@verbs.verb(app, "tsfusion spool list", "tsfusion spool list --spool /robot/spool", name="list")
-def list_(*, spool: Dir = _FOLDER, json: options.Json = False) -> None:
+@verbs.verb(app, "tsfusion spool list", "tsfusion spool list /robot/spool", name="list")
+def list_(
+    folder: Annotated[Path | None, typer.Argument(metavar="[DIR]", help="The folder of spools.")] = None,
+    *,
+    spool: Dir = _FOLDER,
+    json: options.Json = False,
+) -> None:
     """List the spools in which keyframes wait: map, world, keyframes, bytes, age; oldest first.
 
     Exit status 1 where damage has destroyed some.
@@ -44,6 +49,7 @@ def list_(*, spool: Dir = _FOLDER, json: options.Json = False) -> None:
     from tsfusion.core.errors import IncompleteRun
     from tsfusion.delivery import left_spools
 
+    spool = folder or spool
     _check_there(spool)
     rows = [(left, *left.count()) for left in left_spools.find(spool)]
     if json:
@@ -93,7 +99,8 @@ def _line(left: "LeftSpool", keyframes: int, nbytes: int, width: int) -> str:
 @verbs.verb(app, "tsfusion spool send --connect tcp://server:5555", "tsfusion spool send default --map auto")
 def send(
     names: Annotated[
-        list[str] | None, typer.Argument(metavar="[SPOOL]...", help="As `list` shows them; default: all.")
+        list[str] | None,
+        typer.Argument(metavar="[DIR] [SPOOL]...", help="As `list` shows them; default: all."),
     ] = None,
     *,
     spool: Dir = _FOLDER,
@@ -116,6 +123,8 @@ def send(
     from tsfusion.core.errors import TransportError
     from tsfusion.delivery import left_spools
 
+    if names and Path(names[0]).is_dir() and not (spool / names[0]).is_dir():
+        spool, names = Path(names[0]), names[1:]
     chosen = _choose(spool, names)
     folders = {one.folder for one in chosen}
     damaged = {  # counted before: a file goes when the rest of it is sent

@@ -16,6 +16,9 @@ PLAIN_WIDTH = 160  # columns where there is no terminal
 
 
 def status(
+    server: Annotated[
+        str | None, typer.Argument(metavar="[ADDRESS]", help="tcp://HOST:PORT of the server.")
+    ] = None,
     *,
     connect: options.Connect = None,
     control: options.Control = None,
@@ -50,7 +53,7 @@ def status(
     from tsfusion.core.config import ClientConfig
     from tsfusion.wire.curve import client_keys
 
-    address = connect or ClientConfig().address
+    address = server or connect or ClientConfig().address
     watcher = ServerWatcher(
         address, control=control, keys=client_keys(key, server_key), timeout=timeout,
         stall_after=stall_after, only=map_ or "",

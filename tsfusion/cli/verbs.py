@@ -47,6 +47,10 @@ class _ShortHelp:
 class Group(_ShortHelp, TyperGroup):
     """A command that has verbs."""
 
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        rest: list[str] = super().parse_args(ctx, ["--help"] if args == ["--help-all"] else args)
+        return rest
+
 
 class Verb(_ShortHelp, TyperCommand):
     """A verb; each of its flags `--some-flag` can be set by the variable `TSFUSION_SOME_FLAG` too."""
@@ -60,6 +64,8 @@ class Verb(_ShortHelp, TyperCommand):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         _refuse_empty(ctx, args)
+        if not any("--help-all" in param.opts for param in self.params):  # a verb without rare flags
+            args = ["--help" if word == "--help-all" else word for word in args]
         words = [new for old in args for new in _renamed(old)]
         for flag, (place, usual) in _PLACES.items():
             if any(param.opts == [flag] and param.nargs == 1 for param in self.params):

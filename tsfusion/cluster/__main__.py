@@ -34,7 +34,10 @@ def _next(stream: BinaryIO) -> AnyJob | None:
     head = stream.read(LENGTH.size)
     if len(head) < LENGTH.size:
         return None
-    job: AnyJob = msgspec.msgpack.decode(stream.read(LENGTH.unpack(head)[0]), type=AnyJob)
+    try:
+        job: AnyJob = msgspec.msgpack.decode(stream.read(LENGTH.unpack(head)[0]), type=AnyJob)
+    except (msgspec.MsgspecError, RecursionError) as error:
+        sys.exit(f"tsfusion worker: what came on stdin is no job: {error}")
     return job
 
 

@@ -464,7 +464,7 @@ def load(path: str | Path | None, **volume: Any) -> Config:
         ) from error
     try:
         tables = tomllib.loads(content.decode("utf-8-sig"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # also too many digits, or too deep
         raise InvalidConfig(
             f"{path} is not TOML: {error}; `tsfusion config dump` shows what one looks like"
         ) from error
@@ -474,7 +474,7 @@ def load(path: str | Path | None, **volume: Any) -> Config:
         made = make_settings(Config, tables)
         made.volumes()
         return made
-    except InvalidConfig as error:
+    except (InvalidConfig, RecursionError) as error:
         raise InvalidConfig(f"{path}: {error}") from error
 
 

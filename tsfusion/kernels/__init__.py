@@ -16,7 +16,7 @@ try:
     import taichi as taichi
 except ModuleNotFoundError as error:
     raise MissingDependency(
-        "fusing needs taichi, which has no build for this platform; "
+        "fusing needs taichi, which is not installed here or has no build for this platform; "
         "run `tsfusion serve` on an x86-64 machine and send keyframes to it from here"
     ) from error
 except ImportError as error:  # a library of the system, which small containers do not have

@@ -69,7 +69,7 @@ def _of_run(folder: Path) -> Measure:
         record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
         errors = np.load(folder / "error.npy", allow_pickle=False)
         voxel_size = float(record["config"]["voxel_size"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise DatasetError(
             f"{folder} holds no error that was measured (error.npy of a run whose dataset knows its surface)"
         ) from error

@@ -9,6 +9,7 @@ import shlex
 import sys
 import time
 from contextlib import suppress
+from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -118,9 +119,10 @@ def _provenance(status: Status, target: Target, world: str) -> Provenance:
 
 
 def write_ledger(work: Path, records: list[KeyframeTimes]) -> None:
-    """Write `delay.csv` and `delay.png`."""
+    """Write `delay.csv`, and `delay.png` where matplotlib is installed."""
     latency_ledger.write_csv(records, work / "delay.csv")
-    latency_ledger.plot(records, work / "delay.png")
+    if find_spec("matplotlib") is not None:
+        latency_ledger.plot(records, work / "delay.png")
 
 
 def write_record(work: Path, summary: msgspec.Struct) -> None:

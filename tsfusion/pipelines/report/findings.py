@@ -93,7 +93,7 @@ def read(folder: Path, meshes: dict[str, Mesh] | None = None) -> RunFindings:
 def _record(path: Path) -> dict[str, Any]:
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise OutputError(f"cannot read {path}: {error}; expected the results of a run") from error
     if not isinstance(record, dict) or not ({"dataset", "source"} & record.keys()):
         raise OutputError(f"{path} is of no run; expected what replay, scan or demo left")
