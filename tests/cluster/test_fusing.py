@@ -5,7 +5,7 @@ import json
 import os
 import shutil
 import signal
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -147,6 +147,49 @@ def test_an_interrupted_run_goes_on(state: Path, tmp_path: Path, expected: Volum
     assert len(second.done) == run.jobs - 3
     with pytest.raises(OutputError, match="holds files already"):
         fuse(state, tmp_path / "out")
+
+
+def zeroed(part: Path, other: Path) -> None:
+    content = part.read_bytes()
+    middle = len(content) // 2
+    part.write_bytes(content[:middle] + bytes(64) + content[middle + 64 :])
+
+
+def cut(part: Path, other: Path) -> None:
+    part.write_bytes(part.read_bytes()[: part.stat().st_size // 2])
+
+
+def exchanged(part: Path, other: Path) -> None:
+    ours, theirs = part.read_bytes(), other.read_bytes()
+    part.write_bytes(theirs)
+    other.write_bytes(ours)
+
+
+def listed_elsewhere(part: Path, other: Path) -> None:
+    """One job's list takes the place of another's."""
+    mine, theirs = (next(part.parent.glob(f"{one.name.rpartition('-')[0]}.done")) for one in (part, other))
+    mine.write_bytes(theirs.read_bytes())
+
+
+def unlisted(part: Path, other: Path) -> None:
+    """A list of a version that wrote no digests."""
+    for path in part.parent.glob("*.done"):
+        found = msgspec.msgpack.decode(path.read_bytes())
+        path.write_bytes(msgspec.msgpack.encode({key: one for key, one in found.items() if key != "digests"}))
+
+
+@pytest.mark.parametrize("harm", [zeroed, cut, exchanged, listed_elsewhere, unlisted])
+def test_a_part_that_is_not_what_its_job_wrote_is_made_anew(
+    state: Path, tmp_path: Path, expected: Volume, harm: Callable[[Path, Path], None]
+) -> None:
+    with pytest.raises(WorkerLost):
+        fuse(state, tmp_path / "out", InThisProcess(3, lose={"add": ATTEMPTS}))
+    part, other, _ = sorted((tmp_path / "out" / fusion.WORK).glob("fuse-*.tsf"))
+    harm(part, other)
+    again = InThisProcess(3)
+    assert fuse(state, tmp_path / "out", again).map_hash == expected.map_hash()
+    made_anew = {zeroed: 1, cut: 1, exchanged: 2, listed_elsewhere: 1, unlisted: 3}[harm]
+    assert sum(name.startswith("fuse") for name in again.done) == made_anew
 
 
 def test_other_keyframes_or_settings_begin_anew(state: Path, tmp_path: Path) -> None:

@@ -95,13 +95,14 @@ class CarryingOut:
                 )
 
     def _done(self, job: AnyJob) -> Done | None:
-        """How a job ended in an earlier run, if all of its files are still there."""
+        """How a job ended in an earlier run, if all of its files are still there, as it wrote them."""
         try:
             content = jobs.done_file(self._folder, job.name).read_bytes()
             done = msgspec.msgpack.decode(content, type=Done)
-        except (OSError, msgspec.DecodeError):
-            return None
-        return done if all((self._folder / name).is_file() for name in done.files) else None
+            is_whole = (done.name, done.digests) == (job.name, jobs.digests(self._folder, done.files))
+        except (OSError, ValueError, msgspec.DecodeError, RecursionError):
+            is_whole = False
+        return done if is_whole else None
 
 
 def _error(message: Failed) -> TsfusionError:

@@ -60,15 +60,16 @@ def run(job: AnyJob) -> Iterator[Message]:
     except (TsfusionError, MemoryError) as error:
         yield Failed(job.name, type(error).__name__, str(error))
         return
-    done = Done(
-        name=job.name,
-        seconds=round(time.monotonic() - begin, 3),
-        cpu_seconds=round(time.process_time() - cpu, 3),
-        base_rss=base,
-        peak_rss=process.peak_rss_bytes(),
-        **made,
-    )
     try:
+        done = Done(
+            name=job.name,
+            seconds=round(time.monotonic() - begin, 3),
+            cpu_seconds=round(time.process_time() - cpu, 3),
+            base_rss=base,
+            peak_rss=process.peak_rss_bytes(),
+            digests=jobs.digests(folder, made["files"]),
+            **made,
+        )
         with replacing(jobs.done_file(folder, job.name)) as file:
             file.write(msgspec.msgpack.encode(done))
     except OSError as error:

@@ -5,6 +5,8 @@ Whoever does a job writes its files under names that nobody has had before, and 
 last. A worker that was taken for dead and went on does no harm.
 """
 
+import hashlib
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,8 @@ from numpy.typing import NDArray
 
 from tsfusion.core.config import VolumeConfig
 from tsfusion.geometry.up_direction import Up
+
+_PART = 1 << 20  # bytes that are read at a time
 
 
 class JournalKeyframes(Struct, tag="journal", frozen=True):
@@ -150,7 +154,7 @@ class Done(Struct, tag="done", frozen=True, kw_only=True):
     """A job is done.
 
     Attributes:
-        files: that it has written, in its folder.
+        files: that it has written, in its folder; `digests` of their contents.
         left_out: reason → number of keyframes that the map could not take.
         seconds, cpu_seconds: that it took.
         figures: of what it made.
@@ -163,6 +167,7 @@ class Done(Struct, tag="done", frozen=True, kw_only=True):
     cpu_seconds: float
     base_rss: int
     peak_rss: int
+    digests: list[str] = []
     read: int = 0
     fused: int = 0
     left_out: dict[str, int] = {}
@@ -185,6 +190,18 @@ class Lost(Struct, tag="lost", frozen=True):
 
 
 Message = Progress | Done | Failed | Lost
+
+
+def digests(folder: Path, files: Iterable[str]) -> list[str]:
+    """Digests of the contents of files; raises OSError where one is missing."""
+    found = []
+    for name in files:
+        digest = hashlib.blake2b(digest_size=16)
+        with (folder / name).open("rb") as file:
+            while part := file.read(_PART):
+                digest.update(part)
+        found.append(digest.hexdigest())
+    return found
 
 
 def done_file(folder: Path, name: str) -> Path:
