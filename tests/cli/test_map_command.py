@@ -75,6 +75,20 @@ def test_hash_is_a_line_and_has_all_that_the_journal_holds(here: Here, state: Pa
     assert {path: path.read_bytes() for path in state.rglob("*") if path.is_file()} == before
 
 
+def test_another_maps_checkpoint_is_refused(here: Here, tmp_path: Path) -> None:
+    ours, theirs = (
+        make_map(tmp_path / name / "maps" / "default", range(2), session=session)
+        for name, session in (("ours", ANNA), ("theirs", BOB))
+    )
+    (ours / "map.tsf").write_bytes((theirs / "map.tsf").read_bytes())
+    for verb in ("hash", "info"):
+        done = here("map", verb, tmp_path / "ours")
+        assert (done.returncode, done.stdout) == (1, "")
+        assert "is the checkpoint of another map than that of the journal beside it" in done.stderr
+        assert "a server that starts there sets it aside and builds the map from the journal" in done.stderr
+    assert here("map", "hash", theirs).returncode == 0
+
+
 def test_what_damage_has_cost_is_the_last_line_and_status_1(here: Here, tmp_path: Path) -> None:
     folder = make_map(tmp_path / "state" / "maps" / "default", range(4), behind=2)
     path = segment_path(folder / "journal", 1)

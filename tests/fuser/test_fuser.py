@@ -24,6 +24,7 @@ from command_processes import alive, python
 from failures import raising, refuse
 from keyframes_and_servers import VOLUME, pose, serving, until, wall
 from resident_memory import unnamed_files_rss
+from saved_maps import ANNA, BOB, make_map
 
 import tsfusion
 from tsfusion import VolumeConfig
@@ -34,7 +35,7 @@ from tsfusion.fuser import messages, opened_map
 from tsfusion.fuser.current_keyframe import CurrentKeyframe
 from tsfusion.fuser.fuser import Fuser
 from tsfusion.fuser.map_checkpoints import MapCheckpoints
-from tsfusion.journal import Journal, Position
+from tsfusion.journal import Journal, Position, segment_path
 from tsfusion.journal.state_folder import MAP_FILE, PREVIOUS_FILE
 from tsfusion.wire import codec, corrections, record_header
 from tsfusion.wire.mesh_updates import Meshed
@@ -304,6 +305,31 @@ def test_a_damaged_checkpoint_is_set_aside_and_the_journal_fused_anew(
         assert "built again from the journal" in caplog.text
         assert (tmp_path / name).read_bytes() == stored
     assert not path.exists()
+
+
+def test_another_maps_checkpoint_is_set_aside_and_the_journal_fused_anew(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It is whole in itself, as a slip of `cp` or a restored backup leaves it."""
+    ours, theirs = make_map(tmp_path / "ours", range(3)), make_map(tmp_path / "theirs", range(5), session=BOB)
+    content = (theirs / "map.tsf").read_bytes()
+    (ours / "map.tsf").write_bytes(content)
+    fuser, _ = opened(ours)
+    assert fuser.ready().done == {}
+    assert "is the checkpoint of another map than that of the journal beside it" in caplog.text
+    assert (ours / "map.damaged").read_bytes() == content
+
+
+def test_an_older_or_newer_checkpoint_of_the_same_journal_is_taken(tmp_path: Path) -> None:
+    folder = make_map(tmp_path, range(2))
+    older = (folder / "map.tsf").read_bytes()
+    make_map(folder, range(2, 4), session=BOB)
+    newer = (folder / "map.tsf").read_bytes()
+    (folder / "map.tsf").write_bytes(older)
+    assert set(opened(folder)[0].ready().done) == {ANNA}
+    (folder / "map.tsf").write_bytes(newer)
+    segment_path(folder / "journal", 2).unlink()  # as in a backup that has the journal as it was before
+    assert set(opened(folder)[0].ready().done) == {ANNA, BOB}
 
 
 @pytest.mark.parametrize("code", [errno.EMFILE, errno.EIO, errno.EACCES, errno.ENOMEM])

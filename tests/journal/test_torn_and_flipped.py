@@ -347,3 +347,21 @@ def test_bytes_of_any_kind_are_read_without_a_complaint(kept: Segment, content: 
     for prefix in (b"", mcap_layout.OPENING, kept.whole[: mcap_layout.segment_start_bytes()]):
         kept.path.write_bytes(prefix + content)
         assert not [step for step in scan_records(kept.path) if isinstance(step, Record)]
+
+
+def test_another_record_in_a_place_is_told_from_a_damaged_one(segment: Segment) -> None:
+    def is_other(place: Position, seq: int, session: bytes = bytes(range(16))) -> bool:
+        return journal.has_another(segment.path.parent, session, seq, place)
+
+    first, second, *_ = segment.places
+    assert not is_other(first, 1)
+    assert is_other(first, 2)
+    assert is_other(first, 1, bytes(16))
+    inside = Position(1, first.offset + 7)
+    assert is_other(inside, 1)  # where a record of another journal began
+    assert not is_other(Position(1, len(segment.whole) + 100), 1)  # the journal is shorter
+    assert not is_other(Position(2, first.offset), 1)  # that segment is not there
+    segment.path.write_bytes(flipped(segment.whole, first.offset + 100, 1))
+    assert not is_other(first, 2)
+    assert not is_other(inside, 1)
+    assert not is_other(second, 2)

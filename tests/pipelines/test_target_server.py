@@ -79,7 +79,10 @@ def test_a_saved_map_is_kept_whatever_became_of_others(tmp_path: Path) -> None:
         assert target.child is not None
         os.kill(target.child.pid, signal.SIGKILL)
     assert target.unkept == ""
-    assert (tmp_path / "map.tsf").read_bytes() == saved.read_bytes()
+    content = saved.read_bytes()
+    assert (tmp_path / "map.tsf").read_bytes() == content
+    (tmp_path / "map.tsf").write_bytes(b"of the user")  # as `cp` writes: into the file that is there
+    assert saved.read_bytes() == content
 
 
 def test_a_map_that_has_moved_is_not_scanned_into_elsewhere(tmp_path: Path) -> None:

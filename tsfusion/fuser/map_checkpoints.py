@@ -3,18 +3,21 @@
 
 import logging
 import os
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from tsfusion import journal
 from tsfusion.core import durable_files
 from tsfusion.core.config import LIMIT_SETTINGS, RUN_SETTINGS, VIEW_SETTINGS, VolumeConfig
 from tsfusion.core.errors import CheckpointError, DamagedCheckpoint, InvalidConfig, TsfusionError
 from tsfusion.fuser.messages import SessionProgress
 from tsfusion.journal import state_folder
 from tsfusion.journal.keyframe_poses import KeyframePoses
+from tsfusion.tsdf import map_history
 
 if TYPE_CHECKING:
     from tsfusion.tsdf.volume import Volume
@@ -125,6 +128,7 @@ def _resume(path: Path, wanted: VolumeConfig, kept: dict[str, Any]) -> "Volume |
     try:
         changed = {name: getattr(wanted, name) for name in ("arch", *VIEW_SETTINGS, *LIMIT_SETTINGS)}
         volume = Volume.load(path, wanted.threads, **kept, **changed)
+        check_journal(path, volume.meta)
     except DamagedCheckpoint as error:
         _set_aside(path, error)
         return None
@@ -142,6 +146,19 @@ def _resume(path: Path, wanted: VolumeConfig, kept: dict[str, Any]) -> "Volume |
                 f"folder or map (only a journal that is whole can build this one anew)"
             )
     return volume
+
+
+def check_journal(path: Path, meta: Mapping[str, Any]) -> None:
+    """Raise DamagedCheckpoint where a checkpoint, of this `meta`, is not of the journal beside it."""
+    folder = path.parent / state_folder.JOURNAL_FOLDER
+    for one in map_history.sessions(meta):
+        for at in (0, -1) if len(one.seqs) else ():
+            seq, place = int(one.seqs[at]), journal.Position(*one.positions[at].tolist())
+            if journal.has_another(folder, bytes.fromhex(one.session), seq, place):
+                raise DamagedCheckpoint(
+                    f"{path} is the checkpoint of another map than that of the journal beside it, which has "
+                    f"another record in the place of keyframe {seq} of session {one.session[:8]}"
+                )
 
 
 def _set_aside(path: Path, error: DamagedCheckpoint) -> None:

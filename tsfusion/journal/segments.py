@@ -6,7 +6,7 @@ import logging
 import os
 import re
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 from msgspec import Struct
@@ -106,6 +106,18 @@ def read_at(path: Path, offset: int) -> Record:
         raise journal_error("read", path, error) from error
     with source:
         return record_at(source, segment_number(path), offset)
+
+
+def has_another(folder: Path, session: bytes, seq: int, position: Position) -> bool:
+    """Whether a journal has another record where it had this one. Damage and missing files show nothing."""
+    path = segment_path(folder, position.segment)
+    with suppress(JournalError):
+        found = read_at(path, position.offset)
+        return (found.session, found.seq) != (session, seq)
+    with suppress(JournalError):
+        whole = (one for one in scan_records(path) if isinstance(one, (Record, Erased)))
+        return any(0 < position.offset - one.position.offset < one.nbytes for one in whole)
+    return False
 
 
 class Reading:

@@ -14,8 +14,9 @@ from msgspec import Struct
 from tsfusion.core import process
 from tsfusion.core.config import ClientConfig, override
 from tsfusion.core.durable_files import make_folder, size_of
-from tsfusion.core.errors import CheckpointError, JournalError, OutputError
+from tsfusion.core.errors import CheckpointError, DamagedCheckpoint, JournalError, OutputError
 from tsfusion.core.folder_lock import lock_folder
+from tsfusion.fuser import map_checkpoints
 from tsfusion.gateway import moved_maps
 from tsfusion.journal import state_folder
 from tsfusion.journal.recording import LOST
@@ -187,6 +188,7 @@ def opened(
     """
     if saved.folder is not None:
         with checkpoint.reading(saved.path) as (header, _):
+            check_checkpoint(saved, header)
             histories, config = map_history.sessions(header.meta), header.config
             tail = settled_maps.records_after(saved.folder, histories, reading)
             lost = _lost(header, tail)
@@ -198,6 +200,16 @@ def opened(
         yield saved.path, damage
         return
     yield saved.path, {}
+
+
+def check_checkpoint(saved: SavedMap, header: checkpoint.CheckpointHeader) -> None:
+    """Raise CheckpointError where the checkpoint in a map's folder is another map's."""
+    try:
+        map_checkpoints.check_journal(saved.path, header.meta)
+    except DamagedCheckpoint as error:
+        raise CheckpointError(
+            f"{error}; a server that starts there sets it aside and builds the map from the journal"
+        ) from error
 
 
 def _lost(header: checkpoint.CheckpointHeader, tail: settled_maps.Tail) -> int:
@@ -219,6 +231,7 @@ def summarise(saved: SavedMap, reading: state_folder.Watcher = lambda _done, _al
     histories = map_history.sessions(header.meta)
     after = lost = None
     if saved.folder is not None:
+        check_checkpoint(saved, header)
         tail = settled_maps.records_after(saved.folder, histories, reading)
         after, lost = Counter(one.is_correction for one in tail.records), _lost(header, tail)
     return MapSummary(

@@ -28,6 +28,7 @@ from tsfusion.core.config import (
     VolumeConfig,
     override,
 )
+from tsfusion.core.durable_files import replacing
 from tsfusion.core.errors import (
     CheckpointError,
     InvalidConfig,
@@ -321,8 +322,13 @@ def opened(
             left = "" if server.state == THROWN_AWAY else f"; its keyframes are in the journal in {folder}"
             target._unkept.append(f"the server could not save the map {name}: {path.name} is missing{left}")
             continue
+        saved = folder / state_folder.MAP_FILE
         try:
-            _copy_map(folder / state_folder.MAP_FILE, path)
+            if server.state == THROWN_AWAY:
+                shutil.move(saved, path)
+            else:  # a file of its own: what a user does to it is nothing to the state
+                with saved.open("rb") as old, replacing(path) as new:
+                    shutil.copyfileobj(old, new)
         except OSError as error:
             path.unlink(missing_ok=True)
             target._unkept.append(f"the map could not be kept in {path.name}: {error.strerror}")
@@ -338,11 +344,3 @@ def _is_saved(folder: Path) -> bool:
     except (CheckpointError, JournalError):
         return False
     return not (found.keyframes_after or found.corrections_after or found.corrections_waiting)
-
-
-def _copy_map(saved: Path, path: Path) -> None:
-    """Put a stopped server's map under another name too: the file is replaced, never changed."""
-    try:
-        os.link(saved, path)
-    except OSError:  # another file system, or one without links
-        shutil.copyfile(saved, path)

@@ -63,6 +63,7 @@ def find(path: Path, name: str | None) -> Source:
     if not (saved.folder / state_folder.JOURNAL_FOLDER).is_dir():
         return Source(name, saved.path, None, _running(saved.folder))
     with checkpoint.reading(saved.path) as (header, _):
+        saved_maps.check_checkpoint(saved, header)
         knows_journal = "done" in header.meta
     if not knows_journal:
         note = "the map does not say which keyframes of its journal it has: there is no way back in time"
