@@ -3,7 +3,11 @@
 
 import os
 import signal
+import socket
+import subprocess
+import sys
 import threading
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -11,12 +15,15 @@ from command_processes import Here, descendants, eventually
 from silent_display import Silent
 
 from tsfusion import Volume
-from tsfusion.cluster import fusion, keyframe_sources
+from tsfusion.cluster import fusion, keyframe_sources, ray_scheduler
 from tsfusion.cluster.ray_scheduler import RayCluster
 from tsfusion.core.config import VolumeConfig
 from tsfusion.core.errors import TransportError
 
-pytest.importorskip("ray", reason="Ray is not installed: pip install '.[ray]'")
+if find_spec("ray") is None:
+    pytest.skip("Ray is not installed: pip install '.[ray]'", allow_module_level=True)
+os.environ |= ray_scheduler.OWN  # Ray reads them once a process
+os.environ["RAY_AUTH_TOKEN"] = TOKEN = "0123456789abcdef" * 4
 # Ray's own: sockets and files of a cluster that ends with the process
 pytestmark = [pytest.mark.filterwarnings("ignore"), pytest.mark.nightly]
 
@@ -84,6 +91,29 @@ def test_a_node_that_is_killed_takes_no_keyframe_along(tmp_path: Path) -> None:
     assert len(killed) == 2
     assert (run.map_hash, run.keyframes_fused) == (whole.map_hash(), 24)
     assert run.workers_lost >= 1
+
+
+def test_another_user_of_the_machine_is_refused() -> None:
+    """The cluster is on loopback, where every user of a machine is, and asks for a token."""
+    cluster = RayCluster(1)
+    try:
+        import ray
+
+        host, _, port = ray.get_runtime_context().gcs_address.rpartition(":")
+        assert host == "127.0.0.1"
+        with socket.socket() as elsewhere:  # a port of ours on another address is free
+            elsewhere.bind(("127.0.0.2", int(port)))
+        for token in ("", "f" * 64, TOKEN):
+            code = f"import ray; ray.init(address='{host}:{port}', log_to_driver=False); print('in')"
+            clean = {name: one for name, one in os.environ.items() if not name.startswith("RAY_AUTH")}
+            mode = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": token} if token else {}
+            done = subprocess.run(
+                [sys.executable, "-c", code],
+                check=False, env=clean | mode, capture_output=True, text=True, timeout=120,
+            )  # fmt: skip
+            assert (done.returncode == 0, "in" in done.stdout.split()) == (token == TOKEN,) * 2, done.stderr
+    finally:
+        cluster.close()
 
 
 def test_a_cluster_that_is_not_there_is_told() -> None:

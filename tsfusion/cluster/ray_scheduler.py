@@ -6,6 +6,7 @@ Workers on other machines need tsfusion, and the folder of the results under the
 
 import logging
 import os
+import secrets
 import socket
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -21,6 +22,11 @@ _QUIET = {
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",  # it would warn of GPUs that nobody asked for
     "RAY_USAGE_STATS_ENABLED": "0",  # it would tell its makers that and where we run
 }
+# Of a cluster that is started here; Ray reads them when it is loaded.
+OWN = {
+    "RAY_AUTH_MODE": "token",
+    "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",  # on Linux, too, it listens on loopback then
+}
 
 
 class RayCluster:
@@ -28,7 +34,8 @@ class RayCluster:
 
     Args:
         workers: jobs at the same time, at most; Ray gives each a core.
-        address: of a cluster, `auto` or `ray://HOST:PORT`; None = one is started here, and ended with this.
+        address: of a cluster, `auto` or `ray://HOST:PORT`; None = one is started here, and ended with this:
+            it listens on loopback, and asks everybody for a token that only this process and its own know.
 
     Raises:
         MissingDependency: without Ray.
@@ -40,6 +47,9 @@ class RayCluster:
     def __init__(self, workers: int, address: str | None = None) -> None:
         for variable, value in _QUIET.items():
             os.environ.setdefault(variable, value)
+        if address is None:
+            os.environ.update(OWN)
+            os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
         try:
             import ray
         except ImportError as error:
