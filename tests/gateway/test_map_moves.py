@@ -104,6 +104,29 @@ def test_a_server_that_falls_silent_loses_its_claim(asking: Asking, monkeypatch:
     assert "its move was given up" in str(asking.ask("commit", address="tcp://127.0.0.1:9").error)
 
 
+@pytest.mark.parametrize("steps", [("list",), ("list", "freeze")])
+def test_another_server_takes_the_place_of_a_silent_one(
+    asking: Asking, monkeypatch: pytest.MonkeyPatch, steps: tuple[str, ...]
+) -> None:
+    other, address = bytes(16), {"address": "tcp://127.0.0.1:9", "control": "tcp://127.0.0.1:10"}
+    for step in steps:
+        asking.parcel(step)
+    monkeypatch.setattr(map_departures, "_DOUBTED_S", 0.0)  # it may have been killed: ask again
+    refused = asking.ask("list", move=other)
+    assert (refused.retry, "moving to another server already" in str(refused.error)) == (True, True)
+    asking.parcel(steps[-1])  # it lives
+    monkeypatch.setattr(map_departures, "_REPLACED_S", 0.0)
+    assert "its move was given up" in str(asking.ask("freeze", move=other).error)  # that is no beginning
+    asking.parcel("list", move=other)
+    monkeypatch.undo()
+    assert "moving to another server already" in str(asking.ask(steps[-1]).error)
+    assert "its move was given up" in str(asking.ask("commit", **address).error)
+    asking.push.send_multipart(record(4))
+    asking.served.until(lambda: asking.served.durable == 4)  # until it is frozen for the other
+    asking.parcel("freeze", move=other)
+    asking.parcel("commit", move=other, **address)
+
+
 def test_a_move_that_cannot_begin_leaves_the_map_as_it_was(
     asking: Asking, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Maps that leave this server: what the server that is to have one asks, and what it is answered.
 
-See `wire.map_moves`. A server that falls silent before `commit` loses its claim, and the map goes on here.
+See `wire.map_moves`. A server that falls silent before `commit` loses its claim, and the map goes on here;
+to another server that asks it loses it sooner.
 """
 
 import errno
@@ -32,6 +33,8 @@ log = logging.getLogger(__name__)
 
 _FROZEN_S = 15.0  # without a question, while the map takes no records
 _LEAVING_S = 120.0  # without a question, before that
+_REPLACED_S = 3.0  # without a question, after which a third server may have the map instead
+_DOUBTED_S = 0.5  # after which that server asks again: one that lives asks ten times a second
 
 
 class _Departure(Struct, eq=False):
@@ -109,8 +112,12 @@ class MapDepartures:
         one = self._leaving.get(name)
         if one is not None and one.move == question.move:
             return one
-        if one is not None:
-            raise JournalError(f"map {name} is moving to another server already")
+        if one is not None and (silent := time.monotonic() - one.asked) < _REPLACED_S:
+            again = errno.EAGAIN if silent > _DOUBTED_S else None
+            raise JournalError(f"map {name} is moving to another server already", again)
+        if one is not None and question.step == "list":
+            log.warning("another server takes the map: the one before is silent", extra=logs.about(map=name))
+            self._give_up(name)
         hosted = self._maps.get(name)
         if hosted is None or question.step != "list":
             raise JournalError(f"no map {name} is open here, or its move was given up")
