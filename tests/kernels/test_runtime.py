@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from command_processes import python
+from command_processes import python, tsfusion
 
 _STARTS = """
 import os, threading
@@ -71,3 +71,25 @@ print(sorted(map(sorted, map(os.sched_getaffinity, workers))) == [[core] for cor
 """
     reads = "def cpu_ns(thread): return int(open(f'/proc/self/task/{thread}/schedstat').read().split()[0])\n"
     assert python(reads + program).stdout == "True\n"
+
+
+def test_a_home_that_cannot_be_written_costs_time_and_nothing_else(tmp_path: Path) -> None:
+    """Taichi makes its folder of compiled kernels when the process ends: that was a segmentation fault."""
+    (tmp_path / "file").touch()
+    program = "from tsfusion import Volume; print(len(Volume(0.05).map_hash()))"
+    usual = {name: one for name, one in os.environ.items() if name not in ("XDG_CACHE_HOME", "HOME")}
+    for name in ("HOME", "XDG_CACHE_HOME", "TI_OFFLINE_CACHE_FILE_PATH"):
+        done = python(program, env={**usual, "HOME": str(tmp_path), name: str(tmp_path / "file")})
+        assert (done.returncode, done.stdout) == (0, "32\n")
+        assert f"cannot be kept in {tmp_path / 'file'}" in done.stderr
+        assert "Not a directory" in done.stderr or "File exists" in done.stderr
+    done = python(program, env={**usual, "HOME": str(tmp_path)})
+    assert (done.returncode, done.stdout, done.stderr) == (0, "32\n", "")
+
+
+def test_doctor_says_that_compiled_kernels_are_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", os.devnull)
+    done = tsfusion("doctor")
+    (line,) = (line for line in done.stdout.splitlines() if "Taichi runs" in line)
+    assert f"compiled kernels cannot be kept in {os.devnull}" in line
+    assert "set XDG_CACHE_HOME" in line

@@ -173,6 +173,7 @@ def _kernels() -> Finding:
     import numpy as np
 
     from tsfusion.geometry.mesh import Mesh
+    from tsfusion.kernels.runtime import why_not_kept
     from tsfusion.pipelines.mesh_preview import PreviewCamera, draw
 
     started = time.perf_counter()
@@ -186,7 +187,9 @@ def _kernels() -> Finding:
         return Finding(
             "kernels", False, f"a kernel gave {depth[6, 1]} where 2 is right", "please report this"
         )
-    return Finding("kernels", True, f"Taichi runs; first kernel after {seconds:.1f} s")
+    advice = "set XDG_CACHE_HOME to a folder that can be written: each start takes seconds longer without"
+    found = "; ".join(filter(None, (f"Taichi runs; first kernel after {seconds:.1f} s", why_not_kept())))
+    return Finding("kernels", True, found, advice if why_not_kept() else "")
 
 
 def _port() -> Finding:

@@ -2,6 +2,7 @@
 """Taichi is started once, here, on the thread that will launch kernels."""
 
 import ctypes
+import logging
 import os
 import textwrap
 from contextlib import redirect_stdout, suppress
@@ -14,6 +15,8 @@ from tsfusion.core import process
 from tsfusion.core.errors import MapError, MissingDependency
 
 _GRID = 2048  # blocks of 128 threads of a device's task: of four times as many, most only end: 5 µs each task
+
+log = logging.getLogger(__name__)
 
 _started_threads: int | None = None
 _FORKED = -1
@@ -81,7 +84,7 @@ def start(threads: int | None = None) -> None:
                 cpu_max_num_threads=_started_threads,
                 fast_math=False,  # a reassociated float would make two kernels disagree
                 cfg_optimization=False,  # LLVM does the same, and Taichi's took three quarters of compiling
-                offline_cache=True,
+                offline_cache=not why_not_kept(),
                 log_level=ti.ERROR,
             )
 
@@ -98,8 +101,8 @@ def start_device(arch: str) -> None:
     _leave_out_source_lines()
     with redirect_stdout(StringIO()):
         ti.init(
-            arch=getattr(ti, arch), fast_math=False, cfg_optimization=arch == "cuda", offline_cache=True,
-            log_level=ti.ERROR, saturating_grid_dim=_GRID,
+            arch=getattr(ti, arch), fast_math=False, cfg_optimization=arch == "cuda",
+            offline_cache=not why_not_kept(), log_level=ti.ERROR, saturating_grid_dim=_GRID,
         )  # fmt: skip
     if ti.cfg.arch != getattr(ti, arch):
         raise MissingDependency("Taichi finds no such device, or no driver of one")
@@ -111,6 +114,24 @@ def start_device(arch: str) -> None:
         raise MissingDependency(f"the device cannot run the kernels ({first_line(error)})") from error
     if not is_exact:
         raise MissingDependency("the device does not add 64-bit integers and round 64-bit floats exactly")
+
+
+@cache
+def why_not_kept() -> str:
+    """Why compiled kernels cannot be kept for later processes, which is logged; empty = they can.
+
+    Taichi makes its folder at the end of a process, and where it cannot, that end is a segmentation fault.
+    """
+    from taichi.lang import impl
+
+    folder = os.environ.get("TI_OFFLINE_CACHE_FILE_PATH") or impl.default_cfg().offline_cache_file_path
+    try:
+        os.makedirs(folder, exist_ok=True)
+    except OSError as error:
+        why = f"compiled kernels cannot be kept in {folder}: {error.strerror}"
+        log.warning("%s; each start compiles them anew: set XDG_CACHE_HOME to a folder", why)
+        return why
+    return ""
 
 
 def first_line(error: BaseException) -> str:
