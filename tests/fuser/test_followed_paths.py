@@ -109,6 +109,27 @@ def test_scanners_are_shown_where_their_keyframes_come_to_be() -> None:
     assert follower.question(99.0) is not None
 
 
+def test_keyframes_that_come_from_the_journal_alone_are_asked_for() -> None:
+    """After a server's crash the map gets back what no checkpoint had, and no scanner sends it."""
+    follower, rows = FollowedPaths(), tuple(pose(0.5)[:3].ravel().tolist())
+    follower.on_health(map_health(keyframes_fused=2, waiting=5))
+    asked(poses_of({ONE: 2}), follower)
+    follower.on_health(map_health(keyframes_fused=4, waiting=3))
+    assert follower.question(99.0) is None, "more will come"
+    follower.on_health(map_health(keyframes_fused=7, waiting=0))
+    found, _ = asked(poses_of({ONE: 7}), follower, 99.0)
+    assert len(found.paths[ONE][0]) == 7
+    follower.on_health(map_health(keyframes_fused=7, waiting=0))
+    assert follower.question(199.0) is None
+    for number in (1, 2):
+        follower.on_scanned(Scanned(ONE, 20 + number, rows, "e", number), None)
+    follower.on_scanned(Scanned(ONE, 22, rows, "e", 2, late=True), b"jpeg")
+    follower.on_health(map_health(keyframes_fused=9, waiting=0))
+    assert follower.question(199.0) is None, "they were seen"
+    follower.on_health(map_health(keyframes_fused=10, waiting=0))
+    assert follower.question(199.0) is not None
+
+
 def test_what_makes_no_sense_is_asked_for_again() -> None:
     follower = FollowedPaths()
     question = follower.question(0.0)

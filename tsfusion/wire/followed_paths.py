@@ -31,12 +31,15 @@ class FollowedPaths:
         self._moved: dict[bytes, NDArray[np.float64]] = {}  # T_map_odometry by session
         self._counts: tuple[int, ...] | None = None
         self._number: tuple[str, int] | None = None
+        self._fused = self._fused_then = 0  # keyframes in the map, as it tells, and when they were asked for
+        self._scanned = 0  # that scanners have sent since then
 
     def question(self, now: float) -> Keyframes | None:
         """Next question; None = none."""
         if self._asked is None and self._is_due and now >= self._next:
             self._is_due, self._next = False, now + _PAUSE_S * max(self._answers, 1)
             self._asked, self._answers = Keyframes(), 0
+            self._fused_then, self._scanned = self._fused, 0
             self._pages.clear()
         return self._asked
 
@@ -86,6 +89,7 @@ class FollowedPaths:
         known, self._number = self._number, (scanned.epoch, scanned.number)
         if known is not None and self._number not in (known, (known[0], known[1] + 1)):
             self._is_due = True  # some were missed
+        self._scanned += self._number != known
         T = np.array([*scanned.pose, 0.0, 0.0, 0.0, 1.0]).reshape(4, 4)
         moved = self._moved.get(scanned.session)
         return ScannerSeen(
@@ -99,7 +103,7 @@ class FollowedPaths:
         )
 
     def on_health(self, health: MapHealth) -> None:
-        """Take the map's health: it shows when keyframes have moved or gone."""
+        """Take the map's health: it shows when keyframes have moved, gone, or come from the journal alone."""
         counts = (
             health.corrections,
             health.keyframes_moved,
@@ -108,7 +112,9 @@ class FollowedPaths:
             health.fuser_restarts,
         )
         before, self._counts = self._counts, counts
-        self._is_due |= before not in (None, counts)
+        self._fused = health.keyframes_fused
+        came_alone = not health.waiting and self._fused - self._fused_then > self._scanned
+        self._is_due |= came_alone or before not in (None, counts)
 
 
 def _joined(pages: list[_Page]) -> _Page:
