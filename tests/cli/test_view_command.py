@@ -21,7 +21,6 @@ from live_pages import DEADLINE, address_of, ended, running, viewing
 from tsfusion.cli import verbs
 from tsfusion.cli import view as view_command
 from tsfusion.core.errors import InvalidConfig
-from tsfusion.pipelines import viewer_child
 from tsfusion.pipelines.viewer_child import ViewerChild
 from tsfusion.viewer.live_page import LivePage
 from tsfusion.viewer.page_place import listen
@@ -204,33 +203,6 @@ def test_a_page_that_does_not_start_is_a_warning(caplog: pytest.LogCaptureFixtur
     assert line.startswith(f"the page has ended with status 1: cannot show a page at 127.0.0.1:{port}: ")
     assert line.endswith("; everything else goes on")
     assert not told
-
-
-def test_a_page_that_the_system_ends_is_started_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    page = f"""
-import json, os, pathlib, signal, sys
-place = pathlib.Path({str(tmp_path / "times")!r})
-place.write_text(place.read_text() + "x" if place.exists() else "x")
-print(json.dumps({{"url": "page " + place.read_text()}}), flush=True)
-if len(place.read_text()) == 1:
-    os.kill(os.getpid(), signal.SIGKILL)
-sys.stdin.read()
-"""
-    monkeypatch.setattr(viewer_child, "_COMMAND", (sys.executable, "-c", page))
-    monkeypatch.setattr(viewer_child, "_LEAST_SECONDS", -1.0)
-    told: list[str] = []
-    viewer = ViewerChild("127.0.0.1:0", told.append)
-    viewer.start(NOBODY)
-    try:
-        assert eventually(lambda: told == ["page x", "page xx"], DEADLINE)
-    finally:
-        viewer.close()
-    assert not viewer._reader.is_alive()
-    assert [one.getMessage() for one in caplog.records] == [
-        "the page has ended with status -9; everything else goes on"
-    ]
 
 
 def test_a_page_with_too_much_memory_begins_again_at_its_address(

@@ -7,7 +7,6 @@ import os
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 
@@ -24,7 +23,6 @@ _COMMAND = (sys.executable, "-m", "tsfusion", "view", "--json", "--from-parent")
 _ANYWHERE = {"0.0.0.0": "127.0.0.1", "*": "127.0.0.1", "::": "::1"}  # how it is reached from here
 _WARNING = "tsfusion view: WARNING: "
 _END_SECONDS = 5.0
-_LEAST_SECONDS = 10.0  # that a page lasts which is started again when the system has ended it
 _FOR_THE_VIEWER = ("TSFUSION_TOKEN", "TSFUSION_NO_BROWSER")
 
 log = logging.getLogger(__name__)
@@ -51,7 +49,7 @@ class ViewerChild:
         self._truth = truth
         self._tell = tell
         self._process: subprocess.Popen[str] | None = None
-        self._reader = threading.Thread(target=self._keep, name="page", daemon=True)
+        self._reader = threading.Thread(target=self._follow, name="page", daemon=True)
         self._is_ending = False
 
     def start(
@@ -72,17 +70,9 @@ class ViewerChild:
             "--listen": self._place,
         }
         flags = [f"{flag}={value}" for flag, value in given.items() if value is not None]
-        self._command = [*_COMMAND, _reached(address), *flags]
-        self._keys = json.dumps(keys and msgspec.to_builtins(keys))
-        self._launch()
-        if self._process is not None:
-            self._reader.start()
-
-    def _launch(self) -> None:
-        self._process, self._started = None, time.monotonic()
         try:
             self._process = subprocess.Popen(
-                self._command,
+                [*_COMMAND, _reached(address), *flags],
                 stdin=subprocess.PIPE,  # closes when we die, however we die: it then ends by itself
                 stdout=subprocess.PIPE,
                 stderr=subprocess.STDOUT,
@@ -91,10 +81,12 @@ class ViewerChild:
                 **process.OWN_GROUP,  # Ctrl-C is ours to handle
             )
             assert self._process.stdin is not None
-            self._process.stdin.write(self._keys + "\n")
+            self._process.stdin.write(json.dumps(keys and msgspec.to_builtins(keys)) + "\n")
             self._process.stdin.flush()
         except OSError as error:
             log.warning("the page cannot be shown: %s; everything else goes on", error.strerror)
+        if self._process is not None:
+            self._reader.start()
 
     def close(self) -> None:
         """End the page."""
@@ -107,31 +99,24 @@ class ViewerChild:
         except subprocess.TimeoutExpired:
             self._process.kill()
         self._reader.join(_END_SECONDS)
+        with suppress(OSError), self._process:  # closes its pipes
+            pass
 
-    def _keep(self) -> None:
-        """Pass on what the page says, and start it again where the system has ended it."""
-        while self._process is not None and self._follow(self._process):
-            self._launch()
-            if self._is_ending and self._process is not None:
-                self._process.terminate()
-
-    def _follow(self, child: "subprocess.Popen[str]") -> bool:
-        """Pass on what a page says, until it ends; whether it is to be started again."""
-        why = ""
-        with suppress(OSError), child:  # closes its pipes
-            assert child.stdout is not None
-            for line in map(str.strip, child.stdout):
-                if line.startswith('{"url"'):
-                    self._tell(json.loads(line)["url"])
-                elif line.startswith(_WARNING):
-                    log.warning("page: %s", line.removeprefix(_WARNING))
-                elif line:  # the last one says why it ends
-                    why = f": {line.removeprefix('tsfusion: ')}"
-        if self._is_ending:
-            return False
+    def _follow(self) -> None:
+        """Pass on what it says, until it ends."""
+        child, why = self._process, ""
+        assert child is not None
+        assert child.stdout is not None
+        for line in map(str.strip, child.stdout):
+            if line.startswith('{"url"'):
+                self._tell(json.loads(line)["url"])
+            elif line.startswith(_WARNING):
+                log.warning("page: %s", line.removeprefix(_WARNING))
+            elif line:  # the last one says why it ends
+                why = f": {line.removeprefix('tsfusion: ')}"
         status = child.wait()
-        log.warning("the page has ended with status %d%s; everything else goes on", status, why)
-        return status < 0 and time.monotonic() > self._started + _LEAST_SECONDS
+        if not self._is_ending:
+            log.warning("the page has ended with status %d%s; everything else goes on", status, why)
 
 
 def _reached(address: str) -> str:
