@@ -119,6 +119,27 @@ def test_nothing_is_erased_before_map_and_checkpoints_let_it_go(asked: Asked) ->
     assert answer.erased == 2
 
 
+def test_copies_in_quarantine_are_erased_too(asked: Asked) -> None:
+    aside = Quarantine(asked.folder / "quarantine", 1 << 20)
+    for seq in (1, 2, 3):
+        frames = codec.encode(wall(seq), session=SESSION, seq=seq, jpeg_quality=90)
+        assert aside.keep(frames, session=SESSION, seq=seq, reason="crash") is not None
+    asked.map = Forgetting(
+        "default", asked.folder, asked.journal, aside, append=asked._write, send=asked._send
+    )
+    asked.ask(erase=True)
+    asked.find(1, 3)
+    asked.step(settled=True)
+    assert len(aside) == 3
+    asked.map.on_saved(Saved(True, alone=True))
+    for _ in range(3):
+        asked.step(settled=True)
+    assert [int(path.name.split("-")[1]) for path in aside.folder.iterdir()] == [2]
+    (answer,) = asked.answers
+    assert isinstance(answer, Forgotten)
+    assert (answer.erased, answer.quarantined) == (2, 2)
+
+
 def test_nothing_is_erased_that_the_fuser_was_not_given_yet(asked: Asked) -> None:
     """The server's record may overtake keyframes of others that wait; a crash then would lose their count."""
     asked.in_map = 2

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Answers of a server to another that asks for a map: only files of the map, and never its only copy."""
 
+import threading
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,10 +13,10 @@ import zmq
 from keyframes_and_servers import connected, until
 from served_gateway import Served, record, serving_here
 
-from tsfusion.core.errors import DecodeError
-from tsfusion.gateway import map_departures
+from tsfusion.core.errors import DecodeError, JournalError
+from tsfusion.gateway import map_arrivals, map_departures
 from tsfusion.wire import messages, sockets
-from tsfusion.wire.map_moves import HandOver, Parcel
+from tsfusion.wire.map_moves import HandOver, MapFile, Parcel
 from tsfusion.wire.messages import Command, Reply
 
 MOVE, SESSION = bytes(range(16)), bytes(16)
@@ -142,6 +143,58 @@ def test_a_move_that_cannot_begin_leaves_the_map_as_it_was(
     assert not hosted.is_leaving
     assert asking.parcel("list").files
     assert hosted.is_leaving
+
+
+def test_a_map_that_forgets_keyframes_does_not_leave(asking: Asking, monkeypatch: pytest.MonkeyPatch) -> None:
+    hosted = asking.served.gateway.maps.get("default")
+    assert hosted is not None
+    with monkeypatch.context() as forgetting:
+        forgetting.setattr(type(hosted.forgetting), "is_idle", False)
+        refused = asking.ask("list")
+        assert (refused.retry, "forgets keyframes: ask again" in str(refused.error)) == (True, True)
+    assert not hosted.is_leaving
+    assert asking.parcel("list").files
+
+
+class Arriving(map_arrivals.MapArrival):
+    """A map that comes, of a server that answers as it is told to; no thread asks."""
+
+    def __init__(self, folder: Path, answers: list[tuple[Parcel, list[memoryview]]]) -> None:
+        self.folder, self._answers, self._stopping = folder, answers, threading.Event()
+        self._have, self._copied = {}, 0
+        self.asked: list[tuple[str, int]] = []
+
+    def _ask(self, link: Any, step: str, *, file: str = "", offset: int = 0, **_: Any) -> Any:
+        assert step == "read"
+        self.asked.append((file, offset))
+        return self._answers.pop(0)
+
+
+def piece_of(content: bytes) -> tuple[Parcel, list[memoryview]]:
+    return Parcel(crc32=zlib.crc32(content)), [memoryview(content)]
+
+
+def test_a_piece_that_was_damaged_on_its_way_ends_the_move(tmp_path: Path) -> None:
+    parcel, _ = piece_of(b"piece")
+    arriving = Arriving(tmp_path, [(parcel, [memoryview(b"peace")])])
+    with pytest.raises(JournalError, match=r"a piece of map\.tsf was damaged on its way"):
+        arriving._take_files(None, (MapFile("map.tsf", 5, "1"),))  # type: ignore[arg-type]
+    assert (tmp_path / "map.tsf").read_bytes() == b""
+
+
+def test_a_checkpoint_of_another_version_is_copied_from_its_start(tmp_path: Path) -> None:
+    """It is another file, and may be longer; a segment grows and goes on where it was."""
+    arriving = Arriving(
+        tmp_path, [piece_of(b"older"), piece_of(b"rec"), piece_of(b"the newer"), piece_of(b"ord")]
+    )
+    first = (MapFile("map.tsf", 5, "1"), MapFile("journal/000001.mcap", 3, ""))
+    arriving._take_files(None, first)  # type: ignore[arg-type]
+    arriving._take_files(None, first)  # type: ignore[arg-type]
+    then = (MapFile("map.tsf", 9, "2"), MapFile("journal/000001.mcap", 6, ""))
+    arriving._take_files(None, then)  # type: ignore[arg-type]
+    assert arriving.asked[2:] == [("map.tsf", 0), ("journal/000001.mcap", 3)]
+    assert (tmp_path / "map.tsf").read_bytes() == b"the newer"
+    assert (tmp_path / "journal/000001.mcap").read_bytes() == b"record"
 
 
 @pytest.mark.parametrize(

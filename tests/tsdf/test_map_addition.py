@@ -17,7 +17,7 @@ from tsfusion.core.config import SERVER_SESSION
 from tsfusion.core.errors import MapError, MapFull, WeightOverflow
 from tsfusion.journal import state_folder
 from tsfusion.journal.keyframe_poses import KeyframePoses
-from tsfusion.kernels.integrate import COLOR_LIMIT, WEIGHT_LIMIT
+from tsfusion.kernels.integrate import COLOR_LIMIT, WEIGHT_LIMIT, WEIGHT_MASK
 from tsfusion.tsdf.map_history import of_clients, sessions
 
 VIEWS = sphere_views(0.4, 6)
@@ -115,6 +115,22 @@ def test_a_sum_without_room_leaves_the_map_as_it_was() -> None:
     with pytest.raises(WeightOverflow, match="1 blocks"):
         volume.merge(volume_of(VIEWS[:1], voxel_size=0.03))
     volume.merge(volume_of(VIEWS[:1], voxel_size=0.03).crop((9, 9, 9, 10, 10, 10)))
+
+
+def test_a_sum_knows_how_many_votes_its_voxels_have() -> None:
+    """Else a keyframe that comes after it is added where its votes do not fit."""
+    here, there = volume_of(VIEWS[:1], voxel_size=0.03), volume_of(VIEWS[:1], voxel_size=0.03)
+    slot, voxel = np.argwhere(here._store.sums & WEIGHT_MASK)[0]
+    row = there._store.slots_of(here._store.keys[slot : slot + 1])[0]
+    one = int(here._store.sums[slot, voxel] & WEIGHT_MASK)
+    there._store.sums[row, voxel] += WEIGHT_LIMIT - 1 - 2 * one
+    there._store.measure_bounds()
+    here.merge(there)
+    assert here._store.sums[slot, voxel] & WEIGHT_MASK == WEIGHT_LIMIT - 1
+    before = state_of(here)
+    with pytest.raises(WeightOverflow):
+        here.integrate(VIEWS[0])
+    assert state_of(here) == before
 
 
 def test_settled_colours_are_averaged() -> None:

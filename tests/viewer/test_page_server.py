@@ -126,6 +126,9 @@ def test_a_foreign_origin_is_refused(page: PageServer) -> None:
         f"http://{host}:1",
         "null",
         f"ftp://{host}:{port}",
+        f"http://{host}:{port}0",
+        f"http://{host}:{port}.evil.example",
+        f"http://evil.example/{host}:{port}",
     )
     for origin in (*foreign, None):
         assert (origin, visit_status(page, origin=origin)) == (origin, HTTPStatus.FORBIDDEN)
