@@ -496,8 +496,14 @@ FAULTS = (
     ),
     Fault(
         "kernels/runtime.py",
-        "                offline_cache=not why_not_kept(),\n                log_level",
-        "                offline_cache=True,\n                log_level",
-        "kernels/test_runtime.py::test_a_home_that_cannot_be_written_costs_time_and_nothing_else",
+        '        os.environ["TI_OFFLINE_CACHE_FILE_PATH"] = other',
+        "        pass",
+        "kernels/test_runtime.py::test_a_home_that_cannot_be_written_is_done_without",
+    ),
+    Fault(
+        "kernels/runtime.py",
+        "if found.st_uid != os.getuid() or found.st_mode != stat.S_IFDIR | 0o700:",
+        "if False:",
+        "kernels/test_runtime.py::test_a_home_that_cannot_be_written_is_done_without",
     ),
 )

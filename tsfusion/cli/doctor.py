@@ -173,7 +173,7 @@ def _kernels() -> Finding:
     import numpy as np
 
     from tsfusion.geometry.mesh import Mesh
-    from tsfusion.kernels.runtime import why_not_kept
+    from tsfusion.kernels.runtime import kept_in
     from tsfusion.pipelines.mesh_preview import PreviewCamera, draw
 
     started = time.perf_counter()
@@ -187,9 +187,10 @@ def _kernels() -> Finding:
         return Finding(
             "kernels", False, f"a kernel gave {depth[6, 1]} where 2 is right", "please report this"
         )
-    advice = "set XDG_CACHE_HOME to a folder that can be written: each start takes seconds longer without"
-    found = "; ".join(filter(None, (f"Taichi runs; first kernel after {seconds:.1f} s", why_not_kept())))
-    return Finding("kernels", True, found, advice if why_not_kept() else "")
+    folder, why = kept_in()
+    found = f"Taichi runs; first kernel after {seconds:.1f} s"
+    note = f"; compiled ones are kept in {folder}, as {why}" if why else ""
+    return Finding("kernels", True, found + note, "set XDG_CACHE_HOME to a folder of your own" if why else "")
 
 
 def _port() -> Finding:

@@ -2,8 +2,9 @@
 """Taichi is started once, here, on the thread that will launch kernels."""
 
 import ctypes
-import logging
 import os
+import stat
+import tempfile
 import textwrap
 from contextlib import redirect_stdout, suppress
 from functools import cache
@@ -15,8 +16,6 @@ from tsfusion.core import process
 from tsfusion.core.errors import MapError, MissingDependency
 
 _GRID = 2048  # blocks of 128 threads of a device's task: of four times as many, most only end: 5 µs each task
-
-log = logging.getLogger(__name__)
 
 _started_threads: int | None = None
 _FORKED = -1
@@ -77,6 +76,7 @@ def start(threads: int | None = None) -> None:
         _thread = get_ident()
         _leave_out_source_lines()
         _started_threads = threads or len(process.cores())
+        kept_in()
         # `ti.init` starts the threads of kernels last, and prints; a program may be reading our stdout
         with process.cores_of_their_own(_started_threads), redirect_stdout(StringIO()):
             ti.init(
@@ -84,7 +84,7 @@ def start(threads: int | None = None) -> None:
                 cpu_max_num_threads=_started_threads,
                 fast_math=False,  # a reassociated float would make two kernels disagree
                 cfg_optimization=False,  # LLVM does the same, and Taichi's took three quarters of compiling
-                offline_cache=not why_not_kept(),
+                offline_cache=True,
                 log_level=ti.ERROR,
             )
 
@@ -99,10 +99,11 @@ def start_device(arch: str) -> None:
     from tsfusion.kernels import taichi as ti
 
     _leave_out_source_lines()
+    kept_in()
     with redirect_stdout(StringIO()):
         ti.init(
-            arch=getattr(ti, arch), fast_math=False, cfg_optimization=arch == "cuda",
-            offline_cache=not why_not_kept(), log_level=ti.ERROR, saturating_grid_dim=_GRID,
+            arch=getattr(ti, arch), fast_math=False, cfg_optimization=arch == "cuda", offline_cache=True,
+            log_level=ti.ERROR, saturating_grid_dim=_GRID,
         )  # fmt: skip
     if ti.cfg.arch != getattr(ti, arch):
         raise MissingDependency("Taichi finds no such device, or no driver of one")
@@ -117,21 +118,26 @@ def start_device(arch: str) -> None:
 
 
 @cache
-def why_not_kept() -> str:
-    """Why compiled kernels cannot be kept for later processes, which is logged; empty = they can.
+def kept_in() -> tuple[str, str]:
+    """The folder of compiled kernels, and why it is not the usual one; empty = it is.
 
-    Taichi makes its folder at the end of a process, and where it cannot, that end is a segmentation fault.
+    Taichi makes the folder when a process ends, and where it cannot, that end is a segmentation fault.
     """
     from taichi.lang import impl
 
-    folder = os.environ.get("TI_OFFLINE_CACHE_FILE_PATH") or impl.default_cfg().offline_cache_file_path
+    usual = os.environ.get("TI_OFFLINE_CACHE_FILE_PATH") or impl.default_cfg().offline_cache_file_path
     try:
-        os.makedirs(folder, exist_ok=True)
+        os.makedirs(usual, exist_ok=True)
     except OSError as error:
-        why = f"compiled kernels cannot be kept in {folder}: {error.strerror}"
-        log.warning("%s; each start compiles them anew: set XDG_CACHE_HOME to a folder", why)
-        return why
-    return ""
+        other = f"{tempfile.gettempdir()}/tsfusion-kernels-{os.getuid()}"
+        with suppress(OSError):
+            os.mkdir(other, 0o700)
+        found = os.lstat(other)
+        if found.st_uid != os.getuid() or found.st_mode != stat.S_IFDIR | 0o700:  # what runs is read there
+            other = tempfile.mkdtemp(prefix="tsfusion-kernels-")
+        os.environ["TI_OFFLINE_CACHE_FILE_PATH"] = other  # an argument of `ti.init` would be warned of
+        return other, f"{usual} cannot be made: {error.strerror}"
+    return usual, ""
 
 
 def first_line(error: BaseException) -> str:
