@@ -453,12 +453,6 @@ FAULTS = (
         "gateway/test_map_moves.py::test_a_map_that_forgets_keyframes_does_not_leave",
     ),
     Fault(
-        "gateway/map_departures.py",
-        'if one is not None and question.step == "list":',
-        "if one is not None:",
-        "gateway/test_map_moves.py::test_another_server_takes_the_place_of_a_silent_one",
-    ),
-    Fault(
         "gateway/forgetting.py",
         "            self._quarantine.drop(session.session, NumberRanges(_ranges(session)))\n",
         "            0\n",
