@@ -12,12 +12,8 @@ import numpy as np
 from _peers import DATA, Open3D, VDBFusion, surroundings, timed_keyframes
 from numpy.typing import NDArray
 
-from tsfusion.core.config import SENSORS
-from tsfusion.datasets import Synthetic, open_dataset
-from tsfusion.datasets.formats import stanford_bunny
-from tsfusion.datasets.synthetic import benchmark_worlds
-from tsfusion.evaluation import surface_error
-from tsfusion.evaluation.known_surfaces import (
+from lab.evaluation import stanford_bunny
+from lab.evaluation.known_surfaces import (
     COMPLETE_WITHIN,
     KnownSurface,
     ReferenceSurface,
@@ -25,7 +21,11 @@ from tsfusion.evaluation.known_surfaces import (
     measure,
     rounded,
 )
-from tsfusion.evaluation.view_prediction import compare_views
+from lab.evaluation.view_prediction import compare_views
+from tsfusion.core.config import SENSORS
+from tsfusion.datasets import Synthetic, open_dataset
+from tsfusion.datasets.synthetic import benchmark_worlds
+from tsfusion.evaluation import surface_error
 from tsfusion.geometry.keyframe import Intrinsics, Keyframe
 from tsfusion.geometry.measured_points import points_world
 from tsfusion.kernels import runtime

@@ -19,6 +19,7 @@ from tsfusion.geometry.measured_points import depth_metres, points_world
 from tsfusion.geometry.mesh import Mesh
 
 ROOT = Path(__file__).parents[1]
+sys.path.append(str(ROOT))  # lab is not installed
 DATA = Path(os.environ.get("TSFUSION_DATA", ROOT.parent / "shared" / "data"))
 WARM_UP = 5  # keyframes not counted
 

@@ -219,7 +219,7 @@ def _meshes() -> dict[str, Any]:
     """Scan the kitchen with its own poses and with the true ones; compare the meshes."""
     if not (DATA / KITCHEN).exists():
         return {"name": "mesh", "error": f"no {KITCHEN} in {DATA}"}
-    from tsfusion.evaluation.held_out_views import compare_scans
+    from lab.evaluation.held_out_views import compare_scans
 
     with tempfile.TemporaryDirectory(prefix="tsfusion-localization-") as folder:
         for name in ("rgbd", "given"):

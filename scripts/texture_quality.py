@@ -29,8 +29,8 @@ import numpy as np
 from _peers import Open3D, surroundings
 from numpy.typing import NDArray
 
+from lab.evaluation import view_colors
 from tsfusion import Keyframe, Volume, open_dataset
-from tsfusion.evaluation import view_colors
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.tsdf import texturing
 from tsfusion.tsdf.texturing import TextureSettings

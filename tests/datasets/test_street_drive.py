@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from geometry_checks import move
 
+from lab.evaluation.known_surfaces import WorldSurface, drive_surface
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets import KITTI, StreetDrive, Synthetic, open_dataset
 from tsfusion.datasets.synthetic import roadside, worlds
 from tsfusion.datasets.synthetic.rendered_recordings import record
-from tsfusion.evaluation.known_surfaces import WorldSurface, drive_surface
 
 
 @pytest.fixture(scope="module")

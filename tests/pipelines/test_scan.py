@@ -29,12 +29,12 @@ from command_processes import (
 )
 from small_recordings import seven_scenes
 
+from lab.evaluation.held_out_views import compare_scans
 from tsfusion import Volume, open_dataset
 from tsfusion.cli.progress import Quiet
 from tsfusion.core.config import ClientConfig, ScanConfig, VolumeConfig
 from tsfusion.core.errors import InvalidConfig, InvalidKeyframe
 from tsfusion.datasets.trajectory_files import read_tum, write_tum
-from tsfusion.evaluation.held_out_views import compare_scans
 from tsfusion.geometry.frame import Frame
 from tsfusion.journal.recording import JournalRecording
 from tsfusion.pipelines import engine

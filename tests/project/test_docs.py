@@ -30,7 +30,7 @@ DOCUMENTS = [*(ROOT / name for name in ROOT_DOCUMENTS), *sorted((ROOT / "docs").
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_files_and_tests_that_are_named_exist(path: Path) -> None:
     text = path.read_text(encoding="utf-8")
-    for file, test in re.findall(r"((?:tests|scripts|docs)/[\w/.-]+\.\w+)(?:::(\w+))?", text):
+    for file, test in re.findall(r"((?:lab|tests|scripts|docs)/[\w/.-]+\.\w+)(?:::(\w+))?", text):
         named = ROOT / file
         assert named.exists(), file
         assert not test or f"def {test}(" in named.read_text(encoding="utf-8"), f"{file}::{test}"

@@ -135,7 +135,7 @@ def test_architecture_shows_every_wing() -> None:
 
 def test_tests_lie_where_their_wing_says() -> None:
     folders = {path.parent for path in TESTS.rglob("test_*.py")}
-    others = {TESTS / name for name in ("end_to_end", "project")}
+    others = {TESTS / name for name in ("end_to_end", "lab", "project")}
     assert others <= folders
     for folder in folders - others:
         assert (PACKAGE / folder.relative_to(TESTS)).is_dir(), f"{folder} is the folder of no wing"
@@ -149,6 +149,12 @@ def test_imports_go_down() -> None:
         if wing(target) != wing(name) and row(target) <= row(name)
     ]
     assert not upward
+
+
+def test_no_module_needs_what_is_not_installed() -> None:
+    for name in modules():
+        heads = {target.partition(".")[0] for target in imports(name)}
+        assert not heads & {"lab", "scripts", "tests"}, f"tsfusion.{name} imports from beside the package"
 
 
 def test_package_root_imports_nothing() -> None:

@@ -17,9 +17,9 @@ from kernel_twins import Voxel
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from lab.evaluation import stanford_bunny
 from tsfusion import Mesh, Volume
 from tsfusion.core.errors import InvalidConfig
-from tsfusion.datasets.formats import stanford_bunny
 from tsfusion.kernels import surface_cells
 from tsfusion.tsdf import mesh_extraction
 from tsfusion.tsdf.block_store import BlockStore, cells_of, pack_keys, unpack_keys

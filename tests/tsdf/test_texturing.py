@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from gltf_validation import problems
 
+from lab.evaluation import view_colors
 from tsfusion import Keyframe, Volume
 from tsfusion.core.errors import InvalidConfig, MapError
 from tsfusion.datasets.synthetic.dataset import Synthetic
-from tsfusion.evaluation import view_colors
 from tsfusion.geometry import se3
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.textured_mesh import TexturedMesh

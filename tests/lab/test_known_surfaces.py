@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 import trimesh
 
+from lab.evaluation.known_surfaces import ReferenceSurface, WorldSurface, edges_of, measure
 from tsfusion import Mesh
 from tsfusion.datasets import Synthetic
 from tsfusion.datasets.synthetic import benchmark_worlds, worlds
-from tsfusion.evaluation.known_surfaces import ReferenceSurface, WorldSurface, edges_of, measure
 from tsfusion.geometry.measured_points import points_world
 
 VOXEL = 0.02

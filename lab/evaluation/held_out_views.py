@@ -9,10 +9,10 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from lab.evaluation.view_prediction import compare_views
 from tsfusion.core.config import SENSORS
 from tsfusion.datasets.dataset import NOMINAL_NS, Dataset, frame_of
 from tsfusion.datasets.trajectory_files import read_tum
-from tsfusion.evaluation.view_prediction import compare_views
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.trajectory import rigid
 

@@ -8,7 +8,7 @@ import pytest
 from geometry_checks import move
 from numpy.typing import NDArray
 
-from tsfusion.datasets.formats import stanford_bunny
+from lab.evaluation import stanford_bunny
 
 scipy_spatial = pytest.importorskip("scipy.spatial")
 
