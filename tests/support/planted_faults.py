@@ -190,7 +190,7 @@ FAULTS = (
     ),
     Fault(
         "tsdf/checkpoint.py",
-        "    if not 0 <= header.blocks <= header.config.max_blocks:",
+        "    if not 0 <= header.blocks <= header.config.max_blocks or header.keyframes < 0:",
         "    if False:",
         "tsdf/test_checkpoint.py::test_each_part_of_a_forged_file_is_checked",
     ),
