@@ -152,11 +152,11 @@ def _checked(dataset: "Dataset") -> tuple[str, list[str]]:
     What was not said when the recording was found is printed on stderr.
     """
     from tsfusion.core.errors import DatasetError, JournalError
-    from tsfusion.datasets.dataset import frame_of
+    from tsfusion.datasets.dataset import first_frame
     from tsfusion.evaluation import pose_check
 
     try:
-        report, untimed = pose_check.check(dataset), frame_of(dataset, 0).untimed
+        report, untimed = pose_check.check(dataset), first_frame(dataset).untimed
     except (DatasetError, JournalError):  # the replay comes to that frame, and tells
         return "", []
     doubt = report.text if report.verdict == "disagree" else ""

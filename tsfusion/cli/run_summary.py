@@ -32,6 +32,8 @@ def print_replay(run: "ReplaySummary") -> None:
     ]
     if run.keyframes_rejected:
         lines.insert(1, f"not in map {explained(run.keyframes_rejected)}")
+    if run.frames_skipped:
+        lines.insert(1, f"left out   {counted(run.frames_skipped)}")
     if run.camera:
         lines.insert(0, f"camera     {run.camera}")
     if run.accuracy is not None:

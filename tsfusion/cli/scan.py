@@ -273,11 +273,11 @@ def _warnings(dataset: "Dataset") -> list[str]:
     from tsfusion.cli import output
     from tsfusion.core import process
     from tsfusion.core.errors import DatasetError
-    from tsfusion.datasets.dataset import frame_of
+    from tsfusion.datasets.dataset import first_frame
     from tsfusion.evaluation import pose_check
 
     try:
-        (depth, color), untimed = pose_check.check_frames(dataset), frame_of(dataset, 0).untimed
+        (depth, color), untimed = pose_check.check_frames(dataset), first_frame(dataset).untimed
     except DatasetError:  # the scan comes to that frame, and tells
         return []
     process.give_back_memory()

@@ -28,6 +28,7 @@ from tsfusion.core.errors import (
     OutputError,
     TsfusionError,
 )
+from tsfusion.datasets.dataset import UNREADABLE, UnreadableFrame
 from tsfusion.geometry import up_direction
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.mesh_parts import joined
@@ -144,6 +145,8 @@ def _fuse(job: jobs.Fuse, folder: Path) -> Doing:
             parts.add(keyframe())
         except (MapError, DecodeError, InvalidKeyframe) as error:
             left_out[str(error)] += 1
+        except UnreadableFrame:
+            left_out[UNREADABLE] += 1
         read += 1
         if time.monotonic() - told > _PROGRESS_S:
             told = time.monotonic()

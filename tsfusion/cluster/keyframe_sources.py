@@ -25,7 +25,7 @@ from tsfusion.core.errors import CheckpointError, DatasetError, InvalidConfig, J
 from tsfusion.core.output_folder import RECORD
 from tsfusion.datasets import open_dataset
 from tsfusion.datasets.cameras import camera_files
-from tsfusion.datasets.dataset import Dataset, frame_of, pose_of
+from tsfusion.datasets.dataset import Dataset, first_frame, pose_of
 from tsfusion.datasets.registry import sweep_doubt
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.geometry.origin import Origin, world_of
@@ -303,7 +303,7 @@ def _state(dataset: Dataset, path: str, options: dict[str, Any]) -> str:
         return ""
     digest = hashlib.blake2b(str(getattr(dataset, "camera", "")).encode(), digest_size=16)
     with suppress(DatasetError):  # whoever reads that frame tells
-        first = frame_of(dataset, 0)
+        first = first_frame(dataset)
         digest.update(f"{first.intrinsics} {first.baseline_fx} {first.depth_scale} {first.motion}".encode())
         if doubt := sweep_doubt(first):
             log.warning("%s: %s", path, doubt)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError, InvalidConfig
-from tsfusion.datasets.dataset import Dataset, frame_of
+from tsfusion.datasets.dataset import Dataset, first_frame
 from tsfusion.datasets.readers import checked_intrinsics
 from tsfusion.geometry.calibration import Camera, Size, Undistorter
 from tsfusion.geometry.calibration_files import read_camera, read_depth_unit
@@ -111,7 +111,7 @@ def camera_line(dataset: Dataset, first: Frame | None = None) -> str:
     camera = getattr(dataset, "camera", None)
     if isinstance(camera, RecordedCamera):
         return str(camera)
-    first = frame_of(dataset, 0) if first is None else first
+    first = first_frame(dataset) if first is None else first
     return "" if first.intrinsics is None else f"{described(first.intrinsics, first.shape)}, from its frames"
 
 

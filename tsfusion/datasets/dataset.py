@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: MIT
 """The `Dataset` protocol, its base for recordings, and choosing some of a dataset's frames."""
 
+import logging
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import cached_property
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import cached_property, partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Protocol, TypeVar, overload, runtime_checkable
@@ -11,8 +12,9 @@ from typing import Any, Protocol, TypeVar, overload, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tsfusion.core.errors import DatasetError, InvalidKeyframe
+from tsfusion.core.errors import DatasetError, InvalidKeyframe, TsfusionError
 from tsfusion.datasets.accelerometer import Accelerometer
+from tsfusion.datasets.depth_files import check_byte_order
 from tsfusion.datasets.point_times import PointTimes, Scan, point_times
 from tsfusion.geometry import origin
 from tsfusion.geometry.frame import Frame
@@ -25,11 +27,24 @@ from tsfusion.geometry.trajectory import PoseAt
 STREET = MappingProxyType({"voxel_size": 0.1})  # usual there: at 2 cm a stereo keyframe takes 1.5 s
 NOMINAL_NS = 33_333_333  # between frames of a recording without times: thirty a second
 SCAN = "`tsfusion scan PATH` finds poses by itself"
+WITHOUT_DEPTH = "without depth"
 WITHOUT_POSE = "without a pose"  # how the reasons of frames that poses would have kept begin
+UNREADABLE = "unreadable"  # reason of frames that are left out when they are read
 CLOCK = "after the clock"  # how the reason of those begins that came when it had stepped back
 _LATE_NS = 50_000_000  # a stamp may come late: from another thread, or with exposure
 _FEWEST_TIMES = 10  # of each part on average; more parts are a series without an order
+_FIRST_TRIES = 50  # frames that cannot be read and none before them that can: so it is with all
 _T = TypeVar("_T")
+
+log = logging.getLogger(__name__)
+
+
+class UnreadableFrame(DatasetError):
+    """A frame of a recording cannot be read, and is counted in its `skipped`; most others can."""
+
+
+class UnreadableRecording(DatasetError):
+    """Most frames of a recording cannot be read."""
 
 
 class SeveralRecordings(DatasetError):
@@ -62,7 +77,10 @@ class Dataset(Protocol):
 
 
 class Frames(ShownRecording):
-    """Base of recordings: indexing and iteration over `_frame(index)`, which alone opens a frame's files."""
+    """Base of recordings: indexing and iteration over `_frame(index)`, which alone opens a frame's files.
+
+    A frame that cannot be read raises UnreadableFrame, and iteration leaves it out, unless most are so.
+    """
 
     camera: Any = None  # `cameras.RecordedCamera` of depth images; None = points
     depth_unit: Any = None  # `cameras.DepthUnit` of integer depth
@@ -75,6 +93,8 @@ class Frames(ShownRecording):
     _deskew = True  # whether times of points count
     _between: Callable[[], PoseAt] | None = None  # makes `_pose_at`; None = there are poses of frames alone
     _accelerometer: Accelerometer | None = None
+    _unread: Mapping[int, str] = MappingProxyType({})  # why frames cannot be read, by index
+    _was_read: bool = False  # whether any frame could be
 
     @abstractmethod
     def _frame(self, index: int) -> Frame: ...
@@ -84,9 +104,27 @@ class Frames(ShownRecording):
         index = self._checked(index)
         try:
             frame = self._frame(index)
-            return frame.along_axis() if self.along_ray else frame
-        except InvalidKeyframe as error:
-            raise DatasetError(f"keyframe {index} of {self.name}: {error}") from error
+            if frame.depth is not None:
+                check_byte_order(frame.depth, f"keyframe {index} of {self.name}")
+        except (DatasetError, InvalidKeyframe) as error:
+            raise self._left_out(index, error) from error
+        self._was_read = True
+        return frame.along_axis() if self.along_ray else frame
+
+    def _left_out(self, index: int, error: TsfusionError) -> DatasetError:
+        """Count a frame that cannot be read; its error, which is the recording's where most are like it."""
+        if isinstance(error, UnreadableRecording):
+            return error
+        unnamed = f"keyframe {index} of {self.name}: " if isinstance(error, InvalidKeyframe) else ""
+        why = f"{unnamed}{error}"
+        if not self._unread and not isinstance(error, UnreadableFrame):
+            log.warning("frame %d of %s is left out: %s", index, self.name, why)
+        self._unread = {**self._unread, index: why}
+        bad = self.skipped[UNREADABLE] = len(self._unread)
+        if 2 * bad <= len(self) and (self._was_read or bad < _FIRST_TRIES):
+            return UnreadableFrame(why)
+        others = f"; {bad} of {len(self)} frames of {self.name} cannot be read" if bad > 1 else ""
+        return UnreadableRecording(next(iter(self._unread.values())) + others)
 
     def pose(self, index: int) -> NDArray[np.float64] | None:
         """(4, 4) T_world_camera as recorded, None where it is not; no image is read where that can be."""
@@ -130,10 +168,10 @@ class Frames(ShownRecording):
         return frame.keyframe(frame.T_world_camera, frame.motion)
 
     def _first(self) -> Frame:
-        return self.frame(0)
+        return first_frame(self)
 
     def __iter__(self) -> Iterator[Keyframe]:
-        return (self[index] for index in range(len(self)))
+        return (keyframe for _, keyframe in readable(self.__getitem__, range(len(self))))
 
     def _checked(self, index: int) -> int:
         count = len(self)
@@ -207,13 +245,32 @@ class Selection(Frames):
         return frame_of(self._dataset, self._indices[index])
 
     def _keyframe(self, index: int) -> Keyframe:
-        return self._dataset[self._indices[index]]
+        try:
+            return self._dataset[self._indices[index]]
+        except DatasetError as error:
+            raise self._left_out(index, error) from error
 
 
 def frame_of(dataset: Dataset, index: int) -> Frame:
     """Frame `index` of any dataset: without its pose's help where the dataset has frames of its own."""
     own: Callable[[int], Frame] | None = getattr(dataset, "frame", None)
     return own(index) if own is not None else Frame.of(dataset[index], dataset.sensor)
+
+
+def readable(read: Callable[[int], _T], indices: Iterable[int]) -> Iterator[tuple[int, _T]]:
+    """Each index with what `read` makes of it, without those whose frame alone cannot be read."""
+    for index in indices:
+        try:
+            found = read(index)
+        except UnreadableFrame:
+            continue
+        yield index, found
+
+
+def first_frame(dataset: Dataset) -> Frame:
+    """The first frame that can be read; raises DatasetError where there is none."""
+    found = readable(partial(frame_of, dataset), range(len(dataset)))
+    return next((frame for _, frame in found), None) or frame_of(dataset, 0)
 
 
 def pose_of(dataset: Dataset, index: int) -> NDArray[np.float64] | None:

@@ -13,7 +13,9 @@ from tsfusion.datasets.readers import read_image
 from tsfusion.geometry.sample_ranges import FARTHEST_M, NEAREST_M
 
 SUFFIXES = (".png", ".tif", ".tiff", ".pgm", ".exr", ".npy")
-_EVERY = 4  # pixels, looked at for the unit
+_EVERY = 4  # pixels, looked at for the unit; rows, for the order of bytes
+_FEWEST_STEPS = 200  # between neighbours, that tell the order of bytes
+_SMOOTHER = 8  # times; depth the right way round is 10 to 100 times smoother
 
 
 def read_depth(path: Path, *, invalid: int | None = None) -> NDArray[Any]:
@@ -55,6 +57,25 @@ def check_metres(depth: NDArray[np.float32], source: object) -> None:
         f"{source}: depth is expected in metres, but the median of its floats is {middle:.5g}: {unit}? "
         f"then give --option depth_scale={scale} (in Python depth_scale={scale})"
     )
+
+
+def check_byte_order(depth: NDArray[Any], source: object) -> None:
+    """Raise DatasetError where (H, W) uint16 depth is far smoother with its numbers' bytes exchanged."""
+    if depth.dtype != np.uint16 or not (depth & 0xFF).any():  # others are what they are
+        return
+    rows = depth[::_EVERY]
+    both = (rows[:, 1:] > 0) & (rows[:, :-1] > 0)
+    if np.count_nonzero(both) < _FEWEST_STEPS:
+        return
+    steps, exchanged = (
+        np.abs(np.diff(image.astype(np.int32), axis=1))[both].mean() for image in (rows, rows.byteswap())
+    )
+    if steps > _SMOOTHER * exchanged:
+        raise DatasetError(
+            f"{source}: the two bytes of each depth value are exchanged (neighbours differ by {steps:.0f}, "
+            f"after exchanging them by {exchanged:.0f}): write the depth anew in the PNG's own byte order, "
+            "big-endian (numpy's `byteswap()` mends what was read)"
+        )
 
 
 def read_npy(path: Path) -> NDArray[Any]:

@@ -10,10 +10,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from tsfusion.core.errors import DatasetError
+
 SortKey = tuple[tuple[int, Decimal, str], ...]
 
 _NUMBER = re.compile(r"[0-9]+(?:\.[0-9]+)?")
-_NANOSECONDS = 19  # digits of a time of this century
+_SPLIT = re.compile(
+    r"[^0-9]*(?P<s>[0-9]+(?=\.)|[0-9]{10}(?=[^0-9.]))(?P<mark>[^0-9]+)(?P<f>[0-9]{1,9})[^0-9]*"
+)
+_UNIX_DIGITS = 10  # of seconds of this century
+_EPOCH_UNITS = {13: 10**6, 16: 10**3, 19: 1}  # nanoseconds, by the digits of a time of this century
+_UNITS = {"hundredths": 10**7, "milliseconds": 10**6, "microseconds": 10**3, "nanoseconds": 1}
+_USUAL_WIDTHS = {3, 6, 9}  # digits of ms, µs and ns with their zeros
+_FASTEST_NS, _SLOWEST_NS = 2 * 10**6, 10**12  # between frames
 
 
 def order(name: str) -> SortKey:
@@ -61,14 +70,92 @@ def _unnumbered(name: str) -> str:
 
 
 def time_of(name: str) -> int | None:
-    """Timestamp in a name, nanoseconds: of decimal seconds (TUM) or nanoseconds (EuRoC); None = neither."""
+    """Timestamp in a name, nanoseconds: of decimal seconds (TUM) or a Unix time in ms, µs or ns (EuRoC)."""
     if re.fullmatch(r"\d+\.\d+", name, re.ASCII):
         return int(Decimal(name) * 1_000_000_000)
-    return int(name) if re.fullmatch(rf"\d{{{_NANOSECONDS}}}", name, re.ASCII) else None
+    return int(name) * _EPOCH_UNITS[len(name)] if name.isdecimal() and len(name) in _EPOCH_UNITS else None
 
 
-def times_of_names(names: Sequence[str]) -> NDArray[np.int64] | None:
-    """(n,) nanoseconds from the names of a recording's files; None unless all are times, in order."""
-    stamps = [stamp for name in names if (stamp := time_of(name)) is not None]
-    in_order = len(stamps) == len(names) and all(a < b for a, b in pairwise(stamps))
-    return np.array(stamps, dtype=np.int64) if in_order else None
+def in_time(files: Sequence[Path], names: Sequence[str]) -> tuple[list[Path], NDArray[np.int64] | None]:
+    """Files in the order of the times in their names, with (n,) nanoseconds; else as they are, and None.
+
+    A time is one that `time_of` reads, beside words too, or Unix seconds, a separator and a fraction
+    (`SEC_USEC`). Fractions of unequal width are decimals, or ms, µs or ns without leading zeros: what fits
+    all names, with the most regular steps.
+
+    Raises:
+        DatasetError: more than one of these fits.
+    """
+    stamps = _times(names)
+    if stamps is None:
+        return list(files), None
+    order = np.argsort(stamps, kind="stable")
+    return [files[index] for index in order], stamps[order]
+
+
+def _times(names: Sequence[str]) -> NDArray[np.int64] | None:
+    whole = [time_of(found[0]) if len(found := numbers_in(name)) == 1 else None for name in names]
+    split = [match for name in names if (match := _SPLIT.fullmatch(name))]
+    if len(split) < len(names):
+        stamps = np.array([] if None in whole else whole, np.int64)
+        return stamps if len(stamps) == len(set(stamps.tolist())) > 0 else None
+    parts = [(match["s"], match["f"]) for match in split]
+    is_decimal, widths = split[0]["mark"] == ".", {len(fraction) for _, fraction in parts}
+    counted = sorted((int(s), int(f)) for s, f in parts)
+    if not (is_decimal and len(widths) == 1) and all(
+        a + 1 == b and s == t for (s, a), (t, b) in pairwise(counted)
+    ):
+        return None  # a counter beside the time at which the recording began, or a chapter
+    if len(widths) == 1 and (is_decimal or widths <= _USUAL_WIDTHS):
+        ways = {"decimals": _read(parts, None)}
+    else:
+        ways = _ways(parts)
+    is_stripped = len(parts[0][0]) < _UNIX_DIGITS and not any(f[-1] == "0" for _, f in parts if len(f) > 1)
+    if not any(map(_is_plausible, ways.values())):
+        decimals = ways.get("decimals") if is_decimal else None
+        return decimals if decimals is not None and len(set(decimals.tolist())) == len(decimals) else None
+    return _chosen(
+        {way: stamps for way, stamps in ways.items() if _is_plausible(stamps)}, names[0], is_stripped
+    )
+
+
+def _ways(parts: Sequence[tuple[str, str]]) -> dict[str, NDArray[np.int64]]:
+    """Nanoseconds by each way to read fractions of unequal width that none of them excludes."""
+    several = [fraction for _, fraction in parts if len(fraction) > 1]
+    led, ended = (any(one[at] == "0" for one in several) for at in (0, -1))
+    largest = max(int(fraction) for _, fraction in parts)
+    units = {} if led else {way: unit for way, unit in _UNITS.items() if largest * unit < 10**9}
+    ways = {way: _read(parts, unit) for way, unit in units.items()}
+    is_unix, is_even = len(parts[0][0]) == _UNIX_DIGITS, len({len(one) for one in several}) == 1
+    if not (ended and ways and is_unix and not is_even):  # decimals end in 0 where all have one width
+        ways["decimals"] = _read(parts, None)
+    return ways
+
+
+def _read(parts: Sequence[tuple[str, str]], unit: int | None) -> NDArray[np.int64]:
+    """(n,) nanoseconds of seconds and their fractions, in `unit` nanoseconds; None = decimals."""
+    fractions = [int(f.ljust(9, "0")) if unit is None else int(f) * unit for _, f in parts]
+    return np.array([int(s) * 10**9 for s, _ in parts], np.int64) + np.array(fractions, np.int64)
+
+
+def _chosen(ways: dict[str, NDArray[np.int64]], name: str, is_stripped: bool) -> NDArray[np.int64]:
+    """The way with clearly the most regular steps; else decimals, if these may lack their last zeros."""
+    best, *others = sorted(ways, key=lambda way: _unevenness(ways[way]))
+    if not others or _unevenness(ways[others[0]]) > 2 * _unevenness(ways[best]) + 0.05:
+        return ways[best]
+    if is_stripped and "decimals" in ways:
+        return ways["decimals"]
+    raise DatasetError(
+        f"names such as {name} are ambiguous times: the fraction may be {best} or {others[0]}; expected "
+        "fractions of one width, with their leading zeros (SEC.NNNNNNNNN)"
+    )
+
+
+def _is_plausible(stamps: NDArray[np.int64]) -> bool:
+    steps = np.diff(np.sort(stamps))
+    return not len(steps) or bool(steps.min() > 0 and _FASTEST_NS <= np.median(steps) <= _SLOWEST_NS)
+
+
+def _unevenness(stamps: NDArray[np.int64]) -> float:
+    """Spread of the logarithms of the steps between times; 0 = all are equal."""
+    return float(np.log(np.diff(np.sort(stamps))).std()) if len(stamps) > 1 else 0.0

@@ -48,7 +48,7 @@ def poses_of(
                 f"{path} has {len(poses)} poses for {count} frames, and {timeless} has no times to pair them "
                 "by: give one pose a frame, or times in both (TUM's format; images named by their seconds)"
             )
-        return list(poses)
+        return [T if np.isfinite(T).all() else None for T in poses]
     trajectory, offset = read_tum(path), round(time_offset_s * 1e9)
     found = [trajectory.at(int(stamp) + offset, max_gap_ns=round(max_gap_s * 1e9)) for stamp in stamps_ns]
     if posed and (times[-1] < stamps_ns[0] + offset or times[0] > stamps_ns[-1] + offset):

@@ -6,7 +6,7 @@ import zlib
 from collections.abc import Sequence
 from contextlib import suppress
 from os import SEEK_CUR, SEEK_END
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import Any, BinaryIO
 
 import cv2
@@ -44,6 +44,11 @@ def read_numbers(path: Path, content: str, *, columns: int | None = None) -> NDA
         raise DatasetError(f"{path} is empty; expected {content}")
     columns = columns or len(lines[0][1].split())
     return np.array([numbers(path, number, line.split(), columns, content) for number, line in lines])
+
+
+def listed_file(root: Path, name: str) -> Path:
+    """A file that a list names, from `root`; with Windows' separators too."""
+    return root / name if (root / name).exists() else root / PureWindowsPath(name).as_posix()
 
 
 def numbers(path: Path, line: int, words: list[str], count: int, content: str) -> list[float]:

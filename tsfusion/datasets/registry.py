@@ -203,9 +203,9 @@ def _open_as(name: str, opener: Callable[..., Dataset], options: dict[str, Any])
 def describe(dataset: Dataset) -> str:
     """One line: number and kind of frames, size, rate, how many have a pose, the camera. Reads one frame."""
     from tsfusion.datasets.cameras import camera_line, depth_line
-    from tsfusion.datasets.dataset import frame_of, pose_of
+    from tsfusion.datasets.dataset import first_frame, pose_of
 
-    first = frame_of(dataset, 0)
+    first = first_frame(dataset)
     words = {"pair": "stereo pairs", "points": "scans", "disparity": "disparity images"}
     kind = words.get(first.kind) or ("depth images" if first.color is None else "RGB-D frames")
     size = "" if first.kind == "points" else f" {first.shape[1]}×{first.shape[0]}"

@@ -1,12 +1,16 @@
 # SPDX-License-Identifier: MIT
 """Trajectory files: the text formats of the field, read and written."""
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tsfusion.core.counts import count_of
 from tsfusion.core.errors import DatasetError, InvalidKeyframe
 from tsfusion.datasets.dataset import require_one_clock
 from tsfusion.datasets.readers import numbers, read_lines, read_numbers
@@ -14,6 +18,38 @@ from tsfusion.geometry.keyframe import check_pose
 from tsfusion.geometry.origin import FARTHEST
 from tsfusion.geometry.se3 import Transform
 from tsfusion.geometry.trajectory import Trajectory, quaternion, rigid
+
+_T = TypeVar("_T")
+_RTABMAP_COLUMNS = 9
+TUM_COLUMNS = (8, _RTABMAP_COLUMNS)
+_SAME_M, _SAME_DEG = 1e-3, 0.1  # two poses at one time that differ by less are one
+
+log = logging.getLogger(__name__)
+
+
+def usable(
+    source: object, items: Iterable[_T], read: Callable[[_T], Transform | None]
+) -> list[Transform | None]:
+    """The pose that `read` makes of each item, None where it is broken; the first broken one is said.
+
+    Raises:
+        DatasetError: most are broken; the error of the first.
+    """
+    poses: list[Transform | None] = []
+    broken: list[DatasetError] = []
+    for item in items:
+        try:
+            poses.append(read(item))
+        except DatasetError as error:
+            broken.append(error)
+            poses.append(None)
+    if 2 * len(broken) > len(poses):
+        raise broken[0]
+    if broken:
+        log.warning(
+            "%s: %d of %d poses are broken, the first: %s", source, len(broken), len(poses), broken[0]
+        )
+    return poses
 
 
 def write_tum(path: Path, timestamps_ns: Sequence[int], poses: Sequence[Transform]) -> None:
@@ -41,32 +77,83 @@ def nanoseconds(seconds: str, path: Path, line: int) -> int:
 
 
 def read_tum(path: Path) -> Trajectory:
-    """`timestamp tx ty tz qx qy qz qw` a line (TUM RGB-D, CoRBS, most SLAM systems)."""
-    content = "`timestamp tx ty tz qx qy qz qw` a line"
-    stamps: list[int] = []
-    rows: list[list[float]] = []
-    for number, line in read_lines(path, content):
-        words = line.replace(",", " ").split()
-        rows.append(numbers(path, number, words, 8, content)[1:])
-        check_quaternion(rows[-1][3:], path, number)
-        stamps.append(nanoseconds(words[0], path, number))
-    return _in_order(stamps, rows, path, content)
+    """`timestamp tx ty tz qx qy qz qw` a line (TUM RGB-D, CoRBS, most SLAM systems); RTAB-Map adds an id.
+
+    A line without a rigid pose is a hole: nothing is interpolated across it.
+
+    Raises:
+        DatasetError: most lines are no poses, or two poses at one time differ.
+    """
+    content = "`timestamp tx ty tz qx qy qz qw` a line, or with RTAB-Map's id after it"
+
+    def values(words: list[str], number: int) -> list[float]:
+        has_id = len(words) == _RTABMAP_COLUMNS and words[-1].isdecimal()
+        return numbers(path, number, words[:-1] if has_id else words, 8, content)[1:]
+
+    return _read(path, content, None, partial(nanoseconds, path=path), values)
 
 
 def read_euroc(path: Path) -> Trajectory:
-    """EuRoC / ASL ground truth: `ns, px, py, pz, qw, qx, qy, qz, …` a line, T_world_body."""
+    """EuRoC / ASL ground truth: `ns, px, py, pz, qw, qx, qy, qz, …` a line, T_world_body; as `read_tum`."""
     content = "`ns,px,py,pz,qw,qx,qy,qz,…` a line"
-    stamps: list[int] = []
-    rows: list[list[float]] = []
-    for number, line in read_lines(path, content):
-        words = [word.strip() for word in line.split(",")]
-        if not words[0].isdecimal() or int(words[0]) >= 2**63:
-            raise DatasetError(f"{path}:{number}: timestamp must be nanoseconds, got {words[0]!r}")
+
+    def stamp(word: str, line: int) -> int:
+        if not word.isdecimal() or int(word) >= 2**63:
+            raise DatasetError(f"{path}:{line}: timestamp must be nanoseconds, got {word!r}")
+        return int(word)
+
+    def values(words: list[str], number: int) -> list[float]:
         px, py, pz, qw, qx, qy, qz = numbers(path, number, words[1:8], 7, content)
-        check_quaternion([qx, qy, qz, qw], path, number)
-        stamps.append(int(words[0]))
-        rows.append([px, py, pz, qx, qy, qz, qw])
-    return _in_order(stamps, rows, path, content)
+        return [px, py, pz, qx, qy, qz, qw]
+
+    return _read(path, content, ",", stamp, values)
+
+
+def _read(
+    path: Path,
+    content: str,
+    separator: str | None,
+    stamp_of: Callable[..., int],
+    values_of: Callable[[list[str], int], list[float]],
+) -> Trajectory:
+    """The poses of a file's lines in time order; of a broken one whose time can be read NaN."""
+    stamps: list[int] = []
+
+    def read(line: tuple[int, str]) -> NDArray[np.float64]:
+        stamps.append(-1)
+        text = line[1] if separator else line[1].replace(",", " ")
+        words = [word.strip() for word in text.split(separator)]
+        stamps[-1] = stamp_of(words[0], line=line[0])
+        values = np.array(values_of(words, line[0]))
+        check_quaternion(values[3:], path, line[0])
+        values[3:] /= np.linalg.norm(values[3:])
+        return values
+
+    rows = usable(path, read_lines(path, content), read)
+    if not rows:
+        raise DatasetError(f"{path} holds no poses; expected {content}")
+    require_one_clock([stamp for stamp in stamps if stamp >= 0], path)
+    times = np.array(stamps, np.int64)
+    table = np.array([np.full(7, np.nan) if row is None else row for row in rows])
+    order = np.argsort(times, kind="stable")[np.count_nonzero(times < 0) :]
+    times, table = times[order], table[order]
+    _check_twins(times, table, path)
+    first = np.unique(times, return_index=True)[1]
+    return Trajectory(times[first], table[first, :3], table[first, 3:])
+
+
+def _check_twins(times: NDArray[np.int64], table: NDArray[np.float64], path: Path) -> None:
+    """Raise DatasetError where two poses at one time differ: nobody knows which one counts."""
+    one, other = table[:-1], table[1:]
+    apart = np.linalg.norm(one[:, :3] - other[:, :3], axis=1)
+    turned = 2 * np.degrees(np.arccos(np.minimum(np.abs((one[:, 3:] * other[:, 3:]).sum(axis=1)), 1)))
+    twins = np.flatnonzero((np.diff(times) == 0) & ((apart > _SAME_M) | (turned > _SAME_DEG)))
+    if len(twins):
+        raise DatasetError(
+            f"{path} has two poses at one time, {count_of(len(twins), 'time')}, the first at "
+            f"{times[twins[0]] / 1e9:.6f} s: they are {apart[twins].max():.3f} m and "
+            f"{turned[twins].max():.2f}° apart at most; expected one pose a time"
+        )
 
 
 def check_quaternion(quaternion: Sequence[float] | NDArray[np.float64], path: Path, line: int) -> None:
@@ -76,20 +163,9 @@ def check_quaternion(quaternion: Sequence[float] | NDArray[np.float64], path: Pa
         raise DatasetError(f"{path}:{line}: quaternion must have length 1, got {norm:.4g}")
 
 
-def _in_order(stamps: list[int], rows: list[list[float]], path: Path, content: str) -> Trajectory:
-    if not rows:
-        raise DatasetError(f"{path} holds no poses; expected {content}")
-    require_one_clock(stamps, path)
-    order = np.unique(np.array(stamps, dtype=np.int64), return_index=True)[1]
-    table = np.array(rows)[order]
-    quaternions = table[:, 3:] / np.linalg.norm(table[:, 3:], axis=1, keepdims=True)
-    return Trajectory(np.array(stamps, dtype=np.int64)[order], table[:, :3], quaternions)
-
-
-def read_kitti(path: Path) -> list[Transform]:
-    """3×4 row-major matrices, one a line; the line number is the frame number."""
-    table = read_numbers(path, "12 numbers a line, a 3×4 row-major camera-to-world matrix", columns=12)
-    return [checked_pose(row.reshape(3, 4), f"{path}, pose {index}") for index, row in enumerate(table)]
+def read_kitti(path: Path) -> list[Transform | None]:
+    """3×4 row-major matrices, one a line; the line number is the frame number; None where one is broken."""
+    return _read_rows(path, "12 numbers a line, a 3×4 row-major camera-to-world matrix", 12)
 
 
 def read_matrix(path: Path) -> Transform:
@@ -100,60 +176,79 @@ def read_matrix(path: Path) -> Transform:
     return checked_pose(table, path)
 
 
-def read_matrix_rows(path: Path) -> list[Transform]:
-    """4×4 matrices, one a line of 16 numbers (HoloLens folders)."""
-    table = read_numbers(path, "16 numbers a line, a 4×4 row-major camera-to-world matrix", columns=16)
-    return [checked_pose(row.reshape(4, 4), f"{path}, pose {index}") for index, row in enumerate(table)]
+def read_matrix_rows(path: Path) -> list[Transform | None]:
+    """4×4 matrices, one a line of 16 numbers (HoloLens folders); None where one is broken."""
+    return _read_rows(path, "16 numbers a line, a 4×4 row-major camera-to-world matrix", 16)
 
 
-def read_log(path: Path) -> list[tuple[int, Transform]]:
-    """Redwood / Open3D `.log`: a line of three integers, then a 4×4 camera-to-world matrix; repeated."""
+def _read_rows(path: Path, content: str, columns: int) -> list[Transform | None]:
+    lines = read_lines(path, content)
+    if not lines:
+        raise DatasetError(f"{path} is empty; expected {content}")
+
+    def read(numbered: tuple[int, tuple[int, str]]) -> Transform:
+        index, (line, text) = numbered
+        row = np.array(numbers(path, line, text.split(), columns, content))
+        return checked_pose(row.reshape(-1, 4), f"{path}, pose {index}")
+
+    return usable(path, enumerate(lines), read)
+
+
+def read_log(path: Path) -> list[tuple[int, Transform | None]]:
+    """Redwood / Open3D `.log`: a line of three integers, then a 4×4 camera-to-world matrix; repeated.
+
+    None where a matrix is broken.
+    """
     lines = read_lines(path, "a Redwood trajectory: three integers, then a 4×4 matrix, repeated")
     if not lines or len(lines) % 5:
         raise DatasetError(
             f"{path} has {len(lines)} lines; expected five a pose: three integers, then a 4×4 matrix"
         )
-    poses = []
+    heads = []
     for start in range(0, len(lines), 5):
         number, head = lines[start]
         words = head.split()
         if len(words) != 3 or not words[0].isdigit():
             raise DatasetError(f"{path}:{number}: three integers expected before each matrix, got {head!r}")
-        rows = [numbers(path, n, line.split(), 4, "a 4×4 matrix") for n, line in lines[start + 1 : start + 5]]
-        poses.append((int(words[0]), checked_pose(np.array(rows), f"{path}:{number}")))
-    return poses
+        heads.append(int(words[0]))
+
+    def read(start: int) -> Transform:
+        rows = [numbers(path, n, text.split(), 4, "a 4×4 matrix") for n, text in lines[start + 1 : start + 5]]
+        return checked_pose(np.array(rows), f"{path}:{lines[start][0]}")
+
+    return list(zip(heads, usable(path, range(0, len(lines), 5), read), strict=True))
 
 
 def read_poses(path: Path) -> tuple[NDArray[np.int64] | None, NDArray[np.float64]]:
-    """Read a trajectory file: TUM (8 numbers in the first line), KITTI (12), 4×4 matrices (16) or Redwood's
-    `.log` (3), whose poses come in the order of their numbers.
+    """Read a trajectory file: TUM (8 numbers in the first line, with RTAB-Map's ids 9), KITTI (12), 4×4
+    matrices (16) or Redwood's `.log` (3), whose poses come in the order of their numbers.
 
     Returns:
-        (n,) timestamps in nanoseconds, None where the format has none; (n, 4, 4) poses.
+        (n,) timestamps in nanoseconds, None where the format has none; (n, 4, 4) poses, NaN where broken.
 
     Raises:
         DatasetError: for a missing file, or one of another format.
     """
     columns = _columns(path)
-    if columns == 8:
+    if columns in TUM_COLUMNS:
         tum = read_tum(path)
         poses = [rigid(q, t) for q, t in zip(tum.quaternions, tum.translations, strict=True)]
         return tum.timestamps_ns, np.array(poses)
-    if columns == 12:
-        return None, np.array(read_kitti(path))
-    if columns == 16:
-        return None, np.array(read_matrix_rows(path))
     if columns == 3:
-        return None, np.array([T for _, T in sorted(read_log(path), key=lambda one: one[0])])
-    raise DatasetError(
-        f"{path} is no trajectory: expected 8 numbers a line (TUM), 12 (KITTI), 16 (4×4) or a Redwood .log, "
-        f"got {columns}"
-    )
+        found = [T for _, T in sorted(read_log(path), key=lambda one: one[0])]
+    elif columns in (12, 16):
+        found = read_kitti(path) if columns == 12 else read_matrix_rows(path)
+    else:
+        raise DatasetError(
+            f"{path} is no trajectory: expected 8 numbers a line (TUM), 9 (RTAB-Map), 12 (KITTI), 16 "
+            f"(4×4) or a Redwood .log, got {columns}"
+        )
+    return None, np.array([np.full((4, 4), np.nan) if T is None else T for T in found])
 
 
 def is_log(path: Path) -> bool:
     """Whether a trajectory is a Redwood `.log`, or nothing that `read_poses` reads."""
-    return _columns(path) not in (8, 12, 16)
+    return _columns(path) not in (*TUM_COLUMNS, 12, 16)
 
 
 def _columns(path: Path) -> int:

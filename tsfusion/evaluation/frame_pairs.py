@@ -3,11 +3,12 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.datasets.dataset import Dataset, frame_of
+from tsfusion.datasets.dataset import Dataset, frame_of, readable
 from tsfusion.evaluation.color_registration import Outlines, outlines
 from tsfusion.evaluation.depth_units import DepthUnit, depth_unit
 from tsfusion.evaluation.depth_views import DepthView, depth_view
@@ -94,12 +95,13 @@ def wanted_pairs(count: int) -> list[tuple[int, int]]:
 
 
 def seen_frames(dataset: Dataset, wanted: Sequence[tuple[int, int]]) -> dict[int, SeenFrame]:
-    """The frames of some pairs by index, each read once.
+    """The frames of some pairs by index, each read once, without those that cannot be read.
 
     Raises:
         DatasetError: a frame cannot be read.
     """
-    return {index: _seen(dataset, index) for index in sorted({i for pair in wanted for i in pair} or {0})}
+    indices = sorted({index for pair in wanted for index in pair} or {0})
+    return dict(readable(partial(_seen, dataset), indices))
 
 
 def _seen(dataset: Dataset, index: int) -> SeenFrame:
@@ -114,8 +116,8 @@ def pairs_of(frames: dict[int, SeenFrame], wanted: Sequence[tuple[int, int]]) ->
     """The pairs whose frames both have a pose and a view."""
     pairs = []
     for i, j in wanted:
-        first, second = frames[i], frames[j]
-        if first.view is None or second.view is None:
+        first, second = frames.get(i), frames.get(j)
+        if first is None or second is None or first.view is None or second.view is None:
             continue
         if first.T_world_camera is not None and second.T_world_camera is not None:
             poses = first.T_world_camera, second.T_world_camera

@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.datasets.dataset import Dataset, frame_of
+from tsfusion.datasets.dataset import Dataset, frame_of, readable
 from tsfusion.evaluation.camera_check import (
     CameraMistake,
     best_camera,
@@ -139,8 +139,8 @@ def check_frames(dataset: Dataset) -> tuple[str | None, str | None]:
         DatasetError: a frame cannot be read.
     """
     units, edges = [], {}
-    for index in sorted({index for pair in wanted_pairs(len(dataset)) for index in pair} or {0}):
-        frame = frame_of(dataset, index)
+    indices = sorted({index for pair in wanted_pairs(len(dataset)) for index in pair} or {0})
+    for index, frame in readable(partial(frame_of, dataset), indices):
         if frame.kind == "points":
             return None, None
         units.append(depth_unit(frame, None))

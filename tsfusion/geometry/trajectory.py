@@ -19,8 +19,8 @@ class Trajectory:
 
     Attributes:
         timestamps_ns: (n,) int64, strictly increasing.
-        translations: (n, 3) float64, metres.
-        quaternions: (n, 4) float64, x y z w, unit length.
+        translations: (n, 3) float64, metres; NaN = the pose is not known.
+        quaternions: (n, 4) float64, x y z w, unit length, or NaN.
     """
 
     timestamps_ns: NDArray[np.int64]
@@ -30,7 +30,8 @@ class Trajectory:
     def at(self, timestamp_ns: int, *, max_gap_ns: int) -> Transform | None:
         """Interpolate the pose at a time: SLERP and linear between the neighbours, never beyond the ends.
 
-        None when the neighbours are more than `max_gap_ns` apart, unless one is within a millisecond.
+        None when the neighbours are more than `max_gap_ns` apart, unless one is within a millisecond, or when
+        one of them is not known.
         """
         stamps = self.timestamps_ns
         right = int(np.searchsorted(stamps, timestamp_ns))
@@ -40,10 +41,17 @@ class Trajectory:
         )
         if right in (0, len(stamps)) or stamps[right] - stamps[right - 1] > max_gap_ns:
             near = abs(int(stamps[nearest]) - timestamp_ns) <= _EXACT_NS
-            return rigid(self.quaternions[nearest], self.translations[nearest]) if near else None
+            return _known(self.quaternions[nearest], self.translations[nearest]) if near else None
         share = (timestamp_ns - stamps[right - 1]) / (stamps[right] - stamps[right - 1])
         t = (1 - share) * self.translations[right - 1] + share * self.translations[right]
-        return rigid(slerp(self.quaternions[right - 1], self.quaternions[right], share), t)
+        between = _known(slerp(self.quaternions[right - 1], self.quaternions[right], share), t)
+        if between is None and stamps[right] == timestamp_ns:
+            return _known(self.quaternions[right], self.translations[right])
+        return between
+
+
+def _known(quaternion: NDArray[np.float64], translation: NDArray[np.float64]) -> Transform | None:
+    return rigid(quaternion, translation) if np.isfinite(quaternion).all() else None
 
 
 def slerp(q0: NDArray[np.float64], q1: NDArray[np.float64], share: float) -> NDArray[np.float64]:

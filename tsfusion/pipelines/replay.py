@@ -18,7 +18,7 @@ from tsfusion.core.counts import count_of
 from tsfusion.core.errors import DatasetError, JournalError, OutputError
 from tsfusion.core.output_folder import results
 from tsfusion.datasets import Dataset
-from tsfusion.datasets.dataset import force_of
+from tsfusion.datasets.dataset import UnreadableFrame, force_of, readable
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.geometry.origin import world_of
 from tsfusion.geometry.up_direction import HeldSensor, Up
@@ -58,7 +58,7 @@ def replay(
     `mesh.ply`, `mesh.glb`, `preview.png`, `keyframes.txt`, `delay.csv`, `delay.png`, `growth.csv`, `run.json`
     and `report.html` with its pictures, with a server of its own also `map.tsf`, and of a world whose surface
     is known `error.npy`, appear together when all of it went well, and not at all otherwise. A keyframe that
-    cannot be read ends the replay: what came before it is in the results, which say so.
+    cannot be read is left out and counted; where most cannot, the replay ends, and its results say so.
 
     Args:
         out: None = a new folder `out/DATE_TIME`; see `output_folder.results`.
@@ -80,14 +80,15 @@ def replay(
         OutputError: `out` cannot be written (checked first), or the mesh is empty.
         TransportError: the server cannot be reached, ended, or stopped fusing; WorldRefused: the map has
             keyframes of another world.
-        DatasetError, JournalError: the first keyframe cannot be read.
+        DatasetError, JournalError: most keyframes cannot be read, or a journal's first.
     """
     unread: list[str] = []
     stamps: list[int] = []
     poses: list[NDArray[np.float64]] = []
     run_files.check_folder(out)
     with results(out, overwrite=overwrite) as (work, folder), ExitStack() as watching:
-        first = dataset[0]  # a dataset that cannot be read is an error before a server starts
+        # A dataset that cannot be read is an error before a server starts.
+        begin, first = next(readable(dataset.__getitem__, range(len(dataset))), None) or (0, dataset[0])
         if connect is None:
             map_size.check_fits(first, volume)
         progress.stage(engine.STARTING if connect is None else f"connecting to {connect}")
@@ -118,7 +119,7 @@ def replay(
                 server is not None and server.state != target_server.THROWN_AWAY
             )
             with _saying_what_stays(sender, target.link.map) if outlives else nullcontext():
-                for index, keyframe in enumerate(_keyframes(dataset, first, running, rate, unread)):
+                for index, keyframe in _keyframes(dataset, (begin, first), running, rate, unread):
                     running.wait_turn(AHEAD if rate is None else target.link.backlog)
                     of = sensor or keyframe.sensor
                     sender.send(dataclasses.replace(keyframe, captured_ns=time.monotonic_ns(), sensor=of))
@@ -183,21 +184,25 @@ def _saying_what_stays(sender: Client, map_name: str) -> Iterator[None]:
 
 
 def _keyframes(
-    dataset: Dataset, first: Keyframe, running: Engine, rate: float | None, unread: list[str]
-) -> Iterator[Keyframe]:
-    """Yield each keyframe at its time, up to one that is `unread`; a sensor that was late does not catch up.
+    dataset: Dataset, first: tuple[int, Keyframe], running: Engine, rate: float | None, unread: list[str]
+) -> Iterator[tuple[int, Keyframe]]:
+    """Yield each keyframe and its index at its time, without those that cannot be read.
+
+    Where most cannot, or a journal is damaged, it ends, `unread`. A sensor that was late does not catch up.
 
     One that waits for its time is read when that is near: a sensor's next image does not take a core while
     the server fuses the last one, and read at once it added a third to the delay on two cores.
     """
     due, ahead = time.monotonic(), float("inf")
     yield first
-    for index in range(1, len(dataset)):
+    for index in range(first[0] + 1, len(dataset)):
         if rate is not None:
             running.wait_until(due + 1 / rate - ahead)
         began = time.monotonic()
         try:
             keyframe = dataset[index]
+        except UnreadableFrame:
+            continue
         except (DatasetError, JournalError) as error:
             unread.append(f"keyframe {index} of {len(dataset)} cannot be read, and ended the replay: {error}")
             return
@@ -205,4 +210,4 @@ def _keyframes(
             ahead = _READ_AHEAD * (time.monotonic() - began)
             due = max(due + 1 / rate, time.monotonic())
             running.wait_until(due)
-        yield keyframe
+        yield index, keyframe

@@ -11,7 +11,7 @@ from tsfusion.core.errors import DatasetError, InvalidConfig, InvalidKeyframe
 from tsfusion.datasets.accelerometer import Accelerometer, read_table
 from tsfusion.datasets.cameras import RecordedCamera
 from tsfusion.datasets.dataset import SCAN, Frames, keep_posed, require_folder, require_frames
-from tsfusion.datasets.readers import read_image, read_lines
+from tsfusion.datasets.readers import listed_file, read_image, read_lines
 from tsfusion.datasets.trajectory_files import read_euroc
 from tsfusion.geometry.calibration import Rectifier
 from tsfusion.geometry.calibration_files import read_rig, read_tree
@@ -126,7 +126,7 @@ def _listed(camera: Path) -> list[tuple[int, Path]]:
         words = [word.strip() for word in line.split(",")]
         if len(words) != 2 or not words[0].isdecimal() or int(words[0]) >= 2**63:
             raise DatasetError(f"{path}:{number}: {line!r}; expected {content}")
-        images.append((int(words[0]), camera / "data" / words[1]))
+        images.append((int(words[0]), listed_file(camera / "data", words[1])))
     return sorted(images)
 
 

@@ -21,6 +21,8 @@ from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.se3 import Transform
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
+_SIZES = 3  # images that tell the size of all
+_FIRST_TRIES = 50  # images that cannot be read and none that can: so it is with all
 COLOR = ("color", "colour", "rgb", "image", "images")  # folders beside depth/, by preference
 
 
@@ -149,24 +151,40 @@ def _files(where: Path, expected: str, pattern: str, suffixes: tuple[str, ...]) 
 
 
 def first_size(depth: Sequence[Path]) -> tuple[int, int]:
-    """(height, width) of a recording's first depth image, for which its camera is looked up."""
-    height, width = read_depth(depth[0]).shape
-    return int(height), int(width)
+    """(height, width) of most of a recording's first depth images, for which its camera is looked up."""
+    sizes: list[tuple[int, int]] = []
+    for index, file in enumerate(depth):
+        try:
+            height, width = read_depth(file).shape
+        except DatasetError:
+            if not sizes and (2 * index >= len(depth) or index >= _FIRST_TRIES):
+                raise  # so it is with all of them
+            continue
+        sizes.append((height, width))
+        if len(sizes) == _SIZES:
+            break
+    return max(sizes, key=sizes.count)
 
 
 def color_images(depth: list[Path], where: Path, expected: str) -> list[Path]:
-    """The colour image of each depth image, by file name."""
+    """The colour image of each depth image, by file name; of some it may be missing.
+
+    Raises:
+        DatasetError: of most it is.
+    """
     by_stem = {path.stem: path for path in images(where, expected)}
-    for image in depth:
-        if image.stem not in by_stem:
-            raise DatasetError(
-                f"{where / image.stem}.png or .jpg is missing, but {image} is there; expected {expected}"
-            )
-    return [by_stem[image.stem] for image in depth]
+    found = [by_stem.get(image.stem, where / f"{image.stem}.png") for image in depth]
+    missing = [file for image, file in zip(depth, found, strict=True) if image.stem not in by_stem]
+    if 2 * len(missing) > len(depth):
+        raise DatasetError(
+            f"{where / missing[0].stem}.png or .jpg is missing, but {depth[0].parent} has its depth; "
+            f"expected {expected}"
+        )
+    return found
 
 
 def poses_by_number(
-    names: Sequence[str], poses: list[tuple[int, Transform]], source: Path
+    names: Sequence[str], poses: Sequence[tuple[int, Transform | None]], source: Path
 ) -> list[Transform | None]:
     """The pose of each image: the one numbered as its name; of as many poses with other numbers the k-th.
 

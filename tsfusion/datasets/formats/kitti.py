@@ -215,7 +215,7 @@ def _trajectory(root: Path, sequence: str, poses: str | Path | None, *, posed: b
         path = Path(poses) if Path(poses).is_file() else root / poses
     elif not posed and not path.exists():
         return {}
-    return dict(enumerate(read_kitti(path)))
+    return {frame: T for frame, T in enumerate(read_kitti(path)) if T is not None}
 
 
 @cache

@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError, InvalidConfig, InvalidKeyframe
 from tsfusion.datasets.cameras import MILLIMETRES, DepthUnit, RecordedCamera, given_camera
-from tsfusion.datasets.dataset import Frames, keep_posed, require_frames
+from tsfusion.datasets.dataset import WITHOUT_DEPTH, Frames, first_frame, keep_posed, require_frames
 from tsfusion.datasets.depth_files import check_metres, read_depth
-from tsfusion.datasets.formats.image_folders import resample_for_camera
-from tsfusion.datasets.readers import read_color, turned_by_exif
+from tsfusion.datasets.formats.image_folders import first_size, resample_for_camera
+from tsfusion.datasets.readers import listed_file, read_color, turned_by_exif
+from tsfusion.datasets.trajectory_files import usable
 from tsfusion.geometry.calibration import Camera, Undistorter
 from tsfusion.geometry.calibration_files import read_text
 from tsfusion.geometry.frame import Frame
@@ -93,20 +94,21 @@ class Nerfstudio(Frames):
         own = _depth_unit(capture, file)
         self.depth_scale = own.metres if depth_scale is None else depth_scale
         applied = _scale(capture, "applied_scale", file) if "applied_scale" in capture else 1.0
-        listed, poses = [], []
+        listed, posed_by = [], []
         for number, frame in enumerate(capture["frames"]):
             where = f"{file}, frame {number}"
             entry = _listed_frame(file.parent, capture, frame, where, color=color)
             if entry is not None:
                 listed.append(entry)
-                poses.append(_pose(frame, applied, where))
+                posed_by.append((frame, where))
         if not listed:
             raise DatasetError(
                 f"{file} has {len(capture['frames'])} frames, none with depth_file_path or depth_path; "
                 "expected depth images: colour alone cannot be fused"
             )
         if len(listed) < len(capture["frames"]):
-            self.skipped["without depth"] = len(capture["frames"]) - len(listed)
+            self.skipped[WITHOUT_DEPTH] = len(capture["frames"]) - len(listed)
+        poses = usable(file, posed_by, lambda one: _pose(one[0], applied, one[1]))
         self._listed, self._poses = keep_posed(listed, poses, posed=posed, skipped=self.skipped)
         require_frames(len(self._listed), file, EXPECTED, self.skipped)
         self._undistorters: dict[Camera, Undistorter] = {}
@@ -141,12 +143,12 @@ class Nerfstudio(Frames):
         self, file: Path, intrinsics: Intrinsics | None, calibration: str | Path | None
     ) -> RecordedCamera:
         """The camera that was given, which is that of all frames; else that of the first frame."""
-        height, width = _read_depth(self._listed[0].depth, self.depth_scale)[0].shape
+        height, width = first_size([entry.depth for entry in self._listed])
         given = given_camera((height, width), intrinsics=intrinsics, calibration=calibration)
         if given is not None:
             self._given = given.lens
             return given
-        first = self.frame(0).intrinsics
+        first = first_frame(self).intrinsics
         assert first is not None
         undistorted = ", undistorted" if self._undistorters else ""
         return RecordedCamera(first, (height, width), f"from {file.name}{undistorted}")
@@ -181,7 +183,8 @@ def _listed_frame(
     if "w" in camera and "h" in camera:
         size = (int(_number(camera, "h", where)), int(_number(camera, "w", where)))
     file = frame.get("file_path") if color else None
-    return _ListedFrame(root / str(depth), _image(root / str(file)) if file else None, size, camera, where)
+    color_file = _image(listed_file(root, str(file))) if file else None
+    return _ListedFrame(listed_file(root, str(depth)), color_file, size, camera, where)
 
 
 def _image(path: Path) -> Path:

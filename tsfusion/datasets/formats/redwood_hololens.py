@@ -12,7 +12,7 @@ from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.cameras import PublishedCamera, find_camera
 from tsfusion.datasets.dataset import SCAN, keep_posed, require_folder, require_frames
 from tsfusion.datasets.depth_files import SUFFIXES
-from tsfusion.datasets.file_names import numbers_in, series_of, times_of_names
+from tsfusion.datasets.file_names import in_time, numbers_in, series_of
 from tsfusion.datasets.formats.image_folders import (
     COLOR,
     DepthImages,
@@ -165,6 +165,7 @@ class Redwood(DepthImages):
         self.root = root = require_folder(path, "Redwood")
         beside = {} if _depth_folders(root) else _only_series(root)
         files = [*beside] or depth_images(_depth_folder(root), REDWOOD_EXPECTED)
+        files, times = in_time(files, _names(files))
         log = _log(root) if trajectory is None else Path(trajectory)
         if log is not None and not log.is_file():
             log = root / log
@@ -174,7 +175,7 @@ class Redwood(DepthImages):
             raise DatasetError(f"{root} has no trajectory; expected {REDWOOD_EXPECTED}; {hint}")
         skipped: dict[str, int] = {}
         try:
-            found = _poses(files, log, posed=posed, time_offset_s=time_offset_s)
+            found = _poses(files, log, times, posed=posed, time_offset_s=time_offset_s)
         except DatasetError as error:
             if posed or trajectory is not None or log is None:
                 raise
@@ -182,6 +183,7 @@ class Redwood(DepthImages):
             found = [None] * len(files)
         depth, poses = keep_posed(files, found, posed=posed, skipped=skipped)
         require_frames(len(depth), root, REDWOOD_EXPECTED, skipped)
+        kept = set(depth)
         colored: list[Path | None] = []
         if color and beside:
             colored = [beside[file] for file in depth]
@@ -201,24 +203,24 @@ class Redwood(DepthImages):
             camera=camera,
             skipped=skipped,
             depth_scale=depth_scale,
-            timestamps_ns=_times(depth),
+            timestamps_ns=None if times is None else times[[file in kept for file in files]],
         )
 
 
 def _poses(
-    files: list[Path], path: Path | None, *, posed: bool, time_offset_s: float
+    files: list[Path],
+    path: Path | None,
+    times: NDArray[np.int64] | None,
+    *,
+    posed: bool,
+    time_offset_s: float,
 ) -> list[Transform | None]:
     """Poses of a `.log` by number; of another trajectory by time, or one for each image."""
     if path is None:
         return [None] * len(files)
     if is_log(path):
         return poses_by_number(_names(files), read_log(path), path)
-    return poses_of(path, len(files), _times(files), posed=posed, time_offset_s=time_offset_s)
-
-
-def _times(files: list[Path]) -> NDArray[np.int64] | None:
-    """Nanoseconds of images from their names; None = they have none."""
-    return times_of_names(_names(files))
+    return poses_of(path, len(files), times, posed=posed, time_offset_s=time_offset_s)
 
 
 def _names(files: list[Path]) -> list[str]:

@@ -76,15 +76,15 @@ class Replica(DepthImages):
 
 
 def _frames(root: Path, depth: list[Path]) -> list[Path | None]:
-    """`frame000010.jpg` of `depth000010.png`; all or none."""
-    by_number = {path.stem[len("frame") :]: path for path in images(root / "results", EXPECTED, "frame*")}
-    if not by_number:
-        return []
-    for path in depth:
-        number = path.stem[len("depth") :]
-        if number not in by_number:
-            raise DatasetError(f"{path.with_name(f'frame{number}.jpg')} is missing, but {path} is there")
-    return [by_number[path.stem[len("depth") :]] for path in depth]
+    """`frame000010.jpg` of `depth000010.png`; none where there are none, else of some it may be missing."""
+    there = images(root / "results", EXPECTED, "frame*")
+    by_number = {path.stem[len("frame") :]: path for path in there}
+    numbers_ = [path.stem[len("depth") :] for path in depth]
+    missing = [number for number in numbers_ if number not in by_number]
+    if there and 2 * len(missing) > len(depth):
+        name = root / "results" / f"frame{missing[0]}.jpg"
+        raise DatasetError(f"{name} is missing, but depth{missing[0]} is there")
+    return [by_number.get(n, root / "results" / f"frame{n}.jpg") for n in numbers_] if there else []
 
 
 def _poses(root: Path, files: list[Path], *, posed: bool) -> list[Transform | None]:

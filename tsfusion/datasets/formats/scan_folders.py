@@ -11,7 +11,7 @@ import numpy as np
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.dataset import SCAN, Frames, keep_posed, require_folder, require_frames
-from tsfusion.datasets.file_names import numbers_in, series_of, times_of_names
+from tsfusion.datasets.file_names import in_time, series_of
 from tsfusion.datasets.given_trajectory import poses_between, poses_of
 from tsfusion.datasets.scan_files import SUFFIXES, USUAL_FIELDS, read_scan
 from tsfusion.datasets.trajectory_files import read_poses
@@ -29,7 +29,6 @@ _FEWEST = 2
 _FEW_OTHERS = 4  # files of a series for each of another name, at least
 _RUN = "run.json"  # beside the meshes of a scan
 _HEADER_BYTES = 1 << 14
-_SECONDS, _NANOSECONDS = 10, 9  # digits of the two numbers of a time
 
 log = logging.getLogger(__name__)
 
@@ -75,10 +74,9 @@ class ScanFolder(Frames):
         self.name, self.sensor, self.skipped, self._fields = f"LiDAR scans {root.name}", sensor, {}, fields
         self._deskew = deskew
         series = _series(root)
-        files = series.files
+        files, stamps = in_time(series.files, [file.stem for file in series.files])
         if series.others:
             self.skipped["of another name"] = series.others
-        stamps = times_of_names([_time(file.stem) for file in files])
         poses: list[Transform | None] = [None] * len(files)
         where = _poses(root) if trajectory is None else Path(trajectory).expanduser()
         if trajectory is None and where is not None and (root / "calib.txt").is_file():
@@ -173,14 +171,6 @@ def _is_mesh(file: Path) -> bool:
     except OSError:
         return False
     return re.search(rb"^element\s+face\s+0*[1-9]", head, re.MULTILINE) is not None
-
-
-def _time(name: str) -> str:
-    """The time in a name, as decimal seconds or nanoseconds; else anything."""
-    numbers = numbers_in(name)
-    if len(numbers) == 2 and len(numbers[0]) == _SECONDS and len(numbers[1]) <= _NANOSECONDS:
-        return f"{numbers[0]}{numbers[1]:0>{_NANOSECONDS}}" if numbers[1].isdecimal() else ""
-    return numbers[0] if len(numbers) == 1 else ""
 
 
 def _poses(root: Path) -> Path | None:

@@ -18,7 +18,7 @@ from tsfusion.datasets.formats.image_folders import (
     resample_for_camera,
 )
 from tsfusion.datasets.readers import intrinsics_of, read_color, read_lines, read_numbers
-from tsfusion.datasets.trajectory_files import read_matrix
+from tsfusion.datasets.trajectory_files import read_matrix, usable
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.se3 import Transform
 
@@ -63,9 +63,8 @@ class ScanNet(DepthImages):
         root = require_folder(path, "ScanNet")
         skipped: dict[str, int] = {}
         files = depth_images(root / "depth", EXPECTED)
-        depth, poses = keep_posed(
-            files, [_pose(root / "pose" / f"{file.stem}.txt") for file in files], posed=posed, skipped=skipped
-        )
+        found = usable(root / "pose", (root / "pose" / f"{file.stem}.txt" for file in files), _pose)
+        depth, poses = keep_posed(files, found, posed=posed, skipped=skipped)
         require_frames(len(depth), root, EXPECTED, skipped)
         self.color_intrinsics = _color_intrinsics(root) if color else None
         super().__init__(

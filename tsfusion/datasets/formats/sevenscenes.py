@@ -9,11 +9,12 @@ import numpy as np
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.cameras import PublishedCamera, find_camera
-from tsfusion.datasets.dataset import Frames, keep_posed, require_folder, require_frames
+from tsfusion.datasets.dataset import WITHOUT_DEPTH, Frames, keep_posed, require_folder, require_frames
 from tsfusion.datasets.depth_files import read_depth
 from tsfusion.datasets.file_names import in_order
+from tsfusion.datasets.formats.image_folders import first_size
 from tsfusion.datasets.readers import read_color
-from tsfusion.datasets.trajectory_files import read_matrix
+from tsfusion.datasets.trajectory_files import read_matrix, usable
 from tsfusion.geometry.depth_registration import Registration
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
@@ -77,20 +78,21 @@ class SevenScenes(Frames):
         for sequence in _sequences(root):
             depth = _frames(sequence, "depth.png")
             alone = _frames(sequence, "pose.txt") - depth
-            if alone:
+            if len(alone) > len(depth):
                 raise DatasetError(
                     f"{sequence / min(alone)}.depth.png is missing, but its pose.txt is there; "
                     f"expected {EXPECTED}"
                 )
+            if alone:
+                self.skipped[WITHOUT_DEPTH] = self.skipped.get(WITHOUT_DEPTH, 0) + len(alone)
             stems += in_order(sequence / stem for stem in depth)
-        self._stems, self._poses = keep_posed(
-            stems, [_pose(s) for s in stems], posed=posed, skipped=self.skipped
-        )
+        poses = usable(root, stems, _pose)
+        self._stems, self._poses = keep_posed(stems, poses, posed=posed, skipped=self.skipped)
         require_frames(len(self._stems), root, EXPECTED, self.skipped)
         self._suffix = _color_suffix(self._stems[0]) if color else None
         folder, own = self._stems[0].parent, _is_own(root)
         self.camera = find_camera(
-            root, read_depth(_file(self._stems[0], "depth.png")).shape,
+            root, first_size([_file(stem, "depth.png") for stem in self._stems]),
             intrinsics=intrinsics, calibration=calibration, places=(folder, root, root.absolute().parent),
             published=PublishedCamera("7-Scenes", KINECT) if own else None,
         )  # fmt: skip

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: MIT
 """Text lists of time-stamped images, as TUM's tools write them, matched by time."""
 
-from pathlib import Path, PureWindowsPath
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.dataset import nearest_in_time, require_one_clock
-from tsfusion.datasets.readers import read_lines
+from tsfusion.datasets.readers import listed_file, read_lines
 from tsfusion.datasets.trajectory_files import nanoseconds
 
 ASSOCIATIONS = ("associations.txt", "association.txt", "associated.txt")
@@ -27,7 +27,7 @@ def read_recording(root: Path, *, max_difference_ns: int) -> ImageList:
     """`depth.txt` with `rgb.txt` where it exists, or a list of pairs in one of `ASSOCIATIONS` alone.
 
     Raises:
-        DatasetError: a malformed line, an empty list, a listed image that is missing.
+        DatasetError: a malformed line, an empty list, most listed images are missing.
     """
     pairs = next((root / name for name in ASSOCIATIONS if (root / name).is_file()), None)
     if pairs is not None and not (root / "depth.txt").exists():
@@ -58,7 +58,7 @@ def _read_list(path: Path) -> list[tuple[int, Path]]:
         words = line.split(maxsplit=1)
         if len(words) != 2:
             raise DatasetError(f"{path}:{number}: {line!r}; expected {content}")
-        images.append((nanoseconds(words[0], path, number), _beside(path, words[1])))
+        images.append((nanoseconds(words[0], path, number), listed_file(path.parent, words[1])))
     _check(path, [image for _, image in images], content)
     require_one_clock([stamp for stamp, _ in images], path)
     return sorted(set(images))  # a line may be there twice
@@ -74,22 +74,20 @@ def _read_pairs(path: Path) -> ImageList:
             raise DatasetError(f"{path}:{number}: {line!r}; expected {content}")
         depth, color = (0, 2) if "depth" in words[1].lower() else (2, 0)
         stamp = nanoseconds(words[depth], path, number)
-        rows.append((stamp, _beside(path, words[depth + 1]), _beside(path, words[color + 1])))
+        rows.append(
+            (stamp, listed_file(path.parent, words[depth + 1]), listed_file(path.parent, words[color + 1]))
+        )
     _check(path, [file for row in rows for file in row[1:]], content)
     require_one_clock([row[0] for row in rows], path)
     rows = sorted(set(rows))
     return ImageList([row[0] for row in rows], [row[1] for row in rows], [row[2] for row in rows])
 
 
-def _beside(path: Path, listed: str) -> Path:
-    return path.parent / PureWindowsPath(listed).as_posix()
-
-
 def _check(path: Path, images: list[Path], content: str) -> None:
     if not images:
         raise DatasetError(f"{path} lists no images; expected {content}")
     missing = [image for image in images if not image.is_file()]
-    if missing:
+    if 2 * len(missing) > len(images):
         raise DatasetError(
             f"{missing[0]} is missing ({len(missing)} of {len(images)} images that {path} lists)"
         )

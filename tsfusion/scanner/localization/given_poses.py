@@ -7,10 +7,11 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.readers import read_lines
-from tsfusion.datasets.trajectory_files import nanoseconds, read_kitti, read_tum
+from tsfusion.datasets.trajectory_files import TUM_COLUMNS, nanoseconds, read_poses, read_tum
 from tsfusion.geometry import origin as origins
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.sweeps import motion_about
@@ -18,7 +19,7 @@ from tsfusion.geometry.trajectory import Trajectory, quaternion
 from tsfusion.scanner.localization.localizer import Localizer, Lost, Pose
 from tsfusion.scanner.localization.tracking_keyframes import TrackingKeyframes
 
-_TUM_COLUMNS, _KITTI_COLUMNS = 8, 12
+_KITTI_COLUMNS = 12
 
 
 class TrajectoryFilePoses(Localizer):
@@ -50,7 +51,8 @@ class TrajectoryFilePoses(Localizer):
         origin: object = None,
     ) -> None:
         self._trajectory = read_trajectory(Path(path).expanduser())
-        self.origin = origins.found([*self._trajectory.translations[:1]], origin)
+        known = self._trajectory.translations[np.isfinite(self._trajectory.translations[:, 0])]
+        self.origin = origins.found([*known[:1]], origin)
         if self.origin is not None:
             moved = self._trajectory.translations - self.origin.position
             self._trajectory = replace(self._trajectory, translations=moved)
@@ -100,14 +102,14 @@ def read_trajectory(path: Path) -> Trajectory:
         raise DatasetError(f"{path} holds no poses")
     number, first = lines[0]
     columns = len(first.replace(",", " ").split())
-    if columns == _TUM_COLUMNS:
+    if columns in TUM_COLUMNS:
         return read_tum(path)
     if columns != _KITTI_COLUMNS:
         raise DatasetError(
-            f"{path}:{number}: {columns} numbers; expected TUM's 8 (`timestamp tx ty tz qx qy qz qw`) or "
-            "KITTI's 12"
+            f"{path}:{number}: {columns} numbers; expected TUM's 8 (`timestamp tx ty tz qx qy qz qw`), "
+            "RTAB-Map's 9 or KITTI's 12"
         )
-    poses = read_kitti(path)
+    poses = read_poses(path)[1]
     times_path = _times_of(path)
     times = [nanoseconds(line, times_path, n) for n, line in read_lines(times_path, "seconds, a pose a line")]
     if len(times) < len(poses):
@@ -127,7 +129,7 @@ def _times_of(path: Path) -> Path:
     )
 
 
-def _in_time(stamps: Sequence[int], poses: Sequence[np.ndarray], path: Path) -> Trajectory:
+def _in_time(stamps: Sequence[int], poses: NDArray[np.float64], path: Path) -> Trajectory:
     times = np.array(stamps, dtype=np.int64)
     if (np.diff(times) <= 0).any():
         line = int(np.argmax(np.diff(times) <= 0)) + 2

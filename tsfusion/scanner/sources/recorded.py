@@ -8,7 +8,7 @@ from itertools import islice
 from typing import Any
 
 from tsfusion.datasets.cameras import RecordedCamera
-from tsfusion.datasets.dataset import NOMINAL_NS, Dataset, frame_of
+from tsfusion.datasets.dataset import NOMINAL_NS, Dataset, UnreadableFrame, frame_of
 from tsfusion.geometry.frame import Frame
 from tsfusion.scanner.sources.source import LiveSource, Source
 
@@ -42,7 +42,10 @@ class RecordedSource(LiveSource):
                 self._closed.wait(max(0.0, due - time.monotonic()))
             if self._closed.is_set():
                 return
-            frame = frame_of(self._dataset, index)
+            try:
+                frame = frame_of(self._dataset, index)
+            except UnreadableFrame:
+                continue
             stamp = frame.timestamp_ns
             if self._dataset.timestamps_ns is None and not stamp:
                 stamp = (index + 1) * NOMINAL_NS
