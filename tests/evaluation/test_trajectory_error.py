@@ -15,7 +15,7 @@ from command_processes import tsfusion
 from tsfusion import DatasetError
 from tsfusion.cli.ate import table
 from tsfusion.datasets import open_dataset, select
-from tsfusion.datasets.dataset import pose_of
+from tsfusion.datasets.dataset import NOMINAL_NS, Frames, pose_of
 from tsfusion.datasets.trajectory_files import read_poses, read_tum, write_tum
 from tsfusion.evaluation.trajectory_error import absolute_error, associate, paired, umeyama
 from tsfusion.geometry import se3
@@ -224,3 +224,38 @@ def test_unequal_numbers_without_times(data, tmp_path):
     (tmp_path / "one.txt").write_text(lines[0])
     with pytest.raises(DatasetError, match="two positions or more"):
         absolute_error(*paired(tmp_path / "one.txt", tmp_path / "one.txt"))
+
+
+def test_poses_are_paired_by_what_both_files_know(tmp_path, caplog):
+    poses, uneven = walk(40), np.cumsum(RNG.uniform(0.04, 0.12, 40) * 1e9).astype(np.int64)
+    truth, untimed = tmp_path / "truth.txt", Untimed(list(poses))
+    write_tum(truth, list(map(int, uneven)), list(poses))
+    assert absolute_error(*paired(truth, untimed)).rmse < 1e-6
+    some = [*range(20), *range(25, 40)]
+    write_tum(tmp_path / "scan.txt", [(k + 1) * NOMINAL_NS for k in some], [poses[k] for k in some])
+    assert absolute_error(*paired(tmp_path / "scan.txt", untimed)).count == 35
+    write_tum(tmp_path / "part.txt", [int(uneven[k]) for k in some], [poses[k] for k in some])
+    with pytest.raises(DatasetError, match=r"35 poses and untimed 40, .* no times in untimed"):
+        paired(tmp_path / "part.txt", untimed)
+    assert not caplog.messages
+    late = [int(ns) + 17_000_000 * (k % 4 == 3) for k, ns in enumerate(uneven)]
+    write_tum(tmp_path / "late.txt", late, list(poses))
+    paired(tmp_path / "late.txt", truth)
+    assert caplog.messages == ["30 of 40 poses have a partner within 0.01 s; the error is of these"]
+    later = [int(ns) + 17_000_000 * (k % 4 != 3) for k, ns in enumerate(uneven)]
+    write_tum(tmp_path / "later.txt", later, list(poses))
+    with pytest.raises(DatasetError, match=r"only 10 of 40 poses have a partner within 0\.01 s"):
+        paired(tmp_path / "later.txt", truth)
+
+
+class Untimed(Frames):
+    """A recording of poses alone, without times."""
+
+    def __init__(self, poses):
+        self.name, self.sensor, self.skipped, self._poses = "untimed", "kinect", {}, poses
+
+    def __len__(self):
+        return len(self._poses)
+
+    def _frame(self, index):
+        raise DatasetError(f"frame {index} has no image")

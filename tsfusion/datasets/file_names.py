@@ -110,6 +110,8 @@ def _times(names: Sequence[str]) -> NDArray[np.int64] | None:
         ways = {"decimals": _read(parts, None)}
     else:
         ways = _ways(parts)
+        if not is_decimal and len(widths) > 1:
+            ways.pop("decimals", None)  # without a point nobody leaves out their last zeros
     is_stripped = len(parts[0][0]) < _UNIX_DIGITS and not any(f[-1] == "0" for _, f in parts if len(f) > 1)
     if not any(map(_is_plausible, ways.values())):
         decimals = ways.get("decimals") if is_decimal else None

@@ -3,6 +3,7 @@
 
 import re
 from collections.abc import Callable, Iterable
+from io import BufferedReader, BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -83,13 +84,28 @@ def _pcd(path: Path) -> tuple[Scan, int]:
         from pypcd4.pypcd4 import PointCloud
     except ImportError as error:
         raise MissingDependency("to read PCD: pip install pypcd4 (or '.[lidar]')") from error
-    with path.open("rb") as file:
-        head = file.read(_HEADER_BYTES)
+    content = path.read_bytes()
+    head = content[:_HEADER_BYTES]
     sizes = re.search(rb"^DATA binary_?s?compressed\r?\n....(.{4})", head, re.MULTILINE | re.DOTALL)
     read_limits.check(path, int.from_bytes(sizes[1], "little") if sizes else 0)
-    read = PointCloud.from_path(path)
+    whole = BytesIO(_without_empty_fields(head) + content[_HEADER_BYTES:])
+    read = PointCloud.from_fileobj(BufferedReader(whole))
     points = np.asarray(read.numpy(("x", "y", "z")))
     return _timed(points, read.fields, read.pc_data), int(read.metadata.points)
+
+
+def _without_empty_fields(head: bytes) -> bytes:
+    """The start of a PCD file without fields of COUNT 0, which hold nothing."""
+    counts = re.search(rb"^COUNT +([0-9 ]+)", head, re.MULTILINE)
+    kept = [bool(int(count)) for count in counts[1].split()] if counts else []
+    if all(kept):
+        return head
+
+    def without(line: re.Match[bytes]) -> bytes:
+        words = line[2].split()
+        return line[1] + b"".join(b" " + word for word, keep in zip(words, kept, strict=True) if keep)
+
+    return re.sub(rb"^(FIELDS|SIZE|TYPE|COUNT) +([^\r\n]*[^\s])", without, head, count=4, flags=re.MULTILINE)
 
 
 def _ply(path: Path) -> tuple[Scan, int]:

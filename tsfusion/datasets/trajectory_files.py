@@ -22,7 +22,7 @@ from tsfusion.geometry.trajectory import Trajectory, quaternion, rigid
 _T = TypeVar("_T")
 _RTABMAP_COLUMNS = 9
 TUM_COLUMNS = (8, _RTABMAP_COLUMNS)
-_SAME_M, _SAME_DEG = 1e-3, 0.1  # two poses at one time that differ by less are one
+_SAME_M, _SAME_DEG = 0.01, 1.0  # two poses at one time that differ by less are one
 
 log = logging.getLogger(__name__)
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Error of an estimated trajectory (Sturm et al., "A benchmark for RGB-D SLAM systems", 2012)."""
 
+import logging
 from pathlib import Path
 
 import msgspec
@@ -13,6 +14,8 @@ from tsfusion.datasets.trajectory_files import read_poses
 from tsfusion.geometry import se3
 
 Poses = NDArray[np.float64]  # (n, 4, 4) T_world_camera
+
+log = logging.getLogger(__name__)
 
 
 class TrajectoryError(msgspec.Struct, frozen=True, kw_only=True):
@@ -70,6 +73,7 @@ def absolute_error(estimate: Poses, reference: Poses, *, align: bool = True) -> 
     traces = np.einsum("nij,nij->n", aligned[:, :3, :3], reference[:, :3, :3])
     angles = np.degrees(np.arccos(np.clip((traces - 1) / 2, -1, 1)))
     length = float(np.linalg.norm(np.diff(reference[:, :3, 3], axis=0), axis=1).sum())
+    error = error.round(12)  # picometres: what is less comes of the arithmetic
     return TrajectoryError(
         count=len(error),
         min=float(error.min()),
@@ -122,47 +126,73 @@ def _span(stamps_ns: NDArray[np.int64]) -> str:
     return f"{stamps_ns[0] / 1e9:.3f} to {stamps_ns[-1] / 1e9:.3f} s"
 
 
-def dataset_trajectory(dataset: Dataset) -> tuple[NDArray[np.int64], Poses]:
-    """The poses of a recording; without times in it, the times that `tsfusion scan` would give.
+def dataset_trajectory(dataset: Dataset) -> tuple[NDArray[np.int64] | None, Poses]:
+    """The poses of a recording's frames.
 
     Returns:
-        (n,) timestamps in nanoseconds and (n, 4, 4) poses, of the frames that have one.
+        (n,) timestamps in nanoseconds, None where none were recorded, and (n, 4, 4) poses, NaN where a frame
+        has none.
 
     Raises:
         DatasetError: when no frame has.
     """
-    found = [(index, T) for index in range(len(dataset)) if (T := pose_of(dataset, index)) is not None]
-    if not found:
+    found = [pose_of(dataset, index) for index in range(len(dataset))]
+    if all(T is None for T in found):
         raise DatasetError(f"{dataset.name} has no poses to compare with; give a trajectory file")
-    stamps = dataset.timestamps_ns
-    times = [(index + 1) * NOMINAL_NS if stamps is None else int(stamps[index]) for index, _ in found]
-    return np.array(times, dtype=np.int64), np.array([T for _, T in found])
+    return dataset.timestamps_ns, np.array([np.full((4, 4), np.nan) if T is None else T for T in found])
 
 
 def paired(
     estimate: Path, reference: Path | Dataset, *, max_difference_s: float = 0.01
 ) -> tuple[Poses, Poses]:
-    """The poses of two files (or a file and a recording) that belong together: by time, else by line.
+    """The poses of two files (or a file and a recording) that belong together, and the log says which share.
+
+    They are paired by time where both have times; frames of a recording without times by the numbers that
+    `tsfusion scan` writes as times; else line by line.
 
     Raises:
-        DatasetError: when nothing can be paired, or without times for unequal numbers.
+        DatasetError: when less than half of the shorter one is paired, or without times for unequal numbers.
     """
     stamps, poses = read_poses(estimate)
     of_reference = read_poses(reference) if isinstance(reference, Path) else dataset_trajectory(reference)
-    reference_stamps, references = of_reference
-    if stamps is not None and reference_stamps is not None:
-        a, b = associate(stamps, reference_stamps, round(min(max_difference_s, 1e9) * 1e9))
+    times, references = of_reference
+    if times is None and not isinstance(reference, Path):
+        if stamps is not None and not (stamps % NOMINAL_NS).any():
+            times = NOMINAL_NS * np.arange(1, len(references) + 1, dtype=np.int64)
+        elif len(poses) != len(references):
+            references = _known(references)
+    if stamps is not None and times is not None:
+        ours, theirs = (np.isfinite(each[:, 0, 0]) for each in (poses, references))
+        poses, stamps, references, times = poses[ours], stamps[ours], references[theirs], times[theirs]
+        a, b = associate(stamps, times, round(min(max_difference_s, 1e9) * 1e9))
+        _tell_share(len(a), min(len(poses), len(references)), max_difference_s)
         return poses[a], references[b]
     if len(poses) != len(references):
         name = reference if isinstance(reference, Path) else reference.name
-        both = ((estimate, stamps), (name, reference_stamps))
-        timeless = " and ".join(str(each) for each, times in both if times is None)
+        timeless = " and ".join(str(each) for each, of in ((estimate, stamps), (name, times)) if of is None)
         raise DatasetError(
             f"{estimate} has {len(poses)} poses and {name} {len(references)}, to be paired line by line as "
             f"there are no times in {timeless}: give an estimate with times (TUM's format), and as reference "
             "a file with times or the dataset's folder"
         )
-    return poses, references
+    both = np.isfinite(poses[:, 0, 0]) & np.isfinite(references[:, 0, 0])
+    return poses[both], references[both]
+
+
+def _known(poses: Poses) -> Poses:
+    return poses[np.isfinite(poses[:, 0, 0])]
+
+
+def _tell_share(pairs: int, shorter: int, max_difference_s: float) -> None:
+    """Say how many poses have a partner; raise DatasetError below half."""
+    text = f"{pairs} of {shorter} poses have a partner within {max_difference_s:g} s"
+    if 2 * pairs < shorter:
+        raise DatasetError(
+            f"only {text}, too few for a figure of the whole: are both of one recording and clock? "
+            "--max-difference SECONDS allows more between the two"
+        )
+    if pairs < shorter:
+        log.warning("%s; the error is of these", text)
 
 
 _NARROWEST = 0.4  # of the view's longer side

@@ -62,7 +62,6 @@ def test_frames_without_a_pose_are_skipped_and_counted(tmp_path):
 @pytest.mark.parametrize(
     ("name", "content", "match"),
     [
-        ("frame-000001.depth.png", None, r"frame-000001\.depth\.png is missing"),
         ("frame-000001.color.png", None, r"frame-000001\.color\.png is missing; expected a colour image"),
         (SECOND_POSE, POSE.replace("0.5", "nan"), r"frame-000001\.pose\.txt:1: not finite"),
         (SECOND_POSE, POSE.replace("0.5", "0.5x"), r"pose\.txt:1: could not convert .*0\.5x"),
@@ -82,11 +81,13 @@ def test_a_broken_seven_scenes_folder_is_one_clear_line(tmp_path, name, content,
 
 def test_depth_saved_as_eight_bits_or_colour_of_another_size_is_refused(tmp_path):
     seven_scenes(tmp_path)
-    cv2.imwrite(str(tmp_path / "frame-000000.depth.png"), np.ones((6, 8), np.uint8))
+    for frame in range(3):
+        cv2.imwrite(str(tmp_path / f"frame-{frame:06d}.depth.png"), np.ones((6, 8), np.uint8))
     cv2.imwrite(str(tmp_path / "frame-000001.color.png"), np.ones((3, 4, 3), np.uint8))
     with pytest.raises(DatasetError, match=r"must hold one 16-bit channel or floats, got .* 8 bits"):
         SevenScenes(tmp_path)
-    cv2.imwrite(str(tmp_path / "frame-000000.depth.png"), np.ones((6, 8), np.uint16))
+    for frame in range(3):
+        cv2.imwrite(str(tmp_path / f"frame-{frame:06d}.depth.png"), np.ones((6, 8), np.uint16))
     dataset = SevenScenes(tmp_path)
     with pytest.raises(DatasetError, match=r"is 4×3, its depth image 8×6; expected equal .*color=false"):
         dataset[1]
@@ -125,7 +126,7 @@ def test_scannet_frames_that_the_tracker_lost_have_no_pose(tmp_path):
         (put("intrinsic/intrinsic_depth.txt", "1 0 0\n"), r"depth\.txt: 3 numbers; expected"),
         (put("pose/7.txt", "1 0 0 0\n"), r"pose/7\.txt must hold 4 rows of 4 numbers, got 1"),
         (put("pose/7.txt", matrix(np.eye(4)).replace("1.0", "2.0")), r"pose/7\.txt: T_world_camera must"),
-        (put("color/7.jpg", None), r"color/7\.png or \.jpg is missing, but .*depth/7\.png is there"),
+        (put("color/7.jpg", None), r"color/7\.png is missing; expected a colour image"),
         (put("color/7.jpg", ""), r"color/7\.jpg cannot be decoded"),
         (put("depth/0.png", None), r"holds no usable frames"),
         (put("intrinsic/intrinsic_color.txt", "1170 0 648\n0 1170 484\n0 0 1\n"),
@@ -180,7 +181,7 @@ def test_replica_without_its_camera_file_has_nice_slams_camera(tmp_path):
             put("cam_params.json", "{}"),
             r"cam_params\.json must hold camera: w, h, fx.*; KeyError|holds no named",
         ),
-        (put("room0/results/frame000001.jpg", None), r"frame000001\.jpg is missing, but .*depth000001\.png"),
+        (put("room0/results/frame000001.jpg", None), r"frame000001\.jpg is missing; expected a colour image"),
         (
             put("cam_params.json", None),
             r"is not known \(that of NICE-SLAM's Replica is published for 1200×680",
@@ -201,7 +202,7 @@ def test_a_broken_replica_scene_is_one_clear_line(tmp_path, change, match):
     [
         (put("poses.txt", (ROW + "\n") * 2), r"poses\.txt has 2 poses for 3 depth images"),
         (put("poses.txt", ROW + "\n" + ROW.replace("0.5", "inf") + "\n" + ROW), r"poses\.txt:2: not finite"),
-        (put("images/00001.png", None), r"00001\.png or \.jpg is missing, but .*depth"),
+        (put("images/00001.png", None), r"00001\.png is missing; expected a colour image"),
         (put("K.txt", None), r"is not known: no .*K\.txt.*; give --intrinsics"),
     ],
 )
@@ -209,8 +210,7 @@ def test_a_broken_hololens_folder_is_one_clear_line(tmp_path, change, match):
     hololens(tmp_path / "h")
     assert [int(keyframe.depth[0, 0]) for keyframe in HoloLens(tmp_path / "h")] == [7, 8, 9]
     change(tmp_path / "h")
-    with pytest.raises(DatasetError, match=match):
-        list(HoloLens(tmp_path / "h"))
+    one_line(lambda: list(HoloLens(tmp_path / "h")), match)
 
 
 def test_redwood_poses_go_by_number_unless_there_are_as_many_images(tmp_path):

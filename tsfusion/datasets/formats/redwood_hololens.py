@@ -112,6 +112,8 @@ class HoloLens(DepthImages):
                 f"{root / 'poses.txt'} has {len(poses)} poses for {len(depth)} depth images; "
                 "expected as many: line k belongs to the k-th image"
             )
+        skipped: dict[str, int] = {}
+        depth, poses = keep_posed(depth, poses, posed=posed, skipped=skipped)
         super().__init__(
             f"HoloLens {root.name}",
             sensor=sensor,
@@ -119,7 +121,7 @@ class HoloLens(DepthImages):
             color=color_images(depth, root / "images", HOLOLENS_EXPECTED) if color else [],
             poses=poses,
             camera=find_camera(root, first_size(depth), intrinsics=intrinsics, calibration=calibration),
-            skipped={},
+            skipped=skipped,
             depth_scale=depth_scale,
         )
 
