@@ -22,9 +22,9 @@ from lab.evaluation.known_surfaces import (
     rounded,
 )
 from lab.evaluation.view_prediction import compare_views
+from lab.worlds import benchmark_worlds
 from tsfusion.core.config import SENSORS
 from tsfusion.datasets import Synthetic, open_dataset
-from tsfusion.datasets.synthetic import benchmark_worlds
 from tsfusion.evaluation import surface_error
 from tsfusion.geometry.keyframe import Intrinsics, Keyframe
 from tsfusion.geometry.measured_points import points_world

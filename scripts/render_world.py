@@ -17,10 +17,10 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from lab.worlds.rendered_recordings import record
 from tsfusion.core.errors import TsfusionError
 from tsfusion.datasets import Synthetic
 from tsfusion.datasets.synthetic.desk_world import STEPS
-from tsfusion.datasets.synthetic.rendered_recordings import record
 from tsfusion.datasets.synthetic.street_drive import DRIVES, StreetDrive
 
 

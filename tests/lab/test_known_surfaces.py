@@ -6,9 +6,10 @@ import pytest
 import trimesh
 
 from lab.evaluation.known_surfaces import ReferenceSurface, WorldSurface, edges_of, measure
+from lab.worlds import benchmark_worlds
 from tsfusion import Mesh
 from tsfusion.datasets import Synthetic
-from tsfusion.datasets.synthetic import benchmark_worlds, worlds
+from tsfusion.datasets.synthetic import worlds
 from tsfusion.geometry.measured_points import points_world
 
 VOXEL = 0.02

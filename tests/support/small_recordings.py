@@ -61,6 +61,21 @@ def kitti(root: Path, count: int = 4) -> Path:
     return root
 
 
+def round_a_block(file: Path) -> Path:
+    """Poses in KITTI's format: round a block of 40×30 m and a little on, in its axes (y down, z forward)."""
+    lines = []
+    for index in range(150):
+        way, share = divmod(index, 36)[0] % 4, index % 36 / 36
+        angle = -np.pi / 2 * (way + max(0.0, share - 0.75) * 4)
+        corner = [(0, 0), (0, 40), (-30, 40), (-30, 0)][way]
+        ahead = [(0, 0), (0, 40), (-30, 40), (-30, 0)][(way + 1) % 4]
+        x, z = np.array(corner) + share * (np.array(ahead) - corner)
+        y, cosine, sine = 0.02 * z, np.cos(angle), np.sin(angle)
+        lines.append(f"{cosine} 0 {sine} {x} 0 1 0 {y} {-sine} 0 {cosine} {z}")
+    file.write_text("\n".join(lines))
+    return file
+
+
 def hololens(root: Path, count: int = 3) -> Path:
     """Depth of (7 + frame) mm, all with one pose."""
     for name in ("depth", "images"):
