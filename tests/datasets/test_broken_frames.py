@@ -138,3 +138,15 @@ def test_fields_of_pcd_without_values_are_passed_over(tmp_path):
     )
     (tmp_path / "a.pcd").write_bytes(head.encode() + points.tobytes())
     assert (read_scan(tmp_path / "a.pcd").points == points).all()
+
+
+def test_a_folder_without_depth_is_refused_with_or_without_poses(tmp_path):
+    for name in ("depth", "color"):
+        (tmp_path / name).mkdir()
+        cv2.imwrite(str(tmp_path / name / "0.jpg"), np.zeros((6, 8, 3), np.uint8))
+    poses = tmp_path / "poses.txt"
+    poses.write_text(f"1 {IDENTITY}\n")
+    for options in ({"posed": False}, {"trajectory": poses}):
+        one_line(
+            lambda options=options: open_dataset(tmp_path, **options), "no usable frames; expected depth"
+        )

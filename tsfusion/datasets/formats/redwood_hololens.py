@@ -167,6 +167,7 @@ class Redwood(DepthImages):
         self.root = root = require_folder(path, "Redwood")
         beside = {} if _depth_folders(root) else _only_series(root)
         files = [*beside] or depth_images(_depth_folder(root), REDWOOD_EXPECTED)
+        require_frames(len(files), root, REDWOOD_EXPECTED, {})
         files, times = in_time(files, _names(files))
         log = _log(root) if trajectory is None else Path(trajectory)
         if log is not None and not log.is_file():
