@@ -204,7 +204,7 @@ def write_page(
         + ", ".join(world.title for world in found.worlds),
         verdict=f"{met} of {len(made)} claims are met as tested here"
         + (f"; {len(unknown)} could not be measured" if unknown else "") + ".",
-        missed=bool(unknown), warnings=_warnings(limits, told), tiles=_tiles(found),
+        level="bad" if unknown else "good", warnings=_warnings(limits, told), tiles=_tiles(found),
         footer=f"From {folder}/run.json. This file needs no network and no other file.",
     )  # fmt: skip
     shown.sections = [

@@ -21,7 +21,8 @@ STATS = ClientStats(
     [
         ({}, ""),
         ({"skipped": {"thinned": 5, "dropped": 1}}, ""),  # which a policy asked for
-        ({"rejected": {"no_samples": 5}}, ""),
+        ({"rejected": {"no_samples": 5}}, ""),  # there was nothing to lose
+        ({"rejected": {"KeyframeTooLarge": 1}}, "the map took 9 of 10 keyframes only: all too far"),
         (
             {"waiting": 3},
             "3 keyframes are not at the server (no server answers), but in SPOOL; check",
@@ -43,10 +44,13 @@ def test_what_is_not_at_the_server_or_in_its_map(changed: dict[str, Any], words:
     assert bool(words) == bool(found)
 
 
-def test_most_frames_lost() -> None:
-    assert shortfall.of_tracking(40, 20, "dark") == ""
-    found = shortfall.of_tracking(40, 19, "dark")
-    assert found.startswith("only 19 of 40 frames were localised (dark): move more slowly")
+def test_frames_lost() -> None:
+    assert shortfall.of_tracking(40, 38, "dark") == ""
+    found = shortfall.of_tracking(40, 37, "dark")
+    assert found.startswith(
+        "the sensor was lost (dark): only 37 of 40 frames were localised; move more slowly"
+    )
+    assert "40 of 40 frames were localised, in 2 maps" in shortfall.of_tracking(40, 40, "dark", maps=2)
     late = shortfall.of_tracking(40, 19, "late", localizer="feed")
     assert "send poses sooner" in late
     assert "slowly" not in late
@@ -54,8 +58,31 @@ def test_most_frames_lost() -> None:
     assert shortfall.together(["", found, "", "more"]) == f"{found}; more"
 
 
-def test_most_frames_without_a_pose() -> None:
-    assert shortfall.of_poses(20, {"without a pose in time": 20, "without depth": 90}) == ""
+@pytest.mark.parametrize(
+    ("changed", "level", "headline"),
+    [
+        ({}, "good", "Complete: all 90 keyframes were fused."),
+        ({"missed": "lost"}, "bad", "Lost"),
+        ({"complete": False}, "notice", "90 of 90 keyframes were fused; the source was not read to its end."),
+        ({"keyframes_fused": 89, "keyframes_rejected": {"no_samples": 1}}, "notice",
+         "89 of 90 keyframes were fused; not in the map: 1 × no_samples."),
+        ({"frames": 100, "frames_tracked": 99}, "notice",
+         "90 of 90 keyframes were fused; 1 frame was not localised."),
+        ({"warnings": ["the colour is late"]}, "notice", "90 of 90 keyframes were fused; see the warnings."),
+        ({"keyframes_fused": 2, "keyframes_durable": 90}, "good",
+         "Complete: all 90 keyframes are at the server, 2 fused so far."),
+        ({"keyframes_fused": 2}, "notice", "2 of 90 keyframes were fused."),
+    ],
+)  # fmt: skip
+def test_a_run_is_as_good_as_its_worst_finding(changed: dict[str, Any], level: str, headline: str) -> None:
+    record = {"keyframes_sent": 90, "keyframes_fused": 90, "missed": "", **changed}
+    found = shortfall.verdict(record)
+    assert (found.level, found.headline) == (level, headline)
+
+
+def test_many_frames_without_a_pose() -> None:
+    assert shortfall.of_poses(39, {"without a pose in time": 2, "without depth": 90}) == ""
+    assert shortfall.of_poses(45, {"without a pose": 15}).startswith("only 45 of 60 frames have a pose")
     found = shortfall.of_poses(20, {"without a pose in time": 20, "without a pose": 1})
     assert found.startswith("only 20 of 41 frames have a pose")
     assert "--trajectory FILE" in found

@@ -2,11 +2,14 @@
 """Progress of a run on stderr: a table that moves on a terminal, plain lines elsewhere, or nothing."""
 
 import logging
+import os
+import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
+from types import FrameType
 from typing import TYPE_CHECKING
 
 import typer
@@ -24,6 +27,7 @@ if TYPE_CHECKING:
 
 _LINE_INTERVAL = 2.0  # seconds between plain lines
 _DRAWINGS = 5  # of a table, a second
+_ENDING = b"\nending: what is on its way is finished (press Ctrl-C again to end at once)\n"
 
 
 def shown(*, quiet: bool) -> "Quiet":
@@ -38,6 +42,30 @@ def reading(text: str, *, quiet: bool) -> Iterator[Callable[[int, int], None]]:
     """A function that takes the bytes read and all bytes, and shows them after `text`."""
     with shown(quiet=quiet) as display:
         yield partial(display.show_bytes, text)
+
+
+@contextmanager
+def ended_by_signals(end: Callable[[], object]) -> Iterator[None]:
+    """Call `end` at the first Ctrl-C or SIGTERM: the run ends as at the end of a recording.
+
+    The second one interrupts as usual.
+    """
+    before = {signum: signal.getsignal(signum) for signum in (signal.SIGINT, signal.SIGTERM)}
+
+    def stop(signum: int, frame: FrameType | None) -> None:
+        for each, handler in before.items():
+            signal.signal(each, handler)
+        end()
+        with suppress(OSError):  # of a reader that went away
+            os.write(2, _ENDING)  # safe inside a handler, which `print` is not
+
+    for signum in before:
+        signal.signal(signum, stop)
+    try:
+        yield
+    finally:
+        for signum, handler in before.items():
+            signal.signal(signum, handler)
 
 
 class Quiet:

@@ -2,6 +2,7 @@
 """`tsfusion replay` and `tsfusion demo`."""
 
 from pathlib import Path
+from threading import Event
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -45,9 +46,7 @@ def replay(
     unpack: options.Unpack = False,
     check_: Annotated[
         bool,
-        options.option(
-            "--check/--no-check", None, "Warn when poses, camera and depth disagree; status 1.", rare=True
-        ),
+        options.option("--check/--no-check", None, "Stop when poses, camera and depth disagree.", rare=True),
     ] = True,
     up: options.UpDirection = None,
     keep_islands: options.KeepIslands = None,
@@ -82,7 +81,7 @@ def replay(
     missed = [shortfall.of_poses(posed, dataset.skipped), shortfall.of_absence(absent)]
     doubt, warnings = _checked(dataset) if check_ and not _is_synthetic(path) else ("", [])
     if doubt:
-        missed.append(f"the map is likely wrong (--no-check accepts it): {doubt}")
+        missed.insert(0, f"the map is wrong in places (--no-check accepts it): {doubt}")
     client = options.client_settings(
         chosen, connect, control=control, map=map_, key=key, server_key=server_key
     )
@@ -147,11 +146,14 @@ def _is_synthetic(path: Path) -> bool:
 
 
 def _checked(dataset: "Dataset") -> tuple[str, list[str]]:
-    """Mistake because of which poses, camera and depth disagree, empty = none; and other oddities.
+    """Mistake in a part of the poses, empty = none; and other oddities.
 
     What was not said when the recording was found is printed on stderr.
+
+    Raises:
+        IncompleteRun: where poses, camera or depth are wrong in the whole recording.
     """
-    from tsfusion.core.errors import DatasetError, JournalError
+    from tsfusion.core.errors import DatasetError, IncompleteRun, JournalError
     from tsfusion.datasets.dataset import first_frame
     from tsfusion.evaluation import pose_check
 
@@ -160,6 +162,8 @@ def _checked(dataset: "Dataset") -> tuple[str, list[str]]:
     except (DatasetError, JournalError):  # the replay comes to that frame, and tells
         return "", []
     doubt = report.text if report.verdict == "disagree" else ""
+    if doubt and report.frames is None:
+        raise IncompleteRun(f"nothing is fused, as {doubt} (--no-check fuses it all the same)")
     warnings = [report.color] if report.color is not None and not doubt else []
     for line in filter(None, [doubt, *warnings]):
         output.text(f"warning: {line}", err=True)
@@ -212,10 +216,12 @@ def _run(
     from tsfusion.cli import progress, run_page, run_summary
     from tsfusion.pipelines.replay import replay as run
 
-    with progress.shown(quiet=json) as display:
+    end = Event()
+    with progress.ended_by_signals(end.set), progress.shown(quiet=json) as display:
         result = run(
-            dataset, out, viewer=run_page.beside(view, display, truth=truth), progress=display, **settings
-        )
+            dataset, out, viewer=run_page.beside(view, display, truth=truth), progress=display,
+            ended=end.is_set, **settings,
+        )  # fmt: skip
     if json:
         output.as_json(result)
     else:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 from tsfusion.cli import output
 from tsfusion.cli.output import counted, grouped, size
 from tsfusion.core.counts import count_of
+from tsfusion.core.headline import MARKS
 from tsfusion.wire.messages import explained
 
 if TYPE_CHECKING:
@@ -34,16 +35,13 @@ def print_replay(run: "ReplaySummary") -> None:
         lines.insert(1, f"not in map {explained(run.keyframes_rejected)}")
     if run.frames_skipped:
         lines.insert(1, f"left out   {counted(run.frames_skipped)}")
-    if run.camera:
-        lines.insert(0, f"camera     {run.camera}")
     if run.accuracy is not None:
         error = run.accuracy
         lines.append(
             f"accuracy   mean {error.mean_mm:.2f} mm, p50 {error.p50_mm:.2f}, p95 {error.p95_mm:.2f} mm "
             "from the known surface"
         )
-    lines.append(_results(run.folder))
-    output.text("\n".join(lines), indent=11)
+    output.text("\n".join([*_head(run), *lines, _results(run.folder)]), indent=11)
 
 
 def print_scan(result: "ScanSummary", spool: Path, connect: str | None) -> None:
@@ -64,8 +62,6 @@ def print_scan(result: "ScanSummary", spool: Path, connect: str | None) -> None:
         if delay.count
         else "delay      not known: nothing was fused yet",
     ]
-    if result.camera:
-        lines.insert(0, f"camera     {result.camera}")
     if result.frames_skipped:
         lines.append(f"left out   {counted(result.frames_skipped)}")
     if result.keyframes_rejected:
@@ -82,8 +78,7 @@ def print_scan(result: "ScanSummary", spool: Path, connect: str | None) -> None:
         lines.append(
             f"mesh       tsfusion mesh {connect} {result.maps[0].name}.glb --map {result.maps[0].name}"
         )
-    lines.append(_results(result.folder))
-    output.text("\n".join(lines), indent=11)
+    output.text("\n".join([*_head(result), *lines, _results(result.folder)]), indent=11)
 
 
 def _results(folder: str) -> str:
@@ -125,8 +120,16 @@ def check(run: "ReplaySummary | ScanSummary") -> None:
     """Raise IncompleteRun when the run has missed what it was for: the last line, and status 1."""
     from tsfusion.core.errors import IncompleteRun
 
-    if run.missed:
-        raise IncompleteRun(run.missed)
+    if run.verdict is not None and run.verdict.level == "bad":
+        raise IncompleteRun(run.verdict.text)
+
+
+def _head(run: "ReplaySummary | ScanSummary") -> list[str]:
+    """The verdict with its sign, unless `check` is to say it, and the camera: a line each."""
+    camera, verdict = [f"camera     {run.camera}"] if run.camera else [], run.verdict
+    if verdict is None or verdict.level == "bad":
+        return camera
+    return [f"{MARKS[verdict.level]} {verdict.headline}", *camera]
 
 
 def _map_lines(found: "MapResult", *, given: bool) -> list[str]:

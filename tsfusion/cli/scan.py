@@ -1,13 +1,8 @@
 # SPDX-License-Identifier: MIT
 """`tsfusion scan`."""
 
-import os
-import signal
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -19,7 +14,6 @@ if TYPE_CHECKING:
     from tsfusion.datasets import Dataset
     from tsfusion.scanner.sources.source import Source
 
-_ENDING = b"\nending: what is on its way is finished (press Ctrl-C again to end at once)\n"
 _pose_option = partial(options.option, panel="Poses", rare=True)
 _keyframe_option = partial(options.option, panel="Keyframes", rare=True)
 
@@ -128,7 +122,7 @@ def scan(
     if waits_for := getattr(opened, "waits_for", str)():
         poses = settings["trajectory"] or settings["feed"] or "found from the frames"
         typer.echo(f"{waits_for}; poses: {poses}", err=True)
-    with opened, _ended_by_signals(opened), progress.shown(quiet=json) as display:
+    with opened, progress.ended_by_signals(opened.close), progress.shown(quiet=json) as display:
         usual = getattr(opened, "usual", None)
         chosen = options.configuration_for(
             opened.sensor, config, usual=usual, tell=connect is None, **settings
@@ -287,27 +281,3 @@ def _warnings(dataset: "Dataset") -> list[str]:
         color += "; where the sensor is lost because of it, --option color=false tracks by the depth alone"
         output.text(f"warning: {color}", err=True)
     return [text for text in (color, untimed) if text]
-
-
-@contextmanager
-def _ended_by_signals(source: "Source") -> Iterator[None]:
-    """Close the source at the first Ctrl-C or SIGTERM: the scan ends as at the end of a recording.
-
-    The second one interrupts as usual.
-    """
-    before = {signum: signal.getsignal(signum) for signum in (signal.SIGINT, signal.SIGTERM)}
-
-    def stop(signum: int, frame: FrameType | None) -> None:
-        for each, handler in before.items():
-            signal.signal(each, handler)
-        source.close()
-        with suppress(OSError):  # of a reader that went away
-            os.write(2, _ENDING)  # safe inside a handler, which `print` is not
-
-    for signum in before:
-        signal.signal(signum, stop)
-    try:
-        yield
-    finally:
-        for signum, handler in before.items():
-            signal.signal(signum, handler)

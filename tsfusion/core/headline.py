@@ -9,7 +9,7 @@ from tsfusion.core.counts import count_of
 from tsfusion.core.readable_numbers import span
 
 Level = Literal["good", "notice", "bad"]
-_MARKS: dict[Level, str] = {"good": "✓", "notice": "!", "bad": "✗"}
+MARKS: dict[Level, str] = {"good": "✓", "notice": "!", "bad": "✗"}
 _FEW = 3  # keyframes under way are no delay, however slow the map is: one travels, one waits, one is fused
 _SOON = 1.0  # seconds: what is fused within these is no delay either, however many keyframes it is
 
@@ -54,8 +54,8 @@ class Headline(Struct, frozen=True, kw_only=True):
     @property
     def mark(self) -> tuple[str, Level]:
         """The sign of the worst of the three answers."""
-        level = max((level for _, level in self.parts), key=list(_MARKS).index)
-        return _MARKS[level], level
+        level = max((level for _, level in self.parts), key=list(MARKS).index)
+        return MARKS[level], level
 
     @property
     def words(self) -> str:

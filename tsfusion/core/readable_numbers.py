@@ -1,10 +1,17 @@
 # SPDX-License-Identifier: MIT
 """Numbers as a person reads them."""
 
+from decimal import Decimal
+
 
 def grouped(number: float) -> str:
     """1234567 → 1 234 567."""
     return f"{number:,.0f}".replace(",", "\u202f")
+
+
+def figure(number: float, digits: int = 2) -> str:
+    """Rounded to some digits, without an exponent: 148.3 → 150, 0.0513 → 0.051."""
+    return f"{Decimal(f'{number:.{digits}g}'):f}"
 
 
 def size(count: float) -> str:

@@ -21,6 +21,7 @@ MIN_RESIZED = 1.15  # factor between two sizes of an image below which they are 
 SAME_FACTOR = 0.1  # difference of the factors of width and height that counts as none
 USUAL_SIZES = (0.25, 1 / 3, 0.5, 2 / 3, 1.5, 2.0, 3.0, 4.0)
 UNEQUAL_FOCAL = 0.03  # difference of fx and fy, of fx, above which they may have been exchanged
+MAX_FOCAL_SIGMA = 0.1  # of the focal length, beyond which nobody can tell it
 MIN_SHARE_OF_BEST = 0.8  # fit over the best fit near it, with the camera found
 OUTSIDE = 0.45  # of the image's side, from its centre: a principal point there belongs to another image
 _ALONG_RAY = (
@@ -140,7 +141,7 @@ def best_camera(
     for mistake in likely:
         fits = _fits_with(mistake, pairs, motions)
         tried.append((sure_gain(fits, given), mistake, fits))
-    if focal is not None:
+    if focal is not None and focal.sigma <= MAX_FOCAL_SIGMA:
         tried.append((focal.gain, _focal_mistake(K, focal), focal.fits))
     most = max(gain for gain, _, _ in tried)
     gain, camera, fits = next(

@@ -26,6 +26,8 @@ GOOD_AGREEMENT = 1.7  # at least: colour lies on the depth
 MIN_LEAD = 0.3  # by which edges must agree better elsewhere than where they are
 MIN_TIME_LEAD = 0.15  # the same, with the colour of the frame before or after
 MIN_VOTES = 0.8  # share of the frames of which that holds
+MIN_ERRORS = 3.0  # standard errors by which edges must agree better, too
+SAME_SHIFT = 3  # of these pixels: what half of the frames' own shifts may differ from the common one, at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +106,7 @@ def _other_time(seen: Mapping[int, Outlines]) -> str | None:
     after = np.array([_agreement(a, b) for a, b in neighbours])
     before = np.array([_agreement(b, a) for a, b in neighbours])
     for other, way in ((after, "late"), (before, "early")):
-        if (other - own).mean() > MIN_TIME_LEAD and (other > own).mean() >= MIN_VOTES:
+        if _is_sure(other - own, MIN_TIME_LEAD):
             neighbour = "after" if way == "late" else "before"
             return (
                 f"the colour is about one frame {way}: the depth's edges lie on those of the colour image "
@@ -132,7 +134,10 @@ def _other_place(seen: list[Outlines]) -> str | None:
     mean = agreement[scale].mean(axis=0)
     row, column = np.unravel_index(int(mean.argmax()), mean.shape)
     there = agreement[scale][:, row, column]
-    if (there - here).mean() < MIN_LEAD or (there > here).mean() < MIN_VOTES:
+    own = np.array([np.unravel_index(int(each.argmax()), each.shape) for each in agreement[scale]])
+    stray = np.abs(own - [row, column]).max(axis=1)
+    at_border = {int(row), int(column)} & {0, 2 * MAX_SHIFT}  # and better beyond, perhaps
+    if at_border or not _is_sure(there - here, MIN_LEAD) or np.median(stray) > SAME_SHIFT:
         return None
     shift = (int(column) - MAX_SHIFT) * seen[0].pixel, (int(row) - MAX_SHIFT) * seen[0].pixel
     return (
@@ -140,6 +145,13 @@ def _other_place(seen: list[Outlines]) -> str | None:
         "not touched, but its colours will be misplaced: register colour and depth before (cameras' own "
         "software does it: align, registered, transformed)"
     )
+
+
+def _is_sure(leads: NDArray[np.floating], least: float) -> bool:
+    """Whether edges agree better elsewhere in nearly all frames, and by more than chance."""
+    error = float(leads.std(ddof=1)) / np.sqrt(len(leads))
+    mean = float(leads.mean())
+    return bool(mean > max(least, MIN_ERRORS * error) and (leads > 0).mean() >= MIN_VOTES)
 
 
 def _agreement_by_shift(seen: list[Outlines], scale: float) -> NDArray[np.float32]:

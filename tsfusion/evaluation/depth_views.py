@@ -2,6 +2,7 @@
 """The surface that one frame measured, and the deviation of other frames' points from it."""
 
 from copy import copy
+from functools import cached_property
 from typing import Any, Protocol
 
 import cv2
@@ -26,6 +27,8 @@ GROUND_SLICE = 0.03  # of the range: thickness of the slice that holds the groun
 MIN_GROUND_SHARE = 0.25  # share of the points in one such slice that makes it the ground
 MAX_DISTANCE = 1e6  # metres; points beyond it are invalid
 MAX_TREE_POINTS = 20_000  # of a scan that others are compared with
+NEIGHBOURS = 12  # of a scan's point that show the plane through it: on its ring and on the next ones
+FLAT = 0.2  # of a neighbourhood's width: its thickness at most, and its breadth at least, to show a plane
 EXACT_KD_TREE = 4  # FLANN_INDEX_KDTREE_SINGLE
 _CELL_HASH = np.array([0x9E3779B97F4A7C1, 0x2545F4914F6CDD1D, 0x1B873593CC9E2D51])  # wraps at 64 bits
 _MIN_Z = 1e-6  # metres: a point nearer than this is behind the camera
@@ -178,7 +181,11 @@ def _without_edges(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 
 class _ScanView:
-    """Points of a LiDAR without the ground, which would fit itself under many wrong motions."""
+    """Points of a LiDAR without the ground, which would fit itself under many wrong motions.
+
+    Rings go with the sensor, so that with the distance to the nearest point alone scans fit best where it has
+    not moved: the surface is the plane through neighbouring points, and nobody knows it beside a single ring.
+    """
 
     camera: Intrinsics | None = None
     stereo = False
@@ -191,7 +198,7 @@ class _ScanView:
         self.range_m = float(np.median(np.linalg.norm(finite, axis=1))) if len(finite) else 0.0
         kept = _one_per_cell(_above_ground(finite, self.range_m), max(SCAN_CELL * self.range_m, 1e-6))
         kept = _evenly_chosen(kept, MAX_TREE_POINTS)
-        self._tree = _kd_tree(kept) if len(kept) else None
+        self._kept, self._tree = kept, _kd_tree(kept) if len(kept) else None
         self._box = (kept.min(axis=0), kept.max(axis=0)) if len(kept) else (np.zeros(3), np.zeros(3))
         self.points = np.ascontiguousarray(_evenly_chosen(kept, MAX_POINTS // 2).T)
 
@@ -205,10 +212,34 @@ class _ScanView:
         near = ((rows >= self._box[0]) & (rows <= self._box[1])).all(axis=1)
         deviation = np.full(len(rows), np.inf)
         if near.any():
-            _, squared = self._tree.knnSearch(rows[near].astype(np.float32), 1, params={})
+            found, squared = self._tree.knnSearch(rows[near].astype(np.float32), 1, params={})
+            normals, reach = self._planes
+            nearest = found[:, 0]
+            off = np.abs(((rows[near] - self._kept[nearest]) * normals[nearest]).sum(axis=1))
+            aside = np.sqrt(np.maximum(squared[:, 0] - off**2, 0))
             tolerance = LIDAR_TOLERANCE + 0.005 * self.range_m + 0.01 * np.linalg.norm(rows[near], axis=1)
-            deviation[near] = np.sqrt(squared[:, 0]) / tolerance
+            deviation[near] = np.hypot(off, np.maximum(aside - reach[nearest], 0)) / tolerance
+            deviation[~np.isfinite(deviation)] = np.inf
         return deviation
+
+    @cached_property
+    def _planes(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Normal of the plane through each point, and its reach, metres.
+
+        Both are zero where points lie in no plane, and NaN along a single ring.
+        """
+        assert self._tree is not None
+        count = min(NEIGHBOURS, len(self._kept))
+        found, squared = self._tree.knnSearch(self._kept.astype(np.float32), count, params={})
+        around = self._kept[found]
+        around -= around.mean(axis=1, keepdims=True)
+        spread, axes = np.linalg.eigh(around.transpose(0, 2, 1) @ around)
+        thick, broad, wide = np.sqrt(np.maximum(spread, 0)).T
+        is_flat = (thick < FLAT * broad) & (broad > FLAT * wide)
+        known = is_flat.astype(np.float64)
+        upright = np.abs(axes[:, 1 + int(np.argmin(self._kept[:, 1:].std(axis=0))), 2])
+        known[(broad <= FLAT * wide) & (upright < 0.5)] = np.nan
+        return axes[:, :, 0] * known[:, None], np.sqrt(squared[:, -1]) * known
 
 
 def _evenly_chosen(points: NDArray[np.float64], count: int) -> NDArray[np.float64]:

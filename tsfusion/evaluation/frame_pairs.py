@@ -28,6 +28,7 @@ MIN_GAIN = 0.1  # by which a correction must fit better, on average
 MIN_BETTER = 0.7  # share of the pairs that must fit better
 FIRST_STEP = 0.03  # radians, and metres per metre of depth
 STEP_ROUNDS = 8
+STRAY_PRICE = 0.5  # fit that a correction must gain for each metre over the depth, and each radian
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,11 +66,15 @@ class FramePair:
         first, second = (intended(T) for T in self.poses)
         return np.asarray(np.linalg.inv(second) @ first, np.float64)
 
-    def fit(self, motion: Motion) -> float:
-        """Fit of the first frame's points to the second's surface, 0 to 1; 0 if too few can be compared."""
-        return self.fit_of_shared(motion) or 0.0
+    def fit(self, motion: Motion, tolerance: float = 1.0) -> float:
+        """Fit of the first frame's points to the second's surface, 0 to 1; 0 if too few can be compared.
 
-    def fit_of_shared(self, motion: Motion) -> float | None:
+        Args:
+            tolerance: over that of the sensors.
+        """
+        return self.fit_of_shared(motion, tolerance) or 0.0
+
+    def fit_of_shared(self, motion: Motion, tolerance: float = 1.0) -> float | None:
         """The fit of the first frame's points to the second's surface; None if too few can be compared."""
         points = motion[:3, :3] @ self.first_view.points
         points += motion[:3, 3:]
@@ -77,8 +82,14 @@ class FramePair:
         compared = np.count_nonzero(np.isfinite(deviation))
         if compared < MIN_COMPARED * len(deviation):
             return None
-        fits = 1 - deviation * deviation
+        fits = 1 - (deviation / tolerance) ** 2
         return float(np.maximum(fits, 0, out=fits).sum()) / compared
+
+    def shift(self, motion: Motion, other: Motion) -> float:
+        """Median distance between the first frame's points after one motion and after another, metres."""
+        points = self.first_view.points
+        difference = (motion - other)[:3]
+        return float(np.median(np.linalg.norm(difference[:, :3] @ points + difference[:, 3:], axis=0)))
 
     def seen_by(self, camera: Intrinsics, *, along_ray: bool = False) -> "FramePair":
         """The pair if another camera had measured it, or along each pixel's ray."""
@@ -94,7 +105,7 @@ def wanted_pairs(count: int) -> list[tuple[int, int]]:
     return [(first, first + gap) for first in anchors for gap in PAIR_GAPS if first + gap < count]
 
 
-def seen_frames(dataset: Dataset, wanted: Sequence[tuple[int, int]]) -> dict[int, SeenFrame]:
+def seen_frames(dataset: Dataset, wanted: Sequence[tuple[int, ...]]) -> dict[int, SeenFrame]:
     """The frames of some pairs by index, each read once, without those that cannot be read.
 
     Raises:
@@ -153,14 +164,37 @@ def scaled_motion(motion: Motion, factor: float) -> Motion:
 
 def best_fits_near(pairs: Sequence[FramePair], motions: Sequence[Motion]) -> Fits:
     """The best fit of each pair that small corrections of its motion reach."""
-    return np.array([_best_fit_near(pair, motion) for pair, motion in zip(pairs, motions, strict=True)])
+    return np.array([best_near(pair, motion)[0] for pair, motion in zip(pairs, motions, strict=True)])
 
 
-def _best_fit_near(pair: FramePair, motion: Motion) -> float:
-    """The best fit that small corrections of a motion reach (hill climbing); 0 where it starts from 0."""
-    best = pair.fit(motion)
+def best_near(pair: FramePair, motion: Motion, *, coarse: Sequence[float] = ()) -> tuple[float, Motion]:
+    """The best fit that small corrections of a motion reach (hill climbing), and that motion.
+
+    The fit is 0 where it starts from 0.
+
+    Args:
+        coarse: tolerances over the sensors' own with which to climb before, from far off; then a correction
+            must be worth its size, or it would slide along a wall that shows nothing of it.
+    """
+    given, price = motion, STRAY_PRICE if coarse else 0.0
+
+    def worth(motion: Motion, tolerance: float) -> float:
+        fit = pair.fit(motion, tolerance)
+        if not price or not fit:
+            return fit
+        stray = motion - given
+        size = np.linalg.norm(stray[:3, 3]) / pair.second_view.range_m + np.linalg.norm(stray[:3, :3])
+        return max(1e-9, fit - price * float(size))
+
+    for tolerance in (*coarse, 1.0):
+        motion = _climb(pair, motion, partial(worth, tolerance=tolerance))
+    return pair.fit(motion), motion
+
+
+def _climb(pair: FramePair, motion: Motion, worth: Callable[[Motion], float]) -> Motion:
+    best = worth(motion)
     if best == 0:
-        return 0.0
+        return motion
     steps = np.array([FIRST_STEP * pair.second_view.range_m] * 3 + [FIRST_STEP] * 3)
     for _ in range(STEP_ROUNDS):
         before = best
@@ -168,12 +202,12 @@ def _best_fit_near(pair: FramePair, motion: Motion) -> float:
         for of_axis in corrections:
             for correction in of_axis:
                 moved = correction @ motion
-                if (fit := pair.fit(moved)) > best:
+                if (fit := worth(moved)) > best:
                     motion, best = moved, fit
                     break
         if best == before:
             steps /= 2
-    return best
+    return motion
 
 
 def share_of_best(given: Fits, best: Fits) -> float:

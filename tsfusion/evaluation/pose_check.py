@@ -3,8 +3,9 @@
 
 Where they do not fit, the poses are corrected for each usual mistake (poses inverted, OpenGL axes, wrong
 units, …) and the camera for its own (`camera_check`); what fits clearly better is named. Without such a
-mistake, small corrections of the poses show whether the measurements could fit better. Where the sensor
-hardly moves, or the frames share no surface, the verdict is `cannot tell`.
+mistake, small corrections of the poses show whether the measurements could fit better; `trajectory_check`
+looks for a jump and for drift. Where the sensor hardly moves, or the frames share no surface, the verdict is
+`cannot tell`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 
 from tsfusion.datasets.dataset import Dataset, frame_of, readable
 from tsfusion.evaluation.camera_check import (
+    MAX_FOCAL_SIGMA,
     CameraMistake,
     best_camera,
     centre_doubt,
@@ -59,6 +61,7 @@ from tsfusion.evaluation.pose_mistakes import (
     scale_text,
 )
 from tsfusion.evaluation.time_shift import time_shift, time_text
+from tsfusion.evaluation.trajectory_check import find_fault
 
 Verdict = Literal["agree", "disagree", "cannot tell"]
 
@@ -66,7 +69,6 @@ MIN_LEAD = 0.05  # by which the poses must fit better than the median mistake, o
 MIN_EVIDENCE = 0.2  # share of the pairs that must fit, or nobody can tell
 MIN_UNEXPLAINED_PAIRS = 2  # which small corrections make fit
 MIN_MISFIT_PAIRS, MAX_MISFIT = 3, 0.3  # pairs that see one place, and the fit that none of them reaches
-MAX_FOCAL_SIGMA = 0.1  # of the focal length, beyond which nobody can tell it
 MIN_SHARE_OF_BEST = 0.8  # fit over the best fit near it: less is a disagreement
 TIME_SHIFT_BELOW = 0.97  # share of the best fit below which shifted times are tried
 AS_LIKELY = 0.8  # of the gain by the best explanation: another one is named too
@@ -89,7 +91,8 @@ class PoseCheckReport:
     text: str  # one or two sentences: what is wrong and what to do
     # What is wrong: a name in `MISTAKES`, `scale`, `time`, `point times`, `depth unit`, of the camera
     # (`focal length`, `image size`, `exchanged centre`, `principal point`, `exchanged focal lengths`,
-    # `unequal focal lengths`, `depth along rays`) or `unexplained`; None when they agree
+    # `unequal focal lengths`, `depth along rays`), `jump` or `drift` (in a part of the recording), or
+    # `unexplained`; None when they agree
     mistake: str | None = None
     alternatives: tuple[str, ...] = ()  # other mistakes whose correction fits as well
     fitting_camera: tuple[float, float, float, float] | None = None  # that fits, where it is wrong
@@ -98,6 +101,8 @@ class PoseCheckReport:
     color: str | None = None  # how the colour lies off the depth; None where it does not, or nobody can tell
     factor: float | None = None  # for `scale`, what translations must be multiplied by
     shift: float | None = None  # for `time`, frames later whose pose each frame should have
+    frames: tuple[int, int] | None = None  # for `jump` and `drift`, indices of the frames between which it is
+    metres: float | None = None  # by how much
     pairs: int = 0  # number of pairs of frames compared
     fit: float | None = None  # 0 to 1, how well the pairs fit as given; 1 = far within the sensors' tolerance
     best_fit: float | None = None  # the fit after small corrections
@@ -106,9 +111,9 @@ class PoseCheckReport:
 
 
 def check(dataset: Dataset) -> PoseCheckReport:
-    """Compare neighbouring frames of a dataset, as given and corrected for usual mistakes.
+    """Compare neighbouring frames of a dataset, as given and corrected for usual mistakes, then distant ones.
 
-    Takes about a second, of a LiDAR two; reads about 20 frames.
+    Takes one or two seconds, of a LiDAR some more; reads 20 to 50 frames.
 
     Raises:
         DatasetError: a frame cannot be read.
@@ -122,6 +127,8 @@ def check(dataset: Dataset) -> PoseCheckReport:
         return replace(report, verdict="disagree", text=doubt, mistake="depth unit")
     if report.verdict != "disagree":
         report = _with_doubt(report, frames, pairs)
+    if report.mistake in (None, "unexplained"):
+        report = _with_fault(report, dataset, dict(frames))
     color = misplaced_color({index: frame.outlines for index, frame in frames.items()})
     if color is None:
         return report
@@ -171,6 +178,24 @@ def _with_doubt(
         alternatives=(),
         fitting_camera=msgspec.structs.astuple(likely.camera),
     )
+
+
+def _with_fault(report: PoseCheckReport, dataset: Dataset, frames: dict[int, SeenFrame]) -> PoseCheckReport:
+    """The report with the place where the trajectory is wrong; as it was where none surely is."""
+
+    def compare(first: int, second: int) -> FramePair | None:
+        unread = [index for index in (first, second) if index not in frames]
+        frames.update(seen_frames(dataset, [tuple(unread)]) if unread else {})
+        return next(iter(pairs_of(frames, [(first, second)])), None)
+
+    ranges = [frame.view.range_m for frame in frames.values() if frame.view is not None]
+    fault = find_fault(dataset, compare, float(np.median(ranges))) if ranges else None
+    if fault is None or (report.mistake is not None and fault.mistake != "jump"):
+        return report
+    return replace(
+        report, verdict="disagree", text=f"{_DISAGREE}: {fault.text}", mistake=fault.mistake,
+        alternatives=(), frames=fault.frames, metres=fault.metres,
+    )  # fmt: skip
 
 
 def _of_depth(frames: Mapping[int, SeenFrame]) -> PoseCheckReport | None:

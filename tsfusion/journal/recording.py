@@ -48,6 +48,7 @@ class JournalRecording(ShownRecording):
             raise JournalError(
                 f"no keyframes in {place.path}; expected a state folder, a spool folder or an .mcap file"
             )
+        self._poses = found.poses()
         first = self[0]
         self.sensor = first.sensor or VolumeConfig().sensor
         self.timestamps_ns: NDArray[np.int64] | None = None
@@ -76,6 +77,10 @@ class JournalRecording(ShownRecording):
 
     def _first(self) -> Keyframe:
         return self[0]
+
+    def pose(self, index: int) -> NDArray[np.float64]:
+        """(4, 4) final T_world_camera of a keyframe, which is not read for it."""
+        return np.asarray(self._poses[index])
 
     def __iter__(self) -> Iterator[Keyframe]:
         return (self[index] for index in range(len(self)))

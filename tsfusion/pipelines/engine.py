@@ -68,10 +68,10 @@ class Engine:
         self._target.check()
         return self._observe()
 
-    def wait_until(self, due: float) -> None:
-        """Wait for a moment of `time.monotonic`."""
+    def wait_until(self, due: float, ended: Callable[[], bool] = bool) -> None:
+        """Wait for a moment of `time.monotonic`, or until the run is `ended`."""
         self.check()
-        while time.monotonic() < due:
+        while time.monotonic() < due and not ended():
             time.sleep(_POLL)
             self.check()
 

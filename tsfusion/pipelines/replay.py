@@ -5,7 +5,7 @@ import dataclasses
 import logging
 import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
 
 import numpy as np
@@ -52,13 +52,15 @@ def replay(
     warnings: Sequence[str] = (),
     missed: Sequence[str] = (),
     sensor: str | None = None,
+    ended: Callable[[], bool] = bool,
 ) -> ReplaySummary:
     """Send every keyframe of `dataset` to a server and leave the results in the folder `out`.
 
     `mesh.ply`, `mesh.glb`, `preview.png`, `keyframes.txt`, `delay.csv`, `delay.png`, `growth.csv`, `run.json`
     and `report.html` with its pictures, with a server of its own also `map.tsf`, and of a world whose surface
     is known `error.npy`, appear together when all of it went well, and not at all otherwise. A keyframe that
-    cannot be read is left out and counted; where most cannot, the replay ends, and its results say so.
+    cannot be read is left out and counted; where most cannot, the replay ends, and so it does when `ended`:
+    its results say so.
 
     Args:
         out: None = a new folder `out/DATE_TIME`; see `output_folder.results`.
@@ -75,6 +77,7 @@ def replay(
         warnings: what is odd about the recording, for the results.
         missed: what makes the map wrong or incomplete, a sentence each; empty = nothing is known to.
         sensor: preset that all keyframes are taken to be of; None = each as it says.
+        ended: whether no more keyframes are wanted.
 
     Raises:
         OutputError: `out` cannot be written (checked first), or the mesh is empty.
@@ -119,7 +122,10 @@ def replay(
                 server is not None and server.state != target_server.THROWN_AWAY
             )
             with _saying_what_stays(sender, target.link.map) if outlives else nullcontext():
-                for index, keyframe in _keyframes(dataset, (begin, first), running, rate, unread):
+                keyframes = _keyframes(
+                    dataset, (begin, first), running, rate=rate, unread=unread, ended=ended
+                )
+                for index, keyframe in keyframes:
                     running.wait_turn(AHEAD if rate is None else target.link.backlog)
                     of = sensor or keyframe.sensor
                     sender.send(dataclasses.replace(keyframe, captured_ns=time.monotonic_ns(), sensor=of))
@@ -127,6 +133,8 @@ def replay(
                     stamps.append(keyframe.timestamp_ns)
                     poses.append(keyframe.T_world_camera)
                 running.wait_fused()
+            if outlives and ended():
+                _say_what_stays(sender, target.link.map)
             seconds = time.monotonic() - started
             watching.close()
             peak = process.peak_rss_bytes()  # of sending: drawing the result is not the scanner's work
@@ -145,6 +153,7 @@ def replay(
             seconds=seconds, rate=rate, peak_rss_bytes=peak,
             server_start_seconds=target.child.start_seconds if target.child else None,
             warnings=warnings, missed=[*unread, target.unkept, *missed],
+            complete=not (unread or ended()),
         )  # fmt: skip
         run_files.write_ledger(work, sender.records)
         growth.write_csv(work / "growth.csv")
@@ -174,17 +183,27 @@ def _saying_what_stays(sender: Client, map_name: str) -> Iterator[None]:
     try:
         yield
     except (KeyboardInterrupt, SystemExit):
-        if there := sender.stats.durable:
-            log.warning(
-                "%s of this recording, or more, are in the map %s and stay there: another replay into it "
-                "adds them once more (--map NAME names another map)",
-                count_of(there, "keyframe"), map_name,
-            )  # fmt: skip
+        _say_what_stays(sender, map_name)
         raise
 
 
+def _say_what_stays(sender: Client, map_name: str) -> None:
+    if there := sender.stats.durable:
+        log.warning(
+            "%s of this recording, or more, are in the map %s and stay there: another replay into it "
+            "adds them once more (--map NAME names another map)",
+            count_of(there, "keyframe"), map_name,
+        )  # fmt: skip
+
+
 def _keyframes(
-    dataset: Dataset, first: tuple[int, Keyframe], running: Engine, rate: float | None, unread: list[str]
+    dataset: Dataset,
+    first: tuple[int, Keyframe],
+    running: Engine,
+    *,
+    rate: float | None,
+    unread: list[str],
+    ended: Callable[[], bool],
 ) -> Iterator[tuple[int, Keyframe]]:
     """Yield each keyframe and its index at its time, without those that cannot be read.
 
@@ -197,7 +216,9 @@ def _keyframes(
     yield first
     for index in range(first[0] + 1, len(dataset)):
         if rate is not None:
-            running.wait_until(due + 1 / rate - ahead)
+            running.wait_until(due + 1 / rate - ahead, ended)
+        if ended():
+            return
         began = time.monotonic()
         try:
             keyframe = dataset[index]
@@ -209,5 +230,5 @@ def _keyframes(
         if rate is not None:
             ahead = _READ_AHEAD * (time.monotonic() - began)
             due = max(due + 1 / rate, time.monotonic())
-            running.wait_until(due)
+            running.wait_until(due, ended)
         yield index, keyframe

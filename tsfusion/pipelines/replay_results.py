@@ -7,6 +7,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import msgspec
 import numpy as np
+from msgspec import structs
 from numpy.typing import NDArray
 
 from tsfusion.client import Client
@@ -17,6 +18,7 @@ from tsfusion.geometry.origin import position_of, world_of
 from tsfusion.journal.recording import LOST
 from tsfusion.pipelines import latency_ledger, run_files, shortfall
 from tsfusion.pipelines.run_files import Circumstances, WrittenMap
+from tsfusion.pipelines.shortfall import Verdict
 from tsfusion.wire.health import Status
 from tsfusion.wire.keyframe_times import Spread
 
@@ -51,7 +53,9 @@ class ReplaySummary(msgspec.Struct, frozen=True, kw_only=True):
     keyframes_rejected: dict[str, int]
     frames_skipped: dict[str, int]  # left out at opening, by reason
     warnings: list[str]  # a sentence each
+    complete: bool = True  # whether all keyframes were read: false after Ctrl-C or a failure
     missed: str  # what the run was for and did not reach; empty = it did
+    verdict: Verdict | None = None  # the headline; None = not known yet
     seconds: float  # first keyframe handed over → last one fused
     server_start_seconds: float | None  # None: the server was there already
     map_hash: str
@@ -82,6 +86,7 @@ def summarise(
     server_start_seconds: float | None,
     warnings: Sequence[str],
     missed: Sequence[str],
+    complete: bool,
 ) -> ReplaySummary:
     """A replay in figures.
 
@@ -95,10 +100,11 @@ def summarise(
         server_start_seconds: of the own server; None = the server was there already.
         warnings: what is odd about the recording, a sentence each.
         missed: what else the replay has missed, a sentence each.
+        complete: whether all keyframes were read.
     """
     status, _, figures = written
     stats, delays = sender.stats, latency_ledger.summarise(sender.records)
-    return ReplaySummary(
+    made = ReplaySummary(
         dataset=dataset.name,
         folder=str(folder),
         camera=camera_line(dataset),
@@ -107,6 +113,7 @@ def summarise(
         keyframes_rejected={**stats.skipped, **stats.refused, **stats.rejected},
         frames_skipped=dict(dataset.skipped),
         warnings=[*warnings, *shortfall.of_sweeps([sender])],
+        complete=complete,
         missed=shortfall.together(
             (
                 shortfall.of_delivery(
@@ -133,6 +140,7 @@ def summarise(
         versions=run_files.versions(),
         made=run_files.circumstances(),
     )
+    return structs.replace(made, verdict=shortfall.verdict(msgspec.to_builtins(made)))
 
 
 def server_rss(status: Status) -> dict[str, int]:

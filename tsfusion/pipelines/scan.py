@@ -22,7 +22,6 @@ from tsfusion.core.counts import count_of
 from tsfusion.core.errors import (
     AlignmentRefused,
     DatasetError,
-    IncompleteRun,
     OutputError,
     SourceError,
     TsfusionError,
@@ -177,7 +176,6 @@ def scan(
             seconds = time.monotonic() - started
             growth.stop()
             progress.stage("writing the results")
-            complete = not failure
             write = partial(
                 _write, work, target, sensor=source.sensor,
                 up=up, min_weight=min_weight, keep_islands=keep_islands,
@@ -192,9 +190,9 @@ def scan(
             growth.write_csv(work / "growth.csv")
             result = scan_results.summarise(
                 source, scanner, maps, records, folder=folder, camera=_camera(source, first),
-                localizer=registry.localizer_name(config, first), spool=spool, complete=complete,
+                localizer=registry.localizer_name(config, first), spool=spool, complete=not failure,
                 seconds=seconds, peak_rss_bytes=peak, config=config, volume=volume if own else None,
-                warnings=warnings,
+                warnings=warnings, missed=[*map(str, failure), unplaced, target.unkept],
             )  # fmt: skip
         run_files.write_record(work, result)
         run_files.write_report(work, meshes)
@@ -203,8 +201,6 @@ def scan(
     if failure:
         log.warning("the scan ended early: what came before is in %s", folder)
         raise failure[0]
-    if target.unkept:
-        raise IncompleteRun(target.unkept)
     return result
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
+from msgspec import structs
 
 from tsfusion.core.config import ScanConfig, VolumeConfig
 from tsfusion.datasets.trajectory_files import write_tum
@@ -15,6 +16,7 @@ from tsfusion.evaluation.trajectory_error import TrajectoryError, absolute_error
 from tsfusion.geometry.origin import position_of
 from tsfusion.pipelines import latency_ledger, run_files, shortfall
 from tsfusion.pipelines.run_files import Circumstances, WrittenMap
+from tsfusion.pipelines.shortfall import Verdict
 from tsfusion.scanner.localization.localizer import PoseCorrections
 from tsfusion.scanner.scanner import Scanner, Submap
 from tsfusion.scanner.sources.source import Source
@@ -57,6 +59,7 @@ class ScanSummary(msgspec.Struct, frozen=True, kw_only=True):
     keyframes_by_rule: dict[str, int]
     warnings: list[str]  # what is odd about the recording, a sentence each
     missed: str  # what the scan was for and did not reach; empty = it did
+    verdict: Verdict | None = None  # the headline; None = not known yet
     left: int  # keyframes still in the spool at the end
     link: str  # why the server took nothing at the end; empty = it did
     seconds: float  # from the first frame until the last keyframe was fused (or acknowledged, elsewhere)
@@ -128,12 +131,21 @@ def summarise(
     config: ScanConfig,
     volume: VolumeConfig | None,
     warnings: Sequence[str],
+    missed: Sequence[str],
 ) -> ScanSummary:
-    """A scan in figures."""
+    """A scan in figures.
+
+    Args:
+        missed: what else the scan has missed, a sentence each.
+    """
     state = scanner.state()
     stats = state.stats
     settings = {"scan": config} if volume is None else {"scan": config, "volume": volume}
-    return ScanSummary(
+    tracking = shortfall.of_tracking(
+        state.frames, state.tracked, scanner.last_loss, localizer=localizer,
+        maps=sum(bool(submap.located) for submap in scanner.submaps),
+    )  # fmt: skip
+    made = ScanSummary(
         source=source.name,
         folder=str(folder),
         camera=camera,
@@ -150,8 +162,9 @@ def summarise(
         warnings=[*warnings, *shortfall.of_sweeps([submap.client for submap in scanner.submaps])],
         missed=shortfall.together(
             (
+                *missed,
+                tracking,
                 shortfall.of_delivery(stats, spool=spool, link=state.link, rejection=scanner.first_rejection),
-                shortfall.of_tracking(state.frames, state.tracked, scanner.last_loss, localizer=localizer),
                 shortfall.of_clock(source.skipped),
             )
         ),
@@ -167,6 +180,7 @@ def summarise(
         versions=run_files.versions(),
         made=run_files.circumstances(),
     )
+    return structs.replace(made, verdict=shortfall.verdict(msgspec.to_builtins(made)))
 
 
 def records(submaps: list[Submap]) -> list[KeyframeTimes]:

@@ -1,20 +1,70 @@
 # SPDX-License-Identifier: MIT
 """Shortfalls of a run: what it was for and did not reach, in one line that says what to do.
 
-One rule for all runs. A run reached its purpose when each keyframe that it sent is on the server's disk, when
-the map took at least half of them, and when at least half of the frames were localised. What falls short of
-that still leaves its results; the command ends with the line, and with status 1.
+One rule for all runs. A run reached its purpose when each keyframe that it sent is on the server's disk and
+in one map (half of them, where the others have no sample in range), and nearly all frames have a pose. What
+falls short of that still leaves its results; the command ends with the line, and with status 1. A run is as
+good as its worst finding: the `Verdict` is its headline on the terminal, in `run.json` and in the report.
 """
 
 import os
 from collections.abc import Iterable, Mapping
+from typing import Any
+
+import msgspec
 
 from tsfusion.client import Client, ClientStats
 from tsfusion.core.counts import count_of
+from tsfusion.core.headline import Level
+from tsfusion.core.readable_numbers import counted
 from tsfusion.datasets.dataset import CLOCK, WITHOUT_POSE
+from tsfusion.geometry.sample_ranges import NO_SAMPLES
 from tsfusion.geometry.sweeps import skewed
 
+FEW = 0.05  # share of the frames that may be without a pose: more are a part of the scene
 _LOST = ("spool", "disk")  # reasons of skipping that no policy asks for
+
+
+class Verdict(msgspec.Struct, frozen=True):
+    """A run in one sentence.
+
+    Attributes:
+        level: of its worst finding; `bad` = the command ends with status 1.
+        text: without a full stop.
+    """
+
+    level: Level
+    text: str
+
+    @property
+    def headline(self) -> str:
+        """The sentence as it stands at the top of a page."""
+        end = "" if self.text.endswith((".", ")")) else "."
+        return f"{self.text[:1].upper()}{self.text[1:]}{end if self.level != 'bad' else ''}"
+
+
+def verdict(record: Mapping[str, Any]) -> Verdict:
+    """The verdict on a run by its record, as in `run.json`, also of an older version."""
+    if missed := record.get("missed"):
+        return Verdict("bad", missed)
+    sent, fused = record.get("keyframes_sent", 0), record.get("keyframes_fused", 0)
+    fate = f"{count_of(sent, 'keyframe was', 'keyframes were')} fused"
+    if fused < sent == record.get("keyframes_durable"):
+        fate = f"{count_of(sent, 'keyframe is', 'keyframes are')} at the server, {fused} fused so far"
+        fused = sent
+    lost, skipped = record.get("frames", 0) - record.get("frames_tracked", 0), record.get("frames_skipped")
+    notices = [
+        "" if record.get("complete", True) else "the source was not read to its end",
+        f"{count_of(lost, 'frame was', 'frames were')} not localised" if lost else "",
+        f"frames left out: {counted(skipped)}" if skipped else "",
+        f"not in the map: {counted(record['keyframes_rejected'])}"
+        if record.get("keyframes_rejected")
+        else "",
+        "see the warnings" if record.get("warnings") else "",
+    ]
+    if any(notices) or fused < sent:
+        return Verdict("notice", together((f"{fused} of {fate}", *notices)))
+    return Verdict("good", f"complete: all {fate}")
 
 
 def of_delivery(stats: ClientStats, *, spool: str | os.PathLike[str], link: str, rejection: str) -> str:
@@ -38,7 +88,7 @@ def of_delivery(stats: ClientStats, *, spool: str | os.PathLike[str], link: str,
         return lost
     if stats.refused:
         return f"{_never(stats.refused)}: see the log above"
-    if rejected and 2 * rejected > stats.sent:
+    if stats.rejected.keys() - {NO_SAMPLES} or 2 * rejected > stats.sent:
         return f"the map took {stats.sent - rejected} of {stats.sent} keyframes only: {rejection}"
     if corrections := stats.corrections_refused:
         reasons = ", ".join(f"{count} × {reason}" for reason, count in corrections.items())
@@ -110,14 +160,14 @@ def of_clock(left_out: Mapping[str, int]) -> str:
 
 
 def of_poses(frames: int, left_out: Mapping[str, int]) -> str:
-    """Say that most frames of a recording have no pose; empty = at least half have.
+    """Say that many frames of a recording have no pose; empty = nearly all have.
 
     Args:
         frames: that are left.
         left_out: number of others by reason, as `Dataset.skipped` has them.
     """
     without = sum(count for reason, count in left_out.items() if reason.startswith(WITHOUT_POSE))
-    if without <= frames:
+    if without <= FEW * (frames + without):
         return ""
     return (
         f"only {frames} of {frames + without} frames have a pose, and the rest is not in the map: give a "
@@ -126,15 +176,18 @@ def of_poses(frames: int, left_out: Mapping[str, int]) -> str:
     )
 
 
-def of_tracking(frames: int, tracked: int, why: str, *, localizer: str = "rgbd") -> str:
-    """Say that most frames were lost; empty = at least half have a pose.
+def of_tracking(frames: int, tracked: int, why: str, *, localizer: str = "rgbd", maps: int = 1) -> str:
+    """Say that frames were lost; empty = nearly all have a pose, in one map.
 
     Args:
         why: the sensor was lost the last time.
+        maps: number of maps that the scan is in.
     """
-    if 2 * tracked >= frames:
+    if frames - tracked <= FEW * frames and maps < 2:
         return ""
-    return f"only {tracked} of {frames} frames were localised ({why}): {cure_of_tracking(localizer)}"
+    pieces = f", in {maps} maps" if maps > 1 else ""
+    found = f"only {tracked} of {frames} frames were localised{pieces}"
+    return f"the sensor was lost ({why}): {found}; {cure_of_tracking(localizer)}"
 
 
 def together(shortfalls: Iterable[str]) -> str:

@@ -100,7 +100,7 @@ def _page(about: AboutMap, keyframes: int, figures: dict[str, object]) -> Page:
         verdict=f"{journal.lost} keyframes are lost, at least."
         if journal is not None and damaged
         else "Every byte is as it was written.",
-        missed=bool(damaged),
+        level="bad" if damaged else "good",
         warnings=warnings,
         tiles=[
             ("keyframes", grouped(keyframes), f"of {count_of(len(summary.sessions), 'session')}"),

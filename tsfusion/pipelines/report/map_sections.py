@@ -18,6 +18,7 @@ from tsfusion.pipelines.report.pictures import ErrorScale, Sides
 
 _MOST_PATH = 2000  # points of the trajectory in the 3-D view
 _BINS = 60  # of a histogram
+_LEAST_SHOWN = 0.01  # share of a picture that shows the mesh, or it is left out
 PATH_STYLES = {  # of a trajectory: style, text
     "reference": ("k7 wide", "reference"),
     "trajectory": ("k5", "as tracked"),
@@ -54,6 +55,8 @@ class ShownMap:
         shown = []
         for side in range(pictures.SIDES):
             rgb = self._sides.picture(side)
+            if side and (rgb != rgb[0, 0]).any(axis=2).mean() < _LEAST_SHOWN:
+                continue  # walls are open from behind
             self.pictures[f"{self._name}side{side + 1}"] = rgb
             words = "from the side that shows most" if side == 0 else f"turned by {side * 90}°"
             shown.append(page.picture(pictures.jpeg_url(rgb), f"The mesh {words}"))

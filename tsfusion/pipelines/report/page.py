@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from html import escape
 from importlib import resources
 
+from tsfusion.core.headline import Level
 from tsfusion.geometry.color_scales import ramp
 
 # No request leaves the page, whatever text it holds.
@@ -21,7 +22,7 @@ class Page:
     """A page, as far as it is known.
 
     Attributes:
-        verdict: whether it went well, in a sentence; `missed` = it did not.
+        verdict: whether it went well, in a sentence; `level` is its colour.
         warnings: a sentence each.
         tiles: title, figure and note of what is read at a glance.
         sections: title and HTML.
@@ -30,7 +31,7 @@ class Page:
     title: str
     subtitle: str
     verdict: str
-    missed: bool = False
+    level: Level = "good"
     warnings: list[str] = field(default_factory=list)
     tiles: list[tuple[str, str, str]] = field(default_factory=list)
     sections: list[tuple[str, str]] = field(default_factory=list)
@@ -49,7 +50,7 @@ class Page:
             f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">'
             f"<title>{escape(self.title)}</title><style>{_resource('page.css')}</style></head>\n<body><main>"
             f'<header><h1>{escape(self.title)}</h1><p class="sub">{escape(self.subtitle)}</p>'
-            f'<p class="verdict{" bad" if self.missed else ""}">{escape(self.verdict)}</p>{self._warnings()}'
+            f'<p class="verdict {self.level}">{escape(self.verdict)}</p>{self._warnings()}'
             f"</header>{self._tiles()}\n{sections}\n<footer>{escape(self.footer)}</footer></main>\n"
             f'<script type="application/json" id="ramp">{colors}</script>{viewer}</body></html>\n'
         )

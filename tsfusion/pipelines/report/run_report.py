@@ -5,8 +5,9 @@ from pathlib import Path
 from typing import Any
 
 from tsfusion.core.counts import count_of
-from tsfusion.core.readable_numbers import counted, grouped, size
+from tsfusion.core.readable_numbers import counted, figure, grouped, size
 from tsfusion.geometry.mesh import Mesh
+from tsfusion.pipelines import shortfall
 from tsfusion.pipelines.report import findings, map_sections, page, report_files, run_sections
 from tsfusion.pipelines.report.findings import MapFindings, RunFindings
 from tsfusion.pipelines.report.map_sections import ShownMap
@@ -14,7 +15,6 @@ from tsfusion.pipelines.report.page import Page
 from tsfusion.pipelines.report.report_files import Pictures
 
 _MOST_MAPS = 4  # that are shown in pictures
-_REACHED = "The run reached what it was for."
 _ELSEWHERE = "The map is on its server, so there is no mesh here: `tsfusion mesh` fetches it."
 _GONE = "The mesh of this run is no longer in its folder: `tsfusion mesh` makes one of a kept map."
 
@@ -39,16 +39,15 @@ def write(folder: Path, out: Path, *, meshes: dict[str, Mesh] | None = None) -> 
 
 def _page(found: RunFindings, date: str) -> tuple[Page, Pictures]:
     record = found.record
-    missed = str(record.get("missed") or "")
-    complete = record.get("complete", True)
-    verdict = missed or (
-        "The run reached what it was for." if complete else "The source was not read to its end."
-    )
+    verdict = shortfall.verdict(record)
+    fused, sent = record.get("keyframes_fused", 0), record.get("keyframes_sent", 0)
+    count = f"{fused} of {count_of(sent, 'keyframe')} fused"
+    version = (record.get("versions") or {}).get("tsfusion", "")
     made = Page(
         title=str(record.get("dataset") or record.get("source")),
-        subtitle=f"{_kind(record)} · {date} · tsfusion {(record.get('versions') or {}).get('tsfusion', '')}",
-        verdict=verdict[:1].upper() + verdict[1:],
-        missed=bool(missed) or not complete,
+        subtitle=f"{_kind(record)} · {count} · {date} · tsfusion {version}",
+        verdict=verdict.headline,
+        level=verdict.level,
         warnings=_warnings(found),
         tiles=_tiles(found),
         footer=f"From {record.get('folder', '')}/run.json. This file needs no network and no other file.",
@@ -114,7 +113,7 @@ def _tiles(found: RunFindings) -> list[tuple[str, str, str]]:
         tiles.append(("delay, 95 % below", f"{delay['p95']:.0f} ms",
                       f"median {delay['p50']:.0f}, max {delay['max']:.0f} ms"))  # fmt: skip
     if seconds := record.get("seconds"):
-        tiles.append(("time", f"{seconds:.1f} s", f"{fused / seconds:.2g} keyframes/s"))
+        tiles.append(("time", f"{seconds:.1f} s", f"{figure(fused / seconds)} keyframes/s"))
     if mesh := first.figures.get("mesh"):
         triangles = f"{grouped(mesh['triangles'])} triangles"
         tiles.append(("map", run_sections.extent(mesh), triangles))
@@ -130,7 +129,11 @@ def _tiles(found: RunFindings) -> list[tuple[str, str, str]]:
     if error and record.get("localizer") != "given":
         unit, factor = ("mm", 1000) if error["rmse"] < 1 else ("m", 1)
         tiles.append(
-            ("trajectory error", f"{factor * error['rmse']:.3g} {unit}", f"RMSE over {error['length']:.3g} m")
+            (
+                "trajectory error",
+                f"{figure(factor * error['rmse'], 3)} {unit}",
+                f"RMSE over {figure(error['length'], 3)} m",
+            )
         )
     peaks = record.get("peak_rss_bytes") or {}
     if "server" in peaks:

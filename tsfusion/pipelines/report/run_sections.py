@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
-from tsfusion.core.readable_numbers import counted, grouped, size
+from tsfusion.core.readable_numbers import counted, figure, grouped, size
 from tsfusion.evaluation import trajectory_error
 from tsfusion.pipelines import latency_ledger
 from tsfusion.pipelines.report import charts, page
@@ -165,7 +165,7 @@ def trajectory_errors(found: MapFindings, *, is_given: bool) -> str:
         if not error or is_given:
             continue
         rows.append((text, *(_metres(error[k]) for k in ("rmse", "mean", "median", "std", "min", "max")),
-                     f"{error['drift_percent']:.2g} %", f"{error['length']:.3g} m"))  # fmt: skip
+                     f"{figure(error['drift_percent'])} %", f"{figure(error['length'], 3)} m"))  # fmt: skip
         if (line := _error_along(found, name)) is not None:
             lines.append((*line, f"k{6 if key == 'corrected_error' else 5}", text))
     if not rows:
@@ -227,7 +227,7 @@ def keyframes(record: dict[str, Any]) -> str:
         ("keyframes", f"{fused} of {sent} sent are fused"),
         ("chosen by", counted(record.get("keyframes_by_rule") or {})),
         ("not in the map", counted(named)),
-        ("time", f"{record['seconds']:.1f} s, {rate:.2g} keyframes/s" if record.get("seconds") else ""),
+        ("time", f"{record['seconds']:.1f} s, {figure(rate)} keyframes/s" if record.get("seconds") else ""),
     ])  # fmt: skip
 
 

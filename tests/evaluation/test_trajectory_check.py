@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: MIT
+"""A jump of the poses and a drift between two visits are found with their place and size; good poses pass."""
+
+from collections.abc import Callable
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tsfusion.datasets.dataset import Frames
+from tsfusion.evaluation.pose_check import check
+from tsfusion.geometry import se3
+from tsfusion.geometry.frame import Frame
+from tsfusion.geometry.keyframe import Intrinsics
+
+K, SIZE = Intrinsics(150.0, 150.0, 79.5, 59.5), (120, 160)
+ROOM = np.array([[-2.2, -1.6, 0.0], [2.0, 1.8, 2.5]])
+CABINET = np.array([[1.2, 0.3, 0.0], [2.0, 1.1, 1.2]])
+HALL = np.array([[-40.0, -30.0, 0.0], [100.0, 30.0, 8.0]])
+Poses = list[NDArray[np.float64]]
+
+
+class Walk(Frames):
+    """Frames of a formula, 30 or 10 a second, with poses that may be wrong."""
+
+    def __init__(self, measurements: list[dict[str, object]], poses: Poses, *, hz: int, sensor: str) -> None:
+        self.name, self.sensor, self.skipped = "a walk", sensor, {}
+        self._measured, self._poses = measurements, poses
+        self.timestamps_ns = np.arange(len(poses)) * (10**9 // hz)
+
+    def __len__(self) -> int:
+        return len(self._measured)
+
+    def _frame(self, index: int) -> Frame:
+        return self._posed_frame(index, **self._measured[index])
+
+
+def cast(
+    origin: NDArray[np.float64], rays: NDArray[np.float64], *boxes: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """(n,) lengths of rays from inside the first box to it, or to the others, which are solid."""
+    with np.errstate(divide="ignore"):
+        ends = (boxes[0][:, None] - origin) / rays
+        length = np.max(ends, axis=0).min(axis=1)
+        for box in boxes[1:]:
+            ends = (box[:, None] - origin) / rays
+            near, far = np.min(ends, axis=0).max(axis=1), np.max(ends, axis=0).min(axis=1)
+            length = np.where((near > 0) & (near < far), np.minimum(length, near), length)
+    return length
+
+
+@cache
+def twice_round_a_room() -> tuple[list[dict[str, object]], Poses]:
+    poses, measured = [], []
+    v, u = np.mgrid[: SIZE[0], : SIZE[1]].reshape(2, -1)
+    pixels = np.stack([(u - K.cx) / K.fx, (v - K.cy) / K.fy, np.ones(u.size)], axis=1)
+    for angle in np.linspace(0, 4 * np.pi, 80, endpoint=False):
+        way = np.array([np.cos(angle), np.sin(angle), -0.25]) / np.hypot(1, 0.25)
+        right = np.array([np.sin(angle), -np.cos(angle), 0.0])
+        T = se3.transform(np.stack([right, np.cross(way, right), way], axis=1), [0, 0, 1.3] + 0.5 * way)
+        depth = cast(T[:3, 3], pixels @ T[:3, :3].T, ROOM, CABINET).reshape(SIZE)
+        measured.append(
+            {"depth": np.round(1000 * depth).astype(np.uint16), "depth_scale": 0.001, "intrinsics": K}
+        )
+        poses.append(T)
+    return measured, poses
+
+
+def moved(shift: Callable[[int], float], axis: int = 0) -> Walk:
+    measured, poses = twice_round_a_room()
+    offsets = [shift(index) * np.eye(3)[axis] for index in range(len(poses))]
+    given = [se3.transform(T[:3, :3], T[:3, 3] + off) for T, off in zip(poses, offsets, strict=True)]
+    return Walk(measured, given, hz=30, sensor="kinect")
+
+
+def test_good_poses_pass() -> None:
+    noise = np.random.default_rng(0).normal(0, 0.004, 80)
+    assert check(moved(lambda _: 0.0)).verdict == "agree"
+    assert check(moved(lambda index: noise[index])).verdict == "agree"
+
+
+@pytest.mark.parametrize(("metres", "axis"), [(0.15, 0), (0.4, 1), (1.5, 2)])
+def test_a_jump_is_found_where_it_is(metres: float, axis: int) -> None:
+    report = check(moved(lambda index: metres * (index > 30), axis))
+    assert (report.verdict, report.mistake, report.frames) == ("disagree", "jump", (30, 31))
+    assert report.metres == pytest.approx(metres, rel=0.05)
+    assert f"jump by {metres:.2f} m from frame 30 to 31 (1.00 s to 1.03 s)" in report.text
+
+
+@pytest.mark.parametrize(("metres", "axis"), [(0.2, 0), (0.6, 0)])
+def test_drift_shows_where_a_place_is_seen_again(metres: float, axis: int) -> None:
+    report = check(moved(lambda index: metres * index / 80, axis))
+    assert (report.verdict, report.mistake) == ("disagree", "drift")
+    assert report.frames is not None
+    first, second = report.frames
+    assert second - first >= 35
+    assert report.metres == pytest.approx(metres * (second - first) / 80, abs=0.02)
+
+
+def test_exact_scans_of_a_lidar_that_moves_pass_and_its_jump_does_not() -> None:
+    azimuth, elevation = np.meshgrid(
+        np.linspace(0, 2 * np.pi, 720, endpoint=False), np.radians(np.linspace(-15, 15, 16))
+    )
+    level = np.cos(elevation)
+    rays = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=-1).reshape(
+        -1, 3
+    )
+    poses = [se3.transform(np.eye(3), [0.8 * index, 0.5 * np.sin(0.1 * index), 1.0]) for index in range(40)]
+    boxes = [np.array([[x, y, 0.0], [x + 2, y + 2, 3.0]]) for x, y in ((10, 3), (20, -6), (31, 4), (5, -5))]
+    lengths = [cast(T[:3, 3], rays, HALL, *boxes) for T in poses]
+    measured = [{"points": np.float32(rays * length[:, None])[length < 80]} for length in lengths]
+    assert check(Walk(measured, poses, hz=10, sensor="lidar")).verdict == "agree"
+    jumped = [se3.transform(np.eye(3), T[:3, 3] + [0, 2.5 * (i > 20), 0]) for i, T in enumerate(poses)]
+    report = check(Walk(measured, jumped, hz=10, sensor="lidar"))
+    assert (report.mistake, report.frames) == ("jump", (20, 21))
