@@ -12,7 +12,7 @@ import numpy as np
 from _peers import DATA, Open3D, VDBFusion, surroundings, timed_keyframes
 from numpy.typing import NDArray
 
-from lab.evaluation import stanford_bunny
+from lab.evaluation import stanford_bunny, surface_error
 from lab.evaluation.known_surfaces import (
     COMPLETE_WITHIN,
     KnownSurface,
@@ -25,7 +25,6 @@ from lab.evaluation.view_prediction import compare_views
 from lab.worlds import benchmark_worlds
 from tsfusion.core.config import SENSORS
 from tsfusion.datasets import Synthetic, open_dataset
-from tsfusion.evaluation import surface_error
 from tsfusion.geometry.keyframe import Intrinsics, Keyframe
 from tsfusion.geometry.measured_points import points_world
 from tsfusion.kernels import runtime

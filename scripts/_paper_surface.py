@@ -21,11 +21,11 @@ from _peers import Open3D, VDBFusion
 from msgspec import Struct
 from numpy.typing import NDArray
 
+from lab.evaluation import surface_error
 from lab.evaluation.known_surfaces import COMPLETE_WITHIN, KnownSurface, WorldSurface, measure
 from tsfusion.core import process
 from tsfusion.core.config import SENSORS, VolumeConfig, make_settings
 from tsfusion.datasets import Synthetic, open_dataset
-from tsfusion.evaluation import surface_error
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.geometry.measured_points import points_world
 from tsfusion.geometry.mesh import Mesh

@@ -25,12 +25,15 @@ import numpy as np
 
 from tsfusion import AlignmentRefused, Keyframe, Volume, open_dataset
 from tsfusion.core.config import SensorName, VolumeConfig
-from tsfusion.evaluation import surface_error
+from tsfusion.evaluation.surface_fit import nearest
 from tsfusion.geometry import se3
 from tsfusion.pipelines import map_alignment, mesh_preview
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
+sys.path.append(str(Path(__file__).parents[1]))  # lab is not installed
 from journaled_maps import recorded, unknown_start
+
+from lab.evaluation import surface_error
 
 
 def measured(keyframes: list[Keyframe], most: float) -> np.ndarray:
@@ -48,7 +51,7 @@ def measured(keyframes: list[Keyframe], most: float) -> np.ndarray:
 def f_scores(volume: Volume, reference: np.ndarray, tolerances: tuple[float, ...]) -> list[float]:
     """Percent: harmonic mean of precision and completeness within each tolerance, metres."""
     points = volume.extract_mesh().vertices.astype(np.float64)
-    there, back = (surface_error.nearest(x, y)[0] for x, y in ((points, reference), (reference, points)))
+    there, back = (nearest(x, y)[0] for x, y in ((points, reference), (reference, points)))
     within = partial(surface_error.percent_within, there), partial(surface_error.percent_within, back)
     return [round(surface_error.f_score(*(share(one) for share in within)), 2) for one in tolerances]
 

@@ -9,10 +9,11 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from lab.evaluation import surface_error
 from tsfusion.core.errors import MissingDependency
 from tsfusion.datasets.synthetic.street_drive import StreetDrive
 from tsfusion.datasets.synthetic.worlds import BOX, CYLINDER, GROUND, ROOM, Solids, World
-from tsfusion.evaluation import surface_error
+from tsfusion.evaluation.surface_fit import nearest
 from tsfusion.geometry import se3
 from tsfusion.geometry.mesh import Mesh
 
@@ -98,7 +99,7 @@ class ReferenceSurface:
 
         self._mesh = trimesh.Trimesh(vertices, faces, process=False)
         self._samples, self._face = trimesh.sample.sample_surface(self._mesh, samples, seed=0)
-        near = surface_error.nearest(self._samples, measured)[0] <= reach
+        near = nearest(self._samples, measured)[0] <= reach
         self.seen = surface_error.one_per_cell(self._samples[near], reach)
         self.edges = np.empty((0, 2, 3))
 
@@ -116,7 +117,7 @@ class ReferenceSurface:
 
     def _nearest(self, points: NDArray[np.float64]) -> NDArray[np.int64]:
         """(n,) index of the face that holds the nearest sample."""
-        face: NDArray[np.int64] = self._face[surface_error.nearest(points, self._samples)[1]]
+        face: NDArray[np.int64] = self._face[nearest(points, self._samples)[1]]
         return face
 
 
@@ -168,7 +169,7 @@ def measure(mesh: Mesh, truth: KnownSurface, voxel_size: float) -> dict[str, Any
     near_edge = surface_error.segment_distance(vertices, truth.edges) <= reach
     found["edge_mm"] = surface_error.spread_mm(distance[near_edge]).mean
     try:
-        missed, _ = surface_error.nearest(truth.seen, vertices)
+        missed, _ = nearest(truth.seen, vertices)
     except MissingDependency:
         return rounded(found)
     complete = COMPLETE_WITHIN * voxel_size

@@ -21,7 +21,7 @@ from repository import ROOT
 from tsfusion import Keyframe, open_dataset
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.trajectory_files import write_tum
-from tsfusion.evaluation.surface_error import nearest
+from tsfusion.evaluation.surface_fit import nearest
 
 COUNT = 6
 MANY = 60  # frames of the recordings that are fused

@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.evaluation.surface_error import nearest
+from tsfusion.core.errors import MissingDependency
 from tsfusion.geometry import se3
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.geometry.mesh import Mesh
@@ -35,6 +35,24 @@ class SurfaceFit(msgspec.Struct, frozen=True):
     rmse_m: float
     constraint: float
     matches: int
+
+
+def nearest(
+    points: NDArray[np.floating], targets: NDArray[np.floating]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """(distance, index) of the nearest of `targets` (m, 3) for each of `points` (n, 3); infinite without any.
+
+    Raises:
+        MissingDependency: without scipy.
+    """
+    try:
+        from scipy.spatial import cKDTree
+    except ImportError as error:
+        raise MissingDependency("scipy is not installed (pip install scipy)") from error
+    if not len(targets):
+        return np.full(len(points), np.inf), np.zeros(len(points), np.int64)
+    distance, index = cKDTree(targets).query(points)
+    return distance, index
 
 
 class SampledSurface:

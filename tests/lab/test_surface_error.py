@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from tsfusion.evaluation import surface_error
+from lab.evaluation import surface_error
 
 
 def test_spread_of_known_errors() -> None:

@@ -5,8 +5,6 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core.errors import MissingDependency
-
 _CHUNK = 1 << 21  # point-segment pairs measured at once
 
 
@@ -37,24 +35,6 @@ def f_score(precision: float, completeness: float) -> float:
     """Harmonic mean of precision and completeness; 0 when both are 0."""
     total = precision + completeness
     return 2 * precision * completeness / total if total else 0.0
-
-
-def nearest(
-    points: NDArray[np.floating], targets: NDArray[np.floating]
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """(distance, index) of the nearest of `targets` (m, 3) for each of `points` (n, 3); infinite without any.
-
-    Raises:
-        MissingDependency: without scipy.
-    """
-    try:
-        from scipy.spatial import cKDTree
-    except ImportError as error:
-        raise MissingDependency("scipy is not installed (pip install scipy)") from error
-    if not len(targets):
-        return np.full(len(points), np.inf), np.zeros(len(points), np.int64)
-    distance, index = cKDTree(targets).query(points)
-    return distance, index
 
 
 def angles(normals: NDArray[np.floating], truth: NDArray[np.floating]) -> NDArray[np.float64]:
