@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Registration of a depth and a colour camera: the colour of depth pixels, the depth of colour pixels."""
+"""Registration of a depth and a colour camera: the colour of depth pixels."""
 
 from collections.abc import Iterator
 
@@ -12,7 +12,6 @@ from tsfusion.geometry.keyframe import Intrinsics, check_pose
 
 Size = tuple[int, int]  # height, width
 _FAR = np.float32(65.535)  # metres: assumed depth of pixels without depth
-_OVERLAP = 1.2  # width at which a depth pixel is drawn, in pixels: no gaps on slanted surfaces
 _STRIP = 32  # rows at once
 
 
@@ -46,7 +45,6 @@ class Registration:
         for into, (by_u, by_v, always) in zip(self._at_infinity, turned, strict=True):
             into[:] = by_u * u + by_v * v[:, None] + always
         self._moved = (color.matrix @ T[:3, 3]).astype(np.float32)
-        self._reach = _OVERLAP / 2 * np.array([color.fx / depth.fx, abs(color.fy / depth.fy)])
 
     def color_of_depth(self, color: NDArray[np.uint8], depth_m: NDArray[np.float32]) -> NDArray[np.uint8]:
         """Colour of every depth pixel: (H, W, 3) uint8 of the depth's size.
@@ -59,33 +57,9 @@ class Registration:
             raise InvalidConfig(f"color must be {expected} uint8, got {color.shape} {color.dtype}")
         seen = np.empty((*self.size, 3), np.uint8)
         for rows, z in self._strips(depth_m):
-            u, v, _ = self._pixels(np.where(z > 0, z, _FAR), rows)
+            u, v = self._pixels(np.where(z > 0, z, _FAR), rows)
             seen[rows] = cv2.remap(color, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return seen
-
-    def depth_of_color(self, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Depth of every colour pixel: (H, W) float32 metres of the colour's size, 0 = none.
-
-        Each depth pixel is drawn a fifth larger than it appears there, the nearest in front.
-        """
-        height, width = self.color_size
-        nearest = np.full(height * width, np.inf, np.float32)
-        reach_u, reach_v = (np.float32(reach) for reach in self._reach)
-        for rows, depth in self._strips(depth_m):
-            u, v, z = self._pixels(np.where(depth > 0, depth, np.float32(0)), rows)
-            valid = (depth > 0) & (z > 0)
-            u, v, z = u[valid], v[valid], z[valid]
-            first_u, last_u = np.ceil(u - reach_u), np.floor(u + reach_u)
-            first_v, last_v = np.ceil(v - reach_v), np.floor(v + reach_v)
-            for down in range(int(2 * reach_v) + 1):
-                for right in range(int(2 * reach_u) + 1):
-                    column, row = first_u + right, first_v + down
-                    drawn = (column <= last_u) & (row <= last_v)
-                    drawn &= (column >= 0) & (column < width) & (row >= 0) & (row < height)
-                    at = (row[drawn] * width + column[drawn]).astype(np.intp)
-                    np.minimum.at(nearest, at, z[drawn])
-        nearest[np.isinf(nearest)] = 0
-        return nearest.reshape(height, width)
 
     def _strips(self, depth_m: NDArray[np.float32]) -> Iterator[tuple[slice, NDArray[np.float32]]]:
         """A depth image a few rows at a time, so that what is made of them stays in the cache."""
@@ -96,10 +70,9 @@ class Registration:
             yield rows, depth_m[rows]
 
     def _pixels(self, z: NDArray[np.float32], rows: slice) -> tuple[NDArray[np.float32], ...]:
-        """Columns, rows and depths of some rows' depth pixels in the colour camera."""
+        """Columns and rows of some rows' depth pixels in the colour camera."""
         x, y, there = (
             z * each[rows] + moved for each, moved in zip(self._at_infinity, self._moved, strict=True)
         )
-        behind = there <= 0
-        there[behind] = 1
-        return x / there, y / there, np.where(behind, np.float32(0), there)
+        there[there <= 0] = 1  # behind it
+        return x / there, y / there
