@@ -313,11 +313,6 @@ class Exchange:
         self._asked = 0  # on which connection
         self._why = ""  # there is none
 
-    @property
-    def was_sent(self) -> bool:
-        """Whether the messages left over the connection that stands."""
-        return self._connection.is_made and self._asked == self._connection.made
-
     def reply(self, timeout: float) -> tuple[Reply, list[memoryview]]:
         """The next reply, and the raw frames that came with it.
 

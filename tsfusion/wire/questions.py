@@ -29,7 +29,6 @@ FARTHEST_M = 100.0  # that a distance field reaches
 CELLS_AT_ONCE = 256  # of an answer
 REFINED_AT_ONCE = 64  # likewise, where the surface is not the raw one
 KEYFRAMES_AT_ONCE = 4096
-MOST_FRAMES = 4  # that its points come in
 LONGEST_S = 60.0  # that a question may wait
 LATE = "its time was over before the map came to it"
 _POINTS_A_FRAME = CONTROL_MAX_BYTES // 12
