@@ -92,6 +92,11 @@ def test_nothing_measured_does_not_become_a_point() -> None:
     [
         (([0.0, 0.05], [np.eye(4)] * 2), "motion must cover point_times_s, 0 to 0.1 s, got 0 to 0.05"),
         (([0.0, 0.0], [np.eye(4)] * 2), "rising"),
+        (([0.0], [np.eye(4)]), "rising"),
+        (([], np.zeros((0, 4, 4))), "rising"),
+        (([0.0, np.inf], [np.eye(4)] * 2), "finite"),
+        (([0.0, 0.1], [np.eye(4), np.full((4, 4), np.nan)]), "finite"),
+        (0.1, r"motion must be \(times_s, poses\), got 0.1"),
         (([0.0, 0.1], [np.eye(3)] * 2), r"motion's poses must have shape \(2, 4, 4\)"),
         (([0.0, 0.1], [lidar.pose_at(0.3), lidar.pose_at(0.4)]), r"linalg\.inv\(T_world_camera\)"),
     ],

@@ -254,10 +254,14 @@ class Keyframe(object_cards.Shown):
                 raise InvalidKeyframe("point_times_s must be finite, got NaN or infinity")
             object.__setattr__(self, "point_times_s", times)
             if self.motion is not None:
-                self._put_at_stamp(times, *self.motion)
+                self._put_at_stamp(times, self.motion)
 
-    def _put_at_stamp(self, point_times_s: NDArray[np.float32], times_s: Any, poses: Any) -> None:
+    def _put_at_stamp(self, point_times_s: NDArray[np.float32], given: Any) -> None:
         kinds = np.float32, np.float64
+        try:
+            times_s, poses = given
+        except (TypeError, ValueError) as error:
+            raise InvalidKeyframe(f"motion must be (times_s, poses), got {given!r}") from error
         times = _array("motion's times_s", times_s, kinds, (None,))
         motion = sweeps.Motion(times, _array("motion's poses", poses, kinds, (len(times), 4, 4)))
         no_return = ~np.any(self.points, axis=1)

@@ -83,9 +83,10 @@ def at_stamp(
     Raises:
         InvalidKeyframe: the motion does not cover these times, or is none at the timestamp.
     """
+    rises = len(motion.times_s) > 1 and (np.diff(motion.times_s) > 0).all()
+    if not rises or not np.isfinite(motion.times_s).all() or not np.isfinite(motion.poses).all():
+        raise InvalidKeyframe(f"motion must have finite poses at rising times, got {motion.times_s} s")
     (first, last), twists = motion.times_s[[0, -1]], se3.log(motion.poses)
-    if not (np.diff(motion.times_s) > 0).all():
-        raise InvalidKeyframe(f"motion must have rising times, got {motion.times_s}")
     if len(times_s) and max(first - times_s.min(), times_s.max() - last) > (last - first) / 2:
         raise InvalidKeyframe(
             f"motion must cover point_times_s, {times_s.min():g} to {times_s.max():g} s, got {first:g} to "
