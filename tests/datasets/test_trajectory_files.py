@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets.trajectory_files import nanoseconds
+from tsfusion.datasets.trajectory_files import nanoseconds, read_tum
 from tsfusion.geometry.trajectory import Trajectory, rigid, slerp
 
 scipy_spatial = pytest.importorskip("scipy.spatial")
@@ -50,3 +50,12 @@ def test_stamps_keep_every_digit():
     for bad in ("-1", "nan", "inf", "x", ""):
         with pytest.raises(DatasetError, match=r"list\.txt:1: timestamp must be seconds"):
             nanoseconds(bad, here, 1)
+
+
+def test_a_list_that_was_sorted_as_text_is_put_in_order(tmp_path: Path) -> None:
+    lines = sorted(f"{tenth / 10:.1f} {tenth} 0 0 0 0 0 1" for tenth in range(5, 360))
+    (tmp_path / "poses.txt").write_text("\n".join(lines), encoding="ascii")
+    np.testing.assert_array_equal(read_tum(tmp_path / "poses.txt").translations[:, 0], range(5, 360))
+    (tmp_path / "poses.txt").write_text("\n".join([*lines[:200], *lines[100:300]]), encoding="ascii")
+    with pytest.raises(DatasetError, match="clock steps back"):
+        read_tum(tmp_path / "poses.txt")

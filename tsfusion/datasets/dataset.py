@@ -32,7 +32,7 @@ WITHOUT_POSE = "without a pose"  # how the reasons of frames that poses would ha
 UNREADABLE = "unreadable"  # reason of frames that are left out when they are read
 CLOCK = "after the clock"  # how the reason of those begins that came when it had stepped back
 _LATE_NS = 50_000_000  # a stamp may come late: from another thread, or with exposure
-_FEWEST_TIMES = 10  # of each part on average; more parts are a series without an order
+_FEWEST_TIMES, _MOST_PARTS = 10, 100  # of each part on average; more parts are a series without an order
 _FIRST_TRIES = 50  # frames that cannot be read and none before them that can: so it is with all
 _T = TypeVar("_T")
 
@@ -334,7 +334,7 @@ def clock_parts(stamps_ns: ArrayLike) -> list[slice]:
     """
     stamps, begin = np.asarray(stamps_ns, np.int64), 0
     parts: list[slice] = []
-    while len(stamps) and len(parts) < max(2, len(stamps) // _FEWEST_TIMES):
+    while len(stamps) and len(parts) < max(2, min(_MOST_PARTS, len(stamps) // _FEWEST_TIMES)):
         rest = stamps[begin:]
         late = rest < np.maximum.accumulate(rest) - _LATE_NS
         step = int(np.argmax(late & np.append(late[1:], late[-1:])))
@@ -346,9 +346,13 @@ def clock_parts(stamps_ns: ArrayLike) -> list[slice]:
 
 
 def require_one_clock(stamps_ns: Sequence[int], path: Path) -> None:
-    """Raise DatasetError where the times of a list, in its order, step back into those before."""
+    """Raise DatasetError where the times of a list, in its order, step back into those before.
+
+    A list of files that was sorted as text, 10.5 before 9.5, does not.
+    """
     parts = clock_parts(stamps_ns)
-    if len(parts) > 1:
+    texts = [f"{stamp / 1e9:.9f}" for stamp in stamps_ns] if len(parts) > 1 else []
+    if texts != sorted(texts):
         begin = parts[1].start
         back_s = (max(stamps_ns[:begin]) - stamps_ns[begin]) / 1e9
         raise DatasetError(
