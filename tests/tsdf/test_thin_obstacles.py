@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from thin_obstacles import BAR_HEIGHT, POSTS, VOXEL, scans, views
 
-from tsfusion import Volume, VolumeConfig
+from tsfusion import MapError, Volume, VolumeConfig
 from tsfusion.geometry.map_grids import FREE, OCCUPIED
 
 
@@ -125,6 +125,19 @@ def test_a_map_that_has_not_counted_hits_goes_on(tmp_path: Path, monkeypatch: py
     fresh = Volume(VOXEL, sensor="lidar")
     fresh.integrate(other)
     assert opened.map_hash() == fresh.map_hash()
+
+
+def test_a_map_that_counts_no_hits_is_added_to_one_that_does() -> None:
+    lidar, camera = Volume(VOXEL, sensor="lidar"), Volume(VOXEL, sensor="kinect")
+    for volume, keyframe in zip((lidar, camera), scans(3.0, 2), strict=True):
+        volume.integrate(keyframe)
+    with pytest.raises(MapError, match="add this one to that one"):
+        camera.merge(lidar)
+    counted = int(lidar._store.hits.sum())
+    both = lidar.copy()
+    both.merge(camera)
+    assert (both.keyframes, int(both._store.hits.sum())) == (2, counted)
+    assert both.map_hash() not in (lidar.map_hash(), camera.map_hash())
 
 
 def hits(volume: Volume) -> dict[int, bytes]:

@@ -22,7 +22,7 @@ _VOTES = (1 << 16) - 1
 
 
 def add(store: BlockStore, other: BlockStore, max_blocks: int) -> None:
-    """Add the blocks of `other`, which has the same layers and voxel size.
+    """Add the blocks of `other`, which has the same voxel size and layers; it may lack hits.
 
     Args:
         max_blocks: that `store` may have.
@@ -85,7 +85,7 @@ def _add_rows(
     store.dirty[slots] = CHANGED
     if store.color:
         _add_colors(store, other, slots, theirs)
-    if store.counts_hits:
+    if other.counts_hits:
         store.hits[slots] += other.hits[theirs]
     store.note_written(slots)
     if store.corrected:

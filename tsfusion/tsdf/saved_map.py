@@ -32,7 +32,7 @@ def fill(
         CheckpointError: for other layers than the store has, or blocks that no map has.
     """
     layers = store.layers()
-    if (set(header.layers) ^ set(layers)) - {"hits"}:  # which maps of earlier versions lack
+    if not layers.keys() - {"hits"} <= {*header.layers} <= layers.keys():  # earlier versions count none
         raise CheckpointError(f"{path} is of another version: it has layers {header.layers}")
     checked = 0
     with SideThread() as side:

@@ -330,14 +330,13 @@ class Volume(AskableMap):
         )
 
     def _check_like(self, other: "Volume") -> None:
-        """Raise MapError unless voxels and layers are those of another map."""
+        """Raise MapError unless another map has these voxels and layers; it may lack counted hits."""
         self._check_voxels(other)
-        ours, theirs = (", ".join(sorted(one._store.layers())) for one in (self, other))
-        if ours != theirs:
-            raise MapError(
-                f"the maps have different layers, {ours} and {theirs} (colour, smoothing along rays): "
-                "fuse one anew"
-            )
+        ours, theirs = (set(one._store.layers()) for one in (self, other))
+        if ours - theirs - {"hits"} or theirs - ours:
+            names = " and ".join(", ".join(sorted(one)) for one in (ours, theirs))
+            cure = "add this one to that one" if theirs - ours == {"hits"} else "fuse one anew"
+            raise MapError(f"the maps have different layers, {names} (colour, smoothing along rays): {cure}")
 
     def take_dirty(self) -> NDArray[np.int32]:
         """Coordinates of the blocks changed since the last call: (n, 3) int32, in units of 8 voxels."""
