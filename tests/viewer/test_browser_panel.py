@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Owner of a browser's camera: the page, until somebody moves it, however slow the browser is."""
 
-import contextlib
+from contextlib import nullcontext
 from types import SimpleNamespace
 from typing import Any
 from unittest.mock import MagicMock
@@ -27,14 +27,14 @@ class Browser:
         camera.on_update = lambda tell: setattr(self, "_tell", tell)
         client = MagicMock(camera=camera, gui=MagicMock(add_dropdown=self._dropdown))
         shown: Any = SimpleNamespace(scanners=list, whole_view=self._whole_view)
-        self.panel = BrowserPanel(client, shown, contextlib.nullcontext)
+        self.panel = BrowserPanel(client, shown, nullcontext(), nullcontext(), ["Picture"])
         self.panel.update()
 
     def _whole_view(self, aspect: float, covered: float) -> View:
         self.covered = covered
         return self.whole
 
-    def _dropdown(self, label: str, options: Any, initial_value: str) -> Any:
+    def _dropdown(self, label: str, options: Any, initial_value: str, **_: object) -> Any:
         self.choice = SimpleNamespace(value=initial_value, options=options, on_update=lambda call: None)
         return self.choice
 

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from growing_maps import GrowingMap, surface_update
 from headless_browser import Browser, browser
+from reading_browser import ReadingBrowser
 
 from tsfusion import Intrinsics, Keyframe, Volume
 from tsfusion.geometry.trajectory import quaternion
@@ -169,10 +170,36 @@ def test_a_plane_cuts_the_wall(whole: Shown) -> None:
 def test_colours_by_numbers_have_a_legend(whole: Shown) -> None:
     before = whole.picture()
     whole.control("Colour").value = "Depth [m]"
-    until(lambda: "Depth" in whole.page._panel._legend.content)
+    panel = next(iter(whole.page._browsers.values()))
+    until(lambda: "Depth" in panel._legend.content)
     until(lambda: np.abs(whole.picture()[..., :3].astype(int) - before[..., :3]).max() > 50)
     whole.browser.wait("document.body.innerText.includes('Depth')")
     whole.control("Colour").value = "Picture"
+
+
+def test_a_browser_cuts_and_colours_for_itself_alone(whole: Shown) -> None:
+    pixels, before = whole.pixels(), whole.picture()
+    other = ReadingBrowser(whole.url)
+    try:
+        until(lambda: len(whole.page._browsers) == 2)
+        own, theirs = whole.page._browsers.values()
+        until(lambda: theirs._clipping._low[2] < 0)  # fitted to the map
+        theirs._clipping._plane.value = "z"
+        theirs._clipping._at.value = 0.0
+        theirs._mode.value = "Height"
+        until(lambda: theirs.own is not None and theirs._legend.visible)
+        until(lambda: theirs.own is not None and theirs.own._cover is not None)
+        up = [np.array((0.0, 0, 0)), np.array((2.0, 0, 0.3))]
+        assert whole.page.hit(own._look, *up) is not None
+        assert whole.page.hit(theirs._look, *up) is None, "cut away"
+        assert (whole.pixels(), own.own, own._legend.visible) == (pixels, None, False)
+        np.testing.assert_array_equal(whole.picture(), before)
+        assert len(whole.page.shown_mesh(theirs._look).faces) < len(whole.page.shown_mesh(own._look).faces)
+        theirs._clipping._plane.value, theirs._mode.value = "none", "Picture"
+        until(lambda: theirs.own is None)
+    finally:
+        assert other.close() > 0
+    until(lambda: len(whole.page._browsers) == 1)
 
 
 def test_two_clicks_measure_a_distance(whole: Shown) -> None:

@@ -29,14 +29,14 @@ class TwoMaps(GrowingMap):
 def panel() -> Iterator[SharedPanel]:
     served = PageServer()
     feed = TwoMaps(Volume(voxel_size=0.1, threads=1), [])
-    found = SharedPanel(served.server.gui, feed, ["Picture", "Height"], lambda what, wanted: None)
+    found = SharedPanel(served.server.gui, feed, lambda what, wanted: None)
     tell(found, "attic")
     yield found
     served.close()
 
 
 def tell(panel: SharedPanel, map_name: str) -> None:
-    panel.tell(map_name=map_name, problem="", facts=[], health=None, legend="", sessions=[])
+    panel.tell(map_name=map_name, problem="", facts=[], health=None, sessions=[])
 
 
 def event(control: Any, value: Any, client: object = "a browser") -> Any:
@@ -69,12 +69,3 @@ def test_the_past_is_asked_for_once_the_slider_rests(panel: SharedPanel) -> None
     assert panel.take_orders(moved + 0.6, 0.25).place is None
     panel._note_place(event(panel._time, 40, client=None))
     assert panel.take_orders(moved + 9, 0.25).place is None, "moved by the page itself"
-
-
-def test_a_colour_that_there_is_not_is_not_chosen(panel: SharedPanel) -> None:
-    panel._note(mode="Magic")
-    assert panel.take_orders(0.0, 0.25).mode is None
-    panel._note(mode="Height")
-    panel._note_clipping()
-    orders = panel.take_orders(0.0, 0.25)
-    assert (orders.mode, orders.is_clipping) == ("Height", True)

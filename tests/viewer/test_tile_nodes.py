@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from drawn_scenes import DrawnScene, decoded
 
+from tsfusion.core.token_bucket import Bucket
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.viewer.clipping import Clipping
 from tsfusion.viewer.map_tiles import CELL, EDGE, MapTiles
@@ -42,7 +43,7 @@ class Page:
         self.scene: Any = DrawnScene()
         self.tiles = MapTiles()
         colors = VertexColors(self.tiles, lambda points: None, {})
-        self.nodes = TileNodes(self.scene, self.tiles, colors, max_bytes_per_second=rate, now=0.0)
+        self.nodes = TileNodes(self.scene, self.tiles, colors, Bucket(rate, 0.0, burst=1.0))
         self.nodes.voxel_size = VOXEL
         self.now = 0.0
 

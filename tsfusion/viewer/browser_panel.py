@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Controls of one browser: its camera, measuring, pictures and downloads."""
+"""Controls of one browser: its colours, cut and camera, measuring, pictures and downloads."""
 
-import contextlib
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 
 from tsfusion.viewer import map_views
 from tsfusion.viewer.calm_callbacks import calm
+from tsfusion.viewer.clipping_controls import ClippingControls
 from tsfusion.viewer.map_views import View
 from tsfusion.viewer.state_tables import text
+from tsfusion.viewer.tile_look import MOST_UNREAD, OwnLook, TileLook
 
 if TYPE_CHECKING:
     import viser
@@ -30,7 +32,6 @@ _RENDER = 30.0  # seconds that a browser may take for a picture
 _UPRIGHT = 0.6
 _COVERED = 0.5
 _MARK = (213, 94, 0)
-_WAITING = 64  # messages to a browser that does not read
 
 
 class Shown(Protocol):
@@ -38,6 +39,7 @@ class Shown(Protocol):
 
     voxel_size: float
     map_name: str
+    shared: TileLook
 
     def whole_view(self, aspect: float, covered: float) -> View | None:
         """All of the map."""
@@ -51,11 +53,17 @@ class Shown(Protocol):
         """Sessions and names."""
         ...
 
-    def hit(self, origin: NDArray[np.float64], direction: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    def new_look(self, client: "viser.ClientHandle") -> OwnLook:
+        """Look of a browser alone."""
+        ...
+
+    def hit(
+        self, look: TileLook, origin: NDArray[np.float64], direction: NDArray[np.float64]
+    ) -> NDArray[np.float64] | None:
         """(3,) the point of the surface that a ray meets."""
         ...
 
-    def shown_mesh(self) -> "Mesh":
+    def shown_mesh(self, look: TileLook) -> "Mesh":
         """Mesh of what is shown, in the map's frame."""
         ...
 
@@ -64,14 +72,21 @@ class BrowserPanel:
     """The controls of one browser.
 
     Args:
-        place: makes the container of the controls current.
+        view, cut: make the containers of the controls current.
+        modes: of colours, the first is chosen.
+
+    Attributes:
+        own: look that the browser has chosen; None = the shared one.
+        is_changed: whether another look has been chosen since `change_look`.
     """
 
     def __init__(
         self,
         client: "viser.ClientHandle",
         shown: Shown,
-        place: Callable[[], contextlib.AbstractContextManager[Any]],
+        view: AbstractContextManager[Any],
+        cut: AbstractContextManager[Any],
+        modes: Sequence[str],
     ) -> None:
         self._client, self._shown = client, shown
         self._commanded: View | None = None
@@ -82,14 +97,21 @@ class BrowserPanel:
         self._marks: list[Any] = []
         self._saving = threading.Lock()
         self._is_measuring = False
-        with place():
-            gui = client.gui
+        self.own: OwnLook | None = None
+        self.is_changed = False
+        gui = client.gui
+        with cut:
+            self._clipping = ClippingControls(gui, self._note_change)
+        with view:
+            self._mode: Any = gui.add_dropdown("Colour", tuple(modes), initial_value=modes[0])
+            self._legend = gui.add_html("", visible=False)
             self._camera: Any = gui.add_dropdown("Camera", (WHOLE, BY_HAND), initial_value=WHOLE)
             self._measure = gui.add_button("Measure a distance", hint="Click two points of the surface")
             self._answer = gui.add_html("", visible=False)
             picture = gui.add_button("Save picture")
             model = gui.add_button("Save 3-D model", hint="GLB of what is shown: cut, and in these colours")
             dark = gui.add_checkbox("Dark", False)
+        self._mode.on_update(calm(lambda event: self._note_change()))
         self._camera.on_update(calm(lambda event: self._forget_view()))
         self._measure.on_click(calm(lambda event: self._toggle_measuring()))
         picture.on_click(calm(lambda event: self._save_one(self._save_picture)))
@@ -97,6 +119,45 @@ class BrowserPanel:
         dark.on_update(calm(lambda event: set_theme(client.gui, dark=dark.value)))
         client.camera.fov = map_views.FOV
         client.camera.on_update(calm(lambda event: self._note_move()))
+
+    @property
+    def _look(self) -> TileLook:
+        return self.own or self._shown.shared
+
+    def _note_change(self) -> None:
+        self.is_changed = True
+
+    def change_look(self) -> None:
+        """Look as the controls say: a look of its own where that is not the shared one."""
+        self.is_changed = False
+        mode, clipping, shared = self._mode.value, self._clipping.clipping, self._shown.shared
+        if mode == shared.colors.mode and clipping.normal is None and clipping.box is None:
+            own, self.own = self.own, None
+            if own is not None:
+                own.close()
+        else:
+            if self.own is None:
+                self.own = self._shown.new_look(self._client)
+                self.own.choose(mode)
+            elif mode != self.own.colors.mode:
+                self.own.choose(mode)
+            self.own.nodes.clip(clipping)
+        self._tell_legend()
+
+    def fit(self, low: NDArray[np.float64], high: NDArray[np.float64], up: NDArray[np.float64]) -> None:
+        """Fit sliders and legend to a map from (3,) `low` to (3,) `high`, metres."""
+        self._clipping.fit(low, high, up)
+        self._tell_legend()
+
+    def send(self, now: float) -> None:
+        """Send what is due of the browser's own look."""
+        if self.own is not None:
+            with self._client.atomic():
+                self.own.send(now)
+
+    def _tell_legend(self) -> None:
+        legend = self._look.colors.legend()
+        self._legend.content, self._legend.visible = text(legend), bool(legend)
 
     def update(self) -> None:
         """Move the camera with what it follows, and name the scanners that there are."""
@@ -166,7 +227,7 @@ class BrowserPanel:
             self._answer.visible = False
 
     def _click(self, event: Any) -> None:
-        point = self._shown.hit(np.array(event.ray_origin), np.array(event.ray_direction))
+        point = self._shown.hit(self._look, np.array(event.ray_origin), np.array(event.ray_direction))
         if point is None:
             self._tell("There is no surface.")
             return
@@ -211,7 +272,7 @@ class BrowserPanel:
     def _save_one(self, save: Callable[[], None]) -> None:
         """Save one file at a time, when the browser has taken the last one."""
         waiting = self._client._websock_connection.get_message_buffer().message_from_id
-        if len(waiting) > _WAITING or not self._saving.acquire(blocking=False):
+        if len(waiting) > MOST_UNREAD or not self._saving.acquire(blocking=False):
             return
         try:
             save()
@@ -231,7 +292,7 @@ class BrowserPanel:
             self._send("png", bytes(content.tobytes()))
 
     def _save_model(self) -> None:
-        self._send("glb", self._shown.shown_mesh().encode(".glb"))
+        self._send("glb", self._shown.shown_mesh(self._look).encode(".glb"))
 
     def _send(self, kind: str, content: bytes) -> None:
         stamp = time.strftime("%Y%m%d_%H%M%S")

@@ -8,12 +8,12 @@ from typing import Any
 log = logging.getLogger(__name__)
 
 
-def calm(callback: Callable[[Any], object]) -> Callable[[Any], None]:
+def calm(callback: Callable[..., object]) -> Callable[..., None]:
     """The callback, whose exceptions are logged in a line."""
 
-    def call(event: Any) -> None:
+    def call(*given: Any) -> None:
         try:
-            callback(event)
+            callback(*given)
         except Exception as error:  # noqa: BLE001 - a browser may leave at any moment, in any call
             log.warning("a request of a browser failed: %s: %s", type(error).__name__, error)
 

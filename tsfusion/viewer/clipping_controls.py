@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The controls of the clip plane and the clip box. One for all browsers of a page."""
+"""The controls of the clip plane and the clip box of a browser."""
 
 import math
 from collections.abc import Callable

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from tsfusion.core import process
 from tsfusion.core.readable_numbers import grouped
+from tsfusion.core.token_bucket import Bucket
 from tsfusion.geometry.mesh import Mesh
-from tsfusion.viewer import map_tiles, map_views, pointed_surface
+from tsfusion.viewer import map_views, pointed_surface
 from tsfusion.viewer.browser_panel import BrowserPanel, set_theme
 from tsfusion.viewer.calm_callbacks import calm
 from tsfusion.viewer.map_feed import MapFeed
@@ -24,6 +25,7 @@ from tsfusion.viewer.map_up import MapUp
 from tsfusion.viewer.map_views import View
 from tsfusion.viewer.scanner_marks import ScannerMarks
 from tsfusion.viewer.shared_panel import SharedPanel
+from tsfusion.viewer.tile_look import OwnLook, TileLook
 from tsfusion.viewer.tile_nodes import TileNodes
 from tsfusion.viewer.vertex_colors import VertexColors
 from tsfusion.wire.health import Health
@@ -55,7 +57,7 @@ log = logging.getLogger(__name__)
 
 
 class LivePage:
-    """A page that shows what a feed tells. Everything is shared by its browsers but for `BrowserPanel`.
+    """A page that shows what a feed tells, shared by its browsers but for what `BrowserPanel` has.
 
     Args:
         server: to fill; whoever made it ends it.
@@ -82,22 +84,17 @@ class LivePage:
         self._tiles = MapTiles()
         self._updates: list[SurfaceUpdate] = []  # that have yet to be applied
         self._next_apply = -np.inf
-        self._colors = VertexColors(self._tiles, feed.weights, measures or {})
-        self._nodes = TileNodes(
-            server.scene,
-            self._tiles,
-            self._colors,
-            max_bytes_per_second=max_bytes_per_second,
-            now=self._began,
-        )
+        self._measures = measures or {}
         self._marks = ScannerMarks(server.scene)
-        self._colors.name_clients(self._marks.name)
+        shared, self._own_bucket = (Bucket(max_bytes_per_second, self._began, burst=1.0) for _ in range(2))
+        colors = self._new_colors()
+        self.shared = TileLook(self._tiles, colors, TileNodes(server.scene, self._tiles, colors, shared))
         self._whole_views = map_views.WholeViews(self._tiles)
         self._browsers: dict[int, BrowserPanel] = {}
         self._next_draw = self._looked = self._reckoned = -np.inf
         self._lock = threading.Lock()  # of `_browsers`
         set_theme(server.gui, dark=False)
-        self._panel = SharedPanel(server.gui, feed, self._colors.names, self._marks.show)
+        self._panel = SharedPanel(server.gui, feed, self._marks.show)
         server.on_client_connect(calm(self._welcome))
         server.on_client_disconnect(calm(self._part))
 
@@ -120,7 +117,8 @@ class LivePage:
                 if process.rss_bytes() > memory_bytes:
                     raise MemoryError(f"a page may take {memory_bytes >> 20} MB, and it takes more")
         finally:
-            self._colors.values.close()
+            for look in self._looks():
+                look.colors.values.close()
 
     def _take(self, event: MapEvent) -> None:
         now = time.monotonic()
@@ -150,53 +148,60 @@ class LivePage:
         keys = self._tiles.apply_all(self._updates, now - self._began)
         rest = _rest(began, _SHARE, _TOGETHER) if self._browsers else _TOGETHER[1]
         self._updates, self._next_apply = [], now + rest
-        if not self._colors.is_asked_for:
-            self._nodes.changed(keys)
-        self._ask(keys)
+        for look in self._looks():
+            look.changed(keys)
 
     def _clear(self, event: Cleared) -> None:
         self._updates.clear()
-        self._nodes.clear()
         self._tiles.clear()
+        for look in self._looks():
+            look.clear()
+            look.nodes.voxel_size = event.voxel_size
         self._whole_views.forget()
         self._marks.clear()
-        self._colors.choose(self._colors.mode)
         if event.map != self.map_name:
             self._panel.plots.clear()
             self._up = MapUp()
         self.map_name, self.voxel_size = event.map, event.voxel_size
-        self._nodes.voxel_size = self._marks.voxel_size = event.voxel_size
+        self._marks.voxel_size = event.voxel_size
 
-    def _ask(self, keys: set[map_tiles.Key]) -> None:
-        """Ask for the values of tiles, where they come from elsewhere; without any they are shown at once."""
-        if not self._colors.is_asked_for:
-            return
-        found = {key: self._tiles.tiles[key] for key in keys if key in self._tiles.tiles}
-        self._nodes.changed(key for key in keys if key not in found or not self._nodes.has(key))
-        self._colors.values.ask(found)
+    def _looks(self) -> list[TileLook]:
+        """Shared look of the map, and those of browsers that have chosen another."""
+        return [self.shared, *(one.own for one in self._panels() if one.own is not None)]
+
+    def _panels(self) -> list[BrowserPanel]:
+        with self._lock:
+            return list(self._browsers.values())
+
+    def _new_colors(self) -> VertexColors:
+        colors = VertexColors(self._tiles, self._feed.weights, self._measures)
+        colors.name_clients(self._marks.name)
+        return colors
 
     def _step(self, now: float) -> None:
         """Work between two looks at the feed."""
         if self._updates and now >= self._next_apply:
             self._apply(now)
         self._obey(now)
-        self._nodes.changed(self._colors.values.take_ready())
+        for look in self._looks():
+            look.nodes.changed(look.colors.values.take_ready())
         if now >= self._reckoned + _SELDOM:
             self._reckoned = now
             self._reckon()
         if not self._browsers:
             return
-        if now >= self._next_draw and (self._nodes.is_due(now) or self._marks.is_due(now)):
+        is_due = self._marks.is_due(now) or any(look.nodes.is_due(now) for look in self._looks())
+        if now >= self._next_draw and is_due:
             began = time.thread_time()
             with self._server.atomic():  # else each message wakes the web server's thread
-                self._nodes.send(now)
+                self.shared.nodes.send(now)
                 self._marks.draw(now)
+            for browser in self._panels():
+                calm(BrowserPanel.send)(browser, now)
             self._next_draw = now + _rest(began, _DRAW_SHARE, _DRAW)
         if now >= self._looked + _OFTEN:
             self._looked = now
-            with self._lock:
-                browsers = list(self._browsers.values())
-            for browser in browsers:
+            for browser in self._panels():
                 calm(BrowserPanel.update)(browser)
 
     def _obey(self, now: float) -> None:
@@ -206,33 +211,27 @@ class LivePage:
             self._feed.choose(orders.map_name)
         if orders.place is not None:
             self._feed.seek(orders.place)
-        if orders.mode is not None:
-            self._colors.choose(orders.mode)
-            self._reckoned = now
-            self._reckon()
-            if not self._colors.is_asked_for:
-                self._nodes.changed(self._tiles.tiles)
-            self._ask(set(self._tiles.tiles))
-        if orders.is_clipping:
-            self._next_draw = now
-            self._nodes.clip(self._panel.clipping.clipping)
+        for browser in self._panels():
+            if browser.is_changed:
+                self._next_draw = now
+                calm(BrowserPanel.change_look)(browser)
 
     def _reckon(self) -> None:
         """Bring up direction, scales and states up to date."""
         before = self._up.up
         self._up.look(self._tiles)
-        self._colors.up = self._up.direction
         if self._up.up != before:
             self._server.scene.set_up_direction(self._up.direction)
             self._looked = -np.inf  # cameras follow at once: what browsers tell of them is turned, too
         self._whole_views.refresh(self._up.direction)
-        if self._colors.fit_scale():
-            self._nodes.changed(self._tiles.tiles)
+        for look in self._looks():
+            look.refresh(self._up.direction)
         bounds = [tile.bounds for tile in list(self._tiles.tiles.values())]
         if bounds:
             low = np.min([one[0] for one in bounds], axis=0).astype(np.float64)
             high = np.max([one[1] for one in bounds], axis=0).astype(np.float64)
-            self._panel.clipping.fit(low, high, self._up.direction)
+            for browser in self._panels():
+                calm(BrowserPanel.fit)(browser, low, high, self._up.direction)
         if not self._browsers:
             return
         with self._server.atomic():
@@ -242,18 +241,19 @@ class LivePage:
                 problem=self._problem,
                 facts=facts,
                 health=self._health,
-                legend=self._colors.legend(),
                 sessions=self._marks.sessions,
             )
 
     def _welcome(self, client: "viser.ClientHandle") -> None:
-        panel = BrowserPanel(client, self, self._panel.place)
+        panel = BrowserPanel(client, self, self._panel.view, self._panel.cut, self.shared.colors.names)
         with self._lock:
             self._browsers[client.client_id] = panel
 
     def _part(self, client: "viser.ClientHandle") -> None:
         with self._lock:
-            self._browsers.pop(client.client_id, None)
+            panel = self._browsers.pop(client.client_id, None)
+        if panel is not None and panel.own is not None:
+            panel.own.colors.values.close()
 
     # What the panels of browsers ask
 
@@ -272,12 +272,18 @@ class LivePage:
     def scanners(self) -> list[tuple[bytes, str]]:
         return [(session, self._marks.name(session)) for session in self._marks.sessions]
 
-    def hit(self, origin: NDArray[np.float64], direction: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        return pointed_surface.first_hit(self._tiles, self._nodes.clipping, origin, direction)
+    def new_look(self, client: "viser.ClientHandle") -> OwnLook:
+        look = OwnLook(client, self._tiles, self._new_colors(), self._own_bucket)
+        look.nodes.voxel_size, look.colors.up = self.voxel_size, self._up.direction
+        return look
 
-    def shown_mesh(self) -> Mesh:
-        parts = [self._nodes.shown_mesh(key, tile) for key, tile in list(self._tiles.tiles.items())]
-        return map_tiles.whole(parts, self._up.up)
+    def hit(
+        self, look: TileLook, origin: NDArray[np.float64], direction: NDArray[np.float64]
+    ) -> NDArray[np.float64] | None:
+        return pointed_surface.first_hit(self._tiles, look.nodes.clipping, origin, direction)
+
+    def shown_mesh(self, look: TileLook) -> Mesh:
+        return look.mesh(self._up.up)
 
 
 def _rest(began: float, share: float, bounds: tuple[float, float]) -> float:

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: MIT
-"""The panel that all browsers of a page share: what is shown, how, and how the server is."""
+"""The panel that all browsers of a page share: what is shown, and how the server is."""
 
-import contextlib
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -12,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 from tsfusion.core.readable_numbers import grouped
 from tsfusion.viewer import state_tables
 from tsfusion.viewer.calm_callbacks import calm
-from tsfusion.viewer.clipping_controls import ClippingControls
 from tsfusion.viewer.health_plots import HealthPlots
 from tsfusion.viewer.map_feed import MapFeed, TimeLine
 from tsfusion.wire.health import Health
@@ -31,52 +29,40 @@ class Orders:
     Attributes:
         map_name: to be shown.
         place: number of keyframes of which the map is to be shown.
-        mode: what colours are to mean.
-        is_clipping: whether the clipping has changed.
     """
 
     map_name: str | None = None
     place: int | None = None
-    mode: str | None = None
-    is_clipping: bool = False
 
 
 class SharedPanel:
     """Controls and figures in three tabs.
 
     Args:
-        modes: of colours, the first is chosen.
         show: told what is to be shown or hidden in the scene.
+
+    Attributes:
+        view, cut: where a browser puts controls of its own.
     """
 
-    def __init__(
-        self, gui: "viser.GuiApi", feed: MapFeed, modes: Sequence[str], show: Callable[[str, bool], None]
-    ) -> None:
-        self._feed, self._modes = feed, modes
+    def __init__(self, gui: "viser.GuiApi", feed: MapFeed, show: Callable[[str, bool], None]) -> None:
+        self._feed = feed
         self._orders, self._lock, self._slid_at = Orders(), threading.Lock(), 0.0
         self._wanted_map: str | None = None  # until it is shown
         gui.set_panel_label("tsfusion")
         gui.main_panel.dock_right()
         self._head = gui.add_html(state_tables.summary(feed.title, "", "", ["waiting for the map"], ()))
         tabs = gui.add_tab_group()
-        with tabs.add_tab("View") as self._view:
+        with tabs.add_tab("View") as self.view:
             self._map: Any = self._choice_of_maps(gui)
             self._time: Any = self._time_slider(gui)
-            self._mode: Any = gui.add_dropdown("Colour", tuple(modes), initial_value=modes[0])
-            self._legend = gui.add_html("", visible=False)
             for what, label in _MARKS.items():
                 box: Any = gui.add_checkbox(label, True)
                 box.on_update(calm(partial(_show, show, what)))
-        with tabs.add_tab("Cut"):
-            self.clipping = ClippingControls(gui, self._note_clipping)
+        self.cut = tabs.add_tab("Cut")
         with tabs.add_tab("State"):
             self._tables = gui.add_html(state_tables.text("No server is watched."))
             self.plots = HealthPlots(gui)
-        self._mode.on_update(calm(lambda event: self._note(mode=event.target.value)))
-
-    def place(self) -> contextlib.AbstractContextManager[Any]:
-        """Where a browser puts controls of its own."""
-        return self._view
 
     def take_orders(self, now: float, settled: float) -> Orders:
         """Requests of browsers; a time slider counts once it has rested for `settled` seconds."""
@@ -93,7 +79,6 @@ class SharedPanel:
         problem: str,
         facts: Sequence[str],
         health: Health | None,
-        legend: str,
         sessions: Sequence[bytes],
     ) -> None:
         """Show how things are."""
@@ -103,7 +88,6 @@ class SharedPanel:
             facts += [f"{grouped(found.waiting)} waiting"] if found.waiting else []
         problems = () if health is None else health.problems
         self._head.content = state_tables.summary(self._feed.title, map_name, problem, facts, problems)
-        self._legend.content, self._legend.visible = state_tables.text(legend), bool(legend)
         if health is not None:
             order = [session.hex()[:8] for session in sessions]
             self._tables.content = state_tables.tables(health, map_name, order)
@@ -148,15 +132,6 @@ class SharedPanel:
         if event.client is not None and name in self._map.options:  # the feed is for the page's thread alone
             with self._lock:
                 self._orders.map_name = self._wanted_map = name
-
-    def _note(self, *, mode: str) -> None:
-        if mode in self._modes:
-            with self._lock:
-                self._orders.mode = mode
-
-    def _note_clipping(self) -> None:
-        with self._lock:
-            self._orders.is_clipping = True
 
 
 def _show(show: Callable[[str, bool], None], what: str, event: Any) -> None:

@@ -24,6 +24,7 @@ STEADY_PAUSE = 2.0  # of a tile that changes all the time: half of the work for 
 _SPARED = 5.0  # seconds that an empty node is kept after its last version
 _SOON = 0.5  # seconds after a pause within which a change is one of many
 _CUT_PAUSE = 0.25  # while somebody moves the clip plane
+ROOT = "/map"  # of the names of nodes
 _MARGIN = 1.0  # of a tile's edge that its triangles may reach beyond it
 
 
@@ -31,7 +32,9 @@ class TileNodes:
     """Sends tiles that have changed, whoever waits longest first.
 
     Args:
-        max_bytes_per_second: of all tiles together, on average.
+        bucket: of bytes a second, of all tiles together.
+        root: of the names of nodes.
+        keeps: whether browsers that come later get what has been sent.
     """
 
     def __init__(
@@ -39,13 +42,15 @@ class TileNodes:
         scene: "viser.SceneApi",
         tiles: MapTiles,
         colors: VertexColors,
+        bucket: Bucket,
         *,
-        max_bytes_per_second: float,
-        now: float,
+        root: str = ROOT,
+        keeps: bool = True,
     ) -> None:
+        self._root, self._keeps = root, keeps
         self._scene, self._tiles, self._colors = scene, tiles, colors
-        self._bucket = Bucket(max_bytes_per_second, now, burst=1.0)
-        self._waiting: dict[Key, None] = {}  # in the order in which they are sent
+        self._bucket = bucket
+        self.waiting: dict[Key, None] = {}  # in the order in which they are sent
         self._sent_at: dict[Key, float] = {}
         self._pauses: dict[Key, float] = {}  # until the next version
         self._sides: dict[Key, Side] = {}  # of what is in the scene
@@ -61,7 +66,7 @@ class TileNodes:
     def is_due(self, now: float) -> bool:
         """Whether `send` has something to do."""
         ends = (end for nodes in (self._last, self._spare) for _, end in nodes.values())
-        return any(now >= end for end in ends) or any(now >= self._due(key) for key in self._waiting)
+        return any(now >= end for end in ends) or any(now >= self._due(key) for key in self.waiting)
 
     def has(self, key: Key) -> bool:
         """Whether the scene has a version of a tile."""
@@ -76,7 +81,7 @@ class TileNodes:
             self._nodes,
             self._last,
             self._spare,
-            self._waiting,
+            self.waiting,
             self._sent_at,
             self._pauses,
             self._sides,
@@ -88,7 +93,7 @@ class TileNodes:
     def changed(self, keys: Iterable[Key]) -> None:
         """Note tiles that look different now."""
         for key in keys:
-            self._waiting.setdefault(key)
+            self.waiting.setdefault(key)
 
     def clip(self, clipping: Clipping) -> None:
         """Hide what lies beyond, at once; tiles that are cut follow."""
@@ -116,13 +121,13 @@ class TileNodes:
             if now >= end:
                 del self._spare[key]
                 node.remove()
-        for key in list(self._waiting):
+        for key in list(self.waiting):
             due = self._due(key)
             if due > now:
                 continue
             if self._bucket.wait(1.0, now) > 0:
                 break
-            del self._waiting[key]
+            del self.waiting[key]
             size = self._send(key, now)
             self._cut.discard(key)
             if size:
@@ -184,6 +189,8 @@ class TileNodes:
         else:
             other = self._add(key, node)
         other.glb_data = content
+        if not self._keeps:
+            other._impl.props.glb_data = b""
         if not other.visible:
             other.visible = True
         self._nodes[key] = other
@@ -191,7 +198,7 @@ class TileNodes:
 
     def _add(self, key: Key, node: "viser.GlbHandle | None") -> "viser.GlbHandle":
         """An empty node beside another one: what it is made with stays in viser's memory as long as it."""
-        names = ["/map/" + "_".join(map(str, key)) + version for version in ("", "b")]
+        names = [f"{self._root}/" + "_".join(map(str, key)) + version for version in ("", "b")]
         if node is not None:
             names.remove(node.name)
         return self._scene.add_glb(names[0], tile_glb.EMPTY, cast_shadow=False, receive_shadow=False)

@@ -39,7 +39,7 @@ class Scale:
 
 
 class VertexColors:
-    """Present meaning of colours. One for all browsers of a page.
+    """Present meaning of colours.
 
     Args:
         tiles: that get colours.
