@@ -9,6 +9,7 @@ import sys
 import threading
 from http import HTTPStatus
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
@@ -21,6 +22,7 @@ from live_pages import DEADLINE, address_of, ended, running, viewing
 from tsfusion.cli import verbs
 from tsfusion.cli import view as view_command
 from tsfusion.core.errors import InvalidConfig
+from tsfusion.pipelines import viewer_child
 from tsfusion.pipelines.viewer_child import ViewerChild
 from tsfusion.viewer.live_page import LivePage
 from tsfusion.viewer.page_place import listen
@@ -203,6 +205,18 @@ def test_a_page_that_does_not_start_is_a_warning(caplog: pytest.LogCaptureFixtur
     assert line.startswith(f"the page has ended with status 1: cannot show a page at 127.0.0.1:{port}: ")
     assert line.endswith("; everything else goes on")
     assert not told
+
+
+def test_a_run_s_page_is_told_what_shows_the_map_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    page = 'import json, sys; print(json.dumps({"url": sys.argv[-1]}), flush=True); sys.stdin.read()'
+    monkeypatch.setattr(viewer_child, "_COMMAND", (sys.executable, "-c", page))
+    told: list[str] = []
+    viewer = ViewerChild("127.0.0.1:0", told.append)
+    target: Any = SimpleNamespace(
+        link=SimpleNamespace(address=NOBODY, control=None, map="default"), keys=None
+    )
+    with viewer_child.showing(viewer, target, "out/3"):
+        assert eventually(lambda: told == ["--again=out/3"], DEADLINE)
 
 
 def test_a_page_with_too_much_memory_begins_again_at_its_address(

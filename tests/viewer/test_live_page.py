@@ -79,6 +79,19 @@ class Shown:
         """Number of pixels that show something."""
         return int((self.picture()[..., 3] > 0).sum())
 
+    def press(self, x: float, y: float) -> None:
+        for what in ("mousePressed", "mouseReleased"):
+            self.browser.call(
+                "Input.dispatchMouseEvent", type=what, x=x, y=y, button="left", clickCount=1, buttons=1
+            )
+
+    def click(self, label: str, kind: str) -> None:
+        found = f"[...document.querySelectorAll('{kind}')].find(one => one.innerText.trim() == '{label}')"
+        self.browser.wait(f"!!{found}")
+        self.browser.evaluate(f"{found}.scrollIntoView()")
+        box = f"(b => [b.x + b.width / 2, b.y + b.height / 2])({found}.getBoundingClientRect())"
+        self.press(*self.browser.evaluate(box))
+
     def control(self, label: str) -> Any:
         """A control of the panel by its label."""
         panel = next(iter(self.page._browsers.values()))
@@ -216,21 +229,7 @@ def test_two_clicks_measure_a_distance(whole: Shown) -> None:
 def test_what_a_person_does_in_the_page_gets_through(whole: Shown) -> None:
     """Boxes, choices, buttons, sliders and clicks of the real page are messages that the page takes."""
 
-    def press(x: float, y: float) -> None:
-        for what in ("mousePressed", "mouseReleased"):
-            whole.browser.call(
-                "Input.dispatchMouseEvent", type=what, x=x, y=y, button="left", clickCount=1, buttons=1
-            )
-
-    def click(label: str, kind: str) -> None:
-        found = f"[...document.querySelectorAll('{kind}')].find(one => one.innerText.trim() == '{label}')"
-        whole.browser.wait(f"!!{found}")
-        whole.browser.evaluate(f"{found}.scrollIntoView()")
-        box = whole.browser.evaluate(
-            f"(b => [b.x + b.width / 2, b.y + b.height / 2])({found}.getBoundingClientRect())"
-        )
-        press(*box)
-
+    click, press = whole.click, whole.press
     click("Dark", "label")
     until(lambda: whole.control("Dark").value)
     panel = next(iter(whole.page._browsers.values()))
@@ -266,6 +265,37 @@ def test_problems_are_told_in_words(whole: Shown) -> None:
     whole.browser.wait("document.body.innerText.includes('the server does not answer <for> 3 s')")
     whole.feed.tell(LinkSeen(""))
     whole.browser.wait("document.body.innerText.includes('connected')")
+
+
+def test_the_page_has_the_map_s_name_and_every_control_one(whole: Shown) -> None:
+    whole.browser.wait("document.title == 'wall'")
+    controls = "[...document.querySelectorAll('button, input, [role=slider]')]"
+    named = (
+        "one.labels?.length || one.ariaLabel || one.innerText?.trim() || one.getAttribute('aria-labelledby')"
+    )
+    assert whole.browser.evaluate(f"{controls}.length") > 8
+    assert whole.browser.evaluate(f"{controls}.filter(one => !({named})).map(one => one.outerHTML)") == []
+
+
+def test_arrow_keys_in_a_slider_do_not_turn_the_camera(whole: Shown) -> None:
+    slider = "[...document.querySelectorAll('[role=slider]')].find(one => one.ariaLabel == 'Metres')"
+    whole.click("Cut", "[role=tab]")
+    whole.browser.wait(f"!!{slider}")
+    whole.browser.evaluate(
+        "document.addEventListener('keydown', event => (window.heard ??= []).push(event.code))"
+    )
+    for focused, key in ((f"{slider}.focus()", "ArrowUp"), ("document.activeElement.blur()", "ArrowDown")):
+        whole.browser.evaluate(focused)
+        for what in ("rawKeyDown", "keyUp"):
+            whole.browser.call("Input.dispatchKeyEvent", type=what, key=key, code=key)
+    whole.click("View", "[role=tab]")
+    assert whole.browser.evaluate("window.heard") == ["ArrowDown"], "viser's camera listens there"
+
+
+def test_an_ended_run_is_said(whole: Shown) -> None:
+    whole.page.tell_end("the run has ended; its map is seen again with: tsfusion view out/kitchen")
+    whole.browser.wait("document.body.innerText.includes('tsfusion view out/kitchen')")
+    whole.feed.tell(LinkSeen(""))
 
 
 def test_a_browser_that_leaves_amid_a_picture_ends_nothing(

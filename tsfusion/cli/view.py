@@ -34,6 +34,7 @@ _SERVER = re.compile(r"[\w.-]+:\d{1,5}|\[[\da-fA-F:.]+\]:\d{1,5}", re.ASCII)
 _ERROR = "Error [m]"  # as the page names it
 _NICENESS = 10  # of a page beside a run
 _MEMORY_SHARE, _LEAST_MEMORY = 4, 2 << 30  # of the machine's that a page may take; bytes
+_AGAIN = "its map is seen again with: tsfusion view"
 _LEAST_SECONDS = 60.0  # that a page lasts which may begin again
 
 log = logging.getLogger(__name__)
@@ -65,6 +66,7 @@ def view(
     server_key: options.ServerKey = None,
     json: options.Json = False,
     publish: Annotated[str | None, typer.Option("--publish", hidden=True)] = None,
+    again: Annotated[str | None, typer.Option("--again", hidden=True)] = None,
     from_parent: Annotated[bool, typer.Option("--from-parent", hidden=True)] = False,
     help_all: verbs.HelpAll = None,
 ) -> int:
@@ -109,6 +111,8 @@ def view(
                 is_announced, port, token = True, page.port, page.token  # which stay if it begins again
                 try:
                     shown.run(stop, memory_bytes=memory_bytes)
+                    seen = "this page has ended" if again is None else f"the run has ended; {_AGAIN} {again}"
+                    shown.tell_end(seen)
                 except MemoryError as error:
                     if time.monotonic() < began + _LEAST_SECONDS:  # the map itself is too much
                         raise

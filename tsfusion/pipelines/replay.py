@@ -99,7 +99,7 @@ def replay(
             target_server.opened(
                 connect, work / ".scratch", volume=volume, client=client, server=server
             ) as target,
-            showing(viewer, target),
+            showing(viewer, target, connect or str(folder)),
         ):
             # A recording leaves nothing out: `wait_turn` keeps the spool short, not the policy.
             world = world_of(dataset)

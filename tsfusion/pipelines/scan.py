@@ -140,7 +140,7 @@ def scan(
             target_server.opened(
                 connect, work / ".scratch", volume=volume, client=client, server=server, spools=Path(spool)
             ) as target,
-            showing(viewer, target),
+            showing(viewer, target, connect or str(folder)),
         ):
             leftovers = Leftovers(target, given=localizer.absolute)
             leftovers.begin()

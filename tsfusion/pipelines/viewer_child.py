@@ -60,14 +60,20 @@ class ViewerChild:
         publish: str | None = None,
         map_name: str = DEFAULT_MAP,
         keys: ClientKeys | None = None,
+        again: str | None = None,
     ) -> None:
-        """Show a map of the server that listens at `address`. What goes wrong is a warning, no error."""
+        """Show a map of the server that listens at `address`. What goes wrong is a warning, no error.
+
+        Args:
+            again: what `tsfusion view` shows when the run has ended; the page then says so.
+        """
         given = {
             "--control": control and _reached(control),
             "--publish": publish and _reached(publish),
             "--truth": self._truth,
             "--map": map_name,
             "--listen": self._place,
+            "--again": again,
         }
         flags = [f"{flag}={value}" for flag, value in given.items() if value is not None]
         try:
@@ -135,14 +141,14 @@ def _environment() -> dict[str, str]:
 
 
 @contextmanager
-def showing(viewer: ViewerChild | None, target: Target) -> Iterator[None]:
-    """Show the map that a run sends to, until the end of the block."""
+def showing(viewer: ViewerChild | None, target: Target, again: str) -> Iterator[None]:
+    """Show the map that a run sends to, until the end of the block; afterwards `again` has it."""
     if viewer is None:
         yield
         return
     link = target.link
     try:
-        viewer.start(link.address, control=link.control, map_name=link.map, keys=target.keys)
+        viewer.start(link.address, control=link.control, map_name=link.map, keys=target.keys, again=again)
         yield
     finally:
         viewer.close()

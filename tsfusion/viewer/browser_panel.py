@@ -5,7 +5,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from tsfusion.viewer.tile_look import MOST_UNREAD, OwnLook, TileLook
 if TYPE_CHECKING:
     import viser
 
-    from tsfusion.geometry.mesh import Mesh
+    from tsfusion.viewer.live_page import LivePage
 
 WHOLE, BY_HAND, _FOLLOW = "Whole map", "By hand", "Follow "
 _SETTLED = 10.0  # seconds after a move of ours, in which a slow browser may still tell older places
@@ -32,40 +32,6 @@ _RENDER = 30.0  # seconds that a browser may take for a picture
 _UPRIGHT = 0.6
 _COVERED = 0.5
 _MARK = (213, 94, 0)
-
-
-class Shown(Protocol):
-    """Requests of a browser's panel to the page."""
-
-    voxel_size: float
-    map_name: str
-    shared: TileLook
-
-    def whole_view(self, aspect: float, covered: float) -> View | None:
-        """All of the map."""
-        ...
-
-    def scanner_view(self, session: bytes) -> View | None:
-        """From behind a scanner."""
-        ...
-
-    def scanners(self) -> list[tuple[bytes, str]]:
-        """Sessions and names."""
-        ...
-
-    def new_look(self, client: "viser.ClientHandle") -> OwnLook:
-        """Look of a browser alone."""
-        ...
-
-    def hit(
-        self, look: TileLook, origin: NDArray[np.float64], direction: NDArray[np.float64]
-    ) -> NDArray[np.float64] | None:
-        """(3,) the point of the surface that a ray meets."""
-        ...
-
-    def shown_mesh(self, look: TileLook) -> "Mesh":
-        """Mesh of what is shown, in the map's frame."""
-        ...
 
 
 class BrowserPanel:
@@ -83,7 +49,7 @@ class BrowserPanel:
     def __init__(
         self,
         client: "viser.ClientHandle",
-        shown: Shown,
+        shown: "LivePage",
         view: AbstractContextManager[Any],
         cut: AbstractContextManager[Any],
         modes: Sequence[str],

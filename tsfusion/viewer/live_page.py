@@ -52,6 +52,7 @@ _SETTLED = 0.25  # seconds that a time slider rests before the map is rewound
 _DRAW_SHARE = 0.01  # of a core, for sending tiles and marks: what changes meanwhile is sent once
 _DRAW = (0.25, 1.0)  # seconds between two sendings to browsers, at least and at most
 _OFTEN, _SELDOM = 0.3, 1.0  # seconds between two looks at cameras, and at scales and states
+_FAREWELL = 0.5  # seconds that browsers have for the last words of a page
 
 log = logging.getLogger(__name__)
 
@@ -119,6 +120,13 @@ class LivePage:
         finally:
             for look in self._looks():
                 look.colors.values.close()
+
+    def tell_end(self, sentence: str) -> None:
+        """Say in every browser why nothing changes any more, and wait until that is on its way."""
+        self._problem, self._health = sentence, None
+        self._reckon()
+        self._server.flush()
+        time.sleep(_FAREWELL if self._browsers else 0.0)
 
     def _take(self, event: MapEvent) -> None:
         now = time.monotonic()
@@ -258,21 +266,20 @@ class LivePage:
     # What the panels of browsers ask
 
     def whole_view(self, aspect: float, covered: float) -> View | None:
-        """See `browser_panel.Shown`, with what follows."""
+        """All of the map; see `map_views.whole`."""
         return self._whole_views.of(aspect, covered)
 
     def scanner_view(self, session: bytes) -> View | None:
-        pose = self._marks.pose(session)
-        return (
-            None
-            if pose is None
-            else map_views.behind(pose, self._up.direction, distance=50 * self.voxel_size)
-        )
+        """From behind a scanner."""
+        pose, up = self._marks.pose(session), self._up.direction
+        return None if pose is None else map_views.behind(pose, up, distance=50 * self.voxel_size)
 
     def scanners(self) -> list[tuple[bytes, str]]:
+        """Sessions and names."""
         return [(session, self._marks.name(session)) for session in self._marks.sessions]
 
     def new_look(self, client: "viser.ClientHandle") -> OwnLook:
+        """Look of a browser alone."""
         look = OwnLook(client, self._tiles, self._new_colors(), self._own_bucket)
         look.nodes.voxel_size, look.colors.up = self.voxel_size, self._up.direction
         return look
@@ -280,9 +287,11 @@ class LivePage:
     def hit(
         self, look: TileLook, origin: NDArray[np.float64], direction: NDArray[np.float64]
     ) -> NDArray[np.float64] | None:
+        """(3,) the point of the shown surface that a ray meets."""
         return pointed_surface.first_hit(self._tiles, look.nodes.clipping, origin, direction)
 
     def shown_mesh(self, look: TileLook) -> Mesh:
+        """Mesh of what is shown, in the map's frame."""
         return look.mesh(self._up.up)
 
 

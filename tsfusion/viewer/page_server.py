@@ -6,14 +6,16 @@ viser's own listens for every Origin, takes another port when one is in use, and
 """
 
 import asyncio
+import gzip
 import logging
 import socket
 import threading
 from collections import Counter
 from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, ExitStack, asynccontextmanager
-from functools import partial
+from functools import lru_cache, partial
 from http import HTTPStatus
+from importlib import resources
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
@@ -198,6 +200,10 @@ class PageServer:
 
     def _with_headers(self, connection: "ServerConnection", request: "Request", response: "Response") -> None:
         if response.status_code == HTTPStatus.OK:
+            if response.headers.get("Content-Type", "").startswith("text/html"):
+                response.body = _with_our_head(bytes(response.body))
+                del response.headers["Content-Length"]
+                response.headers["Content-Length"] = str(len(response.body))
             for name, value in self._guard.answer_headers(request.path, request.headers).items():
                 response.headers[name] = value
 
@@ -205,6 +211,16 @@ class PageServer:
         assert self._running is not None
         for connection in self._running.handlers:
             connection.transport.abort()
+
+
+@lru_cache(2)
+def _with_our_head(html: bytes) -> bytes:
+    """viser's page, packed or not, with names for its controls, a title and more contrast."""
+    is_packed = html.startswith(b"\x1f\x8b")
+    html = gzip.decompress(html) if is_packed else html
+    ours = resources.files(__package__).joinpath("page_head.html").read_bytes()
+    html = html.replace(b"<title>Viser</title>", b"<title>tsfusion</title>" + ours, 1)
+    return gzip.compress(html) if is_packed else html
 
 
 def _quiet_logger() -> logging.Logger:

@@ -23,7 +23,11 @@ def summary(title: str, map_name: str, problem: str, facts: Sequence[str], probl
     color, word = (_BAD, escape(problem)) if problem else (_GOOD, "connected")
     dot = f'<span style="color:{color}">{"▲" if problem else "●"}</span>'
     name = f" · {escape(map_name)}" if map_name and map_name not in title else ""
-    lines = [f"<b>{escape(title)}</b>{name}", f"{dot} {word}", " · ".join(map(escape, facts))]
+    style = "font:inherit;font-weight:700;display:inline"
+    head = (
+        f'<h1 style="{style}" data-shown="{escape(map_name or title)}">{escape(title)}</h1>'  # page_head.html
+    )
+    lines = [head + name, f"{dot} {word}", " · ".join(map(escape, facts))]
     text = "".join(f"<div>{line}</div>" for line in lines if line)
     return f'<div style="{_TEXT}">{text}{"".join(map(_warning, problems))}</div>'
 
