@@ -14,7 +14,7 @@ from tsfusion.datasets.dataset import Dataset, Frames, force_of, frame_of, keep_
 from tsfusion.datasets.trajectory_files import read_poses, read_tum
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.se3 import Transform
-from tsfusion.geometry.trajectory import PoseAt, Trajectory, quaternion
+from tsfusion.geometry.trajectory import PoseAt, Trajectory
 
 EXPECTED = "poses at the times of its frames"
 
@@ -72,8 +72,7 @@ def poses_between(
     times = stamps_ns if times is None else times
     if times is None or len(times) != len(poses) or (np.diff(times) <= 0).any():
         return lambda _: None
-    rotations = np.array([quaternion(T[:3, :3]) for T in poses])
-    trajectory, max_gap_ns = Trajectory(times, poses[:, :3, 3], rotations), round(max_gap_s * 1e9)
+    trajectory, max_gap_ns = Trajectory.of(times, poses), round(max_gap_s * 1e9)
     return lambda stamp_ns: trajectory.at(stamp_ns + offset, max_gap_ns=max_gap_ns)
 
 

@@ -21,7 +21,7 @@ from tsfusion.geometry.trajectory import Trajectory, quaternion, rigid
 
 _T = TypeVar("_T")
 _RTABMAP_COLUMNS = 9
-TUM_COLUMNS = (8, _RTABMAP_COLUMNS)
+_TUM_COLUMNS = (8, _RTABMAP_COLUMNS)
 _SAME_M, _SAME_DEG = 0.01, 1.0  # two poses at one time that differ by less are one
 
 log = logging.getLogger(__name__)
@@ -230,7 +230,7 @@ def read_poses(path: Path) -> tuple[NDArray[np.int64] | None, NDArray[np.float64
         DatasetError: for a missing file, or one of another format.
     """
     columns = _columns(path)
-    if columns in TUM_COLUMNS:
+    if columns in _TUM_COLUMNS:
         tum = read_tum(path)
         poses = [rigid(q, t) for q, t in zip(tum.quaternions, tum.translations, strict=True)]
         return tum.timestamps_ns, np.array(poses)
@@ -246,9 +246,14 @@ def read_poses(path: Path) -> tuple[NDArray[np.int64] | None, NDArray[np.float64
     return None, np.array([np.full((4, 4), np.nan) if T is None else T for T in found])
 
 
+def has_times(path: Path) -> bool:
+    """Whether a trajectory is in TUM's format, or RTAB-Map's."""
+    return _columns(path) in _TUM_COLUMNS
+
+
 def is_log(path: Path) -> bool:
     """Whether a trajectory is a Redwood `.log`, or nothing that `read_poses` reads."""
-    return _columns(path) not in (*TUM_COLUMNS, 12, 16)
+    return _columns(path) not in (*_TUM_COLUMNS, 12, 16)
 
 
 def _columns(path: Path) -> int:

@@ -30,15 +30,8 @@ EXPECTED_CAMERA = (
     "Kalibr's, EuRoC's, ROS's, OpenCV's, Open3D's or RealSense's file of a camera; or in a .txt its 3×3 "
     "matrix, or fx fy cx cy"
 )
-_PARTS = (
-    "cam0",
-    "cam",
-    "camera",
-    "camera_params",
-    "intrinsic",
-    "intrinsics",
-    "depth",
-)  # where files with more have the camera
+# Where files with more have the camera
+_PARTS = ("cam0", "cam", "camera", "camera_params", "intrinsic", "intrinsics", "depth")
 _MATRICES = ("camera_matrix", "cameraMatrix", "intrinsic_matrix", "camera_intrinsics", "K", "k", "mtx")
 _COEFFICIENTS = (
     "distortion_coefficients", "distortion_coeffs", "distCoeffs", "dist_coeffs", "coeffs", "distortion",

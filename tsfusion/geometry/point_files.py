@@ -133,9 +133,7 @@ def _write_las(
     names = rows.dtype.names or ()
     header = laspy.LasHeader(version="1.4", point_format=7 if "color" in names else 6)
     header.scales, header.offsets = np.full(3, _LAS_STEP), middle
-    header.global_encoding.wkt = (
-        True  # as formats from 6 on must have it, with a coordinate system or without
-    )
+    header.global_encoding.wkt = True  # as formats from 6 on must have it, also without a system
     header.generating_software = facts.get("generator", "")[:32]
     if origin.crs:
         header.add_crs(_system(origin.crs))

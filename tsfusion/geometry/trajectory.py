@@ -27,6 +27,11 @@ class Trajectory:
     translations: NDArray[np.float64]
     quaternions: NDArray[np.float64]
 
+    @classmethod
+    def of(cls, timestamps_ns: NDArray[np.int64], poses: NDArray[np.float64]) -> "Trajectory":
+        """Make one of (n, 4, 4) poses, NaN where they are not known."""
+        return cls(timestamps_ns, poses[:, :3, 3], np.array([quaternion(T[:3, :3]) for T in poses]))
+
     def at(self, timestamp_ns: int, *, max_gap_ns: int) -> Transform | None:
         """Interpolate the pose at a time: SLERP and linear between the neighbours, never beyond the ends.
 

@@ -18,10 +18,8 @@ from tsfusion.core.errors import MapError, MissingDependency
 _GRID = 2048  # blocks of 128 threads of a device's task: of four times as many, most only end: 5 µs each task
 
 _started_threads: int | None = None
-_FORKED = -1
-_thread: int | None = (
-    None  # the one that kernels run in; _FORKED = it stayed in the parent; None = no one yet
-)
+_FORKED = -1  # the thread stayed in the parent
+_thread: int | None = None  # the one that kernels run in; None = no one yet
 
 
 def check_thread() -> None:

@@ -52,7 +52,6 @@ BLOCKS, VOXELS = 0, 1  # in `counts`
 # become column · depth, row · depth (patches, voxels) and depth (voxels), three numbers each; the depth up to
 # which it carves (voxels); how many units these have, a power of two; fx, fy, cx, cy.
 CENTRE, COLUMN, ROW, DEPTH, FAR, SCALE, FX, FY, CX, CY = 0, 3, 6, 9, 12, 13, 14, 15, 16, 17
-VIEW_FIELDS = 18
 FINEST = 1 << 14  # units a voxel
 
 # Column · depth, row · depth and depth of a voxel, in units; what a step along each axis adds to these.

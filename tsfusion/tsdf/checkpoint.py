@@ -36,12 +36,8 @@ _PART = 1 << 20  # bytes that are copied at a time
 _ROWS = 128  # that are gathered at a time
 _MAX_WINDOW_BYTES = 1 << 24  # of zstd; level 1 uses less
 LAYER_DTYPES = {
-    "sums": np.int64,
-    "color_rgn": np.int64,
-    "color_b": np.int32,
-    "correction": np.float32,
-    "hits": np.int32,
-}
+    "sums": np.int64, "color_rgn": np.int64, "color_b": np.int32, "correction": np.float32, "hits": np.int32,
+}  # fmt: skip
 
 Rows = Iterable[tuple[str, NDArray[Any]]]  # some rows of a chunk at a time, by the name of their layer
 

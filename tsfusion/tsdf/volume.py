@@ -266,8 +266,7 @@ class Volume(AskableMap):
         made._released = list(self._released)
         return made
 
-    def __copy__(self) -> "Volume":
-        return self.copy()
+    __copy__ = copy
 
     def __deepcopy__(self, _known: dict[int, Any]) -> "Volume":
         return self.copy()

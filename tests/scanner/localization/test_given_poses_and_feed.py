@@ -148,8 +148,8 @@ ROW = "1 0 0 0 0 1 0 0 0 0 1 0\n"
         (ROW, None, r"has no times \(KITTI's format\); put them beside it as .*times.txt"),
         (ROW * 3, "0\n1\n", "has 2 lines, .* has 3 poses"),
         (ROW * 3, "0\n2\n1\n", "time 3 is not after the one before it"),
-        ("1 2 3\n", None, "3 numbers; expected TUM's 8"),
-        ("# nothing\n", None, "holds no poses"),
+        ("1 2 3\n", None, "1 lines; expected five a pose"),
+        ("# nothing\n", None, "is no trajectory: .*got 0"),
     ],
 )
 def test_useless_files_are_explained(tmp_path: Path, poses: str, times: str | None, message: str) -> None:

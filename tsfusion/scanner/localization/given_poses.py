@@ -1,25 +1,21 @@
 # SPDX-License-Identifier: MIT
 """Localizers that take known poses: those of a trajectory file (TUM or KITTI), or those of the source."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.readers import read_lines
-from tsfusion.datasets.trajectory_files import TUM_COLUMNS, nanoseconds, read_poses, read_tum
+from tsfusion.datasets.trajectory_files import has_times, nanoseconds, read_poses, read_tum
 from tsfusion.geometry import origin as origins
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.sweeps import motion_about
-from tsfusion.geometry.trajectory import Trajectory, quaternion
+from tsfusion.geometry.trajectory import Trajectory
 from tsfusion.scanner.localization.localizer import Localizer, Lost, Pose
 from tsfusion.scanner.localization.tracking_keyframes import TrackingKeyframes
-
-_KITTI_COLUMNS = 12
 
 
 class TrajectoryFilePoses(Localizer):
@@ -96,25 +92,20 @@ class TrajectoryFilePoses(Localizer):
 
 
 def read_trajectory(path: Path) -> Trajectory:
-    """Read a TUM or KITTI file, recognised by its columns. Raises DatasetError."""
-    lines = read_lines(path, "a trajectory in TUM's or KITTI's format")
-    if not lines:
-        raise DatasetError(f"{path} holds no poses")
-    number, first = lines[0]
-    columns = len(first.replace(",", " ").split())
-    if columns in TUM_COLUMNS:
+    """Read a trajectory, whose times are in `times.txt` where its format has none. Raises DatasetError."""
+    if has_times(path):
         return read_tum(path)
-    if columns != _KITTI_COLUMNS:
-        raise DatasetError(
-            f"{path}:{number}: {columns} numbers; expected TUM's 8 (`timestamp tx ty tz qx qy qz qw`), "
-            "RTAB-Map's 9 or KITTI's 12"
-        )
-    poses = read_poses(path)[1]
+    _, poses = read_poses(path)
     times_path = _times_of(path)
-    times = [nanoseconds(line, times_path, n) for n, line in read_lines(times_path, "seconds, a pose a line")]
+    lines = read_lines(times_path, "seconds, a pose a line")
+    times = np.array([nanoseconds(line, times_path, number) for number, line in lines], np.int64)
     if len(times) < len(poses):
         raise DatasetError(f"{times_path} has {len(times)} lines, {path} has {len(poses)} poses")
-    return _in_time(times[: len(poses)], poses, times_path)
+    times = times[: len(poses)]
+    if (np.diff(times) <= 0).any():
+        line = int(np.argmax(np.diff(times) <= 0)) + 2
+        raise DatasetError(f"{times_path}: time {line} is not after the one before it")
+    return Trajectory.of(times, poses)
 
 
 def _times_of(path: Path) -> Path:
@@ -127,15 +118,6 @@ def _times_of(path: Path) -> Path:
         f"{path} has no times (KITTI's format); put them beside it as {beside}, seconds, a line a pose, or "
         "give a trajectory in TUM's format"
     )
-
-
-def _in_time(stamps: Sequence[int], poses: NDArray[np.float64], path: Path) -> Trajectory:
-    times = np.array(stamps, dtype=np.int64)
-    if (np.diff(times) <= 0).any():
-        line = int(np.argmax(np.diff(times) <= 0)) + 2
-        raise DatasetError(f"{path}: time {line} is not after the one before it")
-    translations = np.array([T[:3, 3] for T in poses])
-    return Trajectory(times, translations, np.array([quaternion(T[:3, :3]) for T in poses]))
 
 
 class GivenPoses(Localizer):

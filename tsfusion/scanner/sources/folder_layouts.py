@@ -15,7 +15,7 @@ from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.formats.image_folders import COLOR
 from tsfusion.datasets.point_times import Scan
 from tsfusion.datasets.readers import decode_image, read_numbers
-from tsfusion.datasets.scan_files import SUFFIXES, check_intensities, read_scan
+from tsfusion.datasets.scan_files import SUFFIXES, read_scan
 from tsfusion.geometry.keyframe import MAX_BASELINE_M
 
 LayoutKind = Literal["depth", "pair", "points"]
@@ -96,18 +96,13 @@ def whole_scan(path: Path) -> Scan | None:
     Raises:
         DatasetError: a `.bin` file holds no points of four numbers.
     """
-    if path.suffix != ".bin":
-        try:
-            return read_scan(path)
-        except DatasetError:
-            return None
-    read_limits.check(path, path.stat().st_size)
-    raw = path.read_bytes()
-    if not raw or len(raw) % _POINT:
+    is_raw, nbytes = path.suffix == ".bin", path.stat().st_size
+    try:
+        return None if is_raw and (not nbytes or nbytes % _POINT) else read_scan(path)
+    except DatasetError:
+        if is_raw:
+            raise
         return None
-    points = np.frombuffer(raw, np.float32).reshape(-1, 4)
-    check_intensities(points, path, "expected float32 x, y, z and the intensity of each point")
-    return Scan(points[:, :3])
 
 
 def depth_of(image: NDArray[Any]) -> NDArray[Any]:
