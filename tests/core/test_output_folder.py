@@ -11,7 +11,7 @@ import pytest
 from command_processes import python
 
 from tsfusion.core.errors import OutputError
-from tsfusion.core.output_folder import building, results
+from tsfusion.core.output_folder import building, check_writable, results
 
 _KILLED = """
 import os, signal, sys
@@ -172,3 +172,11 @@ def test_a_named_folder_is_not_overwritten_silently(at_noon: Path, tmp_path: Pat
     run("b", "empty", overwrite=True)
     assert (tmp_path / "empty" / "run.json").read_text() == "b"
     assert not at_noon.exists()
+
+
+@pytest.mark.parametrize("name", ["map.tsf", "MAP.TSF"])
+def test_a_map_that_is_there_stays_unless_told(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_bytes(b"TSFMAP1\n and more")
+    with pytest.raises(OutputError, match="a map is there"):
+        check_writable(tmp_path / name, (".tsf",))
+    check_writable(tmp_path / name, (".tsf",), overwrite=True)

@@ -63,6 +63,7 @@ def test_frames_bound_a_sweep() -> None:
         ((STAMP / 1e9 + SHARE * 900).astype(np.float32), "float32 is too coarse for t"),
         (SHARE * 1.3e6, r"t spans 1.3e\+06, in any unit no sweep of 0.003 to 0.3 s"),  # a packet's
         (SHARE * 1e12, "in any unit no sweep"),
+        (np.array([-(1 << 62), *[0] * 9, 1 << 62]), "in any unit no sweep"),
     ],
 )
 def test_times_of_no_use_are_named(moments: Any, reason: str) -> None:

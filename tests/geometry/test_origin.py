@@ -37,7 +37,12 @@ def test_only_far_positions_get_one() -> None:
     assert origin.found([]) is None
     assert origin.found([UTM], crs="EPSG:25832") == Origin((447_800, 5_411_400, 300), "EPSG:25832")
     assert origin.found([UTM * 0], crs="EPSG:25832") == Origin((0, 0, 0), "EPSG:25832")
-    for text in ("447000,5411000,0", "447000 5411000 0", (447_000, 5_411_000, 0)):
+    for text in (
+        "447000,5411000,0",
+        "447000 5411000 0",
+        (447_000, 5_411_000, 0),
+        np.array([447_000, 5_411_000, 0]),
+    ):
         assert origin.found([UTM * 0], text) == Origin((447_000, 5_411_000, 0))
 
 

@@ -205,5 +205,5 @@ def check_writable(
             raise OutputError(
                 f"cannot write {path}: a file is there that is no {path.suffix}; choose another name"
             )
-        if there and path.suffix == ".tsf" and not overwrite:
+        if there and begins == _BEGINNINGS[".tsf"] and not overwrite:
             raise OutputError(f"cannot write {path}: a map is there; choose another name, or add --overwrite")

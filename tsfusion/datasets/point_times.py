@@ -62,7 +62,7 @@ def point_times(scan: Scan, stamp_ns: int, between_s: float = 1.0) -> PointTimes
     known = np.isfinite(values) & np.isfinite(points).all(axis=1) & points.any(axis=1)
     if not known.any():
         return PointTimes()
-    first, last = values[known].min(), values[known].max()
+    first, last = values[known].min().item(), values[known].max().item()
     span, longest_s = float(last - first), min(_LONGEST_S, _FRAMES * between_s)
     step = np.spacing(np.abs([first, last]).astype(moments.dtype)).max() if moments.dtype.kind == "f" else 0
     named = _FIELD.fullmatch(field)

@@ -76,7 +76,7 @@ def found(
     """
     if crs is not None and (not isinstance(crs, str) or not _CRS.fullmatch(crs)):
         raise InvalidConfig(f"crs must be EPSG: and a number, such as EPSG:25832, got {crs!r}")
-    if wanted not in (None, AUTO):
+    if wanted is not None and not (isinstance(wanted, str) and wanted == AUTO):
         return Origin(_parsed(wanted), crs or "")
     if not len(positions) or (np.abs(positions[0]).max() <= FAR and not crs):
         return None
