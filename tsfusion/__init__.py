@@ -23,7 +23,6 @@ Names are loaded on first use, so that a scanner which needs only `Client` and `
 imports Taichi.
 """
 
-import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -76,9 +75,6 @@ if TYPE_CHECKING:
     from tsfusion.wire.map_client import MapClient as MapClient
 
 __version__ = "0.1.0"
-
-# OpenCV, which reads this as it loads, takes gigabytes for a file of some bytes that claims to be larger
-os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(1 << 26))
 
 _ERRORS = (
     "AlignmentRefused", "AnswerLate", "CheckpointError", "DamagedCheckpoint", "DatasetError", "DecodeError",

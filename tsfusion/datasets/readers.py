@@ -83,8 +83,8 @@ def decode_image(file: BinaryIO, flags: int) -> NDArray[Any] | None:
     """Decode an image file as OpenCV's `flags` say; None where that fails, or it is far too large.
 
     Pixels come as stored, as calibrations and depth have them: an EXIF orientation is for picture viewers.
-    OpenCV believes an image of a few bytes that claims gigabytes of pixels (but for PNG and JPEG, `tsfusion`
-    bounds that as it is imported). libpng prints what it does not like: a PNG is checked here first, and what
+    OpenCV believes an image of a few bytes that claims gigabytes of pixels (but for PNG and JPEG, the command
+    bounds that). libpng prints what it does not like: a PNG is checked here first, and what
     its pixels do not need is not even read.
     """
     is_png = file.read(len(_PNG)) == _PNG
