@@ -64,6 +64,30 @@ def test_walls_are_open_from_outside_and_closed_from_inside() -> None:
     assert inside[45, 60, 3] == pytest.approx(3.0, rel=1e-4)
 
 
+def test_backs_are_seen_but_those_of_walls() -> None:
+    """A board that turns its back is seen before the sky and, where it is thin, before another surface."""
+
+    def seen(width: float, behind: Mesh) -> np.ndarray:
+        """RGB of a red board, 2 m high, with its back to the camera, in the middle of a picture."""
+        corners = np.array([(-1, 0), (1, 0), (1, 2), (-1, 2)]) * (width / 2, 1)
+        places = np.stack((corners[:, 0], np.full(4, -1.0), corners[:, 1]), axis=1).astype(np.float32)
+        mesh = Mesh(
+            np.concatenate((places, behind.vertices)),
+            np.concatenate((np.array([(0, 2, 1), (0, 3, 2)], np.int32), behind.faces + 4)),
+            np.concatenate((np.tile(np.float32((0, 1, 0)), (4, 1)), behind.normals)),
+            np.array([(200, 40, 40)] * 4 + [(40, 40, 200)] * len(behind.vertices), np.uint8),
+        )
+        camera = PreviewCamera(look((0, -6, 1.4), (0, 1, 0)))
+        return mesh_preview.picture(mesh, camera, 240, 180, up=np.array((0.0, 0, 1)))[90, 120].astype(int)
+
+    room = box_room()
+    far = Mesh(room.vertices, room.faces[(room.vertices[room.faces, 1] > 1.9).all(axis=1)], room.normals)
+    sky = Mesh(room.vertices, room.faces[:0], room.normals)
+    assert seen(2.0, sky)[0] > seen(2.0, sky)[2] + 50, "before the sky"
+    assert seen(0.1, far)[0] > seen(0.1, far)[2] + 50, "a pole"
+    assert seen(2.0, far)[2] > seen(2.0, far)[0] + 50, "a wall is open"
+
+
 @pytest.mark.parametrize("near", [0.05, 0.7, 1.9])
 def test_triangles_through_the_near_plane_are_cut(near: float) -> None:
     """Floor and walls reach behind the eye; every pixel whose surface is beyond `near` is still drawn."""

@@ -22,6 +22,7 @@ _ELEVATIONS = (28.0, 42.0, 58.0)  # degrees above the ground
 _AZIMUTHS = 12
 _NEAR = 0.05  # metres
 _BAND = 64  # rows of a picture that are painted at a time
+_WALL = 0.08  # share of a picture's height: a back that hides a front over more than that stays open
 _SHADING = (0.06, 4.0)  # ambient occlusion: its reach as a share of the mesh's diagonal, and its strength
 
 
@@ -44,7 +45,7 @@ def render(
 ) -> Path:
     """Draw `mesh` to a PNG file, its `up` above (+z where that is not known); complete or not at all.
 
-    Triangles seen from behind are left out, so that a room can be looked into from outside.
+    A wide back that hides a front is left out, so that a room can be looked into from outside.
 
     Args:
         width: pixels.
@@ -72,13 +73,39 @@ def picture(
     mesh: Mesh, camera: PreviewCamera, width: int, height: int, *, up: NDArray[np.float64]
 ) -> NDArray[np.uint8]:
     """(height, width, 3) uint8 sRGB: `draw` with smooth edges, and darker where surfaces are near others."""
-    image = draw(mesh, camera, width * _OVERSAMPLING, height * _OVERSAMPLING, up=up, texture=True)
+    size = (width * _OVERSAMPLING, height * _OVERSAMPLING)
+    image = draw(mesh, camera, *size, up=up, texture=True)
+    if has_colors(mesh) or not isinstance(mesh, TexturedMesh):
+        _add_backs(
+            image,
+            draw(Mesh(mesh.vertices, mesh.faces[:, ::-1], -mesh.normals, mesh.colors), camera, *size, up=up),
+        )
     from tsfusion.kernels import rasterizer
 
     reach, strength = _SHADING
     radius = reach * float(np.linalg.norm(np.ptp(core(mesh), axis=0)))
     rasterizer.occlude(image, _OVERSAMPLING, _focal(camera, image.shape[1]), radius, strength)
     return _develop(image, _OVERSAMPLING)
+
+
+def has_colors(mesh: Mesh) -> bool:
+    """Whether a mesh has colours that differ; a LiDAR's map is grey all over."""
+    return mesh.colors is not None and len(mesh.colors) > 0 and bool(np.ptp(mesh.colors, axis=0).any())
+
+
+def _add_backs(image: NDArray[np.float32], backs: NDArray[np.float32]) -> None:
+    """Put backs of surfaces into a picture of the fronts: poles and chairs, not a wall before its room."""
+    import cv2
+
+    depth, near = image[..., 3], backs[..., 3]
+    shown = (near > 0) & ((depth == 0) | (near < depth))
+    over = (shown & (depth > 0)).astype(np.uint8)
+    count, part = cv2.connectedComponents(over)
+    side = max(1, int(_WALL * len(image)))
+    is_wall = np.zeros(count, bool)
+    is_wall[part[cv2.erode(over, np.ones((side, side), np.uint8)) > 0]] = True
+    shown &= ~is_wall[part]
+    image[shown] = backs[shown]
 
 
 def draw(
@@ -105,7 +132,7 @@ def draw(
     image[..., :3] = BACKGROUND
     up = np.array((0.0, 0.0, 1.0)) if up is None else up
     colors = mesh.colors
-    if colors is None or not np.ptp(colors, axis=0).any():
+    if colors is None or not has_colors(mesh):
         colors = height_colors(mesh.vertices, up)
     is_textured = texture and isinstance(mesh, TexturedMesh)
     if is_textured:

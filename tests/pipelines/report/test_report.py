@@ -2,6 +2,7 @@
 """Reports: one whole page that says what the run's files say, and asks nothing of the network."""
 
 import base64
+import dataclasses
 import json
 import re
 from html.parser import HTMLParser
@@ -192,6 +193,17 @@ def test_names_are_text_whatever_they_hold(tmp_path: Path) -> None:
     assert "<script>alert" not in text
     assert page.scripts == plain.scripts
     assert HOSTILE in page.text
+
+
+def test_a_map_without_colour_is_not_coloured_by_it(tmp_path: Path) -> None:
+    run, mesh = a_run(tmp_path / "run"), ball()
+    grey = np.full(mesh.vertices.shape, 128, np.uint8)  # of a LiDAR
+    dataclasses.replace(mesh, colors=grey).save(run / "mesh.ply")
+    run_report.write(run, run / "report.html")
+    text = (run / "report.html").read_text(encoding="utf-8")
+    assert '<option value="0">' not in text
+    assert '<option value="1">height' in text
+    assert '"colors": false' in text
 
 
 @pytest.mark.parametrize(

@@ -39,6 +39,8 @@ class ShownMap:
         assert found.mesh is not None
         whole = found.mesh
         self.mesh, self.scale = whole.without_islands(), None
+        if not mesh_preview.has_colors(self.mesh):
+            self.mesh = dataclasses.replace(self.mesh, colors=None)
         self.whole_error_mm: NDArray[np.float64] | None = None
         if found.error_m is not None:
             self.whole_error_mm = 1000 * np.abs(found.error_m.astype(np.float64))

@@ -28,12 +28,13 @@ precision highp float;
 in vec3 paint, side, ray;
 uniform vec3 up;
 uniform bool flat_;
+uniform float alpha;
 out vec4 result;
 void main() {
   if (flat_) { result = vec4(0.90, 0.38, 0.0, 1.0); return; }
   vec3 n = normalize(side) * (gl_FrontFacing ? 1.0 : -1.0);
   float light = 0.28 + 0.45 * max(-dot(n, normalize(ray)), 0.0) + 0.35 * (0.5 + 0.5 * dot(n, up));
-  result = vec4(pow(min(pow(paint, vec3(2.2)) * light, 1.0), vec3(1.0 / 2.2)), 1.0);
+  result = vec4(pow(min(pow(paint, vec3(2.2)) * light, 1.0), vec3(1.0 / 2.2)), alpha);
 }`;
 
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
@@ -74,7 +75,7 @@ function decode(bytes, head) {
 class Viewer {
   constructor(box, head, mesh, ramp) {
     this.canvas = box.querySelector("canvas");
-    const gl = (this.gl = this.canvas.getContext("webgl2", { antialias: true }));
+    const gl = (this.gl = this.canvas.getContext("webgl2", { antialias: true, stencil: true }));
     if (!gl) throw new Error("this browser has no WebGL 2");
     this.head = head;
     this.up = head.up;
@@ -147,7 +148,11 @@ class Viewer {
     for (const side of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, side, gl.CLAMP_TO_EDGE);
     for (const size of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, size, gl.LINEAR);
     gl.enable(gl.DEPTH_TEST);
-    gl.cullFace(gl.BACK);
+    gl.enable(gl.CULL_FACE);
+    gl.enable(gl.STENCIL_TEST);
+    gl.stencilOp(gl.KEEP, gl.KEEP, gl.REPLACE);
+    gl.enable(gl.BLEND);
+    gl.blendFuncSeparate(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA, gl.ONE, gl.ONE);
   }
 
   listen(box) {
@@ -234,7 +239,7 @@ class Viewer {
     gl.viewport(0, 0, canvas.width, canvas.height);
     const paper = getComputedStyle(canvas).backgroundColor.match(/[\d.]+/g).map((x) => x / 255);
     gl.clearColor(paper[0], paper[1], paper[2], 1);
-    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT | gl.STENCIL_BUFFER_BIT);
     const [right, forward, upward] = this.axes(), eye = plus(this.target, forward, -this.distance);
     const far = this.distance + 3 * this.reach, near = Math.max(0.01 * this.distance, far * 2e-4);
     const [fx, fy] = this.focal();
@@ -249,9 +254,19 @@ class Viewer {
     gl.uniform2fv(this.at("heights"), this.head.heights);
     gl.uniform1i(this.at("mode"), this.mode);
     gl.uniform1i(this.at("flat_"), 0);
-    this.walls ? gl.disable(gl.CULL_FACE) : gl.enable(gl.CULL_FACE);
     gl.bindVertexArray(this.arrays[0]);
-    gl.drawElements(gl.TRIANGLES, 3 * this.head.triangles, gl.UNSIGNED_INT, 0);
+    const draw = (culled, alpha, front) => {  // what there is a front for is marked
+      gl.cullFace(culled);
+      gl.stencilFunc(culled === gl.BACK ? gl.ALWAYS : gl.EQUAL, front, 1);
+      gl.depthMask(alpha === 1);
+      gl.uniform1f(this.at("alpha"), alpha);
+      gl.drawElements(gl.TRIANGLES, 3 * this.head.triangles, gl.UNSIGNED_INT, 0);
+      gl.depthMask(true);
+    };
+    draw(gl.BACK, 1, 1);
+    draw(gl.FRONT, this.walls ? 1 : 0.15, 1);  // before a front, backs are glass: poles stay, and rooms are open
+    draw(gl.FRONT, 1, 0);
+    gl.stencilFunc(gl.ALWAYS, 1, 1);
     gl.uniform1i(this.at("flat_"), 1);
     gl.bindVertexArray(this.arrays[1]);
     gl.drawArrays(gl.LINE_STRIP, 0, (this.head.path || []).length);
