@@ -151,7 +151,7 @@ def chunk(name: bytes, content: bytes) -> bytes:
 
 def test_nothing_is_printed_by_the_libraries_that_decode(tmp_path, capfd):
     """An ICC profile that libpng does not like, a bit that fell over, a file that ends early."""
-    root = redwood(tmp_path, [0, 1, 2], [0, 1, 2])
+    root = redwood(tmp_path, [*range(6)], [*range(6)])
     files = [root / "depth" / f"0000{number}.png" for number in range(3)]
     whole = files[0].read_bytes()
     files[0].write_bytes(

@@ -84,9 +84,13 @@ def test_some_poses_are_given_where_they_are_known(tmp_path):
         dataset.pose(4)
 
 
-def test_poses_that_are_there_and_broken_are_an_error_all_the_same(tmp_path):
+def test_poses_that_are_there_and_mostly_broken_are_an_error_all_the_same(tmp_path):
     seven_scenes(tmp_path)
-    (tmp_path / "frame-000001.pose.txt").write_text("1 0 0\n")
+    for frame, read in ((1, [True, False, True]), (2, None)):
+        (tmp_path / f"frame-{frame:06d}.pose.txt").write_text("1 0 0\n")
+        if read is not None:
+            dataset = open_dataset(tmp_path, posed=False)
+            assert [dataset.pose(index) is not None for index in range(3)] == read
     with pytest.raises(DatasetError, match="3 numbers, expected 4"):
         open_dataset(tmp_path, posed=False)
     root = kitti(tmp_path / "kitti")

@@ -7,12 +7,15 @@ import struct
 import zlib
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
+import pytest
 
 from tsfusion import Keyframe
 from tsfusion.core.errors import DatasetError
+from tsfusion.datasets.dataset import UNREADABLE, WITHOUT_POSE, Dataset
 
 P0 = "700 0 40 0 0 700 24 0 0 0 1 0"
 P1 = "700 0 40 -350 0 700 24 0 0 0 1 0"
@@ -20,6 +23,7 @@ TR = "0 -1 0 0.1 0 0 -1 0.2 1 0 0 0.3"
 POSE = "1 0 0 0.5\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"
 ROW = POSE.replace("\n", " ")
 CAMERA = "5 0 4\n0 5 3\n0 0 1\n"  # of images of 8×6
+UNREAD, UNPOSED = {UNREADABLE: 1}, {WITHOUT_POSE: 1}  # what a recording counts of one frame
 Change = Callable[[Path], object]  # of a recording in a folder
 
 
@@ -153,18 +157,36 @@ def claim_size(png: Path, side: int) -> None:
 
 
 def one_line(open_: Callable[[], object], match: str | None = None) -> None:
-    """Opening raises a DatasetError of one line that matches, or says such a line and leaves a part out."""
+    """Opening must raise a DatasetError of one line that matches."""
+    with pytest.raises(DatasetError, match=match) as caught:
+        open_()
+    assert "\n" not in str(caught.value)
+
+
+class LeftOut(NamedTuple):
+    """What is said of a recording's broken part that is left out, and what the recording counts then."""
+
+    match: str
+    skipped: dict[str, int]
+
+
+def one_line_of(open_: Callable[[], Dataset], expected: str | LeftOut) -> None:
+    """A recording is refused, as `one_line` has it, or opens without the part that it names."""
+    if isinstance(expected, str):
+        one_line(lambda: list(open_()), expected)
+        return
     said: list[str] = []
     handler = logging.Handler()
     handler.emit = lambda record: said.append(record.getMessage())  # type: ignore[method-assign]
     logging.getLogger("tsfusion").addHandler(handler)
     try:
-        open_()
-    except DatasetError as error:
-        said = [str(error)]
+        dataset = open_()
+        frames = list(dataset)
     finally:
         logging.getLogger("tsfusion").removeHandler(handler)
-    assert any(re.search(match or "", line) for line in said), said
+    assert dataset.skipped == expected.skipped, dataset.skipped
+    assert len(frames) == len(dataset) - dataset.skipped.get(UNREADABLE, 0)
+    assert len([line for line in said if re.search(expected.match, line)]) == 1, said
     assert "\n" not in "".join(said)
 
 

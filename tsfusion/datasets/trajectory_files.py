@@ -3,7 +3,7 @@
 
 import logging
 from collections.abc import Callable, Iterable, Sequence
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -46,10 +46,14 @@ def usable(
     if 2 * len(broken) > len(poses):
         raise broken[0]
     if broken:
-        log.warning(
-            "%s: %d of %d poses are broken, the first: %s", source, len(broken), len(poses), broken[0]
-        )
+        _warn_once(f"{source}: {len(broken)} of {len(poses)} poses are broken, the first: {broken[0]}")
     return poses
+
+
+@lru_cache(maxsize=64)
+def _warn_once(line: str) -> None:
+    """Log a warning, but not again where the same file is read again."""
+    log.warning("%s", line)
 
 
 def write_tum(path: Path, timestamps_ns: Sequence[int], poses: Sequence[Transform]) -> None:

@@ -8,7 +8,19 @@ import cv2
 import numpy as np
 import pytest
 from geometry_checks import warp_residual
-from small_recordings import POSE, ROW, hololens, one_line, put, redwood, seven_scenes
+from small_recordings import (
+    POSE,
+    ROW,
+    UNPOSED,
+    UNREAD,
+    LeftOut,
+    hololens,
+    one_line,
+    one_line_of,
+    put,
+    redwood,
+    seven_scenes,
+)
 from written_recordings import check, matrix, millimetres, replica, scannet, views, write
 
 from tsfusion.core.errors import DatasetError
@@ -62,21 +74,41 @@ def test_frames_without_a_pose_are_skipped_and_counted(tmp_path):
 @pytest.mark.parametrize(
     ("name", "content", "match"),
     [
-        ("frame-000001.color.png", None, r"frame-000001\.color\.png is missing; expected a colour image"),
-        (SECOND_POSE, POSE.replace("0.5", "nan"), r"frame-000001\.pose\.txt:1: not finite"),
-        (SECOND_POSE, POSE.replace("0.5", "0.5x"), r"pose\.txt:1: could not convert .*0\.5x"),
-        (SECOND_POSE, "1 0 0\n", r"pose\.txt:1: 3 numbers, expected 4: a 4×4 camera-to-world"),
-        (SECOND_POSE, "1 0 0 0\n" * 3, r"must hold 4 rows of 4 numbers, got 3"),
-        (SECOND_POSE, "", r"frame-000001\.pose\.txt is empty; expected a 4×4"),
-        (SECOND_POSE, POSE.replace("1 0 0 0.5", "2 0 0 0.5"), r"pose\.txt: T_world_camera must"),
+        (
+            "frame-000001.color.png",
+            None,
+            LeftOut(r"frame-000001\.color\.png is missing; expected a colour image", UNREAD),
+        ),
+        (
+            SECOND_POSE,
+            POSE.replace("0.5", "nan"),
+            LeftOut(r"frame-000001\.pose\.txt:1: not finite", UNPOSED),
+        ),
+        (
+            SECOND_POSE,
+            POSE.replace("0.5", "0.5x"),
+            LeftOut(r"pose\.txt:1: could not convert .*0\.5x", UNPOSED),
+        ),
+        (
+            SECOND_POSE,
+            "1 0 0\n",
+            LeftOut(r"pose\.txt:1: 3 numbers, expected 4: a 4×4 camera-to-world", UNPOSED),
+        ),
+        (SECOND_POSE, "1 0 0 0\n" * 3, LeftOut(r"must hold 4 rows of 4 numbers, got 3", UNPOSED)),
+        (SECOND_POSE, "", LeftOut(r"frame-000001\.pose\.txt is empty; expected a 4×4", UNPOSED)),
+        (
+            SECOND_POSE,
+            POSE.replace("1 0 0 0.5", "2 0 0 0.5"),
+            LeftOut(r"pose\.txt: T_world_camera must", UNPOSED),
+        ),
         ("camera-intrinsics.txt", "1 2\n", r"camera-intrinsics\.txt: 2 numbers; expected .* 3×3 matrix"),
         ("camera-intrinsics.txt", "0 0 4\n0 5 3\n0 0 1\n", r"intrinsics\.txt: intrinsics must be finite"),
-        ("frame-000001.depth.png", "", r"frame-000001\.depth\.png cannot be decoded"),
+        ("frame-000001.depth.png", "", LeftOut(r"frame-000001\.depth\.png cannot be decoded", UNREAD)),
     ],
 )
 def test_a_broken_seven_scenes_folder_is_one_clear_line(tmp_path, name, content, match):
     put(name, content)(seven_scenes(tmp_path))
-    one_line(lambda: list(SevenScenes(tmp_path)), match)
+    one_line_of(lambda: SevenScenes(tmp_path), match)
 
 
 def test_depth_saved_as_eight_bits_or_colour_of_another_size_is_refused(tmp_path):
@@ -124,10 +156,12 @@ def test_scannet_frames_that_the_tracker_lost_have_no_pose(tmp_path):
             "of these 160×120 images is not known",
         ),
         (put("intrinsic/intrinsic_depth.txt", "1 0 0\n"), r"depth\.txt: 3 numbers; expected"),
-        (put("pose/7.txt", "1 0 0 0\n"), r"pose/7\.txt must hold 4 rows of 4 numbers, got 1"),
-        (put("pose/7.txt", matrix(np.eye(4)).replace("1.0", "2.0")), r"pose/7\.txt: T_world_camera must"),
-        (put("color/7.jpg", None), r"color/7\.png is missing; expected a colour image"),
-        (put("color/7.jpg", ""), r"color/7\.jpg cannot be decoded"),
+        (put("pose/7.txt", "1 0 0 0\n"),
+         LeftOut(r"pose/7\.txt must hold 4 rows of 4 numbers, got 1", UNPOSED)),
+        (put("pose/7.txt", matrix(np.eye(4)).replace("1.0", "2.0")),
+         LeftOut(r"pose/7\.txt: T_world_camera must", UNPOSED)),
+        (put("color/7.jpg", None), LeftOut(r"color/7\.png is missing; expected a colour image", UNREAD)),
+        (put("color/7.jpg", ""), LeftOut(r"color/7\.jpg cannot be decoded", UNREAD)),
         (put("depth/0.png", None), r"holds no usable frames"),
         (put("intrinsic/intrinsic_color.txt", "1170 0 648\n0 1170 484\n0 0 1\n"),
          r"with cx 648, cy 484 is of images of another size"),
@@ -138,7 +172,7 @@ def test_a_broken_scannet_scene_is_one_clear_line(tmp_path, change, match):
     change(tmp_path)
     if match == r"holds no usable frames":
         (tmp_path / "depth" / "7.png").unlink()
-    one_line(lambda: list(ScanNet(tmp_path)), match)
+    one_line_of(lambda: ScanNet(tmp_path), match)
 
 
 # --- Replica ---
@@ -181,7 +215,10 @@ def test_replica_without_its_camera_file_has_nice_slams_camera(tmp_path):
             put("cam_params.json", "{}"),
             r"cam_params\.json must hold camera: w, h, fx.*; KeyError|holds no named",
         ),
-        (put("room0/results/frame000001.jpg", None), r"frame000001\.jpg is missing; expected a colour image"),
+        (
+            put("room0/results/frame000001.jpg", None),
+            LeftOut(r"frame000001\.jpg is missing; expected a colour image", UNREAD),
+        ),
         (
             put("cam_params.json", None),
             r"is not known \(that of NICE-SLAM's Replica is published for 1200×680",
@@ -191,7 +228,7 @@ def test_replica_without_its_camera_file_has_nice_slams_camera(tmp_path):
 def test_a_broken_replica_scene_is_one_clear_line(tmp_path, change, match):
     replica_with_camera(tmp_path / "Replica")
     change(tmp_path / "Replica")
-    one_line(lambda: list(Replica(tmp_path / "Replica" / "room0")), match)
+    one_line_of(lambda: Replica(tmp_path / "Replica" / "room0"), match)
 
 
 # --- HoloLens and Redwood ---
@@ -201,8 +238,14 @@ def test_a_broken_replica_scene_is_one_clear_line(tmp_path, change, match):
     ("change", "match"),
     [
         (put("poses.txt", (ROW + "\n") * 2), r"poses\.txt has 2 poses for 3 depth images"),
-        (put("poses.txt", ROW + "\n" + ROW.replace("0.5", "inf") + "\n" + ROW), r"poses\.txt:2: not finite"),
-        (put("images/00001.png", None), r"00001\.png is missing; expected a colour image"),
+        (
+            put("poses.txt", ROW + "\n" + ROW.replace("0.5", "inf") + "\n" + ROW),
+            LeftOut(r"poses\.txt:2: not finite", UNPOSED),
+        ),
+        (
+            put("images/00001.png", None),
+            LeftOut(r"00001\.png is missing; expected a colour image", UNREAD),
+        ),
         (put("K.txt", None), r"is not known: no .*K\.txt.*; give --intrinsics"),
     ],
 )
@@ -210,7 +253,7 @@ def test_a_broken_hololens_folder_is_one_clear_line(tmp_path, change, match):
     hololens(tmp_path / "h")
     assert [int(keyframe.depth[0, 0]) for keyframe in HoloLens(tmp_path / "h")] == [7, 8, 9]
     change(tmp_path / "h")
-    one_line(lambda: list(HoloLens(tmp_path / "h")), match)
+    one_line_of(lambda: HoloLens(tmp_path / "h"), match)
 
 
 def test_redwood_poses_go_by_number_unless_there_are_as_many_images(tmp_path):

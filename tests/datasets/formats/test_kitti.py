@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from command_processes import python, tsfusion
 from geometry_checks import warp_residual
-from small_recordings import P0, P1, TR, kitti, one_line, put
+from small_recordings import P0, P1, TR, UNREAD, LeftOut, kitti, one_line_of, put
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets import KITTI, open_dataset, select
@@ -140,15 +140,25 @@ def test_calibration_without_tr_serves_stereo_only(tmp_path):
     [
         ("stereo", "image_1/000002.png", None, r"image_1/000002\.png is missing: 4 left and 3 right"),
         ("stereo", "image_0/000000.png", None, r"image_0/000000\.png is missing: 3 left and 4 right"),
-        ("stereo", "image_0/000002.png", "x", r"image_0/000002\.png cannot be decoded"),
+        (
+            "stereo",
+            "image_0/000002.png",
+            "x",
+            LeftOut(r"image_0/000002\.png cannot be decoded", UNREAD),
+        ),
         ("stereo", "image_0/copy.png", "x", r"copy\.png is not named by a frame number"),
         ("stereo", "calib.txt", "hello", r"calib\.txt:1: 'hello'; expected `name: numbers`"),
         ("stereo", "calib.txt", f"P0: {P0}\nP1: 1 2\n", r"no usable line P1; expected `P1:` and 12 finite"),
         ("stereo", "calib.txt", f"P0: {P1}\nP1: {P0}\n", r"P1 must lie to the right of P0"),
         ("stereo", "calib.txt", None, r"calib\.txt is missing; expected KITTI's calibration"),
         ("lidar", "calib.txt", f"Tr: 2{TR[1:]}\n", r"calib\.txt: Tr: T_world_camera must hold a rot"),
-        ("lidar", "velodyne/000001.bin", b"12345", r"000001\.bin is not a Velodyne scan"),
-        ("lidar", "velodyne/000001.bin", b"", r"000001\.bin is empty"),
+        (
+            "lidar",
+            "velodyne/000001.bin",
+            b"12345",
+            LeftOut(r"000001\.bin is not a Velodyne scan", UNREAD),
+        ),
+        ("lidar", "velodyne/000001.bin", b"", LeftOut(r"000001\.bin is empty", UNREAD)),
         ("stereo", POSES, None, r"poses/06\.txt is missing; expected 12 numbers a line"),
         ("stereo", POSES, "1 0 0 0 0 1 0 0 0 0 1 nan\n", r"06\.txt:1: not finite"),
         ("stereo", POSES, "1 0 0 0\n", r"06\.txt:1: 4 numbers, expected 12"),
@@ -161,7 +171,7 @@ def test_calibration_without_tr_serves_stereo_only(tmp_path):
 def test_a_broken_sequence_is_one_clear_line(tmp_path, modality, name, content, match):
     root = kitti(tmp_path)
     put(name, content)(root / "sequences" / "06")
-    one_line(lambda: list(KITTI(root, "06", modality)), match)
+    one_line_of(lambda: KITTI(root, "06", modality), match)
 
 
 def test_which_sequence_must_be_clear(tmp_path):

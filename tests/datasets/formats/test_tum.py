@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from geometry_checks import move, warp_residual
-from small_recordings import corbs, one_line, put, replace
+from small_recordings import LeftOut, corbs, one_line, one_line_of, put, replace
 from written_recordings import write
 
 from tsfusion.core.errors import DatasetError
@@ -57,14 +57,31 @@ def test_a_gap_in_the_trajectory_is_not_bridged(tmp_path):
 @pytest.mark.parametrize(
     ("change", "match"),
     [
-        (put("depth/3.png", None), r"3\.png is missing; expected a depth"),
-        (put("rgb/3.png", None), r"3\.png is missing; expected a colour image"),
+        (
+            put("depth/3.png", None),
+            LeftOut(r"3\.png is missing; expected a depth", {"without a pose in time": 1, "unreadable": 1}),
+        ),
+        (
+            put("rgb/3.png", None),
+            LeftOut(
+                r"3\.png is missing; expected a colour image", {"without a pose in time": 1, "unreadable": 1}
+            ),
+        ),
         (replace("depth.txt", "1000.100000 d", "1000.100000d"), r"depth\.txt:4: .*expected `timestamp path`"),
         (replace("depth.txt", "1000.100000", "then"), r"depth\.txt:4: timestamp must be seconds, got 'then'"),
         (put("depth.txt", "# nothing\n"), r"depth\.txt lists no images"),
-        (replace(TRUTH, " 2 0 0", " nan 0 0"), r"groundtruth\.txt:5: not finite"),
-        (replace(TRUTH, " 2 0 0", " 2 0"), r"groundtruth\.txt:5: 7 numbers, expected 8"),
-        (replace(TRUTH, "2 0 0 0 0 0 1", "2 0 0 0 0 0 0"), r":5: quaternion must have"),
+        (
+            replace(TRUTH, " 2 0 0", " nan 0 0"),
+            LeftOut(r"groundtruth\.txt:5: not finite", {"without a pose in time": 2}),
+        ),
+        (
+            replace(TRUTH, " 2 0 0", " 2 0"),
+            LeftOut(r"groundtruth\.txt:5: 7 numbers, expected 8", {"without a pose in time": 2}),
+        ),
+        (
+            replace(TRUTH, "2 0 0 0 0 0 1", "2 0 0 0 0 0 0"),
+            LeftOut(r":5: quaternion must have", {"without a pose in time": 2}),
+        ),
         (replace(TRUTH, "1000", "2000"), r"no usable frames.*\(5 without a pose in time\)"),
         (put(TRUTH, None), r"groundtruth\.txt is missing; expected .*trajectory"),
     ],
@@ -72,7 +89,7 @@ def test_a_gap_in_the_trajectory_is_not_bridged(tmp_path):
 def test_a_broken_recording_is_one_clear_line(tmp_path, change, match):
     place = corbs(tmp_path)
     change(place)
-    one_line(lambda: list(TUM(place)), match)
+    one_line_of(lambda: TUM(place), match)
 
 
 def test_freiburg_images_are_associated_by_time(data, tmp_path):

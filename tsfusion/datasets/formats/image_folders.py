@@ -157,7 +157,7 @@ def first_size(depth: Sequence[Path]) -> tuple[int, int]:
         try:
             height, width = read_depth(file).shape
         except DatasetError:
-            if not sizes and (2 * index >= len(depth) or index >= _FIRST_TRIES):
+            if not sizes and (2 * index + 2 > len(depth) or index >= _FIRST_TRIES):
                 raise  # so it is with all of them
             continue
         sizes.append((height, width))
