@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""Feed mutated messages, journal segments and saved maps to what reads them; a JSON line for each target.
+"""Feed mutated messages, journal segments, saved maps and recordings to what reads them; a line of JSON each.
 
     python scripts/fuzz.py                            10⁶ cases over messages, segments and maps
     python scripts/fuzz.py --only journal --cases 5000000 --seed 7
+    python scripts/fuzz.py --only folder-tum --cases 1000
     python scripts/fuzz.py --corpus FOLDER            go on with what was found there, and add to it
 
 With `atheris` (`pip install '.[fuzz]'`) guided by coverage; without it, and for control messages, by the
 outcomes: what leads to a new one is mutated further. Only the named errors may come out, no case may take a
-second of processor time, and the memory stays under --memory. The exit status is 1 when something broke; the
-case is kept in --crashes.
+second of processor time (a recording ten), and the memory stays under --memory. The exit status is 1 when
+something broke; the case is kept in --crashes.
 """
 
 import argparse
@@ -25,10 +26,16 @@ from typing import Any
 
 TESTS = Path(__file__).parents[1] / "tests" / "support"
 SHARES = {"message": 0.35, "control": 0.25, "corrections": 0.1, "journal": 0.25, "checkpoint": 0.05}
+LAYOUTS = (
+    *("euroc", "flat", "hololens", "kitti", "kitti-raw", "lidar-keyframes", "nerfstudio", "plain", "redwood"),
+    *("replica", "scannet", "scans", "seven-scenes", "stereo", "tum"),
+)
+FOLDERS = {f"folder-{layout}": 0.001 for layout in LAYOUTS}  # of a recording's files
+SHARES |= FOLDERS
 INSTRUMENTED = ["tsfusion.wire", "tsfusion.journal", "tsfusion.tsdf.checkpoint",
 
                 "tsfusion.geometry.keyframe", "tsfusion.gateway.quotas"]  # fmt: skip
-UNGUIDED = {"control"}  # decided in C, whose coverage is not seen
+UNGUIDED = {"control", *FOLDERS}  # decided in C, whose coverage is not seen
 _STATUS = re.compile(r"^#(\d+)\s+(\w+)\s+cov: (\d+) ft: (\d+) corp: (\d+)", re.MULTILINE)
 _FINAL = re.compile(r"^stat::(\w+):\s+(\d+)", re.MULTILINE)
 

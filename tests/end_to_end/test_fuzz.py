@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Mutated messages, segments and saved maps, a few thousand each run. The long form: `scripts/fuzz.py`."""
+"""Mutated messages, segments, saved maps and folders of recordings. The long form: `scripts/fuzz.py`."""
 
 import contextlib
 import random
@@ -8,6 +8,7 @@ import tracemalloc
 import fuzz_mutate
 import pytest
 from fuzz_engine import fuzz
+from fuzz_folders import FOLDERS
 from fuzz_targets import TARGETS
 
 from tsfusion.wire import codec
@@ -24,6 +25,12 @@ def test_only_named_errors_come_out(name: str, times: int) -> None:
     found = fuzz(name, CASES[name] * times, seed=times)
     assert found.cases == CASES[name] * times
     assert len(found.outcomes) > 10, found
+
+
+@pytest.mark.parametrize("cases", [10, pytest.param(1000, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("name", FOLDERS)
+def test_a_harmed_folder_gives_its_good_frames_or_is_refused(name: str, cases: int) -> None:
+    assert fuzz(name, cases, seed=cases).cases == cases
 
 
 def test_the_door_allocates_next_to_nothing() -> None:

@@ -40,11 +40,13 @@ class Target(Struct, frozen=True):
         seeds: where mutations start.
         run: a case; what came of it, in a word.
         mutate: keeps the form.
+        slow_s: processor time that no case may take.
     """
 
     seeds: Callable[[], list[bytes]]
     run: Callable[[bytes], str]
     mutate: fuzz_mutate.Mutate
+    slow_s: float = 1.0
 
 
 # --- keyframe messages ---

@@ -19,6 +19,7 @@ from tsfusion.datasets.formats.replica import Replica
 from tsfusion.datasets.formats.scan_folders import ScanFolder
 from tsfusion.datasets.formats.scannet import ScanNet
 from tsfusion.datasets.formats.sevenscenes import SevenScenes
+from tsfusion.datasets.formats.stereo_folders import StereoFolder
 from tsfusion.datasets.formats.tum import TUM
 from tsfusion.datasets.registry import SYNTHETIC, Found, Layout, describe, find, layouts, open_as
 from tsfusion.datasets.rosbag.dataset import Bag
@@ -43,6 +44,7 @@ __all__ = [
     "ScanNet",
     "Selection",
     "SevenScenes",
+    "StereoFolder",
     "StreetDrive",
     "Synthetic",
     "describe",

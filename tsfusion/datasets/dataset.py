@@ -29,6 +29,7 @@ NOMINAL_NS = 33_333_333  # between frames of a recording without times: thirty a
 SCAN = "`tsfusion scan PATH` finds poses by itself"
 WITHOUT_DEPTH = "without depth"
 WITHOUT_POSE = "without a pose"  # how the reasons of frames that poses would have kept begin
+NO_HALF = "without their other half"  # images of a stereo camera
 UNREADABLE = "unreadable"  # reason of frames that are left out when they are read
 CLOCK = "after the clock"  # how the reason of those begins that came when it had stepped back
 _LATE_NS = 50_000_000  # a stamp may come late: from another thread, or with exposure

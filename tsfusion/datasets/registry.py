@@ -29,6 +29,7 @@ from tsfusion.datasets.formats import (
     scan_folders,
     scannet,
     sevenscenes,
+    stereo_folders,
     tum,
 )
 from tsfusion.datasets.given_trajectory import WithTrajectory
@@ -105,6 +106,7 @@ PLAIN = (
         redwood_hololens.recognises_plain,
         redwood_hololens.Redwood,
     ),
+    Layout("stereo folders", stereo_folders.EXPECTED, stereo_folders.recognises, stereo_folders.StereoFolder),
 )
 # Tried where nothing there is in any other: points beside a recording are often made of it.
 SCANS = (Layout("LiDAR scans", scan_folders.EXPECTED, scan_folders.recognises, scan_folders.ScanFolder),)

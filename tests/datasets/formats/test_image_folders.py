@@ -433,6 +433,15 @@ def test_depth_in_one_folder_is_one_series_of_16_bits(tmp_path):
     one_line(lambda: open_dataset(pictures), "is in no layout known here")
 
 
+def test_an_image_named_otherwise_than_most_shifts_no_pose(tmp_path, caplog):
+    for make, root in ((redwood, tmp_path / "redwood"), (hololens, tmp_path / "hololens")):
+        make(root, [0, 1, 2], [0, 1, 2]) if make is redwood else make(root)
+        (root / "depth" / "00000.png").rename(root / "depth" / "x7-00000.png")
+    assert [keyframe.T_world_camera[0, 3] for keyframe in Redwood(tmp_path / "redwood")] == [1, 2]
+    assert "x7-00000.png is left out: it is named otherwise than 2 others" in caplog.text
+    one_line(lambda: HoloLens(tmp_path / "hololens"), r"poses\.txt has 3 poses for 2 depth images")
+
+
 def test_a_log_that_is_given_beats_the_one_that_is_found(tmp_path):
     root = redwood_room(tmp_path, "image", "trajectory.log")
     lines = (root / "trajectory.log").read_text().splitlines()

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from tsfusion.core.errors import DatasetError, InvalidConfig, InvalidKeyframe
 from tsfusion.datasets.accelerometer import Accelerometer, read_table
 from tsfusion.datasets.cameras import RecordedCamera
-from tsfusion.datasets.dataset import SCAN, Frames, keep_posed, require_folder, require_frames
+from tsfusion.datasets.dataset import NO_HALF, SCAN, Frames, keep_posed, require_folder, require_frames
 from tsfusion.datasets.readers import listed_file, read_image, read_lines
 from tsfusion.datasets.trajectory_files import read_euroc
 from tsfusion.geometry.calibration import Rectifier
@@ -22,7 +22,6 @@ from tsfusion.geometry.trajectory import Trajectory
 
 EXPECTED = "mav0/{cam0,cam1}/{data.csv,sensor.yaml,data/*.png} and mav0/state_groundtruth_estimate0/data.csv"
 _TRUTH = "state_groundtruth_estimate0/data.csv"
-_NO_HALF = "without their other half"
 
 
 def recognises(path: Path) -> bool:
@@ -115,7 +114,7 @@ def _pairs(place: Path, max_difference_ns: int, skipped: dict[str, int]) -> list
     there = [pair for pair in pairs if pair[1].is_file() and pair[2].is_file()]
     alone = max(len(left), len(right)) - len(there)
     if alone:
-        skipped[_NO_HALF] = alone
+        skipped[NO_HALF] = alone
     return there
 
 

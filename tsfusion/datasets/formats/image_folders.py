@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Base of layouts with depth images in one folder and colour images in another."""
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +15,13 @@ from tsfusion.datasets import depth_files
 from tsfusion.datasets.cameras import MILLIMETRES, DepthUnit, RecordedCamera
 from tsfusion.datasets.dataset import Frames
 from tsfusion.datasets.depth_files import check_metres, read_depth
-from tsfusion.datasets.file_names import in_order, numbers_in
+from tsfusion.datasets.file_names import in_order, numbers_in, series_of
 from tsfusion.datasets.readers import read_color
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.se3 import Transform
+
+log = logging.getLogger(__name__)
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
 _SIZES = 3  # images that tell the size of all
@@ -134,14 +137,27 @@ def images(where: Path, expected: str, pattern: str = "[!.]*") -> list[Path]:
 
 
 def depth_images(where: Path, expected: str, pattern: str = "[!.]*") -> list[Path]:
-    """The files of depth in a folder, sorted as `images`; raises DatasetError for files of several kinds."""
+    """The files of depth in a folder, sorted as `images`; one named otherwise than most is left out.
+
+    Raises:
+        DatasetError: they are of several kinds.
+    """
     found = _files(where, expected, pattern, depth_files.SUFFIXES)
     kinds = sorted({path.suffix.lower() for path in found})
     if len(kinds) > 1:
         raise DatasetError(
             f"{where} holds files of {' and '.join(kinds)}; expected depth of one kind: move the others away"
         )
-    return found
+    alike = max(series_of(found), key=len, default=found)
+    lengths = {len(path.stem) for path in found}
+    if len(lengths) == 1 or 2 * len(alike) <= len(found) or len(alike) == len(found):
+        return found
+    other = next(path for path in found if path not in alike)
+    log.warning(
+        "%s is left out%s: it is named otherwise than %d others", other,
+        f", with {len(found) - len(alike) - 1} more" * (len(found) > len(alike) + 1), len(alike),
+    )  # fmt: skip
+    return alike
 
 
 def _files(where: Path, expected: str, pattern: str, suffixes: tuple[str, ...]) -> list[Path]:
@@ -150,14 +166,14 @@ def _files(where: Path, expected: str, pattern: str, suffixes: tuple[str, ...]) 
     return in_order(path for path in where.glob(pattern) if path.suffix.lower() in suffixes)
 
 
-def first_size(depth: Sequence[Path]) -> tuple[int, int]:
-    """(height, width) of most of a recording's first depth images, for which its camera is looked up."""
+def first_size(files: Sequence[Path], read: Callable[[Path], NDArray[Any]] = read_depth) -> tuple[int, int]:
+    """(height, width) of most of a recording's first images, for which its camera is looked up."""
     sizes: list[tuple[int, int]] = []
-    for index, file in enumerate(depth):
+    for index, file in enumerate(files):
         try:
-            height, width = read_depth(file).shape
+            height, width = read(file).shape[:2]
         except DatasetError:
-            if not sizes and (2 * index + 2 > len(depth) or index >= _FIRST_TRIES):
+            if not sizes and (2 * index + 2 > len(files) or index >= _FIRST_TRIES):
                 raise  # so it is with all of them
             continue
         sizes.append((height, width))

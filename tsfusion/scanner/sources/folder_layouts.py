@@ -14,9 +14,8 @@ from tsfusion.core import read_limits
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.formats.image_folders import COLOR
 from tsfusion.datasets.point_times import Scan
-from tsfusion.datasets.readers import decode_image, read_numbers
+from tsfusion.datasets.readers import decode_image
 from tsfusion.datasets.scan_files import SUFFIXES, read_scan
-from tsfusion.geometry.keyframe import MAX_BASELINE_M
 
 LayoutKind = Literal["depth", "pair", "points"]
 
@@ -110,19 +109,3 @@ def depth_of(image: NDArray[Any]) -> NDArray[Any]:
     if image.dtype == np.uint16:
         image[image == _NOT_MEASURED] = 0
     return image
-
-
-def baseline_of(root: Path) -> float | None:
-    """Read the baseline, metres, from `baseline.txt`; None = not there (yet).
-
-    Raises:
-        DatasetError: the file does not hold one number > 0.
-    """
-    path = root / "baseline.txt"
-    if not path.is_file():
-        return None
-    baseline = float(read_numbers(path, "the baseline in metres", columns=1)[0, 0])
-    if not 0 < baseline <= MAX_BASELINE_M:
-        unit = ": are these millimetres?" * (baseline > 0)
-        raise DatasetError(f"{path} must hold the baseline in metres, > 0, got {baseline:g}{unit}")
-    return baseline

@@ -16,12 +16,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core.errors import InvalidConfig, SourceError
+from tsfusion.core.errors import DatasetError, InvalidConfig, SourceError
+from tsfusion.datasets.stereo_pairs import AlreadyRectified, PairRectifier, pair_of, read_rectifier
 from tsfusion.geometry.calibration import Size
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.scanner.sources.source import LiveSource
-from tsfusion.scanner.sources.stereo_pairs import AlreadyRectified, PairRectifier, frame_of, read_rectifier
 
 log = logging.getLogger(__name__)
 
@@ -70,7 +70,7 @@ class StereoVideo(LiveSource):
         super().__init__(f"camera {place}", sensor)
         self._place, self._deadline = str(place), deadline
         self._file, self._reading = _is_file(self._place), threading.RLock()
-        pairs = None if calibration is None else _rectifier_of_known_size(calibration, size)
+        pairs = None if calibration is None else _rectifier(calibration, size, required=size is not None)
         wanted = size or (None if pairs is None else pairs.size)
         self._capture = _open(self._place, self._file, wanted, fps, deadline)
         try:
@@ -80,7 +80,7 @@ class StereoVideo(LiveSource):
                 assert baseline is not None
                 self._pairs: PairRectifier = AlreadyRectified(intrinsics, baseline, size or shown)
             else:
-                self._pairs = pairs or read_rectifier(calibration, size=size or shown)
+                self._pairs = pairs or _rectifier(calibration, size or shown)
         except BaseException:
             self._capture.release()
             raise
@@ -142,13 +142,11 @@ class StereoVideo(LiveSource):
                 f"images of {width}×{height} side by side, as calibrated: {2 * width}×{height}"
             )
         left, right = picture.image[:, :width], picture.image[:, width:]
-        return frame_of(
-            left,
-            right,
-            self._pairs,
+        return Frame(
             sensor=self.sensor,
             timestamp_ns=picture.timestamp_ns,
             captured_ns=picture.captured_ns,
+            **pair_of(left, right, self._pairs),
         )
 
 
@@ -207,13 +205,13 @@ class CameraThread:
         self._pictures.put(picture)
 
 
-def _rectifier_of_known_size(calibration: str | Path, size: Size | None) -> PairRectifier | None:
-    """Read the rectifier; None if the file has no image size, which then comes from the camera."""
+def _rectifier(calibration: str | Path, size: Size | None, *, required: bool = True) -> Any:
+    """Read the rectifier; None if it is not required and the file has no image size: the camera has it."""
     try:
         return read_rectifier(calibration, size=size)
-    except SourceError:
-        if size is not None or not Path(calibration).expanduser().exists():
-            raise
+    except DatasetError as error:
+        if required or not Path(calibration).expanduser().exists():
+            raise SourceError(str(error)) from error
         return None
 
 

@@ -13,20 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError, InvalidConfig, InvalidKeyframe, SourceError
-from tsfusion.datasets import file_names
+from tsfusion.datasets import file_names, stereo_pairs
 from tsfusion.datasets.cameras import (
     FILES,
-    RecordedCamera,
     UnknownCamera,
     camera_files,
-    described,
     find_camera,
 )
 from tsfusion.datasets.depth_files import check_metres, read_depth
 from tsfusion.datasets.point_times import PointTimes, point_times
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
-from tsfusion.scanner.sources import folder_layouts, stereo_pairs
+from tsfusion.scanner.sources import folder_layouts
 from tsfusion.scanner.sources.source import LiveSource, monotonic_of
 
 log = logging.getLogger(__name__)
@@ -232,15 +230,8 @@ class WatchedFolder(LiveSource):
 
     def _frame(self, kind: str, images: list[Any], timestamp_ns: int, captured_ns: int) -> Frame:
         if kind == "pair":
-            left, right = images
-            return stereo_pairs.frame_of(
-                left,
-                right,
-                self._camera,
-                sensor=self.sensor,
-                timestamp_ns=timestamp_ns,
-                captured_ns=captured_ns,
-            )
+            pair = stereo_pairs.pair_of(images[0], images[1], self._camera)
+            return Frame(sensor=self.sensor, timestamp_ns=timestamp_ns, captured_ns=captured_ns, **pair)
         if kind == "points":
             found = point_times(images[0], timestamp_ns) if self._deskew else PointTimes()
             if found.untimed and found.untimed != self._untimed:
@@ -282,11 +273,16 @@ class WatchedFolder(LiveSource):
     def _find_camera(self, kind: str, image: NDArray[np.generic], *, final: bool) -> bool:
         """Read the camera, for which the size of an image is needed; return whether it is there."""
         try:
+            size = image.shape[0], image.shape[1]
+            given: Any = {"intrinsics": self._intrinsics, "calibration": self._calibration}
             if kind == "pair":
-                self._camera = self._pairs(image)
+                self._camera, found = stereo_pairs.find_pairs(
+                    self._root, size, baseline=self._baseline, places=self._places, **given
+                )
+                self.camera = str(found)
             else:
-                self._camera = found = self._one_camera(image)
-                self.camera += f"; {found.depth_unit(self._depth_scale)}"
+                self._camera = found = find_camera(self._root, size, places=self._places, **given)
+                self.camera = f"{found}; {found.depth_unit(self._depth_scale)}"
         except UnknownCamera as error:
             if final:
                 need = " (of a stereo camera FILE, or intrinsics and baseline.txt)" if kind == "pair" else ""
@@ -295,29 +291,6 @@ class WatchedFolder(LiveSource):
             if final or self._calibration is not None:
                 raise SourceError(str(error)) from error
         return self._camera is not None
-
-    def _one_camera(self, image: NDArray[np.generic]) -> RecordedCamera:
-        found = find_camera(
-            self._root, image.shape, intrinsics=self._intrinsics, calibration=self._calibration,
-            places=self._places,
-        )  # fmt: skip
-        self.camera = str(found)
-        return found
-
-    def _pairs(self, image: NDArray[np.generic]) -> stereo_pairs.PairRectifier:
-        size = image.shape[0], image.shape[1]
-        there = any(all((self._root / name).is_file() for name in names) for names in stereo_pairs.FILE_PAIRS)
-        if self._calibration is not None or there:
-            rectifier = stereo_pairs.read_rectifier(self._calibration or self._root, size=size)
-            self.camera = f"{described(rectifier.intrinsics, size)}, rectified by its calibration"
-            return rectifier
-        camera = self._one_camera(image)
-        baseline = self._baseline or folder_layouts.baseline_of(self._root)
-        if baseline is None:
-            raise UnknownCamera(f"{self._root} has no baseline.txt (metres) of the rectified pairs")
-        if camera.undistorter is not None:
-            raise DatasetError(f"{self._root}: pairs need a stereo camera's --calibration, got {camera}")
-        return stereo_pairs.AlreadyRectified(camera.intrinsics, baseline, size)
 
     def _stamps(self, name: str, first: Path) -> tuple[int, int]:
         """`timestamp_ns`, which always grows, and `captured_ns`."""

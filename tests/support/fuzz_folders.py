@@ -1,0 +1,360 @@
+# SPDX-License-Identifier: MIT
+"""Folders of recordings whose files are renamed, exchanged, emptied, cut, doubled, or of another type.
+
+A case is a list of changes. It is refused by a named error, or gives frames of the unharmed recording alone,
+each at its own pose; else it raises `Broken`.
+"""
+
+import json
+import random
+import shutil
+from collections.abc import Callable, Sequence
+from functools import cache, partial
+from hashlib import blake2b
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+import rig_recordings
+from fuzz_targets import Broken, Target, scratch
+from numpy.typing import NDArray
+
+from tsfusion.core.errors import TsfusionError
+from tsfusion.datasets import Dataset, open_dataset
+from tsfusion.geometry import se3
+from tsfusion.geometry.frame import Frame
+from tsfusion.geometry.trajectory import quaternion
+
+COUNT = 6  # frames
+SIZE = (6, 8)
+SAME_POSE = 0.01
+CAMERA = "5 0 4\n0 5 3\n0 0 1\n"
+_CALIBRATION = "P0: 5 0 4 0 0 5 3 0 0 0 1 0\nP1: 5 0 4 -2 0 5 3 0 0 0 1 0\nTr: 0 -1 0 0 0 0 -1 0 1 0 0 0\n"
+_TEXT = (".txt", ".json", ".csv", ".yaml", ".log")
+Poses = dict[bytes, NDArray[np.float64] | None]  # by the digest of what was measured
+
+
+# --- unharmed folders ---
+
+
+def _pose(frame: int) -> NDArray[np.float64]:
+    return se3.exp(np.array((0.3 * frame, 0.2, 0.1 * frame, 0.02, 0.1 * frame, 0.01)))
+
+
+def _matrix(T: NDArray[np.float64], *, lines: bool = False) -> str:
+    rows = [" ".join(f"{value:.9f}" for value in row) for row in T]
+    return ("\n" if lines else " ").join(rows) + "\n"
+
+
+def _tum_line(frame: int) -> str:
+    T = _pose(frame)
+    numbers = " ".join(f"{value:.9f}" for value in (*T[:3, 3], *quaternion(T[:3, :3])))
+    return f"{1000 + frame / 10:.6f} {numbers}\n"
+
+
+def _put(path: Path, content: str) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(content)
+
+
+def _image(path: Path, frame: int, side: int = 0) -> None:
+    """Depth for side 0, else colour or a grey image."""
+    rng = np.random.default_rng((frame, side))
+    depth = rng.integers(500, 3000, SIZE).astype(np.uint16)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(path), rng.integers(0, 256, (*SIZE, 3)).astype(np.uint8) if side else depth)
+
+
+def _points(path: Path, frame: int, columns: int) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.abs(np.random.default_rng(frame).normal(size=(50, columns))).astype(np.float32).tofile(path)
+
+
+def _images(root: Path, depth: str, color: str) -> None:
+    for frame in range(COUNT):
+        _image(root / depth.format(frame), frame)
+        _image(root / color.format(frame), frame, 1)
+
+
+def _rows(columns: int = 4, frames: Sequence[int] = range(COUNT)) -> str:
+    return "".join(_matrix(_pose(frame)[:columns]) for frame in frames)
+
+
+def _tum(root: Path) -> None:
+    for frame in range(COUNT):
+        for side, name in enumerate(("depth", "rgb")):
+            _image(root / name / f"{1000 + frame / 10:.6f}.png", frame, side)
+    for name in ("depth", "rgb"):
+        stamps = [f"{1000 + frame / 10:.6f}" for frame in range(COUNT)]
+        _put(root / f"{name}.txt", "".join(f"{stamp} {name}/{stamp}.png\n" for stamp in stamps))
+    _put(root / "groundtruth.txt", "".join(map(_tum_line, range(COUNT))))
+    _put(root / "K.txt", CAMERA)
+
+
+def _seven_scenes(root: Path) -> None:
+    _images(root, "frame-{:06d}.depth.png", "frame-{:06d}.color.png")
+    for frame in range(COUNT):
+        _put(root / f"frame-{frame:06d}.pose.txt", _matrix(_pose(frame), lines=True))
+    _put(root / "camera-intrinsics.txt", CAMERA)
+
+
+def _scannet(root: Path) -> None:
+    _images(root, "depth/{}.png", "color/{}.jpg")
+    for frame in range(COUNT):
+        _put(root / "pose" / f"{frame}.txt", _matrix(_pose(frame), lines=True))
+    for camera in ("depth", "color"):
+        _put(root / "intrinsic" / f"intrinsic_{camera}.txt", "5 0 4 0\n0 5 3 0\n0 0 1 0\n0 0 0 1\n")
+
+
+def _replica(root: Path) -> None:
+    _images(root, "results/depth{:06d}.png", "results/frame{:06d}.jpg")
+    _put(root / "traj.txt", _rows())
+    camera = {"w": SIZE[1], "h": SIZE[0], "fx": 5.0, "fy": 5.0, "cx": 4.0, "cy": 3.0, "scale": 6553.5}
+    _put(root / "cam_params.json", json.dumps({"camera": camera}))
+
+
+def _nerfstudio(root: Path) -> None:
+    _images(root, "depth/{:04d}.png", "images/{:04d}.png")
+    frames = [
+        {"file_path": f"images/{frame:04d}.png", "depth_file_path": f"depth/{frame:04d}.png",
+         "transform_matrix": _pose(frame).tolist()}
+        for frame in range(COUNT)
+    ]  # fmt: skip
+    camera = {"fl_x": 5.0, "fl_y": 5.0, "cx": 4.5, "cy": 3.5, "w": SIZE[1], "h": SIZE[0]}
+    _put(root / "transforms.json", json.dumps({**camera, "camera_model": "PINHOLE", "frames": frames}))
+
+
+def _hololens(root: Path) -> None:
+    _images(root, "depth/{:05d}.png", "images/{:05d}.png")
+    _put(root / "K.txt", CAMERA)
+    _put(root / "poses.txt", _rows())
+
+
+def _redwood(root: Path) -> None:
+    _images(root, "depth/{:05d}.png", "color/{:05d}.png")
+    _put(root / "camera-intrinsics.txt", CAMERA)
+    poses = (f"{f} {f} {f + 1}\n" + _matrix(_pose(f), lines=True) for f in range(COUNT))
+    _put(root / "trajectory.log", "".join(poses))
+
+
+def _plain(root: Path) -> None:
+    _images(root, "depth/{:05d}.png", "rgb/{:05d}.png")
+    _put(root / "K.txt", CAMERA)
+
+
+def _flat(root: Path) -> None:
+    _images(root, "depth_{:06d}.png", "color_{:06d}.png")
+    _put(root / "K.txt", CAMERA)
+
+
+def _stereo(root: Path) -> None:
+    for frame in range(COUNT):
+        for side, name in enumerate(("left", "right"), 1):
+            _image(root / name / f"{frame:06d}.png", frame, side)
+    _put(root / "K.txt", CAMERA)
+    _put(root / "baseline.txt", "0.12\n")
+
+
+def _kitti(root: Path) -> None:
+    place = root / "sequences" / "06"
+    for frame in range(COUNT):
+        for side in (0, 1):
+            _image(place / f"image_{side}" / f"{frame:06d}.png", frame, side + 1)
+        _points(place / "velodyne" / f"{frame:06d}.bin", frame, 4)
+    _put(place / "calib.txt", _CALIBRATION)
+    _put(place / "times.txt", "".join(f"{frame / 10:e}\n" for frame in range(COUNT)))
+    _put(root / "poses" / "06.txt", _rows(3))
+
+
+def _scans(root: Path) -> None:
+    for frame in range(COUNT):
+        _points(root / f"{frame:06d}.bin", frame, 4)
+    _put(root / "poses_kitti.txt", _rows(3))
+
+
+def _lidar_keyframes(root: Path) -> None:
+    lines = []
+    for frame in range(COUNT):
+        _points(root / f"{frame:06d}" / "points.bin", frame, 3)
+        lines.append(f"v{frame} " + _tum_line(frame).split(" ", 1)[1])
+    _put(root / "graph.txt", "".join(lines))
+
+
+WRITERS: dict[str, Callable[[Path], object]] = {
+    "euroc": partial(rig_recordings.euroc, count=3),
+    "flat": _flat,
+    "hololens": _hololens,
+    "kitti": _kitti,
+    "kitti-raw": partial(rig_recordings.kitti_raw, count=3),
+    "lidar-keyframes": _lidar_keyframes,
+    "nerfstudio": _nerfstudio,
+    "plain": _plain,
+    "redwood": _redwood,
+    "replica": _replica,
+    "scannet": _scannet,
+    "scans": _scans,
+    "seven-scenes": _seven_scenes,
+    "stereo": _stereo,
+    "tum": _tum,
+}
+
+
+# --- changes ---
+
+
+def _rename(root: Path, one: Path, other: Path, number: int) -> None:
+    one.rename(one.with_name(f"x{number % 100}-{one.name}"))
+
+
+def _exchange(root: Path, one: Path, other: Path, number: int) -> None:
+    if _kind(one) != _kind(other):  # else nobody could tell
+        content = one.read_bytes()
+        one.write_bytes(other.read_bytes())
+        other.write_bytes(content)
+
+
+def _kind(file: Path) -> tuple[str, ...]:
+    """What files have in common of which nobody can tell one from the other by what they hold."""
+    if file.suffix in (".png", ".jpg"):
+        image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        return (file.suffix,) if image is None else (str(image.dtype), str(image.ndim))
+    return file.suffix, "".join(letter for letter in file.stem if letter.isalpha())
+
+
+def _cut(root: Path, one: Path, other: Path, number: int) -> None:
+    """Cut a file: one of points within a number, one of text between two, as nobody can tell else."""
+    content = one.read_bytes()
+    end = number % max(len(content), 1) | 1
+    if one.suffix in _TEXT:
+        while end > 0 and content[end - 1 : end] not in (b" ", b"\n", b",", b""):
+            end -= 1
+    one.write_bytes(content[:end])
+
+
+def _of_another_type(root: Path, one: Path, other: Path, number: int) -> None:
+    if one.suffix == ".png":
+        cv2.imwrite(str(one.with_suffix(".jpg")), np.zeros((*SIZE, 3), np.uint8))
+    else:
+        one.write_bytes(b"\xff\xd8\xff\xe0" + bytes(50))
+
+
+def _all(root: Path, one: Path, other: Path, number: int) -> None:
+    """Rename or remove a kind of file."""
+    for file in [each for each in one.parent.iterdir() if each.suffix == one.suffix]:
+        if number % 2:
+            file.unlink()
+        else:
+            file.rename(file.with_suffix(".jpg"))
+
+
+def _exchange_folders(root: Path, one: Path, other: Path, number: int) -> None:
+    places = sorted(
+        place for place in one.parent.parent.iterdir() if place.is_dir() and not place.name.isdigit()
+    )
+    kinds = [{_kind(file) for file in place.glob("*.*")} for place in places[:2]]
+    if root in one.parent.parents and len(places) > 1 and kinds[0].isdisjoint(kinds[1]):
+        aside = one.parent.parent / "aside"
+        places[0].rename(aside)
+        places[1].rename(places[0])
+        aside.rename(places[1])
+
+
+_CHANGES: tuple[Callable[[Path, Path, Path, int], object], ...] = (
+    _rename,
+    _exchange,
+    lambda root, one, other, number: one.write_bytes(b""),
+    _cut,
+    lambda root, one, other, number: shutil.copy(one, one.with_name(f"{one.stem} copy{one.suffix}")),
+    _of_another_type,
+    lambda root, one, other, number: one.unlink(),
+    lambda root, one, other, number: one.write_text("not what it was"),
+    _all,
+    _exchange_folders,
+)
+
+
+def _seeds() -> list[bytes]:
+    return [msgspec.msgpack.encode([[kind, 0, 1, 2]]) for kind in range(len(_CHANGES))]
+
+
+def _mutate(content: bytes, rng: random.Random, corpus: Sequence[bytes]) -> bytes:
+    """Another file, another change, or one more."""
+    changes = msgspec.msgpack.decode(content)[:1] if rng.random() < 0.5 else []
+    changes.append([rng.randrange(len(_CHANGES)), *(rng.randrange(1 << 16) for _ in range(3))])
+    return msgspec.msgpack.encode(changes)
+
+
+# --- a case ---
+
+
+def _digest(frame: Frame) -> bytes:
+    measured = [frame.depth, frame.left, frame.right, frame.points]
+    found = b"".join(np.ascontiguousarray(one).tobytes() for one in measured if one is not None)
+    return blake2b(found, digest_size=16).digest()
+
+
+def _frames(dataset: Dataset) -> Poses:
+    found: Poses = {}
+    for index in range(len(dataset)):
+        try:
+            frame = dataset.frame(index)  # type: ignore[attr-defined]
+        except TsfusionError:
+            continue
+        found[_digest(frame)] = frame.T_world_camera
+    return found
+
+
+@cache
+def _whole(layout: str) -> tuple[Path, Poses]:
+    """The unharmed folder, and its frames."""
+    root = scratch() / layout / "whole"
+    root.mkdir(parents=True)
+    WRITERS[layout](root)
+    frames = _frames(open_dataset(root, posed=False))
+    if layout == "kitti":
+        frames |= _frames(open_dataset(root, posed=False, modality="lidar"))
+    if len(frames) < 3:
+        raise Broken(f"{layout}: the whole folder has {len(frames)} frames")
+    return root, frames
+
+
+def run(layout: str, content: bytes) -> str:
+    """Harm a copy of the folder, and open it with its poses, without them, and with those of another file."""
+    whole, wanted = _whole(layout)
+    work = whole.with_name("work")
+    shutil.rmtree(work, ignore_errors=True)
+    shutil.copytree(whole, work)
+    for kind, one, other, number in msgspec.msgpack.decode(content):
+        files = sorted(path for path in work.rglob("*") if path.is_file())
+        if files:
+            _CHANGES[kind % len(_CHANGES)](work, files[one % len(files)], files[other % len(files)], number)
+    trajectory = whole.with_name("slam.txt")
+    _put(trajectory, "".join(map(_tum_line, range(COUNT))))
+    options: tuple[dict[str, object], ...] = ({}, {"posed": False}, {"trajectory": trajectory})
+    return "; ".join(_opened(work, wanted, **each) for each in options)
+
+
+def _opened(root: Path, wanted: Poses, **options: object) -> str:
+    try:
+        dataset = open_dataset(root, **options)
+        found = _frames(dataset)
+    except TsfusionError as error:
+        if "\n" in str(error):
+            raise Broken(f"not one line: {error}") from error
+        return type(error).__name__
+    for digest, T in found.items():
+        if digest not in wanted:
+            raise Broken(f"a frame of {dataset.name} is none of the recording, {options}")
+        good = wanted[digest]
+        if T is not None and "trajectory" not in options and (
+            good is None or np.abs(T - good).max() > SAME_POSE
+        ):  # fmt: skip
+            raise Broken(f"a frame of {dataset.name} is at another's pose, {options}")
+    return f"{len(found)} of {COUNT}, {sum(T is not None for T in found.values())} posed"
+
+
+FOLDERS = {
+    f"folder-{layout}": Target(seeds=_seeds, run=partial(run, layout), mutate=_mutate, slow_s=10.0)
+    for layout in WRITERS
+}

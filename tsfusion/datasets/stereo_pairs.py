@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: MIT
+"""Stereo cameras: their calibration, rectification of their images, and the frames made of them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core.errors import DatasetError, InvalidConfig
+from tsfusion.datasets.cameras import RecordedCamera, UnknownCamera, find_camera
+from tsfusion.datasets.readers import read_numbers
+from tsfusion.geometry.calibration import Rectifier, Size
+from tsfusion.geometry.calibration_files import read_rig
+from tsfusion.geometry.keyframe import MAX_BASELINE_M, Intrinsics
+
+# A folder as a calibration: the files of the left and the right camera, or of intrinsics and extrinsics.
+FILE_PAIRS = (
+    ("cam0/sensor.yaml", "cam1/sensor.yaml"),
+    ("mav0/cam0/sensor.yaml", "mav0/cam1/sensor.yaml"),
+    ("left.yaml", "right.yaml"),
+    ("intrinsics.yml", "extrinsics.yml"),
+)
+
+
+class PairRectifier(Protocol):
+    """Rectifies pairs of images, as `calibration.Rectifier` does."""
+
+    @property
+    def intrinsics(self) -> Intrinsics: ...
+
+    @property
+    def baseline_fx(self) -> float: ...
+
+    @property
+    def size(self) -> Size: ...
+
+    def pair(self, left: NDArray[Any], right: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Rectify both images."""
+
+
+@dataclass(frozen=True)
+class AlreadyRectified:
+    """`PairRectifier` for images that are rectified already."""
+
+    intrinsics: Intrinsics
+    baseline_m: float
+    size: Size
+
+    @property
+    def baseline_fx(self) -> float:
+        """Baseline times focal length, metre · pixels."""
+        return self.baseline_m * self.intrinsics.fx
+
+    def pair(self, left: NDArray[Any], right: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Return both images as they are.
+
+        Raises:
+            InvalidConfig: they have another size.
+        """
+        for shown in (left.shape[:2], right.shape[:2]):
+            if shown != self.size:
+                raise InvalidConfig(f"the camera has images of {self.size[::-1]} pixels, got {shown[::-1]}")
+        return left, right
+
+
+def read_rectifier(calibration: str | Path, *, size: Size | None) -> Rectifier:
+    """Read a calibration from a file, or from a folder with a pair of files (`FILE_PAIRS`).
+
+    Args:
+        size: (height, width) of one image, for files without one.
+
+    Raises:
+        DatasetError: it cannot be read; the message says what was expected.
+    """
+    path = Path(calibration).expanduser()
+    files = [path]
+    if path.is_dir():
+        found = [names for names in FILE_PAIRS if all((path / name).is_file() for name in names)]
+        if not found:
+            expected = "; ".join(" and ".join(names) for names in FILE_PAIRS)
+            raise DatasetError(f"{path} holds no calibration of a stereo camera; expected one of {expected}")
+        files = [path / name for name in found[0]]
+    try:
+        try:
+            rig = read_rig(*files)
+        except DatasetError:
+            if size is None:
+                raise
+            rig = read_rig(*files, size=size)
+        return Rectifier(rig)
+    except (DatasetError, InvalidConfig) as error:
+        raise DatasetError(f"calibration: {error}") from error
+
+
+def find_pairs(
+    root: Path,
+    size: Size,
+    *,
+    intrinsics: Intrinsics | None = None,
+    calibration: str | Path | None = None,
+    baseline: float | None = None,
+    places: Sequence[Path] = (),
+) -> tuple[PairRectifier, RecordedCamera]:
+    """Find the stereo camera of a recording: how its pairs are rectified, and the left camera then.
+
+    Args:
+        root: the recording's folder.
+        size: (height, width) of its images.
+        intrinsics, baseline: of rectified images; pixels, metres; default from files of the folder.
+        calibration: of raw images; default a pair of files in the folder (`FILE_PAIRS`).
+        places: folders to look in for files of a camera, as of `find_camera`.
+
+    Raises:
+        UnknownCamera: nothing says what it is.
+        DatasetError: a file of it cannot be used.
+    """
+    there = any(all((root / name).is_file() for name in names) for names in FILE_PAIRS)
+    if calibration is not None or there:
+        rectifier = read_rectifier(calibration or root, size=size)
+        source = "rectified by its calibration"
+        return rectifier, RecordedCamera(rectifier.intrinsics, rectifier.size, source)
+    camera = find_camera(root, size, intrinsics=intrinsics, places=places)
+    baseline = baseline or baseline_of(root)
+    if baseline is None:
+        raise UnknownCamera(f"{root} has no baseline.txt (metres) of the rectified pairs")
+    if camera.undistorter is not None:
+        raise DatasetError(f"{root}: pairs need a stereo camera's --calibration, got {camera}")
+    return AlreadyRectified(camera.intrinsics, baseline, size), camera
+
+
+def baseline_of(root: Path) -> float | None:
+    """Read the baseline, metres, from `baseline.txt`; None = not there (yet).
+
+    Raises:
+        DatasetError: the file does not hold one number > 0.
+    """
+    path = root / "baseline.txt"
+    if not path.is_file():
+        return None
+    baseline = float(read_numbers(path, "the baseline in metres", columns=1)[0, 0])
+    if not 0 < baseline <= MAX_BASELINE_M:
+        unit = ": are these millimetres?" * (baseline > 0)
+        raise DatasetError(f"{path} must hold the baseline in metres, > 0, got {baseline:g}{unit}")
+    return baseline
+
+
+def pair_of(left: NDArray[Any], right: NDArray[Any], pairs: PairRectifier) -> dict[str, Any]:
+    """Fields of a rectified `Frame`, of raw (H, W) grey or (H, W, 3) BGR uint8; colour is the left one's."""
+    left, right = pairs.pair(left, right)
+    return {
+        "left": _grey(left),
+        "right": _grey(right),
+        "color": left if left.ndim == 3 else np.repeat(left[:, :, None], 3, axis=2),
+        "intrinsics": pairs.intrinsics,
+        "baseline_fx": pairs.baseline_fx,
+    }
+
+
+def _grey(image: NDArray[Any]) -> NDArray[np.uint8]:
+    if image.ndim == 2:
+        return image
+    grey: NDArray[np.uint8] = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    return grey
