@@ -28,7 +28,10 @@ def test_only_named_errors_come_out(name: str, times: int) -> None:
 
 
 @pytest.mark.parametrize("cases", [10, pytest.param(1000, marks=pytest.mark.nightly)])
-@pytest.mark.parametrize("name", FOLDERS)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(one, marks=pytest.mark.slow if one == "folder-euroc" else ()) for one in FOLDERS],
+)
 def test_a_harmed_folder_gives_its_good_frames_or_is_refused(name: str, cases: int) -> None:
     assert fuzz(name, cases, seed=cases).cases == cases
 
