@@ -77,7 +77,8 @@ class Clock:
         self.now += self._reading[index]
         return index
 
-    def wait_until(self, due: float) -> None:
+    def wait_until(self, due: float, ended: Callable[[], bool]) -> None:
+        assert not ended()
         self.now = max(self.now, due)
 
 
@@ -99,7 +100,8 @@ def test_a_keyframe_at_a_rate_is_read_shortly_before_its_time(
 ) -> None:
     clock: Any = Clock(*reading)
     monkeypatch.setattr(replay.time, "monotonic", lambda: clock.now)
-    came = [round(clock.now, 6) for _ in replay._keyframes(clock, cast(Any, 0), clock, rate, [])]
+    first, how = (0, cast(Any, 0)), {"rate": rate, "unread": [], "ended": lambda: False}
+    came = [round(clock.now, 6) for _ in replay._keyframes(clock, first, clock, **how)]
     assert came == yielded
     assert clock.reads == reads
 
@@ -266,8 +268,8 @@ def test_a_damaged_journal_leaves_its_results_and_status_1(
 @pytest.mark.slow
 @pytest.mark.usefixtures("quick_servers")
 @pytest.mark.parametrize("flags", [(), ("--no-check",)])  # the check reads that image first
-def test_an_image_that_cannot_be_read_ends_a_replay_with_its_results(
-    here: Here, tmp_path: Path, flags: tuple[str, ...]
+def test_an_image_that_cannot_be_read_is_left_out_and_said(
+    here: Here, tmp_path: Path, flags: tuple[str, ...], caplog: pytest.LogCaptureFixture
 ) -> None:
     views = [
         replace(one, depth=(one.measurement * one.depth_scale * 1000).astype(np.uint16), depth_scale=1e-3)
@@ -278,10 +280,10 @@ def test_an_image_that_cannot_be_read_ends_a_replay_with_its_results(
     image.write_bytes(image.read_bytes()[:60])
     done = here("replay", folder, "--out", tmp_path / "out", "--voxel-size", VOXEL, *flags)
     assert done.returncode == 1, done.stderr
-    assert "keyframe 3 of 5 cannot be read, and ended the replay" in done.stderr
-    assert image.name in done.stderr
+    assert "1 of 5 frames cannot be read, and are not in the map" in done.stderr
+    assert image.name in caplog.text
     record = json.loads((tmp_path / "out" / "run.json").read_text())
-    assert (record["keyframes_fused"], record["missed"].startswith("keyframe 3 of 5")) == (3, True)
+    assert (record["keyframes_fused"], record["frames_skipped"]) == (4, {"unreadable": 1})
     assert (tmp_path / "out" / "mesh.ply").is_file()
 
 

@@ -120,6 +120,7 @@ def summarise(
                     stats, spool="the spool", link=sender.problem, rejection=sender.first_rejection
                 ),
                 shortfall.of_damage(dataset.skipped.get(LOST, 0)),
+                shortfall.of_unreadable(len(dataset), dataset.skipped),
                 shortfall.of_clock(dataset.skipped),
                 *missed,
             )

@@ -166,6 +166,7 @@ def summarise(
                 tracking,
                 shortfall.of_delivery(stats, spool=spool, link=state.link, rejection=scanner.first_rejection),
                 shortfall.of_clock(source.skipped),
+                shortfall.of_unreadable(source.length or state.frames, source.skipped),
             )
         ),
         left=stats.waiting,

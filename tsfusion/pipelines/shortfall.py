@@ -17,7 +17,7 @@ from tsfusion.client import Client, ClientStats
 from tsfusion.core.counts import count_of
 from tsfusion.core.headline import Level
 from tsfusion.core.readable_numbers import counted
-from tsfusion.datasets.dataset import CLOCK, WITHOUT_POSE
+from tsfusion.datasets.dataset import CLOCK, UNREADABLE, WITHOUT_POSE
 from tsfusion.geometry.sample_ranges import NO_SAMPLES
 from tsfusion.geometry.sweeps import skewed
 
@@ -174,6 +174,14 @@ def of_poses(frames: int, left_out: Mapping[str, int]) -> str:
         "trajectory of all (--trajectory FILE, --option max_gap_s=SECONDS bridges gaps), or let "
         "`tsfusion scan` find them"
     )
+
+
+def of_unreadable(frames: int, left_out: Mapping[str, int]) -> str:
+    """Say that many of a recording's frames cannot be read; empty = nearly all can."""
+    bad = left_out.get(UNREADABLE, 0)
+    if bad <= FEW * frames:
+        return ""
+    return f"{bad} of {frames} frames cannot be read, and are not in the map: see the first of them above"
 
 
 def of_tracking(frames: int, tracked: int, why: str, *, localizer: str = "rgbd", maps: int = 1) -> str:
