@@ -51,7 +51,8 @@ def run(
         server: `listen` with port 0 draws a random one.
         volume: the settings of every map that has none of its own.
         on_ready: called once with the real addresses, when keyframes are accepted and kernels are warm.
-        volumes: maps with settings of their own, opened at the start; so are those in the state folder.
+        volumes: maps with settings of their own, opened at the start. Others in the state folder are opened
+            one after the other when it is ready, or as soon as somebody asks for them.
         guest: of a server with keys, a public key that may watch every map besides those in its list.
         on_health: called with the server's state about once a second.
 
@@ -103,6 +104,7 @@ def _open(
     stack.enter_context(lock_folder(state, "state", "server"))
     for name in moved_maps.departed_names(state):
         moved_maps.put_aside(state, name)
+    own = frozenset(volumes)
     for name in state_folder.map_names(state):
         if len(volumes) < server.max_maps and state_folder.holds_a_map(state_folder.map_folder(state, name)):
             volumes.setdefault(name, volumes[DEFAULT_MAP])
@@ -121,7 +123,7 @@ def _open(
     stack.callback(gateway.moves.close)
     watchdog = Watchdog()
     report = _ReadingReport(metrics, watchdog, signals)
-    gateway.maps.open_at_start(volumes, report)
+    gateway.maps.open_at_start(volumes, report, later=volumes.keys() - own)
     return gateway, watchdog, report
 
 

@@ -54,6 +54,38 @@ def test_a_greeting_makes_no_map_and_a_record_does(served: Served, tmp_path: Pat
         assert served.greet(link, "yard2").reason == "map"
 
 
+def test_maps_of_the_state_folder_begin_when_they_are_asked_for_or_one_by_one(tmp_path: Path) -> None:
+    """The server is ready before, and ends without them; one opens at a time."""
+    names = ("yard", "house", "shed")
+    with (
+        serving_here(tmp_path, later=names) as served,
+        connected(sockets.dealer, served.addresses.control) as link,
+    ):
+        maps = served.gateway.maps
+
+        def begun() -> list[str]:
+            return [one.name for one in maps if one.fuser.pid]
+
+        maps.is_ending = True  # so that none begins by itself
+        for _ in range(3):
+            served.step()
+        assert begun() == ["default"]
+        assert (maps.warm, maps.drained, maps.settled) == (True, True, True)
+        assert served.gateway.health().maps["shed"].state == "opening"
+        served.until(lambda: isinstance(served.greet(link, "house"), Welcome))
+        assert begun() == ["default", "house"]
+        maps.is_ending = False
+        served.until(lambda: len(begun()) == 3)
+        assert "yard" in begun()
+        served.until(lambda: len(begun()) == 4 and maps.warm)
+        maps.is_ending = True
+    with serving_here(tmp_path / "other", later=names) as served:
+        served.gateway.stop_accepting()
+        served.until(served.gateway.maps.finish)
+        assert served.gateway.maps.finished_well
+        assert [one.fuser.pid for one in served.gateway.maps if one.name != "default"] == [0, 0, 0]
+
+
 def test_a_record_whose_frames_are_too_large_together_is_refused(tmp_path: Path) -> None:
     """ZeroMQ limits a single frame. Nor does such a record make a map."""
     frames = record(1)

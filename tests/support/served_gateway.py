@@ -55,8 +55,14 @@ class Served:
 
 
 @contextlib.contextmanager
-def serving_here(state: Path, *, guest: str | None = None, **settings: Any) -> Iterator[Served]:
-    """Start a gateway whose default map is open, and end it afterwards whatever happens."""
+def serving_here(
+    state: Path, *, guest: str | None = None, later: tuple[str, ...] = (), **settings: Any
+) -> Iterator[Served]:
+    """Start a gateway whose default map is open, and end it afterwards whatever happens.
+
+    Args:
+        later: further maps, whose fusers wait.
+    """
     with contextlib.ExitStack() as stack:
         stack.enter_context(mock.patch.object(fuser_process, "COMMAND", COMMAND))
         stack.enter_context(mock.patch.object(fuser_supervisor, "_END_DEADLINE", 0.0))
@@ -70,7 +76,7 @@ def serving_here(state: Path, *, guest: str | None = None, **settings: Any) -> I
         stack.callback(ports.close)
         gateway = Gateway(context, server, ports, access, Metrics(server))
         stack.callback(gateway.maps.close)
-        gateway.maps.open_at_start({"default": VolumeConfig()})
+        gateway.maps.open_at_start(dict.fromkeys(("default", *later), VolumeConfig()), later=later)
         until(lambda: gateway.step() or gateway.maps.warm)
         yield Served(gateway)
 

@@ -25,10 +25,11 @@ COMMAND = (sys.executable, "-m", "tsfusion.fuser")
 
 
 class FuserProcess:
-    """A process that is started at once. Call `close` when it has ended, or to end it.
+    """A process that is started at once, or by `start`. Call `close` when it has ended, or to end it.
 
     Args:
         name: of the map, for the log lines; empty = that of a `Begin` that comes later.
+        waits: for `start`.
 
     Attributes:
         has_started: whether it has said so, and takes messages.
@@ -38,7 +39,13 @@ class FuserProcess:
     """
 
     def __init__(
-        self, context: "zmq.Context[Any]", name: str, log_format: LogFormat, log_level: LogLevel
+        self,
+        context: "zmq.Context[Any]",
+        name: str,
+        log_format: LogFormat,
+        log_level: LogLevel,
+        *,
+        waits: bool = False,
     ) -> None:
         self.has_started = False
         self._working = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115  nameless, held as long as this
@@ -48,16 +55,23 @@ class FuserProcess:
             self.clear_current_keyframe()
             endpoint = f"ipc://{self._scratch}/{_SOCKET}"
             self.socket.bind(endpoint)
-            self._process = subprocess.Popen(
-                [*COMMAND, endpoint, log_format, log_level, name],
-                stdin=subprocess.PIPE,  # closes when the gateway dies, however it dies
-                stdout=subprocess.DEVNULL,
-                pass_fds=[self._working.fileno()],
-                **process.OWN_GROUP,  # a Ctrl-C is for the gateway
-            )
+            self._command = [*COMMAND, endpoint, log_format, log_level, name]
+            self._process: subprocess.Popen[bytes] | None = None
+            if not waits:
+                self.start()
         except BaseException:
             self._clear_up()
             raise
+
+    def start(self) -> None:
+        """Start it; raises OSError."""
+        self._process = subprocess.Popen(
+            self._command,
+            stdin=subprocess.PIPE,  # closes when the gateway dies, however it dies
+            stdout=subprocess.DEVNULL,
+            pass_fds=[self._working.fileno()],
+            **process.OWN_GROUP,  # a Ctrl-C is for the gateway
+        )
 
     @property
     def working_file(self) -> str:
@@ -66,13 +80,13 @@ class FuserProcess:
 
     @property
     def pid(self) -> int:
-        """The number of the process."""
-        return self._process.pid
+        """The number of the process; 0 = it was not started."""
+        return self._process.pid if self._process else 0
 
     @property
     def status(self) -> int | None:
-        """The exit status; None = it runs."""
-        return self._process.poll()
+        """The exit status; None = it runs, or was not started."""
+        return self._process.poll() if self._process else None
 
     @property
     def current_keyframe(self) -> int:
@@ -98,7 +112,8 @@ class FuserProcess:
 
     def kill(self) -> None:
         """Kill the process: it ends at once, or, where it waits for a disk, when that answers."""
-        self._process.kill()
+        if self._process:
+            self._process.kill()
 
     def close(self, timeout: float = 0.0, *, wait: bool = True) -> None:
         """End the process and clear up. It may end by itself within so many seconds; then it is killed.
@@ -106,6 +121,9 @@ class FuserProcess:
         Args:
             wait: some seconds until a killed one has ended. It is reaped in any case.
         """
+        if self._process is None:
+            self._clear_up()
+            return
         assert self._process.stdin is not None
         with suppress(OSError):
             self._process.stdin.close()  # it ends when it sees that

@@ -43,9 +43,11 @@ class FuserSupervisor:
     Args:
         ahead: another folder, in which the map is read until `begin_work` says that it lies in its own.
         spares: processes that have all but the map.
+        waits: for `begin`.
 
     Attributes:
         is_prepared: whether the map was read ahead.
+        waits: whether no process was started yet.
     """
 
     def __init__(
@@ -57,8 +59,9 @@ class FuserSupervisor:
         *,
         ahead: Path | None = None,
         spares: SpareFusers | None = None,
+        waits: bool = False,
     ) -> None:
-        self._map = folder.name
+        self._map, self.waits = folder.name, waits
         self._server, self._ahead = server, ahead
         self._spares = spares or SpareFusers(context, server)
         self._begin = fuser_messages.Begin(
@@ -90,7 +93,7 @@ class FuserSupervisor:
             raise MapError(f"the fuser process of map {self._map} cannot be started: {error}") from error
 
     def _start(self) -> None:
-        self._process = self._spares.take(self._map, self._begin.volume)
+        self._process = self._spares.take(self._map, self._begin.volume, waits=self.waits)
         self.is_prepared = False
         self.ready = False  # it has opened the map and compiled the kernels
         self.held = ""
@@ -101,6 +104,15 @@ class FuserSupervisor:
         self.in_flight: deque[int] = deque()  # indices that it has not answered, oldest first
         if self._process.has_started:
             self._send_begin()
+
+    def begin(self) -> None:
+        """Start the process that waits, if it does; raises MapError."""
+        if self.waits:
+            try:
+                self._process.start()
+            except OSError as error:
+                raise MapError(f"the fuser process of map {self._map} cannot be started: {error}") from error
+            self.waits, self._silence = False, FuserSilence(self._process.pid)
 
     def _send_begin(self) -> None:
         """Give the process its map. It takes messages, and none was sent: there is room for this one."""

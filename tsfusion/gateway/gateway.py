@@ -122,7 +122,7 @@ class Gateway:
 
     def stop_accepting(self) -> None:
         """Take no more keyframes; clients keep those that are not acknowledged."""
-        self._accepting, self._stopped = False, True
+        self._accepting, self._stopped, self.maps.is_ending = False, True, True
 
     def step(self) -> None:
         """Wait a moment for messages, and handle those that came.

@@ -57,6 +57,7 @@ class HostedMap:
         watch: told how far the journal is read: that may take minutes, in which nothing else is done.
         fuser: that read the map ahead; None = one begins now.
         spares: processes that it may take.
+        waits: for `fuser.begin`, until when nothing is fused.
     """
 
     def __init__(
@@ -71,6 +72,7 @@ class HostedMap:
         watch: ReadingWatcher = lambda _done, _all, _records: None,
         fuser: FuserSupervisor | None = None,
         spares: SpareFusers | None = None,
+        waits: bool = False,
     ) -> None:
         self.name, self.volume = name, volume
         self.folder = state_folder.map_folder(server.state, name)
@@ -104,7 +106,9 @@ class HostedMap:
         )
         self._retention = JournalRetention(self._journal, self._index, self.sessions, server.journal_bytes)
         map_opening.warn_of_old_corrections(self.folder)
-        self.fuser = fuser or FuserSupervisor(context, self.folder, server, volume, spares=spares)
+        self.fuser = fuser or FuserSupervisor(
+            context, self.folder, server, volume, spares=spares, waits=waits
+        )
         if fuser is not None:
             fuser.begin_work()
         self._checkpoints = CheckpointOrders(self.fuser, self._journal)

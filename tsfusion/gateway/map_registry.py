@@ -4,7 +4,7 @@
 import logging
 import re
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -63,14 +63,17 @@ class MapRegistry:
         self._directory = MapDirectory(server.directory) if server.directory else None
         if self._directory is not None:
             self._directory.check()
-        self._started = False
+        self._started = self.is_ending = False  # when it ends, no map begins that waits
 
     def __iter__(self) -> Iterator[HostedMap]:
         return iter(self._open.values())
 
     def get(self, name: str) -> HostedMap | None:
-        """An open map, by name."""
-        return self._open.get(name)
+        """An open map, by name; its fuser begins."""
+        hosted = self._open.get(name)
+        if hosted is not None:
+            hosted.fuser.begin()
+        return hosted
 
     def progress(self, name: str, session: bytes) -> tuple[int, int]:
         """The highest seq of a session that is durable, and that is fused."""
@@ -83,11 +86,16 @@ class MapRegistry:
         return hosted.sessions.get(key) if hosted else None
 
     def open_at_start(
-        self, volumes: Mapping[str, VolumeConfig], watch: MapWatcher = lambda *_progress: None
+        self,
+        volumes: Mapping[str, VolumeConfig],
+        watch: MapWatcher = lambda *_progress: None,
+        *,
+        later: Collection[str] = (),
     ) -> None:
         """Open maps by name with their settings; those that clients ask for get those of the default map.
 
         Args:
+            later: maps whose fusers begin when somebody asks for them, or else one after the other.
             watch: told how far the journal of a map is read, also of a map that is opened later. What it
                 raises ends the start.
 
@@ -96,7 +104,7 @@ class MapRegistry:
         """
         self._volumes, self._watch = volumes, watch
         for name in volumes:
-            self._open_map(name)
+            self._open_map(name, waits=name in later)
 
     def end_start(self, place: Place) -> None:
         """Go on when a map cannot be opened, from here on; before, that is an error of the server.
@@ -219,13 +227,10 @@ class MapRegistry:
 
     def open_for_client(self, name: str) -> HostedMap | None:
         """A map by name, opened or made when need be; None when it cannot be, and `why_not` says why."""
-        hosted = self._open.get(name)
-        if hosted is not None:
-            return hosted
-        if self.why_not(name):
+        if self.why_not(name) and name not in self._open:
             return None
         try:
-            return self._open_map(name)
+            return self.get(name) or self._open_map(name)
         except TsfusionError as error:
             self._give_up(name, error)
             return None
@@ -313,7 +318,7 @@ class MapRegistry:
             self._kept.pop(next(iter(self._kept)))
         return name
 
-    def _open_map(self, name: str, fuser: FuserSupervisor | None = None) -> HostedMap:
+    def _open_map(self, name: str, fuser: FuserSupervisor | None = None, *, waits: bool = False) -> HostedMap:
         own = moved_maps.volume_of(self._folder(name))
         volume = own or self._volumes.get(name) or self._volumes[DEFAULT_MAP]
         try:
@@ -327,6 +332,7 @@ class MapRegistry:
                 watch=partial(self._watch, name),
                 fuser=fuser,
                 spares=self._spares,
+                waits=waits,
             )
         except OSError as error:
             raise journal_error("open", self._folder(name), error) from error
@@ -364,35 +370,43 @@ class MapRegistry:
                     raise
                 self._give_up(hosted.name, error)
         if self._started:
-            self._spares.step(self._volumes[DEFAULT_MAP], may_start=self.warm)
+            waiting = next((hosted for hosted in self if hosted.fuser.waits), None)
+            self._spares.step(self._volumes[DEFAULT_MAP], may_start=self.warm and waiting is None)
+            if waiting is not None and self.warm and not self.is_ending:
+                self.open_for_client(waiting.name)
         return for_people
 
     @property
     def warm(self) -> bool:
-        """Whether every open map can take keyframes."""
-        return all(hosted.warm for hosted in self)
+        """Whether every open map can take keyframes, but for those whose fusers wait."""
+        return all(hosted.warm for hosted in self._begun)
+
+    @property
+    def _begun(self) -> list[HostedMap]:
+        """The maps whose fusers do not wait: nobody has asked for the others, and the next start has them."""
+        return [hosted for hosted in self if not hosted.fuser.waits]
 
     @property
     def drained(self) -> bool:
-        """Whether every map has every keyframe of its journal."""
-        return all(hosted.drained for hosted in self)
+        """Whether every map that has begun has every keyframe of its journal."""
+        return all(hosted.drained for hosted in self._begun)
 
     @property
     def settled(self) -> bool:
-        """Whether every map is drained, or never will be."""
-        return all(hosted.settled for hosted in self)
+        """Whether every map that has begun is drained, or never will be."""
+        return all(hosted.settled for hosted in self._begun)
 
     def finish(self) -> bool:
         """Have every fuser write its checkpoint and end; whether all have ended. Call it until they have."""
         self._spares.close()
-        for hosted in self:
+        for hosted in self._begun:
             hosted.fuser.finish()
-        return all(hosted.fuser.ended() for hosted in self)
+        return all(hosted.fuser.ended() for hosted in self._begun)
 
     @property
     def finished_well(self) -> bool:
         """Whether every checkpoint is on the disk."""
-        return all(hosted.fuser.finished_well for hosted in self)
+        return all(hosted.fuser.finished_well for hosted in self._begun)
 
     def close(self) -> None:
         """End the fusers and finish the journals."""

@@ -49,8 +49,8 @@ class SpareFusers:
         self._failures = 0  # in a row, of those that never became ready
         self._start_at = 0.0  # time.monotonic()
 
-    def take(self, name: str, volume: VolumeConfig) -> FuserProcess:
-        """A process for a map: a spare one, or another that begins now.
+    def take(self, name: str, volume: VolumeConfig, *, waits: bool = False) -> FuserProcess:
+        """A process for a map: a spare one, or another that begins now, or that `waits`.
 
         Raises:
             OSError, zmq.ZMQError: when the system cannot start it.
@@ -59,7 +59,7 @@ class SpareFusers:
             if one.is_warm and one.volume == volume and one.process.status is None:
                 self._spares.remove(one)
                 return one.process
-        return self._start(name)
+        return self._start(name, waits=waits)
 
     def step(self, volume: VolumeConfig, *, may_start: bool) -> None:
         """Have as many as there are to be, for these settings, one after the other; after `close` none.
@@ -97,8 +97,9 @@ class SpareFusers:
         self._start_at = time.monotonic() + pause
         log.warning("a spare fuser cannot be started: %s; it is tried again in %.0f s", why, pause)
 
-    def _start(self, name: str) -> FuserProcess:
-        return FuserProcess(self._context, name, self._server.log_format, self._server.log_level)
+    def _start(self, name: str, *, waits: bool = False) -> FuserProcess:
+        log_format, log_level = self._server.log_format, self._server.log_level
+        return FuserProcess(self._context, name, log_format, log_level, waits=waits)
 
     def close(self) -> None:
         """End them; no other begins: the server ends, and steps on until its maps are saved."""
