@@ -63,9 +63,8 @@ def test_two_scanners_two_maps(tmp_path: Path) -> None:
     assert len(JournalRecording(tmp_path, "yard-2")) == len(JournalRecording(tmp_path / "maps/yard-2")) == 8
     with serving(tmp_path) as server:  # both are taken up again, without anybody asking
         until(lambda: set(fetch_health(server.address).maps) == set(numbers))
-        assert fetch_status(server.address, map_name="yard-2").map_hash == map_hash(
-            map(wall, numbers["yard-2"])
-        )
+        status = fetch_status(server.address, map_name="yard-2", timeout=DEADLINE)  # it opens now
+        assert status.map_hash == map_hash(map(wall, numbers["yard-2"]))
         assert server.terminate() == 0
 
 

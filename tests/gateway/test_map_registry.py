@@ -20,6 +20,7 @@ from tsfusion.core.config import ServerConfig
 from tsfusion.core.errors import JournalError
 from tsfusion.gateway import map_registry
 from tsfusion.gateway.client_routes import ClientRoutes
+from tsfusion.gateway.fuser_process import FuserProcess
 from tsfusion.gateway.hosted_map import HostedMap
 from tsfusion.gateway.map_registry import MapRegistry
 from tsfusion.gateway.metrics import Metrics
@@ -84,6 +85,27 @@ def test_maps_of_the_state_folder_begin_when_they_are_asked_for_or_one_by_one(tm
         served.until(served.gateway.maps.finish)
         assert served.gateway.maps.finished_well
         assert [one.fuser.pid for one in served.gateway.maps if one.name != "default"] == [0, 0, 0]
+
+
+def test_a_question_waits_for_its_map_to_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Up to its own time; a fuser that cannot be started is a reason to refuse it, and is tried again."""
+    with (
+        serving_here(tmp_path, later=("house", "shed")) as served,
+        connected(sockets.dealer, served.addresses.control) as link,
+    ):
+        served.gateway.maps.is_ending = True  # so that none begins by itself
+
+        def asked(name: str, seconds: float) -> messages.Reply:
+            link.send(messages.encode(Command(name="status", map=name, timeout_s=seconds)))
+            reply: messages.Reply = served.heard(link, messages.Reply)
+            return reply
+
+        with monkeypatch.context() as full:
+            full.setattr(FuserProcess, "start", refuse(errno.EAGAIN))
+            assert "cannot be started" in str(asked("shed", 60.0).error)
+            assert "shed" in "".join(served.gateway.health().problems)
+        assert asked("house", 60.0).error == "it has no map"  # so says the fuser
+        served.until(lambda: asked("shed", 60.0).error == "it has no map")
 
 
 def test_a_record_whose_frames_are_too_large_together_is_refused(tmp_path: Path) -> None:

@@ -87,7 +87,7 @@ class FuserQueries:
     def _pass_on(self, query: PendingQuery, hosted: HostedMap) -> str:
         """Why the fuser cannot be asked now; empty = it was."""
         if not hosted.fuser.ready:
-            return _RESTARTS
+            return "the map is being opened, or its fuser restarts"
         if query.command.name == "mesh" and (problem := self._why_no_mesh(query, hosted)):
             return problem
         self._count += 1

@@ -106,13 +106,20 @@ class FuserSupervisor:
             self._send_begin()
 
     def begin(self) -> None:
-        """Start the process that waits, if it does; raises MapError."""
-        if self.waits:
-            try:
-                self._process.start()
-            except OSError as error:
-                raise MapError(f"the fuser process of map {self._map} cannot be started: {error}") from error
-            self.waits, self._silence = False, FuserSilence(self._process.pid)
+        """Start the process that waits, if it does; it is tried again a second after it could not be."""
+        if not self.waits or time.monotonic() < self._restart_at:
+            return
+        try:
+            self._process.start()
+        except OSError as error:
+            self._note_no_start(error)
+            return
+        self.waits, self.failed, self._restart_at = False, "", 0.0
+        self._silence = FuserSilence(self._process.pid)
+
+    def _note_no_start(self, error: OSError | zmq.ZMQError) -> None:
+        self.failed = f"its fuser process cannot be started: {error}"
+        self._restart_at = time.monotonic() + 1.0
 
     def _send_begin(self) -> None:
         """Give the process its map. It takes messages, and none was sent: there is room for this one."""
@@ -275,8 +282,7 @@ class FuserSupervisor:
         try:
             self._start()
         except (OSError, zmq.ZMQError) as error:
-            self.failed = f"its fuser process cannot be started: {error}"
-            self._restart_at = time.monotonic() + 1.0
+            self._note_no_start(error)
             return
         dead.close()
         self.restarts += 1

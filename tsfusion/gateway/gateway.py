@@ -38,7 +38,7 @@ from tsfusion.gateway.metrics import Metrics
 from tsfusion.gateway.ports import Flood, Ports, Subscriptions, receive_some
 from tsfusion.gateway.problems import Problem, ProblemTimes
 from tsfusion.gateway.scan_updates import ScanUpdates
-from tsfusion.wire import messages, sockets
+from tsfusion.wire import messages, questions, sockets
 from tsfusion.wire.allowed_maps import ALL_MAPS, AllowedMaps
 from tsfusion.wire.forgetting import Forgotten
 from tsfusion.wire.health import Health, MapHealth
@@ -54,6 +54,8 @@ _REPLIES_SHARE = 4  # one fourth of the memory is for meshes and answers that wa
 _PLACE_KEPT = 0.5  # seconds for which it is known at which server a map is
 _MOST_PLACES = 64
 _OF_AN_OPEN_MAP = frozenset({"forget", "ask", "status", "mesh"})
+_MOST_HELD = 32  # commands that wait for their map to open
+_HELD_SHARE = 0.9  # of a command's time: the answer is to come within it
 Handlers = dict[sockets.AnySocket, Callable[[list[zmq.Frame]], None]]
 
 
@@ -101,6 +103,7 @@ class Gateway:
             ports, metrics, self._refused, unread=unread, max_bytes=most_unread, rate=server.quota_questions
         )
         self._places: dict[str, tuple[tuple[str, str] | None, float]] = {}  # map → where it is, until when
+        self._held: list[tuple[str, float, Callable[[], None]]] = []  # map, until when, what is done then
         self._publishing: dict[str, bool] = {}  # map → whether its fuser was told to send triangles
         self._limits = ConnectionLimits(ports, access, self._refused, server.memory_bytes)
         self._activity = ActivityLog()
@@ -147,6 +150,10 @@ class Gateway:
             self._pass_to_people(hosted, message)
         self.moves.step()
         self._questions.step()
+        now = time.monotonic()
+        for one in [one for one in self._held if now > one[1] or not self._opens(one[0])]:
+            self._held.remove(one)
+            one[2]()
         self._scans.step()
         self._update_fusers()
         self._snapshot()
@@ -243,8 +250,19 @@ class Gateway:
         else:
             self._greetings.on_ping(identity.bytes, message, client, self.epoch)
 
+    def _opens(self, name: str) -> bool:
+        """Whether a map is here and its fuser will soon be ready."""
+        hosted = self.maps.get(name)
+        return hosted is not None and not hosted.fuser.ready and not hosted.fuser.failed
+
     def _on_command(
-        self, identity: bytes, command: messages.Command, points: list[zmq.Frame], client: str
+        self,
+        identity: bytes,
+        command: messages.Command,
+        points: list[zmq.Frame],
+        client: str,
+        *,
+        was_held: bool = False,
     ) -> None:
         maps = self._admission.maps_of(client)
         if command.name == "ping":
@@ -267,6 +285,15 @@ class Gateway:
             why = f"map {command.map} is at {place.address} now"
             reply = messages.Reply(name=command.name, number=command.number, error=why, elsewhere=place)
             self.ports.reply(identity, reply)
+        elif (
+            command.name in _OF_AN_OPEN_MAP
+            and not was_held
+            and len(self._held) < _MOST_HELD
+            and self._opens(command.map)
+        ):
+            until = time.monotonic() + _HELD_SHARE * min(questions.LONGEST_S, command.timeout_s)
+            again = partial(self._on_command, identity, command, points, client, was_held=True)
+            self._held.append((command.map, until, again))
         elif command.name == "forget":
             self._on_forget(identity, command, client)
         elif command.name in ("move", "hand_over"):

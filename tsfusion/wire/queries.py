@@ -77,7 +77,8 @@ def fetch_status(
     Raises:
         TransportError: when the server cannot say.
     """
-    reply, _ = _request_if_present(address, control, Command(name="status", map=map_name), timeout, keys)
+    command = Command(name="status", map=map_name, timeout_s=timeout)
+    reply, _ = _request_if_present(address, control, command, timeout, keys)
     if reply.status is None:
         raise TransportError(f"the server at {address} answered without a status")
     return reply.status
@@ -123,7 +124,7 @@ def fetch_mesh(
             `timeout` seconds.
         TransportError: when the server cannot make it, or not within `timeout` seconds.
     """
-    command = Command(name="mesh", map=map_name, min_weight=min_weight)
+    command = Command(name="mesh", map=map_name, min_weight=min_weight, timeout_s=timeout)
     deadline = time.monotonic() + timeout
     refused: CommandRefused | None = None
     while True:
@@ -167,7 +168,9 @@ def forget(
         ServerUnreachable: when nobody is there, or it takes longer.
         TransportError: when the server cannot, or this client may not.
     """
-    command = Command(name="forget", map=map_name, selection=selection, erase=erase, dry_run=dry_run)
+    command = Command(
+        name="forget", map=map_name, selection=selection, erase=erase, dry_run=dry_run, timeout_s=timeout
+    )
     reply, _ = _request_if_present(address, control, command, timeout, keys)
     if reply.forgotten is None:
         raise TransportError(f"the server at {address} answered without what it forgot")
