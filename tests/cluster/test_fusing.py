@@ -258,8 +258,8 @@ def test_keyframes_that_the_journal_no_longer_has_are_told(here: Here, tmp_path:
     folder = make_map(tmp_path / "state" / "maps" / "default", range(4))
     make_map(folder, range(4, 8))  # in a segment of their own
     segment_path(folder / "journal", 1).unlink()
-    for command in ("fuse", "replay"):
-        done = here(command, tmp_path / "state", "--out", tmp_path / command)
+    for command, *flags in (("fuse",), ("replay", "--no-check")):  # the walls of this map move
+        done = here(command, tmp_path / "state", "--out", tmp_path / command, *flags)
         assert done.returncode == 1
         assert "the journal no longer has 4 keyframes of the map" in done.stderr.splitlines()[-1]
         assert (tmp_path / command / "mesh.ply").is_file()
@@ -273,7 +273,8 @@ def test_results_never_replace_a_servers_map(here: Here, tmp_path: Path, command
     content = (folder / "map.tsf").read_bytes()
     done = here(command, "synthetic:room", "--option", "count=2", "--out", folder, "--overwrite")
     assert "a server keeps its map there" in done.stderr
-    again = here("replay", tmp_path / "state", "--state", tmp_path / "state", "--out", tmp_path / "again")
+    own = ("--state", tmp_path / "state", "--no-check")
+    again = here("replay", tmp_path / "state", *own, "--out", tmp_path / "again")
     assert "its keyframes would count twice there" in again.stderr
     assert (done.returncode, again.returncode) == (1, 1)
     assert (folder / "map.tsf").read_bytes() == content
