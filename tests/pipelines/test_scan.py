@@ -243,13 +243,13 @@ def test_ctrl_c_ends_a_scan_with_its_results(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("quick_servers")
-def test_a_recording_that_breaks_off_keeps_what_came_before(here: Here, tmp_path: Path) -> None:
+def test_a_recording_with_a_broken_frame_goes_on_without_it(here: Here, tmp_path: Path) -> None:
     folder = recording(tmp_path / "broken", broken=7)
     done = here("scan", folder, *COARSE, "--out", tmp_path / "out")
     assert done.returncode == 1
-    assert "cannot be decoded" in done.stderr.splitlines()[-1]
+    assert "1 of 12 frames cannot be read" in done.stderr.splitlines()[-1]
     run = json.loads((tmp_path / "out" / "run.json").read_text())
-    assert (run["frames"], run["complete"]) == (7, False)
+    assert (run["frames"], run["frames_skipped"], run["complete"]) == (11, {"unreadable": 1}, True)
     assert (tmp_path / "out" / "mesh.ply").exists()
 
 

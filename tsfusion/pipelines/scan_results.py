@@ -11,6 +11,7 @@ import numpy as np
 from msgspec import structs
 
 from tsfusion.core.config import ScanConfig, VolumeConfig
+from tsfusion.datasets.dataset import UNREADABLE
 from tsfusion.datasets.trajectory_files import write_tum
 from tsfusion.evaluation.trajectory_error import TrajectoryError, absolute_error
 from tsfusion.geometry.origin import position_of
@@ -150,7 +151,7 @@ def summarise(
         folder=str(folder),
         camera=camera,
         localizer=localizer,
-        complete=complete and state.frames >= (source.length or 0),
+        complete=complete and state.frames + source.skipped.get(UNREADABLE, 0) >= (source.length or 0),
         frames=state.frames,
         frames_tracked=state.tracked,
         frames_skipped=dict(source.skipped),
