@@ -150,11 +150,12 @@ def _resume(path: Path, wanted: VolumeConfig, kept: dict[str, Any]) -> "Volume |
 
 def check_journal(path: Path, meta: Mapping[str, Any]) -> None:
     """Raise DamagedCheckpoint where a checkpoint, of this `meta`, is not of the journal beside it."""
-    folder = path.parent / state_folder.JOURNAL_FOLDER
+    folder, written_ns = path.parent / state_folder.JOURNAL_FOLDER, path.stat().st_mtime_ns
     for one in map_history.sessions(meta):
         for at in (0, -1) if len(one.seqs) else ():
             seq, place = int(one.seqs[at]), journal.Position(*one.positions[at].tolist())
-            if journal.has_another(folder, bytes.fromhex(one.session), seq, place):
+            session = bytes.fromhex(one.session)
+            if journal.has_another(folder, session, seq, place, until_ns=written_ns):
                 raise DamagedCheckpoint(
                     f"{path} is the checkpoint of another map than that of the journal beside it, which has "
                     f"another record in the place of keyframe {seq} of session {one.session[:8]}"

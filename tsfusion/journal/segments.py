@@ -108,12 +108,19 @@ def read_at(path: Path, offset: int) -> Record:
         return record_at(source, segment_number(path), offset)
 
 
-def has_another(folder: Path, session: bytes, seq: int, position: Position) -> bool:
-    """Whether a journal has another record where it had this one. Damage and missing files show nothing."""
+def has_another(
+    folder: Path, session: bytes, seq: int, position: Position, *, until_ns: int | None = None
+) -> bool:
+    """Whether a journal has another record where it had this one. Damage and missing files show nothing.
+
+    Args:
+        until_ns: when the journal had it: one that was logged later begins a journal anew; None = any counts.
+    """
     path = segment_path(folder, position.segment)
     with suppress(JournalError):
         found = read_at(path, position.offset)
-        return (found.session, found.seq) != (session, seq)
+        is_later = until_ns is not None and found.logged_ns > until_ns
+        return (found.session, found.seq) != (session, seq) and not is_later
     with suppress(JournalError):
         whole = (one for one in scan_records(path) if isinstance(one, (Record, Erased)))
         return any(0 < position.offset - one.position.offset < one.nbytes for one in whole)
