@@ -287,14 +287,15 @@ def inverted(place: Path, folder: Path) -> Path:
     return copy
 
 
-def test_replay_warns(data: Data, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_replay_stops_before_it_fuses_what_is_wrong(
+    data: Data, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     from tsfusion.cli import replay
+    from tsfusion.core.errors import IncompleteRun
 
     wrong = inverted(data(FOLDERS["open3d"]), tmp_path)
-    doubt, warnings = replay._checked(open_dataset(wrong))
-    assert doubt.startswith("poses and depth disagree: the poses are world-to-camera")
-    assert capsys.readouterr().err.startswith(f"warning: {doubt}"[:70])
-    assert not warnings
+    with pytest.raises(IncompleteRun, match=r"nothing is fused, .* the poses are world-to-camera"):
+        replay._checked(open_dataset(wrong))
     assert replay._checked(open_dataset(data(FOLDERS["open3d"]))) == ("", [])
     assert capsys.readouterr().err == ""
 
