@@ -149,8 +149,14 @@ def _resume(path: Path, wanted: VolumeConfig, kept: dict[str, Any]) -> "Volume |
 
 
 def check_journal(path: Path, meta: Mapping[str, Any]) -> None:
-    """Raise DamagedCheckpoint where a checkpoint, of this `meta`, is not of the journal beside it."""
-    folder, written_ns = path.parent / state_folder.JOURNAL_FOLDER, path.stat().st_mtime_ns
+    """Raise DamagedCheckpoint where a checkpoint, of this `meta`, is not of the journal beside it.
+
+    CheckpointError where it cannot be looked at.
+    """
+    try:
+        folder, written_ns = path.parent / state_folder.JOURNAL_FOLDER, path.stat().st_mtime_ns
+    except OSError as error:
+        raise CheckpointError(f"{path} cannot be read: {error.strerror}") from error
     for one in map_history.sessions(meta):
         for at in (0, -1) if len(one.seqs) else ():
             seq, place = int(one.seqs[at]), journal.Position(*one.positions[at].tolist())
