@@ -24,3 +24,13 @@ except ImportError as error:  # a library of the system, which small containers 
         f"taichi does not load ({error}); where there is no desktop, install libx11-6 (Debian, Ubuntu) or "
         "libX11 (Fedora)"
     ) from error
+
+# Types of arrays of one dimension, or of as many as their name ends with
+_array = taichi.types.ndarray
+I32, I32x2, I32x3 = (_array(dtype=taichi.i32, ndim=n) for n in (1, 2, 3))
+I64, I64x2 = (_array(dtype=taichi.i64, ndim=n) for n in (1, 2))
+F32, F32x2, F32x3 = (_array(dtype=taichi.f32, ndim=n) for n in (1, 2, 3))
+F64, F64x2 = (_array(dtype=taichi.f64, ndim=n) for n in (1, 2))
+U8, U8x2, U8x3 = (_array(dtype=taichi.u8, ndim=n) for n in (1, 2, 3))
+U64x2 = _array(dtype=taichi.u64, ndim=2)
+ANY, ANYx2 = (_array(ndim=n) for n in (1, 2))

@@ -8,6 +8,7 @@ from it, does not depend on which thread came first. No locks, no compare-and-sw
 
 import taichi as ti
 
+from tsfusion.kernels import I32, I64
 from tsfusion.kernels.quick_launch import QuickLaunch
 from tsfusion.kernels.voxel_traversal import hash_key
 
@@ -62,14 +63,7 @@ def map_find(keys: ti.template(), slots: ti.template(), mask, key):
 
 @QuickLaunch
 @ti.kernel
-def insert_blocks(
-    keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    first: ti.i32,
-    count: ti.i32,
-    first_slot: ti.i32,
-    map_keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    map_slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
-):
+def insert_blocks(keys: I64, first: ti.i32, count: ti.i32, first_slot: ti.i32, map_keys: I64, map_slots: I32):
     """Give `keys[first + i]` the slot `first_slot + i`. Serial; the caller keeps the table half empty and
     the keys distinct and new."""
     mask = map_keys.shape[0] - 1
@@ -86,12 +80,7 @@ def insert_blocks(
 
 @QuickLaunch
 @ti.kernel
-def find_blocks(
-    keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    map_keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    map_slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
-):
+def find_blocks(keys: I64, map_keys: I64, map_slots: I32, slots: I32):
     """Slots of block keys, -1 where absent."""
     mask = map_keys.shape[0] - 1
     for i in range(keys.shape[0]):
@@ -100,11 +89,7 @@ def find_blocks(
 
 @QuickLaunch
 @ti.kernel
-def find_places(
-    keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    map_keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    places: ti.types.ndarray(dtype=ti.i32, ndim=1),
-):
+def find_places(keys: I64, map_keys: I64, places: I32):
     """Where blocks that are in the hash stand there. Serial, as `insert_blocks`."""
     mask = map_keys.shape[0] - 1
     ti.loop_config(serialize=True)

@@ -3,6 +3,7 @@
 
 import numpy as np
 
+from tsfusion.kernels import F64, I64
 from tsfusion.kernels import taichi as ti
 
 _ADDED = 4096
@@ -10,14 +11,14 @@ _STEP = -(1 << 27) - 3
 
 
 @ti.kernel
-def _sum_and_largest(sums: ti.types.ndarray(dtype=ti.i64, ndim=1), count: ti.i32, step: ti.i64):
+def _sum_and_largest(sums: I64, count: ti.i32, step: ti.i64):
     for i in range(count):
         ti.atomic_add(sums[0], step * i)
         ti.atomic_max(sums[1], ti.cast(i, ti.i64) << 42)
 
 
 @ti.kernel
-def _roots(values: ti.types.ndarray(dtype=ti.f64, ndim=1)):
+def _roots(values: F64):
     for i in range(values.shape[0]):
         values[i] = ti.floor(65536.0 / ti.sqrt(values[i]) + 0.5)
 

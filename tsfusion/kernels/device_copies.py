@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tsfusion.kernels import ANY, I32x2
 from tsfusion.kernels import taichi as ti
 from tsfusion.kernels.quick_launch import Copied
 
@@ -25,13 +26,13 @@ _DTYPES = {ti.i32: np.dtype(np.int32), ti.i64: np.dtype(np.int64)}
 
 
 @ti.kernel
-def _read(source: ti.types.ndarray(ndim=1), out: ti.types.ndarray(ndim=1)):
+def _read(source: ANY, out: ANY):
     for i in range(out.shape[0]):
         out[i] = source[i]
 
 
 @ti.kernel
-def _read_rows(source: ti.types.ndarray(dtype=ti.i32, ndim=2), out: ti.types.ndarray(dtype=ti.i32, ndim=2)):
+def _read_rows(source: I32x2, out: I32x2):
     for i, j in ti.ndrange(out.shape[0], out.shape[1]):
         out[i, j] = source[i, j]
 

@@ -9,6 +9,7 @@ What is counted is counted in many places first: a device makes one addition to 
 
 import taichi as ti
 
+from tsfusion.kernels import I32, I64, I32x2, I64x2
 from tsfusion.kernels.block_hash import map_find
 from tsfusion.kernels.device_told import (
     APART,
@@ -416,29 +417,12 @@ def add_and_admit(
 @QuickLaunch
 @ti.kernel
 def add_rays(
-    rays: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    first_ray: ti.i32,
-    end_ray: ti.i32,
-    sign_: ti.i32,
-    oldest: ti.i32,
-    stamp: ti.i32,
+    rays: I32x2, first_ray: ti.i32, end_ray: ti.i32, sign_: ti.i32, oldest: ti.i32, stamp: ti.i32,
     kind: ti.i32,  # of votes
-    hash_keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    hash_slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    winners: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    missing: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    places: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    claims: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    stamps: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    told: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    groups: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    totals: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    listed: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    marks: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    sums: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    color_rgn: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    color_b: ti.types.ndarray(dtype=ti.i32, ndim=2),
-):
+    hash_keys: I64, hash_slots: I32, winners: I32, missing: I64, places: I32x2, claims: I32, stamps: I32,
+    told: I32, groups: I32x2, totals: I64, listed: I32x2, marks: I32, sums: I64x2, color_rgn: I64x2,
+    color_b: I32x2,
+):  # fmt: skip
     """Add rays of places `first_ray` … `end_ray` − 1 as `integrate.add_rays` does, to blocks of slot ≥
     `oldest`; missing blocks are told of. Where the updates are more than `listed` has room for, none is made,
     and `told` says so."""

@@ -8,6 +8,7 @@ The kernels add the rays, too (`device_integration`): one launch takes half of t
 
 import taichi as ti
 
+from tsfusion.kernels import F64, I32, I64, U8, ANYx2, F32x2, F64x2, I32x2, I64x2, U8x2
 from tsfusion.kernels.device_integration import (
     COSTS,
     CROSSED,
@@ -210,41 +211,15 @@ def point_rays(
 @QuickLaunch
 @ti.kernel
 def fuse_image(
-    image: ti.types.ndarray(ndim=2),
-    is_disparity: ti.i32,
-    scale: ti.f64,
-    color: ti.types.ndarray(dtype=ti.u8, ndim=2),
-    has_color: ti.i32,
-    confidence: ti.types.ndarray(dtype=ti.u8, ndim=2),
-    has_confidence: ti.i32,
-    camera_rows: ti.types.ndarray(dtype=ti.f64, ndim=2),
-    model: ti.types.ndarray(dtype=ti.f64, ndim=1),
-    bundle: ti.i32,
-    depths: ti.types.ndarray(dtype=ti.i32, ndim=1),  # of each tile's pixels, one tile after the other
-    tiles: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    rays: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    count: ti.i32,
+    image: ANYx2, is_disparity: ti.i32, scale: ti.f64, color: U8x2, has_color: ti.i32, confidence: U8x2,
+    has_confidence: ti.i32, camera_rows: F64x2, model: F64, bundle: ti.i32,
+    depths: I32,  # of each tile's pixels, one tile after the other
+    tiles: I32x2, rays: I32x2, count: ti.i32,
     kind: ti.i32,  # of votes
-    sign_: ti.i32,
-    stamp: ti.i32,
-    first_slot: ti.i32,
-    room: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    hash_keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    hash_slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    winners: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    missing: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    places: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    claims: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    stamps: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    told: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    groups: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    totals: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    listed: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    marks: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    sums: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    color_rgn: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    color_b: ti.types.ndarray(dtype=ti.i32, ndim=2),
-):
+    sign_: ti.i32, stamp: ti.i32, first_slot: ti.i32, room: I64, hash_keys: I64, hash_slots: I32,
+    winners: I32, missing: I64, places: I32x2, claims: I32, stamps: I32, told: I32, groups: I32x2,
+    totals: I64, listed: I32x2, marks: I32, sums: I64x2, color_rgn: I64x2, color_b: I32x2,
+):  # fmt: skip
     """Make an image's rays and add the first `count` of them: all or none."""
     # Here, because each end of a loop that is found later is a task of its own
     rays_end, places_end, votes_end = count, whole_groups(count), 1 + ti.min(kind, COLOR_VOTE) * count
@@ -262,39 +237,15 @@ def fuse_image(
 @QuickLaunch
 @ti.kernel
 def fuse_points(
-    points: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    starts: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    color: ti.types.ndarray(dtype=ti.u8, ndim=2),
-    has_color: ti.i32,
-    confidence: ti.types.ndarray(dtype=ti.u8, ndim=1),
-    has_confidence: ti.i32,
-    pose: ti.types.ndarray(dtype=ti.f64, ndim=2),
-    model: ti.types.ndarray(dtype=ti.f64, ndim=1),
-    bundle: ti.i32,
-    trusts: ti.types.ndarray(dtype=ti.i32, ndim=1),  # confidence in each point, 0 = none; < 0: begins a ray
-    rays: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    count: ti.i32,
+    points: F32x2, starts: F32x2, color: U8x2, has_color: ti.i32, confidence: U8, has_confidence: ti.i32,
+    pose: F64x2, model: F64, bundle: ti.i32,
+    trusts: I32,  # confidence in each point, 0 = none; < 0: begins a ray
+    rays: I32x2, count: ti.i32,
     kind: ti.i32,  # of votes
-    sign_: ti.i32,
-    stamp: ti.i32,
-    first_slot: ti.i32,
-    room: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    hash_keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    hash_slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    winners: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    missing: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    places: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    claims: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    stamps: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    told: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    groups: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    totals: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    listed: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    marks: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    sums: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    color_rgn: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    color_b: ti.types.ndarray(dtype=ti.i32, ndim=2),
-):
+    sign_: ti.i32, stamp: ti.i32, first_slot: ti.i32, room: I64, hash_keys: I64, hash_slots: I32,
+    winners: I32, missing: I64, places: I32x2, claims: I32, stamps: I32, told: I32, groups: I32x2,
+    totals: I64, listed: I32x2, marks: I32, sums: I64x2, color_rgn: I64x2, color_b: I32x2,
+):  # fmt: skip
     """Make the rays of points and add the first `count` of them: all or none."""
     rays_end, places_end, votes_end = count, whole_groups(count), 1 + ti.min(kind, COLOR_VOTE) * count
     point_rays(

@@ -4,6 +4,7 @@
 
 import taichi as ti
 
+from tsfusion.kernels import ANY, I32, I64, ANYx2, I64x2
 from tsfusion.kernels.integrate import CUBE, lane_weight
 from tsfusion.kernels.quick_launch import QuickLaunch
 from tsfusion.kernels.space_carving import BITS
@@ -11,13 +12,7 @@ from tsfusion.kernels.space_carving import BITS
 
 @QuickLaunch
 @ti.kernel
-def write_hash(
-    places: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    hash_keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    hash_slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
-):
+def write_hash(places: I32, keys: I64, slots: I32, hash_keys: I64, hash_slots: I32):
     """Write keys and slots to places of the hash from block to slot."""
     for i in range(places.shape[0]):
         hash_keys[places[i]] = keys[i]
@@ -26,12 +21,7 @@ def write_hash(
 
 @QuickLaunch
 @ti.kernel
-def largest_weights(
-    sums: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    count: ti.i32,
-    found: ti.types.ndarray(dtype=ti.i32, ndim=1),
-):
+def largest_weights(sums: I64x2, slots: I32, count: ti.i32, found: I32):
     """`found[i]` = the largest weight lane in block `slots[i]`, of the first `count`."""
     for i in range(count):
         most = 0
@@ -42,13 +32,7 @@ def largest_weights(
 
 @QuickLaunch
 @ti.kernel
-def add_free_blocks(
-    slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    amounts: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    masks: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    sign_: ti.i32,
-    sums: ti.types.ndarray(dtype=ti.i64, ndim=2),
-):
+def add_free_blocks(slots: I32, amounts: I64, masks: I64x2, sign_: ti.i32, sums: I64x2):
     """Add to the clear voxels of blocks, as `space_carving.add_free_blocks`."""
     for i in range(slots.shape[0] * CUBE):
         n, v = i // CUBE, i % CUBE
@@ -57,36 +41,28 @@ def add_free_blocks(
 
 
 @ti.kernel
-def read_rows(
-    layer: ti.types.ndarray(ndim=2),
-    slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    rows: ti.types.ndarray(ndim=2),
-):
+def read_rows(layer: ANYx2, slots: I32, rows: ANYx2):
     """`rows[i]` = row `slots[i]` of a layer."""
     for i in range(slots.shape[0] * CUBE):
         rows[i // CUBE, i % CUBE] = layer[slots[i // CUBE], i % CUBE]
 
 
 @ti.kernel
-def write_rows(
-    layer: ti.types.ndarray(ndim=2),
-    slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    rows: ti.types.ndarray(ndim=2),
-):
+def write_rows(layer: ANYx2, slots: I32, rows: ANYx2):
     """Row `slots[i]` of a layer = `rows[i]`."""
     for i in range(slots.shape[0] * CUBE):
         layer[slots[i // CUBE], i % CUBE] = rows[i // CUBE, i % CUBE]
 
 
 @ti.kernel
-def move_rows(layer: ti.types.ndarray(ndim=2), count: ti.i32, larger: ti.types.ndarray(ndim=2)):
+def move_rows(layer: ANYx2, count: ti.i32, larger: ANYx2):
     """Copy the first `count` rows of a layer into a larger one."""
     for i in range(count * CUBE):
         larger[i // CUBE, i % CUBE] = layer[i // CUBE, i % CUBE]
 
 
 @ti.kernel
-def move_list(listed: ti.types.ndarray(ndim=1), larger: ti.types.ndarray(ndim=1)):
+def move_list(listed: ANY, larger: ANY):
     """Copy a list into a larger one."""
     for i in range(listed.shape[0]):
         larger[i] = listed[i]

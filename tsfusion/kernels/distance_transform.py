@@ -11,6 +11,7 @@ Grids are flat arrays of (X, Y, Z), z fastest. A site is a voxel at the surface.
 
 import taichi as ti
 
+from tsfusion.kernels import F32, I32, F32x2, I32x3
 from tsfusion.kernels.quick_launch import QuickLaunch
 from tsfusion.kernels.run_loop import runs, unit_of
 from tsfusion.kernels.voxel_traversal import vec3i
@@ -111,16 +112,9 @@ def surface_offset(values: ti.template(), shape, at):
 @QuickLaunch
 @ti.kernel
 def mark_sites(
-    values: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    X: ti.i32,
-    Y: ti.i32,
-    Z: ti.i32,
-    first: ti.i32,
-    end: ti.i32,
-    rims: ti.i32,
-    squared: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    nearest: ti.types.ndarray(dtype=ti.i32, ndim=1),
-):
+    values: F32, X: ti.i32, Y: ti.i32, Z: ti.i32, first: ti.i32, end: ti.i32, rims: ti.i32, squared: I32,
+    nearest: I32,
+):  # fmt: skip
     """Begin a transform in the rows `first` ≤ x < `end`: sites are 0 from themselves, all else is far.
 
     `rims`: whether the rims of bodies are sites, too.
@@ -149,19 +143,9 @@ def last_place(p, g_p, site_p, q, g_q, site_q):
 @QuickLaunch
 @ti.kernel
 def spread_along_lines(
-    squared: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    nearest: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    length: ti.i32,
-    inner: ti.i32,
-    first_line: ti.i32,
-    last_line: ti.i32,
-    begin: ti.i32,
-    end: ti.i32,
-    most: ti.i32,
-    stack: ti.types.ndarray(dtype=ti.i32, ndim=3),
-    out_squared: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    out_nearest: ti.types.ndarray(dtype=ti.i32, ndim=1),
-):
+    squared: I32, nearest: I32, length: ti.i32, inner: ti.i32, first_line: ti.i32, last_line: ti.i32,
+    begin: ti.i32, end: ti.i32, most: ti.i32, stack: I32x3, out_squared: I32, out_nearest: I32,
+):  # fmt: skip
     """Smallest squared distance along each line, at its places `begin` … `end` − 1.
 
     The grid is (…, `length`, `inner`); in the output a line has `end` − `begin` places. What is farther than
@@ -208,14 +192,7 @@ def spread_along_lines(
 
 
 @ti.kernel
-def place_sites(
-    values: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    shape: vec3i,
-    squared: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    rows: vec2i,
-    columns: vec2i,
-    offsets: ti.types.ndarray(dtype=ti.f32, ndim=2),
-):
+def place_sites(values: F32, shape: vec3i, squared: I32, rows: vec2i, columns: vec2i, offsets: F32x2):
     """`offsets`: the way to the surface of the sites (`squared` is 0) in some `rows`, x, and `columns`, y;
     0 of a rim.
     """
@@ -235,21 +212,10 @@ def place_sites(
 
 @ti.kernel
 def measure(
-    values: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    shape: vec3i,
-    begin: vec3i,
-    extent: vec3i,
-    squared: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    nearest: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    rows: vec2i,
-    columns: vec2i,
-    subvoxel: ti.i32,
-    placed: ti.i32,
-    offsets: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    edge: ti.f32,
-    most: ti.f32,
-    distances: ti.types.ndarray(dtype=ti.f32, ndim=1),
-):
+    values: F32, shape: vec3i, begin: vec3i, extent: vec3i, squared: I32, nearest: I32, rows: vec2i,
+    columns: vec2i, subvoxel: ti.i32, placed: ti.i32, offsets: F32x2, edge: ti.f32, most: ti.f32,
+    distances: F32,
+):  # fmt: skip
     """Distances in metres, at most `most`, of the voxels in some `rows`, x, and `columns`, y (first,
     end), of the box `begin`, `extent`:
     to the surface at the nearest site, or to the site's centre. Negative where a voxel lies behind it.

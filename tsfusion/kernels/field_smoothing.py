@@ -20,6 +20,7 @@ before one is written: where an array is, LLVM looks up again after each store.
 
 import taichi as ti
 
+from tsfusion.kernels import F32, I32, F32x2, I32x2, I64x2, U64x2
 from tsfusion.kernels.integrate import lane_weight
 from tsfusion.kernels.quick_launch import QuickLaunch
 from tsfusion.kernels.run_loop import runs, unit_of
@@ -46,12 +47,7 @@ def without_lowest(plane):
 
 @QuickLaunch
 @ti.kernel
-def mark_voxels(
-    values: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    reach: ti.f32,
-    planes: ti.types.ndarray(dtype=ti.u64, ndim=2),
-    counts: ti.types.ndarray(dtype=ti.i32, ndim=2),
-):
+def mark_voxels(values: F32x2, reach: ti.f32, planes: U64x2, counts: I32x2):
     """Mark the voxels of each block that were seen within `reach` quanta of the surface."""
     for run in range(runs(values.shape[0])):  # run loop: kernels/run_loop.py
         b = unit_of(run, values.shape[0])
@@ -99,17 +95,10 @@ def link(
 @QuickLaunch
 @ti.kernel
 def list_voxels(
-    values: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    sums: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    around: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (blocks, 6): −x, +x, −y, +y, −z, +z; −1 = none
-    planes: ti.types.ndarray(dtype=ti.u64, ndim=2),
-    places: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    links: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    y: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    weight: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    x: ti.types.ndarray(dtype=ti.f32, ndim=1),
-):
+    values: F32x2, slots: I32, sums: I64x2,
+    around: I32x2,  # (blocks, 6): −x, +x, −y, +y, −z, +z; −1 = none
+    planes: U64x2, places: I32x2, links: I32x2, y: F32, weight: F32, x: F32,
+):  # fmt: skip
     """Fill the list: each voxel's value, its weight in full-confidence samples, and its neighbours."""
     for run in range(runs(values.shape[0])):  # run loop: kernels/run_loop.py
         b = unit_of(run, values.shape[0])
@@ -141,10 +130,8 @@ def parent_of(o, bits):
 @ti.kernel
 def mark_parents(
     bits: ti.i32,  # of the finer cells
-    planes: ti.types.ndarray(dtype=ti.u64, ndim=2),
-    coarse_planes: ti.types.ndarray(dtype=ti.u64, ndim=2),
-    coarse_counts: ti.types.ndarray(dtype=ti.i32, ndim=2),
-):
+    planes: U64x2, coarse_planes: U64x2, coarse_counts: I32x2,
+):  # fmt: skip
     """Mark the cells that hold a listed finer cell."""
     for run in range(runs(planes.shape[0])):  # run loop: kernels/run_loop.py
         b = unit_of(run, planes.shape[0])
@@ -189,19 +176,9 @@ def off_center(o, bits, axis):
 @ti.kernel
 def list_parents(
     bits: ti.i32,  # of the finer cells
-    around: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    planes: ti.types.ndarray(dtype=ti.u64, ndim=2),
-    places: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    links: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    y: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    weight: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    coarse_planes: ti.types.ndarray(dtype=ti.u64, ndim=2),
-    coarse_places: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    coarse_links: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    coarse_y: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    coarse_weight: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    coarse_x: ti.types.ndarray(dtype=ti.f32, ndim=1),
-):
+    around: I32x2, planes: U64x2, places: I32x2, links: I32x2, y: F32, weight: F32, coarse_planes: U64x2,
+    coarse_places: I32x2, coarse_links: I32x2, coarse_y: F32, coarse_weight: F32, coarse_x: F32,
+):  # fmt: skip
     """Each coarse cell: the weighted mean of its finer cells, the sum of their weights, its neighbours.
 
     Each value is moved to the cell's centre along its own slope: ramps stay ramps where cells are missing.
@@ -243,14 +220,9 @@ def list_parents(
 @ti.kernel
 def refine(
     bits: ti.i32,  # of the finer cells
-    links: ti.types.ndarray(dtype=ti.i32, ndim=2),  # of the coarse cells
-    coarse_planes: ti.types.ndarray(dtype=ti.u64, ndim=2),
-    coarse_places: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    coarse_x: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    planes: ti.types.ndarray(dtype=ti.u64, ndim=2),
-    places: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    x: ti.types.ndarray(dtype=ti.f32, ndim=1),
-):
+    links: I32x2,  # of the coarse cells
+    coarse_planes: U64x2, coarse_places: I32x2, coarse_x: F32, planes: U64x2, places: I32x2, x: F32,
+):  # fmt: skip
     """Start the finer cells from the coarse solution, linear inside each coarse cell."""
     for run in range(runs(planes.shape[0])):  # run loop: kernels/run_loop.py
         b = unit_of(run, planes.shape[0])
@@ -285,24 +257,11 @@ def share_of(before: ti.template(), after: ti.template(), bent, sharpness, i):
 @QuickLaunch
 @ti.kernel
 def weigh(
-    x_before: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    x_after: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    y_before: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    y_after: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    z_before: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    z_after: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    x: ti.types.ndarray(dtype=ti.f32, ndim=1),
+    x_before: I32, x_after: I32, y_before: I32, y_after: I32, z_before: I32, z_after: I32, x: F32,
     sharpness: ti.f32,  # 1 / ε; 0: ω = 1
-    weight: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    smoothness: ti.f32,
-    omega_x: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    omega_y: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    omega_z: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    inverse: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    q_x: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    q_y: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    q_z: ti.types.ndarray(dtype=ti.f32, ndim=1),
-):
+    weight: F32, smoothness: ti.f32, omega_x: F32, omega_y: F32, omega_z: F32, inverse: F32, q_x: F32,
+    q_y: F32, q_z: F32,
+):  # fmt: skip
     """ω = 1 / (1 + (D2 x / ε)²), 0 where one of the three cells is missing; q = ω D2 x; and 1 / M with
     M = W + 4 λ Σ |D2|ᵀ ω: then 0 < M⁻¹ A ≤ 1, as (1, −2, 1) has an l1 norm of 4."""
     for group in range(x_before.shape[0] // ABREAST):
@@ -335,27 +294,12 @@ def weigh(
 @QuickLaunch
 @ti.kernel
 def relax(
-    x_before: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    x_after: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    y_before: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    y_after: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    z_before: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    z_after: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    y: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    weight: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    omega_x: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    omega_y: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    omega_z: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    inverse: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    smoothness: ti.f32,
-    steps: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (AT_ONCE, 2): share of the last, gain of the residual
+    x_before: I32, x_after: I32, y_before: I32, y_after: I32, z_before: I32, z_after: I32, y: F32,
+    weight: F32, omega_x: F32, omega_y: F32, omega_z: F32, inverse: F32, smoothness: ti.f32,
+    steps: F32x2,  # (AT_ONCE, 2): share of the last, gain of the residual
     bent: ti.i32,  # whether q is of this x
-    q_x: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    q_y: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    q_z: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    step: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    x: ti.types.ndarray(dtype=ti.f32, ndim=1),
-):
+    q_x: F32, q_y: F32, q_z: F32, step: F32, x: F32,
+):  # fmt: skip
     """Some steps of the Chebyshev iteration, each after q = ω D2 x along each axis."""
     for k in ti.static(range(AT_ONCE)):
         for group in range(x_before.shape[0] // ABREAST * (1 - bent if ti.static(k == 0) else 1)):
@@ -385,12 +329,7 @@ def relax(
 
 @QuickLaunch
 @ti.kernel
-def write_values(
-    planes: ti.types.ndarray(dtype=ti.u64, ndim=2),
-    places: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    x: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    values: ti.types.ndarray(dtype=ti.f32, ndim=2),
-):
+def write_values(planes: U64x2, places: I32x2, x: F32, values: F32x2):
     """The field where it was solved; other values stay."""
     for run in range(runs(planes.shape[0])):  # run loop: kernels/run_loop.py
         b = unit_of(run, planes.shape[0])

@@ -7,6 +7,7 @@ regulariser, whose `weigh` and `relax` then solve it: paper eq. 3 with no weight
 
 import taichi as ti
 
+from tsfusion.kernels import F32, I32, I64, U8, F32x2, I32x2, U8x2, U64x2
 from tsfusion.kernels.field_smoothing import count_bits, link, without_lowest
 from tsfusion.kernels.integrate import CUBE
 from tsfusion.kernels.normal_smoothing import block_at, value_at
@@ -26,10 +27,9 @@ vec3f = ti.types.vector(3, ti.f32)
 
 @ti.kernel
 def find_rims(
-    around: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (blocks, 27): rows of the blocks around, −1 = none
-    values: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    rims: ti.types.ndarray(dtype=ti.u8, ndim=2),
-):
+    around: I32x2,  # (blocks, 27): rows of the blocks around, −1 = none
+    values: F32x2, rims: U8x2,
+):  # fmt: skip
     """1 for each seen voxel that the surface passes and that has an unseen one among the 26 around."""
     for run in range(runs(values.shape[0])):  # run loop: kernels/run_loop.py
         b = unit_of(run, values.shape[0])
@@ -95,15 +95,12 @@ def normal_at(values: ti.template(), around: ti.template(), b, p):
 
 @ti.kernel
 def mark_unseen(
-    keys: ti.types.ndarray(dtype=ti.i64, ndim=1),  # sorted
-    around: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    values: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    rims: ti.types.ndarray(dtype=ti.u8, ndim=2),
-    columns: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (n, 3) of a ball: x, y, and how far it reaches in z
+    keys: I64,  # sorted
+    around: I32x2, values: F32x2, rims: U8x2,
+    columns: I32x2,  # (n, 3) of a ball: x, y, and how far it reaches in z
     slab: ti.f32,  # voxels from the plane of the rim, and how that grows with the distance from it
-    slope: ti.f32,
-    marks: ti.types.ndarray(dtype=ti.u8, ndim=2),
-):
+    slope: ti.f32, marks: U8x2,
+):  # fmt: skip
     """Mark the unseen voxels in a ball around each rim voxel that are near the surface as it would go on.
 
     Threads that meet write the same.
@@ -137,13 +134,7 @@ def mark_unseen(
 
 
 @ti.kernel
-def take_marked(
-    around: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    values: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    marks: ti.types.ndarray(dtype=ti.u8, ndim=2),
-    planes: ti.types.ndarray(dtype=ti.u64, ndim=2),
-    counts: ti.types.ndarray(dtype=ti.i32, ndim=2),
-):
+def take_marked(around: I32x2, values: F32x2, marks: U8x2, planes: U64x2, counts: I32x2):
     """Take the voxels to solve and the seen ones up to `RING` before or behind them along an axis."""
     for run in range(runs(values.shape[0])):  # run loop: kernels/run_loop.py
         b = unit_of(run, values.shape[0])
@@ -168,17 +159,10 @@ def take_marked(
 
 @ti.kernel
 def list_marked(
-    sides: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (blocks, 6): −x, +x, −y, +y, −z, +z; −1 = none
-    values: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    marks: ti.types.ndarray(dtype=ti.u8, ndim=2),
-    planes: ti.types.ndarray(dtype=ti.u64, ndim=2),
-    places: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    links: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    y: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    weight: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    x: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    layer: ti.types.ndarray(dtype=ti.i32, ndim=1),
-):
+    sides: I32x2,  # (blocks, 6): −x, +x, −y, +y, −z, +z; −1 = none
+    values: F32x2, marks: U8x2, planes: U64x2, places: I32x2, links: I32x2, y: F32, weight: F32, x: F32,
+    layer: I32,
+):  # fmt: skip
     """Fill the list: the value and weight of each seen voxel, none of the others, and the neighbours."""
     for run in range(runs(values.shape[0])):  # run loop: kernels/run_loop.py
         b = unit_of(run, values.shape[0])
@@ -201,11 +185,10 @@ def list_marked(
 
 @ti.kernel
 def extend(
-    sweep: ti.i32,
-    links: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    layer: ti.types.ndarray(dtype=ti.i32, ndim=1),  # the last of it, as of `x`, stands for none
-    x: ti.types.ndarray(dtype=ti.f32, ndim=1),
-) -> ti.i32:
+    sweep: ti.i32, links: I32x2,
+    layer: I32,  # the last of it, as of `x`, stands for none
+    x: F32,
+) -> ti.i32:  # fmt: skip
     """Give a first value to voxels beside those that have one: the mean of what ramps and neighbours say.
 
     Returns how many got one.
@@ -233,15 +216,10 @@ def extend(
 
 @ti.kernel
 def mark_guessed_faces(
-    count: ti.i32,
-    around: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    unseen: ti.types.ndarray(dtype=ti.u64, ndim=2),  # (row, 8): planes, as in `surface_cells`
-    inside: ti.types.ndarray(dtype=ti.u64, ndim=2),
-    active: ti.types.ndarray(dtype=ti.u64, ndim=2),
-    first: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    triangle_count: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    guessed: ti.types.ndarray(dtype=ti.u8, ndim=1),
-):
+    count: ti.i32, around: I32x2,
+    unseen: U64x2,  # (row, 8): planes, as in `surface_cells`
+    inside: U64x2, active: U64x2, first: I32x2, triangle_count: I32, guessed: U8,
+):  # fmt: skip
     """1 for each triangle, in the order of `emit_faces`, of a cell with a corner that nobody saw."""
     for run in range(runs(BANDS)):  # run loop: kernels/run_loop.py
         band = unit_of(run, BANDS)

@@ -11,6 +11,7 @@ Addition modulo 2⁶⁴ is a group: any order gives the same bytes, and subtract
 
 import taichi as ti
 
+from tsfusion.kernels import I32, I64, U8, I32x2, I64x2
 from tsfusion.kernels.block_hash import map_find, set_insert
 from tsfusion.kernels.block_windows import (
     UNKNOWN,
@@ -377,23 +378,10 @@ def add_bands(
 @QuickLaunch
 @ti.kernel
 def add_rays(
-    rays: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    bands: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    again: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    job: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    hash_keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    hash_slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    missing: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    scratch: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    owners: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    stamps: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    places: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    dirty: ti.types.ndarray(dtype=ti.u8, ndim=1),
-    touched: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    sums: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    color_rgn: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    color_b: ti.types.ndarray(dtype=ti.i32, ndim=1),
-):
+    rays: I32x2, bands: I32x2, again: I32x2, job: I32, hash_keys: I64, hash_slots: I32, missing: I64,
+    scratch: I64, owners: I64, stamps: I32, places: I32, dirty: U8, touched: I32, sums: I64, color_rgn: I64,
+    color_b: I32,
+):  # fmt: skip
     """Add to every voxel that each ray crosses in its band, in blocks of slot ≥ `OLDEST`.
 
     Rays that cross blocks the map does not have are listed in `again`, the keys in `missing`; when those
@@ -416,23 +404,10 @@ def add_rays(
 @QuickLaunch
 @ti.kernel
 def add_shared_rays(
-    rays: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    bands: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    again: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    job: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    hash_keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    hash_slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    missing: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    scratch: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    owners: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    stamps: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    places: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    dirty: ti.types.ndarray(dtype=ti.u8, ndim=1),
-    touched: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    sums: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    color_rgn: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    color_b: ti.types.ndarray(dtype=ti.i32, ndim=1),
-):
+    rays: I32x2, bands: I32x2, again: I32x2, job: I32, hash_keys: I64, hash_slots: I32, missing: I64,
+    scratch: I64, owners: I64, stamps: I32, places: I32, dirty: U8, touched: I32, sums: I64, color_rgn: I64,
+    color_b: I32,
+):  # fmt: skip
     """Add the rays that cross blocks of other units to these, with atomics: after `add_rays`, same arguments.
 
     A kernel of its own, because one thread need not wait until it is compiled.
@@ -448,11 +423,7 @@ def add_shared_rays(
 
 @QuickLaunch
 @ti.kernel
-def largest_weights(
-    sums: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    touched: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    bounds: ti.types.ndarray(dtype=ti.i32, ndim=1),
-):
+def largest_weights(sums: I64x2, touched: I32, bounds: I32):
     """`bounds[slot]` = the largest weight lane in each touched block."""
     count = touched[TOUCHED_COUNT]
     for run in range(runs(count)):  # run loop: kernels/run_loop.py

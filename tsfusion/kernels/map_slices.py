@@ -3,6 +3,7 @@
 
 import taichi as ti
 
+from tsfusion.kernels import F32, I32, I64, F32x2, I32x2, I64x2
 from tsfusion.kernels.block_hash import map_find
 from tsfusion.kernels.integrate import QUANTA_PER_VOXEL, lane_weight
 from tsfusion.kernels.run_loop import runs, unit_of
@@ -14,28 +15,11 @@ vec3d = ti.types.vector(3, ti.f64)
 
 @ti.kernel
 def read_columns(
-    cells: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    width: ti.i32,
-    row: ti.i32,
-    column: ti.i32,
-    across: ti.i32,
-    heights: ti.i32,
-    corner: vec3d,
-    along_row: vec3d,
-    along_column: vec3d,
-    along_height: vec3d,
-    map_keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    map_slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    sums: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    correction: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    corrected: ti.i32,
-    color_rgn: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    hits: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    layers: ti.i32,
-    min_weight: ti.i32,
-    values: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    seen: ti.types.ndarray(dtype=ti.i32, ndim=1),
-):
+    cells: I32, width: ti.i32, row: ti.i32, column: ti.i32, across: ti.i32, heights: ti.i32, corner: vec3d,
+    along_row: vec3d, along_column: vec3d, along_height: vec3d, map_keys: I64, map_slots: I32, sums: I64x2,
+    correction: F32x2, corrected: ti.i32, color_rgn: I64x2, hits: I32x2, layers: ti.i32, min_weight: ti.i32,
+    values: F32, seen: I32,
+):  # fmt: skip
     """`values`: the smallest signed distance in voxels (`held`) among the samples of each of the `cells`
     that were seen, NaN where none was; `seen`: how many were.
 

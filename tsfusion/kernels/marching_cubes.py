@@ -8,6 +8,7 @@ the number of bits before its own.
 
 import taichi as ti
 
+from tsfusion.kernels import I32, I64, F32x2, I32x2, I64x2, U8x2, U64x2
 from tsfusion.kernels.quick_launch import QuickLaunch
 from tsfusion.kernels.run_loop import runs, unit_of
 from tsfusion.kernels.surface_cells import case_of, corner_planes, lowest
@@ -147,22 +148,10 @@ def color_at(
 @QuickLaunch
 @ti.kernel
 def emit_vertices(
-    count: ti.i32,
-    keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    around: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    values: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    edges: ti.types.ndarray(dtype=ti.u64, ndim=2),
-    first: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    padded: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    voxel_size: ti.f64,
-    slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    color_rgn: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    color_b: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    has_color: ti.i32,
-    positions: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    normals: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    colors: ti.types.ndarray(dtype=ti.u8, ndim=2),
-):
+    count: ti.i32, keys: I64, around: I32x2, values: F32x2, edges: U64x2, first: I32x2, padded: F32x2,
+    voxel_size: ti.f64, slots: I32, color_rgn: I64x2, color_b: I32x2, has_color: ti.i32, positions: F32x2,
+    normals: F32x2, colors: U8x2,
+):  # fmt: skip
     """Position, unit normal and colour of every vertex: where the value crosses zero along its edge."""
     for run in range(runs(BANDS)):  # run loop: kernels/run_loop.py
         band = unit_of(run, BANDS)
@@ -213,17 +202,9 @@ def vertex_on(edges: ti.template(), starts: ti.template(), first: ti.template(),
 @QuickLaunch
 @ti.kernel
 def emit_faces(
-    count: ti.i32,
-    around: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    inside: ti.types.ndarray(dtype=ti.u64, ndim=2),
-    active: ti.types.ndarray(dtype=ti.u64, ndim=2),
-    edges: ti.types.ndarray(dtype=ti.u64, ndim=2),
-    starts: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    first: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    triangle_count: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    triangle_starts: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    faces: ti.types.ndarray(dtype=ti.i32, ndim=2),
-):
+    count: ti.i32, around: I32x2, inside: U64x2, active: U64x2, edges: U64x2, starts: I32x2, first: I32x2,
+    triangle_count: I32, triangle_starts: I32x2, faces: I32x2,
+):  # fmt: skip
     """Triangles of each cell, as the numbers of the vertices on its edges."""
     for run in range(runs(BANDS)):  # run loop: kernels/run_loop.py
         band = unit_of(run, BANDS)

@@ -7,6 +7,7 @@ the centre row of (I + λ D2ᵀD2)⁻¹, as many samples a side as were seen.
 
 import taichi as ti
 
+from tsfusion.kernels import I32, F32x2, I32x2
 from tsfusion.kernels.integrate import CUBE
 from tsfusion.kernels.quick_launch import QuickLaunch
 from tsfusion.kernels.run_loop import runs, unit_of
@@ -51,13 +52,13 @@ def interpolate(values: ti.template(), around: ti.template(), b, p):
 @QuickLaunch
 @ti.kernel
 def smooth_along_normals(
-    rows: ti.types.ndarray(dtype=ti.i32, ndim=1),  # the blocks to write; −1 = none there
-    around: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (rows, 27): rows of `values`, −1 = none
-    values: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    rows: I32,  # the blocks to write; −1 = none there
+    around: I32x2,  # (rows, 27): rows of `values`, −1 = none
+    values: F32x2,
     reach: ti.f32,  # quanta
-    centre: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (most + 1, most + 1): centre[n, k], k from the centre
-    smoothed: ti.types.ndarray(dtype=ti.f32, ndim=2),
-):
+    centre: F32x2,  # (most + 1, most + 1): centre[n, k], k from the centre
+    smoothed: F32x2,
+):  # fmt: skip
     """Replace the values within `reach` of the surface."""
     for run in range(runs(rows.shape[0])):  # run loop: kernels/run_loop.py
         r = unit_of(run, rows.shape[0])

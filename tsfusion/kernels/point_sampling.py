@@ -10,6 +10,7 @@ the distance is, to first order, that to the surface.
 
 import taichi as ti
 
+from tsfusion.kernels import F32, I32, I64, U8, ANYx2, F32x2, I64x2
 from tsfusion.kernels.block_hash import map_find
 from tsfusion.kernels.integrate import CUBE, QUANTA_PER_VOXEL, lane_distance, lane_weight
 from tsfusion.kernels.quick_launch import QuickLaunch
@@ -124,17 +125,9 @@ def blend_shares(v, f):
 
 @ti.func
 def write_sample(
-    n,
-    packed,
-    held,
-    f,
-    kind,
-    min_weight,
-    metres,
-    distance: ti.template(),
-    weight: ti.template(),
+    n, packed, held, f, kind, min_weight, metres, distance: ti.template(), weight: ti.template(),
     gradient: ti.template(),
-):
+):  # fmt: skip
     """Sample n: of the sums of its eight corners, at the place f in their cell."""
     v = corners_f(0.0)
     w = corners_f(0.0)
@@ -155,13 +148,7 @@ def write_sample(
 
 @QuickLaunch
 @ti.kernel
-def list_blocks(
-    points: ti.types.ndarray(ndim=2),
-    per_metre: ti.f64,
-    map_keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    map_slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    is_needed: ti.types.ndarray(dtype=ti.u8, ndim=1),
-):
+def list_blocks(points: ANYx2, per_metre: ti.f64, map_keys: I64, map_slots: I32, is_needed: U8):
     """Mark the slots of the blocks whose voxels `interpolate` reads."""
     count = points.shape[0]
     for run in range(runs((count + BAND - 1) // BAND)):  # run loop: kernels/run_loop.py
@@ -187,12 +174,7 @@ def list_blocks(
 
 @QuickLaunch
 @ti.kernel
-def pair(
-    slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    sums: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    values: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    pairs: ti.types.ndarray(dtype=ti.i64, ndim=2),
-):
+def pair(slots: I32, sums: I64x2, values: F32x2, pairs: I64x2):
     """Row n of `pairs`: row n of `values`, bits, in the upper halves; in the lower ones Σ w of `slots[n]`.
 
     What `interpolate` reads of a point lies together then: at points in random order it waits for memory.
@@ -211,19 +193,12 @@ def pair(
 @QuickLaunch
 @ti.kernel
 def interpolate(
-    points: ti.types.ndarray(ndim=2),
-    per_metre: ti.f64,
-    map_keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    map_slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    sums: ti.types.ndarray(dtype=ti.i64, ndim=2),  # SOLVED: pairs
-    min_weight: ti.i32,
-    kind: ti.i32,
-    correction: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    row_of: ti.types.ndarray(dtype=ti.i32, ndim=1),  # SOLVED: row of a slot
-    distance: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    weight: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    gradient: ti.types.ndarray(dtype=ti.f32, ndim=2),
-):
+    points: ANYx2, per_metre: ti.f64, map_keys: I64, map_slots: I32,
+    sums: I64x2,  # SOLVED: pairs
+    min_weight: ti.i32, kind: ti.i32, correction: F32x2,
+    row_of: I32,  # SOLVED: row of a slot
+    distance: F32, weight: F32, gradient: F32x2,
+):  # fmt: skip
     """Distance in metres, weight in full samples, and gradient at every point."""
     count = points.shape[0]
     metres = ti.cast(1.0 / (per_metre * QUANTA_PER_VOXEL), ti.f32)
@@ -265,19 +240,10 @@ def interpolate(
 
 @ti.kernel
 def interpolate_within(
-    points: ti.types.ndarray(ndim=2),
-    per_metre: ti.f64,
-    rows: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    begin: vec3i,
-    size: vec3i,
-    sums: ti.types.ndarray(dtype=ti.i64, ndim=2),  # SOLVED: pairs
-    min_weight: ti.i32,
-    kind: ti.i32,
-    correction: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    distance: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    weight: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    gradient: ti.types.ndarray(dtype=ti.f32, ndim=2),
-):
+    points: ANYx2, per_metre: ti.f64, rows: I32, begin: vec3i, size: vec3i,
+    sums: I64x2,  # SOLVED: pairs
+    min_weight: ti.i32, kind: ti.i32, correction: F32x2, distance: F32, weight: F32, gradient: F32x2,
+):  # fmt: skip
     """As `interpolate`, to the bit, at many points: by a table instead of the hash, and many at once.
 
     `rows` has the rows in `sums` of the blocks in a box, which begins at block `begin` and has `size` of them

@@ -9,6 +9,7 @@ Triangles whose back is turned are not drawn, so a room opens like a doll's hous
 import taichi as ti
 import taichi.math as tm
 
+from tsfusion.kernels import F32x2, F32x3, I32x2, I64x2, U8x2, U8x3
 from tsfusion.kernels.run_loop import runs, unit_of
 
 EMPTY = (1 << 63) - 1
@@ -85,13 +86,7 @@ def fill(seen: ti.types.ndarray(), a, b, c, triangle, focal, width, height):
 
 
 @ti.kernel
-def rasterise(
-    seen: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    vertices: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    faces: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    focal: ti.f32,
-    near: ti.f32,
-):
+def rasterise(seen: I64x2, vertices: F32x2, faces: I32x2, focal: ti.f32, near: ti.f32):
     """Fill `seen` (H, W), which holds EMPTY, from `vertices` (n, 3) and `faces` (m, 3)."""
     height, width = seen.shape[0], seen.shape[1]
     for f in range(faces.shape[0]):
@@ -142,17 +137,11 @@ def shares(edges, ray):
 
 @ti.kernel
 def look_up(
-    seen: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    vertices: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    faces: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    normals: ti.types.ndarray(dtype=ti.f32, ndim=2),  # of no rows: none wanted
-    colors: ti.types.ndarray(dtype=ti.u8, ndim=2),  # likewise
-    focal: ti.f32,
-    empty: ti.i64,
-    depth: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    normal: ti.types.ndarray(dtype=ti.f32, ndim=3),
-    color: ti.types.ndarray(dtype=ti.u8, ndim=3),
-):
+    seen: I64x2, vertices: F32x2, faces: I32x2,
+    normals: F32x2,  # of no rows: none wanted
+    colors: U8x2,  # likewise
+    focal: ti.f32, empty: ti.i64, depth: F32x2, normal: F32x3, color: U8x3,
+):  # fmt: skip
     """Depth, unit normal and colour of every pixel that is not EMPTY, as the corners of its triangle say."""
     height, width = seen.shape[0], seen.shape[1]
     per_pixel = 1.0 / focal
@@ -193,18 +182,9 @@ def look_up(
 
 @ti.kernel
 def shade(
-    image: ti.types.ndarray(dtype=ti.f32, ndim=3),
-    seen: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    vertices: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    faces: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    normals: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    colors: ti.types.ndarray(dtype=ti.u8, ndim=2),
-    focal: ti.f32,
-    up_x: ti.f32,
-    up_y: ti.f32,
-    up_z: ti.f32,
-    empty: ti.i64,
-):
+    image: F32x3, seen: I64x2, vertices: F32x2, faces: I32x2, normals: F32x2, colors: U8x2, focal: ti.f32,
+    up_x: ti.f32, up_y: ti.f32, up_z: ti.f32, empty: ti.i64,
+):  # fmt: skip
     """Write `image` (H, W, 4): linear RGB in 0…1 and depth in metres, where `seen` is not EMPTY.
 
     `normals` and `up` are in camera coordinates; `colors` (n, 3) are sRGB. A lamp at the eye gives form,
@@ -250,13 +230,7 @@ def step_between(image: ti.types.ndarray(), v, u, dv, du, focal):
 
 
 @ti.kernel
-def occlude(
-    image: ti.types.ndarray(dtype=ti.f32, ndim=3),
-    samples: ti.i32,
-    focal: ti.f32,
-    radius: ti.f32,
-    strength: ti.f32,
-):
+def occlude(image: F32x3, samples: ti.i32, focal: ti.f32, radius: ti.f32, strength: ti.f32):
     """Darken `image` (H, W, 4), in place, where surfaces within `radius` metres stand before the sky.
 
     Ambient occlusion from the depths alone (McGuire et al., "The alchemy screen-space ambient obscurance

@@ -14,6 +14,7 @@ each voxel that was voted for becomes the mean of its x̂.
 
 import taichi as ti
 
+from tsfusion.kernels import F32, I32, I64, I32x2
 from tsfusion.kernels.block_hash import map_find
 from tsfusion.kernels.block_windows import UNKNOWN, WINDOW_BITS, WINDOW_BLOCKS, WINDOWS, open_window
 from tsfusion.kernels.integrate import (
@@ -201,23 +202,12 @@ def gather(
 @QuickLaunch
 @ti.kernel
 def smooth_rays(
-    rays: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    bands: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    units: ti.i32,
-    hash_keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    hash_slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    scratch: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    places: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    rays: I32x2, bands: I32x2, units: ti.i32, hash_keys: I64, hash_slots: I32, scratch: I64, places: I32,
     smoothness: ti.f32,
     weighted: ti.i32,  # A = diag(W), scaled to mean 1, or I
     feedback: ti.i32,  # y from the stored regularised values, or from the raw sums
-    sums: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    correction: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    signal: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    crossed: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    votes: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    voted: ti.types.ndarray(dtype=ti.i32, ndim=1),
-):
+    sums: I64, correction: F32, signal: F32, crossed: I32, votes: I64, voted: I32,
+):  # fmt: skip
     """Gather y along each ray's band, solve, and add x̂ to `votes` as (Σ x̂ · 16) · 2²⁴ + n.
 
     `units` run at the same time, each through its own bands. The layers are flat, as for `add_rays`. `voted`:
@@ -294,13 +284,7 @@ def smooth_rays(
 
 @QuickLaunch
 @ti.kernel
-def commit_votes(
-    touched: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    sums: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    votes: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    voted: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    correction: ti.types.ndarray(dtype=ti.f32, ndim=1),
-):
+def commit_votes(touched: I32, sums: I64, votes: I64, voted: I32, correction: F32):
     """A voxel's value (Σ w·m + correction) / Σ w becomes the mean that its rays propose; clears `votes`."""
     for i in range(voted[0]):
         place = voted[1 + i]

@@ -11,6 +11,7 @@ One unit of parallel work is a band, a contiguous run of tiles with a region of 
 
 import taichi as ti
 
+from tsfusion.kernels import F64, ANYx2, F64x2, I32x2, U8x2
 from tsfusion.kernels.quick_launch import QuickLaunch
 from tsfusion.kernels.run_loop import runs, unit_of
 from tsfusion.kernels.sensor_noise import (
@@ -377,9 +378,8 @@ def layer_color(
 
 @ti.func
 def write_layer_ray(
-    rays: ti.template(), r, first, model: ti.template(), camera, plane, unit,
-    color: ti.template(), has_color, confidence: ti.template(), has_confidence, depths: ti.template(),
-    colors: ti.template(), cell, layer,
+    rays: ti.template(), r, first, model: ti.template(), camera, plane, unit, color: ti.template(), has_color,
+    confidence: ti.template(), has_confidence, depths: ti.template(), colors: ti.template(), cell, layer,
 ):  # fmt: skip
     """Write ray `r` through the mean of a layer's samples; returns its weight, 0 if it is out of reach, and
     what it costs to add it.
@@ -414,19 +414,13 @@ def write_layer_ray(
 @QuickLaunch
 @ti.kernel
 def rays_from_image(
-    image: ti.types.ndarray(ndim=2),
-    is_disparity: ti.i32,
+    image: ANYx2, is_disparity: ti.i32,
     scale: ti.f64,  # depth = image · scale, or scale / image
-    color: ti.types.ndarray(dtype=ti.u8, ndim=2),  # (H, 3 W): blue, green, red
-    has_color: ti.i32,
-    confidence: ti.types.ndarray(dtype=ti.u8, ndim=2),
-    has_confidence: ti.i32,
-    camera_rows: ti.types.ndarray(dtype=ti.f64, ndim=2),  # (4, 3): `Camera`
-    model: ti.types.ndarray(dtype=ti.f64, ndim=1),
-    bundle: ti.i32,
-    rays: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    bands: ti.types.ndarray(dtype=ti.i32, ndim=2),
-):
+    color: U8x2,  # (H, 3 W): blue, green, red
+    has_color: ti.i32, confidence: U8x2, has_confidence: ti.i32,
+    camera_rows: F64x2,  # (4, 3): `Camera`
+    model: F64, bundle: ti.i32, rays: I32x2, bands: I32x2,
+):  # fmt: skip
     """Fill `rays`: one a layer of depth, cell by cell, tile by tile."""
     tiles_x = (image.shape[1] + TILE - 1) // TILE
     tiles = tiles_x * ((image.shape[0] + TILE - 1) // TILE)

@@ -7,6 +7,7 @@ One unit of parallel work is a band, a contiguous run of points with a region of
 
 import taichi as ti
 
+from tsfusion.kernels import F64, U8, F32x2, F64x2, I32x2, U8x2
 from tsfusion.kernels.quick_launch import QuickLaunch
 from tsfusion.kernels.run_loop import runs, unit_of
 from tsfusion.kernels.sensor_noise import (
@@ -95,18 +96,12 @@ def write_bundle_ray(rays: ti.template(), r, first, model: ti.template(), pose: 
 @QuickLaunch
 @ti.kernel
 def rays_from_points(
-    points: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    starts: ti.types.ndarray(dtype=ti.f32, ndim=2),  # of the rays, sensor frame: (1, 3) or (N, 3)
-    color: ti.types.ndarray(dtype=ti.u8, ndim=2),
-    has_color: ti.i32,
-    confidence: ti.types.ndarray(dtype=ti.u8, ndim=1),
-    has_confidence: ti.i32,
-    pose: ti.types.ndarray(dtype=ti.f64, ndim=2),  # (3, 4), metres → voxels
-    model: ti.types.ndarray(dtype=ti.f64, ndim=1),
-    bundle: ti.i32,
-    rays: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    bands: ti.types.ndarray(dtype=ti.i32, ndim=2),
-):
+    points: F32x2,
+    starts: F32x2,  # of the rays, sensor frame: (1, 3) or (N, 3)
+    color: U8x2, has_color: ti.i32, confidence: U8, has_confidence: ti.i32,
+    pose: F64x2,  # (3, 4), metres → voxels
+    model: F64, bundle: ti.i32, rays: I32x2, bands: I32x2,
+):  # fmt: skip
     """Consecutive points within a voxel of the first become one ray; range is measured along the ray."""
     count = points.shape[0]
     own_starts = ti.select(starts.shape[0] == 1, 0, 1)

@@ -14,6 +14,7 @@ the one that they are counted from.
 
 import taichi as ti
 
+from tsfusion.kernels import F64, I32, I64, U8, F32x2, I32x2, I64x2, U8x2
 from tsfusion.kernels.integrate import (
     CHANGED,
     CUBE,
@@ -116,18 +117,11 @@ def fill_level(n, levels: ti.template(), clear: ti.template(), least: ti.templat
 @QuickLaunch
 @ti.kernel
 def find_clear_depths(
-    image: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    is_disparity: ti.i32,
+    image: F32x2, is_disparity: ti.i32,
     scale: ti.f64,  # depth = image · scale, or scale / image
-    confidence: ti.types.ndarray(dtype=ti.u8, ndim=2),
-    has_confidence: ti.i32,
-    view: ti.types.ndarray(dtype=ti.f64, ndim=1),
-    model: ti.types.ndarray(dtype=ti.f64, ndim=1),
-    levels: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    clear: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    least: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    most: ti.types.ndarray(dtype=ti.i32, ndim=1),
-):
+    confidence: U8x2, has_confidence: ti.i32, view: F64, model: F64, levels: I32x2, clear: I32x2, least: I32,
+    most: I32,
+):  # fmt: skip
     """Fill `clear`, (rows, columns) of patches, with the depths up to which these are clear, and `least` and
     `most` with those of squares of 2×2 patches, of 4×4, and so on.
 
@@ -292,20 +286,12 @@ def mark_clear(
 @QuickLaunch
 @ti.kernel
 def list_free_blocks(
-    clear: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    clear: I32x2,
     height: ti.i32,  # pixels
-    width: ti.i32,
-    levels: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    least: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    most: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    view: ti.types.ndarray(dtype=ti.f64, ndim=1),
-    model: ti.types.ndarray(dtype=ti.f64, ndim=1),
-    cubes: ti.types.ndarray(dtype=ti.i32, ndim=1),  # the first of them, and how many on each axis
-    keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    amounts: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    masks: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    counts: ti.types.ndarray(dtype=ti.i32, ndim=1),
-):
+    width: ti.i32, levels: I32x2, least: I32, most: I32, view: F64, model: F64,
+    cubes: I32,  # the first of them, and how many on each axis
+    keys: I64, amounts: I64, masks: I64x2, counts: I32,
+):  # fmt: skip
     """List the blocks with voxels that an image looks through: their keys, which of their voxels these are,
     and what is added to each of them. `counts`: how many blocks and voxels; if there are more blocks than the
     list takes, it ends there."""
@@ -369,17 +355,9 @@ def list_free_blocks(
 @QuickLaunch
 @ti.kernel
 def add_free_blocks(
-    slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    amounts: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    masks: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    sign_: ti.i32,
-    stamp: ti.i32,
-    stamps: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    places: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    dirty: ti.types.ndarray(dtype=ti.u8, ndim=1),
-    touched: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    sums: ti.types.ndarray(dtype=ti.i64, ndim=2),
-):
+    slots: I32, amounts: I64, masks: I64x2, sign_: ti.i32, stamp: ti.i32, stamps: I32, places: I32, dirty: U8,
+    touched: I32, sums: I64x2,
+):  # fmt: skip
     """Add to the clear voxels of blocks, whose slots these are, each of them once; list those that keyframe
     `stamp` has not touched yet."""
     for run in range(runs(slots.shape[0])):  # run loop: kernels/run_loop.py

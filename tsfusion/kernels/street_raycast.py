@@ -8,6 +8,7 @@ Everything is in float64 and every ray is independent: images do not depend on t
 import taichi as ti
 import taichi.math as tm
 
+from tsfusion.kernels import F64, I32, F32x2, F64x2
 from tsfusion.kernels.synthetic_raycast import may_meet, solid_ray, vec3
 
 # What a ray meets, beside the number of a solid
@@ -104,20 +105,9 @@ def meet_ground(heights: ti.template(), apart: ti.template(), layout: ti.templat
 
 @ti.kernel
 def cast_view(
-    T_world_sensor: ti.types.ndarray(dtype=ti.f64, ndim=2),
-    directions: ti.types.ndarray(dtype=ti.f64, ndim=2),
-    tile: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    starts: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    listed: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    nearest: ti.types.ndarray(dtype=ti.f64, ndim=1),
-    solids: ti.types.ndarray(dtype=ti.f64, ndim=2),
-    heights: ti.types.ndarray(dtype=ti.f64, ndim=2),
-    apart: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    layout: ti.types.ndarray(dtype=ti.f64, ndim=1),
-    reach: ti.f64,
-    distance: ti.types.ndarray(dtype=ti.f64, ndim=1),
-    hit: ti.types.ndarray(dtype=ti.i32, ndim=1),
-):
+    T_world_sensor: F64x2, directions: F64x2, tile: I32, starts: I32, listed: I32, nearest: F64,
+    solids: F64x2, heights: F64x2, apart: F32x2, layout: F64, reach: ti.f64, distance: F64, hit: I32,
+):  # fmt: skip
     """Cast every ray to the nearest of the solids listed for its tile, and to the ground.
 
     Args:

@@ -4,6 +4,7 @@
 import taichi as ti
 import taichi.math as tm
 
+from tsfusion.kernels import F64, I32, F32x2, F64x2, I32x2, U8x2
 from tsfusion.kernels.street_raycast import KERB, ROAD, SKY, sample
 from tsfusion.kernels.street_textures import cell_at, fract, inside, octave, rgb3
 from tsfusion.kernels.street_things import bounded_color
@@ -123,20 +124,9 @@ def sky_color(d):
 
 @ti.kernel
 def shade_view(
-    T_world_sensor: ti.types.ndarray(dtype=ti.f64, ndim=2),
-    directions: ti.types.ndarray(dtype=ti.f64, ndim=2),
-    distance: ti.types.ndarray(dtype=ti.f64, ndim=1),
-    hit: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    pixel: ti.f64,
-    solids: ti.types.ndarray(dtype=ti.f64, ndim=2),
-    heights: ti.types.ndarray(dtype=ti.f64, ndim=2),
-    apart: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    nearest_node: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    course: ti.types.ndarray(dtype=ti.f64, ndim=2),
-    shade: ti.types.ndarray(dtype=ti.u8, ndim=2),
-    layout: ti.types.ndarray(dtype=ti.f64, ndim=1),
-    color: ti.types.ndarray(dtype=ti.f32, ndim=2),
-):
+    T_world_sensor: F64x2, directions: F64x2, distance: F64, hit: I32, pixel: ti.f64, solids: F64x2,
+    heights: F64x2, apart: F32x2, nearest_node: I32x2, course: F64x2, shade: U8x2, layout: F64, color: F32x2,
+):  # fmt: skip
     """Give every ray that `street_raycast.cast_view` has cast its colour.
 
     Args:

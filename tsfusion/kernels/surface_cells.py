@@ -12,6 +12,7 @@ Blocks are rows of arrays. Row `count` stands for every block that is not there:
 
 import taichi as ti
 
+from tsfusion.kernels import I32, I64, F32x2, I32x2, U64x2
 from tsfusion.kernels.block_hash import map_find
 from tsfusion.kernels.quick_launch import QuickLaunch
 from tsfusion.kernels.run_loop import runs, unit_of
@@ -88,13 +89,10 @@ def shift_column(key, column):
 
 @ti.kernel
 def collect_around(
-    count: ti.i32,
-    wanted: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    map_keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    map_slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    table: ti.types.ndarray(dtype=ti.i64, ndim=1),  # empty; never more than half full
-    keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
-) -> ti.i32:
+    count: ti.i32, wanted: I64, map_keys: I64, map_slots: I32,
+    table: I64,  # empty; never more than half full
+    keys: I64,
+) -> ti.i32:  # fmt: skip
     """List the blocks of the map that are, or touch, one of the `wanted` (sorted). Returns how many."""
     found = 0
     mask = table.shape[0] - 1
@@ -182,16 +180,9 @@ def is_between(r, x, j, around: ti.template(), values: ti.template(), behind, cl
 
 @ti.func
 def find_active(
-    r,
-    around: ti.template(),
-    seen: ti.template(),
-    inside: ti.template(),
-    active: ti.template(),
-    triangle_count: ti.template(),
-    values: ti.template(),
-    behind,
-    clear,
-):
+    r, around: ti.template(), seen: ti.template(), inside: ti.template(), active: ti.template(),
+    triangle_count: ti.template(), values: ti.template(), behind, clear,
+):  # fmt: skip
     """Fill a row's `active`; returns how many triangles it has."""
     total = 0
     seen_low = corner_planes(seen, around, r, 0)
@@ -223,13 +214,9 @@ def find_active(
 
 @ti.func
 def find_edges(
-    r,
-    around: ti.template(),
-    inside: ti.template(),
-    active: ti.template(),
-    edges: ti.template(),
+    r, around: ti.template(), inside: ti.template(), active: ti.template(), edges: ti.template(),
     starts: ti.template(),
-):
+):  # fmt: skip
     """Fill `edges` and `starts` of a row; returns how many vertices it has."""
     total = 0
     here = around[r, HERE]
@@ -291,24 +278,22 @@ def triangles_around(state: ti.template(), around: ti.template(), r):
 @ti.kernel
 def find_cells(
     count: ti.i32,
-    keys: ti.types.ndarray(dtype=ti.i64, ndim=1),  # sorted
+    keys: I64,  # sorted
     wanted_count: ti.i32,
-    wanted: ti.types.ndarray(dtype=ti.i64, ndim=1),  # some of the keys: whose cells are meshed
-    table: ti.types.ndarray(dtype=ti.i64, ndim=1),  # the keys' hash
-    table_rows: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    values: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    wanted: I64,  # some of the keys: whose cells are meshed
+    table: I64,  # the keys' hash
+    table_rows: I32, values: F32x2,
     behind: ti.f32,  # quanta, as `is_between`
     clear: ti.f32,  # `NEVER`, where maps are not carved
-    triangle_count: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    around: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (row, 27): rows of the blocks around
-    seen: ti.types.ndarray(dtype=ti.u64, ndim=2),  # (row, 8): planes
-    inside: ti.types.ndarray(dtype=ti.u64, ndim=2),
-    active: ti.types.ndarray(dtype=ti.u64, ndim=2),
-    edges: ti.types.ndarray(dtype=ti.u64, ndim=2),  # (row, 24): the voxels whose edge carries a vertex
-    starts: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (row, 24): vertices of the row before this plane's
-    state: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (row, 4): wanted, signs, triangles, vertices
-    first: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (row, 2): first vertex and triangle; last the totals
-):
+    triangle_count: I32,
+    around: I32x2,  # (row, 27): rows of the blocks around
+    seen: U64x2,  # (row, 8): planes
+    inside: U64x2, active: U64x2,
+    edges: U64x2,  # (row, 24): the voxels whose edge carries a vertex
+    starts: I32x2,  # (row, 24): vertices of the row before this plane's
+    state: I32x2,  # (row, 4): wanted, signs, triangles, vertices
+    first: I32x2,  # (row, 2): first vertex and triangle; last the totals
+):  # fmt: skip
     """Find the crossed cells and the edges with vertices. Rows without vertices keep old `edges`."""
     for r in range(count + 1):
         state[r, 0] = 0

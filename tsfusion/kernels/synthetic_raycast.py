@@ -8,6 +8,7 @@ in float64, so images do not depend on the thread count.
 import taichi as ti
 import taichi.math as tm
 
+from tsfusion.kernels import F64, I32, F64x2, U8x2
 from tsfusion.kernels.synthetic_textures import solid_color
 
 # Kinds of solid, column 0. Centre: columns 1-3, half sizes: 4-6, yaw cosine and sine: 7-8,
@@ -223,16 +224,9 @@ def daylight(solids: ti.template(), listed: ti.template(), first, last, p, norma
 
 @ti.kernel
 def cast(
-    T_world_sensor: ti.types.ndarray(dtype=ti.f64, ndim=2),
-    directions: ti.types.ndarray(dtype=ti.f64, ndim=2),
-    solids: ti.types.ndarray(dtype=ti.f64, ndim=2),
-    tile_of: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    starts: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    listed: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    distance: ti.types.ndarray(dtype=ti.f64, ndim=1),
-    incidence: ti.types.ndarray(dtype=ti.f64, ndim=1),
-    color: ti.types.ndarray(dtype=ti.u8, ndim=2),
-):
+    T_world_sensor: F64x2, directions: F64x2, solids: F64x2, tile_of: I32, starts: I32, listed: I32,
+    distance: F64, incidence: F64, color: U8x2,
+):  # fmt: skip
     """Cast every ray to the nearest solid.
 
     Args:

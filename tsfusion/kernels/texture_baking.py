@@ -9,6 +9,8 @@ alone. So nothing depends on the order of the threads.
 import taichi as ti
 import taichi.math as tm
 
+from tsfusion.kernels import F32, I32, U8, F32x2, F32x3, F64x2, I32x2, I64x2
+
 NOBODY = (1 << 63) - 1
 SUBTEXEL = 256.0  # units of distance in a texel
 _NEAR = 0.05  # metres in front of a camera where it begins to see
@@ -59,12 +61,7 @@ def nearest_in_triangle(a, b, c, p):
 
 
 @ti.kernel
-def claim_texels(
-    owner: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    corners: ti.types.ndarray(dtype=ti.f32, ndim=3),
-    chosen: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    reach: ti.f32,
-):
+def claim_texels(owner: I64x2, corners: F32x3, chosen: I32, reach: ti.f32):
     """Fill `owner` (H, W), which holds NOBODY: each texel within `reach` texels of a triangle of `chosen`.
 
     `corners` (m, 3, 2) are in texels.
@@ -84,12 +81,7 @@ def claim_texels(
 
 
 @ti.kernel
-def mark_covered(
-    owner: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    corners: ti.types.ndarray(dtype=ti.f32, ndim=3),
-    chosen: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    covered: ti.types.ndarray(dtype=ti.u8, ndim=1),
-):
+def mark_covered(owner: I64x2, corners: F32x3, chosen: I32, covered: U8):
     """Set `covered[f]` of each triangle that has another one's texel well inside it."""
     height, width = owner.shape[0], owner.shape[1]
     for index in range(chosen.shape[0]):
@@ -107,15 +99,9 @@ def mark_covered(
 
 @ti.kernel
 def place_texels(
-    texels: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    owner: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    corners: ti.types.ndarray(dtype=ti.f32, ndim=3),
-    vertices: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    normals: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    faces: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    points: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    directions: ti.types.ndarray(dtype=ti.f32, ndim=2),
-):
+    texels: I32x2, owner: I64x2, corners: F32x3, vertices: F32x2, normals: F32x2, faces: I32x2, points: F32x2,
+    directions: F32x2,
+):  # fmt: skip
     """Write where the texels `texels` (n, 2), row and column, lie on the mesh, and the normals there."""
     for r in range(texels.shape[0]):
         j, i = texels[r, 0], texels[r, 1]
@@ -166,18 +152,9 @@ def is_inside(at, height, width):
 
 @ti.kernel
 def look(
-    points: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    normals: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    T: ti.types.ndarray(dtype=ti.f64, ndim=2),
-    T_color: ti.types.ndarray(dtype=ti.f64, ndim=2),
-    K: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    depth: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    clearness: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    tolerance: ti.f32,
-    relative: ti.f32,
-    least_cosine: ti.f32,
-    found: ti.types.ndarray(dtype=ti.f32, ndim=2),
-):
+    points: F32x2, normals: F32x2, T: F64x2, T_color: F64x2, K: F32, depth: F32x2, clearness: F32x2,
+    tolerance: ti.f32, relative: ti.f32, least_cosine: ti.f32, found: F32x2,
+):  # fmt: skip
     """Write column, row and quality of each point in an image to `found` (n, 3); quality 0 = not seen.
 
     A point is seen where the image's own depth lies within `tolerance + relative · z` of the point's: nothing
@@ -212,13 +189,7 @@ def look(
 
 
 @ti.kernel
-def blend(
-    found: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    bands: ti.types.ndarray(dtype=ti.f32, ndim=3),
-    unit: ti.f32,
-    power: ti.f32,
-    sums: ti.types.ndarray(dtype=ti.f32, ndim=2),
-):
+def blend(found: F32x2, bands: F32x3, unit: ti.f32, power: ti.f32, sums: F32x2):
     """Add an image to `sums` (n, 8): Σ of weight and coarse colour, Σ of weight and fine colour.
 
     `bands` (H, W, 7): the image's coarse part, its fine part, and its trust. Coarse colours are mixed by

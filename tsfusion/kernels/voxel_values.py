@@ -3,6 +3,7 @@
 
 import taichi as ti
 
+from tsfusion.kernels import I32, I64, F32x2, I32x2, I64x2
 from tsfusion.kernels.block_hash import map_find
 from tsfusion.kernels.integrate import CUBE, WEIGHT_BITS, lane_weight
 from tsfusion.kernels.quick_launch import QuickLaunch
@@ -43,13 +44,7 @@ def held(value, slot, o, color_rgn: ti.template(), hits: ti.template(), layers):
 
 
 @ti.kernel
-def hold_hits(
-    slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    color_rgn: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    hits: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    layers: ti.i32,
-    values: ti.types.ndarray(dtype=ti.f32, ndim=2),
-):
+def hold_hits(slots: I32, color_rgn: I64x2, hits: I32x2, layers: ti.i32, values: F32x2):
     """Row r of `values`, those of the block in `slots[r]` in voxels, becomes what is `held` there."""
     for run in range(runs(BANDS)):  # run loop: kernels/run_loop.py
         band = unit_of(run, BANDS)
@@ -63,16 +58,9 @@ def hold_hits(
 @QuickLaunch
 @ti.kernel
 def read_values(
-    count: ti.i32,
-    keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    map_keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    map_slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    sums: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    correction: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    corrected: ti.i32,
-    min_weight: ti.i32,
-    values: ti.types.ndarray(dtype=ti.f32, ndim=2),
-):
+    count: ti.i32, keys: I64, map_keys: I64, map_slots: I32, sums: I64x2, correction: F32x2,
+    corrected: ti.i32, min_weight: ti.i32, values: F32x2,
+):  # fmt: skip
     """Row r of `values`: smoothed or raw values of block `keys[r]` in quanta; NaN below `min_weight`."""
     mask = map_keys.shape[0] - 1
     for run in range(runs(BANDS)):  # run loop: kernels/run_loop.py
