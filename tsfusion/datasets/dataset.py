@@ -29,6 +29,7 @@ NOMINAL_NS = 33_333_333  # between frames of a recording without times: thirty a
 SCAN = "`tsfusion scan PATH` finds poses by itself"
 WITHOUT_DEPTH = "without depth"
 WITHOUT_POSE = "without a pose"  # how the reasons of frames that poses would have kept begin
+NO_POSE_IN_TIME = f"{WITHOUT_POSE} in time"
 NO_HALF = "without their other half"  # images of a stereo camera
 UNREADABLE = "unreadable"  # reason of frames that are left out when they are read
 CLOCK = "after the clock"  # how the reason of those begins that came when it had stepped back
@@ -36,6 +37,8 @@ _LATE_NS = 50_000_000  # a stamp may come late: from another thread, or with exp
 _FEWEST_TIMES, _MOST_PARTS = 10, 100  # of each part on average; more parts are a series without an order
 _FIRST_TRIES = 50  # frames that cannot be read and none before them that can: so it is with all
 _T = TypeVar("_T")
+Times = NDArray[np.int64] | None  # (n,) nanoseconds of a recording's frames; None where none were recorded
+Poses = Sequence[NDArray[np.float64] | None]  # (4, 4) T_world_camera of frames, None where there is none
 
 log = logging.getLogger(__name__)
 
@@ -46,6 +49,10 @@ class UnreadableFrame(DatasetError):
 
 class UnreadableRecording(DatasetError):
     """Most frames of a recording cannot be read."""
+
+
+class NoPoses(DatasetError):
+    """A recording has no poses of its own."""
 
 
 class SeveralRecordings(DatasetError):
@@ -284,6 +291,16 @@ def force_of(dataset: Dataset, index: int) -> NDArray[np.float64] | None:
     """Specific force of frame `index` of any dataset, (3,) m/s² in its axes; None where there is none."""
     own: Callable[[int], NDArray[np.float64] | None] | None = getattr(dataset, "specific_force", None)
     return own(index) if own is not None else None
+
+
+def poses_if_any(read: Callable[[], Poses], count: int, *, posed: bool) -> Poses:
+    """The poses of `count` frames; where the recording has none, None for each, or NoPoses if `posed`."""
+    try:
+        return read()
+    except NoPoses:
+        if posed:
+            raise
+    return [None] * count
 
 
 def keep_posed(

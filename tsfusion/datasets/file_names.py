@@ -96,7 +96,7 @@ def in_time(files: Sequence[Path], names: Sequence[str]) -> tuple[list[Path], ND
 def _times(names: Sequence[str]) -> NDArray[np.int64] | None:
     whole = [time_of(found[0]) if len(found := numbers_in(name)) == 1 else None for name in names]
     split = [match for name in names if (match := _SPLIT.fullmatch(name))]
-    if len(split) < len(names):
+    if len(split) < len(names) or not split:
         stamps = np.array([] if None in whole else whole, np.int64)
         return stamps if len(stamps) == len(set(stamps.tolist())) > 0 else None
     parts = [(match["s"], match["f"]) for match in split]

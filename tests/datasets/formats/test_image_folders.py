@@ -160,7 +160,7 @@ def test_scannet_frames_that_the_tracker_lost_have_no_pose(tmp_path):
          LeftOut(r"pose/7\.txt must hold 4 rows of 4 numbers, got 1", UNPOSED)),
         (put("pose/7.txt", matrix(np.eye(4)).replace("1.0", "2.0")),
          LeftOut(r"pose/7\.txt: T_world_camera must", UNPOSED)),
-        (put("color/7.jpg", None), LeftOut(r"color/7\.png is missing; expected a colour image", UNREAD)),
+        (put("color/7.jpg", None), LeftOut(r"color/7\.jpg is missing; expected a colour image", UNREAD)),
         (put("color/7.jpg", ""), LeftOut(r"color/7\.jpg cannot be decoded", UNREAD)),
         (put("depth/0.png", None), r"holds no usable frames"),
         (put("intrinsic/intrinsic_color.txt", "1170 0 648\n0 1170 484\n0 0 1\n"),

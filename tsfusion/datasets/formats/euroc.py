@@ -10,7 +10,15 @@ from numpy.typing import NDArray
 from tsfusion.core.errors import DatasetError, InvalidConfig, InvalidKeyframe
 from tsfusion.datasets.accelerometer import Accelerometer, read_table
 from tsfusion.datasets.cameras import RecordedCamera
-from tsfusion.datasets.dataset import NO_HALF, SCAN, Frames, keep_posed, require_folder, require_frames
+from tsfusion.datasets.dataset import (
+    NO_HALF,
+    NO_POSE_IN_TIME,
+    SCAN,
+    Frames,
+    keep_posed,
+    require_folder,
+    require_frames,
+)
 from tsfusion.datasets.readers import listed_file, read_image, read_lines
 from tsfusion.datasets.trajectory_files import read_euroc
 from tsfusion.geometry.calibration import Rectifier
@@ -71,7 +79,7 @@ class EuRoC(Frames):
         gap, offset = round(max_gap_s * 1e9), round(time_offset_s * 1e9)
         poses = [_pose(trajectory, stamp + offset, gap, T_body_camera) for stamp, _, _ in pairs]
         self._pairs, self._poses = keep_posed(
-            pairs, poses, posed=posed, skipped=self.skipped, reason="without a pose in time"
+            pairs, poses, posed=posed, skipped=self.skipped, reason=NO_POSE_IN_TIME
         )
         require_frames(len(self._pairs), place, EXPECTED, self.skipped)
         self.timestamps_ns = np.array([stamp for stamp, _, _ in self._pairs], dtype=np.int64)

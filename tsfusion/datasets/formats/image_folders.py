@@ -1,8 +1,12 @@
 # SPDX-License-Identifier: MIT
 """Base of layouts with depth images in one folder and colour images in another."""
 
+import inspect
 import logging
+import re
+from abc import abstractmethod
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +16,21 @@ from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets import depth_files
-from tsfusion.datasets.cameras import MILLIMETRES, DepthUnit, RecordedCamera
-from tsfusion.datasets.dataset import Frames
+from tsfusion.datasets.cameras import MILLIMETRES, RecordedCamera, find_camera
+from tsfusion.datasets.dataset import (
+    NO_POSE_IN_TIME,
+    WITHOUT_POSE,
+    Frames,
+    Poses,
+    Times,
+    keep_posed,
+    poses_if_any,
+    require_folder,
+    require_frames,
+)
 from tsfusion.datasets.depth_files import check_metres, read_depth
 from tsfusion.datasets.file_names import in_order, numbers_in, series_of
+from tsfusion.datasets.given_trajectory import poses_of
 from tsfusion.datasets.readers import read_color
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
@@ -32,38 +47,118 @@ COLOR = ("color", "colour", "rgb", "image", "images")  # folders beside depth/, 
 class DepthImages(Frames):
     """Frames of one depth image each, with colour and a pose where they are recorded.
 
+    A layout is a class: its attributes say what is usual there, `_files` and `_recorded_poses` what its
+    folder holds, `_colors` and `_known_camera` where colour and camera are, `_registered` how colour fits.
+
     Args:
-        depth: files of 16-bit depth, or of floats.
-        color: as many files, None where there is no colour; or an empty list.
-        poses: as many (4, 4), None where there is no pose.
-        camera: of the depth images; distortion is removed from depth and colour.
-        depth_scale: metres per unit; None = for 16 bits as the camera's file states, else `usual_unit`, and
-            floats are metres.
+        path: the recording's folder.
+        trajectory: poses instead of those in the folder; in TUM's, KITTI's or Redwood's format.
+        intrinsics, calibration: of the depth images, instead of a file of the camera in the folder
+            (`cameras.FILES`) or of the camera that a benchmark publishes; distortion is removed.
+        depth_scale: metres per unit; default as a file of the camera states, else as usual in the layout,
+            and 1 for floats.
+        max_gap_s: between two poses that are interpolated, seconds; across a longer gap there is no pose.
+        time_offset_s: added to an image's time before its pose is looked up, seconds.
+        sensor: name of the sensor model; default the layout's.
+        color: read colour images.
+        posed: leave out frames without a pose; else they are kept, with `T_world_camera` None.
+
+    Raises:
+        DatasetError: no such folder, no frames, most images missing, malformed poses or camera.
     """
 
+    layout = ""
+    expected = ""
+    sensor = "kinect"
+    usual_unit = MILLIMETRES
+    usual_gap_s = 0.2
+    not_measured: int | None = None  # a value that means so, beside 0
     camera: RecordedCamera
+
+    def __init_subclass__(cls) -> None:
+        """Name the common options where a layout adds some of its own and passes on `**options`."""
+        own, common = (inspect.signature(each.__init__).parameters for each in (cls, DepthImages))
+        named = {**common, **own}
+        named.pop("options", None)
+        cls.__signature__ = inspect.Signature([*named.values()][1:])  # type: ignore[attr-defined]
 
     def __init__(
         self,
-        name: str,
+        path: str | Path,
         *,
-        sensor: str,
-        depth: Sequence[Path],
-        color: Sequence[Path | None],
-        poses: Sequence[Transform | None],
-        camera: RecordedCamera,
-        skipped: dict[str, int],
+        trajectory: str | Path | None = None,
+        intrinsics: Intrinsics | None = None,
+        calibration: str | Path | None = None,
         depth_scale: float | None = None,
-        usual_unit: DepthUnit = MILLIMETRES,
-        timestamps_ns: NDArray[np.int64] | None = None,
+        max_gap_s: float | None = None,
+        time_offset_s: float = 0.0,
+        sensor: str | None = None,
+        color: bool = True,
+        posed: bool = True,
     ) -> None:
-        self.name, self.sensor, self.skipped, self.camera = name, sensor, skipped, camera
-        self.intrinsics, self.timestamps_ns = camera.intrinsics, timestamps_ns
-        self.depth_unit = camera.depth_unit(depth_scale, usual_unit)
+        self.skipped = {}
+        root, given = self._opened(path, trajectory)
+        self._gap_s = self.usual_gap_s if max_gap_s is None else max_gap_s
+        self._offset_s, self._posed, self._why = time_offset_s, posed, WITHOUT_POSE
+        files, times = self._files(root)
+        require_frames(len(files), root, self.expected, self.skipped)
+        read = self._recorded_poses if given is None else self._poses_of
+        found = poses_if_any(partial(read, given or root, files, times), len(files), posed=posed)
+        kept, self._poses = keep_posed(
+            range(len(files)), found, posed=posed, skipped=self.skipped, reason=self._why
+        )
+        require_frames(len(kept), root, self._wanted(), self.skipped)
+        self._depth, self._kept = [files[index] for index in kept], kept
+        self._color = self._colors(root) if color else []
+        self.uncolored = [*self._color].count(None)
+        self.timestamps_ns = None if times is None else times[kept]
+        self.name, self.sensor = f"{self.layout} {root.name}", sensor or self.sensor
+        self.camera = find_camera(
+            root, first_size(self._depth), intrinsics=intrinsics, calibration=calibration,
+            **self._known_camera(root),
+        )  # fmt: skip
+        self.intrinsics = self.camera.intrinsics
+        self.depth_unit = self.camera.depth_unit(depth_scale, self.usual_unit)
         self.depth_scale = self.depth_unit.metres
         self._float_scale = 1.0 if depth_scale is None else depth_scale
-        self._depth, self._color, self._poses = depth, color, poses
         self._kind: np.dtype[Any] | None = None  # of the first depth image that was read
+
+    def _opened(self, path: str | Path, trajectory: str | Path | None) -> tuple[Path, Path | None]:
+        """The folder, and the file of poses that was given, which may be named from there."""
+        root = require_folder(path, self.layout)
+        given = None if trajectory is None else Path(trajectory).expanduser()
+        return root, given if given is None or given.exists() else root / given
+
+    @abstractmethod
+    def _files(self, root: Path) -> tuple[list[Path], Times]:
+        """Depth images in order, and their times, (n,) nanoseconds, where they are known."""
+
+    @abstractmethod
+    def _recorded_poses(self, root: Path, files: list[Path], times: Times) -> Poses:
+        """The pose of each depth image; raises NoPoses where the folder has none."""
+
+    def _poses_of(self, path: Path, files: list[Path], times: Times) -> Poses:
+        """Poses of a trajectory: by time where both have times, else one for each image."""
+        self._why = WITHOUT_POSE if times is None else NO_POSE_IN_TIME
+        where = {"max_gap_s": self._gap_s, "time_offset_s": self._offset_s}
+        return poses_of(path, len(files), times, posed=self._posed, **where)
+
+    def _wanted(self) -> str:
+        """What frames with poses need."""
+        if self._why == WITHOUT_POSE:
+            return self.expected
+        return (
+            f"poses at most {self._gap_s:g} s apart around the images' times (--option max_gap_s=SECONDS "
+            "takes longer gaps, time_offset_s=SECONDS is added to these times)"
+        )
+
+    def _colors(self, root: Path) -> Sequence[Path | None]:
+        """A colour image for each depth image, None where there is none; empty where there is no colour."""
+        return []
+
+    def _known_camera(self, root: Path) -> dict[str, Any]:
+        """Where the camera is: `places`, `files` and `published` of `find_camera`."""
+        return {}
 
     def __len__(self) -> int:
         return len(self._depth)
@@ -82,7 +177,7 @@ class DepthImages(Frames):
 
     def _measured(self, file: Path) -> NDArray[Any]:
         """Depth of the pinhole camera: uint16 in `depth_scale`, or float32 metres."""
-        depth, size = read_depth(file), self.camera.size
+        depth, size = read_depth(file, invalid=self.not_measured), self.camera.size
         self._kind = self._kind or depth.dtype
         if depth.shape != size:
             raise DatasetError(
@@ -182,21 +277,25 @@ def first_size(files: Sequence[Path], read: Callable[[Path], NDArray[Any]] = rea
     return max(sizes, key=sizes.count)
 
 
-def color_images(depth: list[Path], where: Path, expected: str) -> list[Path]:
+def color_images(depth: list[Path], where: Path, expected: str, word: str = "") -> list[Path]:
     """The colour image of each depth image, by file name; of some it may be missing.
+
+    Args:
+        word: at the start of colour's names, where those of depth begin with `depth`; empty = they are equal.
 
     Raises:
         DatasetError: of most it is.
     """
-    by_stem = {path.stem: path for path in images(where, expected)}
-    found = [by_stem.get(image.stem, where / f"{image.stem}.png") for image in depth]
-    missing = [file for image, file in zip(depth, found, strict=True) if image.stem not in by_stem]
+    by_stem = {path.stem: path for path in images(where, expected, f"{word}[!.]*")}
+    stems = [re.sub("^depth", word, image.stem) if word else image.stem for image in depth]
+    missing = [stem for stem in stems if stem not in by_stem]
     if 2 * len(missing) > len(depth):
         raise DatasetError(
-            f"{where / missing[0].stem}.png or .jpg is missing, but {depth[0].parent} has its depth; "
+            f"{where / missing[0]}.png or .jpg is missing, but {depth[0].parent} has its depth; "
             f"expected {expected}"
         )
-    return found
+    suffix = next(iter(by_stem.values()), where / ".png").suffix
+    return [by_stem.get(stem, where / f"{stem}{suffix}") for stem in stems]
 
 
 def poses_by_number(

@@ -1,16 +1,15 @@
 # SPDX-License-Identifier: MIT
 """RGB-D folders with one pose file: HoloLens recordings and Redwood / Open3D reconstructions."""
 
-import logging
 import re
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any
 
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets.cameras import PublishedCamera, find_camera
-from tsfusion.datasets.dataset import SCAN, keep_posed, require_folder, require_frames
+from tsfusion.datasets.cameras import PublishedCamera
+from tsfusion.datasets.dataset import SCAN, NoPoses, Poses, Times
 from tsfusion.datasets.depth_files import SUFFIXES
 from tsfusion.datasets.file_names import in_time, numbers_in, series_of
 from tsfusion.datasets.formats.image_folders import (
@@ -18,14 +17,12 @@ from tsfusion.datasets.formats.image_folders import (
     DepthImages,
     color_images,
     depth_images,
-    first_size,
     poses_by_number,
 )
 from tsfusion.datasets.formats.image_folders import SUFFIXES as COLOR_SUFFIXES
-from tsfusion.datasets.given_trajectory import poses_of
+from tsfusion.datasets.given_trajectory import found_poses
 from tsfusion.datasets.trajectory_files import is_log, read_log, read_matrix_rows
 from tsfusion.geometry.keyframe import Intrinsics
-from tsfusion.geometry.se3 import Transform
 
 HOLOLENS_EXPECTED = "K.txt, poses.txt, depth/*.png and images/*.png"
 REDWOOD_EXPECTED = (
@@ -50,8 +47,6 @@ _LOG_NAMES = ("*traj*.log", "*-traj.txt")
 # In the name of an image that has its colour beside it: depth_3, depth16_3, depth_raw_3
 _DEPTH = re.compile("depth(?:16(?=[_-])|[_-]?raw)?", re.IGNORECASE)
 _FEWEST = 2  # images of a series
-
-logger = logging.getLogger(__name__)
 
 
 def recognises_hololens(path: Path) -> bool:
@@ -79,51 +74,28 @@ class HoloLens(DepthImages):
     """HoloLens RGB-D as in deep-video-mvs: line k of `poses.txt` belongs to the k-th image by name.
 
     https://github.com/ardaduz/deep-video-mvs. Time-of-flight depth in uint16 millimetres, registered to
-    colour; no timestamps.
-
-    Args:
-        intrinsics, calibration: instead of `K.txt`.
-        depth_scale: metres per unit; default as a file of the camera states, else 0.001.
-        posed: `poses.txt` must be there; else frames come without a pose where it is not.
-
-    Raises:
-        DatasetError: no such folder, no frames, unequal numbers of images and poses, a malformed line.
+    colour; no timestamps. Options are those of `DepthImages`.
     """
 
-    def __init__(
-        self,
-        path: str | Path,
-        *,
-        intrinsics: Intrinsics | None = None,
-        calibration: str | Path | None = None,
-        depth_scale: float | None = None,
-        sensor: str = "tof",
-        color: bool = True,
-        posed: bool = True,
-    ) -> None:
-        root = require_folder(path, "HoloLens")
-        depth = depth_images(root / "depth", HOLOLENS_EXPECTED)
-        require_frames(len(depth), root / "depth", HOLOLENS_EXPECTED, {})
-        poses: list[Transform | None] = [None] * len(depth)
-        if posed or (root / "poses.txt").exists():
-            poses = [*read_matrix_rows(root / "poses.txt")]
-        if len(poses) != len(depth):
+    layout, expected, sensor = "HoloLens", HOLOLENS_EXPECTED, "tof"
+
+    def _files(self, root: Path) -> tuple[list[Path], Times]:
+        return depth_images(root / "depth", HOLOLENS_EXPECTED), None
+
+    def _recorded_poses(self, root: Path, files: list[Path], times: Times) -> Poses:
+        path = root / "poses.txt"
+        if not path.exists():
+            raise NoPoses(f"{path} is missing; expected 16 numbers a line; {SCAN}")
+        poses = read_matrix_rows(path)
+        if len(poses) != len(files):
             raise DatasetError(
-                f"{root / 'poses.txt'} has {len(poses)} poses for {len(depth)} depth images; "
+                f"{path} has {len(poses)} poses for {len(files)} depth images; "
                 "expected as many: line k belongs to the k-th image"
             )
-        skipped: dict[str, int] = {}
-        depth, poses = keep_posed(depth, poses, posed=posed, skipped=skipped)
-        super().__init__(
-            f"HoloLens {root.name}",
-            sensor=sensor,
-            depth=depth,
-            color=color_images(depth, root / "images", HOLOLENS_EXPECTED) if color else [],
-            poses=poses,
-            camera=find_camera(root, first_size(depth), intrinsics=intrinsics, calibration=calibration),
-            skipped=skipped,
-            depth_scale=depth_scale,
-        )
+        return poses
+
+    def _colors(self, root: Path) -> list[Path]:
+        return color_images(self._depth, root / "images", HOLOLENS_EXPECTED)
 
 
 class Redwood(DepthImages):
@@ -137,93 +109,50 @@ class Redwood(DepthImages):
     Args:
         path: the folder, or the `.log` in it to take the poses from.
         trajectory: default `trajectory.log`, `scene/trajectory.log`, `odometry.log` or the one file named
-            `*traj*.log` or `*-traj.txt`; a file of another SLAM in TUM's or KITTI's format too.
+            `*traj*.log` or `*-traj.txt`.
         intrinsics, calibration: default a file of the camera in the folder (`cameras.FILES`); for recordings
             that Redwood and Open3D distribute, known by their names, at 640×480 else 525, 525, 319.5, 239.5.
-        depth_scale: metres per unit; default as a file of the camera states, else 0.001, and 1 for floats.
-        time_offset_s: added to an image's time before its pose is looked up, seconds.
-        posed: leave out frames without a pose; else they are kept, with `T_world_camera` None.
 
-    Raises:
-        DatasetError: no such folder, no frames, a missing image, a malformed trajectory.
+    Other options are those of `DepthImages`.
     """
 
-    def __init__(
-        self,
-        path: str | Path,
-        *,
-        trajectory: str | Path | None = None,
-        intrinsics: Intrinsics | None = None,
-        calibration: str | Path | None = None,
-        depth_scale: float | None = None,
-        time_offset_s: float = 0.0,
-        sensor: str = "kinect",
-        color: bool = True,
-        posed: bool = True,
-    ) -> None:
+    layout, expected = "Redwood", REDWOOD_EXPECTED
+
+    def _opened(self, path: str | Path, trajectory: str | Path | None) -> tuple[Path, Path | None]:
         path = Path(path).expanduser()
         if path.is_file():
             path, trajectory = _root_of(path) or path.parent, trajectory or path.absolute()
-        self.root = root = require_folder(path, "Redwood")
-        beside = {} if _depth_folders(root) else _only_series(root)
-        files = [*beside] or depth_images(_depth_folder(root), REDWOOD_EXPECTED)
-        require_frames(len(files), root, REDWOOD_EXPECTED, {})
-        files, times = in_time(files, _names(files))
-        log = _log(root) if trajectory is None else Path(trajectory)
-        if log is not None and not log.is_file():
-            log = root / log
-        if log is None and posed:
+        self.root, given = super()._opened(path, trajectory)
+        return self.root, given
+
+    def _files(self, root: Path) -> tuple[list[Path], Times]:
+        self._beside = {} if _depth_folders(root) else _only_series(root)
+        files = [*self._beside] or depth_images(_depth_folder(root), REDWOOD_EXPECTED)
+        return in_time(files, _names(files))
+
+    def _recorded_poses(self, root: Path, files: list[Path], times: Times) -> Poses:
+        path = _log(root)
+        if path is None:
             given = root / "groundtruth.txt"  # TUM's
             hint = f"{SCAN}, or --trajectory {given} names them" if given.is_file() else SCAN
-            raise DatasetError(f"{root} has no trajectory; expected {REDWOOD_EXPECTED}; {hint}")
-        skipped: dict[str, int] = {}
-        try:
-            found = _poses(files, log, times, posed=posed, time_offset_s=time_offset_s)
-        except DatasetError as error:
-            if posed or trajectory is not None or log is None:
-                raise
-            logger.warning("%s is not taken for the poses of these images: %s", log.name, error)
-            found = [None] * len(files)
-        depth, poses = keep_posed(files, found, posed=posed, skipped=skipped)
-        require_frames(len(depth), root, REDWOOD_EXPECTED, skipped)
-        kept = set(depth)
-        colored: list[Path | None] = []
-        if color and beside:
-            colored = [beside[file] for file in depth]
-            self.uncolored = colored.count(None)
-        elif color and (where := _color_folder(root)):
-            colored = [*color_images(depth, where, REDWOOD_EXPECTED)]
-        camera = find_camera(
-            root, first_size(depth), intrinsics=intrinsics, calibration=calibration,
-            places=(root, depth[0].parent), published=_PRIMESENSE if _is_redwoods_own(root) else None,
-        )  # fmt: skip
-        super().__init__(
-            f"Redwood {root.name}",
-            sensor=sensor,
-            depth=depth,
-            color=colored,
-            poses=poses,
-            camera=camera,
-            skipped=skipped,
-            depth_scale=depth_scale,
-            timestamps_ns=None if times is None else times[[file in kept for file in files]],
-        )
+            raise NoPoses(f"{root} has no trajectory; expected {REDWOOD_EXPECTED}; {hint}")
+        return found_poses(partial(self._poses_of, path, files, times), path, posed=self._posed)
 
+    def _poses_of(self, path: Path, files: list[Path], times: Times) -> Poses:
+        """Poses of a `.log` by number; of another trajectory by time, or one for each image."""
+        if is_log(path):
+            return poses_by_number(_names(files), read_log(path), path)
+        return super()._poses_of(path, files, times)
 
-def _poses(
-    files: list[Path],
-    path: Path | None,
-    times: NDArray[np.int64] | None,
-    *,
-    posed: bool,
-    time_offset_s: float,
-) -> list[Transform | None]:
-    """Poses of a `.log` by number; of another trajectory by time, or one for each image."""
-    if path is None:
-        return [None] * len(files)
-    if is_log(path):
-        return poses_by_number(_names(files), read_log(path), path)
-    return poses_of(path, len(files), times, posed=posed, time_offset_s=time_offset_s)
+    def _colors(self, root: Path) -> Sequence[Path | None]:
+        if self._beside:
+            return [self._beside[file] for file in self._depth]
+        where = _color_folder(root)
+        return color_images(self._depth, where, REDWOOD_EXPECTED) if where else []
+
+    def _known_camera(self, root: Path) -> dict[str, Any]:
+        published = _PRIMESENSE if _is_redwoods_own(root) else None
+        return {"places": (root, self._depth[0].parent), "published": published}
 
 
 def _names(files: list[Path]) -> list[str]:

@@ -10,7 +10,14 @@ from typing import NamedTuple
 import numpy as np
 
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets.dataset import SCAN, Frames, keep_posed, require_folder, require_frames
+from tsfusion.datasets.dataset import (
+    NO_POSE_IN_TIME,
+    SCAN,
+    Frames,
+    keep_posed,
+    require_folder,
+    require_frames,
+)
 from tsfusion.datasets.file_names import in_time, series_of
 from tsfusion.datasets.given_trajectory import poses_between, poses_of
 from tsfusion.datasets.scan_files import SUFFIXES, USUAL_FIELDS, read_scan
@@ -103,7 +110,7 @@ class ScanFolder(Frames):
                     poses_between, where, stamps, max_gap_s=max_gap_s, time_offset_s=time_offset_s
                 )
         kept, self._poses = keep_posed(
-            range(len(files)), poses, posed=posed, skipped=self.skipped, reason="without a pose in time"
+            range(len(files)), poses, posed=posed, skipped=self.skipped, reason=NO_POSE_IN_TIME
         )
         require_frames(len(kept), root, EXPECTED, self.skipped)
         self._files = [files[index] for index in kept]

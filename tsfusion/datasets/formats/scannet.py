@@ -8,13 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets.cameras import find_camera
-from tsfusion.datasets.dataset import keep_posed, require_folder, require_frames
+from tsfusion.datasets.dataset import Poses, Times
 from tsfusion.datasets.formats.image_folders import (
     DepthImages,
     color_images,
     depth_images,
-    first_size,
     resample_for_camera,
 )
 from tsfusion.datasets.readers import intrinsics_of, read_color, read_lines, read_numbers
@@ -38,51 +36,23 @@ class ScanNet(DepthImages):
     http://www.scan-net.org. Depth in uint16 millimetres; the colour camera stands beside the depth camera
     and has other pixels: colour is resampled by both cameras' matrices, as if they stood in one place.
     Frames that the authors' tracker lost have poses of -inf: they count as frames without a pose. No
-    timestamps (nominally 30 Hz).
-
-    Args:
-        intrinsics, calibration: of the depth camera, instead of its file.
-        depth_scale: metres per unit; default 0.001.
-        posed: leave out frames without a pose; else they are kept, with `T_world_camera` None.
-
-    Raises:
-        DatasetError: no such folder, no frames, a missing image, a malformed pose or camera file.
+    timestamps (nominally 30 Hz). Options are those of `DepthImages`.
     """
 
-    def __init__(
-        self,
-        path: str | Path,
-        *,
-        intrinsics: Intrinsics | None = None,
-        calibration: str | Path | None = None,
-        depth_scale: float | None = None,
-        sensor: str = "kinect",
-        color: bool = True,
-        posed: bool = True,
-    ) -> None:
-        root = require_folder(path, "ScanNet")
-        skipped: dict[str, int] = {}
-        files = depth_images(root / "depth", EXPECTED)
-        found = usable(root / "pose", (root / "pose" / f"{file.stem}.txt" for file in files), _pose)
-        depth, poses = keep_posed(files, found, posed=posed, skipped=skipped)
-        require_frames(len(depth), root, EXPECTED, skipped)
-        self.color_intrinsics = _color_intrinsics(root) if color else None
-        super().__init__(
-            f"ScanNet {root.name}",
-            sensor=sensor,
-            depth=depth,
-            color=color_images(depth, root / "color", EXPECTED) if color else [],
-            poses=poses,
-            camera=find_camera(
-                root,
-                first_size(depth),
-                intrinsics=intrinsics,
-                calibration=calibration,
-                files=filter(None, [_camera_file(root, "depth")]),
-            ),
-            skipped=skipped,
-            depth_scale=depth_scale,
-        )
+    layout, expected = "ScanNet", EXPECTED
+
+    def _files(self, root: Path) -> tuple[list[Path], Times]:
+        return depth_images(root / "depth", EXPECTED), None
+
+    def _recorded_poses(self, root: Path, files: list[Path], times: Times) -> Poses:
+        return usable(root / "pose", (root / "pose" / f"{file.stem}.txt" for file in files), _pose)
+
+    def _colors(self, root: Path) -> list[Path]:
+        self.color_intrinsics = _color_intrinsics(root)
+        return color_images(self._depth, root / "color", EXPECTED)
+
+    def _known_camera(self, root: Path) -> dict[str, Any]:
+        return {"files": filter(None, [_camera_file(root, "depth")])}
 
     def _registered(self, color: Path, depth: NDArray[Any]) -> NDArray[np.uint8]:
         if self.color_intrinsics is None:

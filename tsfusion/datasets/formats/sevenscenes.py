@@ -4,19 +4,19 @@
 import re
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets.cameras import PublishedCamera, find_camera
-from tsfusion.datasets.dataset import WITHOUT_DEPTH, Frames, keep_posed, require_folder, require_frames
-from tsfusion.datasets.depth_files import read_depth
+from tsfusion.datasets.cameras import PublishedCamera
+from tsfusion.datasets.dataset import WITHOUT_DEPTH, Poses, Times
 from tsfusion.datasets.file_names import in_order
-from tsfusion.datasets.formats.image_folders import first_size
+from tsfusion.datasets.formats.image_folders import DepthImages
 from tsfusion.datasets.readers import read_color
 from tsfusion.datasets.trajectory_files import read_matrix, usable
 from tsfusion.geometry.depth_registration import Registration
-from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.se3 import Transform
 
@@ -40,41 +40,30 @@ def recognises(path: Path) -> bool:
     return any(_frames(sequence, "depth.png") for sequence in _sequences(path))
 
 
-class SevenScenes(Frames):
+class SevenScenes(DepthImages):
     """A scene (every `seq-*` in it, one world) or a single sequence.
 
     Depth is uint16 millimetres. 7-Scenes colour has the depth's size but comes from another camera, up to
     35 pixels off: it is registered to the depth here. There are no timestamps (nominally 30 Hz).
 
     Args:
-        path: the scene's or the sequence's folder.
-        intrinsics, calibration: default a file of the camera (`cameras.FILES`) beside the frames or up to
-            two folders up; for a scene of 7-Scenes (by its name and `TrainSplit.txt`, or in a folder
-            `7scenes`) at 640×480 else 585, 585, 320, 240.
-        color: read colour images.
+        path: the scene's or the sequence's folder. A file of the camera may lie beside the frames or up to
+            two folders up; a scene of 7-Scenes (by its name and `TrainSplit.txt`, or in a folder `7scenes`)
+            at 640×480 has 585, 585, 320, 240 without one.
         register: move colour onto depth; default: for a scene of 7-Scenes with its own depth camera
             (3DMatch's colour is registered already).
-        posed: leave out frames without a pose; else they are kept, with `T_world_camera` None.
-
-    Raises:
-        DatasetError: no such folder, no frames, a missing image, a malformed pose or camera file.
+        options: those of `DepthImages`.
     """
 
-    def __init__(
-        self,
-        path: str | Path,
-        *,
-        intrinsics: Intrinsics | None = None,
-        calibration: str | Path | None = None,
-        depth_scale: float | None = None,
-        sensor: str = "kinect",
-        color: bool = True,
-        register: bool | None = None,
-        posed: bool = True,
-    ) -> None:
-        root = require_folder(path, "7-Scenes")
-        self.name, self.sensor, self.skipped = f"7-Scenes {root.name}", sensor, {}
-        stems: list[Path] = []
+    layout, expected, not_measured = "7-Scenes", EXPECTED, NOT_MEASURED
+
+    def __init__(self, path: str | Path, *, register: bool | None = None, **options: Any) -> None:
+        super().__init__(path, **options)
+        is_known = _is_own(Path(path).expanduser()) and self.intrinsics == KINECT
+        self._register = is_known if register is None else register
+
+    def _files(self, root: Path) -> tuple[list[Path], Times]:
+        files: list[Path] = []
         for sequence in _sequences(root):
             depth = _frames(sequence, "depth.png")
             alone = _frames(sequence, "pose.txt") - depth
@@ -85,39 +74,28 @@ class SevenScenes(Frames):
                 )
             if alone:
                 self.skipped[WITHOUT_DEPTH] = self.skipped.get(WITHOUT_DEPTH, 0) + len(alone)
-            stems += in_order(sequence / stem for stem in depth)
-        poses = usable(root, stems, _pose)
-        self._stems, self._poses = keep_posed(stems, poses, posed=posed, skipped=self.skipped)
-        require_frames(len(self._stems), root, EXPECTED, self.skipped)
-        self._suffix = _color_suffix(self._stems[0]) if color else None
-        folder, own = self._stems[0].parent, _is_own(root)
-        self.camera = find_camera(
-            root, first_size([_file(stem, "depth.png") for stem in self._stems]),
-            intrinsics=intrinsics, calibration=calibration, places=(folder, root, root.absolute().parent),
-            published=PublishedCamera("7-Scenes", KINECT) if own else None,
-        )  # fmt: skip
-        self.intrinsics = self.camera.intrinsics
-        self.depth_unit = self.camera.depth_unit(depth_scale)
-        self._register = own and self.intrinsics == KINECT if register is None else register
+            files += in_order(sequence / f"{stem}.depth.png" for stem in depth)
+        return files, None
 
-    def __len__(self) -> int:
-        return len(self._stems)
+    def _recorded_poses(self, root: Path, files: list[Path], times: Times) -> Poses:
+        return usable(root, files, _pose)
 
-    def _frame(self, index: int) -> Frame:
-        stem = self._stems[index]
-        depth = read_depth(_file(stem, "depth.png"), invalid=NOT_MEASURED)
-        if depth.shape != self.camera.size:
-            raise DatasetError(f"{stem}.depth.png has shape {depth.shape}, others {self.camera.size}")
-        depth = self.camera.depth(depth)
-        color = None if self._suffix is None else read_color(_file(stem, self._suffix), depth.shape)
-        if color is not None and self._register:
-            registration = _registration(self.intrinsics, depth.shape)
-            color = registration.color_of_depth(color, depth * np.float32(self.depth_unit.metres))
-        elif color is not None:
-            color = np.asarray(self.camera.color(color), np.uint8)
-        return self._posed_frame(
-            index, depth=depth, depth_scale=self.depth_unit.metres, color=color, intrinsics=self.intrinsics
-        )
+    def _colors(self, root: Path) -> list[Path]:
+        folder = self._depth[0].parent
+        kinds = [kind for kind in ("color.png", "color.jpg") if any(folder.glob(f"frame-*.{kind}"))]
+        return [_beside(file, kinds[0]) for file in self._depth] if kinds else []
+
+    def _known_camera(self, root: Path) -> dict[str, Any]:
+        published = PublishedCamera("7-Scenes", KINECT) if _is_own(root) else None
+        places = (self._depth[0].parent, root, root.absolute().parent)
+        return {"places": places, "published": published}
+
+    def _registered(self, color: Path, depth: NDArray[Any]) -> NDArray[np.uint8]:
+        if not self._register:
+            return super()._registered(color, depth)
+        registration = _registration(self.intrinsics, depth.shape)
+        metres = depth * np.float32(self.depth_scale)
+        return registration.color_of_depth(read_color(color, depth.shape), metres)
 
 
 @lru_cache(maxsize=1)
@@ -138,21 +116,13 @@ def _frames(sequence: Path, suffix: str) -> set[str]:
     return {path.name[: -len(suffix) - 1] for path in sequence.glob(f"frame-*.{suffix}")}
 
 
-def _file(stem: Path, suffix: str) -> Path:
-    return stem.with_name(f"{stem.name}.{suffix}")
+def _beside(depth: Path, kind: str) -> Path:
+    return depth.with_name(depth.name.removesuffix("depth.png") + kind)
 
 
-def _pose(stem: Path) -> Transform | None:
-    path = _file(stem, "pose.txt")
+def _pose(depth: Path) -> Transform | None:
+    path = _beside(depth, "pose.txt")
     return read_matrix(path) if path.exists() else None
-
-
-def _color_suffix(stem: Path) -> str | None:
-    """The colour file's ending in this data set, None when it has no colour."""
-    for suffix in ("color.png", "color.jpg"):
-        if any(stem.parent.glob(f"frame-*.{suffix}")):
-            return suffix
-    return None
 
 
 def _is_own(root: Path) -> bool:

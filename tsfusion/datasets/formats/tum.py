@@ -3,26 +3,22 @@
 
 import re
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.accelerometer import read_table
-from tsfusion.datasets.cameras import DepthUnit, PublishedCamera, find_camera
-from tsfusion.datasets.dataset import SCAN, keep_posed, require_folder, require_frames
-from tsfusion.datasets.formats.image_folders import DepthImages, first_size
+from tsfusion.datasets.cameras import DepthUnit, PublishedCamera
+from tsfusion.datasets.dataset import SCAN, NoPoses, Poses, Times
+from tsfusion.datasets.formats.image_folders import DepthImages
 from tsfusion.datasets.formats.tum_lists import ASSOCIATIONS, read_recording
-from tsfusion.datasets.given_trajectory import poses_of
 from tsfusion.geometry.keyframe import Intrinsics
-from tsfusion.geometry.se3 import Transform
 
 EXPECTED = (
     "groundtruth.txt or *.gt.freiburg, the images that depth.txt and rgb.txt, or associations.txt, list, and "
     "camera-intrinsics.txt unless it is a recording of TUM, CoRBS or ICL-NUIM"
 )
 DEPTH_SCALE = 1 / 5000  # metres per unit
-_UNIT = DepthUnit(DEPTH_SCALE, "usual for TUM RGB-D", is_stated=False)
 # A Kinect's accelerometer is turned by half around the camera's axis.
 _R_CAMERA_KINECT = np.diag((-1.0, -1.0, 1.0))
 
@@ -76,95 +72,48 @@ class TUM(DepthImages):
             benchmark's, by the folder's name (freiburg1-3, CoRBS, ICL-NUIM), at 640×480 alone.
         depth_scale: metres per unit; default as a file of the camera states, else 1/5000, and 1 for floats.
         max_difference_s: between a depth image and its colour image, seconds.
-        max_gap_s: between the two poses interpolated, seconds; across a longer gap there is no pose.
-        time_offset_s: added to an image's stamp before its pose is looked up, seconds.
-        posed: leave out frames without a pose; else they are kept, with `T_world_camera` None.
-
-    Raises:
-        DatasetError: no such folder, no frames, a listed image is missing, a malformed line.
+        options: those of `DepthImages`.
     """
 
+    layout, expected, usual_gap_s = "TUM", EXPECTED, 0.1
+    usual_unit = DepthUnit(DEPTH_SCALE, "usual for TUM RGB-D", is_stated=False)
     quaternions = True
 
-    def __init__(
-        self,
-        path: str | Path,
-        *,
-        trajectory: str | Path | None = None,
-        intrinsics: Intrinsics | None = None,
-        calibration: str | Path | None = None,
-        depth_scale: float | None = None,
-        max_difference_s: float = 0.02,
-        max_gap_s: float = 0.1,
-        time_offset_s: float = 0.0,
-        sensor: str | None = None,
-        color: bool = True,
-        posed: bool = True,
-    ) -> None:
-        root = require_folder(path, "TUM RGB-D")
-        listed = read_recording(root, max_difference_ns=round(max_difference_s * 1e9))
-        benchmark = _benchmark(root)
-        skipped: dict[str, int] = {}
-        poses = _poses_at(
-            listed.timestamps_ns,
-            _trajectory(root, trajectory, posed=posed),
-            posed=posed,
-            max_gap_s=max_gap_s,
-            time_offset_s=time_offset_s,
-        )
-        chosen, poses = keep_posed(
-            range(len(poses)), poses, posed=posed, skipped=skipped, reason="without a pose in time"
-        )
-        gap = (
-            f"poses at most {max_gap_s:g} s apart around the images' times (--option max_gap_s=SECONDS takes "
-            "longer gaps, time_offset_s=SECONDS is added to these times)"
-        )
-        require_frames(len(chosen), root, gap if skipped else EXPECTED, skipped)
-        depth = [listed.depth[i] for i in chosen]
-        camera = find_camera(
-            root, first_size(depth), intrinsics=intrinsics, calibration=calibration,
-            places=(root, depth[0].parent),
-            published=benchmark and PublishedCamera(benchmark.source, benchmark.intrinsics),
-        )  # fmt: skip
-        super().__init__(
-            f"{benchmark.name if benchmark else 'TUM'} {root.name}",
-            sensor=sensor or (benchmark.sensor if benchmark else "kinect"),
-            depth=depth,
-            color=[listed.color[i] for i in chosen] if color and listed.color else [],
-            poses=poses,
-            camera=camera,
-            skipped=skipped,
-            depth_scale=depth_scale,
-            usual_unit=DepthUnit(DEPTH_SCALE, f"published for {benchmark.source}") if benchmark else _UNIT,
-            timestamps_ns=np.array([listed.timestamps_ns[i] for i in chosen], dtype=np.int64),
-        )
-        self.uncolored = list(self._color).count(None)
+    def __init__(self, path: str | Path, *, max_difference_s: float = 0.02, **options: Any) -> None:
+        self._max_difference_ns = round(max_difference_s * 1e9)
+        super().__init__(path, **options)
+
+    def _files(self, root: Path) -> tuple[list[Path], Times]:
+        self._listed = read_recording(root, max_difference_ns=self._max_difference_ns)
+        self._benchmark = _benchmark(root)
+        if self._benchmark is not None:
+            self.layout, self.sensor = self._benchmark.name, self._benchmark.sensor
+            self.usual_unit = DepthUnit(DEPTH_SCALE, f"published for {self._benchmark.source}")
         self._accelerometer = read_table(
             root / "accelerometer.txt", "`timestamp ax ay az` a line", _R_CAMERA_KINECT,
             separator=None, first=1,
         )  # fmt: skip
+        return self._listed.depth, np.array(self._listed.timestamps_ns, np.int64)
+
+    def _recorded_poses(self, root: Path, files: list[Path], times: Times) -> Poses:
+        return self._poses_of(_trajectory(root), files, times)
+
+    def _colors(self, root: Path) -> list[Path | None]:
+        return [self._listed.color[index] for index in self._kept] if self._listed.color else []
+
+    def _known_camera(self, root: Path) -> dict[str, Any]:
+        known = self._benchmark and PublishedCamera(self._benchmark.source, self._benchmark.intrinsics)
+        return {"places": (root, self._depth[0].parent), "published": known}
 
 
-def _poses_at(
-    stamps_ns: list[int], trajectory: Path | None, *, posed: bool, max_gap_s: float, time_offset_s: float
-) -> list[Transform | None]:
-    if trajectory is None:
-        return [None] * len(stamps_ns)
-    return poses_of(
-        trajectory, len(stamps_ns), stamps_ns, posed=posed, max_gap_s=max_gap_s, time_offset_s=time_offset_s
-    )
-
-
-def _trajectory(root: Path, given: str | Path | None, *, posed: bool) -> Path | None:
-    if given is not None:
-        return Path(given) if Path(given).exists() else root / given
+def _trajectory(root: Path) -> Path:
     found = [path for path in (root / "groundtruth.txt", *_corbs(root), *_icl(root)) if path.is_file()]
-    if not found and posed:
-        raise DatasetError(
+    if not found:
+        raise NoPoses(
             f"{root / 'groundtruth.txt'} is missing; expected `timestamp tx ty tz qx qy qz qw` a line "
             f"(one elsewhere: --trajectory FILE, in Python trajectory=FILE); {SCAN}"
         )
-    return found[0] if found else None
+    return found[0]
 
 
 def _corbs(root: Path) -> list[Path]:
