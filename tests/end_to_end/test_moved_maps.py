@@ -131,6 +131,22 @@ def test_a_live_map_moves_and_every_keyframe_is_in_it_once(tmp_path: Path) -> No
         assert (tmp_path / "two" / "moved" / "default.json").exists()
 
 
+def test_a_map_comes_into_the_process_of_an_empty_one_which_gets_another(tmp_path: Path) -> None:
+    with serving(tmp_path / "one") as one, serving(tmp_path / "two") as two:
+        with Client(one.address, spool=tmp_path / "spool", map="yard", config=QUICK) as client:
+            client.send(wall(0))
+            client.wait_fused(DEADLINE)
+        queries.move_map("yard", one.address, two.address)
+        with Client(two.address, spool=tmp_path / "other", config=QUICK) as client:
+            client.send(wall(1))
+            client.wait_fused(DEADLINE)
+        assert {each.fuser_restarts for each in queries.fetch_health(two.address).maps.values()} == {0}
+        assert two.terminate() == 0
+    for name, number in (("yard", 0), ("default", 1)):
+        saved = state_folder.map_folder(tmp_path / "two", name) / state_folder.MAP_FILE
+        assert tsfusion("map", "hash", saved).stdout.strip() == map_hash([wall(number)])
+
+
 def test_a_map_that_cannot_go_stays_and_goes_on(tmp_path: Path) -> None:
     with sending(tmp_path, fuser=SUMS) as (one, two, sender):
         with Client(two.address, spool=tmp_path / "other") as other:

@@ -247,6 +247,12 @@ def test_a_source_that_does_not_answer_is_an_error_and_blocks_nothing(
     context.term()
 
 
+def command_of(source: Served, name: str = "default") -> bytes:
+    """A command to fetch a map from a server."""
+    places = {"source": source.addresses.data, "source_control": source.addresses.control}
+    return messages.encode_sealed(Command(name="move", map=name, **places))
+
+
 def test_a_map_comes_and_goes_on_where_it_was(asking: Asking, tmp_path: Path) -> None:
     first = asking.served
     with (
@@ -254,8 +260,7 @@ def test_a_map_comes_and_goes_on_where_it_was(asking: Asking, tmp_path: Path) ->
         connected(sockets.dealer, second.addresses.control) as link,
         connected(sockets.push, second.addresses.data) as push,
     ):
-        command = Command(name="move", source=first.addresses.data, source_control=first.addresses.control)
-        link.send(messages.encode_sealed(command))
+        link.send(command_of(first))
         until(lambda: first.step() or second.step() or link.poll(0))
         reply = messages.decode_to_client(link.recv())
         assert isinstance(reply, Reply)
@@ -269,3 +274,41 @@ def test_a_map_comes_and_goes_on_where_it_was(asking: Asking, tmp_path: Path) ->
             push.send_multipart(record(seq))
         second.until(lambda: second.durable == 4 and second.gateway.health().duplicates == 1)
     assert first.greet(asking.link, "default").address == second.addresses.data
+
+
+@pytest.mark.parametrize("name", ["default", "yard"])
+def test_a_map_that_comes_is_read_by_an_empty_ones_process(asking: Asking, tmp_path: Path, name: str) -> None:
+    """A start takes seconds; the empty map gets another process, when it is not the one that comes."""
+    first = asking.served
+    first.greet(asking.link, name)
+    asking.push.send_multipart(record(1, name))
+    first.until(lambda: name in first.gateway.health().maps)
+    with (
+        serving_here(tmp_path / "other") as second,
+        connected(sockets.dealer, second.addresses.control) as link,
+    ):
+        hosted = second.gateway.maps.get("default")
+        assert hosted is not None
+        process = hosted.fuser.pid
+        link.send(command_of(first, name))
+        until(lambda: first.step() or second.step() or link.poll(0))
+        come = second.gateway.maps.get(name)
+        assert come is not None
+        assert come.fuser.pid == process
+        second.until(lambda: all(each.fuser.ready for each in second.gateway.maps))
+        assert second.gateway.health().problems == ()
+        assert name == "default" or hosted.fuser.pid not in (0, process)
+
+
+def test_a_map_in_use_keeps_its_process(tmp_path: Path) -> None:
+    with (
+        serving_here(tmp_path) as served,
+        connected(sockets.dealer, served.addresses.control) as link,
+    ):
+        hosted = served.gateway.maps.get("default")
+        assert hosted is not None
+        process = hosted.fuser.pid
+        served.greet(link, "default")  # a scanner is about to send
+        fuser = served.gateway.maps.open_ahead("yard", tmp_path, hosted.volume)
+        assert process == hosted.fuser.pid != fuser.pid
+        fuser.close()

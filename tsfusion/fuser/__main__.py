@@ -5,7 +5,7 @@ import logging
 import select
 import signal
 import sys
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, cast
 
@@ -23,6 +23,7 @@ from tsfusion.fuser.opened_map import OpenedMap
 from tsfusion.wire import sockets
 
 _LOCK_WAIT_S = 60.0  # for another fuser to end: it may be reading a large map
+_held = ExitStack()  # the folder of the map
 
 
 def run(endpoint: str) -> int:
@@ -79,6 +80,7 @@ def _serve(link: sockets.AnySocket) -> int:
             continue
         message = inbox.orders.popleft()
         if isinstance(message, fuser_messages.Warm | fuser_messages.Open):
+            fuser = None  # of an empty map that does without this process
             if not ahead.do(message):
                 return 1
         elif isinstance(message, fuser_messages.Begin):
@@ -154,12 +156,13 @@ def _open_map(
 
 
 def _lock(begin: fuser_messages.Begin) -> None:
-    """Hold the map's folder until this process ends."""
+    """Hold the map's folder until this process ends, or has another map."""
     process.end_first()
-    lock_folder(
+    _held.close()
+    _held.push(lock_folder(
         Path(begin.folder), "map", "fuser", name=LOCK, wait=_LOCK_WAIT_S, error_type=MapError,
         make=False,  # one that is away must not be made in its place
-    )  # fmt: skip
+    ))  # fmt: skip
 
 
 def _say_failed(link: sockets.AnySocket, error: Exception) -> None:

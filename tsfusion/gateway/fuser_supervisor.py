@@ -17,6 +17,7 @@ from tsfusion.core import logs, process
 from tsfusion.core.config import CacheConfig, ServerConfig, VolumeConfig
 from tsfusion.core.errors import MapError
 from tsfusion.fuser import messages as fuser_messages
+from tsfusion.gateway.fuser_process import FuserProcess
 from tsfusion.gateway.fuser_silence import FuserSilence
 from tsfusion.gateway.spare_fusers import SpareFusers
 from tsfusion.wire import sockets
@@ -116,6 +117,12 @@ class FuserSupervisor:
             return
         self.waits, self.failed, self._restart_at = False, "", 0.0
         self._silence = FuserSilence(self._process.pid)
+
+    def give_process(self) -> FuserProcess:
+        """The process, which another map is to have; the next one waits for `begin`."""
+        given, self.waits = self._process, True
+        self._start()
+        return given
 
     def _note_no_start(self, error: OSError | zmq.ZMQError) -> None:
         self.failed = f"its fuser process cannot be started: {error}"

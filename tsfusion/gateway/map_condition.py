@@ -63,7 +63,7 @@ class MapCondition:
         """The state in a word."""
         if self._fuser.failed:
             return "failed"
-        if not self.warm:
+        if not self.warm or self._fuser.waits:
             return "opening"
         if not self._fuser.ready:
             return "restarting"

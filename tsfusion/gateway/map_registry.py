@@ -167,7 +167,7 @@ class MapRegistry:
         return "" if self.get(name) is not None else self.why_not(name)
 
     def _has_own(self, name: str) -> bool:
-        hosted = self.get(name)
+        hosted = self._open.get(name)
         return state_folder.holds_records(self._folder(name)) if hosted is None else not hosted.is_empty
 
     def begin_to_take(self, name: str) -> None:
@@ -179,15 +179,23 @@ class MapRegistry:
     def end_to_take(self, name: str) -> None:
         """Note that a map has come, or will not come."""
         self.arriving.discard(name)
-        if (hosted := self.get(name)) is not None:
+        if (hosted := self._open.get(name)) is not None:
             hosted.stay()
 
     def open_ahead(self, name: str, folder: Path, volume: VolumeConfig) -> FuserSupervisor:
         """A fuser that reads a map in a folder where it waits, for `take_in` to go on with.
 
+        Where no spare process has these settings, that of an empty map is taken: a start takes seconds.
+
         Raises:
             MapError: when the system cannot start it.
         """
+        in_use = {route.map for route in self._routes}
+        idle = (one for one in self if one.is_empty and one.fuser.idle and one.volume == volume)
+        if not self._spares.has_for(volume):
+            unused = sorted((one for one in idle if one.name not in in_use), key=lambda one: one.name != name)
+            for hosted in unused[:1]:
+                self._spares.add(hosted.fuser.give_process(), volume)
         place = self._folder(name)
         return FuserSupervisor(self._context, place, self._server, volume, ahead=folder, spares=self._spares)
 
@@ -370,7 +378,7 @@ class MapRegistry:
                     raise
                 self._give_up(hosted.name, error)
         if self._started:
-            waiting = next((hosted for hosted in self if hosted.fuser.waits), None)
+            waiting = next((one for one in self if one.fuser.waits and one.name not in self.arriving), None)
             self._spares.step(self._volumes[DEFAULT_MAP], may_start=self.warm and waiting is None)
             if waiting is not None and self.warm and not self.is_ending:
                 self.open_for_client(waiting.name)

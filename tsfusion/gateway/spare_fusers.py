@@ -26,6 +26,10 @@ class _Spare:
         self.is_warm = False
         self.problem = ""  # why it cannot be of use; empty = it can
 
+    def fits(self, volume: VolumeConfig) -> bool:
+        """Whether a map with these settings can have the process now."""
+        return self.is_warm and self.volume == volume and self.process.status is None
+
     def receive(self) -> None:
         """Take its messages."""
         with suppress(zmq.Again):
@@ -56,10 +60,19 @@ class SpareFusers:
             OSError, zmq.ZMQError: when the system cannot start it.
         """
         for one in self._spares:
-            if one.is_warm and one.volume == volume and one.process.status is None:
+            if one.fits(volume):
                 self._spares.remove(one)
                 return one.process
         return self._start(name, waits=waits)
+
+    def add(self, process: FuserProcess, volume: VolumeConfig) -> None:
+        """Take a process that has its kernels, from a map that has nothing."""
+        self._spares.append(_Spare(process, volume))
+        self._spares[-1].is_warm = True
+
+    def has_for(self, volume: VolumeConfig) -> bool:
+        """Whether a map with these settings would get a spare process."""
+        return any(one.fits(volume) for one in self._spares)
 
     def step(self, volume: VolumeConfig, *, may_start: bool) -> None:
         """Have as many as there are to be, for these settings, one after the other; after `close` none.
