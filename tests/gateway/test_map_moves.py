@@ -312,3 +312,21 @@ def test_a_map_in_use_keeps_its_process(tmp_path: Path) -> None:
         fuser = served.gateway.maps.open_ahead("yard", tmp_path, hosted.volume)
         assert process == hosted.fuser.pid != fuser.pid
         fuser.close()
+
+
+def test_a_second_asker_hears_of_the_same_move(asking: Asking, tmp_path: Path) -> None:
+    """The first has given up waiting, and began again."""
+    first = asking.served
+    with (
+        serving_here(tmp_path / "other") as second,
+        connected(sockets.dealer, second.addresses.control) as link,
+        connected(sockets.dealer, second.addresses.control) as again,
+    ):
+        link.send(command_of(first))
+        second.until(lambda: second.gateway.moves._arrivals)
+        again.send(command_of(first))
+        until(lambda: first.step() or second.step() or (link.poll(0) and again.poll(0)))
+        for one in (link, again):
+            reply = messages.decode_to_client(one.recv())
+            assert isinstance(reply, Reply)
+            assert reply.moved is not None

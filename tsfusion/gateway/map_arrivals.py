@@ -80,10 +80,11 @@ class MapArrival:
         resumed: Arrival | None = None,
     ) -> None:
         self.name = request.name
-        self.on_end = on_end
+        self.on_end = [on_end]
         self.outcome: Moved | str | None = None  # how it went, or why the map did not come
         self.folder = arriving_folder(state, request.name)
-        self._request, self._own, self._keys, self._resumed = request, own, keys, resumed
+        self.request = request
+        self._own, self._keys, self._resumed = own, keys, resumed
         self._move = secrets.token_bytes(16) if resumed is None else bytes.fromhex(resumed.move)
         self._have: dict[str, tuple[int, str]] = {}  # bytes and version, by file
         self._copied = self._number = 0
@@ -102,7 +103,7 @@ class MapArrival:
         try:
             with (
                 sockets.open_context() as context,
-                closing(open_connection(context, self._request.source_control, self._keys)) as link,
+                closing(open_connection(context, self.request.source_control, self._keys)) as link,
             ):
                 self.outcome = self._fetch(link)
         except (TsfusionError, OSError) as error:
@@ -134,7 +135,7 @@ class MapArrival:
         for folder in (self.folder, *(path for path in self.folder.iterdir() if path.is_dir())):
             durable_files.sync_folder(folder)
         arrival = Arrival(
-            self._move.hex(), self._request.source, self._request.source_control, last.volume, last.sessions
+            self._move.hex(), self.request.source, self.request.source_control, last.volume, last.sessions
         )
         with durable_files.replacing(self.folder / state_folder.ARRIVED_FILE) as file:
             file.write(msgspec.json.encode(arrival))
@@ -243,14 +244,14 @@ class MapArrival:
         )
         self._number += 1
         command = messages.Command(name="hand_over", map=self.name, hand_over=question, number=self._number)
-        name = f"{self._request.source} (control {link.address})"
+        name = f"{self.request.source} (control {link.address})"
         exchange = Exchange(link, [[messages.encode_sealed(command)]], name)
         while True:
             reply, frames = exchange.reply(_ANSWER_S)
             if reply.number == self._number:  # else it is late, of a question that was asked twice
                 break
         if reply.error is not None:
-            raise CommandRefused(self._request.source, reply.error, retry=reply.retry)
+            raise CommandRefused(self.request.source, reply.error, retry=reply.retry)
         return reply.parcel or Parcel(), frames
 
 

@@ -91,7 +91,8 @@ class MapMoves:
                 log.error("%s", outcome, extra=logs.about(map=one.name))
             if fuser is not None:
                 fuser.close(wait=False)
-            one.on_end(outcome)
+            for answer in one.on_end:
+                answer(outcome)
 
     def _prepare(self, one: MapArrival) -> None:
         """Have a map read where it is being copied to; where that fails it is read later."""
@@ -154,11 +155,16 @@ class MapMoves:
         sockets.check_reachable(source, has_keys=self._server.keys is not None)
         if (source, control) == self._maps.place:
             raise InvalidConfig(f"map {command.map} is to come from this server itself")
+        request = Request(command.map, source, control)
+        under_way = next((one for one in self._arrivals if one.request == request), None)
+        if under_way is not None and len(under_way.on_end) < _MOST_UNREAD:
+            under_way.on_end.append(answer)  # its asker gave up waiting, and asks again
+            return
         if why := self._maps.why_not_take(command.map):
             raise JournalError(why)
         if len(self._arrivals) >= _MOST_ARRIVALS:
             raise JournalError("too many maps are coming: ask again")
-        self._begin(Request(command.map, source, control), answer, None)
+        self._begin(request, answer, None)
 
     def _begin(self, request: Request, answer: map_arrivals.OnEnd, resumed: Arrival | None) -> None:
         self._maps.begin_to_take(request.name)
