@@ -28,7 +28,18 @@ TESTS = Path(__file__).parents[1] / "tests" / "support"
 SHARES = {"message": 0.35, "control": 0.25, "corrections": 0.1, "journal": 0.25, "checkpoint": 0.05}
 LAYOUTS = (
     *("euroc", "flat", "hololens", "kitti", "kitti-raw", "lidar-keyframes", "nerfstudio", "plain", "redwood"),
-    *("replica", "scannet", "scans", "seven-scenes", "stereo", "tum"),
+    *(
+        "replica",
+        "scannet",
+        "scans",
+        "scans-las",
+        "scans-laz",
+        "scans-pcd",
+        "scans-ply",
+        "seven-scenes",
+        "stereo",
+    ),
+    *("tum", "bag-mcap", "bag-mcap-zstd", "bag-ros1", "bag-ros1-lz4", "bag-sqlite3"),
 )
 FOLDERS = {f"folder-{layout}": 0.001 for layout in LAYOUTS}  # of a recording's files
 SHARES |= FOLDERS

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Folders of recordings whose files are renamed, exchanged, emptied, cut, doubled, or of another type.
+"""Recordings whose files are renamed, exchanged, emptied, cut, doubled, of another type, or have other bytes.
 
 A case is a list of changes. It is refused by a named error, or gives frames of the unharmed recording alone,
-each at its own pose; else it raises `Broken`.
+each at its own pose; else it raises `Broken`. Of other bytes nobody can tell: then any frames will do.
 """
 
 import json
@@ -19,11 +19,15 @@ import numpy as np
 import rig_recordings
 from fuzz_targets import Broken, Target, scratch
 from numpy.typing import NDArray
+from rosbag_scenes import COLOR, DEPTH, infos, records
+from rosbag_writing import OPTICAL, writing
 
 from tsfusion.core.errors import TsfusionError
 from tsfusion.datasets import Dataset, open_dataset
+from tsfusion.datasets.dataset import UnreadableRecording
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
+from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.trajectory import quaternion
 
 COUNT = 6  # frames
@@ -31,6 +35,7 @@ SIZE = (6, 8)
 SAME_POSE = 0.01
 CAMERA = "5 0 4\n0 5 3\n0 0 1\n"
 _CALIBRATION = "P0: 5 0 4 0 0 5 3 0 0 0 1 0\nP1: 5 0 4 -2 0 5 3 0 0 0 1 0\nTr: 0 -1 0 0 0 0 -1 0 1 0 0 0\n"
+_HEADER = 300  # bytes
 _TEXT = (".txt", ".json", ".csv", ".yaml", ".log")
 Poses = dict[bytes, NDArray[np.float64] | None]  # by the digest of what was measured
 
@@ -181,7 +186,61 @@ def _lidar_keyframes(root: Path) -> None:
     _put(root / "graph.txt", "".join(lines))
 
 
+def _clouds(suffix: str, root: Path) -> None:
+    """Scans named by their times, as text and as numbers, packed ones too; and poses by time."""
+    for frame in range(COUNT):
+        points = np.abs(np.random.default_rng(frame).normal(size=(50, 4))).astype(np.float32)
+        _CLOUDS[suffix](root / f"{1000 + frame / 10:.6f}.{suffix}", points, frame)
+    _put(root / "poses_tum.txt", "".join(map(_tum_line, range(COUNT))))
+
+
+def _pcd(path: Path, points: NDArray[np.float32], frame: int) -> None:
+    from pypcd4 import Encoding, PointCloud
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    kinds = (Encoding.ASCII, Encoding.BINARY, Encoding.BINARY_COMPRESSED)
+    PointCloud.from_xyzi_points(points).save(path, kinds[frame % len(kinds)])
+
+
+def _ply(path: Path, points: NDArray[np.float32], frame: int) -> None:
+    fields = "".join(f"property float {name}\n" for name in ("x", "y", "z", "intensity"))
+    kind = ("ascii", "binary_little_endian")[frame % 2]
+    _put(path, f"ply\nformat {kind} 1.0\nelement vertex {len(points)}\n{fields}end_header\n")
+    with path.open("ab") as file:
+        np.savetxt(file, points) if kind == "ascii" else file.write(points.tobytes())
+
+
+def _las(path: Path, points: NDArray[np.float32], frame: int) -> None:
+    import laspy
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    las = laspy.create(point_format=1 + 5 * (frame % 2), file_version="1.4")
+    las.xyz, las.gps_time = points[:, :3], np.linspace(0, 0.1, len(points))
+    las.write(path)
+
+
+_CLOUDS = {"pcd": _pcd, "ply": _ply, "las": _las, "laz": _las}
+
+
+def _bag(form: str, root: Path) -> None:
+    """Depth with colour, or a LiDAR's points, and transforms; no message is in another's chunk."""
+    root.mkdir(parents=True, exist_ok=True)
+    camera = Intrinsics(5.0, 5.0, 4.0, 3.0)
+    with writing(root, form) as (bag, _):
+        for frame in range(COUNT):
+            stamp, rng = 1000 * 10**9 + frame * 10**8, np.random.default_rng((frame, 0))
+            bag.transform(_pose(frame), "map", OPTICAL, stamp)
+            if form.startswith("mcap"):
+                points = np.abs(rng.normal(size=(50, 3))).astype(np.float32)
+                bag.cloud("/points", records(x=points[:, 0], y=points[:, 1], z=points[:, 2]), stamp, OPTICAL)
+                continue
+            infos(bag, stamp, SIZE, camera)
+            bag.image(DEPTH, rng.integers(500, 3000, SIZE).astype(np.uint16), "16UC1", stamp)
+            bag.image(COLOR, rng.integers(0, 256, (*SIZE, 3)).astype(np.uint8), "rgb8", stamp)
+
+
 WRITERS: dict[str, Callable[[Path], object]] = {
+    **{f"bag-{form}": partial(_bag, form) for form in ("ros1", "ros1-lz4", "sqlite3", "mcap", "mcap-zstd")},
     "euroc": partial(rig_recordings.euroc, count=3),
     "flat": _flat,
     "hololens": _hololens,
@@ -194,6 +253,7 @@ WRITERS: dict[str, Callable[[Path], object]] = {
     "replica": _replica,
     "scannet": _scannet,
     "scans": _scans,
+    **{f"scans-{suffix}": partial(_clouds, suffix) for suffix in _CLOUDS},
     "seven-scenes": _seven_scenes,
     "stereo": _stereo,
     "tum": _tum,
@@ -208,7 +268,9 @@ def _rename(root: Path, one: Path, other: Path, number: int) -> None:
 
 
 def _exchange(root: Path, one: Path, other: Path, number: int) -> None:
-    if _kind(one) != _kind(other):  # else nobody could tell
+    unharmed = [root.with_name("whole") / file.relative_to(root) for file in (one, other)]
+    were_alike = all(map(Path.is_file, unharmed)) and _kind(unharmed[0]) == _kind(unharmed[1])
+    if _kind(one) != _kind(other) and not were_alike:  # else nobody could tell
         content = one.read_bytes()
         one.write_bytes(other.read_bytes())
         other.write_bytes(content)
@@ -216,9 +278,12 @@ def _exchange(root: Path, one: Path, other: Path, number: int) -> None:
 
 def _kind(file: Path) -> tuple[str, ...]:
     """What files have in common of which nobody can tell one from the other by what they hold."""
-    if file.suffix in (".png", ".jpg"):
-        image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
-        return (file.suffix,) if image is None else (str(image.dtype), str(image.ndim))
+    content = file.read_bytes()
+    image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED) if content else None
+    if image is not None:
+        return str(image.dtype), str(image.ndim)
+    if b"\0" in content:  # points
+        return ("numbers",)
     return file.suffix, "".join(letter for letter in file.stem if letter.isalpha())
 
 
@@ -260,6 +325,14 @@ def _exchange_folders(root: Path, one: Path, other: Path, number: int) -> None:
         aside.rename(places[1])
 
 
+def _other_bytes(root: Path, one: Path, other: Path, number: int) -> None:
+    """Change bytes of a file, half of them near its start, where headers are."""
+    content, rng = bytearray(one.read_bytes()), random.Random(number)
+    for _ in range(1 << rng.randrange(5) if content else 0):
+        content[rng.randrange(rng.choice((len(content), min(len(content), _HEADER))))] = rng.randrange(256)
+    one.write_bytes(content)
+
+
 _CHANGES: tuple[Callable[[Path, Path, Path, int], object], ...] = (
     _rename,
     _exchange,
@@ -271,6 +344,7 @@ _CHANGES: tuple[Callable[[Path, Path, Path, int], object], ...] = (
     lambda root, one, other, number: one.write_text("not what it was"),
     _all,
     _exchange_folders,
+    _other_bytes,
 )
 
 
@@ -299,6 +373,8 @@ def _frames(dataset: Dataset) -> Poses:
     for index in range(len(dataset)):
         try:
             frame = dataset.frame(index)  # type: ignore[attr-defined]
+        except UnreadableRecording:
+            raise
         except TsfusionError:
             continue
         found[_digest(frame)] = frame.T_world_camera
@@ -321,21 +397,24 @@ def _whole(layout: str) -> tuple[Path, Poses]:
 
 def run(layout: str, content: bytes) -> str:
     """Harm a copy of the folder, and open it with its poses, without them, and with those of another file."""
-    whole, wanted = _whole(layout)
+    whole, frames = _whole(layout)
+    wanted: Poses | None = frames
     work = whole.with_name("work")
     shutil.rmtree(work, ignore_errors=True)
     shutil.copytree(whole, work)
     for kind, one, other, number in msgspec.msgpack.decode(content):
         files = sorted(path for path in work.rglob("*") if path.is_file())
+        change = _CHANGES[kind % len(_CHANGES)]
+        wanted = None if change is _other_bytes else wanted
         if files:
-            _CHANGES[kind % len(_CHANGES)](work, files[one % len(files)], files[other % len(files)], number)
+            change(work, files[one % len(files)], files[other % len(files)], number)
     trajectory = whole.with_name("slam.txt")
     _put(trajectory, "".join(map(_tum_line, range(COUNT))))
     options: tuple[dict[str, object], ...] = ({}, {"posed": False}, {"trajectory": trajectory})
     return "; ".join(_opened(work, wanted, **each) for each in options)
 
 
-def _opened(root: Path, wanted: Poses, **options: object) -> str:
+def _opened(root: Path, wanted: Poses | None, **options: object) -> str:
     try:
         dataset = open_dataset(root, **options)
         found = _frames(dataset)
@@ -343,10 +422,15 @@ def _opened(root: Path, wanted: Poses, **options: object) -> str:
         if "\n" in str(error):
             raise Broken(f"not one line: {error}") from error
         return type(error).__name__
-    for digest, T in found.items():
+    shift = None
+    for digest, T in found.items() if wanted is not None else ():
+        assert wanted is not None
         if digest not in wanted:
             raise Broken(f"a frame of {dataset.name} is none of the recording, {options}")
         good = wanted[digest]
+        if T is not None and good is not None and "KITTI raw" in dataset.name:
+            shift = good[:3, 3] - T[:3, 3] if shift is None else shift  # its first packet is the origin
+            T[:3, 3] += shift
         if T is not None and "trajectory" not in options and (
             good is None or np.abs(T - good).max() > SAME_POSE
         ):  # fmt: skip

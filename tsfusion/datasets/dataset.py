@@ -187,6 +187,28 @@ class Frames(ShownRecording):
             raise IndexError(f"{self.name} has {count} keyframes, got index {index}")
         return index % count
 
+    def _keep(
+        self,
+        files: Sequence[_T],
+        poses: Poses,
+        where: tuple[Path, str],
+        *,
+        posed: bool,
+        reason: str = WITHOUT_POSE,
+    ) -> list[_T]:
+        """Files of the frames that stay: all, or if `posed` those with a pose; their poses are `_poses`.
+
+        Args:
+            where: the folder and what is expected there, for the error that none stays.
+            reason: of those that are left out, in `skipped`.
+        """
+        pairs = [pair for pair in zip(files, poses, strict=True) if pair[1] is not None or not posed]
+        if len(pairs) < len(files):
+            self.skipped[reason] = self.skipped.get(reason, 0) + len(files) - len(pairs)
+        require_frames(len(pairs), *where, self.skipped)
+        self._poses = [pose for _, pose in pairs]
+        return [file for file, _ in pairs]
+
     def _posed_frame(self, index: int, **measurement: Any) -> Frame:
         """A frame with the recorded pose, sensor and time of an index."""
         T, stamp = self._poses[index], self._stamp(index)
@@ -293,29 +315,22 @@ def force_of(dataset: Dataset, index: int) -> NDArray[np.float64] | None:
     return own(index) if own is not None else None
 
 
-def poses_if_any(read: Callable[[], Poses], count: int, *, posed: bool) -> Poses:
-    """The poses of `count` frames; where the recording has none, None for each, or NoPoses if `posed`."""
+def poses_if_any(read: Callable[[], Poses], count: int, *, posed: bool, guessed: bool = False) -> Poses:
+    """The poses of `count` frames; None for each where the recording has none.
+
+    Args:
+        posed: whether that is an error.
+        guessed: whether a file was taken for the poses by its name alone; if not `posed`, one that does not
+            fit is a warning.
+    """
     try:
         return read()
-    except NoPoses:
-        if posed:
+    except DatasetError as error:
+        if posed or not (guessed or isinstance(error, NoPoses)):
             raise
+        if not isinstance(error, NoPoses):
+            log.warning("no recorded poses are taken: %s", error)
     return [None] * count
-
-
-def keep_posed(
-    files: Sequence[_T],
-    poses: Sequence[NDArray[np.float64] | None],
-    *,
-    posed: bool,
-    skipped: dict[str, int],
-    reason: str = WITHOUT_POSE,
-) -> tuple[list[_T], list[NDArray[np.float64] | None]]:
-    """Leave out frames without a pose if `posed`, and count them in `skipped`: (files, poses) that remain."""
-    pairs = [pair for pair in zip(files, poses, strict=True) if pair[1] is not None or not posed]
-    if len(pairs) < len(files):
-        skipped[reason] = skipped.get(reason, 0) + len(files) - len(pairs)
-    return [file for file, _ in pairs], [pose for _, pose in pairs]
 
 
 def select(

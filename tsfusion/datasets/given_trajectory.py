@@ -2,8 +2,7 @@
 """Poses of another SLAM for a recording: by time where both have times, else one a frame, in order."""
 
 import dataclasses
-import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -15,19 +14,13 @@ from tsfusion.datasets.dataset import (
     NO_POSE_IN_TIME,
     Dataset,
     Frames,
-    NoPoses,
-    Poses,
     force_of,
     frame_of,
-    keep_posed,
-    require_frames,
 )
 from tsfusion.datasets.trajectory_files import read_poses, read_tum
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.se3 import Transform
 from tsfusion.geometry.trajectory import PoseAt, Trajectory
-
-log = logging.getLogger(__name__)
 
 EXPECTED = "poses at the times of its frames"
 
@@ -72,17 +65,6 @@ def poses_of(
     return found
 
 
-def found_poses(read: Callable[[], Poses], path: Path, *, posed: bool) -> Poses:
-    """Poses of a file that nobody named; without `posed`, one that does not fit is a warning and NoPoses."""
-    try:
-        return read()
-    except DatasetError as error:
-        if posed:
-            raise
-        log.warning("%s is not taken for the poses of this recording: %s", path.name, error)
-        raise NoPoses(str(error)) from error
-
-
 def poses_between(
     path: Path, stamps_ns: NDArray[np.int64] | None, *, max_gap_s: float = 0.2, time_offset_s: float = 0.0
 ) -> PoseAt:
@@ -123,10 +105,9 @@ class WithTrajectory(Frames):
         self.camera, self.depth_unit = (getattr(dataset, name, None) for name in ("camera", "depth_unit"))
         self.usual = getattr(dataset, "usual", {})
         found = poses_of(path, len(dataset), dataset.timestamps_ns, posed=posed, **where)
-        self._indices, self._poses = keep_posed(
-            range(len(dataset)), found, posed=posed, skipped=self.skipped, reason=NO_POSE_IN_TIME
+        self._indices = self._keep(
+            range(len(dataset)), found, (path, EXPECTED), posed=posed, reason=NO_POSE_IN_TIME
         )
-        require_frames(len(self._indices), path, EXPECTED, self.skipped)
         if dataset.timestamps_ns is not None:
             self.timestamps_ns = dataset.timestamps_ns[self._indices]
         self._between = partial(poses_between, path, dataset.timestamps_ns, **where)

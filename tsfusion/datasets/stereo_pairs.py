@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: MIT
 """Stereo cameras: their calibration, rectification of their images, and the frames made of them."""
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import cv2
 import numpy as np
@@ -12,10 +13,15 @@ from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError, InvalidConfig
 from tsfusion.datasets.cameras import RecordedCamera, UnknownCamera, find_camera
-from tsfusion.datasets.readers import read_numbers
+from tsfusion.datasets.dataset import NO_HALF, Frames
+from tsfusion.datasets.readers import read_image, read_numbers
 from tsfusion.geometry.calibration import Rectifier, Size
 from tsfusion.geometry.calibration_files import read_rig
+from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import MAX_BASELINE_M, Intrinsics
+
+_Key = TypeVar("_Key", int, str)
+log = logging.getLogger(__name__)
 
 # A folder as a calibration: the files of the left and the right camera, or of intrinsics and extrinsics.
 FILE_PAIRS = (
@@ -47,13 +53,8 @@ class AlreadyRectified:
     """`PairRectifier` for images that are rectified already."""
 
     intrinsics: Intrinsics
-    baseline_m: float
+    baseline_fx: float  # metre · pixels
     size: Size
-
-    @property
-    def baseline_fx(self) -> float:
-        """Baseline times focal length, metre · pixels."""
-        return self.baseline_m * self.intrinsics.fx
 
     def pair(self, left: NDArray[Any], right: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
         """Return both images as they are.
@@ -129,7 +130,7 @@ def find_pairs(
         raise UnknownCamera(f"{root} has no baseline.txt (metres) of the rectified pairs")
     if camera.undistorter is not None:
         raise DatasetError(f"{root}: pairs need a stereo camera's --calibration, got {camera}")
-    return AlreadyRectified(camera.intrinsics, baseline, size), camera
+    return AlreadyRectified(camera.intrinsics, baseline * camera.intrinsics.fx, size), camera
 
 
 def baseline_of(root: Path) -> float | None:
@@ -158,6 +159,47 @@ def pair_of(left: NDArray[Any], right: NDArray[Any], pairs: PairRectifier) -> di
         "intrinsics": pairs.intrinsics,
         "baseline_fx": pairs.baseline_fx,
     }
+
+
+def paired(
+    left: dict[_Key, Path], right: dict[_Key, Path], skipped: dict[str, int]
+) -> dict[_Key, tuple[Path, Path]]:
+    """Images of both cameras by name or number; those of one camera alone are counted."""
+    alone = [(left | right)[key] for key in left.keys() ^ right.keys()]
+    if alone:
+        skipped[NO_HALF] = len(alone)
+        first, more = min(alone), f", with {len(alone) - 1} more" * (len(alone) > 1)
+        log.warning("%s is left out%s: the other camera has no image of this name", first, more)
+    return {key: (file, right[key]) for key, file in left.items() if key in right}
+
+
+class PairedImages(Frames):
+    """Frames of a left and a right image each, rectified where they are not."""
+
+    _files: Sequence[tuple[Path, ...]]  # left and right
+    _pairs: PairRectifier
+    _with_color: bool
+
+    def __len__(self) -> int:
+        return len(self._files)
+
+    def _frame(self, index: int) -> Frame:
+        files = self._files[index]
+        left, right = map(self._image, files)
+        try:
+            measured = pair_of(left, right, self._pairs)
+        except (InvalidConfig, cv2.error) as error:
+            raise DatasetError(f"{files[0]} or its right image: {error}") from error
+        measured["color"] = self._color(index, measured["color"]) if self._with_color else None
+        return self._posed_frame(index, **measured)
+
+    def _color(self, index: int, left: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """(H, W, 3) uint8 BGR of the left camera, whose rectified image is `left`; grey three times."""
+        return left
+
+    def _image(self, file: Path) -> NDArray[Any]:
+        """(H, W) or (H, W, 3) uint8, as stored."""
+        return read_image(file, "an image", cv2.IMREAD_ANYCOLOR)
 
 
 def _grey(image: NDArray[Any]) -> NDArray[np.uint8]:

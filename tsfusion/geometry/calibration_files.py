@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from tsfusion.core import read_limits
 from tsfusion.core.errors import DatasetError, InvalidConfig
-from tsfusion.geometry.calibration import Camera, Size, StereoRig
+from tsfusion.geometry.calibration import MODELS, Camera, Size, StereoRig
 from tsfusion.geometry.se3 import inverse, transform
 
 EXPECTED = (
@@ -281,6 +281,9 @@ def _distortion(tree: Tree) -> tuple[float, ...]:
     """The coefficients of a lens; none where the file has none."""
     named = next((tree[name] for name in _COEFFICIENTS if name in tree), None)
     if named is None:
+        model = str(tree.get("distortion_model", ""))
+        if MODELS.get(model.lower(), "pinhole") != "pinhole" and tree.keys().isdisjoint(_NAMED_COEFFICIENTS):
+            raise InvalidConfig(f"distortion_model is {model}, and its coefficients are missing (is it cut?)")
         given = [float(tree.get(name, 0)) for name in _NAMED_COEFFICIENTS]
         count = 8 if any(given[5:]) else 5
         return tuple(given[: 4 if _is_fisheye(tree) else count])

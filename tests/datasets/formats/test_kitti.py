@@ -14,6 +14,7 @@ from small_recordings import P0, P1, TR, UNREAD, LeftOut, kitti, one_line_of, pu
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets import KITTI, open_dataset, select
+from tsfusion.datasets.dataset import NO_HALF
 from tsfusion.datasets.given_trajectory import WithTrajectory
 from tsfusion.geometry.measured_points import depth_metres, points_world
 from tsfusion.geometry.stereo_matching import Matcher
@@ -138,8 +139,8 @@ def test_calibration_without_tr_serves_stereo_only(tmp_path):
 @pytest.mark.parametrize(
     ("modality", "name", "content", "match"),
     [
-        ("stereo", "image_1/000002.png", None, r"image_1/000002\.png is missing: 4 left and 3 right"),
-        ("stereo", "image_0/000000.png", None, r"image_0/000000\.png is missing: 3 left and 4 right"),
+        ("stereo", "image_1/000002.png", None, LeftOut(r"image_0/000002\.png is left out", {NO_HALF: 1})),
+        ("stereo", "image_0/000000.png", None, LeftOut(r"image_1/000000\.png is left out", {NO_HALF: 1})),
         (
             "stereo",
             "image_0/000002.png",

@@ -14,16 +14,16 @@ from tsfusion.datasets.dataset import (
     NO_HALF,
     NO_POSE_IN_TIME,
     SCAN,
-    Frames,
-    keep_posed,
+    NoPoses,
+    Poses,
+    poses_if_any,
     require_folder,
-    require_frames,
 )
 from tsfusion.datasets.readers import listed_file, read_image, read_lines
+from tsfusion.datasets.stereo_pairs import PairedImages
 from tsfusion.datasets.trajectory_files import read_euroc
 from tsfusion.geometry.calibration import Rectifier
 from tsfusion.geometry.calibration_files import read_rig, read_tree
-from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import check_pose
 from tsfusion.geometry.se3 import Transform
 from tsfusion.geometry.trajectory import Trajectory
@@ -37,7 +37,7 @@ def recognises(path: Path) -> bool:
     return any((root / "cam0" / "data.csv").is_file() for root in (path / "mav0", path))
 
 
-class EuRoC(Frames):
+class EuRoC(PairedImages):
     """Stereo pairs in the ASL layout, undistorted and rectified by `sensor.yaml`.
 
     https://projects.asl.ethz.ch/datasets/doku.php?id=kmavvisualinertialdatasets. Frames are grey pairs in the
@@ -73,38 +73,24 @@ class EuRoC(Frames):
         place = root / "mav0" if (root / "mav0").is_dir() else root
         self.name, self.sensor, self.skipped = f"EuRoC {place.absolute().parent.name}", sensor, {}
         pairs = _pairs(place, round(max_difference_s * 1e9), self.skipped)
-        require_frames(len(pairs), place, EXPECTED, self.skipped)
-        self._rectifier, T_body_camera = _calibrated(place)
-        trajectory = _trajectory(place, required=posed)
+        rectifier, T_body_camera = _calibrated(place)
         gap, offset = round(max_gap_s * 1e9), round(time_offset_s * 1e9)
-        poses = [_pose(trajectory, stamp + offset, gap, T_body_camera) for stamp, _, _ in pairs]
-        self._pairs, self._poses = keep_posed(
-            pairs, poses, posed=posed, skipped=self.skipped, reason=NO_POSE_IN_TIME
-        )
-        require_frames(len(self._pairs), place, EXPECTED, self.skipped)
-        self.timestamps_ns = np.array([stamp for stamp, _, _ in self._pairs], dtype=np.int64)
-        self.intrinsics, self.baseline_fx = self._rectifier.intrinsics, self._rectifier.baseline_fx
-        self.camera = RecordedCamera(self.intrinsics, self._rectifier.size, "from sensor.yaml, rectified")
+
+        def read() -> Poses:
+            trajectory = _trajectory(place)
+            return [_pose(trajectory, stamp + offset, gap, T_body_camera) for stamp, _, _ in pairs]
+
+        poses = poses_if_any(read, len(pairs), posed=posed)
+        kept = self._keep(pairs, poses, (place, EXPECTED), posed=posed, reason=NO_POSE_IN_TIME)
+        self._files = [pair[1:] for pair in kept]
+        self.timestamps_ns = np.array([stamp for stamp, _, _ in kept], dtype=np.int64)
+        self._pairs, self.intrinsics = rectifier, rectifier.intrinsics
+        self.camera = RecordedCamera(self.intrinsics, rectifier.size, "from sensor.yaml, rectified")
         self._accelerometer = _accelerometer(place, T_body_camera)
         self._with_color = color
 
-    def __len__(self) -> int:
-        return len(self._pairs)
-
-    def _frame(self, index: int) -> Frame:
-        _, left_file, right_file = self._pairs[index]
-        try:
-            left, right = self._rectifier.pair(_grey(left_file), _grey(right_file))
-        except InvalidConfig as error:
-            raise DatasetError(f"{left_file} or its right image: {error}") from error
-        return self._posed_frame(
-            index,
-            left=left,
-            right=right,
-            baseline_fx=self.baseline_fx,
-            intrinsics=self.intrinsics,
-            color=np.repeat(left[:, :, None], 3, axis=2) if self._with_color else None,
-        )
+    def _image(self, file: Path) -> NDArray[np.uint8]:
+        return _grey(file)
 
 
 def _pairs(place: Path, max_difference_ns: int, skipped: dict[str, int]) -> list[tuple[int, Path, Path]]:
@@ -163,19 +149,17 @@ def _accelerometer(place: Path, T_body_camera: Transform) -> Accelerometer | Non
     )  # fmt: skip
 
 
-def _trajectory(place: Path, *, required: bool) -> Trajectory | None:
+def _trajectory(place: Path) -> Trajectory:
     path = place / _TRUTH
-    if path.exists():
-        return read_euroc(path)
-    if required:
-        raise DatasetError(f"{path} is missing; expected `ns,px,py,pz,qw,qx,qy,qz,…` a line; {SCAN}")
-    return None
+    if not path.exists():
+        raise NoPoses(f"{path} is missing; expected `ns,px,py,pz,qw,qx,qy,qz,…` a line; {SCAN}")
+    return read_euroc(path)
 
 
 def _pose(
-    trajectory: Trajectory | None, stamp_ns: int, max_gap_ns: int, T_body_camera: Transform
+    trajectory: Trajectory, stamp_ns: int, max_gap_ns: int, T_body_camera: Transform
 ) -> Transform | None:
-    T_world_body = None if trajectory is None else trajectory.at(stamp_ns, max_gap_ns=max_gap_ns)
+    T_world_body = trajectory.at(stamp_ns, max_gap_ns=max_gap_ns)
     return None if T_world_body is None else T_world_body @ T_body_camera
 
 

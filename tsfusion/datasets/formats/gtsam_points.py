@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: MIT
 """Keyframes of a LiDAR map with their pose graph, as gtsam_points has them."""
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets.dataset import SCAN, Frames, keep_posed, require_folder, require_frames
+from tsfusion.datasets.dataset import SCAN, Frames, NoPoses, Poses, poses_if_any, require_folder
 from tsfusion.datasets.file_names import in_order
 from tsfusion.datasets.readers import numbers, read_lines
 from tsfusion.datasets.scan_files import read_scan
@@ -42,11 +43,8 @@ class LidarDump(Frames):
         root = require_folder(path, "LiDAR keyframes")
         self.name, self.sensor, self.skipped = f"LiDAR keyframes {root.name}", sensor, {}
         files = [file for file in in_order(root.glob("*/points.bin")) if file.parent.name.isdecimal()]
-        graph = _read_graph(root / "graph.txt", required=posed)
-        self._files, self._poses = keep_posed(
-            files, [graph.get(int(file.parent.name)) for file in files], posed=posed, skipped=self.skipped
-        )
-        require_frames(len(self._files), root, EXPECTED, self.skipped)
+        poses = poses_if_any(partial(_poses, root / "graph.txt", files), len(files), posed=posed)
+        self._files = self._keep(files, poses, (root, EXPECTED), posed=posed)
 
     def __len__(self) -> int:
         return len(self._files)
@@ -55,13 +53,11 @@ class LidarDump(Frames):
         return self._posed_frame(index, points=read_scan(self._files[index], fields=3).points)
 
 
-def _read_graph(path: Path, *, required: bool) -> dict[int, Transform]:
+def _poses(path: Path, files: list[Path]) -> Poses:
     if not path.exists():
-        if required:
-            raise DatasetError(f"{path} is missing; expected {EXPECTED}; {SCAN}")
-        return {}
+        raise NoPoses(f"{path} is missing; expected {EXPECTED}; {SCAN}")
     content = "`vK tx ty tz qx qy qz qw` a line"
-    poses = {}
+    poses: dict[int, Transform] = {}
     for number, line in read_lines(path, content):
         name, *words = line.split()
         if not name.startswith("v"):
@@ -71,4 +67,4 @@ def _read_graph(path: Path, *, required: bool) -> dict[int, Transform]:
         values = np.array(numbers(path, number, words, 7, content))
         check_quaternion(values[3:], path, number)
         poses[int(name[1:])] = rigid(values[3:] / np.linalg.norm(values[3:]), values[:3])
-    return poses
+    return [poses.get(int(file.parent.name)) for file in files]

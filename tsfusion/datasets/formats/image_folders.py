@@ -23,7 +23,6 @@ from tsfusion.datasets.dataset import (
     Frames,
     Poses,
     Times,
-    keep_posed,
     poses_if_any,
     require_folder,
     require_frames,
@@ -72,6 +71,7 @@ class DepthImages(Frames):
     sensor = "kinect"
     usual_unit = MILLIMETRES
     usual_gap_s = 0.2
+    guesses = False  # whether it finds a file of poses by its name alone
     not_measured: int | None = None  # a value that means so, beside 0
     camera: RecordedCamera
 
@@ -103,11 +103,9 @@ class DepthImages(Frames):
         files, times = self._files(root)
         require_frames(len(files), root, self.expected, self.skipped)
         read = self._recorded_poses if given is None else self._poses_of
-        found = poses_if_any(partial(read, given or root, files, times), len(files), posed=posed)
-        kept, self._poses = keep_posed(
-            range(len(files)), found, posed=posed, skipped=self.skipped, reason=self._why
-        )
-        require_frames(len(kept), root, self._wanted(), self.skipped)
+        own = partial(read, given or root, files, times)
+        found = poses_if_any(own, len(files), posed=posed, guessed=self.guesses and given is None)
+        kept = self._keep(range(len(files)), found, (root, self._wanted()), posed=posed, reason=self._why)
         self._depth, self._kept = [files[index] for index in kept], kept
         self._color = self._colors(root) if color else []
         self.uncolored = [*self._color].count(None)

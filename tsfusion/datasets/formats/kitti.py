@@ -6,8 +6,8 @@ so that one missing image shifts all later ones unnoticed. A file's name is its 
 pose and time are the lines of that number.
 """
 
-from collections.abc import Mapping
-from functools import cache
+from collections.abc import Mapping, Sequence
+from functools import cache, partial
 from importlib.machinery import PathFinder
 from importlib.util import find_spec, module_from_spec
 from pathlib import Path
@@ -19,19 +19,21 @@ from numpy.typing import NDArray
 from tsfusion.core.errors import DatasetError, MissingDependency
 from tsfusion.datasets.cameras import RecordedCamera
 from tsfusion.datasets.dataset import (
+    SCAN,
     STREET,
-    Frames,
+    NoPoses,
+    Poses,
     SeveralRecordings,
-    keep_posed,
+    poses_if_any,
     require_folder,
-    require_frames,
 )
 from tsfusion.datasets.file_names import in_order
+from tsfusion.datasets.formats.image_folders import first_size
 from tsfusion.datasets.readers import intrinsics_of, read_color, read_lines
+from tsfusion.datasets.stereo_pairs import AlreadyRectified, PairedImages, paired
 from tsfusion.datasets.trajectory_files import checked_pose, nanoseconds, read_kitti
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
-from tsfusion.geometry.se3 import Transform
 
 EXPECTED = "sequences/NN/{calib.txt,times.txt,image_0,image_1,velodyne} and poses/NN.txt"
 
@@ -61,43 +63,28 @@ def open_kitti(
     return KITTI(root, sequence, modality=modality, poses=poses, color=color, posed=posed)
 
 
-class KITTIFrames(Frames):
+class KITTIFrames(PairedImages):
     """Base of both KITTI layouts: stereo pairs or Velodyne scans by frame number."""
 
-    intrinsics: Intrinsics | None
-    baseline_fx: float | None
+    intrinsics: Intrinsics | None = None
+    baseline_fx: float | None = None
     usual = STREET
     _frames: list[int]
-    _poses: list[Transform | None]
-    _left: dict[int, Path]  # or the scans
-    _right: dict[int, Path]
-    _with_color: bool
-
-    def __len__(self) -> int:
-        return len(self._frames)
+    _files: list[tuple[Path, ...]]  # or the scan alone
 
     def _describe_camera(self, file: str) -> None:
-        if self.intrinsics is not None:
-            size = _read_grey(self._left[self._frames[0]]).shape
-            self.camera = RecordedCamera(self.intrinsics, (size[0], size[1]), f"from {file}")
+        if self.intrinsics is not None and self.baseline_fx is not None:
+            size = first_size([left for left, *_ in self._files], self._image)
+            self.camera = RecordedCamera(self.intrinsics, size, f"from {file}")
+            self._pairs = AlreadyRectified(self.intrinsics, self.baseline_fx, size)
 
     def _frame(self, index: int) -> Frame:
-        number = self._frames[index]
         if self.sensor == "lidar":
-            return self._posed_frame(index, points=read_scan(self._left[number]))
-        left, right = read_pair(self._left[number], self._right[number])
-        return self._posed_frame(
-            index,
-            left=left,
-            right=right,
-            baseline_fx=self.baseline_fx,
-            intrinsics=self.intrinsics,
-            color=self._color(number, left) if self._with_color else None,
-        )
+            return self._posed_frame(index, points=read_scan(self._files[index][0]))
+        return super()._frame(index)
 
-    def _color(self, number: int, left: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """(H, W, 3) uint8 BGR of the left camera: the grey image, three times."""
-        return np.repeat(left[:, :, None], 3, axis=2)
+    def _image(self, file: Path) -> NDArray[np.uint8]:
+        return _read_grey(file)
 
 
 class KITTI(KITTIFrames):
@@ -133,16 +120,16 @@ class KITTI(KITTIFrames):
         root = require_folder(root, "KITTI odometry")
         place = require_folder(root / "sequences" / sequence, "KITTI odometry (sequences/NN)")
         self.name, self.sensor, self.skipped = f"KITTI {sequence} {modality}", modality, {}
-        self._left, self._right = _stereo_files(place) if modality == "stereo" else (_scan_files(place), {})
+        files = frames_of(
+            place, ("image_0", "image_1") if modality == "stereo" else ("velodyne",), self.skipped
+        )
         calibration = read_calibration(
             place / "calib.txt", dict.fromkeys(("P0", "P1") if modality == "stereo" else ("Tr",), 12)
         )
-        trajectory = _trajectory(root, sequence, poses, posed=posed)
-        self._colored: dict[int, Path] = {}
-        self._frames, found = keep_posed(
-            list(self._left), [trajectory.get(n) for n in self._left], posed=posed, skipped=self.skipped
-        )
-        require_frames(len(self._frames), place, EXPECTED, self.skipped)
+        trajectory = partial(_trajectory, root, sequence, poses, [*files])
+        found = poses_if_any(trajectory, len(files), posed=posed)
+        self._frames = self._keep([*files], found, (place, EXPECTED), posed=posed)
+        self._files, self._colored = [files[number] for number in self._frames], {}
         self.timestamps_ns = _read_times(place / "times.txt", self._frames)
         self._with_color = color
         if modality == "stereo":
@@ -153,13 +140,11 @@ class KITTI(KITTIFrames):
         else:
             T_cam0_velo = checked_pose(calibration["Tr"].reshape(3, 4), f"{place / 'calib.txt'}: Tr")
             T_velo_cam0 = np.linalg.inv(T_cam0_velo)
-            found = [None if T is None else T_velo_cam0 @ T @ T_cam0_velo for T in found]
-        self._poses = found
+            self._poses = [None if T is None else T_velo_cam0 @ T @ T_cam0_velo for T in self._poses]
 
-    def _color(self, number: int, left: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        if number not in self._colored:
-            return super()._color(number, left)
-        return read_color(self._colored[number], left.shape)
+    def _color(self, index: int, left: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        colored = self._colored.get(self._frames[index])
+        return left if colored is None else read_color(colored, left.shape[:2])
 
 
 def _is_sequence(path: Path) -> bool:
@@ -186,36 +171,23 @@ def files_by_frame(place: Path, suffix: str) -> dict[int, Path]:
     return {int(path.stem): path for path in files}
 
 
-def _stereo_files(place: Path) -> tuple[dict[int, Path], dict[int, Path]]:
-    left, right = files_by_frame(place / "image_0", ".png"), files_by_frame(place / "image_1", ".png")
-    if not left or not right:
-        raise DatasetError(f"{place} has {len(left)} left and {len(right)} right images; expected {EXPECTED}")
-    alone = sorted(left.keys() ^ right.keys())
-    if alone:
-        side = "image_1" if alone[0] in left else "image_0"
-        raise DatasetError(
-            f"{place / side / f'{alone[0]:06d}.png'} is missing: "
-            f"{len(left)} left and {len(right)} right images, {len(alone)} without their other half; "
-            "expected pairs of equal name"
-        )
-    return left, right
+def frames_of(place: Path, folders: Sequence[str], skipped: dict[str, int]) -> dict[int, tuple[Path, ...]]:
+    """Frame number → left and right image, or the scan alone; images without their other half are counted."""
+    if len(folders) == 1:
+        return {number: (file,) for number, file in files_by_frame(place / folders[0], ".bin").items()}
+    left, right = (files_by_frame(place / folder, ".png") for folder in folders)
+    return {**paired(left, right, skipped)}
 
 
-def _scan_files(place: Path) -> dict[int, Path]:
-    scans = files_by_frame(place / "velodyne", ".bin")
-    if not scans:
-        raise DatasetError(f"{place / 'velodyne'} has no scans (*.bin); expected {EXPECTED}")
-    return scans
-
-
-def _trajectory(root: Path, sequence: str, poses: str | Path | None, *, posed: bool) -> dict[int, Transform]:
-    """Frame number → pose; without `posed` the benchmark's own file may be missing, as it is from 11 on."""
+def _trajectory(root: Path, sequence: str, poses: str | Path | None, frames: list[int]) -> Poses:
+    """The pose of each frame; the benchmark has none from sequence 11 on."""
     path = root / "poses" / f"{sequence}.txt"
     if poses is not None:
         path = Path(poses) if Path(poses).is_file() else root / poses
-    elif not posed and not path.exists():
-        return {}
-    return {frame: T for frame, T in enumerate(read_kitti(path)) if T is not None}
+    elif not path.exists():
+        raise NoPoses(f"{path} is missing; expected 12 numbers a line; {SCAN}")
+    found = read_kitti(path)
+    return [found[number] if number < len(found) else None for number in frames]
 
 
 @cache
@@ -271,16 +243,6 @@ def _read_times(path: Path, frames: list[int]) -> NDArray[np.int64] | None:
             f"{path} has {len(stamps)} lines, but there is a frame {frames[-1]}; expected a line a frame"
         )
     return np.array([stamps[number] for number in frames], dtype=np.int64)
-
-
-def read_pair(left_file: Path, right_file: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Two (H, W) grey images of one size."""
-    left, right = _read_grey(left_file), _read_grey(right_file)
-    if left.shape != right.shape:
-        raise DatasetError(
-            f"{right_file} has shape {right.shape}, its left image {left.shape}; expected equal sizes"
-        )
-    return left, right
 
 
 def _read_grey(path: Path) -> NDArray[np.uint8]:

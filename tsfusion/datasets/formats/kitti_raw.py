@@ -5,6 +5,7 @@ Calibration and GPS packets are read by pykitti's functions; files are chosen he
 their names: `pykitti.raw` goes by their place in a sorted list, and several drives lack some scans.
 """
 
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,10 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets.dataset import SeveralRecordings, keep_posed, require_folder, require_frames
-from tsfusion.datasets.formats.kitti import KITTIFrames, files_by_frame, pykitti_utils, read_calibration
+from tsfusion.datasets.dataset import NoPoses, Poses, SeveralRecordings, poses_if_any, require_folder
+from tsfusion.datasets.formats.kitti import (
+    KITTIFrames,
+    files_by_frame,
+    frames_of,
+    pykitti_utils,
+    read_calibration,
+)
 from tsfusion.datasets.readers import intrinsics_of, read_color, read_numbers
-from tsfusion.datasets.trajectory_files import checked_pose
+from tsfusion.datasets.trajectory_files import checked_pose, usable
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.se3 import Transform, inverse, transform
 
@@ -65,25 +72,22 @@ class KITTIRaw(KITTIFrames):
         if modality is None:
             modality = "stereo" if (drive / f"image_{chosen[0]}").is_dir() else "lidar"
         self.name, self.sensor, self.skipped = f"KITTI raw {drive.name} {modality}", modality, {}
-        left, self._right = _files(drive, modality, chosen, self.skipped)
-        require_frames(len(left), drive, EXPECTED, self.skipped)
-        body = _imu_poses(drive / "oxts" / "data", required=posed)
+        sensors = [f"image_{camera}" for camera in chosen] if modality == "stereo" else ["velodyne_points"]
+        files = frames_of(drive, [f"{sensor}/data" for sensor in sensors], self.skipped)
+        body = poses_if_any(partial(_imu_poses, drive / "oxts" / "data", [*files]), len(files), posed=posed)
         calibration = _sensor_calibration(
-            drive.parent, None if modality == "lidar" else chosen, imu=bool(body)
+            drive.parent, None if modality == "lidar" else chosen, imu=any(T is not None for T in body)
         )
-        poses = [body[n] @ calibration.T_imu_sensor if n in body else None for n in left]
-        self._frames, self._poses = keep_posed(list(left), poses, posed=posed, skipped=self.skipped)
-        require_frames(len(self._frames), drive, EXPECTED, self.skipped)
-        self._left, self._colored, self._with_color = left, chosen[0] == "02", color
+        poses = [None if T is None else T @ calibration.T_imu_sensor for T in body]
+        self._frames = self._keep([*files], poses, (drive, EXPECTED), posed=posed)
+        self._files = [files[number] for number in self._frames]
+        self._colored, self._with_color = chosen[0] == "02", color
         self.intrinsics, self.baseline_fx = calibration.intrinsics, calibration.baseline_fx
         self._describe_camera("calib_cam_to_cam.txt")
-        times = (
-            drive / (f"image_{chosen[0]}" if modality == "stereo" else "velodyne_points") / "timestamps.txt"
-        )
-        self.timestamps_ns = _read_times(times, self._frames)
+        self.timestamps_ns = _read_times(drive / sensors[0] / "timestamps.txt", self._frames)
 
-    def _color(self, number: int, left: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        return read_color(self._left[number], left.shape) if self._colored else super()._color(number, left)
+    def _color(self, index: int, left: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        return read_color(self._files[index][0], left.shape[:2]) if self._colored else left
 
 
 class _SensorCalibration(NamedTuple):
@@ -145,34 +149,24 @@ def _cameras(drive: Path, cameras: str | None) -> tuple[str, str]:
     return _CAMERAS[cameras]
 
 
-def _files(
-    drive: Path, modality: str, cameras: tuple[str, str], skipped: dict[str, int]
-) -> tuple[dict[int, Path], dict[int, Path]]:
-    """Frame number → left image or scan, and → right image; pairs alone are left out and counted."""
-    if modality == "lidar":
-        return files_by_frame(drive / "velodyne_points" / "data", ".bin"), {}
-    left, right = (files_by_frame(drive / f"image_{camera}" / "data", ".png") for camera in cameras)
-    alone = left.keys() ^ right.keys()
-    if alone:
-        skipped["without their other half"] = len(alone)
-    both = left.keys() & right.keys()
-    return {n: file for n, file in left.items() if n in both}, right
-
-
-def _imu_poses(place: Path, *, required: bool) -> dict[int, Transform]:
-    """Frame number → T_world_imu, by pykitti's Mercator projection; the first packet is the origin."""
+def _imu_poses(place: Path, frames: list[int]) -> Poses:
+    """T_world_imu of frames, by pykitti's Mercator projection; the first packet is the origin."""
     files = files_by_frame(place, ".txt")
-    if required and not files:
-        raise DatasetError(f"{place} has no packets (*.txt); expected {EXPECTED}")
-    poses: dict[int, Transform] = {}
-    scale, origin, pykitti = None, None, pykitti_utils()
-    for number, file in files.items():
+    if not files:
+        raise NoPoses(f"{place} has no packets (*.txt); expected {EXPECTED}")
+    pykitti = pykitti_utils()
+    scale, origin = None, None
+
+    def read(file: Path) -> Transform:
+        nonlocal scale, origin
         packet = pykitti.OxtsPacket(*read_numbers(file, "30 numbers of a GPS/IMU packet", columns=_PACKET)[0])
         scale = np.cos(np.radians(packet.lat)) if scale is None else scale
         R, t = pykitti.pose_from_oxts_packet(packet, scale)
         origin = t if origin is None else origin
-        poses[number] = transform(R, t - origin)
-    return poses
+        return checked_pose(transform(R, t - origin), file)
+
+    poses = dict(zip(files, usable(place, files.values(), read), strict=True))
+    return [poses.get(number) for number in frames]
 
 
 def _rigid(path: Path) -> Transform:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError, InvalidConfig, InvalidKeyframe
 from tsfusion.datasets.cameras import MILLIMETRES, DepthUnit, RecordedCamera, given_camera
-from tsfusion.datasets.dataset import WITHOUT_DEPTH, Frames, first_frame, keep_posed, require_frames
+from tsfusion.datasets.dataset import WITHOUT_DEPTH, Frames, first_frame
 from tsfusion.datasets.depth_files import check_metres, read_depth
 from tsfusion.datasets.formats.image_folders import first_size, resample_for_camera
 from tsfusion.datasets.readers import listed_file, read_color, turned_by_exif
@@ -109,8 +109,7 @@ class Nerfstudio(Frames):
         if len(listed) < len(capture["frames"]):
             self.skipped[WITHOUT_DEPTH] = len(capture["frames"]) - len(listed)
         poses = usable(file, posed_by, lambda one: _pose(one[0], applied, one[1]))
-        self._listed, self._poses = keep_posed(listed, poses, posed=posed, skipped=self.skipped)
-        require_frames(len(self._listed), file, EXPECTED, self.skipped)
+        self._listed = self._keep(listed, poses, (file, EXPECTED), posed=posed)
         self._undistorters: dict[Camera, Undistorter] = {}
         self._given: Camera | None = None  # instead of the file's
         self.camera = self._camera_of_first(file, intrinsics, calibration)

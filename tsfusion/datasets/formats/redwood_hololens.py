@@ -3,7 +3,6 @@
 
 import re
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,6 @@ from tsfusion.datasets.formats.image_folders import (
     poses_by_number,
 )
 from tsfusion.datasets.formats.image_folders import SUFFIXES as COLOR_SUFFIXES
-from tsfusion.datasets.given_trajectory import found_poses
 from tsfusion.datasets.trajectory_files import is_log, read_log, read_matrix_rows
 from tsfusion.geometry.keyframe import Intrinsics
 
@@ -116,7 +114,7 @@ class Redwood(DepthImages):
     Other options are those of `DepthImages`.
     """
 
-    layout, expected = "Redwood", REDWOOD_EXPECTED
+    layout, expected, guesses = "Redwood", REDWOOD_EXPECTED, True
 
     def _opened(self, path: str | Path, trajectory: str | Path | None) -> tuple[Path, Path | None]:
         path = Path(path).expanduser()
@@ -136,7 +134,7 @@ class Redwood(DepthImages):
             given = root / "groundtruth.txt"  # TUM's
             hint = f"{SCAN}, or --trajectory {given} names them" if given.is_file() else SCAN
             raise NoPoses(f"{root} has no trajectory; expected {REDWOOD_EXPECTED}; {hint}")
-        return found_poses(partial(self._poses_of, path, files, times), path, posed=self._posed)
+        return self._poses_of(path, files, times)
 
     def _poses_of(self, path: Path, files: list[Path], times: Times) -> Poses:
         """Poses of a `.log` by number; of another trajectory by time, or one for each image."""

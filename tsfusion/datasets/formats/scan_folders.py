@@ -14,16 +14,16 @@ from tsfusion.datasets.dataset import (
     NO_POSE_IN_TIME,
     SCAN,
     Frames,
-    keep_posed,
+    NoPoses,
+    Poses,
+    poses_if_any,
     require_folder,
-    require_frames,
 )
 from tsfusion.datasets.file_names import in_time, series_of
 from tsfusion.datasets.given_trajectory import poses_between, poses_of
 from tsfusion.datasets.scan_files import SUFFIXES, USUAL_FIELDS, read_scan
 from tsfusion.datasets.trajectory_files import read_poses
 from tsfusion.geometry.frame import Frame
-from tsfusion.geometry.se3 import Transform
 
 EXPECTED = (
     "scans numbered or named by their times (.bin, .pcd, .ply, .las or .laz) in the folder, velodyne/, "
@@ -84,35 +84,21 @@ class ScanFolder(Frames):
         files, stamps = in_time(series.files, [file.stem for file in series.files])
         if series.others:
             self.skipped["of another name"] = series.others
-        poses: list[Transform | None] = [None] * len(files)
-        where = _poses(root) if trajectory is None else Path(trajectory).expanduser()
-        if trajectory is None and where is not None and (root / "calib.txt").is_file():
-            raise DatasetError(
-                f"{root} has KITTI's calib.txt, so {where.name} may be the camera's poses; open the "
-                "benchmark's folder, which holds sequences/, or name the LiDAR's poses with --trajectory"
-            )
-        if where is None and posed:
-            raise DatasetError(f"{root} has no poses; expected {EXPECTED}; {SCAN}")
-        if where is not None:
-            try:
-                poses = poses_of(
-                    where, len(files), stamps, posed=posed, max_gap_s=max_gap_s, time_offset_s=time_offset_s
-                )
-            except DatasetError as error:
-                if posed or trajectory is not None:
-                    raise
-                log.warning("%s is not taken for the poses of these scans: %s", where.name, error)
-            else:
-                times = read_poses(where)[0] if stamps is None else None
-                if times is not None and (np.diff(times) > 0).all():  # one pose a scan, in order
-                    stamps, time_offset_s = times, 0.0
-                self._between = partial(
-                    poses_between, where, stamps, max_gap_s=max_gap_s, time_offset_s=time_offset_s
-                )
-        kept, self._poses = keep_posed(
-            range(len(files)), poses, posed=posed, skipped=self.skipped, reason=NO_POSE_IN_TIME
-        )
-        require_frames(len(kept), root, EXPECTED, self.skipped)
+        where = {"max_gap_s": max_gap_s, "time_offset_s": time_offset_s}
+        given = None if trajectory is None else Path(trajectory).expanduser()
+
+        def read() -> Poses:
+            nonlocal stamps
+            file = given or _poses(root)
+            found = poses_of(file, len(files), stamps, posed=posed, **where)
+            times = read_poses(file)[0] if stamps is None else None
+            if times is not None and (np.diff(times) > 0).all():  # one pose a scan, in order
+                stamps, where["time_offset_s"] = times, 0.0
+            self._between = partial(poses_between, file, stamps, **where)
+            return found
+
+        poses = poses_if_any(read, len(files), posed=posed, guessed=given is None)
+        kept = self._keep(range(len(files)), poses, (root, EXPECTED), posed=posed, reason=NO_POSE_IN_TIME)
         self._files = [files[index] for index in kept]
         self.timestamps_ns = None if stamps is None else stamps[kept]
 
@@ -180,7 +166,15 @@ def _is_mesh(file: Path) -> bool:
     return re.search(rb"^element\s+face\s+0*[1-9]", head, re.MULTILINE) is not None
 
 
-def _poses(root: Path) -> Path | None:
-    """The file of poses in a folder, by preference."""
+def _poses(root: Path) -> Path:
+    """The file of poses in a folder, by preference; raises NoPoses where there is none."""
     named = (path for pattern in _POSES for path in sorted(root.glob(pattern)) if path.is_file())
-    return next((path for path in named if not path.name.startswith(".")), None)
+    found = next((path for path in named if not path.name.startswith(".")), None)
+    if found is None:
+        raise NoPoses(f"{root} has no poses; expected {EXPECTED}; {SCAN}")
+    if (root / "calib.txt").is_file():
+        raise DatasetError(
+            f"{root} has KITTI's calib.txt, so {found.name} may be the camera's poses; open the "
+            "benchmark's folder, which holds sequences/, or name the LiDAR's poses with --trajectory"
+        )
+    return found

@@ -2,18 +2,12 @@
 """Folders of a stereo camera's images: left/ and right/ with equal names."""
 
 from pathlib import Path
-from typing import Any
 
-import cv2
-from numpy.typing import NDArray
-
-from tsfusion.core.errors import DatasetError, InvalidConfig
-from tsfusion.datasets.dataset import NO_HALF, SCAN, Frames, require_folder, require_frames
+from tsfusion.core.errors import DatasetError
+from tsfusion.datasets.dataset import SCAN, require_folder
 from tsfusion.datasets.file_names import in_time
 from tsfusion.datasets.formats.image_folders import first_size, images
-from tsfusion.datasets.readers import read_image
-from tsfusion.datasets.stereo_pairs import find_pairs, pair_of
-from tsfusion.geometry.frame import Frame
+from tsfusion.datasets.stereo_pairs import PairedImages, find_pairs, paired
 from tsfusion.geometry.keyframe import Intrinsics
 
 EXPECTED = (
@@ -30,7 +24,7 @@ def recognises(path: Path) -> bool:
     return all((path / side).is_dir() and bool(images(path / side, EXPECTED)) for side in _SIDES)
 
 
-class StereoFolder(Frames):
+class StereoFolder(PairedImages):
     """Pairs of images by name, rectified where they are not, in the axes of the rectified left camera.
 
     Names that are decimal seconds or nanoseconds are times. Images without their other half are left out and
@@ -61,31 +55,11 @@ class StereoFolder(Frames):
         if posed:
             raise DatasetError(f"{root} has no poses; expected --trajectory FILE; {SCAN}")
         left, right = ({file.stem: file for file in images(root / side, EXPECTED)} for side in _SIDES)
-        names = [name for name in left if name in right]
-        if alone := len(left) + len(right) - 2 * len(names):
-            self.skipped[NO_HALF] = alone
-        require_frames(len(names), root, EXPECTED, self.skipped)
-        files, self.timestamps_ns = in_time([left[name] for name in names], names)
-        self._poses = [None] * len(files)
-        self._files = [(file, right[file.stem]) for file in files]
+        pairs = paired(left, right, self.skipped)
+        files, self.timestamps_ns = in_time([left[name] for name in pairs], [*pairs])
+        nowhere = [None] * len(files)
+        self._files = self._keep([pairs[file.stem] for file in files], nowhere, (root, EXPECTED), posed=False)
+        size, self._with_color = first_size(files, self._image), color
         self._pairs, self.camera = find_pairs(
-            root, first_size(files, _image), intrinsics=intrinsics, calibration=calibration, baseline=baseline
+            root, size, intrinsics=intrinsics, calibration=calibration, baseline=baseline
         )
-        self._with_color = color
-
-    def __len__(self) -> int:
-        return len(self._files)
-
-    def _frame(self, index: int) -> Frame:
-        left, right = map(_image, self._files[index])
-        try:
-            measured = pair_of(left, right, self._pairs)
-        except (InvalidConfig, cv2.error) as error:
-            raise DatasetError(f"{self._files[index][0]} or its right image: {error}") from error
-        if not self._with_color:
-            measured["color"] = None
-        return self._posed_frame(index, **measured)
-
-
-def _image(file: Path) -> NDArray[Any]:
-    return read_image(file, "an image", cv2.IMREAD_ANYCOLOR)

@@ -15,14 +15,7 @@ import numpy as np
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.cameras import DepthUnit, RecordedCamera
-from tsfusion.datasets.dataset import (
-    CLOCK,
-    Frames,
-    clock_parts,
-    keep_posed,
-    nearest_in_time,
-    require_frames,
-)
+from tsfusion.datasets.dataset import CLOCK, NO_POSE_IN_TIME, Frames, clock_parts, nearest_in_time
 from tsfusion.datasets.depth_files import check_metres
 from tsfusion.datasets.rosbag import messages
 from tsfusion.datasets.rosbag.cameras import CameraWatch
@@ -163,7 +156,6 @@ class Bag(Frames):
         self._pair(mains, others, round(difference_s * 1e9))
         self._pose(poses.finish(required=posed, part=cut), round(time_offset_s * 1e9), posed)
         self._registration = self._register(poses)
-        require_frames(len(self._mains), path, EXPECTED, self.skipped)
         self._accelerometer = imu.accelerometer(partial(self._from_frame, poses))
 
     def __len__(self) -> int:
@@ -270,13 +262,8 @@ class Bag(Frames):
         if rig is not None and rig.rectifier is not None:
             turned = rig.rectifier.T_left_rectified
             self._poses = [None if pose is None else pose @ turned for pose in self._poses]
-        chosen, self._poses = keep_posed(
-            range(len(self._poses)),
-            self._poses,
-            posed=posed,
-            skipped=self.skipped,
-            reason="without a pose in time",
-        )
+        where = self._recording.path, EXPECTED
+        chosen = self._keep(range(len(self._poses)), self._poses, where, posed=posed, reason=NO_POSE_IN_TIME)
         self._between = lambda: lambda stamp: at(stamp + offset_ns)
         self.timestamps_ns = self.timestamps_ns[chosen]
         self._mains = [self._mains[i] for i in chosen]

@@ -78,7 +78,9 @@ class StereoVideo(LiveSource):
             if calibration is None:
                 assert intrinsics is not None
                 assert baseline is not None
-                self._pairs: PairRectifier = AlreadyRectified(intrinsics, baseline, size or shown)
+                self._pairs: PairRectifier = AlreadyRectified(
+                    intrinsics, baseline * intrinsics.fx, size or shown
+                )
             else:
                 self._pairs = pairs or _rectifier(calibration, size or shown)
         except BaseException:
