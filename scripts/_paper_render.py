@@ -18,13 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core import durable_files, process
-from tsfusion.datasets import Dataset, StreetDrive, open_dataset
+from tsfusion.datasets import Dataset
 from tsfusion.datasets.dataset import frame_of, pose_of
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics, Keyframe
 
 sys.path.append(str(Path(__file__).parents[1]))  # lab is not installed
 from lab.worlds import rendered_recordings
+from lab.worlds.named_worlds import open_world
+from lab.worlds.street_drive import StreetDrive
 
 _ARRAYS = ("depth", "disparity", "left", "right", "points", "color", "T_world_camera")
 _NUMBERS = ("depth_scale", "disparity_scale", "baseline_fx")
@@ -126,7 +128,7 @@ def main() -> int:
 
     dataset, folder = world.open(), Path(sys.argv[2])
     if world.source.partition(":")[2].startswith("kitti"):
-        drive = open_dataset(world.source, **world.options, count=world.limit)
+        drive = open_world(world.source, **world.options, count=world.limit)
         assert isinstance(drive, StreetDrive)
         rendered_recordings.record(drive, folder, progress=tell)
     else:

@@ -23,9 +23,10 @@ from numpy.typing import NDArray
 
 from lab.evaluation import surface_error
 from lab.evaluation.known_surfaces import COMPLETE_WITHIN, KnownSurface, WorldSurface, measure
+from lab.worlds.named_worlds import open_world
 from tsfusion.core import process
 from tsfusion.core.config import SENSORS, VolumeConfig, make_settings
-from tsfusion.datasets import Synthetic, open_dataset
+from tsfusion.datasets import Synthetic
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.geometry.measured_points import points_world
 from tsfusion.geometry.mesh import Mesh
@@ -182,7 +183,7 @@ def _row(world: PaperWorld, method: str, settings: dict[str, Any], found: dict[s
 def known_surface(world: PaperWorld, indices: list[int]) -> KnownSurface:
     """The surface of a rendered world, and the part of it that some frames saw without noise."""
     options = {**world.options, "noise": False} if _takes_noise(world) else world.options
-    clean: Any = open_dataset(world.source, **options)
+    clean: Any = open_world(world.source, **options)
     reach = SENSORS[world.sensor].max_range
     shown = []
     for index in indices:
@@ -194,7 +195,7 @@ def known_surface(world: PaperWorld, indices: list[int]) -> KnownSurface:
 
 
 def _takes_noise(world: PaperWorld) -> bool:
-    return isinstance(open_dataset(world.source, **world.options), Synthetic)
+    return isinstance(open_world(world.source, **world.options), Synthetic)
 
 
 def _clean_points(clean: Any, index: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

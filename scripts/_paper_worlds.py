@@ -12,8 +12,9 @@ from msgspec import Struct
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
+from lab.worlds.named_worlds import open_world
 from tsfusion.core.config import LocalizerName, ScanConfig, SensorName
-from tsfusion.datasets import Dataset, open_dataset, registry, select
+from tsfusion.datasets import Dataset, open_dataset, select
 from tsfusion.datasets.dataset import NOMINAL_NS, pose_of
 from tsfusion.geometry.frame import Frame
 from tsfusion.scanner.keyframe_selection import OUTDOORS, KeyframeSelector
@@ -30,7 +31,7 @@ class PaperWorld(Struct, frozen=True, kw_only=True):
     Attributes:
         name: short, for files.
         title: for a person; says what it really is.
-        source, options: what `open_dataset` takes.
+        source, options: what `open_world` takes.
         limit: number of frames; None = all.
         keyframes: as many are chosen, if the path allows; None = by the usual distance.
         died_at: the keyframe at which the paper's baseline ended; None = not said.
@@ -70,7 +71,7 @@ class PaperWorld(Struct, frozen=True, kw_only=True):
         options = dict(self.options)
         if not self.is_rendered:
             options["posed"] = False
-        return select(open_dataset(self.source, **options), limit=self.limit)
+        return select(open_world(self.source, **options), limit=self.limit)
 
 
 def worlds(
@@ -106,7 +107,7 @@ def _sequence(kitti: Path | None, number: str, keyframes: int, died_at: int, rms
         return PaperWorld(
             title=f"KITTI {number}, recorded", source=str(kitti), options={"sequence": number}, **common
         )
-    if _has_world(f"kitti{number}") and (root / "poses" / f"{number}.txt").is_file():
+    if (root / "poses" / f"{number}.txt").is_file():
         return PaperWorld(
             title=f"path of KITTI {number} through a rendered street", source=f"synthetic:kitti{number}",
             options={"kitti": str(root.absolute())}, **common,
@@ -150,15 +151,9 @@ def _desk(corbs: Path | None, limit: int | None) -> PaperWorld:
             limit=limit,
             **common,
         )
-    if _has_world("desk"):
-        return PaperWorld(
-            title="rendered desk, a Kinect v2's errors", source="synthetic:desk", sensor="tof",
-            voxel_size=0.01, options={"count": limit or 300}, limit=limit or 300, **common,
-        )  # fmt: skip
     return PaperWorld(
-        title="rendered room, Kinect noise, hand-held (no desk here)", source="synthetic:room",
-        options={"count": limit or 200, "path": "handheld"}, sensor="kinect", voxel_size=0.02,
-        limit=limit or 200, **common,
+        title="rendered desk, a Kinect v2's errors", source="synthetic:desk", sensor="tof", voxel_size=0.01,
+        options={"count": limit or 300}, limit=limit or 300, **common,
     )  # fmt: skip
 
 
@@ -171,11 +166,6 @@ def sweep_worlds(found: list[PaperWorld]) -> list[PaperWorld]:
         options={"count": 40}, sensor="lidar", localizer="lidar", voxel_size=0.1,
     )  # fmt: skip
     return [stereo, depth or _desk(None, None), lidar]
-
-
-def _has_world(name: str) -> bool:
-    """Whether this version renders a world of that name."""
-    return name in registry.SYNTHETIC[1]
 
 
 def planned_keyframes(

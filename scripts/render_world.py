@@ -17,11 +17,10 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from lab.worlds.desk_world import STEPS, Desk
 from lab.worlds.rendered_recordings import record
+from lab.worlds.street_drive import DRIVES, StreetDrive
 from tsfusion.core.errors import TsfusionError
-from tsfusion.datasets import Synthetic
-from tsfusion.datasets.synthetic.desk_world import STEPS
-from tsfusion.datasets.synthetic.street_drive import DRIVES, StreetDrive
 
 
 def main() -> int:
@@ -47,10 +46,10 @@ def main() -> int:
     return 0
 
 
-def _opened(options: argparse.Namespace) -> StreetDrive | Synthetic:
+def _opened(options: argparse.Namespace) -> StreetDrive | Desk:
     if options.world in DRIVES:
         return StreetDrive(options.world, kitti=options.kitti, count=options.count, seed=options.seed)
-    return Synthetic(options.world, count=options.count or STEPS, seed=options.seed)
+    return Desk(count=options.count or STEPS, seed=options.seed)
 
 
 class _Progress:

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lab.evaluation import surface_error
+from lab.worlds.street_drive import StreetDrive, StreetWorld
 from tsfusion.core.errors import MissingDependency
-from tsfusion.datasets.synthetic.street_drive import StreetDrive
 from tsfusion.datasets.synthetic.worlds import BOX, CYLINDER, GROUND, ROOM, Solids, World
 from tsfusion.evaluation.surface_fit import nearest
 from tsfusion.geometry import se3
@@ -59,8 +59,9 @@ class WorldSurface:
 
     def distance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """The world's distance, but of each column of points only to the solids that can be nearest."""
-        world = replace(self._world, upright=None)
-        points = self._world.turned(points)
+        world = self._world
+        if isinstance(world, StreetWorld):
+            world, points = replace(world, upright=None), world.turned(points)
         result = np.empty(len(points))
         column = np.floor(points[:, :2] / _COLUMN).astype(np.int64) @ (1 << 20, 1)
         order = np.argsort(column, kind="stable")

@@ -16,11 +16,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from lab.worlds.street_drive import StreetDrive
 from tsfusion.core.durable_files import make_folder, replacing, sync_folder
 from tsfusion.core.errors import DatasetError
 from tsfusion.core.folder_lock import hold
 from tsfusion.datasets.synthetic.dataset import DEPTH_SCALE, Synthetic
-from tsfusion.datasets.synthetic.street_drive import StreetDrive
 from tsfusion.datasets.trajectory_files import write_tum
 
 ABOUT = "world.json"

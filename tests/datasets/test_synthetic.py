@@ -13,6 +13,7 @@ from geometry_checks import move, warp_residual
 from rgbd_scenes import track
 from scipy.spatial import cKDTree
 
+from lab.worlds.desk_world import desk
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets import Synthetic
 from tsfusion.datasets.synthetic import worlds
@@ -283,7 +284,7 @@ def test_rays_meet_what_the_twin_meets_first(world):
 
 
 @pytest.mark.parametrize(
-    ("world", "sensor"), [("rooms", "kinect"), ("corridor", "kinect"), ("street", "lidar"), ("desk", "tof")]
+    ("world", "sensor"), [("rooms", "kinect"), ("corridor", "kinect"), ("street", "lidar"), (desk(), "tof")]
 )
 def test_a_ray_that_is_asked_about_few_solids_sees_the_same(world, sensor, monkeypatch):
     dataset = Synthetic(world, sensor, count=9, width=160)
@@ -296,18 +297,3 @@ def test_a_ray_that_is_asked_about_few_solids_sees_the_same(world, sensor, monke
     few = [digest(dataset[index]) for index in range(0, 9, 2)]
     monkeypatch.setattr(RayTiles, "lists", whole)
     assert [digest(dataset[index]) for index in range(0, 9, 2)] == few
-
-
-def test_a_kinect_v2_at_the_desk_has_its_noise_and_loses_outlines():
-    dataset, clean = (Synthetic("desk", count=600, noise=noise, width=320) for noise in (True, False))
-    assert (dataset.sensor, dataset.camera.size, dataset[0].sensor) == ("tof", (240, 320), "tof")
-    poses = np.array([dataset.pose(index) for index in range(0, 600, 5)])
-    assert dataset.distance(poses[:, :3, 3]).min() > 0.15
-    noisy, true = (each[300].depth.astype(float) * DEPTH_SCALE for each in (dataset, clean))
-    lost = (true > 0) & (noisy == 0)
-    assert 0.002 < lost.mean() < 0.05
-    error = (noisy - true)[(noisy > 0) & (true > 0)]
-    assert 0.001 < np.median(np.abs(error)) / 0.6745 < 0.006
-    assert 0.002 < (np.abs(error) > 0.03).mean() < 0.05  # between front and back
-    assert np.abs(clean.distance(points_world(clean[300])[::50])).max() < 1e-4
-    assert Synthetic("desk").camera.size == (480, 640)

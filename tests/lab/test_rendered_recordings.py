@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from small_recordings import round_a_block
 
+from lab.worlds.desk_world import Desk
 from lab.worlds.rendered_recordings import record
+from lab.worlds.street_drive import StreetDrive
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets import KITTI, StreetDrive, Synthetic, open_dataset
+from tsfusion.datasets import KITTI, open_dataset
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +67,7 @@ def test_pykitti_reads_a_recording(path, tmp_path):
 
 
 def test_a_desk_is_recorded_as_corbs_is(tmp_path):
-    desk = Synthetic("desk", count=4, width=64)
+    desk = Desk(count=4, width=64)
     record(desk, tmp_path / "desk")
     dataset = open_dataset(tmp_path / "desk")
     assert (len(dataset), dataset.sensor, dataset.camera.intrinsics) == (4, "tof", desk.camera.intrinsics)
@@ -74,4 +76,4 @@ def test_a_desk_is_recorded_as_corbs_is(tmp_path):
     np.testing.assert_allclose(theirs.depth / 5000, ours.depth * 1e-4, atol=1.01e-4)
     np.testing.assert_allclose(dataset.pose(3), desk.pose(3), atol=1e-8)
     with pytest.raises(DatasetError, match="can be recorded as tof or as a drive, not as lidar"):
-        record(Synthetic("desk", "lidar", count=1), tmp_path / "scans")
+        record(Desk("desk", "lidar", count=1), tmp_path / "scans")

@@ -4,10 +4,10 @@
 import numpy as np
 import pytest
 
+from lab.worlds.street_drive import DRIVES
 from tsfusion import Intrinsics, open_dataset
 from tsfusion.core.config import ScanConfig
 from tsfusion.datasets.dataset import frame_of
-from tsfusion.datasets.synthetic.street_drive import DRIVES
 from tsfusion.datasets.trajectory_files import read_kitti
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame

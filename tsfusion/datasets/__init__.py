@@ -21,10 +21,9 @@ from tsfusion.datasets.formats.scannet import ScanNet
 from tsfusion.datasets.formats.sevenscenes import SevenScenes
 from tsfusion.datasets.formats.stereo_folders import StereoFolder
 from tsfusion.datasets.formats.tum import TUM
-from tsfusion.datasets.registry import SYNTHETIC, Found, Layout, describe, find, layouts, open_as
+from tsfusion.datasets.registry import Found, Layout, describe, find, layouts, open_as, world_layout
 from tsfusion.datasets.rosbag.dataset import Bag
-from tsfusion.datasets.synthetic.dataset import Synthetic
-from tsfusion.datasets.synthetic.street_drive import DRIVES, StreetDrive
+from tsfusion.datasets.synthetic.dataset import WORLDS, Synthetic
 
 __all__ = [
     "KITTI",
@@ -45,7 +44,6 @@ __all__ = [
     "Selection",
     "SevenScenes",
     "StereoFolder",
-    "StreetDrive",
     "Synthetic",
     "describe",
     "find",
@@ -84,5 +82,5 @@ def open_dataset(path: str | Path, /, *, unpack: bool = False, **options: Any) -
     if len(words) > 2:
         raise DatasetError(f"{path!s}: expected synthetic:WORLD or synthetic:WORLD:SENSOR")
     given = dict(zip(("world", "sensor"), filter(None, words), strict=False))
-    opener = StreetDrive if given.get("world") in DRIVES else Synthetic
-    return open_as(SYNTHETIC[0], opener, {**given, **options})
+    theirs = world_layout(given["world"]) if given.get("world", "room") not in WORLDS else None
+    return open_as("synthetic", theirs.open if theirs else Synthetic, {**given, **options})

@@ -50,8 +50,10 @@ class Layout(NamedTuple):
     Attributes:
         name: for reports.
         description: the expected files, in one line.
-        recognises: True if a folder or file is in this layout; quick, reads no images, raises nothing.
-        open: `open(path, **options)` → a dataset; takes `posed` where frames may lack a pose.
+        recognises: True if a folder or file is in this layout; quick, reads no images, raises nothing. Of a
+            layout that is a world's, True of `Path("synthetic:WORLD")`.
+        open: `open(path, **options)` → a dataset; takes `posed` where frames may lack a pose. A world's takes
+            `world` and `sensor` by name.
 
     Examples:
         >>> from tsfusion.datasets import layouts
@@ -113,14 +115,18 @@ SCANS = (Layout("LiDAR scans", scan_folders.EXPECTED, scan_folders.recognises, s
 SYNTHETIC = (
     "synthetic",
     "no files: synthetic:WORLD, or synthetic:WORLD:SENSOR; worlds: room (also -untextured, -plain, -bare), "
-    "street, corridor, rooms, desk; sensors: kinect, tof, stereo, lidar; or kitti06, kitti07: stereo pairs "
-    "along KITTI's path, with --option kitti=FOLDER, which holds its poses",
+    "street, corridor, rooms; sensors: kinect, tof, stereo, lidar",
 )
 
 
 def layouts() -> list[Layout]:
     """Every layout, in the order in which they are tried."""
     return [*_plugins(), *BUILT_IN, *PLAIN, *SCANS]
+
+
+def world_layout(name: str) -> Layout | None:
+    """Layout of another package that stands for `synthetic:NAME`."""
+    return next((one for one in _plugins() if _recognises(one, Path(f"synthetic:{name}"))), None)
 
 
 def find(path: str | Path, *, unpack: bool = False) -> Found:

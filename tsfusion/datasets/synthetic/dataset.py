@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.dataset import STREET, Frames
-from tsfusion.datasets.synthetic import desk_world, loop_worlds, worlds
+from tsfusion.datasets.synthetic import loop_worlds, worlds
 from tsfusion.datasets.synthetic.ray_tiles import RayTiles
 from tsfusion.geometry.frame import Frame
-from tsfusion.geometry.keyframe import Intrinsics
 
 USUAL_COUNT = 40  # keyframes
 FRAME_NS = 100_000_000  # nominal: ten keyframes a second
@@ -35,15 +34,6 @@ _T_CAMERA_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0,
 
 
 @dataclass(frozen=True)
-class SyntheticCamera:
-    """A pinhole camera of a synthetic recording; `baseline` in metres, for stereo."""
-
-    size: tuple[int, int]  # height, width
-    intrinsics: Intrinsics
-    baseline: float
-
-
-@dataclass(frozen=True)
 class SyntheticLidar:
     """A spinning LiDAR: elevations in degrees, range and noise in metres."""
 
@@ -57,18 +47,12 @@ class SyntheticLidar:
     grazing: float = 0.03  # |cosine| below which nothing returns
 
 
-CAMERAS = {
-    "room": SyntheticCamera((240, 320), Intrinsics(292.5, 292.5, 159.5, 119.5), 0.12),
-    "street": SyntheticCamera((188, 620), Intrinsics(353.5, 353.5, 309.5, 91.5), 0.54),
-    "desk": SyntheticCamera((480, 640), Intrinsics(468.60, 468.61, 318.27, 243.99), 0.12),  # CoRBS'
-}
 LIDARS = {"room": SyntheticLidar(lowest=-45.0, highest=45.0, max_range=30.0), "street": SyntheticLidar()}
 WORLDS: dict[str, Callable[[int], worlds.World]] = {  # by the number of keyframes
     "room": lambda _: worlds.room(),
     "street": lambda count: worlds.street(max(80.0, count + 40.0)),
     "corridor": lambda _: loop_worlds.ring(),
     "rooms": lambda _: loop_worlds.rooms(),
-    "desk": lambda _: desk_world.desk(),
     **{
         name: lambda _, name=name: worlds.room(name)  # type: ignore[misc]
         for name in ("room-untextured", "room-plain", "room-bare")
@@ -89,9 +73,8 @@ class Synthetic(Frames):
     - lidar: 64 × 900 rays, range error 2 cm, 2 % lost, grazing rays lost. Points carry colour.
 
     Args:
-        world: a name in `WORLDS` (`room`, `street`, …), or a `World` of your own, seen with the room's camera
-            and LiDAR.
-        sensor: `kinect`, `tof`, `stereo` or `lidar`; default `tof` at the desk, else `kinect`.
+        world: a name in `WORLDS` (`room`, `street`, …), or a `World` of your own, seen with the room's LiDAR.
+        sensor: `kinect`, `tof`, `stereo` or `lidar`; default the world's, `kinect`.
         count: keyframes, spread over the whole path; default the first 40 of as many as let a scanner follow
             it (`World.steps`). The room's path is a closed circle, the street's goes on by a metre each.
         seed: of the noise; the world does not change.
@@ -117,9 +100,11 @@ class Synthetic(Frames):
         path: str | None = None,
     ) -> None:
         if isinstance(world, str) and world not in WORLDS:
-            raise DatasetError(f"world must be one of {', '.join(WORLDS)}, got {world!r}")
-        sensor = sensor or ("tof" if world == "desk" else "kinect")
-        if sensor not in SENSORS:
+            raise DatasetError(
+                f"world must be one of {', '.join(WORLDS)}, got {world!r}; in a clone, `pip install -e lab` "
+                "adds kitti06, kitti07 and desk"
+            )
+        if sensor and sensor not in SENSORS:
             raise DatasetError(
                 f"sensor of a synthetic world must be kinect, tof, stereo or lidar, got {sensor!r}"
             )
@@ -130,18 +115,18 @@ class Synthetic(Frames):
                 f"got count {count}, seed {seed}, width {width}"
             )
         self.world = WORLDS[world](count) if isinstance(world, str) else world
-        self.name, self.sensor, self.skipped = f"synthetic {self.world.name}", sensor, {}
+        self.name, self.sensor, self.skipped = f"synthetic {self.world.name}", sensor or self.world.sensor, {}
         self.usual = STREET if self.world.name == "street" else {}
         self.timestamps_ns = np.arange(count, dtype=np.int64) * FRAME_NS
         path = path or next(iter(self.world.paths))
         if path not in self.world.paths:
             raise DatasetError(f"path must be one of {', '.join(self.world.paths)}, got {path!r}")
         self._path = self.world.paths[path]
-        self.camera = _resized(CAMERAS.get(self.world.name, CAMERAS["room"]), width)
+        self.camera = _resized(self.world.camera, width)
         self.lidar = LIDARS.get(self.world.name, LIDARS["room"])
         self._count, self._seed, self._noise, self._with_color = count, seed, noise, color
         self._steps = self.world.steps if given is None else count
-        lidar = sensor == "lidar"
+        lidar = self.sensor == "lidar"
         self._directions = _lidar_rays(self.lidar) if lidar else _camera_rays(self.camera)
         shape = (self.lidar.rows, self.lidar.columns) if lidar else self.camera.size
         self._tiles = RayTiles(self._directions, shape)
@@ -267,16 +252,15 @@ def stereo(
     return np.where(valid, units, 0).astype(np.uint16)
 
 
-def _resized(camera: SyntheticCamera, width: int | None) -> SyntheticCamera:
+def _resized(camera: worlds.SyntheticCamera, width: int | None) -> worlds.SyntheticCamera:
     if width is None:
         return camera
     factor = width / camera.size[1]
-    return SyntheticCamera(
-        (round(camera.size[0] * factor), width), camera.intrinsics.scaled(factor), camera.baseline
-    )
+    size = (round(camera.size[0] * factor), width)
+    return worlds.SyntheticCamera(size, camera.intrinsics.scaled(factor), camera.baseline)
 
 
-def _camera_rays(camera: SyntheticCamera) -> NDArray[np.float64]:
+def _camera_rays(camera: worlds.SyntheticCamera) -> NDArray[np.float64]:
     """(H·W, 3) float64 directions with z = 1."""
     K, (height, width) = camera.intrinsics, camera.size
     v, u = np.mgrid[:height, :width]

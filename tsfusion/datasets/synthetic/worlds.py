@@ -6,12 +6,12 @@ A world is the union of its solids; the renderer casts rays at the same table.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.geometry import se3
+from tsfusion.geometry.keyframe import Intrinsics
 
 # (m, 12): kind, centre xyz, half sizes xyz, cos yaw, sin yaw, material, variant, top
 Solids = NDArray[np.float64]
@@ -24,16 +24,18 @@ INTERIOR, WOOD, MARBLE, STRIPES, ROAD, PAVEMENT, FACADE, PAINT, METAL, BARK, LEA
 _CHUNK = 1 << 16  # points measured at once
 
 
-class Ground(Protocol):
-    """Ground that is no solid of the table."""
+@dataclass(frozen=True)
+class SyntheticCamera:
+    """A pinhole camera of a synthetic recording; `baseline` in metres, for stereo."""
 
-    def distance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Signed distance: (n, 3) metres in the solids' axes → (n,), positive above."""
+    size: tuple[int, int]  # height, width
+    intrinsics: Intrinsics
+    baseline: float
 
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """Solids and the sensor's path."""
+    """Solids, the sensor's path, and the sensor that usually takes it."""
 
     name: str
     solids: Solids  # (m, 12) float64, metres
@@ -41,26 +43,21 @@ class World:
     paths: dict[str, Callable[[int, int], NDArray[np.float64]]]
     # Frames of the whole usual path when a person walks it, near enough for a scanner to follow
     steps: int = 40
-    ground: Ground | None = None
-    # (3, 3) rotation of the world's points into the axes of the solids (z up) and the ground; None = none
-    upright: NDArray[np.float64] | None = None
+    sensor: str = "kinect"
+    camera: SyntheticCamera = SyntheticCamera((240, 320), Intrinsics(292.5, 292.5, 159.5, 119.5), 0.12)
 
     def distance(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
         """Signed distance to the nearest surface: (n, 3) metres → (n,) float64, negative inside solids.
 
         Exact outside every solid; inside it is exact where solids do not overlap.
         """
-        points = self.turned(np.asarray(points, dtype=np.float64).reshape(-1, 3))
-        result = np.full(len(points), np.inf) if self.ground is None else self.ground.distance(points)
+        points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+        result = np.full(len(points), np.inf)
         for start in range(0, len(points), _CHUNK):
             part = slice(start, start + _CHUNK)
             for solid in self.solids:
                 np.minimum(result[part], _distance(solid, points[part]), out=result[part])
         return result
-
-    def turned(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The world's points (n, 3) in the axes of its solids."""
-        return points if self.upright is None else points @ self.upright.T
 
     def near(self, position: NDArray[np.float64], reach: float) -> Solids:
         """The solids that begin within `reach` metres of `position`."""
@@ -104,7 +101,8 @@ def street(length: float = 80.0) -> World:
     for side in (-1, 1):
         solids += _houses(rng[side], side, length)
         solids += _kerbside(rng[side], side, length)
-    return World("street", np.array(solids), {"drive": _drive})
+    camera = SyntheticCamera((188, 620), Intrinsics(353.5, 353.5, 309.5, 91.5), 0.54)
+    return World("street", np.array(solids), {"drive": _drive}, camera=camera)
 
 
 def solid(

@@ -7,6 +7,7 @@ path comes back, it finds the street as it was.
 
 import hashlib
 import os
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,11 +15,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from lab.worlds.road_ground import RoadGround
+from lab.worlds.roadside import roadside
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.cameras import RecordedCamera
 from tsfusion.datasets.dataset import STREET, Frames
-from tsfusion.datasets.synthetic.road_ground import RoadGround
-from tsfusion.datasets.synthetic.roadside import roadside
 from tsfusion.datasets.synthetic.worlds import World
 from tsfusion.datasets.trajectory_files import read_kitti
 from tsfusion.geometry import se3
@@ -47,6 +48,25 @@ class DriveName(NamedTuple):
 
     sequence: str
     keyframe_distance: float
+
+
+@dataclass(frozen=True, eq=False)
+class StreetWorld(World):
+    """Solids on a ground that is no solid of the table."""
+
+    ground: RoadGround | None = None
+    # (3, 3) rotation of the world's points into the axes of the solids (z up) and the ground; None = none
+    upright: Floats | None = None
+
+    def distance(self, points: NDArray[np.floating]) -> Floats:
+        """Signed distance as `World.distance`, the ground's too."""
+        points = self.turned(np.asarray(points, dtype=np.float64).reshape(-1, 3))
+        to_solids = super().distance(points)
+        return to_solids if self.ground is None else np.minimum(to_solids, self.ground.distance(points))
+
+    def turned(self, points: Floats) -> Floats:
+        """The world's points (n, 3) in the axes of its solids."""
+        return points if self.upright is None else points @ self.upright.T
 
 
 DRIVES = {"kitti06": DriveName("06", 2.505), "kitti07": DriveName("07", 2.68)}
@@ -124,7 +144,7 @@ class StreetDrive(Frames):
 
     def fingerprint(self) -> str:
         """Hash of the poses and of small pictures of some of them: another street or look has another."""
-        from tsfusion.datasets.synthetic.street_views import StreetRenderer
+        from lab.worlds.street_views import StreetRenderer
 
         settings = [self._seed, self._noise, *self.size, BLUR, READ_NOISE, SHOT_NOISE]
         digest = hashlib.sha256(np.array(self._poses).tobytes() + np.array(settings, dtype=float).tobytes())
@@ -168,7 +188,7 @@ class StreetDrive(Frames):
 
     def _rendering(self) -> Any:
         if self._renderer is None:
-            from tsfusion.datasets.synthetic.street_views import StreetRenderer
+            from lab.worlds.street_views import StreetRenderer
 
             self._renderer = StreetRenderer(self.world.solids, self._ground, self.size, self.intrinsics)
         return self._renderer
@@ -204,11 +224,11 @@ def find_poses(sequence: str, kitti: str | Path | None) -> Path:
     return file
 
 
-def street_along(poses: Floats, upright: Floats, *, name: str) -> tuple[World, RoadGround]:
+def street_along(poses: Floats, upright: Floats, *, name: str) -> tuple[StreetWorld, RoadGround]:
     """Street along the poses (n, 4, 4) of a camera 1.65 m above the road."""
     ground = RoadGround.along(poses[:, :3, 3] @ upright.T - (0, 0, CAMERA_HEIGHT))
     solids = roadside(ground, seed=len(poses) + sum(map(ord, name)))
-    return World(name, solids, {}, ground=ground, upright=upright), ground
+    return StreetWorld(name, solids, {}, ground=ground, upright=upright), ground
 
 
 def _upright(poses: Floats) -> Floats:

@@ -11,9 +11,9 @@ from geometry_checks import move
 from small_recordings import round_a_block
 
 from lab.evaluation.known_surfaces import WorldSurface, drive_surface
-from tsfusion.core.errors import DatasetError
-from tsfusion.datasets import StreetDrive, open_dataset
-from tsfusion.datasets.synthetic import roadside, worlds
+from lab.worlds import roadside
+from lab.worlds.street_drive import StreetDrive
+from tsfusion.datasets.synthetic import worlds
 
 
 @pytest.fixture(scope="module")
@@ -99,8 +99,8 @@ def test_tiles_lose_no_solid(drive):
 
 
 def _cast_all(renderer, T, lists, pixels):
-    from tsfusion.datasets.synthetic.street_views import REACH
-    from tsfusion.kernels.street_raycast import cast_view
+    from lab.worlds.kernels.street_raycast import cast_view
+    from lab.worlds.street_views import REACH
 
     distance, hit = np.empty(len(pixels)), np.empty(len(pixels), dtype=np.int32)
     ground = renderer._ground
@@ -144,21 +144,10 @@ def test_nothing_stands_in_the_way(data, name):
     assert min(built) >= 3  # along the whole path
 
 
-def test_missing_poses_are_one_clear_line(tmp_path, monkeypatch):
-    monkeypatch.delenv("TSFUSION_DATA", raising=False)
-    with pytest.raises(DatasetError, match=r"path of KITTI 07 is needed: say --option kitti=FOLDER"):
-        open_dataset("synthetic:kitti07")
-    with pytest.raises(
-        DatasetError, match=r"poses/06.txt does not exist: expected the true poses of KITTI 06"
-    ):
-        open_dataset("synthetic:kitti06", kitti=tmp_path)
-    with pytest.raises(DatasetError, match="sensor of kitti06 must be stereo, got 'lidar'"):
-        open_dataset("synthetic:kitti06:lidar", kitti=tmp_path)
-
-
 def test_the_tables_agree_with_the_kernels(drive):
     drive._rendering()
-    from tsfusion.kernels import street_shading, street_things, synthetic_raycast
+    from lab.worlds.kernels import street_shading, street_things
+    from tsfusion.kernels import synthetic_raycast
 
     for name in (
         *(

@@ -4,6 +4,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from tsfusion.core.errors import DatasetError
+from tsfusion.datasets.synthetic.dataset import Synthetic
 from tsfusion.datasets.synthetic.worlds import (
     AXLE,
     BOX,
@@ -19,13 +21,38 @@ from tsfusion.datasets.synthetic.worlds import (
     SPHERE,
     STRIPES,
     WOOD,
+    SyntheticCamera,
     World,
     look_at,
     solid,
 )
+from tsfusion.geometry.keyframe import Intrinsics
 
+CAMERA = SyntheticCamera((480, 640), Intrinsics(468.60, 468.61, 318.27, 243.99), 0.12)  # CoRBS'
 TOP = 0.74  # metres, of the desk
 STEPS = 600  # frames of the whole path, at ten a second
+
+
+class Desk(Synthetic):
+    """Keyframes of the desk, with the options of `Synthetic`; its usual sensor is `tof`."""
+
+    def __init__(
+        self,
+        world: str = "desk",
+        sensor: str | None = None,
+        *,
+        count: int | None = None,
+        seed: int = 0,
+        noise: bool = True,
+        width: int | None = None,
+        color: bool = True,
+        path: str | None = None,
+    ) -> None:
+        if world != "desk":
+            raise DatasetError(f"world must be desk, got {world!r}")
+        super().__init__(
+            desk(), sensor, count=count, seed=seed, noise=noise, width=width, color=color, path=path
+        )
 
 
 def desk() -> World:
@@ -43,7 +70,7 @@ def desk() -> World:
         *_chair(-0.2, 0.05, 0.3),
         *_shelf(),
     ]
-    return World("desk", np.array(rows), {"hand": _hand}, steps=STEPS)
+    return World("desk", np.array(rows), {"hand": _hand}, steps=STEPS, sensor="tof", camera=CAMERA)
 
 
 def _on_the_desk() -> list[list[float]]:

@@ -8,10 +8,10 @@ in what is there already: a path that comes back finds its own street again.
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.datasets.synthetic.road_ground import KERB, STEP, Floats, RoadGround
+from lab.worlds.road_ground import KERB, STEP, Floats, RoadGround
 from tsfusion.datasets.synthetic.worlds import AXLE, BOX, CYLINDER, PRISM, SPHERE, Solids, solid
 
-# As in kernels/street_things.py
+# As in worlds/kernels/street_things.py
 HOUSE, TILES, BODY, CABIN, TYRE, POLE, TRUNK, CROWN, HEDGE, SIGN, FENCE, BIN = range(20, 32)
 SUNK = 2.0  # metres of a house below the ground
 SUN = np.array([0.42, 0.56, 0.714])  # direction to it

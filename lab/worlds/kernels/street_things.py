@@ -4,7 +4,7 @@
 import taichi as ti
 import taichi.math as tm
 
-from tsfusion.kernels.street_textures import (
+from lab.worlds.kernels.street_textures import (
     cell,
     cell_at,
     fract,

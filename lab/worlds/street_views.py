@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.datasets.synthetic.road_ground import RoadGround
+from lab.worlds.road_ground import RoadGround
 from tsfusion.datasets.synthetic.worlds import Solids
 from tsfusion.geometry.keyframe import Intrinsics
 
@@ -62,7 +62,7 @@ class StreetRenderer:
     def _cast(
         self, T: Floats, lists: tuple[NDArray[np.int32], NDArray[np.int32], Floats], pixels: Floats
     ) -> tuple[Floats, NDArray[np.int32]]:
-        from tsfusion.kernels.street_raycast import cast_view
+        from lab.worlds.kernels.street_raycast import cast_view
 
         columns = -(-self._size[1] // TILE)
         u, v = np.rint(pixels).astype(np.int32).T
@@ -78,7 +78,7 @@ class StreetRenderer:
     def _shade(
         self, T: Floats, pixels: Floats, distance: Floats, hit: NDArray[np.int32]
     ) -> NDArray[np.float32]:
-        from tsfusion.kernels.street_shading import shade_view
+        from lab.worlds.kernels.street_shading import shade_view
 
         color, ground = np.empty((len(pixels), 3), dtype=np.float32), self._ground
         shade_view(
