@@ -15,10 +15,9 @@ from written_recordings import check, matrix, millimetres, views, write
 from tsfusion.core.errors import DatasetError, MissingDependency
 from tsfusion.datasets import open_dataset
 from tsfusion.datasets.depth_files import check_metres, read_depth
-from tsfusion.datasets.readers import read_color
+from tsfusion.datasets.readers import read_color, read_image
 from tsfusion.datasets.rosbag import messages
 from tsfusion.geometry.measured_points import depth_metres
-from tsfusion.scanner.sources import folder_layouts
 from tsfusion.viewer.small_pictures import small_picture
 from tsfusion.wire.array_encoding import unpack_image
 
@@ -187,7 +186,7 @@ def test_colour_is_read_as_stored_whatever_its_exif_orientation(tmp_path, orient
     bag = SimpleNamespace(format="jpeg", data=raw)
     for found in (
         read_color(tmp_path / "a.jpg", (24, 32)),
-        folder_layouts.whole_image(tmp_path / "a.jpg", cv2.IMREAD_ANYCOLOR),
+        read_image(tmp_path / "a.jpg", "an image", cv2.IMREAD_ANYCOLOR),
         messages.color(bag),
         unpack_image(raw.tobytes(), np.dtype(np.uint8), (24, 32, 3)),
         small_picture(raw.tobytes()),

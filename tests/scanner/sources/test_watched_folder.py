@@ -143,7 +143,7 @@ def test_a_slow_untidy_writer(tmp_path: Path) -> None:
                 (tmp_path / "seen-9").touch()
         assert writer.wait(30) == 0
     assert numbers(frames) == [0, 1, 3, 6, 9, 10]
-    assert source.skipped == {"damaged": 2, "without its other image": 1, "malformed": 1, "late": 1}
+    assert source.skipped == {"unreadable": 3, "without its other image": 1, "late": 1}
     stamps = [frame.timestamp_ns for frame in frames]
     assert stamps == sorted(set(stamps))
     now = time.monotonic_ns()
@@ -171,6 +171,16 @@ def test_names_that_are_times(tmp_path: Path) -> None:
     _, frames = whole(tmp_path)
     assert numbers(frames) == [0, 1]
     assert [frame.timestamp_ns for frame in frames] == [1305031102175304000, 1305031102500000000]
+
+
+def test_fractions_that_the_series_reads_in_another_way_are_refused(tmp_path: Path) -> None:
+    """SEC.NSEC without leading zeros: each name alone is decimal seconds."""
+    camera(tmp_path)
+    for number in range(12):
+        nanoseconds = 1305031102 * 10**9 + 90_000_001 * number
+        rgbd(tmp_path, number, name=f"{nanoseconds // 10**9}.{nanoseconds % 10**9}")
+    with pytest.raises(SourceError, match=r"names such as 1305.* are no decimals.*leading zeros"):
+        whole(tmp_path)
 
 
 def test_names_that_are_no_times_take_the_files(tmp_path: Path) -> None:
@@ -212,12 +222,13 @@ def test_depth_in_floats(tmp_path: Path, ending: str) -> None:
     for name, image in (("0", metres), ("1", metres * 1000)):
         path = tmp_path / "depth" / f"{name}.{ending}"
         np.save(path, image) if ending == "npy" else cv2.imwrite(str(path), image)
-    with WatchedFolder(tmp_path, deadline=0.2) as source:
-        frames = iter(source)
-        assert (next(frames).depth == metres).all()
-        with pytest.raises(SourceError, match=r"in metres, .*: millimetres\? then .* depth_scale=0\.001"):
-            next(frames)
+    with WatchedFolder(tmp_path, deadline=0.2, idle=0.5) as source:
+        (frame,) = source
+        assert (frame.depth == metres).all()
+    assert source.skipped == {"unreadable": 1}
     (tmp_path / "depth" / f"0.{ending}").unlink()
+    with pytest.raises(SourceError, match=r"in metres, .*: millimetres\? then .* depth_scale=0\.001"):
+        whole(tmp_path)
     _, (frame,) = whole(tmp_path, depth_scale=0.001)
     np.testing.assert_allclose(frame.depth, metres, rtol=1e-6)
 
@@ -308,7 +319,7 @@ def test_scans(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         write(tmp_path, "velodyne/000002.bin", points.tobytes()[:-3])
         (tmp_path / "DONE").touch()
         assert list(frames) == []
-    assert source.skipped == {"damaged": 1}
+    assert source.skipped == {"unreadable": 1}
     assert source.sensor == "lidar"
 
 
@@ -316,14 +327,16 @@ def test_points_of_three_numbers_are_refused(tmp_path: Path) -> None:
     good = np.abs(np.random.default_rng(0).normal(size=(100, 4))).astype(np.float32)
     write(tmp_path, "000000.bin", (-good).tobytes())
     settle(tmp_path / "000000.bin")
-    with WatchedFolder(tmp_path, poll=0.01) as source, pytest.raises(SourceError, match="below 0"):
+    with WatchedFolder(tmp_path, poll=0.01, idle=0.2) as source, pytest.raises(SourceError, match="below 0"):
         list(source)
-    write(tmp_path, "000000.bin", good.tobytes())
-    write(tmp_path, "000001.bin", (-good).tobytes())
-    write(tmp_path, "000002.bin", good.tobytes())
-    (tmp_path / "DONE").touch()
+    for number in range(1, 6):
+        write(tmp_path, f"{number:06d}.bin", (good if number > 4 else -good).tobytes())
+        settle(tmp_path / f"{number:06d}.bin")
+    with WatchedFolder(tmp_path, poll=0.01) as source, pytest.raises(SourceError, match="below 0"):
+        list(source)  # the first five are enough
+    write(tmp_path, "000004.bin", good.tobytes())
     source, frames = whole(tmp_path)
-    assert (len(frames), source.skipped) == (2, {"malformed": 1})
+    assert (len(frames), source.skipped) == (2, {"unreadable": 4})
 
 
 def test_a_lens_that_distorts(tmp_path: Path) -> None:
@@ -368,18 +381,18 @@ def test_files_that_go_away_while_they_are_read(tmp_path: Path, monkeypatch: pyt
     camera(tmp_path)
     for number in (0, 1):
         rgbd(tmp_path, number)
-    whole_image = folder_layouts.whole_image
+    is_whole = folder_layouts.is_whole
 
-    def then_gone(path: Path, flags: int) -> Any:
-        image = whole_image(path, flags)
+    def then_gone(path: Path, *, settled: bool) -> bool:
+        found = is_whole(path, settled=settled)
         if path.stem.endswith("0"):
             path.unlink()
-        return image
+        return found
 
-    monkeypatch.setattr(folder_layouts, "whole_image", then_gone)
+    monkeypatch.setattr(folder_layouts, "is_whole", then_gone)
     source, frames = whole(tmp_path)
     assert numbers(frames) == [1]
-    assert source.skipped == {"damaged": 1}
+    assert source.skipped == {"unreadable": 1}
 
 
 def test_an_image_that_claims_to_be_huge_is_left_out(tmp_path: Path) -> None:
@@ -389,7 +402,7 @@ def test_an_image_that_claims_to_be_huge_is_left_out(tmp_path: Path) -> None:
     claim_size(tmp_path / "depth" / "000000.png", 100_000)
     source, frames = whole(tmp_path)
     assert numbers(frames) == [1]
-    assert source.skipped == {"damaged": 1}
+    assert source.skipped == {"unreadable": 1}
 
 
 def test_close_from_another_thread_ends_the_iteration(tmp_path: Path) -> None:

@@ -43,7 +43,59 @@ _FIRST_TRIES = 50  # images that cannot be read and none that can: so it is with
 COLOR = ("color", "colour", "rgb", "image", "images")  # folders beside depth/, by preference
 
 
-class DepthImages(Frames):
+class DepthReader:
+    """Reader of the depth images of one camera, and of the colour of the same pixels."""
+
+    camera: RecordedCamera
+    usual_unit = MILLIMETRES
+    not_measured: int | None = None  # a value that means so, beside 0
+
+    def use_camera(self, camera: RecordedCamera, depth_scale: float | None) -> None:
+        """Name the camera of the images, before the first is read.
+
+        Args:
+            camera: its distortion is removed from depth and colour.
+            depth_scale: metres per unit; None = of integers as the camera's file states, else `usual_unit`,
+                and floats are metres.
+        """
+        self.camera, self.intrinsics = camera, camera.intrinsics
+        self.depth_unit = camera.depth_unit(depth_scale, self.usual_unit)
+        self.depth_scale = self.depth_unit.metres
+        self._float_scale = 1.0 if depth_scale is None else depth_scale
+        self._kind: np.dtype[Any] | None = None  # of the first depth image that was read
+
+    def read(self, depth: Path, color: Path | None) -> dict[str, Any]:
+        """Fields of a `Frame`; raises DatasetError for an image that is not as the others."""
+        measured = self._measured(depth)
+        return {
+            "depth": measured,
+            "depth_scale": self.depth_scale,
+            "color": None if color is None else self._registered(color, measured),
+            "intrinsics": self.intrinsics,
+        }
+
+    def _measured(self, file: Path) -> NDArray[Any]:
+        """Depth of the pinhole camera: uint16 in `depth_scale`, or float32 metres."""
+        depth, size = read_depth(file, invalid=self.not_measured), self.camera.size
+        self._kind = self._kind or depth.dtype
+        if depth.shape != size:
+            raise DatasetError(
+                f"{file} is {depth.shape[1]}×{depth.shape[0]}, others are {size[1]}×{size[0]}; "
+                "expected one size, as there is one camera"
+            )
+        if depth.dtype != self._kind:
+            raise DatasetError(f"{file} holds {depth.dtype}, others {self._kind}; expected one kind of depth")
+        if depth.dtype == np.float32:
+            depth *= np.float32(self._float_scale)
+            check_metres(depth, file)
+        return self.camera.depth(depth)
+
+    def _registered(self, color: Path, depth: NDArray[Any]) -> NDArray[np.uint8]:
+        """The colour of each depth pixel."""
+        return np.asarray(self.camera.color(read_color(color, depth.shape)), np.uint8)
+
+
+class DepthImages(DepthReader, Frames):
     """Frames of one depth image each, with colour and a pose where they are recorded.
 
     A layout is a class: its attributes say what is usual there, `_files` and `_recorded_poses` what its
@@ -69,11 +121,8 @@ class DepthImages(Frames):
     layout = ""
     expected = ""
     sensor = "kinect"
-    usual_unit = MILLIMETRES
     usual_gap_s = 0.2
     guesses = False  # whether it finds a file of poses by its name alone
-    not_measured: int | None = None  # a value that means so, beside 0
-    camera: RecordedCamera
 
     def __init_subclass__(cls) -> None:
         """Name the common options where a layout adds some of its own and passes on `**options`."""
@@ -111,15 +160,11 @@ class DepthImages(Frames):
         self.uncolored = [*self._color].count(None)
         self.timestamps_ns = None if times is None else times[kept]
         self.name, self.sensor = f"{self.layout} {root.name}", sensor or self.sensor
-        self.camera = find_camera(
+        camera = find_camera(
             root, first_size(self._depth), intrinsics=intrinsics, calibration=calibration,
             **self._known_camera(root),
         )  # fmt: skip
-        self.intrinsics = self.camera.intrinsics
-        self.depth_unit = self.camera.depth_unit(depth_scale, self.usual_unit)
-        self.depth_scale = self.depth_unit.metres
-        self._float_scale = 1.0 if depth_scale is None else depth_scale
-        self._kind: np.dtype[Any] | None = None  # of the first depth image that was read
+        self.use_camera(camera, depth_scale)
 
     def _opened(self, path: str | Path, trajectory: str | Path | None) -> tuple[Path, Path | None]:
         """The folder, and the file of poses that was given, which may be named from there."""
@@ -162,36 +207,8 @@ class DepthImages(Frames):
         return len(self._depth)
 
     def _frame(self, index: int) -> Frame:
-        depth = self._measured(self._depth[index])
         color = self._color[index] if self._color else None
-        registered = None if color is None else self._registered(color, depth)
-        return self._posed_frame(
-            index,
-            depth=depth,
-            depth_scale=self.depth_scale,
-            color=registered,
-            intrinsics=self.intrinsics,
-        )
-
-    def _measured(self, file: Path) -> NDArray[Any]:
-        """Depth of the pinhole camera: uint16 in `depth_scale`, or float32 metres."""
-        depth, size = read_depth(file, invalid=self.not_measured), self.camera.size
-        self._kind = self._kind or depth.dtype
-        if depth.shape != size:
-            raise DatasetError(
-                f"{file} is {depth.shape[1]}×{depth.shape[0]}, others are {size[1]}×{size[0]}; "
-                "expected one size, as there is one camera"
-            )
-        if depth.dtype != self._kind:
-            raise DatasetError(f"{file} holds {depth.dtype}, others {self._kind}; expected one kind of depth")
-        if depth.dtype == np.float32:
-            depth *= np.float32(self._float_scale)
-            check_metres(depth, file)
-        return self.camera.depth(depth)
-
-    def _registered(self, color: Path, depth: NDArray[Any]) -> NDArray[np.uint8]:
-        """The colour of each depth pixel."""
-        return np.asarray(self.camera.color(read_color(color, depth.shape)), np.uint8)
+        return self._posed_frame(index, **self.read(self._depth[index], color))
 
 
 def resample_for_camera(

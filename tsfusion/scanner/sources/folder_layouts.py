@@ -3,19 +3,11 @@
 
 import re
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
-from tsfusion.core import read_limits
-from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.formats.image_folders import COLOR
-from tsfusion.datasets.point_times import Scan
-from tsfusion.datasets.readers import decode_image
-from tsfusion.datasets.scan_files import SUFFIXES, read_scan
+from tsfusion.datasets.scan_files import SUFFIXES
 
 LayoutKind = Literal["depth", "pair", "points"]
 
@@ -25,12 +17,12 @@ EXPECTED = (
     "NAME.bin|pcd|ply|las|laz, there or in velodyne/"
 )
 
-_NOT_MEASURED = 65535  # 7-Scenes' value for pixels without depth
 _IMAGES = r"\.(?:png|jpe?g)"
 _ENDINGS = (_IMAGES, r"\.(?:png|tiff?|exr|npy)", r"\.(?:bin|pcd|ply|las|laz)")
 _ANY_IMAGE, _DEPTH, _SCAN = (re.compile(rf"([^.].*){ending}") for ending in _ENDINGS)
 _FLAT_DEPTH, _FLAT_COLOR = re.compile(r"(frame-.+)\.depth\.png"), re.compile(rf"(frame-.+)\.color{_IMAGES}")
 _PNG_END, _JPEG_END = b"\0\0\0\0IEND\xaeB`\x82", b"\xff\xd9"
+_ENDS = {".png": _PNG_END, ".jpg": _JPEG_END, ".jpeg": _JPEG_END}
 _POINT = 16  # bytes: x, y, z and intensity in float32
 
 
@@ -81,31 +73,11 @@ def layout_of(root: Path) -> FolderLayout | None:
     return None
 
 
-def whole_image(path: Path, flags: int) -> NDArray[Any] | None:
-    """Decode an image with OpenCV's `flags`; None while it is incomplete, or if it is damaged."""
-    raw = path.read_bytes() if path.stat().st_size <= read_limits.MAX_FILE_BYTES else b""
-    if not raw.endswith(_PNG_END if path.suffix == ".png" else _JPEG_END):
-        return None
-    return decode_image(BytesIO(raw), flags)
-
-
-def whole_scan(path: Path) -> Scan | None:
-    """Read points; None while the file is incomplete, or if it is damaged.
-
-    Raises:
-        DatasetError: a `.bin` file holds no points of four numbers.
-    """
-    is_raw, nbytes = path.suffix == ".bin", path.stat().st_size
-    try:
-        return None if is_raw and (not nbytes or nbytes % _POINT) else read_scan(path)
-    except DatasetError:
-        if is_raw:
-            raise
-        return None
-
-
-def depth_of(image: NDArray[Any]) -> NDArray[Any]:
-    """Set pixels that were not measured to 0, in place."""
-    if image.dtype == np.uint16:
-        image[image == _NOT_MEASURED] = 0
-    return image
+def is_whole(path: Path, *, settled: bool) -> bool:
+    """Whether a file is complete, by the mark at its end; by its `settled` state where it has none."""
+    if path.suffix.lower() in _ENDS:
+        with path.open("rb") as file:
+            file.seek(max(0, path.stat().st_size - len(_PNG_END)))
+            return file.read().endswith(_ENDS[path.suffix.lower()])
+    nbytes = path.stat().st_size
+    return settled and nbytes > 0 and not (path.suffix == ".bin" and nbytes % _POINT)

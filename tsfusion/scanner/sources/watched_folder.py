@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError, InvalidConfig, InvalidKeyframe, SourceError
@@ -20,8 +19,13 @@ from tsfusion.datasets.cameras import (
     camera_files,
     find_camera,
 )
-from tsfusion.datasets.depth_files import check_metres, read_depth
+from tsfusion.datasets.dataset import UNREADABLE
+from tsfusion.datasets.depth_files import read_depth
+from tsfusion.datasets.formats.image_folders import DepthReader
+from tsfusion.datasets.formats.sevenscenes import NOT_MEASURED
 from tsfusion.datasets.point_times import PointTimes, point_times
+from tsfusion.datasets.readers import read_image
+from tsfusion.datasets.scan_files import read_scan
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.scanner.sources import folder_layouts
@@ -35,6 +39,8 @@ SENSORS = {"depth": "kinect", "pair": "stereo", "points": "lidar"}
 _PAUSE_FACTOR = 10  # pause between two listings, at least, in times a listing took
 _SETTLED_S = 0.5  # seconds without a change after which a file without an end mark counts as complete
 _OLDEST_S = 600.0  # file times before this are of another clock
+_FIRST_TRIES = 5  # frames that cannot be read and none before them that can: so it is with all
+_ENOUGH = 10  # names that tell what their fractions are
 _WAIT = object()  # the frame's files are not complete yet
 
 
@@ -102,6 +108,10 @@ class WatchedFolder(LiveSource):
         self._last: file_names.SortKey = ()
         self._colored: bool | None = None  # whether frames come with colour; None = not known yet
         self._camera: Any = None  # a RecordedCamera or a PairRectifier
+        self._depth = DepthReader()
+        self._depth.not_measured = NOT_MEASURED
+        self._times_checked = False
+        self._any_read, self._why_unreadable = False, ""
         self._begun: Any = None  # state of the incomplete frame's files
         self._since = time.monotonic()  # when something last changed
 
@@ -152,6 +162,8 @@ class WatchedFolder(LiveSource):
                 self._since = time.monotonic()
             else:
                 if ended or (self._idle is not None and time.monotonic() - self._since > self._idle):
+                    if self._why_unreadable and not self._any_read:
+                        raise SourceError(self._why_unreadable)
                     return
             self._closed.wait(pause)
 
@@ -176,7 +188,23 @@ class WatchedFolder(LiveSource):
                 self._skip("late")
             elif match:
                 found.append((match[1], where / file))
+        if not self._times_checked and len(found) + len(self._handled) >= _ENOUGH:
+            self._times_checked = True
+            self._check_times([*(Path(file).stem for file in self._handled), *(name for name, _ in found)])
         return sorted(found, key=lambda item: file_names.order(item[0]))
+
+    def _check_times(self, names: list[str]) -> None:
+        """Raise SourceError where the series of names tells other times than each of them alone."""
+        alone = sorted(stamp for name in names if (stamp := file_names.time_of(name)) is not None)
+        try:
+            series = file_names.in_time([Path(name) for name in names], names)[1]
+        except DatasetError as error:
+            raise SourceError(str(error)) from error
+        if series is not None and len(alone) == len(names) and alone != series.tolist():
+            raise SourceError(
+                f"{self._root}: fractions in names such as {names[0]} are no decimals, by the others: write "
+                "SEC.NNNNNNNNN with leading zeros, or `tsfusion scan PATH` when the folder is complete"
+            )
 
     def _read(self, name: str, first: Path, *, final: bool) -> Any:
         """Read a frame; None if it is left out, or `_WAIT`."""
@@ -193,88 +221,56 @@ class WatchedFolder(LiveSource):
             if kind == "pair" or self._colored:
                 return self._skip("without its other image")
             self._colored = False  # no frame has colour
-        images: list[Any]
+        files = [first] if second is None else [first, second]
         try:
-            if kind == "points":
-                written = time.time() - first.stat().st_mtime
-                images = [
-                    folder_layouts.whole_scan(first) if max(waited, written) > _SETTLED_S or final else None
-                ]
-            else:
-                settled = final or max(waited, time.time() - first.stat().st_mtime) > _SETTLED_S
-                images = [_depth(first, settled=settled) if kind == "depth" else _image(first, kind)]
-                images += [] if second is None else [_image(second, "pair")]
-        except OSError:  # deleted meanwhile
-            images = [None]
-        except DatasetError as error:
-            if not self._last:  # so it is with all of them
-                raise SourceError(str(error)) from error
-            return self._malformed(first, error)
-        if any(image is None for image in images):
-            return self._skip("damaged") if final else _WAIT
-        if kind != "points" and self._camera is None and not self._find_camera(kind, images[0], final=final):
-            return _WAIT
-        self._colored = self._colored or (kind == "depth" and len(images) == 2)
-        try:
-            return self._frame(kind, images, *self._stamps(name, first))
-        except OSError:  # deleted meanwhile
-            return self._skip("damaged")
-        except (InvalidKeyframe, InvalidConfig, cv2.error) as error:
-            return self._malformed(first, error)
+            settled = final or max(waited, time.time() - first.stat().st_mtime) > _SETTLED_S
+            if not all(folder_layouts.is_whole(file, settled=settled) for file in files):
+                return self._unreadable(first, f"{first} is not complete") if final else _WAIT
+            if kind != "points" and self._camera is None and not self._find_camera(kind, first, final=final):
+                return _WAIT
+            self._colored = self._colored or (kind == "depth" and len(files) == 2)
+            frame = self._frame(kind, files, *self._stamps(name, first))
+        except (DatasetError, InvalidKeyframe, InvalidConfig, cv2.error, OSError) as error:
+            return self._unreadable(first, error)
+        self._any_read = True
+        return frame
 
-    def _malformed(self, first: Path, error: Exception) -> Any:
-        """Leave a frame out; of the first one the log says why."""
-        if "malformed" not in self.skipped:
+    def _unreadable(self, first: Path, error: object) -> None:
+        """Leave a frame out; of the first one the log says why.
+
+        Raises:
+            SourceError: so it is with all of them.
+        """
+        if not self._why_unreadable:
+            self._why_unreadable = str(error)
             log.warning("%s: %s is left out: %s", self.name, first.name, error)
-        return self._skip("malformed")
+        self._skip(UNREADABLE)
+        if not self._any_read and self.skipped[UNREADABLE] >= _FIRST_TRIES:
+            raise SourceError(self._why_unreadable)
 
-    def _frame(self, kind: str, images: list[Any], timestamp_ns: int, captured_ns: int) -> Frame:
+    def _frame(self, kind: str, files: list[Path], timestamp_ns: int, captured_ns: int) -> Frame:
+        measured: dict[str, Any]
         if kind == "pair":
-            pair = stereo_pairs.pair_of(images[0], images[1], self._camera)
-            return Frame(sensor=self.sensor, timestamp_ns=timestamp_ns, captured_ns=captured_ns, **pair)
-        if kind == "points":
-            found = point_times(images[0], timestamp_ns) if self._deskew else PointTimes()
+            left, right = map(_image, files)
+            measured = stereo_pairs.pair_of(left, right, self._camera)
+        elif kind == "points":
+            scan = read_scan(files[0])
+            found = point_times(scan, timestamp_ns) if self._deskew else PointTimes()
             if found.untimed and found.untimed != self._untimed:
                 log.warning("%s: %s", self.name, found.untimed)
                 self._untimed = found.untimed
-            return Frame(
-                sensor=self.sensor, points=images[0].points, timestamp_ns=timestamp_ns,
-                captured_ns=captured_ns, **found._asdict(),
-            )  # fmt: skip
-        depth, color, K = self._undistorted(
-            folder_layouts.depth_of(images[0]), images[1] if images[1:] else None
-        )
-        frame = Frame(
-            sensor=self.sensor,
-            depth=depth,
-            depth_scale=self._camera.depth_unit(self._depth_scale).metres,
-            color=color,
-            intrinsics=K,
-            timestamp_ns=timestamp_ns,
-            captured_ns=captured_ns,
-        )
-        return frame.along_axis() if self._along_ray else frame
+            measured = {"points": scan.points, **found._asdict()}
+        else:
+            measured = self._depth.read(files[0], files[1] if files[1:] else None)
+        frame = Frame(sensor=self.sensor, timestamp_ns=timestamp_ns, captured_ns=captured_ns, **measured)
+        return frame.along_axis() if self._along_ray and kind == "depth" else frame
 
-    def _undistorted(self, depth: NDArray[Any], color: Any) -> tuple[NDArray[Any], Any, Intrinsics]:
-        """Undistort depth and colour by the calibration; also return the intrinsics."""
-        if depth.shape != self._camera.size:
-            raise InvalidKeyframe(f"depth has shape {depth.shape}, others {self._camera.size}")
-        if depth.dtype == np.float32:
-            depth = depth * np.float32(self._depth_scale or 1.0)
-            try:
-                check_metres(depth, self._root)
-            except DatasetError as error:  # so it is with all of them
-                raise SourceError(str(error)) from error
-        if color is not None and color.ndim == 2:
-            color = cv2.cvtColor(color, cv2.COLOR_GRAY2BGR)
-        color = None if color is None else self._camera.color(color)
-        return self._camera.depth(depth), color, self._camera.intrinsics
-
-    def _find_camera(self, kind: str, image: NDArray[np.generic], *, final: bool) -> bool:
+    def _find_camera(self, kind: str, first: Path, *, final: bool) -> bool:
         """Read the camera, for which the size of an image is needed; return whether it is there."""
+        image = _image(first) if kind == "pair" else read_depth(first)
+        size = image.shape[0], image.shape[1]
+        given: Any = {"intrinsics": self._intrinsics, "calibration": self._calibration}
         try:
-            size = image.shape[0], image.shape[1]
-            given: Any = {"intrinsics": self._intrinsics, "calibration": self._calibration}
             if kind == "pair":
                 self._camera, found = stereo_pairs.find_pairs(
                     self._root, size, baseline=self._baseline, places=self._places, **given
@@ -282,7 +278,8 @@ class WatchedFolder(LiveSource):
                 self.camera = str(found)
             else:
                 self._camera = found = find_camera(self._root, size, places=self._places, **given)
-                self.camera = f"{found}; {found.depth_unit(self._depth_scale)}"
+                self._depth.use_camera(found, self._depth_scale)
+                self.camera = f"{found}; {self._depth.depth_unit}"
         except UnknownCamera as error:
             if final:
                 need = " (of a stereo camera FILE, or intrinsics and baseline.txt)" if kind == "pair" else ""
@@ -304,18 +301,8 @@ class WatchedFolder(LiveSource):
         self.sensor = self._sensor or SENSORS[self._layout.kind if self._layout else "depth"]
 
 
-def _image(path: Path, kind: str) -> NDArray[Any] | None:
-    return folder_layouts.whole_image(path, cv2.IMREAD_UNCHANGED if kind == "depth" else cv2.IMREAD_ANYCOLOR)
-
-
-def _depth(path: Path, *, settled: bool) -> NDArray[Any] | None:
-    """Depth of any kind; None while it is incomplete, or if it is damaged."""
-    if path.suffix == ".png":
-        return _image(path, "depth")
-    try:
-        return read_depth(path) if settled else None  # these kinds have no mark at their end
-    except DatasetError:
-        return None
+def _image(path: Path) -> NDArray[Any]:
+    return read_image(path, "an image", cv2.IMREAD_ANYCOLOR)
 
 
 def _state(path: Path | None) -> tuple[int, int] | None:
