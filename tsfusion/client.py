@@ -266,7 +266,7 @@ class Client:
 
     @property
     def link_state(self) -> LinkState:
-        """How client and server stand with each other."""
+        """State of the link to the server."""
         return self._outbox.link_state
 
     @property

@@ -126,7 +126,7 @@ class RunProgress:
 
 
 def fused_rows(read: int, fused: int, total: int, rates: Rates) -> list[Row]:
-    """How much of a journal is read, and fused."""
+    """Share of a journal that is read, and fused."""
     reading, fusing = rates(read, fused)
     return [
         Row("read", f"{read}{_of(total)}", _rate(reading), _left(read, total, reading), _share(read, total)),
@@ -135,14 +135,14 @@ def fused_rows(read: int, fused: int, total: int, rates: Rates) -> list[Row]:
 
 
 def byte_row(text: str, done: int, total: int, rates: Rates) -> Row:
-    """How much is read, after `text`."""
+    """Bytes that are read, after `text`."""
     rate, _ = rates(done, 0)
     shown = "" if rate is None else f"{size(rate)}/s"
     return Row(text, f"{size(done)} of {size(total)}", shown, "", _share(done, total))
 
 
 def step_row(text: str, done: int, total: int) -> Row:
-    """How many steps are done, after `text`."""
+    """Number of steps done, after `text`."""
     return Row(text, f"{done}{_of(total)}", share=_share(done, total))
 
 

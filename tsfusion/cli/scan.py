@@ -259,7 +259,7 @@ def _open(
 
 
 def _warnings(dataset: "Dataset") -> list[str]:
-    """What is odd about a recording's frames, a sentence each; new ones are printed on stderr, too.
+    """Oddities of a recording's frames, a sentence each; new ones are printed on stderr, too.
 
     Raises:
         DatasetError: their depth cannot be used, or nobody knows its unit.

@@ -45,7 +45,7 @@ class StatusScreen:
         return render(self._snapshot, self._console.width, silent=now - self._answered if is_missing else 0.0)
 
     def cut(self) -> RenderableType:
-        """The same, and how many lines there are that the terminal has no room for."""
+        """The lines that the terminal has room for, and the number of the others."""
         height, whole = self._console.height, self.whole()
         lines = self._console.render_lines(whole, pad=False)
         if len(lines) <= height:

@@ -205,5 +205,5 @@ def digests(folder: Path, files: Iterable[str]) -> list[str]:
 
 
 def done_file(folder: Path, name: str) -> Path:
-    """Where a job writes that it is done."""
+    """File in which a job writes that it is done."""
     return folder / f"{name}.done"

@@ -238,7 +238,7 @@ class LoadSettings(TypedDict, total=False):
 
 
 class VolumeSettings(LoadSettings, total=False):
-    """The same of all fields of `VolumeConfig`."""
+    """Settings of `VolumeConfig` by name, all of them."""
 
     voxel_size: float
     sensor: str  # as of a `Dataset`

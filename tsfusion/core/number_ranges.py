@@ -32,7 +32,6 @@ class NumberRanges:
         return ((first, last) for first, last in self._ranges.tolist())
 
     def __len__(self) -> int:
-        """How many numbers there are."""
         return int((self._ranges[:, 1] - self._ranges[:, 0] + 1).sum())
 
     def __str__(self) -> str:

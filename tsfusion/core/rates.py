@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""How fast counts grow."""
+"""Growth of counts."""
 
 import time
 from collections import deque
@@ -9,7 +9,7 @@ _SHORTEST = 1.0  # seconds until there is a rate
 
 
 class Rates:
-    """How much two counts grew a second, over the last seconds; None = too short a time to tell.
+    """Growth of two counts a second, over the last seconds; None = too short a time to tell.
 
     Counts that fall are those of something new, and begin anew.
     """

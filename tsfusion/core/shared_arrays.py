@@ -22,7 +22,7 @@ _STEP = 1 << 20
 
 
 class Place(NamedTuple):
-    """Where an array lies in shared memory."""
+    """Place of an array in shared memory."""
 
     offset: int
     shape: tuple[int, ...]

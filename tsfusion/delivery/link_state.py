@@ -45,7 +45,6 @@ class LinkState(Struct, frozen=True):
 
     @property
     def is_refused(self) -> bool:
-        """Whether the server does not want this client."""
         return self.kind in ("refused", "other_world", "locked_out")
 
     # --- the transport ---

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tsfusion.datasets.cameras import DepthUnit as StoredUnit
+from tsfusion.datasets.cameras import DepthUnit
 from tsfusion.evaluation.depth_views import DepthView
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.sample_ranges import FARTHEST_M, NEAREST_M
@@ -21,7 +21,7 @@ COARSE_UNIT_M = 5e-4  # finer units may be millimetres, coarser ones may be fine
 
 
 @dataclass(frozen=True)
-class DepthUnit:
+class UnitEvidence:
     """Evidence in one frame's depth for its unit.
 
     Attributes:
@@ -45,17 +45,17 @@ class DepthUnit:
     exchanged: bool = False
 
 
-def depth_unit(frame: Frame, view: DepthView | None) -> DepthUnit:
+def unit_evidence(frame: Frame, view: DepthView | None) -> UnitEvidence:
     """Evidence for its unit in a frame's depth, of which `view` is made."""
     if frame.left is not None and frame.right is not None and exchanged(frame.left, frame.right):
-        return DepthUnit(1.0, exchanged=True)
+        return UnitEvidence(1.0, exchanged=True)
     if frame.depth is None:
-        return DepthUnit(0.0 if view is None else view.range_m)
+        return UnitEvidence(0.0 if view is None else view.range_m)
     depth = frame.depth[::4, ::4]
     measured = depth[np.isfinite(depth) & (depth > 0)]
     integer = frame.depth.dtype == np.uint16
     scale, is_indoor = frame.depth_scale if integer else 1.0, frame.sensor in ("kinect", "tof")
-    return DepthUnit(
+    return UnitEvidence(
         float(np.median(measured)) * scale if len(measured) else 0.0,
         FARTHEST_M,
         0.0 if frame.sensor == "scanner" else NEAREST_M,
@@ -66,7 +66,7 @@ def depth_unit(frame: Frame, view: DepthView | None) -> DepthUnit:
     )
 
 
-def unusable_depth(frames: Sequence[DepthUnit]) -> str | None:
+def unusable_depth(frames: Sequence[UnitEvidence]) -> str | None:
     """One sentence on depth in an impossible unit; None where it is possible."""
     seen = [each for each in frames if each.typical_m > 0]
     near = [each for each in seen if each.typical_m < each.nearest_m]
@@ -80,7 +80,7 @@ def unusable_depth(frames: Sequence[DepthUnit]) -> str | None:
     return None
 
 
-def doubtful_depth(frames: Sequence[DepthUnit], unit: StoredUnit | None) -> str | None:
+def doubtful_depth(frames: Sequence[UnitEvidence], unit: DepthUnit | None) -> str | None:
     """One sentence on a unit of depth that nobody stated and rooms or sensors contradict; None where it fits.
 
     Args:
@@ -102,7 +102,7 @@ def doubtful_depth(frames: Sequence[DepthUnit], unit: StoredUnit | None) -> str 
     )
 
 
-def _near_text(unit: DepthUnit) -> str:
+def _near_text(unit: UnitEvidence) -> str:
     found = f"depth is unusable: it reads as {1000 * unit.typical_m:.2g} mm on average"
     if 0 < unit.levels <= FEW_LEVELS:
         return (
@@ -114,7 +114,7 @@ def _near_text(unit: DepthUnit) -> str:
     return f"{found}: floats are expected in metres; multiply them (by 1000 if they are in kilometres)"
 
 
-def _far_text(unit: DepthUnit) -> str:
+def _far_text(unit: UnitEvidence) -> str:
     found = f"depth is unusable: it reads as {unit.typical_m:.3g} m on average"
     if unit.farthest_m != FARTHEST_M:
         return f"{found}: millimetres were taken for metres (of the points, or the baseline): divide by 1000"

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from tsfusion.datasets.dataset import Dataset, frame_of, readable
 from tsfusion.evaluation.color_registration import Outlines, outlines
-from tsfusion.evaluation.depth_units import DepthUnit, depth_unit
+from tsfusion.evaluation.depth_units import UnitEvidence, unit_evidence
 from tsfusion.evaluation.depth_views import DepthView, depth_view
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import FrameKind
@@ -44,7 +44,7 @@ class SeenFrame:
     """
 
     kind: FrameKind
-    depth: DepthUnit
+    depth: UnitEvidence
     T_world_camera: Transform | None
     view: DepthView | None
     outlines: Outlines | None
@@ -119,7 +119,7 @@ def _seen(dataset: Dataset, index: int) -> SeenFrame:
     frame = frame_of(dataset, index)
     view = depth_view(frame)
     skewed = None if frame.motion is None else depth_view(replace(frame, motion=None))
-    unit = depth_unit(frame, view)
+    unit = unit_evidence(frame, view)
     return SeenFrame(frame.kind, unit, frame.T_world_camera, view, outlines(frame), skewed)
 
 

@@ -28,7 +28,7 @@ from tsfusion.evaluation.camera_check import (
     likely_cameras,
 )
 from tsfusion.evaluation.color_registration import misplaced_color, outlines
-from tsfusion.evaluation.depth_units import depth_unit, doubtful_depth, unusable_depth
+from tsfusion.evaluation.depth_units import doubtful_depth, unit_evidence, unusable_depth
 from tsfusion.evaluation.fitted_factors import (
     AS_GOOD,
     MIN_FOCAL_SIGMA,
@@ -150,7 +150,7 @@ def check_frames(dataset: Dataset) -> tuple[str | None, str | None]:
     for index, frame in readable(partial(frame_of, dataset), indices):
         if frame.kind == "points":
             return None, None
-        units.append(depth_unit(frame, None))
+        units.append(unit_evidence(frame, None))
         edges[index] = outlines(frame)
     doubt = doubtful_depth(units, getattr(dataset, "depth_unit", None))
     return unusable_depth(units) or doubt, misplaced_color(edges)

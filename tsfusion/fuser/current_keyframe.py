@@ -23,7 +23,6 @@ class CurrentKeyframe:
 
     @property
     def is_set(self) -> bool:
-        """Whether the process is at a keyframe."""
         return bool(struct.unpack_from("<q", self._word, 0) != (NOT_WORKING,))
 
     @contextmanager

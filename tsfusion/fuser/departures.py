@@ -56,7 +56,6 @@ class Departures:
         return self.window.wait_ms
 
     def is_due(self, *, idle: bool) -> bool:
-        """Whether to go on looking now."""
         if self._searches:
             return self._searches[0].is_due(idle=idle)
         return self.window.is_due(idle=idle)

@@ -77,7 +77,6 @@ class KeepWindow:
         return round(1000 * _INTERVAL_S) if self._is_behind else None
 
     def is_due(self, *, idle: bool) -> bool:
-        """Whether to look now."""
         now = time.monotonic()
         if not self._is_behind or (self._asked is not None and now < self._asked + _PATIENCE_S):
             return False
@@ -113,7 +112,7 @@ class KeepWindow:
         return beyond
 
     def _count_older(self, kept: KeptKeyframes, order: NDArray[np.int64], seconds: float) -> int:
-        """How many came more than so long before the last: by halving, so that few are looked at."""
+        """Number of keyframes older than so long before the last: by halving, so that few are looked at."""
         newest = self._logged_ns(kept, int(order[-1]))
         if newest is None:
             return 0

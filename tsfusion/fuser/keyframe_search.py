@@ -45,7 +45,6 @@ class KeyframeSearch:
         self._first_ns: int | None = None  # of the first record in the journal
 
     def is_due(self, *, idle: bool) -> bool:
-        """Whether to go on now."""
         return idle or time.monotonic() >= self._next
 
     def go_on(self) -> Found | None:

@@ -77,7 +77,7 @@ class ClientRoute(Struct, eq=False):
         return Problem(text, self.map, f"client {who}, session {self.session.hex()[:8]}") if text else None
 
     def health(self, now: float, session: Session | None) -> ClientHealth:
-        """How the client is doing.
+        """Health of the client.
 
         Args:
             now: `time.monotonic()`.

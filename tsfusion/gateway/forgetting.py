@@ -86,7 +86,6 @@ class Forgetting:
 
     @property
     def is_idle(self) -> bool:
-        """Whether no request waits."""
         return not self._requests
 
     def add(self, request: Request) -> None:

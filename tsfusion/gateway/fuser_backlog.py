@@ -23,7 +23,6 @@ class FuserBacklog:
 
     @property
     def is_empty(self) -> bool:
-        """Whether the fuser has answered every record."""
         return not self.keyframes and not self.corrections
 
     def _count(self) -> None:

@@ -373,7 +373,7 @@ class Gateway:
     # --- health ---
 
     def health(self, shown: AllowedMaps = ALL_MAPS) -> Health:
-        """How the server is doing.
+        """Health of the server.
 
         Args:
             shown: only these maps, their clients, and their problems; `ready` is the whole server's.

@@ -113,17 +113,17 @@ class KeyframeIndex:
         return IndexEntry(index, place, session, times, captured, bool(is_correction))
 
     def corrections(self, indices: Iterable[int]) -> int:
-        """How many of these records are corrections."""
+        """Number of corrections among these records."""
         column, first = self._columns["is_correction"], self._first
         return sum(column[index - first] for index in indices)
 
     def after(self, session: Session, seq: int) -> int:
-        """How many records of a session that are not forgotten have a sequence number up to `seq`."""
+        """Number of a session's records up to sequence number `seq`, without forgotten ones."""
         seqs, first = self._columns["seq"], self._first
         return bisect_right(session.entries, seq, key=lambda index: seqs[index - first])
 
     def keyframes_up_to(self, session: Session, seq: int) -> int:
-        """How many keyframes of a session that are not forgotten have a sequence number up to `seq`."""
+        """Number of a session's keyframes up to sequence number `seq`, without forgotten ones."""
         entries = session.entries[: self.after(session, seq)]
         return len(entries) - self.corrections(entries)
 

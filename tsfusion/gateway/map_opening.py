@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What is found when a map is opened: its journal, and whether its checkpoint fits it."""
+"""Findings when a map is opened: its journal, and whether its checkpoint fits it."""
 
 import glob
 import logging
@@ -57,7 +57,7 @@ def compare(name: str, journal: Journal, sessions: Sessions, ready: Ready) -> No
 
 
 def contents(ready: Ready, waiting: int) -> str:
-    """What there is of a map, for the log.
+    """Contents of a map, for the log.
 
     Args:
         waiting: keyframes of its journal that are not in it.
@@ -69,7 +69,7 @@ def contents(ready: Ready, waiting: int) -> str:
 
 
 def loss(name: str, journal: Journal, ready: Ready) -> str:
-    """What is neither in a checkpoint nor in the journal, which is logged; empty = nothing."""
+    """Loss of records that neither a checkpoint nor the journal has, which is logged; empty = none."""
     if ready.done or journal.first <= 1:
         return ""
     found = f"its checkpoints are lost, and with them what was journaled before segment {journal.first}"

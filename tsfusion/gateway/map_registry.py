@@ -423,7 +423,7 @@ class MapRegistry:
             hosted.close()
 
     def health(self) -> dict[str, MapHealth]:
-        """How each map is doing, by name."""
+        """Health of each map, by name."""
         return {hosted.name: hosted.health() for hosted in self}
 
     def problems(self) -> list[Problem]:

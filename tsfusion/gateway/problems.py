@@ -31,7 +31,7 @@ class Problem(Struct, frozen=True):
 
     @property
     def key(self) -> tuple[str, str, str]:
-        """The same for as long as it is the same problem: figures in its words may change."""
+        """Name of the problem while it lasts: figures in its words may change."""
         return self.map, self.client, re.sub(r"[0-9]+", "#", self.text)
 
     @property

@@ -63,7 +63,6 @@ class Sessions:
 
     @property
     def of_clients(self) -> int:
-        """How many sessions are clients': all but the server's own."""
         return len(self) - (SERVER_SESSION in self._by_key)
 
     def get(self, key: bytes) -> Session | None:

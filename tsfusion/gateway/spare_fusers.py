@@ -71,7 +71,6 @@ class SpareFusers:
         self._spares[-1].is_warm = True
 
     def has_for(self, volume: VolumeConfig) -> bool:
-        """Whether a map with these settings would get a spare process."""
         return any(one.fits(volume) for one in self._spares)
 
     def step(self, volume: VolumeConfig, *, may_start: bool) -> None:

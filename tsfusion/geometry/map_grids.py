@@ -194,7 +194,7 @@ class DistanceSlice:
 
     @property
     def reach(self) -> float:
-        """How far distances are known, metres."""
+        """Distance up to which an answer knows, metres."""
         return self.max_distance
 
     def save(self, path: str | Path) -> list[Path]:
@@ -254,7 +254,7 @@ class DistanceField:
 
     @property
     def reach(self) -> float:
-        """How far distances are known, metres."""
+        """Distance up to which an answer knows, metres."""
         return self.max_distance
 
     def at(self, points: ArrayLike) -> NDArray[np.float32]:

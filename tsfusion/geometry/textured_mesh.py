@@ -109,7 +109,6 @@ class TexturedMesh(Mesh):
         return {**super().figures, "texture": texture}
 
     def of_faces(self, kept: NDArray[np.bool_] | NDArray[np.integer]) -> "TexturedMesh":
-        """The same as `Mesh.of_faces`."""
         part = super().of_faces(kept)
         return dataclasses.replace(self, **fields_of(part), texture=self.texture.of_faces(kept))
 

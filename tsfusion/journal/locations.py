@@ -40,7 +40,7 @@ def is_url(path: Path) -> bool:
 
 
 def absolute(text: str) -> str:
-    """The same place for a process that runs in another folder."""
+    """Name of a place for a process that runs in another folder."""
     return text if _URL.match(text) else str(Path(text).absolute())
 
 

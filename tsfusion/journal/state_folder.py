@@ -84,7 +84,6 @@ def _fail(error: OSError) -> None:
 
 
 def is_state_folder(path: Path) -> bool:
-    """Whether a folder is a server's state folder."""
     return (path / MAPS_FOLDER).is_dir()
 
 

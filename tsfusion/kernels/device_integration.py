@@ -136,7 +136,7 @@ def shares_place(k, places: ti.template(), claims: ti.template()):
 
 @ti.func
 def crossed(rays: ti.template(), r):
-    """How many voxels ray `r` crosses."""
+    """Number of voxels that ray `r` crosses."""
     n, length = 1, rays[r, LENGTH]
     for a in ti.static(range(3)):
         if rays[r, CROSSING + a] < length:

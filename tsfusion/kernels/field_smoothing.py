@@ -35,7 +35,7 @@ abreast = ti.types.vector(ABREAST, ti.f32)
 
 @ti.func
 def count_bits(plane):
-    """How many bits of a word are set."""
+    """Number of a word's bits that are set."""
     return ti.cast(ti.math.popcnt(plane), ti.i32)
 
 

@@ -135,12 +135,12 @@ class RewoundMap:
 
     @property
     def place(self) -> int:
-        """How many of the keyframes that can come and go are in the map."""
+        """Number of the keyframes in the map that can come and go."""
         return int(np.isin(self._now, (_THERE, _ELSEWHERE)).sum())
 
     @property
     def behind(self) -> int:
-        """How many keyframes come, go or move between the saved map and the settled one."""
+        """Number of keyframes that come, go or move between the saved map and the settled one."""
         return _steps(self._saved, len(self._saved)) + len(self._removed)
 
     @property
@@ -284,7 +284,7 @@ def _may_come(history: map_history.SessionHistory | None, seq: int) -> bool:
 
 
 def _steps(now: NDArray[np.int8], target: int) -> int:
-    """How many keyframes have to be added or taken away until `target` of them are there."""
+    """Number of keyframes to add or to take away until `target` of them are there."""
     before, after = now[:target], now[target:]
     return int(
         (before == _ABSENT).sum() + (after == _THERE).sum() + 2 * (before == _ELSEWHERE).sum()

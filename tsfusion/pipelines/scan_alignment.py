@@ -48,7 +48,7 @@ class Answer(NamedTuple):
 
 @dataclass
 class Placing:
-    """How a scan came to its place.
+    """Place of a scan, and its evidence.
 
     Attributes:
         T_map_world: (4, 4); None = it was not found.

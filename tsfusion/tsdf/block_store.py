@@ -217,7 +217,6 @@ class BlockStore:
 
     @property
     def is_in_files(self) -> bool:
-        """Whether blocks may leave memory."""
         return self._residency is not None
 
     def keep_within_memory(self) -> None:

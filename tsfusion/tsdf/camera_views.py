@@ -19,7 +19,7 @@ MOST_TRIANGLES = 1 << 21  # that are drawn at a time
 
 
 class _Wanted(NamedTuple):
-    """What a view shows beside depth."""
+    """Images of a view beside depth."""
 
     normals: bool
     colors: bool

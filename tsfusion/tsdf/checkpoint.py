@@ -134,7 +134,7 @@ def write_pieces(
     map_hash: Callable[[], str] | None = None,
     between: Callable[[], None] = lambda: None,
 ) -> Path:
-    """The same as `write`, of blocks that come in pieces, so that no more than one of them is in memory.
+    """Write a map whose blocks come in pieces, as `write`, with no more than one of them in memory.
 
     Args:
         blocks: number of all of them.

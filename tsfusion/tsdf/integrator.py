@@ -122,7 +122,7 @@ class Integrator:
 
     @property
     def _vote(self) -> int:
-        """What the keyframe's rays leave where they end."""
+        """Vote of the keyframe's rays where they end."""
         if self._buffers.colored:
             return integrate.COLOR_VOTE
         return integrate.HIT_VOTE if self._store.counts_hits else integrate.NO_VOTE

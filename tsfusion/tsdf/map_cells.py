@@ -46,7 +46,7 @@ def listed_since(
     to_cells: Callable[[NDArray[np.int64]], NDArray[np.int64]],
     reach: int,
 ) -> tuple[NDArray[np.int64], int | None]:
-    """The same as `listed`, only of the cells that changes after the stamp `since` reach.
+    """List cells as `listed`, only those that changes after the stamp `since` reach.
 
     Looked through layer by layer, so that an answer costs what lies in a few layers, not in the map.
 

@@ -30,7 +30,7 @@ class Numbered(NamedTuple):
     first: NDArray[np.int64]
 
     def before(self, later: "Numbered", last: np.int64) -> "Numbered":
-        """These and the later ones, up to a key."""
+        """Join these blocks and later ones, up to a key."""
         n = int(np.searchsorted(later.keys, last, side="right"))
         return Numbered(
             np.concatenate([self.keys, later.keys[:n]]),

@@ -69,7 +69,7 @@ def _fill(
 def _table(
     keys: NDArray[np.int64], most: int
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]] | None:
-    """Which of some blocks is where: `rows`, `begin` and `size` of `interpolate_within`.
+    """Table of blocks by their place: `rows`, `begin` and `size` of `interpolate_within`.
 
     None where these blocks lie so far apart that the table would have more than `most` numbers.
     """

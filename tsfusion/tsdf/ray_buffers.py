@@ -62,7 +62,7 @@ class RayBuffers:
 
     @property
     def voted(self) -> NDArray[np.int32]:
-        """How many voxels have votes, and where these are in `votes` (kernels/ray_smoothing.py)."""
+        """Number of voxels that have votes, and their places in `votes` (kernels/ray_smoothing.py)."""
         return self._voted.array
 
     @property

@@ -205,7 +205,7 @@ class ReadableMap(object_cards.Shown):
         return self._cells_reached(dirty, self.model.surface)
 
     def _cells_reached(self, dirty: NDArray[np.int32], surface: Surface) -> NDArray[np.int32]:
-        """The same as `cells_to_mesh`, of a surface."""
+        """Cells to mesh again, as `cells_to_mesh`, of a surface."""
         return cells_of(unpack_keys(self.values_reached(dirty, surface)))
 
     def values_reached(self, dirty: NDArray[np.int32], surface: Surface | None = None) -> NDArray[np.int64]:
@@ -329,7 +329,7 @@ class ReadableMap(object_cards.Shown):
 
 
 def map_provenance(header: CheckpointHeader) -> Provenance:
-    """What a file of a saved map's surface says about it, as `ReadableMap.provenance`, by its header."""
+    """Provenance of a saved map's surface, as `ReadableMap.provenance`, by its header."""
     return _provenance(header.meta, header.keyframes, header.map_hash, header.config, None)
 
 

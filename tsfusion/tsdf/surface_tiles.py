@@ -139,7 +139,7 @@ class SurfaceTiles:
         return self._numbers
 
     def affordable(self, keys: NDArray[np.int64], most: int) -> int:
-        """How many of the first blocks lie in cubes that are kept, and in so many that are not."""
+        """Number of the first blocks that lie in cubes that are kept, and in so many that are not."""
         if self._view is values_of:
             return len(keys)
         numbers, first = np.unique(_tile_of(keys), return_index=True)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Where each colour image was really taken, and how bright it is: so that images agree on a surface.
+"""True place and brightness of each colour image: so that images agree on a surface.
 
 Poses are never exact, and colour and depth are often taken some milliseconds apart: on a wall two metres away
 half a degree is four pixels. Each image is moved until it agrees with the mean of all others on points of the

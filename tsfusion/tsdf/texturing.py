@@ -41,7 +41,7 @@ Watch = Callable[[str, int, int], None]
 
 
 class TextureSettings(Struct, frozen=True):
-    """How a texture is made.
+    """Settings of a texture.
 
     Attributes:
         size: texels of a page's side, at most; where they do not suffice there are several pages.

@@ -82,7 +82,7 @@ class MapTiles:
         return self.apply_all([update], now_s)
 
     def apply_all(self, updates: Sequence[SurfaceUpdate], now_s: float) -> set[Key]:
-        """The same as `apply`, of several updates at once, of which the last has the newest cells.
+        """Apply several updates at once, of which the last has the newest cells.
 
         A scanner that stands still changes the same cells with each keyframe: only the newest are looked at.
         """

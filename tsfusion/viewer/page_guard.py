@@ -143,7 +143,6 @@ class PageGuard:
 
 
 def is_websocket(headers: Headers) -> bool:
-    """Whether a request is for a WebSocket."""
     return any("websocket" in value.lower() for value in headers.get_all("Upgrade"))
 
 

@@ -109,7 +109,6 @@ class ScannerMarks:
             scanner.is_found, scanner.is_placed, scanner.is_drawn = True, False, False
 
     def is_due(self, now: float) -> bool:
-        """Whether `draw` has something to do."""
         return any(
             not one.is_placed
             or (not one.is_drawn and now >= one.path_at + _PATH_PAUSE)

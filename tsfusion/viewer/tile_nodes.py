@@ -64,12 +64,10 @@ class TileNodes:
         self.bytes_sent = 0
 
     def is_due(self, now: float) -> bool:
-        """Whether `send` has something to do."""
         ends = (end for nodes in (self._last, self._spare) for _, end in nodes.values())
         return any(now >= end for end in ends) or any(now >= self._due(key) for key in self.waiting)
 
     def has(self, key: Key) -> bool:
-        """Whether the scene has a version of a tile."""
         return key in self._nodes
 
     def clear(self) -> None:

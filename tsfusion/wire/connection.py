@@ -61,7 +61,6 @@ class Connection:
 
     @property
     def is_made(self) -> bool:
-        """Whether the connection stands."""
         return self._monitor.connected
 
     @property

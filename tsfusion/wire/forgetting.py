@@ -103,10 +103,10 @@ class Forgotten(Struct, frozen=True, kw_only=True):
 
     @property
     def keyframes(self) -> int:
-        """How many keyframes were forgotten that were not before."""
+        """Number of keyframes that were forgotten now."""
         return sum(one.keyframes for one in self.sessions)
 
     @property
     def selected(self) -> int:
-        """How many keyframes were selected, those that were forgotten before included."""
+        """Number of keyframes that were selected, those that were forgotten before included."""
         return sum(len(one.numbers) for one in self.sessions)

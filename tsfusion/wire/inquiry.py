@@ -73,7 +73,6 @@ class Inquiry:
 
     @property
     def may_ask(self) -> bool:
-        """Whether a question may be asked now: none is under way."""
         return bool(self.watches) and self._connection.is_made and self._asked_until is None
 
     def ask(self, map_name: str, question: Question, *, compress: bool) -> None:

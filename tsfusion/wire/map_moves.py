@@ -76,7 +76,7 @@ class Parcel(Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class Moved(Struct, frozen=True):
-    """How a move went.
+    """Outcome of a move.
 
     Attributes:
         frozen_s: seconds in which the map took no records.

@@ -152,7 +152,6 @@ class MapWatcher:
             zmq.zmq_poll(polled, int(1000 * min(until, 1.0)) + 1)
 
     def _due(self) -> float:
-        """When there is something to do although nothing comes."""
         waits = [self._inquiry.due]
         if self._next_read > time.monotonic():
             waits.append(self._next_read)

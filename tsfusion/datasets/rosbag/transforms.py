@@ -130,7 +130,6 @@ class TransformTree:
         return any((parent, child) in self._dynamic for child, parent in pairwise(chain))
 
     def connected(self, one: str, other: str) -> bool:
-        """Whether the two are in one tree."""
         return self.ancestors(one)[-1] == self.ancestors(other)[-1]
 
     def at(self, target: str, source: str, stamp: int) -> Transform | None:

@@ -60,7 +60,6 @@ class RunFindings:
 
 
 def is_run(folder: Path) -> bool:
-    """Whether a folder holds the results of a run."""
     return (folder / RECORD).is_file()
 
 

@@ -164,7 +164,6 @@ def open_stream(
 
 
 def plugged_in(rs: Any, device: Any) -> bool:
-    """Whether the camera is still connected."""
     if not device.supports(rs.camera_info.serial_number):
         return bool(device.is_connected())
     return bool(device.is_connected()) or device.get_info(rs.camera_info.serial_number) in _cameras(rs)

@@ -42,7 +42,6 @@ class RectificationCheck:
 
     @property
     def ok(self) -> bool:
-        """Whether no problem was found."""
         return not self.problems
 
 
@@ -58,12 +57,10 @@ class RectificationMonitor:
 
     @property
     def wants_pair(self) -> bool:
-        """Whether another pair is needed."""
         return len(self._left) < SAMPLES
 
     @property
     def wants_motion(self) -> bool:
-        """Whether another motion's offset is needed."""
         return len(self._offsets) < SAMPLES
 
     def add_pair(self, left: Pixels, right: Pixels, shape: tuple[int, ...]) -> None:
