@@ -242,8 +242,8 @@ class Frames(ShownRecording):
         return 0 if self.timestamps_ns is None else int(self.timestamps_ns[index])
 
 
-class Selection(Frames):
-    """Selected keyframes of another dataset; `select` makes one.
+class Wrapped(Frames):
+    """Some frames of another dataset.
 
     Has the other's `distance` where it has one: the measure of a world whose surface is known.
     """
@@ -252,27 +252,31 @@ class Selection(Frames):
 
     def __init__(self, dataset: Dataset, indices: Sequence[int]) -> None:
         self.name, self.sensor, self.skipped = dataset.name, dataset.sensor, dataset.skipped
-        self._dataset, self._indices = dataset, list(indices)
-        self.camera, self.depth_unit = (getattr(dataset, name, None) for name in ("camera", "depth_unit"))
-        self.quaternions = getattr(dataset, "quaternions", False)
-        self.usual = getattr(dataset, "usual", {})
-        self.origin = getattr(dataset, "origin", None)
-        if hasattr(dataset, "distance"):
-            self.distance = dataset.distance
-        if dataset.timestamps_ns is not None:
-            self.timestamps_ns = dataset.timestamps_ns[self._indices]
+        self._dataset = dataset
+        for name in ("camera", "depth_unit", "quaternions", "usual", "origin", "distance"):
+            if hasattr(dataset, name):
+                setattr(self, name, getattr(dataset, name))
+        self._choose(indices)
+
+    def _choose(self, indices: Sequence[int]) -> None:
+        self._indices, stamps = list(indices), self._dataset.timestamps_ns
+        self.timestamps_ns = None if stamps is None else stamps[self._indices]
 
     def __len__(self) -> int:
         return len(self._indices)
-
-    def pose(self, index: int) -> NDArray[np.float64] | None:
-        return pose_of(self._dataset, self._indices[self._checked(index)])
 
     def specific_force(self, index: int) -> NDArray[np.float64] | None:
         return force_of(self._dataset, self._indices[self._checked(index)])
 
     def _frame(self, index: int) -> Frame:
         return frame_of(self._dataset, self._indices[index])
+
+
+class Selection(Wrapped):
+    """Selected keyframes of another dataset; `select` makes one."""
+
+    def pose(self, index: int) -> NDArray[np.float64] | None:
+        return pose_of(self._dataset, self._indices[self._checked(index)])
 
     def _keyframe(self, index: int) -> Keyframe:
         try:

@@ -10,13 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets.dataset import (
-    NO_POSE_IN_TIME,
-    Dataset,
-    Frames,
-    force_of,
-    frame_of,
-)
+from tsfusion.datasets.dataset import NO_POSE_IN_TIME, Dataset, Wrapped
 from tsfusion.datasets.trajectory_files import read_poses, read_tum
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.se3 import Transform
@@ -91,7 +85,7 @@ def pairs_by_time(path: Path, dataset: Dataset) -> bool:
     return times is not None and (dataset.timestamps_ns is not None or len(poses) != len(dataset))
 
 
-class WithTrajectory(Frames):
+class WithTrajectory(Wrapped):
     """Another dataset's frames with the poses of a file.
 
     Args:
@@ -100,26 +94,14 @@ class WithTrajectory(Frames):
     """
 
     def __init__(self, dataset: Dataset, path: Path, *, posed: bool = True, **where: float) -> None:
-        self._dataset, self.skipped = dataset, dict(dataset.skipped)
-        self.name, self.sensor = dataset.name, dataset.sensor
-        self.camera, self.depth_unit = (getattr(dataset, name, None) for name in ("camera", "depth_unit"))
-        self.usual = getattr(dataset, "usual", {})
+        super().__init__(dataset, range(len(dataset)))
+        self.skipped, self.quaternions = dict(dataset.skipped), False
         found = poses_of(path, len(dataset), dataset.timestamps_ns, posed=posed, **where)
-        self._indices = self._keep(
-            range(len(dataset)), found, (path, EXPECTED), posed=posed, reason=NO_POSE_IN_TIME
-        )
-        if dataset.timestamps_ns is not None:
-            self.timestamps_ns = dataset.timestamps_ns[self._indices]
+        self._choose(self._keep(self._indices, found, (path, EXPECTED), posed=posed, reason=NO_POSE_IN_TIME))
         self._between = partial(poses_between, path, dataset.timestamps_ns, **where)
 
-    def __len__(self) -> int:
-        return len(self._indices)
-
-    def specific_force(self, index: int) -> NDArray[np.float64] | None:
-        return force_of(self._dataset, self._indices[self._checked(index)])
-
     def _frame(self, index: int) -> Frame:
-        measured = frame_of(self._dataset, self._indices[index])
+        measured = super()._frame(index)
         motion = self._motion(index, measured.point_times_s)
         return dataclasses.replace(measured, T_world_camera=self._poses[index], motion=motion)
 

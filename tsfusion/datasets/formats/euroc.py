@@ -128,21 +128,24 @@ def _calibrated(place: Path) -> tuple[Rectifier, Transform]:
     files = [place / camera / "sensor.yaml" for camera in ("cam0", "cam1")]
     try:
         rectifier = Rectifier(read_rig(*files))
-        T_BS = np.array(read_tree(files[0])["T_BS"]["data"], dtype=np.float64)
-        return rectifier, check_pose(T_BS.reshape(4, 4)) @ rectifier.T_left_rectified
-    except (InvalidConfig, InvalidKeyframe, KeyError, TypeError, ValueError) as error:
+    except InvalidConfig as error:
         raise DatasetError(f"{files[0]} and cam1's: {error}") from error
+    return rectifier, _on_body(files[0]) @ rectifier.T_left_rectified
+
+
+def _on_body(file: Path) -> Transform:
+    """T_BS of a sensor.yaml: the sensor's place on the body."""
+    try:
+        T_BS = np.array(read_tree(file)["T_BS"]["data"], dtype=np.float64)
+        return check_pose(T_BS.reshape(4, 4))
+    except (InvalidConfig, InvalidKeyframe, KeyError, TypeError, ValueError) as error:
+        raise DatasetError(f"{file}: T_BS: {error}") from error
 
 
 def _accelerometer(place: Path, T_body_camera: Transform) -> Accelerometer | None:
     """Accelerometer of `imu0`, if there is one."""
-    sensor, R_body_imu = place / "imu0" / "sensor.yaml", np.eye(3)
-    try:
-        if sensor.is_file():
-            T_BS = np.array(read_tree(sensor)["T_BS"]["data"], dtype=np.float64)
-            R_body_imu = check_pose(T_BS.reshape(4, 4))[:3, :3]
-    except (InvalidConfig, InvalidKeyframe, KeyError, TypeError, ValueError) as error:
-        raise DatasetError(f"{sensor}: {error}") from error
+    sensor = place / "imu0" / "sensor.yaml"
+    R_body_imu = _on_body(sensor)[:3, :3] if sensor.is_file() else np.eye(3)
     return read_table(
         place / "imu0" / "data.csv", "`ns,wx,wy,wz,ax,ay,az` a line", T_body_camera[:3, :3].T @ R_body_imu,
         separator=",", first=4,

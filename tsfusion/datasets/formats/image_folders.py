@@ -31,6 +31,7 @@ from tsfusion.datasets.depth_files import check_metres, read_depth
 from tsfusion.datasets.file_names import in_order, numbers_in, series_of
 from tsfusion.datasets.given_trajectory import poses_of
 from tsfusion.datasets.readers import read_color
+from tsfusion.geometry.calibration import Size
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.se3 import Transform
@@ -160,10 +161,8 @@ class DepthImages(DepthReader, Frames):
         self.uncolored = [*self._color].count(None)
         self.timestamps_ns = None if times is None else times[kept]
         self.name, self.sensor = f"{self.layout} {root.name}", sensor or self.sensor
-        camera = find_camera(
-            root, first_size(self._depth), intrinsics=intrinsics, calibration=calibration,
-            **self._known_camera(root),
-        )  # fmt: skip
+        size = first_size(self._depth)
+        camera = self._find_camera(root, size, depth_scale, intrinsics=intrinsics, calibration=calibration)
         self.use_camera(camera, depth_scale)
 
     def _opened(self, path: str | Path, trajectory: str | Path | None) -> tuple[Path, Path | None]:
@@ -198,6 +197,10 @@ class DepthImages(DepthReader, Frames):
     def _colors(self, root: Path) -> Sequence[Path | None]:
         """A colour image for each depth image, None where there is none; empty where there is no colour."""
         return []
+
+    def _find_camera(self, root: Path, size: Size, depth_scale: float | None, **given: Any) -> RecordedCamera:
+        """The camera of the depth images; `given` are intrinsics and calibration."""
+        return find_camera(root, size, **given, **self._known_camera(root))
 
     def _known_camera(self, root: Path) -> dict[str, Any]:
         """Where the camera is: `places`, `files` and `published` of `find_camera`."""

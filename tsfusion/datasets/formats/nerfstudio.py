@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError, InvalidConfig, InvalidKeyframe
 from tsfusion.datasets.cameras import MILLIMETRES, DepthUnit, RecordedCamera, given_camera
-from tsfusion.datasets.dataset import WITHOUT_DEPTH, Frames, first_frame
+from tsfusion.datasets.dataset import WITHOUT_DEPTH, Poses, Times, first_frame
 from tsfusion.datasets.depth_files import check_metres, read_depth
-from tsfusion.datasets.formats.image_folders import first_size, resample_for_camera
+from tsfusion.datasets.formats.image_folders import DepthImages, resample_for_camera
 from tsfusion.datasets.readers import listed_file, read_color, turned_by_exif
 from tsfusion.datasets.trajectory_files import usable
-from tsfusion.geometry.calibration import Camera, Undistorter
+from tsfusion.geometry.calibration import Camera, Size, Undistorter
 from tsfusion.geometry.calibration_files import read_text
 from tsfusion.geometry.frame import Frame
-from tsfusion.geometry.keyframe import Intrinsics, check_pose
+from tsfusion.geometry.keyframe import check_pose
 from tsfusion.geometry.origin import FARTHEST
 from tsfusion.geometry.se3 import Transform
 
@@ -56,7 +56,7 @@ def recognises(path: Path) -> bool:
     return (path / "transforms.json").is_file()
 
 
-class Nerfstudio(Frames):
+class Nerfstudio(DepthImages):
     """Frames with depth of a nerfstudio or instant-ngp capture.
 
     https://docs.nerf.studio/quickstart/data_conventions.html. Poses are camera-to-world with OpenGL axes, in
@@ -70,65 +70,54 @@ class Nerfstudio(Frames):
         intrinsics, calibration: of the depth images (pixel centres at integers), instead of the file's.
         depth_scale: metres per unit; default the file's `depth_unit_scale_factor` or `integer_depth_scale`,
             else 0.001.
-        posed: leave out frames without a pose; else they are kept, with `T_world_camera` None.
 
-    Raises:
-        DatasetError: no such file, no frame with depth, a missing image, a camera that cannot be used.
+    Other options are those of `DepthImages`.
     """
 
-    def __init__(
-        self,
-        path: str | Path,
-        *,
-        intrinsics: Intrinsics | None = None,
-        calibration: str | Path | None = None,
-        depth_scale: float | None = None,
-        sensor: str = "kinect",
-        color: bool = True,
-        posed: bool = True,
-    ) -> None:
+    layout, expected = "nerfstudio", EXPECTED
+
+    def _opened(self, path: str | Path, trajectory: str | Path | None) -> tuple[Path, Path | None]:
         path = Path(path).expanduser()
-        file = path if path.is_file() else path / "transforms.json"
-        capture = _read(file)
-        self.name, self.sensor, self.skipped = f"nerfstudio {file.absolute().parent.name}", sensor, {}
-        own = _depth_unit(capture, file)
-        self.depth_scale = own.metres if depth_scale is None else depth_scale
-        applied = _scale(capture, "applied_scale", file) if "applied_scale" in capture else 1.0
-        listed, posed_by = [], []
-        for number, frame in enumerate(capture["frames"]):
-            where = f"{file}, frame {number}"
-            entry = _listed_frame(file.parent, capture, frame, where, color=color)
-            if entry is not None:
-                listed.append(entry)
-                posed_by.append((frame, where))
-        if not listed:
-            raise DatasetError(
-                f"{file} has {len(capture['frames'])} frames, none with depth_file_path or depth_path; "
-                "expected depth images: colour alone cannot be fused"
-            )
-        if len(listed) < len(capture["frames"]):
-            self.skipped[WITHOUT_DEPTH] = len(capture["frames"]) - len(listed)
-        poses = usable(file, posed_by, lambda one: _pose(one[0], applied, one[1]))
-        self._listed = self._keep(listed, poses, (file, EXPECTED), posed=posed)
+        self._file = path if path.is_file() else path / "transforms.json"
         self._undistorters: dict[Camera, Undistorter] = {}
         self._given: Camera | None = None  # instead of the file's
-        self.camera = self._camera_of_first(file, intrinsics, calibration)
-        self.depth_unit = self.camera.depth_unit(depth_scale, own)
-        self.depth_scale = self.depth_unit.metres
+        self._capture = _read(self._file)
+        self.usual_unit = _depth_unit(self._capture, self._file)
+        return super()._opened(self._file.absolute().parent, trajectory)
 
-    def __len__(self) -> int:
-        return len(self._listed)
+    def _files(self, root: Path) -> tuple[list[Path], Times]:
+        frames = [(frame, f"{self._file}, frame {n}") for n, frame in enumerate(self._capture["frames"])]
+        listed = [_listed_frame(self._file.parent, self._capture, *each) for each in frames]
+        self._with_depth = [each for each, entry in zip(frames, listed, strict=True) if entry is not None]
+        self._listed = [entry for entry in listed if entry is not None]
+        if not self._listed:
+            raise DatasetError(
+                f"{self._file} has {len(frames)} frames, none with depth_file_path or depth_path; "
+                "expected depth images: colour alone cannot be fused"
+            )
+        if len(self._listed) < len(frames):
+            self.skipped[WITHOUT_DEPTH] = len(frames) - len(self._listed)
+        return [entry.depth for entry in self._listed], None
+
+    def _recorded_poses(self, root: Path, files: list[Path], times: Times) -> Poses:
+        capture, file = self._capture, self._file
+        applied = _scale(capture, "applied_scale", file) if "applied_scale" in capture else 1.0
+        return usable(file, self._with_depth, lambda one: _pose(one[0], applied, one[1]))
+
+    def _colors(self, root: Path) -> list[Path | None]:
+        return [self._listed[index].color for index in self._kept]
 
     def _frame(self, index: int) -> Frame:
-        entry = self._listed[index]
+        entry = self._listed[self._kept[index]]
         depth, scale = _read_depth(entry.depth, self.depth_scale)
-        color = None if entry.color is None else read_color(entry.color, None)
+        file = self._color[index] if self._color else None
+        color = None if file is None else read_color(file, None)
         size = entry.size or (depth if color is None else color).shape[:2]
         camera = self._given or _camera(entry, size)
         fitted = _resized(camera, depth.shape[:2], entry.where)
-        if color is not None and entry.color is not None and color.shape != (*depth.shape, 3):
-            if turned := turned_by_exif(entry.color, color.shape, camera.size):
-                raise DatasetError(f"{entry.color}: {turned}")
+        if color is not None and file is not None and color.shape != (*depth.shape, 3):
+            if turned := turned_by_exif(file, color.shape, camera.size):
+                raise DatasetError(f"{file}: {turned}")
             own = _resized(camera, color.shape[:2], entry.where)
             color = resample_for_camera(color, own.intrinsics, fitted.intrinsics, depth.shape)
         intrinsics = fitted.intrinsics
@@ -138,19 +127,17 @@ class Nerfstudio(Frames):
             color = None if color is None else undistorter.image(color)
         return self._posed_frame(index, depth=depth, depth_scale=scale, color=color, intrinsics=intrinsics)
 
-    def _camera_of_first(
-        self, file: Path, intrinsics: Intrinsics | None, calibration: str | Path | None
-    ) -> RecordedCamera:
+    def _find_camera(self, root: Path, size: Size, depth_scale: float | None, **given: Any) -> RecordedCamera:
         """The camera that was given, which is that of all frames; else that of the first frame."""
-        height, width = first_size([entry.depth for entry in self._listed])
-        given = given_camera((height, width), intrinsics=intrinsics, calibration=calibration)
-        if given is not None:
-            self._given = given.lens
-            return given
+        found = given_camera(size, **given)
+        if found is not None:
+            self._given = found.lens
+            return found
+        self.depth_scale = self.usual_unit.metres if depth_scale is None else depth_scale
         first = first_frame(self).intrinsics
         assert first is not None
         undistorted = ", undistorted" if self._undistorters else ""
-        return RecordedCamera(first, (height, width), f"from {file.name}{undistorted}")
+        return RecordedCamera(first, size, f"from {self._file.name}{undistorted}")
 
     def _undistorter(self, camera: Camera) -> Undistorter:
         if camera not in self._undistorters:
@@ -172,7 +159,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _listed_frame(
-    root: Path, capture: dict[str, Any], frame: dict[str, Any], where: str, *, color: bool
+    root: Path, capture: dict[str, Any], frame: dict[str, Any], where: str
 ) -> _ListedFrame | None:
     camera = {**capture, **frame}
     depth = frame.get("depth_file_path") or frame.get("depth_path")
@@ -181,7 +168,7 @@ def _listed_frame(
     size = None
     if "w" in camera and "h" in camera:
         size = (int(_number(camera, "h", where)), int(_number(camera, "w", where)))
-    file = frame.get("file_path") if color else None
+    file = frame.get("file_path")
     color_file = _image(listed_file(root, str(file))) if file else None
     return _ListedFrame(listed_file(root, str(depth)), color_file, size, camera, where)
 

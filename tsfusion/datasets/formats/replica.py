@@ -6,8 +6,13 @@ from typing import Any
 
 from tsfusion.datasets.cameras import DepthUnit, PublishedCamera
 from tsfusion.datasets.dataset import SCAN, NoPoses, Poses, Times
-from tsfusion.datasets.formats.image_folders import DepthImages, color_images, depth_images, images
-from tsfusion.datasets.readers import numbers
+from tsfusion.datasets.formats.image_folders import (
+    DepthImages,
+    color_images,
+    depth_images,
+    images,
+    poses_by_number,
+)
 from tsfusion.datasets.trajectory_files import read_matrix_rows
 from tsfusion.geometry.keyframe import Intrinsics
 
@@ -38,11 +43,7 @@ class Replica(DepthImages):
         path = root / "traj.txt"
         if not path.exists():
             raise NoPoses(f"{path} is missing; expected 16 numbers a line; {SCAN}")
-        poses = read_matrix_rows(path)
-        if len(poses) == len(files):
-            return poses
-        lines = [int(numbers(file, 0, [file.stem[len("depth") :]], 1, "depthN.png")[0]) for file in files]
-        return [poses[line] if line < len(poses) else None for line in lines]
+        return poses_by_number([file.stem for file in files], [*enumerate(read_matrix_rows(path))], path)
 
     def _colors(self, root: Path) -> list[Path]:
         """`frame000010.jpg` of `depth000010.png`; none where there are none."""
