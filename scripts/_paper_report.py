@@ -19,7 +19,7 @@ from _paper_verdicts import Findings, Verdict
 from tsfusion.core import durable_files
 from tsfusion.evaluation.trajectory_error import TrajectoryError
 from tsfusion.pipelines import run_files
-from tsfusion.pipelines.report import page, report_files
+from tsfusion.pipelines.report import page
 from tsfusion.pipelines.report.page import Page
 
 RECORD, REPORT = "run.json", "report.html"
@@ -219,7 +219,7 @@ def write_page(
         ("Small machines, simulated", _limits(limits, told)),
         ("Errata of the paper", "".join(page.note(line) for line in ERRATA)),
     ]
-    report_files.write(shown.html(), {}, folder / REPORT)
+    page.write(shown.html(), {}, folder / REPORT)
 
 
 def _warnings(limits: Limits, told: dict[str, Any]) -> list[str]:

@@ -18,7 +18,7 @@ from fake_server import saying, serving, status
 from health_snapshots import client, health, map_health
 from rich.console import Console
 
-from tsfusion.cli import status_screen
+from tsfusion.cli import status_view
 from tsfusion.cli.health_poll import READY, ServerWatcher
 from tsfusion.cli.health_poll import ServerSnapshot as Seen
 from tsfusion.cli.status_view import MAX_CLIENTS, render
@@ -390,7 +390,7 @@ def test_a_stall_that_began_before_is_seen_at_once(asking: Here) -> None:
 
 def test_a_silent_server_is_seen_before_the_question_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [100.0]
-    monkeypatch.setattr(status_screen, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr(status_view, "time", SimpleNamespace(monotonic=lambda: now[0]))
     console = Console(width=80, height=24, highlight=False)
 
     def seen() -> list[str]:
@@ -398,7 +398,7 @@ def test_a_silent_server_is_seen_before_the_question_fails(monkeypatch: pytest.M
             console.print(shown.cut())
         return captured.get().splitlines()
 
-    shown = status_screen.StatusScreen(console, "tcp://host:5555")
+    shown = status_view.StatusScreen(console, "tcp://host:5555")
     shown.ask()
     shown.answer(Seen(address="tcp://host:5555", health=health(client("cart"))))
     now[0] += 60.0

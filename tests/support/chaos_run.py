@@ -24,7 +24,7 @@ from tsfusion import journal
 from tsfusion.core.config import ClientConfig, override
 from tsfusion.core.errors import TransportError, TsfusionError
 from tsfusion.core.number_ranges import NumberRanges
-from tsfusion.journal.forgotten_numbers import ForgottenNumbers
+from tsfusion.journal.inspection import ForgottenNumbers
 from tsfusion.journal.state_folder import JournalPlace
 from tsfusion.wire import codec
 from tsfusion.wire.forgetting import Forgotten, Selection

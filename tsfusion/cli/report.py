@@ -31,14 +31,15 @@ def report(
     from tsfusion.cli import opened_maps, output, progress
     from tsfusion.core.errors import InvalidConfig
     from tsfusion.core.output_folder import check_writable
-    from tsfusion.pipelines.report import findings, report_files, run_report
+    from tsfusion.pipelines.report import findings, run_report
+    from tsfusion.pipelines.report.page import ENDINGS
     from tsfusion.pipelines.run_files import REPORT
 
     is_run = findings.is_run(source)
     if is_run and map_ is not None:
         raise InvalidConfig(f"--map has no effect on {source}: a run's report has all its maps")
     page = out or (source / REPORT if is_run else Path(REPORT))
-    check_writable(page, report_files.ENDINGS)
+    check_writable(page, ENDINGS)
     if is_run:
         with progress.shown(quiet=json) as display:
             display.stage(f"drawing {source}")

@@ -84,7 +84,7 @@ def _redraw(watcher: "ServerWatcher", address: str, seconds: float) -> NoReturn:
     from rich.console import Console
     from rich.live import Live
 
-    from tsfusion.cli.status_screen import StatusScreen
+    from tsfusion.cli.status_view import StatusScreen
     from tsfusion.core.errors import TransportError
 
     console = Console(highlight=False)

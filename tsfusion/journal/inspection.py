@@ -4,6 +4,7 @@
 import math
 from array import array
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,9 +15,9 @@ from numpy.typing import NDArray
 from tsfusion import journal
 from tsfusion.core.config import SERVER_SESSION
 from tsfusion.core.errors import DecodeError, InvalidKeyframe
+from tsfusion.core.number_ranges import NumberRanges
 from tsfusion.geometry import se3
 from tsfusion.geometry.keyframe import check_pose
-from tsfusion.journal.forgotten_numbers import ForgottenNumbers
 from tsfusion.journal.mcap_layout import Record
 from tsfusion.journal.record_scan import Damage, Erased
 from tsfusion.journal.state_folder import JournalPlace, Watcher
@@ -303,3 +304,27 @@ def _kind(record: Record) -> str:
 
 def _name(record: Record) -> str:
     return f"{_kind(record)} {record.seq} of session {record.session.hex()[:8]}"
+
+
+class ForgottenNumbers:
+    """A set of (session, number) that grows with each record that forgets keyframes."""
+
+    def __init__(self) -> None:
+        self._sessions: dict[bytes, NumberRanges] = {}
+
+    def __contains__(self, keyframe: tuple[bytes, int]) -> bool:
+        session, seq = keyframe
+        return session in self._sessions and seq in self._sessions[session]
+
+    def note(self, record: Record) -> None:
+        """Take in a record; any but those that forget keyframes, and a damaged one, are passed over."""
+        if record.session != SERVER_SESSION or not record.is_correction:
+            return
+        with suppress(DecodeError):  # `verify` tells of it
+            found = codec.decode(record.frames)
+            if isinstance(found, Correction) and found.target is not None:
+                self._sessions.setdefault(found.target, NumberRanges()).add(found.removed)
+
+    def of(self, session: bytes) -> NumberRanges:
+        """The numbers of one session."""
+        return self._sessions.get(session, NumberRanges())

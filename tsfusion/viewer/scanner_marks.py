@@ -5,13 +5,15 @@ import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.geometry.color_scales import of_number
 from tsfusion.geometry.trajectory import quaternion
-from tsfusion.viewer.small_pictures import small_picture
+from tsfusion.wire import image_headers
 from tsfusion.wire.map_events import PathsFound, ScannerSeen
+from tsfusion.wire.record_header import Refused
 
 if TYPE_CHECKING:
     import viser
@@ -22,6 +24,8 @@ _MOST_POINTS = 3000  # of a drawn path
 _WIDTHS = {"paths": 4.0, "first paths": 1.5}  # pixels
 _FADED = 0.6  # of the way to grey
 _LOST = 60  # voxels: further apart, two keyframes are no neighbours of a path
+_PICTURE_WIDTH = 320  # pixels
+_MOST_PIXELS = 1 << 26
 
 
 @dataclass
@@ -231,3 +235,22 @@ def _segments(points: NDArray[np.float64], most: float) -> NDArray[np.float32]:
 
 def _is_frustum(node: Any) -> bool:
     return hasattr(node, "image")
+
+
+def small_picture(jpeg: bytes) -> NDArray[np.uint8] | None:
+    """(h, w, 3) RGB of a JPEG, at most 320 pixels wide; None = it cannot be read."""
+    try:
+        height, width = image_headers.size(jpeg)
+    except Refused:
+        return None
+    if height * width > _MOST_PIXELS:
+        return None
+    flag = cv2.IMREAD_REDUCED_COLOR_4 if width >= 8 * _PICTURE_WIDTH else cv2.IMREAD_COLOR
+    flag = cv2.IMREAD_REDUCED_COLOR_2 if 4 * _PICTURE_WIDTH <= width < 8 * _PICTURE_WIDTH else flag
+    image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), flag | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image is None:
+        return None
+    if image.shape[1] > _PICTURE_WIDTH:
+        size = (_PICTURE_WIDTH, max(1, round(image.shape[0] * _PICTURE_WIDTH / image.shape[1])))
+        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    return np.ascontiguousarray(image[..., ::-1])

@@ -5,7 +5,7 @@ import threading
 
 import pytest
 
-from tsfusion.scanner.localization.loop_closure.ordered_work import OrderedWork
+from tsfusion.scanner.localization.loop_closure.loop_closing import OrderedWork
 
 SOON = 20.0  # seconds
 

@@ -11,7 +11,7 @@ from tsfusion.journal import inspection, state_folder
 from tsfusion.journal.inspection import JournalInfo
 from tsfusion.journal.journaled_keyframes import JournaledKeyframes
 from tsfusion.pipelines import run_files, saved_maps
-from tsfusion.pipelines.report import page, report_files, run_sections
+from tsfusion.pipelines.report import page, run_sections
 from tsfusion.pipelines.report.findings import MapFindings, Poses
 from tsfusion.pipelines.report.map_sections import ShownMap
 from tsfusion.pipelines.report.page import Page
@@ -57,7 +57,7 @@ def write(about: AboutMap, file: Path, out: Path, *, memory_bytes: int | None = 
     if about.poses is not None and len(about.poses):
         found.paths["keyframes"] = (None, about.poses)
     made = _page(about, stats.keyframes, figures)
-    drawn: report_files.Pictures = {}
+    drawn: page.Pictures = {}
     if found.mesh is None:
         made.sections.append(
             ("The map", page.note("It has no surface yet.") + run_sections.map_facts(figures))
@@ -79,7 +79,7 @@ def write(about: AboutMap, file: Path, out: Path, *, memory_bytes: int | None = 
         ),
         ("Where and with what", run_sections.setting(_setting(about))),
     ]
-    return report_files.write(made.html(), drawn, out)
+    return page.write(made.html(), drawn, out)
 
 
 def _page(about: AboutMap, keyframes: int, figures: dict[str, object]) -> Page:

@@ -6,15 +6,24 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from html import escape
 from importlib import resources
+from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core import durable_files
+from tsfusion.core.errors import OutputError
 from tsfusion.core.headline import Level
 from tsfusion.geometry.color_scales import ramp
+from tsfusion.pipelines import mesh_preview
 
 # No request leaves the page, whatever text it holds.
 _POLICY = (
     "default-src 'none'; base-uri 'none'; "
     "img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
 )
+ENDINGS = (".html", ".htm")
+Pictures = dict[str, NDArray[np.uint8]]  # name, (height, width, 3) RGB
 
 
 @dataclass
@@ -121,3 +130,22 @@ def pair(*parts: str) -> str:
 
 def _resource(name: str) -> str:
     return resources.files(__package__).joinpath(name).read_text(encoding="utf-8")
+
+
+def write(html: str, drawn: Pictures, out: Path) -> list[Path]:
+    """Write a page as `out`, and its pictures as `OUT-NAME.png` beside it; the files, the page last.
+
+    Raises:
+        OutputError: when they cannot be written.
+    """
+    files = []
+    for name, rgb in drawn.items():
+        files.append(out.with_name(f"{out.stem}-{name}.png"))
+        mesh_preview.write_png(rgb, files[-1])
+    try:
+        with durable_files.replacing(out) as file:
+            # Lone surrogates come from names of files that are no text.
+            file.write(html.encode("utf-8", errors="backslashreplace"))
+    except OSError as error:
+        raise OutputError(f"cannot write {out}: {error.strerror}") from error
+    return [*files, out]

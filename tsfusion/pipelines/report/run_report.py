@@ -8,11 +8,10 @@ from tsfusion.core.counts import count_of
 from tsfusion.core.readable_numbers import counted, figure, grouped, size
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.pipelines import shortfall
-from tsfusion.pipelines.report import findings, map_sections, page, report_files, run_sections
+from tsfusion.pipelines.report import findings, map_sections, page, run_sections
 from tsfusion.pipelines.report.findings import MapFindings, RunFindings
 from tsfusion.pipelines.report.map_sections import ShownMap
-from tsfusion.pipelines.report.page import Page
-from tsfusion.pipelines.report.report_files import Pictures
+from tsfusion.pipelines.report.page import Page, Pictures
 
 _MOST_MAPS = 4  # that are shown in pictures
 _ELSEWHERE = "The map is on its server, so there is no mesh here: `tsfusion mesh` fetches it."
@@ -34,7 +33,7 @@ def write(folder: Path, out: Path, *, meshes: dict[str, Mesh] | None = None) -> 
     """
     found = findings.read(folder, meshes)
     made, drawn = _page(found, findings.date_of(found.record, folder))
-    return report_files.write(made.html(), drawn, out)
+    return page.write(made.html(), drawn, out)
 
 
 def _page(found: RunFindings, date: str) -> tuple[Page, Pictures]:

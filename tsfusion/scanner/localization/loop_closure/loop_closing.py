@@ -3,9 +3,14 @@
 
 import itertools
 import logging
+import os
+import threading
 from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from typing import ParamSpec
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +21,6 @@ from tsfusion.scanner.localization.localizer import Localizer, Lost, Pose, PoseC
 from tsfusion.scanner.localization.loop_closure import pose_graph, verification
 from tsfusion.scanner.localization.loop_closure.loop_consensus import Loop, LoopConsensus
 from tsfusion.scanner.localization.loop_closure.odometry_drift import OdometryChain, OdometryDrift
-from tsfusion.scanner.localization.loop_closure.ordered_work import OrderedWork
 from tsfusion.scanner.localization.loop_closure.place_index import CAPACITY, PlaceIndex, PlaceView, place_view
 
 MIN_KEYFRAMES, MIN_WAY = 10, 3.0  # keyframes, and metres plus radians of way: younger places are no loops
@@ -32,6 +36,8 @@ MIN_RELOCALISATION_MATCHES = 30  # that must agree where no odometry supports a 
 MAX_PLACE_SPREAD = 0.3  # metres between the poses that several places give
 
 log = logging.getLogger(__name__)
+Given = ParamSpec("Given")
+_NICE = 10  # of the thread
 
 
 @dataclass(kw_only=True)
@@ -279,3 +285,35 @@ def _depth(frame: Frame) -> NDArray[np.float32] | None:
     depth = np.zeros_like(disparity)
     np.divide(np.float32(frame.baseline_fx), disparity, out=depth, where=disparity > 0)
     return depth
+
+
+class OrderedWork:
+    """Calls that one thread makes, one after the other.
+
+    Args:
+        name: of the thread.
+        most: number of calls that wait or are under way; `add` waits for room.
+    """
+
+    def __init__(self, name: str, most: int) -> None:
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix=name, initializer=_be_nice)
+        self._most = most
+        self._waiting: deque[Future[None]] = deque()
+
+    def add(self, call: Callable[Given, None], *args: Given.args, **kwargs: Given.kwargs) -> None:
+        """Have a call made after those before it. An earlier call's error is raised here, or by `wait`."""
+        while self._waiting and (self._waiting[0].done() or len(self._waiting) >= self._most):
+            self._waiting.popleft().result()
+        self._waiting.append(self._thread.submit(call, *args, **kwargs))
+
+    def wait(self) -> None:
+        """Wait until all calls were made."""
+        while self._waiting:
+            self._waiting.popleft().result()
+
+
+def _be_nice() -> None:
+    """Let the tracker's thread go first, where threads have a priority of their own."""
+    if hasattr(os, "setpriority") and hasattr(os, "sched_setaffinity"):  # Linux
+        with suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
