@@ -267,6 +267,18 @@ def test_keyframes_that_the_journal_no_longer_has_are_told(here: Here, tmp_path:
     assert part.returncode == 0, part.stderr
 
 
+def test_a_recording_of_which_much_cannot_be_read_is_no_success(here: Here, tmp_path: Path) -> None:
+    recording = redwood(tmp_path / "recording", list(range(12)), list(range(12)))
+    for number, image in enumerate(sorted(recording.glob("depth/*"))):
+        cv2.imwrite(str(image), np.full((6, 8), 1500, np.uint16))
+        if number % 3 == 1:
+            image.write_bytes(b"")
+    done = here("fuse", recording, "--voxel-size", "0.2", "--min-weight", "0", "--out", tmp_path / "out")
+    assert done.returncode == 1
+    assert "4 of 12 frames cannot be read, and are not in the map" in done.stderr.splitlines()[-1]
+    assert (tmp_path / "out" / "mesh.ply").is_file()
+
+
 @pytest.mark.parametrize("command", ["fuse", "replay"])
 def test_results_never_replace_a_servers_map(here: Here, tmp_path: Path, command: str) -> None:
     folder = make_map(tmp_path / "state" / "maps" / "default", range(2))

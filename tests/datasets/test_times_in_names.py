@@ -45,6 +45,10 @@ def test_times_are_those_that_were_written(way, stamps):
         [f"1700000000_{k:06d}" for k in range(9)],
         [f"0.{k}" for k in range(1, 30)],
         ["s1_9", "s1_10"],
+        [f"{1700000000 + k // 7}_{k}" for k in range(1, 40)],
+        [f"{1700000000 + k // 7}_{k:06d}" for k in range(40) if k % 11 != 5],
+        [f"cam0.{k}" for k in range(30) if k != 7],
+        [f"cam0.{k}" for k in (1, 2, 3, 5, 6)],
         [f"{1700000000 + k}.5" for k in (0, 1, 1)],
     ],
 )

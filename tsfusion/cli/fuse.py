@@ -97,6 +97,7 @@ def fuse(
     missed = (
         shortfall.of_damage(result.keyframes_lost), shortfall.of_absence(found.absent),
         shortfall.of_poses(result.keyframes, found.left_out), shortfall.of_clock(found.left_out),
+        shortfall.of_unreadable(result.keyframes, result.keyframes_rejected),
     )  # fmt: skip
     if text := shortfall.together(missed):
         raise IncompleteRun(text)

@@ -4,7 +4,6 @@
 import re
 from collections.abc import Iterable, Sequence
 from decimal import Decimal
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -101,11 +100,12 @@ def _times(names: Sequence[str]) -> NDArray[np.int64] | None:
         return stamps if len(stamps) == len(set(stamps.tolist())) > 0 else None
     parts = [(match["s"], match["f"]) for match in split]
     is_decimal, widths = split[0]["mark"] == ".", {len(fraction) for _, fraction in parts}
-    counted = sorted((int(s), int(f)) for s, f in parts)
-    if not (is_decimal and len(widths) == 1) and all(
-        a + 1 == b and s == t for (s, a), (t, b) in pairwise(counted)
-    ):
-        return None  # a counter beside the time at which the recording began, or a chapter
+    steps = np.diff([count for _, count in sorted((int(s), int(f)) for s, f in parts)])
+    is_sensor = len({s for s, _ in parts}) == 1 and all(
+        one.string[one.start("s") - 1].isalpha() for one in split
+    )
+    if (is_sensor or not (is_decimal and len(widths) == 1)) and _counts(steps):
+        return None  # a counter beside a sensor's number, a chapter's or seconds
     if len(widths) == 1 and (is_decimal or widths <= _USUAL_WIDTHS):
         ways = {"decimals": _read(parts, None)}
     else:
@@ -119,6 +119,11 @@ def _times(names: Sequence[str]) -> NDArray[np.int64] | None:
     return _chosen(
         {way: stamps for way, stamps in ways.items() if _is_plausible(stamps)}, names[0], is_stripped
     )
+
+
+def _counts(steps: NDArray[np.int64]) -> bool:
+    """Whether numbers with these steps count on, holes among them, whatever number is before them."""
+    return not len(steps) or bool(steps.min() > 0 and np.median(steps) == 1)
 
 
 def _ways(parts: Sequence[tuple[str, str]]) -> dict[str, NDArray[np.int64]]:

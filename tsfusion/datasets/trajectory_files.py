@@ -141,23 +141,29 @@ def _read(
     table = np.array([np.full(7, np.nan) if row is None else row for row in rows])
     order = np.argsort(times, kind="stable")[np.count_nonzero(times < 0) :]
     times, table = times[order], table[order]
-    _check_twins(times, table, path)
+    if words := twins(times, table):  # nobody knows which one counts
+        raise DatasetError(f"{path} has {words}; expected one pose a time")
     first = np.unique(times, return_index=True)[1]
     return Trajectory(times[first], table[first, :3], table[first, 3:])
 
 
-def _check_twins(times: NDArray[np.int64], table: NDArray[np.float64], path: Path) -> None:
-    """Raise DatasetError where two poses at one time differ: nobody knows which one counts."""
+def twins(times: NDArray[np.int64], table: NDArray[np.float64]) -> str:
+    """Poses at one time that differ, in words; empty = there are none.
+
+    Args:
+        times: (n,) nanoseconds, in order.
+        table: (n, 7) x y z qx qy qz qw.
+    """
     one, other = table[:-1], table[1:]
     apart = np.linalg.norm(one[:, :3] - other[:, :3], axis=1)
     turned = 2 * np.degrees(np.arccos(np.minimum(np.abs((one[:, 3:] * other[:, 3:]).sum(axis=1)), 1)))
-    twins = np.flatnonzero((np.diff(times) == 0) & ((apart > _SAME_M) | (turned > _SAME_DEG)))
-    if len(twins):
-        raise DatasetError(
-            f"{path} has two poses at one time, {count_of(len(twins), 'time')}, the first at "
-            f"{times[twins[0]] / 1e9:.6f} s: they are {apart[twins].max():.3f} m and "
-            f"{turned[twins].max():.2f}° apart at most; expected one pose a time"
-        )
+    found = np.flatnonzero((np.diff(times) == 0) & ((apart > _SAME_M) | (turned > _SAME_DEG)))
+    if not len(found):
+        return ""
+    return (
+        f"two poses at one time, {count_of(len(found), 'time')}, the first at {times[found[0]] / 1e9:.6f} s: "
+        f"they are {apart[found].max():.3f} m and {turned[found].max():.2f}° apart at most"
+    )
 
 
 def check_quaternion(quaternion: Sequence[float] | NDArray[np.float64], path: Path, line: int) -> None:

@@ -98,6 +98,7 @@ def test_euroc_stamps_can_be_shifted_and_poses_missing(euroc):
         (replace(f"{CAM0}/sensor.yaml", "T_BS", "T_XX"), r"sensor\.yaml"),
         (replace(f"{CAM0}/sensor.yaml", "resolution: [376, 240]", "resolution: [752, 480]"),
          r"the camera was calibrated for images of 752×480, got 376×240"),
+        (replace(f"{CAM0}/sensor.yaml", "distortion_model", "other"), r"sensor\.yaml has no distortion_m"),
         (replace(f"{CAM1}/sensor.yaml", "distortion_coefficients", "other"),
          r"distortion_model is .*, and its coefficients are missing"),
         (replace(f"{CAM0}/data.csv", ",", ";"), r"cam0/data\.csv:2: .*; expected `ns,file` a line"),

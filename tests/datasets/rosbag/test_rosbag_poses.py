@@ -47,6 +47,25 @@ def check_turning(found: Bag, after: np.ndarray = T_BODY_OPTICAL, before: np.nda
         assert np.allclose(keyframe.T_world_camera, expected, atol=1e-9, rtol=0)
 
 
+def test_two_poses_at_one_time_are_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    for name, other_m in (("same", 0.0), ("other", 0.4)):
+        with writing(tmp_path / name, "ros1") as (bag, path):
+            moments(bag)
+            bag.transform(T_BODY_OPTICAL, BODY, OPTICAL, 0, static=True, log_ns=T0)
+            for i in range(12):
+                T = turning(i * 0.1)
+                bag.transform(T, WORLD, BODY, T0 + i * 100_000_000)
+                moved = T.copy()
+                moved[0, 3] += other_m if i == 5 else 0
+                bag.transform(moved, WORLD, BODY, T0 + i * 100_000_000)
+        caplog.clear()
+        check_turning(Bag(path))  # the first that came counts
+        said = [line for line in caplog.messages if "two poses at one time" in line]
+        assert len(said) == (name == "other"), said
+    assert "1 time, the first at 1700000000.623457 s: they are 0.400 m and 0.00° apart" in said[0]
+    assert f"({BODY} in {WORLD})" in said[0]
+
+
 def test_transforms_are_chained_and_interpolated(tmp_path: Path) -> None:
     T_odom = se3.exp(np.array([3.0, 1, 0, 0, 0, 0.4]))
     with writing(tmp_path, "ros1") as (bag, path):

@@ -4,6 +4,7 @@
 import json
 import os
 import signal
+import struct
 import subprocess
 import sys
 import textwrap
@@ -393,6 +394,18 @@ def test_files_that_go_away_while_they_are_read(tmp_path: Path, monkeypatch: pyt
     source, frames = whole(tmp_path)
     assert numbers(frames) == [1]
     assert source.skipped == {"unreadable": 1}
+
+
+def test_colour_that_its_exif_orientation_alone_turns_is_named(tmp_path: Path) -> None:
+    camera(tmp_path)
+    upright = color(0).transpose(1, 0, 2)
+    data = cv2.imencode(".jpg", upright)[1].tobytes()
+    tiff = b"MM\0*" + struct.pack(">IHHHIHHI", 8, 1, 0x0112, 3, 1, 6, 0, 0)  # a quarter turn
+    exif = b"\xff\xe1" + struct.pack(">H", len(tiff) + 8) + b"Exif\0\0" + tiff
+    write(tmp_path, "depth/000000.png", png(depth(0)))
+    write(tmp_path, "color/000000.jpg", data[:2] + exif + data[2:])
+    with pytest.raises(SourceError, match="an EXIF orientation turns these: save the images turned"):
+        whole(tmp_path)
 
 
 def test_an_image_that_claims_to_be_huge_is_left_out(tmp_path: Path) -> None:

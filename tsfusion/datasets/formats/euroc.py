@@ -126,6 +126,9 @@ def _listed(camera: Path) -> list[tuple[int, Path]]:
 def _calibrated(place: Path) -> tuple[Rectifier, Transform]:
     """The rectification, and T_body_rectified of the left camera."""
     files = [place / camera / "sensor.yaml" for camera in ("cam0", "cam1")]
+    for file in files:
+        if file.is_file() and "distortion_model" not in read_tree(file):
+            raise DatasetError(f"{file} has no distortion_model (is it cut?); of rectified images it is none")
     try:
         rectifier = Rectifier(read_rig(*files))
     except InvalidConfig as error:

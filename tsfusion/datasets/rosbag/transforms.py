@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Poses of frames over time: the tree of ROS transforms, and topics of poses."""
 
+import logging
 from array import array
 from collections import defaultdict
 from itertools import pairwise
@@ -11,9 +12,12 @@ from numpy.typing import NDArray
 
 from tsfusion.datasets.dataset import clock_parts
 from tsfusion.datasets.rosbag.reader import frame_id, stamp_ns
+from tsfusion.datasets.trajectory_files import twins
 from tsfusion.geometry import se3
 from tsfusion.geometry.se3 import Transform
 from tsfusion.geometry.trajectory import Trajectory, rigid
+
+log = logging.getLogger(__name__)
 
 TF = "tf2_msgs/msg/TFMessage"
 OLD_TF = "tf/msg/tfMessage"
@@ -49,16 +53,21 @@ class PoseSamples:
         table: NDArray[np.float64] = np.array(self._values[-7:]).reshape(1, 7)
         return Trajectory(np.array(self._stamps[-1:], np.int64), table[:, :3], table[:, 3:])
 
-    def trajectory(self, part: int | None = None) -> Trajectory:
+    def trajectory(self, part: int | None = None, of: str = "") -> Trajectory:
         """The poses in the order of time; of equal times the first.
 
         Args:
             part: number of the part to take where their clock stepped back, from 1; None = all.
+            of: name for the warning about poses at one time that differ.
         """
         own = slice(None) if part is None else clock_parts(self._stamps)[:part][-1]
-        stamps, order = np.unique(np.array(self._stamps[own], np.int64), return_index=True)
-        table: NDArray[np.float64] = np.array(self._values).reshape(-1, 7)[own][order]
-        return Trajectory(stamps, table[:, :3], table[:, 3:])
+        stamps = np.array(self._stamps[own], np.int64)
+        table: NDArray[np.float64] = np.array(self._values).reshape(-1, 7)[own]
+        order = np.argsort(stamps, kind="stable")
+        if words := twins(stamps[order], table[order]):
+            log.warning("the recording has %s (%s); the first that came counts", words, of)
+        stamps, first = np.unique(stamps, return_index=True)
+        return Trajectory(stamps, table[first, :3], table[first, 3:])
 
 
 class _Edge(NamedTuple):
@@ -107,7 +116,7 @@ class TransformTree:
             if not samples:
                 continue
             is_static = (parent, child) not in self._dynamic
-            trajectory = samples.last() if is_static else samples.trajectory(part)
+            trajectory = samples.last() if is_static else samples.trajectory(part, f"{child} in {parent}")
             rows = np.hstack([trajectory.translations, trajectory.quaternions])
             constant = is_static or bool((np.ptp(rows, axis=0) < _SAME).all())
             self._edges[child] = _Edge(parent, trajectory, constant)
@@ -188,5 +197,9 @@ class PoseTopic:
     def track(self, part: int | None) -> TransformTrack | None:
         """The poses so far, `part` as of `PoseSamples.trajectory`; None = there is none."""
         return (
-            TransformTrack(self.world, self.body, self._samples.trajectory(part)) if self._samples else None
+            TransformTrack(
+                self.world, self.body, self._samples.trajectory(part, f"{self.body} in {self.world}")
+            )
+            if self._samples
+            else None
         )
