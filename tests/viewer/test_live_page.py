@@ -281,13 +281,21 @@ def test_arrow_keys_in_a_slider_do_not_turn_the_camera(whole: Shown) -> None:
     slider = "[...document.querySelectorAll('[role=slider]')].find(one => one.ariaLabel == 'Metres')"
     whole.click("Cut", "[role=tab]")
     whole.browser.wait(f"!!{slider}")
+    whole.control("Only inside a box").value = True
+    thumb = "document.querySelector('.multi-slider-thumb')"
+    whole.browser.wait(f"!!{thumb}")
     whole.browser.evaluate(
         "document.addEventListener('keydown', event => (window.heard ??= []).push(event.code))"
     )
-    for focused, key in ((f"{slider}.focus()", "ArrowUp"), ("document.activeElement.blur()", "ArrowDown")):
-        whole.browser.evaluate(focused)
+    for place, key in ((slider, "ArrowUp"), (thumb, "ArrowLeft"), ("", "ArrowDown")):
+        whole.browser.evaluate(f"{place}.focus()" if place == slider else "document.activeElement.blur()")
+        if place == thumb:
+            whole.press(
+                *whole.browser.evaluate(f"(b => [b.x + 2, b.y + 2])({thumb}.getBoundingClientRect())")
+            )
         for what in ("rawKeyDown", "keyUp"):
             whole.browser.call("Input.dispatchKeyEvent", type=what, key=key, code=key)
+    whole.control("Only inside a box").value = False
     whole.click("View", "[role=tab]")
     assert whole.browser.evaluate("window.heard") == ["ArrowDown"], "viser's camera listens there"
 
