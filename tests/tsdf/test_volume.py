@@ -2,6 +2,8 @@
 """Laws of the map: it is a sum, whatever the order, the threads or the history."""
 
 import copy
+import dataclasses
+import inspect
 import os
 import pickle
 import re
@@ -33,6 +35,8 @@ from tsfusion.core.errors import (
     OutputError,
     WeightOverflow,
 )
+from tsfusion.geometry.keyframe import KeyframeFields
+from tsfusion.geometry.map_grids import OwnSliceSettings
 from tsfusion.kernels import integrate, ray_smoothing
 from tsfusion.kernels.integrate import QUANTA_PER_VOXEL
 from tsfusion.kernels.voxel_traversal import ADDED, COST, COUNT
@@ -600,6 +604,14 @@ def test_type_checkers_know_every_setting() -> None:
 
     assert get_type_hints(VolumeSettings) == plain(VolumeConfig)
     assert set(get_type_hints(LoadSettings)) == {*VIEW_SETTINGS, *LIMIT_SETTINGS, "arch"}
+    fields = {one.name: one.type for one in dataclasses.fields(Keyframe) if one.init}
+    assert get_type_hints(KeyframeFields) == fields
+
+
+def test_type_checkers_know_how_a_slice_is_cut() -> None:
+    parameters = inspect.signature(Volume.current_slice).parameters
+    cut = {name: one.annotation for name, one in parameters.items() if one.kind is one.KEYWORD_ONLY}
+    assert get_type_hints(OwnSliceSettings) == cut
 
 
 def test_a_number_is_the_voxel_size() -> None:

@@ -5,7 +5,7 @@ import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, TypedDict, TypeVar
 
 import msgspec
 import numpy as np
@@ -289,6 +289,27 @@ class Keyframe(object_cards.Shown):
                 f"[[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got {' '.join(repr(self.intrinsics).split())}"
             )
         object.__setattr__(self, "intrinsics", check_intrinsics(intrinsics))
+
+
+class KeyframeFields(TypedDict, total=False):
+    """Names and types of the fields of a `Keyframe`, for type checkers."""
+
+    T_world_camera: NDArray[np.float64]
+    depth: NDArray[Any] | None
+    depth_scale: float
+    disparity: NDArray[np.uint16] | None
+    disparity_scale: float
+    baseline_fx: float | None
+    points: NDArray[np.float32] | None
+    point_times_s: NDArray[np.float32] | None
+    motion: sweeps.Motion | None
+    origins: NDArray[np.float32] | None
+    color: NDArray[np.uint8] | None
+    confidence: NDArray[np.uint8] | None
+    intrinsics: Intrinsics | None
+    sensor: str | None
+    timestamp_ns: int
+    captured_ns: int
 
 
 def keyframe_of(value: Any) -> Keyframe:

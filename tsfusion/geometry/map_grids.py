@@ -2,9 +2,10 @@
 """Grids of a map for robots: distances and occupancy, and the files that planners read."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import cv2
 import numpy as np
@@ -14,6 +15,7 @@ from tsfusion.core import durable_files
 from tsfusion.core.errors import InvalidConfig, OutputError
 from tsfusion.geometry.map_answers import checked_points
 from tsfusion.geometry.trajectory import quaternion
+from tsfusion.geometry.up_direction import Up
 
 FREE, OCCUPIED, UNSEEN = 0, 100, -1  # as in ROS's nav_msgs/OccupancyGrid
 SLICE_FORMATS = (".pgm", ".yaml", ".png", ".npz")
@@ -289,6 +291,23 @@ class DistanceField:
             "distance": self.distance, "occupancy": self.occupancy, "origin": self.origin,
             "voxel_size": np.float64(self.voxel_size), "max_distance": np.float64(self.max_distance),
         })  # fmt: skip
+
+
+class SliceSettings(TypedDict, total=False):
+    """Names and types of what `Volume.distance_slice` says of a slice, for type checkers."""
+
+    box: Sequence[float] | None
+    resolution: float | None
+    max_distance: float
+    min_weight: float | None
+
+
+class OwnSliceSettings(SliceSettings, total=False):
+    """The same of a map that can find up and its floor."""
+
+    up: Up | str | None
+    above_floor: bool
+    most_cells: int
 
 
 def blocked(

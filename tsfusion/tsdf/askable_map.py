@@ -4,7 +4,7 @@
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,6 +27,11 @@ from tsfusion.tsdf.mesh_extraction import extract_cells
 from tsfusion.tsdf.readable_map import ReadableMap
 from tsfusion.tsdf.surface_tiles import SurfaceTiles
 from tsfusion.tsdf.surface_values import SurfaceView
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+    from tsfusion.geometry.map_grids import OwnSliceSettings
 
 MOST_SURFACES = 2  # that answers are kept of
 MOST_NEW_CUBES = 2  # of a surface that is not kept, in an answer about cells
@@ -251,7 +256,7 @@ class AskableMap(ReadableMap):
         )
 
     def occupancy_slice(
-        self, low: float, high: float, *, need_free: bool = False, **options: Any
+        self, low: float, high: float, *, need_free: bool = False, **options: "Unpack[OwnSliceSettings]"
     ) -> OccupancySlice:
         """A costmap: free, occupied or unseen between two heights; `save` writes it for ROS's map_server.
 
@@ -271,11 +276,11 @@ class AskableMap(ReadableMap):
                 "the map was made without space_carving: it knows free space near surfaces alone; fuse it "
                 "anew with space_carving=True (--space-carving)"
             )
-        options = {"max_distance": self.config.voxel_size, **options}  # nobody asks for distances
+        options.setdefault("max_distance", self.config.voxel_size)  # nobody asks for distances
         return self.current_slice(low, high, **options).occupancy()
 
     def distance_slice(
-        self, low: float, high: float, *, unseen_is_free: bool = False, **options: Any
+        self, low: float, high: float, *, unseen_is_free: bool = False, **options: "Unpack[OwnSliceSettings]"
     ) -> DistanceSlice:
         """Horizontal distance of each cell to what stands between two heights.
 

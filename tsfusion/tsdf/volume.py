@@ -10,7 +10,7 @@ the sums and never change them.
 import copy
 import logging
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from typing_extensions import Unpack
 
     from tsfusion.core.config import LoadSettings, VolumeSettings
+    from tsfusion.geometry.keyframe import KeyframeFields
 
 log = logging.getLogger(__name__)
 _OF_SERVERS = {  # names that no completion shows
@@ -177,7 +178,9 @@ class Volume(AskableMap):
             hint = other_names.instead(name, other_names.VOLUME, dir(type(self)))
             raise AttributeError(f"Volume has no {name}{hint}")
 
-    def integrate(self, keyframe: Keyframe | None = None, *others: object, **fields: Any) -> IntegrateStats:
+    def integrate(
+        self, keyframe: Keyframe | None = None, *others: object, **fields: "Unpack[KeyframeFields]"
+    ) -> IntegrateStats:
         """Add a keyframe. On an error the map is as it was.
 
         One without a usable sample changes nothing and is not counted; the first of them is a warning.
@@ -205,7 +208,9 @@ class Volume(AskableMap):
         reach = VOXEL_LIMIT * self.config.voxel_size
         return why_no_samples(keyframe, model.min_range, model.max_range, reach)
 
-    def retract(self, keyframe: Keyframe | None = None, *others: object, **fields: Any) -> IntegrateStats:
+    def retract(
+        self, keyframe: Keyframe | None = None, *others: object, **fields: "Unpack[KeyframeFields]"
+    ) -> IntegrateStats:
         """Remove a keyframe, given as to `integrate`: the sums get back the bytes they had without it.
 
         Smoothed values cannot be un-smoothed: in the blocks it touched they fall back to the raw ones.
@@ -578,7 +583,7 @@ def _number(value: Any) -> Any:
     return float(str(value)) if isinstance(value, np.floating) else value
 
 
-def _keyframe(keyframe: Any, others: tuple[object, ...], fields: dict[str, Any]) -> Keyframe:
+def _keyframe(keyframe: Any, others: tuple[object, ...], fields: Mapping[str, Any]) -> Keyframe:
     """The keyframe of a call; other values by position are those of another library."""
     if others:
         return keyframe_of((keyframe, *others))

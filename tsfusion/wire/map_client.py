@@ -4,7 +4,7 @@
 import time
 from collections.abc import Sequence
 from types import TracebackType
-from typing import Any, Generic, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
 import numpy as np
 from msgspec import Struct
@@ -22,6 +22,11 @@ from tsfusion.wire.curve import ClientKeys, client_keys
 from tsfusion.wire.messages import Command, Reply
 from tsfusion.wire.queries import CommandRefused, Exchange, open_connection, place_of
 from tsfusion.wire.questions import Answer, Field, MapState, Question, Raycast, Sample, Slice
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+    from tsfusion.geometry.map_grids import SliceSettings
 
 Result = TypeVar("Result")
 _MOST_HOPS = 4  # from server to server, after a map
@@ -184,32 +189,36 @@ class MapClient:
         view = View(**_all(arrays, *names), colors=found_colors if colors else None)
         return _answered(view, answer, delay)
 
-    def occupancy_slice(self, low: float, high: float, **how: Any) -> Answered[OccupancySlice]:
+    def occupancy_slice(
+        self, low: float, high: float, *, up: Up | str, timeout: float | None = None,
+        **how: "Unpack[SliceSettings]",
+    ) -> Answered[OccupancySlice]:  # fmt: skip
         """Costmap of what stands between two heights; see `Volume.occupancy_slice`.
 
         Args:
-            low, high, how: as for `distance_slice`, without `max_distance`.
+            low, high, up, timeout, how: as for `distance_slice`, without `max_distance`.
         """
-        answer, arrays, delay = self._ask_slice("occupancy", low, high, **how)
+        answer, arrays, delay = self._ask_slice("occupancy", low, high, up=up, timeout=timeout, **how)
         found = _all(arrays, "cells", "knows_free_space", *_GRID)
         sliced = OccupancySlice(_grid(found), found["cells"], bool(found["knows_free_space"]))
         return _answered(sliced, answer, delay)
 
     def distance_slice(
-        self, low: float, high: float, *, unseen_is_free: bool = False, **how: Any
-    ) -> Answered[DistanceSlice]:
+        self, low: float, high: float, *, up: Up | str, unseen_is_free: bool = False,
+        timeout: float | None = None, **how: "Unpack[SliceSettings]",
+    ) -> Answered[DistanceSlice]:  # fmt: skip
         """Horizontal distances to what stands between two heights; see `Volume.distance_slice`.
 
         The server keeps the slices of a `box` that were asked last, and brings them up to date: the first
         answer takes it longest. Raises as `sample`.
 
         Args:
-            low, high: metres along `up`.
+            low, high: metres along `up`, such as "z".
             unseen_is_free: as for `Volume.distance_slice`.
-            how: `up`: needed here, such as "z"; `box`, `resolution`, `max_distance`, `min_weight`: as for
-                `Volume.distance_slice`; `timeout`: seconds.
+            timeout: seconds; None = the client's.
+            how: `box`, `resolution`, `max_distance`, `min_weight`: as for `Volume.distance_slice`.
         """
-        answer, arrays, delay = self._ask_slice("distance", low, high, **how)
+        answer, arrays, delay = self._ask_slice("distance", low, high, up=up, timeout=timeout, **how)
         found = _all(arrays, "cells", "distance", "max_distance", *_GRID)
         farthest = float(found["max_distance"])
         distance = blocked(found["distance"], found["cells"], unseen_is_free=unseen_is_free)
