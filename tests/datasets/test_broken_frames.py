@@ -115,6 +115,15 @@ def test_exchanged_bytes_of_depth_are_named():
         check_byte_order(depth.byteswap(), "depth.png")
 
 
+def test_a_recording_with_exchanged_bytes_of_depth_is_refused(tmp_path):
+    root = seven_scenes(tmp_path, count=3, shape=(60, 80))
+    rows, columns = np.mgrid[:60, :80]
+    for path in root.glob("*.depth.png"):
+        cv2.imwrite(str(path), (1500 + 3 * columns + rows).astype(np.uint16).byteswap())
+    with pytest.raises(UnreadableRecording, match="the two bytes of each depth value are exchanged"):
+        list(open_dataset(root))
+
+
 def test_names_of_files_may_have_separators_of_windows(tmp_path):
     (tmp_path / "depth").mkdir()
     for index in range(3):

@@ -10,6 +10,7 @@ from tsfusion import datasets
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets import Dataset, open_dataset, select
 from tsfusion.geometry.keyframe import Keyframe
+from tsfusion.geometry.origin import Origin
 
 
 @pytest.mark.parametrize(
@@ -121,3 +122,10 @@ def test_recorded_datasets_do_not_import_taichi_or_pykitti(tmp_path):
     )
     done = python(code, seven_scenes(tmp_path))
     assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_some_of_a_recording_count_from_its_origin(tmp_path):
+    dataset = open_dataset(seven_scenes(tmp_path, count=3), origin="300,200,100")
+    chosen = dataset[1:]
+    assert chosen.origin == dataset.origin == Origin((300, 200, 100))
+    np.testing.assert_array_equal(chosen[0].T_world_camera, dataset[1].T_world_camera)

@@ -59,3 +59,22 @@ def test_a_child_neither_sends_nor_removes_anything(temporary: bool, tmp_path: P
     assert lines[3].startswith("2 ")
     assert lines[4] == "0 2"
     assert not list(tmp_path.glob("tsfusion-spool-*"))
+
+
+SPOOL = """
+import os
+from tsfusion.delivery.spool import Spool
+spool = Spool(None, 1 << 20)
+child = os.fork()
+if not child:
+    spool.close()
+    os._exit(0)
+os.waitpid(child, 0)
+print(spool.folder.exists())
+spool.close()
+print(spool.folder.exists())
+"""
+
+
+def test_a_child_removes_no_spool_of_its_parent() -> None:
+    assert python(SPOOL).stdout.split() == ["True", "False"]

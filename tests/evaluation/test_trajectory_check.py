@@ -9,7 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 from tsfusion.datasets.dataset import Frames
+from tsfusion.evaluation.frame_pairs import FramePair, pairs_of, seen_frames
 from tsfusion.evaluation.pose_check import check
+from tsfusion.evaluation.trajectory_check import PoseFault, find_fault
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
@@ -74,6 +76,13 @@ def moved(shift: Callable[[int], float], axis: int = 0) -> Walk:
     return Walk(measured, given, hz=30, sensor="kinect")
 
 
+def fault_of(walk: Walk) -> PoseFault | None:
+    def compare(first: int, second: int) -> FramePair | None:
+        return next(iter(pairs_of(seen_frames(walk, [(first, second)]), [(first, second)])), None)
+
+    return find_fault(walk, compare, 2.0)
+
+
 def test_good_poses_pass() -> None:
     noise = np.random.default_rng(0).normal(0, 0.004, 80)
     assert check(moved(lambda _: 0.0)).verdict == "agree"
@@ -96,6 +105,25 @@ def test_drift_shows_where_a_place_is_seen_again(metres: float, axis: int) -> No
     first, second = report.frames
     assert second - first >= 35
     assert report.metres == pytest.approx(metres * (second - first) / 80, abs=0.02)
+
+
+def test_a_step_that_no_sensor_makes_is_a_jump_where_frames_show_nothing() -> None:
+    walk = moved(lambda index: 0.4 * (index > 30))
+    blank = {**walk._measured[30], "depth": np.zeros(SIZE, np.uint16)}
+    walk._measured = [*walk._measured[:30], blank, *walk._measured[31:]]
+    fault = fault_of(walk)
+    assert fault is not None
+    assert (fault.mistake, fault.frames) == ("jump", (30, 31))
+    assert fault.metres == pytest.approx(0.4, rel=0.1)
+    walk.timestamps_ns = None  # who knows how fast it was
+    fault = fault_of(walk)
+    assert fault is not None
+    assert fault.mistake == "drift"
+
+
+def test_poses_that_are_off_each_by_itself_neither_jump_nor_drift() -> None:
+    noise = np.random.default_rng(1).normal(0, 0.12, 80)
+    assert fault_of(moved(lambda index: noise[index])) is None
 
 
 def test_exact_scans_of_a_lidar_that_moves_pass_and_its_jump_does_not() -> None:

@@ -106,6 +106,12 @@ def test_a_motion_that_is_none_is_refused(motion: object, reason: str) -> None:
         keyframe(lidar.sweep(3, columns=8), motion)
 
 
+def test_times_of_points_are_finite() -> None:
+    with pytest.raises(InvalidKeyframe, match="point_times_s must be finite"):
+        Keyframe(points=np.ones((2, 3), np.float32), point_times_s=np.array([0, np.nan], np.float32),
+                 T_world_camera=np.eye(4))  # fmt: skip
+
+
 def test_times_are_of_points() -> None:
     with pytest.raises(InvalidKeyframe, match="go with points only"):
         Keyframe(depth=np.ones((4, 4), np.uint16), point_times_s=np.zeros(16),

@@ -9,6 +9,7 @@ import pytest
 
 from tsfusion import Intrinsics, InvalidConfig, Keyframe, VolumeConfig
 from tsfusion.client import ClientStats
+from tsfusion.datasets.dataset import UNREADABLE
 from tsfusion.pipelines import map_size, shortfall
 
 STATS = ClientStats(
@@ -86,6 +87,12 @@ def test_many_frames_without_a_pose() -> None:
     found = shortfall.of_poses(20, {"without a pose in time": 20, "without a pose": 1})
     assert found.startswith("only 20 of 41 frames have a pose")
     assert "--trajectory FILE" in found
+
+
+def test_many_frames_that_cannot_be_read() -> None:
+    assert shortfall.of_unreadable(40, {UNREADABLE: 2, "without a pose": 30}) == ""
+    found = shortfall.of_unreadable(40, {UNREADABLE: 3})
+    assert found.startswith("3 of 40 frames cannot be read, and are not in the map")
 
 
 def test_a_voxel_size_that_a_keyframe_cannot_have_is_refused_with_a_proposal() -> None:

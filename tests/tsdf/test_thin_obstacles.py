@@ -9,6 +9,7 @@ from thin_obstacles import BAR_HEIGHT, POSTS, VOXEL, scans, views
 
 from tsfusion import MapError, Volume, VolumeConfig
 from tsfusion.geometry.map_grids import FREE, OCCUPIED
+from tsfusion.tsdf.saved_map_addition import add_files
 
 
 def check_not_free(volume: Volume, folder: Path, *, bar: bool) -> None:
@@ -106,6 +107,9 @@ def test_hits_are_sums_that_go_with_the_map(tmp_path: Path) -> None:
         volume.integrate(scan)
     alone = Volume(VOXEL, sensor="lidar")
     alone.integrate(first)
+    parts = [alone.save(tmp_path / "one.tsf"), rest.save(tmp_path / "rest.tsf")]
+    add_files(parts, tmp_path / "sum.tsf")
+    assert hits(Volume.load(tmp_path / "sum.tsf")) == hits(volume)
     alone.merge(rest)
     assert hits(alone) == hits(volume) == hits(Volume.load(volume.save(tmp_path / "map.tsf")))
 

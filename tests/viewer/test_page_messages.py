@@ -88,6 +88,12 @@ def test_a_camera_that_is_nowhere_is_passed_over(change: dict[str, Any]) -> None
     assert taken(CAMERA | change) is None
 
 
+@pytest.mark.parametrize("field", ["ray_origin", "ray_direction"])
+def test_a_click_from_nowhere_is_passed_over(field: str) -> None:
+    assert taken(CLICK | {field: [0.0, 1e308, 0.0]}) is None
+    assert taken(CLICK | {field: [0.0, math.nan, 0.0]}) is None
+
+
 def test_a_picture_that_unpacks_to_too_much_is_passed_over() -> None:
     for width, height, passes in ((7680, 4320, True), (1 << 17, 1 << 17, False)):
         head = b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sII", 13, b"IHDR", width, height)
