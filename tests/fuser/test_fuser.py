@@ -5,6 +5,7 @@ import errno
 import json
 import mmap
 import os
+import shutil
 import signal
 import struct
 import subprocess
@@ -318,6 +319,31 @@ def test_another_maps_checkpoint_is_set_aside_and_the_journal_fused_anew(
     assert fuser.ready().done == {}
     assert "is the checkpoint of another map than that of the journal beside it" in caplog.text
     assert (ours / "map.damaged").read_bytes() == content
+
+
+def journaled(folder: Path, *records: tuple[bytes, int], quality: int = 90) -> None:
+    """Write a journal of records, a session and a number each."""
+    journal = Journal(folder / "journal", 1 << 20, sync=False)
+    for view, (session, seq) in enumerate(records):
+        frames = codec.encode(wall(view), session=session, seq=seq, jpeg_quality=quality)
+        journal.append(frames, session=session, seq=seq)
+    journal.close()
+
+
+def test_a_checkpoint_whose_last_keyframe_alone_is_of_another_map_is_set_aside(tmp_path: Path) -> None:
+    ours = tmp_path / "ours"
+    journaled(ours, (ANNA, 1), (BOB, 1))
+    (ours / "map.tsf").write_bytes((make_map(tmp_path / "theirs", range(2)) / "map.tsf").read_bytes())
+    assert opened(ours)[0].ready().done == {}
+    assert (ours / "map.damaged").exists()
+
+
+@pytest.mark.parametrize("quality", [90, 100])  # records as long as before, and longer ones
+def test_a_journal_that_begins_anew_beside_an_older_checkpoint_keeps_it(tmp_path: Path, quality: int) -> None:
+    folder = make_map(tmp_path, range(3))
+    shutil.rmtree(folder / "journal")
+    journaled(folder, (BOB, 1), (BOB, 2), quality=quality)
+    assert set(opened(folder)[0].ready().done) == {ANNA}
 
 
 def test_an_older_or_newer_checkpoint_of_the_same_journal_is_taken(tmp_path: Path) -> None:

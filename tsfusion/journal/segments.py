@@ -108,22 +108,21 @@ def read_at(path: Path, offset: int) -> Record:
         return record_at(source, segment_number(path), offset)
 
 
-def has_another(
-    folder: Path, session: bytes, seq: int, position: Position, *, until_ns: int | None = None
-) -> bool:
+def has_another(folder: Path, session: bytes, seq: int, position: Position, *, until_ns: int) -> bool:
     """Whether a journal has another record where it had this one. Damage and missing files show nothing.
 
     Args:
-        until_ns: when the journal had it: one that was logged later begins a journal anew; None = any counts.
+        until_ns: when the journal had it: one that was logged later begins a journal anew.
     """
     path = segment_path(folder, position.segment)
     with suppress(JournalError):
         found = read_at(path, position.offset)
-        is_later = until_ns is not None and found.logged_ns > until_ns
-        return (found.session, found.seq) != (session, seq) and not is_later
+        return (found.session, found.seq) != (session, seq) and found.logged_ns <= until_ns
     with suppress(JournalError):
-        whole = (one for one in scan_records(path) if isinstance(one, (Record, Erased)))
-        return any(0 < position.offset - one.position.offset < one.nbytes for one in whole)
+        own = (one for one in scan_records(path) if 0 < position.offset - one.position.offset < one.nbytes)
+        return any(
+            isinstance(one, Erased) or (isinstance(one, Record) and one.logged_ns <= until_ns) for one in own
+        )
     return False
 
 
