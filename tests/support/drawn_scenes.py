@@ -4,6 +4,7 @@
 import json
 import struct
 from dataclasses import dataclass, field
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ class Node:
 
     def __init__(self, scene: "DrawnScene", name: str, fields: dict[str, Any]) -> None:
         self._scene, self.name, self.visible = scene, name, True
+        self._impl = SimpleNamespace(props=SimpleNamespace())  # what viser would keep of it
         self.__dict__.update(fields)
 
     def __setattr__(self, name: str, value: Any) -> None:

@@ -564,7 +564,7 @@ def test_a_copy_shares_nothing(how: Callable[[Volume], Volume], files: bool, tmp
     assert copied.stats().keyframes == 2
     assert (copied.stamp, copied.drops) == (volume.stamp, volume.drops)
     assert np.array_equal(copied.changed_blocks(), volume.changed_blocks())
-    assert copied.held.numbers == volume.held.numbers
+    assert copied.held.numbers == (held := volume.held.numbers)
     copied.integrate(VIEWS[3])
     copied.meta["notes"].append("there")
     copied.release_empty()
@@ -572,7 +572,16 @@ def test_a_copy_shares_nothing(how: Callable[[Volume], Volume], files: bool, tmp
     assert volume.stats().blocks == counts.blocks
     assert volume.keyframes == counts.keyframes
     assert volume.meta == {"notes": ["here"]}
+    assert volume.held.numbers == held != copied.held.numbers
     assert copied.map_hash() == volume_of([*VIEWS[:2], VIEWS[3]], voxel_size=0.02).map_hash()
+
+
+def test_a_copy_knows_which_blocks_have_gone() -> None:
+    volume = volume_of(VIEWS[:2])
+    volume.retract(VIEWS[1])
+    volume.release_empty()
+    assert sum(map(len, volume._released))
+    assert np.array_equal(volume.copy().changed_blocks(), volume.changed_blocks())
 
 
 def test_a_copy_keeps_the_limits_of_its_map() -> None:

@@ -2,6 +2,7 @@
 """Tiles come into the scene within a budget, each in its turn, the newest version of each."""
 
 from collections import Counter
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,8 @@ from tsfusion.core.token_bucket import Bucket
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.viewer.clipping import Clipping
 from tsfusion.viewer.map_tiles import CELL, EDGE, MapTiles
-from tsfusion.viewer.tile_nodes import PAUSE, STEADY_PAUSE, TileNodes
+from tsfusion.viewer.tile_look import MOST_UNREAD, OwnLook
+from tsfusion.viewer.tile_nodes import PAUSE, ROOT, STEADY_PAUSE, TileNodes
 from tsfusion.viewer.vertex_colors import VertexColors
 from tsfusion.wire.map_events import SurfaceUpdate
 
@@ -160,3 +162,28 @@ def test_tiles_that_are_gone_leave_the_scene() -> None:
     assert set(page.scene.nodes) == {"/map/1_0_0"}
     page.nodes.clear()
     assert not page.scene.nodes
+
+
+def test_a_look_of_ones_own_hides_the_shared_one_when_all_of_it_is_there_for_who_reads() -> None:
+    scene, tiles, unread = DrawnScene(), MapTiles(), dict.fromkeys(range(MOST_UNREAD + 1))
+    buffer = SimpleNamespace(message_from_id=unread)
+    client: Any = SimpleNamespace(
+        scene=scene, _websock_connection=SimpleNamespace(get_message_buffer=lambda: buffer)
+    )
+    keys = tiles.apply(floor(4), 0.0)
+    look = OwnLook(client, tiles, VertexColors(tiles, lambda points: None, {}), Bucket(1e5, 0.0, burst=0.1))
+    look.nodes.voxel_size = VOXEL
+    look.changed(keys)
+    look.send(0.05)
+    assert not scene.nodes, "it has much to read before"
+    unread.clear()
+    now, counts = 0.05, []
+    while ROOT not in scene.nodes:
+        assert now < 60
+        counts.append(len(scene.models))
+        look.send(now := now + 0.05)
+    assert len(scene.models) == 4
+    assert {1, 2, 3} & set(counts), "the shared one is there until then"
+    assert not scene.nodes[ROOT].visible
+    look.close()
+    assert not scene.nodes
