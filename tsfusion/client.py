@@ -369,7 +369,7 @@ class Client:
 
     @property
     def first_rejection(self) -> str:
-        """Why the map did not take the first keyframe that it rejected; empty = it took all so far."""
+        """Reason why the map did not take the first keyframe that it rejected; empty = it took all so far."""
         return self._outbox.first_rejection
 
     @property
@@ -379,7 +379,7 @@ class Client:
 
     @property
     def problem(self) -> str:
-        """Why the spool keeps nothing, or the server takes nothing, at the moment; empty when they do."""
+        """Reason why spool or server take nothing at the moment; empty when they do."""
         return "; ".join(filter(None, (self._outbox.spool_problem, self._link_problem())))
 
     def _link_problem(self) -> str:
@@ -426,7 +426,7 @@ class Client:
         return self._outbox.wait(reached, timeout, self._check_running)
 
     def _why(self) -> str:
-        """Why not everything is at the server, for a person."""
+        """Reason why not everything is at the server, for a person."""
         box, last_heard = self._outbox, self._sender.last_heard
         if box.link_state.why:
             return box.link_state.why

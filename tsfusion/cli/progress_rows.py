@@ -147,7 +147,7 @@ def step_row(text: str, done: int, total: int) -> Row:
 
 
 def _trouble(link: str, scan: "ScanState | None") -> str:
-    """Why a run does not go on, in two or three words; the notes have the rest."""
+    """Reason why a run does not go on, in two or three words; the notes have the rest."""
     if scan is not None and scan.state == "lost":
         return "sensor lost"
     if scan is not None and scan.state == "starting" and scan.why:

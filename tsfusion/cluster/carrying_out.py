@@ -95,7 +95,7 @@ class CarryingOut:
                 )
 
     def _done(self, job: AnyJob) -> Done | None:
-        """How a job ended in an earlier run, if all of its files are still there, as it wrote them."""
+        """Result of a job in an earlier run, if all of its files are still there, as it wrote them."""
         try:
             content = jobs.done_file(self._folder, job.name).read_bytes()
             done = msgspec.msgpack.decode(content, type=Done)

@@ -143,7 +143,7 @@ AnyJob = Fuse | Add | MeshRun | MeshMap | MeshTile
 
 
 class Progress(Struct, tag="progress", frozen=True):
-    """How far a job is: keyframes read, and those of them in the map."""
+    """Progress of a job: keyframes read, and those of them in the map."""
 
     name: str
     read: int

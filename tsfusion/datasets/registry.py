@@ -239,7 +239,7 @@ def describe(dataset: Dataset) -> str:
 
 
 def sweep_doubt(first: Frame) -> str:
-    """Why the recording tells no motion within its sweeps; empty = it does, or its points have no times."""
+    """Reason why no motion is known within sweeps; empty = it is, or points have no times."""
     if first.untimed:
         return first.untimed
     lacks = first.motion is None and first.T_world_camera is not None and first.point_times_s is not None

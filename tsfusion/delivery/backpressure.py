@@ -128,7 +128,7 @@ class Thinning:
         self._left_out = self._in_a_row = 0
 
     def reason(self, room: int) -> str:
-        """Why the next keyframe is left out: `thinned` or `room`; empty = it is kept.
+        """Reason why the next keyframe is left out: `thinned` or `room`; empty = it is kept.
 
         Args:
             room: bytes that the spool may still take.

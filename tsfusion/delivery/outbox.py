@@ -113,7 +113,7 @@ class Outbox:
 
     @property
     def lag(self) -> Lag:
-        """How far the map is behind."""
+        """Lag of the map."""
         with self._lock:
             return Lag(self.behind, self._rate.per_second)
 
@@ -388,7 +388,7 @@ class Outbox:
 
     @property
     def first_rejection(self) -> str:
-        """Why the map did not take the first record that it rejected; empty = it took all."""
+        """Reason why the map did not take the first record that it rejected; empty = it took all."""
         with self._lock:
             return self._outcomes.first_rejection
 

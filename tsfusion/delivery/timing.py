@@ -148,7 +148,7 @@ class ClockOffset:
 
 
 class Lag(Struct, frozen=True):
-    """How far the map is behind the sensor."""
+    """Lag of the map behind the sensor."""
 
     keyframes: int  # that it has yet to get
     rate: float | None  # keyframes a second that it takes; None = not known, as while the link is down

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""How well two surfaces of one place lie on each other, and what speaks against it."""
+"""Fit of two surfaces of one place, and what speaks against it."""
 
 import cv2
 import msgspec

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Where one surface may lie in another: found without a first guess, by Open3D.
+"""Places of one surface in another: found without a first guess, by Open3D.
 
 Fast point feature histograms (Rusu, Blodow and Beetz 2009) tell which points look alike, RANSAC which of
 those pairs agree; point-to-plane ICP (Chen and Medioni 1991) brings the surfaces onto each other.

@@ -16,7 +16,7 @@ MIN_SHIFT_SHARE = 0.7  # of the gain by small corrections
 
 
 def time_shift(dataset: Dataset, pairs: Sequence[FramePair], best: Fits) -> int | None:
-    """How many frames later the poses fit clearly better; None where no shift does.
+    """Number of frames by which later poses fit clearly better; None where no shift does.
 
     Args:
         best: fits of the pairs after small corrections.

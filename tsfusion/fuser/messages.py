@@ -70,7 +70,7 @@ class Open(Struct, frozen=True, tag="open"):
 
 
 class SessionProgress(Struct, frozen=True, array_like=True):
-    """How far a map is with a client's session: every keyframe up to `seq` is fused or rejected.
+    """Progress of a map with a client's session: every keyframe up to `seq` is fused or rejected.
 
     `world`: the session's coordinate frame, empty = that of poses given from elsewhere.
     """
@@ -169,7 +169,7 @@ class Ready(Struct, frozen=True, tag="ready"):
 
 
 class CorrectionProgress(Struct, frozen=True, tag="corrected"):
-    """How far the map is with corrected poses.
+    """Progress of the map with corrected poses.
 
     Attributes:
         keyframes: in the map, now.

@@ -84,7 +84,7 @@ class PoseMover:
         return max(self._next - time.monotonic(), 0.0)
 
     def progress(self) -> CorrectionProgress:
-        """How far the map is with corrected poses."""
+        """Progress of the map with corrected poses."""
         return CorrectionProgress(
             self._volume.keyframes,
             self._poses.removed,

@@ -52,7 +52,7 @@ class AccessControl:
 
     @property
     def problem(self) -> str:
-        """Why nobody may connect; empty = the allow-list can be read."""
+        """Reason why nobody may connect; empty = the allow-list can be read."""
         return "" if self._allowed is None else self._allowed.problem
 
     @property

@@ -31,7 +31,7 @@ class Admission:
         return self._access.maps_of(client)
 
     def denial_of_map(self, client: str, map_name: str, *, sends: bool = False) -> str:
-        """Why a client may not use a map, which is counted; empty = it may.
+        """Reason why a client may not use a map, which is counted; empty = it may.
 
         Args:
             sends: whether it is to send keyframes into it.

@@ -70,7 +70,7 @@ class ClientRoute(Struct, eq=False):
 
     @property
     def problem(self) -> Problem | None:
-        """Why next to none of its keyframes comes into the map; None = they do."""
+        """Reason why next to none of its keyframes comes into the map; None = they do."""
         hold = "" if self.hold_reason == "disk" else self.hold_message  # of the disk its map tells already
         text = self.fates.problem(hold)
         who = self.client or f"at {self.address or 'an unknown address'}"

@@ -85,7 +85,7 @@ class FuserQueries:
         self._ports.reply(query.identity, messages.Reply(name=query.command.name, error=error, retry=retry))
 
     def _pass_on(self, query: PendingQuery, hosted: HostedMap) -> str:
-        """Why the fuser cannot be asked now; empty = it was."""
+        """Reason why the fuser cannot be asked now; empty = it was."""
         if not hosted.fuser.ready:
             return "the map is being opened, or its fuser restarts"
         if query.command.name == "mesh" and (problem := self._why_no_mesh(query, hosted)):
@@ -99,7 +99,7 @@ class FuserQueries:
         return ""
 
     def _why_no_mesh(self, query: PendingQuery, hosted: HostedMap) -> str:
-        """Why this mesh is not to be made now; empty = it may."""
+        """Reason why this mesh is not to be made now; empty = it may."""
         under_way = [one for one in self._pending.values() if one.command.name == "mesh"]
         if any(one.owner == query.owner for one in under_way) or self._unread.pending(query.owner):
             return "the mesh that was asked for before is still on its way"

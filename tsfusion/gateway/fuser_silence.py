@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""How long a fuser process has owed an answer, and how much of that time it could work."""
+"""Time for which a fuser process has owed an answer, and how much of that time it could work."""
 
 import time
 

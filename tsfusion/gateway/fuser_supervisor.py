@@ -153,7 +153,7 @@ class FuserSupervisor:
 
     @property
     def problem(self) -> str:
-        """Why no keyframe is fused now, and what to do; empty = they are."""
+        """Reason why no keyframe is fused now, and what to do; empty = they are."""
         if self.failed or self._restart_at:
             return self.failed
         if self.held:

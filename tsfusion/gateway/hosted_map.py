@@ -369,7 +369,7 @@ class HostedMap:
 
     @property
     def problem(self) -> str:
-        """Why keyframes are not accepted or not fused, and what to do; empty = they are."""
+        """Reason why keyframes are not accepted or not fused, and what to do; empty = they are."""
         return self._condition.problem
 
     @property
@@ -378,5 +378,5 @@ class HostedMap:
         return self._condition.notices
 
     def health(self) -> MapHealth:
-        """How the map is doing, as far as it is known without asking the fuser."""
+        """Health of the map, as far as it is known without asking the fuser."""
         return self._condition.health(self._corrections, self.corrections_waiting)

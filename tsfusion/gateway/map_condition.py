@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""How a map is doing: in a word, in lines for a person, and in numbers."""
+"""Condition of a map: in a word, in lines for a person, and in numbers."""
 
 import time
 
@@ -71,7 +71,7 @@ class MapCondition:
 
     @property
     def problem(self) -> str:
-        """Why keyframes are not accepted or not fused, and what to do; empty = they are."""
+        """Reason why keyframes are not accepted or not fused, and what to do; empty = they are."""
         if problem := self._disk.problem or self._fuser.problem:
             return problem
         stalled = self.warm and not self._backlog.is_empty and time.monotonic() - self.moved > _STALLED_AFTER
@@ -105,7 +105,7 @@ class MapCondition:
         return [*notices, *self._outcomes.notices.values()]
 
     def health(self, corrections: int, corrections_waiting: int) -> MapHealth:
-        """How the map is doing, as far as it is known without asking the fuser.
+        """Health of the map, as far as it is known without asking the fuser.
 
         Args:
             corrections: in the journal.

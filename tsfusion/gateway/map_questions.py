@@ -108,7 +108,7 @@ class MapQuestions:
 
     @staticmethod
     def _why_none(command: messages.Command, frames: list[memoryview]) -> str:
-        """Why nobody may ask this; empty = it may be asked."""
+        """Reason why nobody may ask this; empty = it may be asked."""
         if command.question is None:
             return "nothing was asked"
         if not 0 < command.timeout_s <= questions.LONGEST_S:
@@ -116,7 +116,7 @@ class MapQuestions:
         return command.question.problem(frames)
 
     def _pass_on(self, waiting: WaitingQuestion, frames: Sequence[zmq.Frame], hosted: HostedMap) -> str:
-        """Why the fuser cannot be asked now; empty = it was."""
+        """Reason why the fuser cannot be asked now; empty = it was."""
         command = waiting.command
         if not hosted.fuser.ready:
             return "the map is being opened, or its fuser restarts"

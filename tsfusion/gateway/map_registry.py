@@ -159,7 +159,7 @@ class MapRegistry:
             log.error("%s", error, extra=logs.about(map=name))
 
     def why_not_take(self, name: str) -> str:
-        """Why a map of this name cannot come from another server; empty = it can."""
+        """Reason why a map of this name cannot come from another server; empty = it can."""
         if name in self.arriving:
             return f"map {name} is coming already"
         if self._has_own(name):
@@ -244,7 +244,7 @@ class MapRegistry:
             return None
 
     def why_not(self, name: str) -> str:
-        """Why a map that is not open cannot be opened now; empty = it can be."""
+        """Reason why a map that is not open cannot be opened now; empty = it can be."""
         if name in self.arriving:
             return "it is coming from another server"
         why, failed = self._unopened.get(name, ("", -_RETRY_INTERVAL))
@@ -254,7 +254,7 @@ class MapRegistry:
 
     @property
     def why_full(self) -> str:
-        """Why there is no room for another map, and what makes some."""
+        """Reason why there is no room for another map, and what makes some."""
         most = self._server.max_maps
         return (
             f"{most} are open; use one of them (`tsfusion status` lists them), or restart the server with a "
@@ -262,7 +262,7 @@ class MapRegistry:
         )
 
     def why_none_free(self, like: str, maps: AllowedMaps) -> str:
-        """Why `keep_free_name` has no name for a client."""
+        """Reason why `keep_free_name` has no name for a client."""
         if self.free_name(like, maps) is None:
             return f"no name is free of the maps that this key may use: {maps}"
         return f"no room for another map: {self.why_full}"

@@ -30,7 +30,7 @@ _SUFFIX = ".json"
 
 
 class Arrival(Struct, frozen=True):
-    """Where a map came from, and what was acknowledged there.
+    """Origin of a map, and what was acknowledged there.
 
     Attributes:
         move: of this move, in hexadecimal.
@@ -46,7 +46,7 @@ class Arrival(Struct, frozen=True):
 
 
 class Departed(Struct, frozen=True):
-    """Where a map is now.
+    """Place of a map that left.
 
     Attributes:
         move: of this move, in hexadecimal.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""How many questions a map was asked, what became of them, and how long the answers took."""
+"""Questions that a map was asked, what became of them, and how long the answers took."""
 
 from collections import Counter, deque
 from typing import Literal

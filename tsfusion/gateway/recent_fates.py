@@ -46,7 +46,7 @@ class RecentFates:
         self._held_since = 0.0
 
     def problem(self, hold: str = "") -> str:
-        """Why next to none of the client's keyframes comes into the map; empty = they do.
+        """Reason why next to none of the client's keyframes comes into the map; empty = they do.
 
         Args:
             hold: why the server held keyframes off the last time; empty = that is no problem of the client.

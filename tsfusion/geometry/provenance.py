@@ -10,7 +10,7 @@ GENERATOR = "tsfusion"
 
 @dataclass(frozen=True, kw_only=True)
 class Provenance:
-    """Where a surface comes from; None = it is not known.
+    """Origin of a surface; None = it is not known.
 
     Attributes:
         source: name of the map, or of its file or folder: not where that lies, as files are sent around.

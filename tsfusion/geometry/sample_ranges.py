@@ -53,7 +53,7 @@ def wrong_unit(keyframe: Keyframe) -> str:
 
 
 def why_no_samples(keyframe: Keyframe, min_range: float, max_range: float, reach: float) -> str:
-    """Why a map can use none of a keyframe's samples, and what to do, for a person.
+    """Reason why a map can use none of a keyframe's samples, and what to do, for a person.
 
     Args:
         min_range, max_range: of the sensor's model, metres.

@@ -151,7 +151,7 @@ class JournaledKeyframes:
         self._places = [place for place in self._places if place.session in sessions]
 
     def pose_of(self, session: bytes, seq: int) -> NDArray[np.float64] | None:
-        """Where a keyframe was taken, (4, 4) T_world_camera; None = it is not there, or left out."""
+        """Pose of a keyframe, (4, 4) T_world_camera; None = it is not there, or left out."""
         return self._poses.pose_of(session, seq)
 
     def _pose(self, place: KeyframePlace) -> NDArray[np.float64] | None:

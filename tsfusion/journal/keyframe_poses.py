@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Where each keyframe of a map was fused, and where the newest corrections say that it was taken.
+"""Places at which a map's keyframes were fused, and at which the newest corrections say that they were taken.
 
 The map is settled when nothing is different: then it is the map that these keyframes make at their final
 poses, to the bit. A keyframe's pose is that of the newest correction that names it. Without one it is the
@@ -217,7 +217,7 @@ class KeyframePoses:
         poses.fused.extend(keyframe.T_world_camera[:3].ravel())
 
     def fused_after(self, session: bytes, seq: int, most: int) -> "FusedKeyframes":
-        """Where keyframes are fused now, in the order of sessions and numbers: those behind this one.
+        """Poses at which keyframes are fused, in the order of sessions and numbers: those behind this one.
 
         Args:
             most: how many are looked at.
@@ -253,7 +253,7 @@ class KeyframePoses:
         )
 
     def pose_of(self, session: bytes, seq: int) -> NDArray[np.float64] | None:
-        """Where a keyframe is, or is to be: (4, 4) float64; None = it is not in the map, or not known."""
+        """Pose of a keyframe, now or to be: (4, 4) float64; None = it is not in the map, or not known."""
         poses = self._sessions.get(session)
         at = None if poses is None else poses.find(seq)
         if poses is None or at is None:

@@ -90,7 +90,7 @@ def find_blocks(keys: I64, map_keys: I64, map_slots: I32, slots: I32):
 @QuickLaunch
 @ti.kernel
 def find_places(keys: I64, map_keys: I64, places: I32):
-    """Where blocks that are in the hash stand there. Serial, as `insert_blocks`."""
+    """Places of blocks in the hash, where they are in it. Serial, as `insert_blocks`."""
     mask = map_keys.shape[0] - 1
     ti.loop_config(serialize=True)
     for n in range(keys.shape[0]):

@@ -111,7 +111,7 @@ def missing_key(listed: ti.template(), i):
 
 @ti.func
 def winner_place(key, table: ti.template()):
-    """Where a block is in one of the two tables of `WINNERS` places."""
+    """Place of a block in one of the two tables of `WINNERS` places."""
     return table * WINNERS + ((hash_key(key) >> (15 * table)) & (WINNERS - 1))
 
 

@@ -27,7 +27,7 @@ BEGINNERS = max(TOUCHED_AT, CLAIMS)
 
 @ti.func
 def band_field(band, field: ti.template()):
-    """Where a band's field is in `told`."""
+    """Place of a band's field in `told`."""
     return BANDS_AT + band * BAND_FIELDS + field
 
 

@@ -178,7 +178,7 @@ def whole(number):
 
 @ti.func
 def moved(place, steps, x, y, z):
-    """Where the voxel is that lies x, y, z voxels from another one."""
+    """Place of the voxel that lies x, y, z voxels from another one."""
     by = vec3i(x, y, z)
     return Place(
         place.column + (steps.column * by).sum(), place.row + (steps.row * by).sum(),

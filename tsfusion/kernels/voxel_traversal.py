@@ -200,7 +200,7 @@ def offset_in_block(voxel):
 
 @ti.func
 def voxel_of(o):
-    """Where the voxel of this number lies in its block."""
+    """Place of the voxel of this number in its block."""
     return vec3i(o >> 6, (o >> 3) & 7, o & 7)
 
 

@@ -48,7 +48,7 @@ _RIVAL_CONTRADICTED = 0.05  # though it may be contradicted more often, by this 
 
 
 class Alignment(msgspec.Struct, kw_only=True):
-    """Where a second map lies in a first, and what supports it.
+    """Place of a second map in a first, and its evidence.
 
     Attributes:
         T_a_b: (4, 4) rows; p_a = T_a_b @ p_b.
@@ -187,7 +187,7 @@ def check_one_frame(a: Volume, b: Volume, names: Sequence[object]) -> None:
 
 
 class _Looks(NamedTuple):
-    """How often sensors looked through a surface, and how often they saw it."""
+    """Counts of looks through a surface, and of looks at it."""
 
     through: int
     seen: int
@@ -280,7 +280,7 @@ class _Pair:
         return _Answer(T, fit(*surfaces, T, _TOLERANCE * self._voxel), looks, self._tilt(T))
 
     def spread(self, T: Transform) -> float:
-        """How far apart the parts of the common surface want the second map, metres."""
+        """Distance between the places where parts of the common surface want the second map, metres."""
         return parts_spread(*self._sampled(self._voxel), T, _PART_REACH * self._voxel)
 
     def _looks_at(self, for_a: NDArray[np.float64], for_b: NDArray[np.float64]) -> _Looks:
@@ -356,7 +356,7 @@ class _Pair:
 
 
 class Merge(NamedTuple):
-    """How a map was added to another.
+    """Addition of a map to another.
 
     Attributes:
         not_exact: why the result is not the map of the keyframes of both; empty = it is.

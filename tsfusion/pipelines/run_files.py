@@ -52,7 +52,7 @@ def check_folder(out: str | os.PathLike[str] | None) -> None:
 
 
 class Circumstances(msgspec.Struct, frozen=True, kw_only=True):
-    """When and where a run ended, and how it was started. `finished` is local time."""
+    """Time and place of a run's end, and its command. `finished` is local time."""
 
     finished: str
     command: str  # empty = it was not started by the `tsfusion` command

@@ -187,7 +187,7 @@ class Target:
 
     @property
     def unkept(self) -> str:
-        """Why maps could not be kept in files; empty = they were, or the server still runs."""
+        """Reason why maps could not be kept in files; empty = they were, or the server still runs."""
         return "; ".join(self._unkept)
 
     def client(

@@ -19,7 +19,7 @@ class Selector(Protocol):
     """Rule that chooses keyframes."""
 
     def reason(self, frame: Frame, T_world_camera: NDArray[np.float64]) -> str | None:
-        """Why the frame is one, in a word; None = it is not."""
+        """Reason why the frame is one, in a word; None = it is not."""
 
     def accept(self, frame: Frame, T_world_camera: NDArray[np.float64]) -> None:
         """Make the frame the last keyframe."""

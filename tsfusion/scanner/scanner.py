@@ -149,7 +149,7 @@ class Scanner:
 
     @property
     def first_rejection(self) -> str:
-        """Why a map did not take the first keyframe that it rejected; empty = none did."""
+        """Reason why a map did not take the first keyframe that it rejected; empty = none did."""
         return next(filter(None, (submap.client.first_rejection for submap in self.submaps)), "")
 
     @property

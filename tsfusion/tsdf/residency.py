@@ -94,7 +94,7 @@ def _runs(numbers: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
 
 
 def checked_cache(memory_bytes: int, cache: str | os.PathLike[str] | CacheConfig | None) -> CacheConfig:
-    """Where blocks may wait that are not in memory."""
+    """Folder in which blocks may wait that are not in memory."""
     if memory_bytes < 1:
         raise InvalidConfig(f"memory_bytes must be > 0, got {memory_bytes}")
     if sys.platform != "linux" or not process.shared_rss_bytes():

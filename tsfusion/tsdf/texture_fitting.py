@@ -36,7 +36,7 @@ Watch = Callable[[int, int], None]
 
 
 class ImageFit(NamedTuple):
-    """How an image is used. `gain`: (3,) float32 factors on its RGB."""
+    """Use of an image. `gain`: (3,) float32 factors on its RGB."""
 
     T_camera_world: NDArray[np.float64]
     gain: NDArray[np.float32]

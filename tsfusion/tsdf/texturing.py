@@ -154,7 +154,7 @@ def _texel(best: NDArray[np.float32]) -> float:
 
 
 def _laid_out(mesh: Mesh, texel: float, size: int) -> tuple[Layout, list[NDArray[np.int64]]]:
-    """Where each face lies, and whose each texel is; no face covers another."""
+    """Places of the faces, and whose each texel is; no face covers another."""
     vertices, faces, normals = _arrays(mesh)
     charts = texture_charts.find(vertices, faces, normals)
     for attempt in range(_LAYOUTS):

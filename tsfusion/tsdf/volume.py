@@ -203,7 +203,7 @@ class Volume(AskableMap):
         return stats
 
     def why_no_samples(self, keyframe: Keyframe) -> str:
-        """Why `integrate` found no usable sample in a keyframe, and what to do, for a person."""
+        """Reason why `integrate` found no usable sample in a keyframe, and what to do, for a person."""
         model = self.config.model(keyframe.sensor)
         reach = VOXEL_LIMIT * self.config.voxel_size
         return why_no_samples(keyframe, model.min_range, model.max_range, reach)
@@ -530,7 +530,7 @@ class Volume(AskableMap):
 
     @property
     def arch(self) -> Arch:
-        """Where keyframes are fused: as the settings say, or `cpu` where that device is missing."""
+        """Device that fuses keyframes: as the settings say, or `cpu` where that device is missing."""
         return "cpu" if self._device is None else self._device.arch
 
     @property

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Where a page takes what it shows from: a running server, a saved map or a recording of one."""
+"""Source of what a page shows: a running server, a saved map or a recording of one."""
 
 from dataclasses import dataclass
 from typing import Protocol

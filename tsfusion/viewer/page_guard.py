@@ -75,7 +75,7 @@ class PageGuard:
         self.url = f"http://{place}" + (f"/?token={token}" if token is not None else "")
 
     def refusal(self, path: str, headers: Headers) -> Refusal | None:
-        """Why a request is refused; None = it is not."""
+        """Reason why a request is refused; None = it is not."""
         hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
         if len(hosts) != 1 or not self._is_own(hosts[0]):
             return Refusal(

@@ -24,7 +24,7 @@ class AllowedMaps(Struct, frozen=True):
         return "every map" if self.patterns is None else ", ".join(self.patterns) or "no map"
 
     def denial(self, name: str) -> str:
-        """Why a map is not to be had. It does not say whether there is such a map."""
+        """Reason why a map is not to be had. It does not say whether there is such a map."""
         return f"this key may not use map {name}, but: {self}"
 
     def topics(self, topic: bytes) -> list[bytes]:

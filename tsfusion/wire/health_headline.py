@@ -47,7 +47,7 @@ def lost_of_client(one: ClientHealth) -> int:
 
 
 def _trouble(health: Health, maps: dict[str, MapHealth], still: dict[str, float]) -> str:
-    """Why a server, or some map of it, does not work: a few words, as the problems are told at length."""
+    """Reason why a server or a map of it does not work: a few words, as the problems are told at length."""
     longest = max((max(still.get(name, 0.0), one.fusing_s) for name, one in maps.items()), default=0.0)
     if longest >= _STILL:
         return f"nothing fused for {span(longest)}"

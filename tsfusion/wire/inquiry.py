@@ -60,7 +60,7 @@ class Inquiry:
 
     @property
     def problem(self) -> str:
-        """Why the server does not answer, in words; empty = it does, or it is too early to say."""
+        """Reason why the server does not answer, in words; empty = it does, or it is too early to say."""
         now = time.monotonic()
         if self._connection.is_made:
             is_late = self._health_asked is not None and now - self._health_asked > _SILENT_AFTER / 2

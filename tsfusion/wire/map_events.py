@@ -66,7 +66,7 @@ class ScannerSeen:
 
 @dataclass(frozen=True, eq=False)
 class PathsFound:
-    """Where the map's keyframes are: all of them, at the poses that they are fused with now.
+    """Poses of all of the map's keyframes, those that they are fused with now.
 
     Attributes:
         paths: by session: (n,) int64 numbers and (n, 4, 4) float64 T_world_camera.

@@ -50,7 +50,7 @@ class MapFile(Struct, frozen=True):
 
 
 class MovedSession(Struct, frozen=True):
-    """How far a session is: what was acknowledged must be known before the map is read."""
+    """Progress of a session: what was acknowledged must be known before the map is read."""
 
     key: SessionId
     client: str

@@ -277,7 +277,7 @@ class MapWatcher:
             self._events.append(LinkSeen(problem))
 
     def _problem(self) -> str | None:
-        """Why there is nothing to see; empty = there is, None = nobody knows yet."""
+        """Reason why there is nothing to see; empty = there is, None = nobody knows yet."""
         if problem := self._inquiry.problem:
             return problem
         if self._inquiry.watches is False:
@@ -297,7 +297,7 @@ class MapWatcher:
         return self._problem_of_updates()
 
     def _problem_of_updates(self) -> str:
-        """Why mesh updates do not come, though questions are answered."""
+        """Reason why mesh updates do not come, though questions are answered."""
         link = self._updates
         if link.is_made or not (link.problem or link.finds_nobody):
             return ""

@@ -59,7 +59,7 @@ class Sample(Struct, frozen=True, tag="sample", omit_defaults=True):
         return 20 * self.points
 
     def problem(self, frames: Sequence[Any]) -> str:
-        """Why this is not to be asked; empty = it may be. `frames`: what came with it."""
+        """Reason why this is not to be asked; empty = it may be. `frames`: what came with it."""
         if not 1 <= self.points <= MOST_POINTS:
             return f"a question may have 1 to {MOST_POINTS} points, got {self.points}: ask in parts"
         if sum(map(len, frames)) != 12 * self.points:
@@ -97,7 +97,7 @@ class Raycast(Struct, frozen=True, tag="raycast", omit_defaults=True):
         return (4 + 12 * self.normals + 3 * self.colors) * math.prod(self.shape)
 
     def problem(self, frames: Sequence[Any]) -> str:
-        """Why this is not to be asked; empty = it may be. `frames`: what came with it."""
+        """Reason why this is not to be asked; empty = it may be. `frames`: what came with it."""
         if frames:
             return "a view has no points"
         try:
@@ -139,7 +139,7 @@ class Slice(Struct, frozen=True, tag="slice", omit_defaults=True):
         return 5 * MOST_CELLS
 
     def problem(self, frames: Sequence[Any]) -> str:
-        """Why this is not to be asked; empty = it may be. `frames`: what came with it."""
+        """Reason why this is not to be asked; empty = it may be. `frames`: what came with it."""
         numbers = (self.low, self.high, *self.up, *(self.box or ()), self.resolution or 0, self.max_distance)
         if frames or not all(map(math.isfinite, numbers)):
             return "a slice has finite numbers and no points"
@@ -166,7 +166,7 @@ class Field(Struct, frozen=True, tag="field", omit_defaults=True):
         return 5 * MOST_VOXELS
 
     def problem(self, frames: Sequence[Any]) -> str:
-        """Why this is not to be asked; empty = it may be. `frames`: what came with it."""
+        """Reason why this is not to be asked; empty = it may be. `frames`: what came with it."""
         if frames or not all(map(math.isfinite, self.box)):
             return "a distance field has a box of finite numbers and no points"
         if not 0 < self.max_distance <= FARTHEST_M:
@@ -193,7 +193,7 @@ class Cells(Struct, frozen=True, tag="cells", omit_defaults=True):
         return _CELL_BYTES * CELLS_AT_ONCE
 
     def problem(self, frames: Sequence[Any]) -> str:
-        """Why this is not to be asked; empty = it may be. `frames`: what came with it."""
+        """Reason why this is not to be asked; empty = it may be. `frames`: what came with it."""
         if frames:
             return "cells are asked for without points"
         if any(not -_FARTHEST_BLOCK <= one < _FARTHEST_BLOCK for one in self.first or ()):
@@ -218,7 +218,7 @@ class Keyframes(Struct, frozen=True, tag="keyframes", omit_defaults=True):
         return _KEYFRAME_BYTES * KEYFRAMES_AT_ONCE
 
     def problem(self, frames: Sequence[Any]) -> str:
-        """Why this is not to be asked; empty = it may be. `frames`: what came with it."""
+        """Reason why this is not to be asked; empty = it may be. `frames`: what came with it."""
         if frames:
             return "keyframes are asked for without points"
         good = 0 <= self.after < 1 << 63
@@ -330,6 +330,6 @@ def _array(layout: ArrayLayout, frame: Any) -> NDArray[Any]:
 
 
 def _problem_of_weight(min_weight: float | None) -> str:
-    """Why a weight makes no sense; empty = it does."""
+    """Reason why a weight makes no sense; empty = it does."""
     good = min_weight is None or (math.isfinite(min_weight) and min_weight >= 0)
     return "" if good else f"min_weight must be 0 or more, got {min_weight}"

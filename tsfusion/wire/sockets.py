@@ -252,7 +252,7 @@ def format_address(host: str, port: int) -> str:
 
 
 def publish_address(address: str, control: str | None = None, publish: str | None = None) -> str:
-    """Where a server publishes: `publish` if given, else the port after its control address."""
+    """Address at which a server publishes: `publish` if given, else the port after its control address."""
     if publish is not None:
         return format_address(*parse_address(publish))
     return _next_port(control_address(address, control), "mesh updates")

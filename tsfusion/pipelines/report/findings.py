@@ -164,7 +164,7 @@ def _rows(path: Path) -> list[dict[str, str]]:
 
 
 def date_of(record: dict[str, Any], path: Path) -> str:
-    """When a run ended: as it wrote down, or by its folder's name, or by its file."""
+    """Time at which a run ended: as it wrote down, or by its folder's name, or by its file."""
     made = record.get("made") or {}
     if made.get("finished"):
         return str(made["finished"])
