@@ -283,7 +283,7 @@ def _kind(file: Path) -> tuple[str, ...]:
     image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED) if content else None
     if image is not None:
         return str(image.dtype), str(image.ndim)
-    if b"\0" in content:  # points
+    if b"\0" in content or file.suffix[1:] in _CLOUDS:  # points
         return ("numbers",)
     return file.suffix, "".join(letter for letter in file.stem if letter.isalpha())
 

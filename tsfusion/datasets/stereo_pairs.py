@@ -176,12 +176,9 @@ def paired(
 class PairedImages(Frames):
     """Frames of a left and a right image each, rectified where they are not."""
 
-    _files: Sequence[tuple[Path, ...]]  # left and right
+    _files: list[Any]  # left and right image of each
     _pairs: PairRectifier
     _with_color: bool
-
-    def __len__(self) -> int:
-        return len(self._files)
 
     def _frame(self, index: int) -> Frame:
         files = self._files[index]

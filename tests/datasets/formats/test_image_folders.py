@@ -267,6 +267,18 @@ def test_redwood_poses_go_by_number_unless_there_are_as_many_images(tmp_path):
         Redwood(redwood(tmp_path / "none", [7, 8, 9], [0, 1]))
 
 
+def test_another_trajectory_gives_a_pose_for_each_image_of_any_layout(tmp_path):
+    rows = tmp_path / "rows.txt"
+    rows.write_text("".join(f"1 0 0 {x} 0 1 0 0 0 0 1 0\n" for x in (7, 8, 9)))
+    redwood(tmp_path / "redwood", [0, 1, 2], [0, 1, 2])
+    hololens(tmp_path / "hololens")
+    seven_scenes(tmp_path / "scenes")
+    for root in (tmp_path / "redwood", tmp_path / "hololens", tmp_path / "scenes"):
+        dataset = open_dataset(root, trajectory=rows)
+        assert [keyframe.T_world_camera[0, 3] for keyframe in dataset] == [7, 8, 9], dataset.name
+        one_line(lambda root=root: open_dataset(root, trajectory=tmp_path / "none.txt"), "none.txt")
+
+
 @pytest.mark.parametrize(
     ("stems", "log", "expected"),
     [

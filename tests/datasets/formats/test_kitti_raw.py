@@ -112,6 +112,10 @@ def test_kitti_raw_without_a_gps_unit_serves_scans_without_poses(drive):
         (replace("../calib_cam_to_cam.txt", "P_rect_01", "P_rect_09"), r"has no usable line P_rect_01"),
         (replace("../calib_cam_to_cam.txt", "P_rect_01: ", "P_rect_01: x"), r"has no usable line P_rect_01"),
         (replace("../calib_velo_to_cam.txt", "R: ", "R: 9 "), r"calib_velo_to_cam\.txt has no usable line R"),
+        (
+            lambda root: shutil.copy(root / "../calib_imu_to_velo.txt", root / "../calib_velo_to_cam.txt"),
+            r"calib_velo_to_cam\.txt turns forward elsewhere",
+        ),
         (replace("../calib_velo_to_cam.txt", "R: ", "R; "), r"txt:2: .*; expected `name: numbers`"),
         (
             replace("oxts/data/0000000001.txt", " 4 11 4 4 0", ""),

@@ -2,6 +2,7 @@
 """EuRoC micro aerial vehicle recordings, and others in the ASL layout: stereo pairs with a body's poses."""
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -10,15 +11,8 @@ from numpy.typing import NDArray
 from tsfusion.core.errors import DatasetError, InvalidConfig, InvalidKeyframe
 from tsfusion.datasets.accelerometer import Accelerometer, read_table
 from tsfusion.datasets.cameras import RecordedCamera
-from tsfusion.datasets.dataset import (
-    NO_HALF,
-    NO_POSE_IN_TIME,
-    SCAN,
-    NoPoses,
-    Poses,
-    poses_if_any,
-    require_folder,
-)
+from tsfusion.datasets.dataset import NO_HALF, NO_POSE_IN_TIME, SCAN, NoPoses, Poses, Times
+from tsfusion.datasets.folder_frames import FolderFrames
 from tsfusion.datasets.readers import listed_file, read_image, read_lines
 from tsfusion.datasets.stereo_pairs import PairedImages
 from tsfusion.datasets.trajectory_files import read_euroc
@@ -26,7 +20,6 @@ from tsfusion.geometry.calibration import Rectifier
 from tsfusion.geometry.calibration_files import read_rig, read_tree
 from tsfusion.geometry.keyframe import check_pose
 from tsfusion.geometry.se3 import Transform
-from tsfusion.geometry.trajectory import Trajectory
 
 EXPECTED = "mav0/{cam0,cam1}/{data.csv,sensor.yaml,data/*.png} and mav0/state_groundtruth_estimate0/data.csv"
 _TRUTH = "state_groundtruth_estimate0/data.csv"
@@ -37,7 +30,7 @@ def recognises(path: Path) -> bool:
     return any((root / "cam0" / "data.csv").is_file() for root in (path / "mav0", path))
 
 
-class EuRoC(PairedImages):
+class EuRoC(PairedImages, FolderFrames):
     """Stereo pairs in the ASL layout, undistorted and rectified by `sensor.yaml`.
 
     https://projects.asl.ethz.ch/datasets/doku.php?id=kmavvisualinertialdatasets. Frames are grey pairs in the
@@ -48,46 +41,40 @@ class EuRoC(PairedImages):
     Args:
         path: the sequence's folder (it holds `mav0`), or `mav0`.
         max_difference_s: between the two stamps of a pair, seconds.
-        max_gap_s: between the two poses interpolated, seconds; across a longer gap there is no pose.
-        time_offset_s: added to an image's stamp before its pose is looked up, seconds.
-        posed: leave out pairs without a pose; else they are kept, with `T_world_camera` None.
+        options: those of `FolderFrames`.
 
     Raises:
         DatasetError: no such folder, no pairs, a malformed line, a calibration that cannot be used.
     """
 
+    layout, expected, sensor = "EuRoC", EXPECTED, "stereo"
     quaternions = True
 
     def __init__(
-        self,
-        path: str | Path,
-        *,
-        max_difference_s: float = 0.002,
-        max_gap_s: float = 0.1,
-        time_offset_s: float = 0.0,
-        sensor: str = "stereo",
-        color: bool = True,
-        posed: bool = True,
+        self, path: str | Path, *, max_difference_s: float = 0.002, color: bool = True, **options: Any
     ) -> None:
-        root = require_folder(path, "EuRoC")
-        place = root / "mav0" if (root / "mav0").is_dir() else root
-        self.name, self.sensor, self.skipped = f"EuRoC {place.absolute().parent.name}", sensor, {}
-        pairs = _pairs(place, round(max_difference_s * 1e9), self.skipped)
-        rectifier, T_body_camera = _calibrated(place)
-        gap, offset = round(max_gap_s * 1e9), round(time_offset_s * 1e9)
+        self._max_difference_ns, self._with_color = round(max_difference_s * 1e9), color
+        super().__init__(path, **options)
+        self.name = f"EuRoC {self._place.absolute().parent.name}"
+        self._accelerometer = _accelerometer(self._place, self._T_body_camera)
 
-        def read() -> Poses:
-            trajectory = _trajectory(place)
-            return [_pose(trajectory, stamp + offset, gap, T_body_camera) for stamp, _, _ in pairs]
-
-        poses = poses_if_any(read, len(pairs), posed=posed)
-        kept = self._keep(pairs, poses, (place, EXPECTED), posed=posed, reason=NO_POSE_IN_TIME)
-        self._files = [pair[1:] for pair in kept]
-        self.timestamps_ns = np.array([stamp for stamp, _, _ in kept], dtype=np.int64)
+    def _list(self, root: Path) -> tuple[list[tuple[Path, Path]], Times]:
+        self._place = place = root / "mav0" if (root / "mav0").is_dir() else root
+        pairs = _pairs(place, self._max_difference_ns, self.skipped)
+        rectifier, self._T_body_camera = _calibrated(place)
         self._pairs, self.intrinsics = rectifier, rectifier.intrinsics
         self.camera = RecordedCamera(self.intrinsics, rectifier.size, "from sensor.yaml, rectified")
-        self._accelerometer = _accelerometer(place, T_body_camera)
-        self._with_color = color
+        return [pair[1:] for pair in pairs], np.array([stamp for stamp, _, _ in pairs], np.int64)
+
+    def _recorded_poses(self, root: Path, files: object) -> Poses:
+        path = self._place / _TRUTH
+        if not path.exists():
+            raise NoPoses(f"{path} is missing; expected `ns,px,py,pz,qw,qx,qy,qz,…` a line; {SCAN}")
+        trajectory, self._why = read_euroc(path), NO_POSE_IN_TIME
+        gap_ns, offset_ns = round(self._gap_s * 1e9), round(self._offset_s * 1e9)
+        assert self._times is not None
+        found = (trajectory.at(int(stamp) + offset_ns, max_gap_ns=gap_ns) for stamp in self._times)
+        return [None if T is None else T @ self._T_body_camera for T in found]
 
     def _image(self, file: Path) -> NDArray[np.uint8]:
         return _grey(file)
@@ -153,20 +140,6 @@ def _accelerometer(place: Path, T_body_camera: Transform) -> Accelerometer | Non
         place / "imu0" / "data.csv", "`ns,wx,wy,wz,ax,ay,az` a line", T_body_camera[:3, :3].T @ R_body_imu,
         separator=",", first=4,
     )  # fmt: skip
-
-
-def _trajectory(place: Path) -> Trajectory:
-    path = place / _TRUTH
-    if not path.exists():
-        raise NoPoses(f"{path} is missing; expected `ns,px,py,pz,qw,qx,qy,qz,…` a line; {SCAN}")
-    return read_euroc(path)
-
-
-def _pose(
-    trajectory: Trajectory, stamp_ns: int, max_gap_ns: int, T_body_camera: Transform
-) -> Transform | None:
-    T_world_body = trajectory.at(stamp_ns, max_gap_ns=max_gap_ns)
-    return None if T_world_body is None else T_world_body @ T_body_camera
 
 
 def _grey(path: Path) -> NDArray[np.uint8]:

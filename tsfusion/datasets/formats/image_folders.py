@@ -1,12 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Base of layouts with depth images in one folder and colour images in another."""
 
-import inspect
 import logging
 import re
-from abc import abstractmethod
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,19 +14,9 @@ from numpy.typing import NDArray
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets import depth_files
 from tsfusion.datasets.cameras import MILLIMETRES, RecordedCamera, find_camera
-from tsfusion.datasets.dataset import (
-    NO_POSE_IN_TIME,
-    WITHOUT_POSE,
-    Frames,
-    Poses,
-    Times,
-    poses_if_any,
-    require_folder,
-    require_frames,
-)
 from tsfusion.datasets.depth_files import check_metres, read_depth
 from tsfusion.datasets.file_names import in_order, numbers_in, series_of
-from tsfusion.datasets.given_trajectory import poses_of
+from tsfusion.datasets.folder_frames import FolderFrames
 from tsfusion.datasets.readers import read_color
 from tsfusion.geometry.calibration import Size
 from tsfusion.geometry.frame import Frame
@@ -96,103 +83,41 @@ class DepthReader:
         return np.asarray(self.camera.color(read_color(color, depth.shape)), np.uint8)
 
 
-class DepthImages(DepthReader, Frames):
+class DepthImages(DepthReader, FolderFrames):
     """Frames of one depth image each, with colour and a pose where they are recorded.
 
-    A layout is a class: its attributes say what is usual there, `_files` and `_recorded_poses` what its
-    folder holds, `_colors` and `_known_camera` where colour and camera are, `_registered` how colour fits.
+    Of a layout, `_colors` and `_known_camera` say where colour and camera are, `_registered` how colour fits.
 
     Args:
-        path: the recording's folder.
-        trajectory: poses instead of those in the folder; in TUM's, KITTI's or Redwood's format.
         intrinsics, calibration: of the depth images, instead of a file of the camera in the folder
             (`cameras.FILES`) or of the camera that a benchmark publishes; distortion is removed.
         depth_scale: metres per unit; default as a file of the camera states, else as usual in the layout,
             and 1 for floats.
-        max_gap_s: between two poses that are interpolated, seconds; across a longer gap there is no pose.
-        time_offset_s: added to an image's time before its pose is looked up, seconds.
-        sensor: name of the sensor model; default the layout's.
         color: read colour images.
-        posed: leave out frames without a pose; else they are kept, with `T_world_camera` None.
+        options: those of `FolderFrames`.
 
     Raises:
-        DatasetError: no such folder, no frames, most images missing, malformed poses or camera.
+        DatasetError: most images missing, a camera that is not known or malformed; as of `FolderFrames`.
     """
 
-    layout = ""
-    expected = ""
     sensor = "kinect"
-    usual_gap_s = 0.2
-    guesses = False  # whether it finds a file of poses by its name alone
-
-    def __init_subclass__(cls) -> None:
-        """Name the common options where a layout adds some of its own and passes on `**options`."""
-        own, common = (inspect.signature(each.__init__).parameters for each in (cls, DepthImages))
-        named = {**common, **own}
-        named.pop("options", None)
-        cls.__signature__ = inspect.Signature([*named.values()][1:])  # type: ignore[attr-defined]
 
     def __init__(
         self,
         path: str | Path,
         *,
-        trajectory: str | Path | None = None,
         intrinsics: Intrinsics | None = None,
         calibration: str | Path | None = None,
         depth_scale: float | None = None,
-        max_gap_s: float | None = None,
-        time_offset_s: float = 0.0,
-        sensor: str | None = None,
         color: bool = True,
-        posed: bool = True,
+        **options: Any,
     ) -> None:
-        self.skipped = {}
-        root, given = self._opened(path, trajectory)
-        self._gap_s = self.usual_gap_s if max_gap_s is None else max_gap_s
-        self._offset_s, self._posed, self._why = time_offset_s, posed, WITHOUT_POSE
-        files, times = self._files(root)
-        require_frames(len(files), root, self.expected, self.skipped)
-        read = self._recorded_poses if given is None else self._poses_of
-        own = partial(read, given or root, files, times)
-        found = poses_if_any(own, len(files), posed=posed, guessed=self.guesses and given is None)
-        kept = self._keep(range(len(files)), found, (root, self._wanted()), posed=posed, reason=self._why)
-        self._depth, self._kept = [files[index] for index in kept], kept
-        self._color = self._colors(root) if color else []
+        super().__init__(path, **options)
+        self._color = self._colors(self._root) if color else []
         self.uncolored = [*self._color].count(None)
-        self.timestamps_ns = None if times is None else times[kept]
-        self.name, self.sensor = f"{self.layout} {root.name}", sensor or self.sensor
-        size = first_size(self._depth)
-        camera = self._find_camera(root, size, depth_scale, intrinsics=intrinsics, calibration=calibration)
+        given = {"intrinsics": intrinsics, "calibration": calibration}
+        camera = self._find_camera(self._root, first_size(self._files), depth_scale, **given)
         self.use_camera(camera, depth_scale)
-
-    def _opened(self, path: str | Path, trajectory: str | Path | None) -> tuple[Path, Path | None]:
-        """The folder, and the file of poses that was given, which may be named from there."""
-        root = require_folder(path, self.layout)
-        given = None if trajectory is None else Path(trajectory).expanduser()
-        return root, given if given is None or given.exists() else root / given
-
-    @abstractmethod
-    def _files(self, root: Path) -> tuple[list[Path], Times]:
-        """Depth images in order, and their times, (n,) nanoseconds, where they are known."""
-
-    @abstractmethod
-    def _recorded_poses(self, root: Path, files: list[Path], times: Times) -> Poses:
-        """The pose of each depth image; raises NoPoses where the folder has none."""
-
-    def _poses_of(self, path: Path, files: list[Path], times: Times) -> Poses:
-        """Poses of a trajectory: by time where both have times, else one for each image."""
-        self._why = WITHOUT_POSE if times is None else NO_POSE_IN_TIME
-        where = {"max_gap_s": self._gap_s, "time_offset_s": self._offset_s}
-        return poses_of(path, len(files), times, posed=self._posed, **where)
-
-    def _wanted(self) -> str:
-        """What frames with poses need."""
-        if self._why == WITHOUT_POSE:
-            return self.expected
-        return (
-            f"poses at most {self._gap_s:g} s apart around the images' times (--option max_gap_s=SECONDS "
-            "takes longer gaps, time_offset_s=SECONDS is added to these times)"
-        )
 
     def _colors(self, root: Path) -> Sequence[Path | None]:
         """A colour image for each depth image, None where there is none; empty where there is no colour."""
@@ -206,12 +131,9 @@ class DepthImages(DepthReader, Frames):
         """Where the camera is: `places`, `files` and `published` of `find_camera`."""
         return {}
 
-    def __len__(self) -> int:
-        return len(self._depth)
-
     def _frame(self, index: int) -> Frame:
         color = self._color[index] if self._color else None
-        return self._posed_frame(index, **self.read(self._depth[index], color))
+        return self._posed_frame(index, **self.read(self._files[index], color))
 
 
 def resample_for_camera(

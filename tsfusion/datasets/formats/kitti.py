@@ -70,13 +70,15 @@ class KITTIFrames(PairedImages):
     baseline_fx: float | None = None
     usual = STREET
     _frames: list[int]
-    _files: list[tuple[Path, ...]]  # or the scan alone
 
     def _describe_camera(self, file: str) -> None:
         if self.intrinsics is not None and self.baseline_fx is not None:
             size = first_size([left for left, *_ in self._files], self._image)
             self.camera = RecordedCamera(self.intrinsics, size, f"from {file}")
             self._pairs = AlreadyRectified(self.intrinsics, self.baseline_fx, size)
+
+    def __len__(self) -> int:
+        return len(self._files)
 
     def _frame(self, index: int) -> Frame:
         if self.sensor == "lidar":

@@ -29,6 +29,7 @@ from tsfusion.geometry.se3 import Transform, inverse, transform
 EXPECTED = "DATE/DATE_drive_NNNN_sync/{image_00..03,velodyne_points,oxts}/data and DATE/calib_*.txt"
 _CAMERAS = {"grey": ("00", "01"), "color": ("02", "03")}
 _PACKET = 30  # numbers of an oxts line
+_ALONG = 0.9  # cosine of the angle between axes that point forward
 
 
 def recognises(path: Path) -> bool:
@@ -102,10 +103,10 @@ def _sensor_calibration(day: Path, cameras: tuple[str, str] | None, *, imu: bool
     Args:
         imu: whether that place is needed; without, the calibration of the GPS/IMU unit may be missing.
     """
-    T_velo_imu = _rigid(day / "calib_imu_to_velo.txt") if imu else np.eye(4)
+    T_velo_imu = _rigid(day / "calib_imu_to_velo.txt", forward=0) if imu else np.eye(4)
     if cameras is None:
         return _SensorCalibration(inverse(T_velo_imu))
-    T_cam0_velo = _rigid(day / "calib_velo_to_cam.txt") if imu else np.eye(4)
+    T_cam0_velo = _rigid(day / "calib_velo_to_cam.txt", forward=2) if imu else np.eye(4)
     path = day / "calib_cam_to_cam.txt"
     found = read_calibration(path, {"R_rect_00": 9, **{f"P_rect_{camera}": 12 for camera in cameras}})
     left, right = (found[f"P_rect_{camera}"].reshape(3, 4) for camera in cameras)
@@ -169,9 +170,13 @@ def _imu_poses(place: Path, frames: list[int]) -> Poses:
     return [poses.get(number) for number in frames]
 
 
-def _rigid(path: Path) -> Transform:
+def _rigid(path: Path, forward: int) -> Transform:
+    """The transform of a file, whose axis x points along the target's axis `forward`."""
     found = read_calibration(path, {"R": 9, "T": 3})
-    return checked_pose(transform(found["R"].reshape(3, 3), found["T"]), path)
+    T = checked_pose(transform(found["R"].reshape(3, 3), found["T"]), path)
+    if T[forward, 0] < _ALONG:
+        raise DatasetError(f"{path} turns forward elsewhere; expected KITTI's axes (is it another's file?)")
+    return T
 
 
 def _read_times(path: Path, frames: list[int]) -> NDArray[np.int64] | None:

@@ -85,7 +85,7 @@ class Nerfstudio(DepthImages):
         self.usual_unit = _depth_unit(self._capture, self._file)
         return super()._opened(self._file.absolute().parent, trajectory)
 
-    def _files(self, root: Path) -> tuple[list[Path], Times]:
+    def _list(self, root: Path) -> tuple[list[Path], Times]:
         frames = [(frame, f"{self._file}, frame {n}") for n, frame in enumerate(self._capture["frames"])]
         listed = [_listed_frame(self._file.parent, self._capture, *each) for each in frames]
         self._with_depth = [each for each, entry in zip(frames, listed, strict=True) if entry is not None]
@@ -99,7 +99,7 @@ class Nerfstudio(DepthImages):
             self.skipped[WITHOUT_DEPTH] = len(frames) - len(self._listed)
         return [entry.depth for entry in self._listed], None
 
-    def _recorded_poses(self, root: Path, files: list[Path], times: Times) -> Poses:
+    def _recorded_poses(self, root: Path, files: list[Path]) -> Poses:
         capture, file = self._capture, self._file
         applied = _scale(capture, "applied_scale", file) if "applied_scale" in capture else 1.0
         return usable(file, self._with_depth, lambda one: _pose(one[0], applied, one[1]))

@@ -77,10 +77,10 @@ class HoloLens(DepthImages):
 
     layout, expected, sensor = "HoloLens", HOLOLENS_EXPECTED, "tof"
 
-    def _files(self, root: Path) -> tuple[list[Path], Times]:
+    def _list(self, root: Path) -> tuple[list[Path], Times]:
         return depth_images(root / "depth", HOLOLENS_EXPECTED), None
 
-    def _recorded_poses(self, root: Path, files: list[Path], times: Times) -> Poses:
+    def _recorded_poses(self, root: Path, files: list[Path]) -> Poses:
         path = root / "poses.txt"
         if not path.exists():
             raise NoPoses(f"{path} is missing; expected 16 numbers a line; {SCAN}")
@@ -93,7 +93,7 @@ class HoloLens(DepthImages):
         return poses
 
     def _colors(self, root: Path) -> list[Path]:
-        return color_images(self._depth, root / "images", HOLOLENS_EXPECTED)
+        return color_images(self._files, root / "images", HOLOLENS_EXPECTED)
 
 
 class Redwood(DepthImages):
@@ -123,34 +123,34 @@ class Redwood(DepthImages):
         self.root, given = super()._opened(path, trajectory)
         return self.root, given
 
-    def _files(self, root: Path) -> tuple[list[Path], Times]:
+    def _list(self, root: Path) -> tuple[list[Path], Times]:
         self._beside = {} if _depth_folders(root) else _only_series(root)
         files = [*self._beside] or depth_images(_depth_folder(root), REDWOOD_EXPECTED)
         return in_time(files, _names(files))
 
-    def _recorded_poses(self, root: Path, files: list[Path], times: Times) -> Poses:
+    def _recorded_poses(self, root: Path, files: list[Path]) -> Poses:
         path = _log(root)
         if path is None:
             given = root / "groundtruth.txt"  # TUM's
             hint = f"{SCAN}, or --trajectory {given} names them" if given.is_file() else SCAN
             raise NoPoses(f"{root} has no trajectory; expected {REDWOOD_EXPECTED}; {hint}")
-        return self._poses_of(path, files, times)
+        return self._poses_of(path, files)
 
-    def _poses_of(self, path: Path, files: list[Path], times: Times) -> Poses:
+    def _poses_of(self, path: Path, files: list[Path]) -> Poses:
         """Poses of a `.log` by number; of another trajectory by time, or one for each image."""
         if is_log(path):
             return poses_by_number(_names(files), read_log(path), path)
-        return super()._poses_of(path, files, times)
+        return super()._poses_of(path, files)
 
     def _colors(self, root: Path) -> Sequence[Path | None]:
         if self._beside:
-            return [self._beside[file] for file in self._depth]
+            return [self._beside[file] for file in self._files]
         where = _color_folder(root)
-        return color_images(self._depth, where, REDWOOD_EXPECTED) if where else []
+        return color_images(self._files, where, REDWOOD_EXPECTED) if where else []
 
     def _known_camera(self, root: Path) -> dict[str, Any]:
         published = _PRIMESENSE if _is_redwoods_own(root) else None
-        return {"places": (root, self._depth[0].parent), "published": published}
+        return {"places": (root, self._files[0].parent), "published": published}
 
 
 def _names(files: list[Path]) -> list[str]:

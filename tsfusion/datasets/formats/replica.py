@@ -36,10 +36,10 @@ class Replica(DepthImages):
     layout, expected = "Replica", EXPECTED
     usual_unit = DepthUnit(1 / 6553.5, "usual for NICE-SLAM's Replica", is_stated=False)
 
-    def _files(self, root: Path) -> tuple[list[Path], Times]:
+    def _list(self, root: Path) -> tuple[list[Path], Times]:
         return depth_images(root / "results", EXPECTED, "depth*"), None
 
-    def _recorded_poses(self, root: Path, files: list[Path], times: Times) -> Poses:
+    def _recorded_poses(self, root: Path, files: list[Path]) -> Poses:
         path = root / "traj.txt"
         if not path.exists():
             raise NoPoses(f"{path} is missing; expected 16 numbers a line; {SCAN}")
@@ -48,7 +48,7 @@ class Replica(DepthImages):
     def _colors(self, root: Path) -> list[Path]:
         """`frame000010.jpg` of `depth000010.png`; none where there are none."""
         there = images(root / "results", EXPECTED, "frame*")
-        return color_images(self._depth, root / "results", EXPECTED, "frame") if there else []
+        return color_images(self._files, root / "results", EXPECTED, "frame") if there else []
 
     def _known_camera(self, root: Path) -> dict[str, Any]:
         places = (up / "cam_params.json" for up in (root, root.absolute().parent))

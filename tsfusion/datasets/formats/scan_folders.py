@@ -5,22 +5,15 @@ import logging
 import re
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets.dataset import (
-    NO_POSE_IN_TIME,
-    SCAN,
-    Frames,
-    NoPoses,
-    Poses,
-    poses_if_any,
-    require_folder,
-)
+from tsfusion.datasets.dataset import SCAN, NoPoses, Poses, Times
 from tsfusion.datasets.file_names import in_time, series_of
-from tsfusion.datasets.given_trajectory import poses_between, poses_of
+from tsfusion.datasets.folder_frames import FolderFrames
+from tsfusion.datasets.given_trajectory import poses_between
 from tsfusion.datasets.scan_files import SUFFIXES, USUAL_FIELDS, read_scan
 from tsfusion.datasets.trajectory_files import read_poses
 from tsfusion.geometry.frame import Frame
@@ -45,7 +38,7 @@ def recognises(path: Path) -> bool:
     return bool(_all_series(path))
 
 
-class ScanFolder(Frames):
+class ScanFolder(FolderFrames):
     """Scans in the LiDAR's axes, each with the LiDAR's pose in the world's where one is known.
 
     The layout of KITTI's `velodyne/`, and of the folders that KISS-ICP's generic reader takes, with the poses
@@ -53,57 +46,37 @@ class ScanFolder(Frames):
     scans have the times of as many poses. Points of PCD, PLY and LAS with times are put where they were then.
 
     Args:
-        trajectory: default `poses.txt`, `*_kitti.txt` or `*_tum.txt` in the folder.
         fields: float32 numbers a point in `.bin` files, x, y and z first.
-        max_gap_s, time_offset_s: as of `given_trajectory.poses_of`.
         deskew: False for points that are put right already, though they have times.
-        posed: leave out scans without a pose; else they are kept, with `T_world_camera` None.
-
-    Raises:
-        DatasetError: no such folder, no scans, no or malformed poses.
+        options: those of `FolderFrames`; default poses are `poses.txt`, `*_kitti.txt` or `*_tum.txt`.
     """
 
+    layout, expected, sensor, guesses = "LiDAR scans", EXPECTED, "lidar", True
+
     def __init__(
-        self,
-        path: str | Path,
-        *,
-        trajectory: str | Path | None = None,
-        sensor: str = "lidar",
-        fields: int = USUAL_FIELDS,
-        max_gap_s: float = 0.2,
-        time_offset_s: float = 0.0,
-        deskew: bool = True,
-        posed: bool = True,
+        self, path: str | Path, *, fields: int = USUAL_FIELDS, deskew: bool = True, **options: Any
     ) -> None:
-        root = require_folder(path, "LiDAR scans")
         if not 3 <= fields <= 64:
             raise DatasetError(f"fields must be from 3 to 64 numbers a point, got {fields}")
-        self.name, self.sensor, self.skipped, self._fields = f"LiDAR scans {root.name}", sensor, {}, fields
-        self._deskew = deskew
+        self._fields, self._deskew = fields, deskew
+        super().__init__(path, **options)
+
+    def _list(self, root: Path) -> tuple[list[Path], Times]:
         series = _series(root)
-        files, stamps = in_time(series.files, [file.stem for file in series.files])
         if series.others:
             self.skipped["of another name"] = series.others
-        where = {"max_gap_s": max_gap_s, "time_offset_s": time_offset_s}
-        given = None if trajectory is None else Path(trajectory).expanduser()
+        return in_time(series.files, [file.stem for file in series.files])
 
-        def read() -> Poses:
-            nonlocal stamps
-            file = given or _poses(root)
-            found = poses_of(file, len(files), stamps, posed=posed, **where)
-            times = read_poses(file)[0] if stamps is None else None
-            if times is not None and (np.diff(times) > 0).all():  # one pose a scan, in order
-                stamps, where["time_offset_s"] = times, 0.0
-            self._between = partial(poses_between, file, stamps, **where)
-            return found
+    def _recorded_poses(self, root: Path, files: list[Path]) -> Poses:
+        return self._poses_of(_poses(root), files)
 
-        poses = poses_if_any(read, len(files), posed=posed, guessed=given is None)
-        kept = self._keep(range(len(files)), poses, (root, EXPECTED), posed=posed, reason=NO_POSE_IN_TIME)
-        self._files = [files[index] for index in kept]
-        self.timestamps_ns = None if stamps is None else stamps[kept]
-
-    def __len__(self) -> int:
-        return len(self._files)
+    def _poses_of(self, path: Path, files: list[Path]) -> Poses:
+        found = super()._poses_of(path, files)
+        times = read_poses(path)[0] if self._times is None else None
+        if times is not None and (np.diff(times) > 0).all():  # one pose a scan, in order
+            self._times, self._offset_s = times, 0.0
+            self._between = partial(poses_between, path, times, max_gap_s=self._gap_s)
+        return found
 
     def _frame(self, index: int) -> Frame:
         return self._sweep(index, read_scan(self._files[index], fields=self._fields))

@@ -41,15 +41,15 @@ class ScanNet(DepthImages):
 
     layout, expected = "ScanNet", EXPECTED
 
-    def _files(self, root: Path) -> tuple[list[Path], Times]:
+    def _list(self, root: Path) -> tuple[list[Path], Times]:
         return depth_images(root / "depth", EXPECTED), None
 
-    def _recorded_poses(self, root: Path, files: list[Path], times: Times) -> Poses:
+    def _recorded_poses(self, root: Path, files: list[Path]) -> Poses:
         return usable(root / "pose", (root / "pose" / f"{file.stem}.txt" for file in files), _pose)
 
     def _colors(self, root: Path) -> list[Path]:
         self.color_intrinsics = _color_intrinsics(root)
-        return color_images(self._depth, root / "color", EXPECTED)
+        return color_images(self._files, root / "color", EXPECTED)
 
     def _known_camera(self, root: Path) -> dict[str, Any]:
         return {"files": filter(None, [_camera_file(root, "depth")])}

@@ -62,7 +62,7 @@ class SevenScenes(DepthImages):
         is_known = _is_own(Path(path).expanduser()) and self.intrinsics == KINECT
         self._register = is_known if register is None else register
 
-    def _files(self, root: Path) -> tuple[list[Path], Times]:
+    def _list(self, root: Path) -> tuple[list[Path], Times]:
         files: list[Path] = []
         for sequence in _sequences(root):
             depth = _frames(sequence, "depth.png")
@@ -77,17 +77,17 @@ class SevenScenes(DepthImages):
             files += in_order(sequence / f"{stem}.depth.png" for stem in depth)
         return files, None
 
-    def _recorded_poses(self, root: Path, files: list[Path], times: Times) -> Poses:
+    def _recorded_poses(self, root: Path, files: list[Path]) -> Poses:
         return usable(root, files, _pose)
 
     def _colors(self, root: Path) -> list[Path]:
-        folder = self._depth[0].parent
+        folder = self._files[0].parent
         kinds = [kind for kind in ("color.png", "color.jpg") if any(folder.glob(f"frame-*.{kind}"))]
-        return [_beside(file, kinds[0]) for file in self._depth] if kinds else []
+        return [_beside(file, kinds[0]) for file in self._files] if kinds else []
 
     def _known_camera(self, root: Path) -> dict[str, Any]:
         published = PublishedCamera("7-Scenes", KINECT) if _is_own(root) else None
-        places = (self._depth[0].parent, root, root.absolute().parent)
+        places = (self._files[0].parent, root, root.absolute().parent)
         return {"places": places, "published": published}
 
     def _registered(self, color: Path, depth: NDArray[Any]) -> NDArray[np.uint8]:

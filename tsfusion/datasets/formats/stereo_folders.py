@@ -2,10 +2,11 @@
 """Folders of a stereo camera's images: left/ and right/ with equal names."""
 
 from pathlib import Path
+from typing import Any
 
-from tsfusion.core.errors import DatasetError
-from tsfusion.datasets.dataset import SCAN, require_folder
+from tsfusion.datasets.dataset import SCAN, NoPoses, Poses, Times
 from tsfusion.datasets.file_names import in_time
+from tsfusion.datasets.folder_frames import FolderFrames
 from tsfusion.datasets.formats.image_folders import first_size, images
 from tsfusion.datasets.stereo_pairs import PairedImages, find_pairs, paired
 from tsfusion.geometry.keyframe import Intrinsics
@@ -24,7 +25,7 @@ def recognises(path: Path) -> bool:
     return all((path / side).is_dir() and bool(images(path / side, EXPECTED)) for side in _SIDES)
 
 
-class StereoFolder(PairedImages):
+class StereoFolder(PairedImages, FolderFrames):
     """Pairs of images by name, rectified where they are not, in the axes of the rectified left camera.
 
     Names that are decimal seconds or nanoseconds are times. Images without their other half are left out and
@@ -33,11 +34,14 @@ class StereoFolder(PairedImages):
     Args:
         intrinsics, baseline: of rectified images; pixels, metres; default `K.txt` and `baseline.txt`.
         calibration: of raw images; default one of `stereo_pairs.FILE_PAIRS` in the folder.
-        posed: False, as there are no poses here; `open_dataset(path, trajectory=FILE)` gives some.
+        options: those of `FolderFrames`; there are no poses here, so that `trajectory` names some or `posed`
+            is False.
 
     Raises:
         DatasetError: no such folder, no pairs, no camera.
     """
+
+    layout, expected, sensor = "stereo folders", EXPECTED, "stereo"
 
     def __init__(
         self,
@@ -46,20 +50,20 @@ class StereoFolder(PairedImages):
         intrinsics: Intrinsics | None = None,
         calibration: str | Path | None = None,
         baseline: float | None = None,
-        sensor: str = "stereo",
         color: bool = True,
-        posed: bool = True,
+        **options: Any,
     ) -> None:
-        root = require_folder(path, "stereo folders")
-        self.name, self.sensor, self.skipped = f"stereo folders {root.name}", sensor, {}
-        if posed:
-            raise DatasetError(f"{root} has no poses; expected --trajectory FILE; {SCAN}")
+        super().__init__(path, **options)
+        size, self._with_color = first_size([left for left, _ in self._files], self._image), color
+        self._pairs, self.camera = find_pairs(
+            self._root, size, intrinsics=intrinsics, calibration=calibration, baseline=baseline
+        )
+
+    def _list(self, root: Path) -> tuple[list[tuple[Path, Path]], Times]:
         left, right = ({file.stem: file for file in images(root / side, EXPECTED)} for side in _SIDES)
         pairs = paired(left, right, self.skipped)
-        files, self.timestamps_ns = in_time([left[name] for name in pairs], [*pairs])
-        nowhere = [None] * len(files)
-        self._files = self._keep([pairs[file.stem] for file in files], nowhere, (root, EXPECTED), posed=False)
-        size, self._with_color = first_size(files, self._image), color
-        self._pairs, self.camera = find_pairs(
-            root, size, intrinsics=intrinsics, calibration=calibration, baseline=baseline
-        )
+        files, times = in_time([left[name] for name in pairs], [*pairs])
+        return [pairs[file.stem] for file in files], times
+
+    def _recorded_poses(self, root: Path, files: object) -> Poses:
+        raise NoPoses(f"{root} has no poses; expected --trajectory FILE; {SCAN}")

@@ -83,7 +83,7 @@ class TUM(DepthImages):
         self._max_difference_ns = round(max_difference_s * 1e9)
         super().__init__(path, **options)
 
-    def _files(self, root: Path) -> tuple[list[Path], Times]:
+    def _list(self, root: Path) -> tuple[list[Path], Times]:
         self._listed = read_recording(root, max_difference_ns=self._max_difference_ns)
         self._benchmark = _benchmark(root)
         if self._benchmark is not None:
@@ -95,15 +95,15 @@ class TUM(DepthImages):
         )  # fmt: skip
         return self._listed.depth, np.array(self._listed.timestamps_ns, np.int64)
 
-    def _recorded_poses(self, root: Path, files: list[Path], times: Times) -> Poses:
-        return self._poses_of(_trajectory(root), files, times)
+    def _recorded_poses(self, root: Path, files: list[Path]) -> Poses:
+        return self._poses_of(_trajectory(root), files)
 
     def _colors(self, root: Path) -> list[Path | None]:
         return [self._listed.color[index] for index in self._kept] if self._listed.color else []
 
     def _known_camera(self, root: Path) -> dict[str, Any]:
         known = self._benchmark and PublishedCamera(self._benchmark.source, self._benchmark.intrinsics)
-        return {"places": (root, self._depth[0].parent), "published": known}
+        return {"places": (root, self._files[0].parent), "published": known}
 
 
 def _trajectory(root: Path) -> Path:
