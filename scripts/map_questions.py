@@ -97,17 +97,17 @@ def open3d_rows(
     """A view by Open3D: of the same mesh, and of the same raw values."""
     import open3d as o3d
 
-    to_camera = o3d.core.Tensor(np.linalg.inv(T_world_camera))
+    to_camera = o3d.core.Tensor.from_numpy(np.linalg.inv(T_world_camera))
     ours = volume.raycast(camera, T_world_camera, SHAPE, surface="raw").depth
     mesh = volume.extract_mesh(surface="raw").to_open3d()
     scene = o3d.t.geometry.RaycastingScene()
     scene.add_triangles(mesh)
     middle = camera.matrix + np.array([(0, 0, 0.5), (0, 0, 0.5), (0, 0, 0)])  # its pixels' corners
-    rays = scene.create_rays_pinhole(o3d.core.Tensor(middle), to_camera, SHAPE[1], SHAPE[0])
+    rays = scene.create_rays_pinhole(o3d.core.Tensor.from_numpy(middle), to_camera, SHAPE[1], SHAPE[0])
     cast, cpu, wall = best_of(repeats, lambda: scene.cast_rays(rays))
     yield _against("Open3D RaycastingScene", cast["t_hit"].numpy(), ours, cpu, wall)
     grid = volume.to_open3d()
-    blocks, K = grid.hashmap().key_tensor(), o3d.core.Tensor(camera.matrix)
+    blocks, K = grid.hashmap().key_tensor(), o3d.core.Tensor.from_numpy(camera.matrix)
     least = volume.model.min_weight
     shown = ["depth", "normal", *(["color"] if volume.config.color else [])]
     cast, cpu, wall = best_of(
