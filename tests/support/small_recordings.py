@@ -57,7 +57,7 @@ def kitti(root: Path, count: int = 4) -> Path:
         left, right = textured_pair(rng, (48, 160), 8)
         cv2.imwrite(str(place / "image_0" / f"{frame:06d}.png"), left)
         cv2.imwrite(str(place / "image_1" / f"{frame:06d}.png"), right)
-        rng.normal(size=(100, 4)).astype(np.float32).tofile(place / "velodyne" / f"{frame:06d}.bin")
+        np.abs(rng.normal(size=(100, 4))).astype(np.float32).tofile(place / "velodyne" / f"{frame:06d}.bin")
     (place / "calib.txt").write_text(f"P0: {P0}\nP1: {P1}\nP2: {P0}\nP3: {P1}\nTr: {TR}\n")
     (place / "times.txt").write_text("".join(f"{frame / 10:e}\n" for frame in range(count)))
     rows = (f"1 0 0 0 0 1 0 0 0 0 1 {frame}\n" for frame in range(count))

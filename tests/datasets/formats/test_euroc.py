@@ -75,7 +75,7 @@ def test_euroc_images_without_their_other_half_are_counted(euroc):
     with pytest.raises(DatasetError, match=r"no usable frames.*\(3 without their other half\)"):
         EuRoC(euroc, max_difference_s=1e-9)
     right[2].write_bytes(b"")
-    with pytest.raises(DatasetError, match=r"cannot be decoded; expected a grey image"):
+    with pytest.raises(DatasetError, match=r"cannot be decoded; expected an image"):
         dataset[0]
 
 

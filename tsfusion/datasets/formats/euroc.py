@@ -4,16 +4,14 @@
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError, InvalidConfig, InvalidKeyframe
 from tsfusion.datasets.accelerometer import Accelerometer, read_table
 from tsfusion.datasets.cameras import RecordedCamera
 from tsfusion.datasets.dataset import NO_HALF, NO_POSE_IN_TIME, SCAN, NoPoses, Poses, Times
 from tsfusion.datasets.folder_frames import FolderFrames
-from tsfusion.datasets.readers import listed_file, read_image, read_lines
+from tsfusion.datasets.readers import listed_file, read_lines
 from tsfusion.datasets.stereo_pairs import PairedImages
 from tsfusion.datasets.trajectory_files import read_euroc
 from tsfusion.geometry.calibration import Rectifier
@@ -76,9 +74,6 @@ class EuRoC(PairedImages, FolderFrames):
         found = (trajectory.at(int(stamp) + offset_ns, max_gap_ns=gap_ns) for stamp in self._times)
         return [None if T is None else T @ self._T_body_camera for T in found]
 
-    def _image(self, file: Path) -> NDArray[np.uint8]:
-        return _grey(file)
-
 
 def _pairs(place: Path, max_difference_ns: int, skipped: dict[str, int]) -> list[tuple[int, Path, Path]]:
     """(left's stamp, left, right) of images that are there and near in time; a right image serves once."""
@@ -140,13 +135,3 @@ def _accelerometer(place: Path, T_body_camera: Transform) -> Accelerometer | Non
         place / "imu0" / "data.csv", "`ns,wx,wy,wz,ax,ay,az` a line", T_body_camera[:3, :3].T @ R_body_imu,
         separator=",", first=4,
     )  # fmt: skip
-
-
-def _grey(path: Path) -> NDArray[np.uint8]:
-    image = read_image(path, "a grey image")
-    if image.dtype != np.uint8:
-        raise DatasetError(f"{path} must be an 8-bit image, got {image.dtype}")
-    if image.ndim == 3:
-        image = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-    grey: NDArray[np.uint8] = np.ascontiguousarray(image)
-    return grey

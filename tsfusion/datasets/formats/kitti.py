@@ -30,6 +30,7 @@ from tsfusion.datasets.dataset import (
 from tsfusion.datasets.file_names import in_order
 from tsfusion.datasets.formats.image_folders import first_size
 from tsfusion.datasets.readers import intrinsics_of, read_color, read_lines
+from tsfusion.datasets.scan_files import read_scan
 from tsfusion.datasets.stereo_pairs import AlreadyRectified, PairedImages, paired
 from tsfusion.datasets.trajectory_files import checked_pose, nanoseconds, read_kitti
 from tsfusion.geometry.frame import Frame
@@ -82,7 +83,7 @@ class KITTIFrames(PairedImages):
 
     def _frame(self, index: int) -> Frame:
         if self.sensor == "lidar":
-            return self._posed_frame(index, points=read_scan(self._files[index][0]))
+            return self._posed_frame(index, points=read_scan(self._files[index][0]).points)
         return super()._frame(index)
 
     def _image(self, file: Path) -> NDArray[np.uint8]:
@@ -255,16 +256,3 @@ def _read_grey(path: Path) -> NDArray[np.uint8]:
         return np.asarray(pykitti_utils().load_image(path, "L"), dtype=np.uint8)
     except (OSError, SyntaxError, Image.DecompressionBombError) as error:  # a broken PNG is either of two
         raise DatasetError(f"{path} cannot be decoded; expected a grey image ({error})") from error
-
-
-def read_scan(path: Path) -> NDArray[np.float32]:
-    """(n, 3) metres in the Velodyne's axes, without the reflectance."""
-    try:
-        scan: NDArray[np.float32] = pykitti_utils().load_velo_scan(path)
-    except (OSError, ValueError) as error:
-        raise DatasetError(
-            f"{path} is not a Velodyne scan; expected float32 x, y, z, reflectance ({error})"
-        ) from error
-    if not len(scan):
-        raise DatasetError(f"{path} is empty; expected float32 x, y, z, reflectance")
-    return np.ascontiguousarray(scan[:, :3])
