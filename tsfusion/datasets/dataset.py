@@ -401,10 +401,9 @@ def require_one_clock(stamps_ns: Sequence[int], path: Path) -> None:
 def require_folder(path: str | Path, layout: str) -> Path:
     """`path` as an existing folder; raises DatasetError for another."""
     path = Path(path).expanduser()
-    if not path.exists():
-        raise DatasetError(f"{path} does not exist; expected a folder in the {layout} layout")
     if not path.is_dir():
-        raise DatasetError(f"{path} is not a folder; expected a folder in the {layout} layout")
+        wrong = "is not a folder" if path.exists() else "does not exist"
+        raise DatasetError(f"{path} {wrong}; expected a folder in the {layout} layout")
     return path
 
 

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: MIT
 """KITTI odometry: rectified grey stereo pairs or Velodyne scans, with poses.
 
-Files are read by pykitti's readers, but chosen here: pykitti pairs files by their place in a sorted list,
-so that one missing image shifts all later ones unnoticed. A file's name is its frame number, and a frame's
-pose and time are the lines of that number.
+A file's name is its frame number, and a frame's pose and time are the lines of that number: pykitti pairs
+files by their place in a sorted list, so that one missing image shifts all later ones unnoticed.
 """
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from functools import cache, partial
 from importlib.machinery import PathFinder
 from importlib.util import find_spec, module_from_spec
@@ -85,9 +85,6 @@ class KITTIFrames(PairedImages):
         if self.sensor == "lidar":
             return self._posed_frame(index, points=read_scan(self._files[index][0]).points)
         return super()._frame(index)
-
-    def _image(self, file: Path) -> NDArray[np.uint8]:
-        return _read_grey(file)
 
 
 class KITTI(KITTIFrames):
@@ -208,13 +205,13 @@ def pykitti_utils() -> Any:
 
 def read_calibration(path: Path, wanted: dict[str, int]) -> Mapping[str, NDArray[np.float64]]:
     """`name: numbers` a line; each wanted name must be there with so many finite numbers."""
+    found: dict[str, NDArray[np.float64]] = {}
     for number, line in read_lines(path, f"KITTI's calibration with the lines {', '.join(wanted)}"):
-        if ":" not in line:
+        name, colon, words = line.partition(":")
+        if not colon:
             raise DatasetError(f"{path}:{number}: {line!r}; expected `name: numbers`")
-    try:
-        found: dict[str, NDArray[np.float64]] = pykitti_utils().read_calib_file(path)
-    except ValueError as error:
-        raise DatasetError(f"{path}: {error}; expected `name: numbers` a line") from error
+        with suppress(ValueError):  # the day it was made
+            found[name] = np.array(words.split(), np.float64)
     for name, count in wanted.items():
         values = found.get(name)
         if values is None or len(values) != count or not np.isfinite(values).all():
@@ -246,13 +243,3 @@ def _read_times(path: Path, frames: list[int]) -> NDArray[np.int64] | None:
             f"{path} has {len(stamps)} lines, but there is a frame {frames[-1]}; expected a line a frame"
         )
     return np.array([stamps[number] for number in frames], dtype=np.int64)
-
-
-def _read_grey(path: Path) -> NDArray[np.uint8]:
-    """(H, W), a colour image's luminance."""
-    from PIL import Image
-
-    try:
-        return np.asarray(pykitti_utils().load_image(path, "L"), dtype=np.uint8)
-    except (OSError, SyntaxError, Image.DecompressionBombError) as error:  # a broken PNG is either of two
-        raise DatasetError(f"{path} cannot be decoded; expected a grey image ({error})") from error

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """KITTI's raw recordings: rectified stereo pairs or Velodyne scans, with poses of the GPS/IMU unit.
 
-Calibration and GPS packets are read by pykitti's functions; files are chosen here, by the frame number in
-their names: `pykitti.raw` goes by their place in a sorted list, and several drives lack some scans.
+GPS packets become poses by pykitti's function; files are chosen here, by the frame number in their names:
+`pykitti.raw` goes by their place in a sorted list, and several drives lack some scans.
 """
 
 from functools import partial
@@ -21,7 +21,7 @@ from tsfusion.datasets.formats.kitti import (
     pykitti_utils,
     read_calibration,
 )
-from tsfusion.datasets.readers import intrinsics_of, read_color, read_numbers
+from tsfusion.datasets.readers import intrinsics_of, read_numbers
 from tsfusion.datasets.trajectory_files import checked_pose, usable
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.se3 import Transform, inverse, transform
@@ -82,13 +82,10 @@ class KITTIRaw(KITTIFrames):
         poses = [None if T is None else T @ calibration.T_imu_sensor for T in body]
         self._frames = self._keep([*files], poses, (drive, EXPECTED), posed=posed)
         self._files = [files[number] for number in self._frames]
-        self._colored, self._with_color = chosen[0] == "02", color
+        self._with_color = color
         self.intrinsics, self.baseline_fx = calibration.intrinsics, calibration.baseline_fx
         self._describe_camera("calib_cam_to_cam.txt")
         self.timestamps_ns = _read_times(drive / sensors[0] / "timestamps.txt", self._frames)
-
-    def _color(self, index: int, left: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        return read_color(self._files[index][0], left.shape[:2]) if self._colored else left
 
 
 class _SensorCalibration(NamedTuple):

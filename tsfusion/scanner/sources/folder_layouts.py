@@ -17,10 +17,9 @@ EXPECTED = (
     "NAME.bin|pcd|ply|las|laz, there or in velodyne/"
 )
 
-_IMAGES = r"\.(?:png|jpe?g)"
-_ENDINGS = (_IMAGES, r"\.(?:png|tiff?|exr|npy)", r"\.(?:bin|pcd|ply|las|laz)")
+_ENDINGS = (r"\.(?:png|jpe?g)", r"\.(?:png|tiff?|exr|npy)", r"\.(?:bin|pcd|ply|las|laz)")
 _ANY_IMAGE, _DEPTH, _SCAN = (re.compile(rf"([^.].*){ending}") for ending in _ENDINGS)
-_FLAT_DEPTH, _FLAT_COLOR = re.compile(r"(frame-.+)\.depth\.png"), re.compile(rf"(frame-.+)\.color{_IMAGES}")
+_FLAT_DEPTH = re.compile(r"(frame-.+)\.depth\.png")
 _PNG_END, _JPEG_END = b"\0\0\0\0IEND\xaeB`\x82", b"\xff\xd9"
 _ENDS = {".png": _PNG_END, ".jpg": _JPEG_END, ".jpeg": _JPEG_END}
 _POINT = 16  # bytes: x, y, z and intensity in float32
@@ -28,7 +27,7 @@ _POINT = 16  # bytes: x, y, z and intensity in float32
 
 @dataclass(frozen=True)
 class FolderLayout:
-    """Folder and pattern of a frame's first and second file; the pattern's group is the frame's name.
+    """Folder and pattern of a frame's first file, whose group is its name; of the second what follows it.
 
     `files` are those of a frame in words.
     """
@@ -36,14 +35,13 @@ class FolderLayout:
     kind: LayoutKind
     files: str
     first: tuple[Path, re.Pattern[str]]
-    second: tuple[Path, re.Pattern[str]] | None = None
+    second: tuple[Path, str] | None = None
 
     def partner(self, name: str) -> Path | None:
         """Second file of a frame; None = not there."""
         if self.second is None:
             return None
-        where, pattern = self.second
-        middle = ".color" if pattern is _FLAT_COLOR else ""
+        where, middle = self.second
         candidates = (where / f"{name}{middle}.{ending}" for ending in ("png", "jpg", "jpeg"))
         return next((path for path in candidates if path.exists()), None)
 
@@ -54,18 +52,18 @@ def layout_of(root: Path) -> FolderLayout | None:
         color = next((root / name for name in COLOR if (root / name).is_dir()), root / COLOR[0])
         return FolderLayout(
             "depth", f"depth/NAME.png|tiff|exr|npy with {color.name}/NAME.png|jpg", (root / "depth", _DEPTH),
-            (color, _ANY_IMAGE),
+            (color, ""),
         )  # fmt: skip
     if (root / "left").is_dir() and (root / "right").is_dir():
         return FolderLayout(
-            "pair", "left/ and right/NAME.png|jpg", (root / "left", _ANY_IMAGE), (root / "right", _ANY_IMAGE)
+            "pair", "left/ and right/NAME.png|jpg", (root / "left", _ANY_IMAGE), (root / "right", "")
         )
     if (root / "velodyne").is_dir():
         return FolderLayout("points", "velodyne/NAME.bin|pcd|ply|las|laz", (root / "velodyne", _SCAN))
     names = [path.name for path in root.iterdir()]
     if any(_FLAT_DEPTH.fullmatch(name) for name in names):
         return FolderLayout(
-            "depth", "frame-*.depth.png with frame-*.color.png|jpg", (root, _FLAT_DEPTH), (root, _FLAT_COLOR)
+            "depth", "frame-*.depth.png with frame-*.color.png|jpg", (root, _FLAT_DEPTH), (root, ".color")
         )
     for ending in SUFFIXES:  # a file of another may be no scan, such as a mesh
         if any(_SCAN.fullmatch(name) and name.endswith(ending) for name in names):
