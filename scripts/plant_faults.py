@@ -5,9 +5,10 @@
     python scripts/plant_faults.py --only spool     those whose file or line matches
     python scripts/plant_faults.py --first 10 --limit 5
 
-The guards are those of journal, checkpoints, sessions, admission, spool, questions, pages, moves, jobs and
-the map's sums (tests/support/planted_faults.py). The tests that they name have to pass with all guards there;
-then each runs with its guard away. The exit status is 1 when one passes all the same: it needs a test.
+The guards are those of journal, checkpoints, sessions, admission, spool, questions, pages, moves, jobs, the
+map's sums, recordings, verdicts and files for others (tests/support/planted_faults.py). The tests that they
+name have to pass with all guards there; then each runs with its guard away. The exit status is 1 when one
+passes all the same: it needs a test.
 """
 
 import argparse

@@ -5,8 +5,10 @@ import json
 import os
 import shutil
 import signal
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -21,7 +23,7 @@ from silent_display import Silent
 from small_recordings import corbs, kitti, redwood
 
 from tsfusion import Volume
-from tsfusion.cluster import fusion, job_runner, jobs, keyframe_sources
+from tsfusion.cluster import fusion, job_runner, jobs, keyframe_sources, ray_scheduler
 from tsfusion.cluster.carrying_out import ATTEMPTS
 from tsfusion.cluster.fusion import FusedRun, Wishes
 from tsfusion.cluster.jobs import AnyJob, Lost, Message
@@ -426,3 +428,24 @@ def test_killed_and_interrupted_commands_leave_no_worker_and_go_on(tmp_path: Pat
     ):
         whole.integrate(keyframe())
     assert json.loads(done.stdout)["map_hash"] == whole.map_hash()
+
+
+@pytest.mark.parametrize("address", [None, "auto"])
+def test_a_ray_cluster_of_ones_own_is_loopbacks_and_asks_for_a_token(
+    address: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ray itself, where it is installed, is tried in test_ray_scheduler.py."""
+    names = (*ray_scheduler.OWN, *ray_scheduler._QUIET, "RAY_AUTH_TOKEN")
+    for name in names:
+        monkeypatch.setenv(name, "")  # for what was there to come back
+        monkeypatch.delenv(name)
+    seen: dict[str, str] = {}
+    ray = SimpleNamespace(init=lambda **_: seen.update(os.environ), remote=lambda **_: lambda do: do)
+    monkeypatch.setitem(sys.modules, "ray", ray)
+    ray_scheduler.RayCluster(1, address)
+    token, how = seen.get("RAY_AUTH_TOKEN", ""), {name: seen.get(name) for name in ray_scheduler.OWN}
+    if address is None:
+        assert how == {"RAY_AUTH_MODE": "token", "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0"}
+        assert len(token) == 64
+    else:
+        assert (token, set(how.values())) == ("", {None})

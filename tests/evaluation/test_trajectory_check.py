@@ -122,7 +122,7 @@ def test_a_step_that_no_sensor_makes_is_a_jump_where_frames_show_nothing() -> No
 
 
 def test_poses_that_are_off_each_by_itself_neither_jump_nor_drift() -> None:
-    noise = np.random.default_rng(1).normal(0, 0.12, 80)
+    noise = np.random.default_rng(1).normal(0, 0.2, 80)
     assert fault_of(moved(lambda index: noise[index])) is None
 
 

@@ -297,7 +297,8 @@ def test_a_map_that_comes_is_read_by_an_empty_ones_process(asking: Asking, tmp_p
         assert come.fuser.pid == process
         second.until(lambda: all(each.fuser.ready for each in second.gateway.maps))
         assert second.gateway.health().problems == ()
-        assert name == "default" or hosted.fuser.pid not in (0, process)
+        assert hosted.fuser.pid != process
+        assert bool(hosted.fuser.pid) is (name != "default"), "no other one begins for a map that gives way"
 
 
 def test_a_map_in_use_keeps_its_process(tmp_path: Path) -> None:
@@ -310,8 +311,9 @@ def test_a_map_in_use_keeps_its_process(tmp_path: Path) -> None:
         process = hosted.fuser.pid
         served.greet(link, "default")  # a scanner is about to send
         fuser = served.gateway.maps.open_ahead("yard", tmp_path, hosted.volume)
-        assert process == hosted.fuser.pid != fuser.pid
+        pids = hosted.fuser.pid, fuser.pid
         fuser.close()
+    assert pids[0] == process != pids[1]
 
 
 def test_a_second_asker_hears_of_the_same_move(asking: Asking, tmp_path: Path) -> None:

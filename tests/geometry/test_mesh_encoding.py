@@ -125,6 +125,8 @@ def test_glb(mesh: Mesh, tmp_path: Path) -> None:
         normals = values(gltf, part.attributes.NORMAL)
         assert np.linalg.norm(normals, axis=1) == pytest.approx(1, abs=1e-5)
         assert values(gltf, part.attributes.COLOR_0).shape == (len(normals), 4)
+        assert gltf.accessors[part.attributes.COLOR_0].normalized
+        assert gltf.materials[part.material].pbrMetallicRoughness.metallicFactor == 0, "else it is dark"
 
 
 def test_khronos_calls_the_glb_valid(mesh: Mesh, tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from tsfusion import Mesh, MissingDependency
 from tsfusion.core.errors import OutputError
 from tsfusion.geometry import point_files
 from tsfusion.geometry.map_answers import PointCloud
+from tsfusion.geometry.origin import Origin
 from tsfusion.geometry.provenance import Provenance
 
 
@@ -78,10 +79,18 @@ def test_las_and_laz(mesh: Mesh, tmp_path: Path, suffix: str) -> None:
     assert read.header.generating_software.startswith("tsfusion ")
 
 
+def test_las_has_the_coordinates_that_the_poses_came_with(mesh: Mesh, tmp_path: Path) -> None:
+    there = Origin((447_800, 5_411_400, 300))
+    read = laspy.read(point_files.save(tmp_path / "m.las", mesh.vertices, origin=there))
+    places = np.stack((read.x, read.y, read.z), axis=1)
+    assert places - there.position == pytest.approx(mesh.vertices, abs=0.6e-5)
+
+
 def test_las_holds_the_bytes_of_the_standard(mesh: Mesh, tmp_path: Path) -> None:
     """Read by the offsets of ASPRS's LAS 1.4 R15, without a library."""
     content = mesh.save_points(tmp_path / "m.las").read_bytes()
     assert (content[:4], content[24], content[25]) == (b"LASF", 1, 4)
+    assert struct.unpack_from("<H", content, 6)[0] & 16, "the WKT bit, which these formats must have"
     start, _, kind, size = struct.unpack_from("<IIBH", content, 96)
     assert kind == 7
     (count,) = struct.unpack_from("<Q", content, 247)

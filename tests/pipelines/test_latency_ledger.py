@@ -2,12 +2,14 @@
 """Figures, files and plot of the latency ledger."""
 
 import csv
+import sys
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from tsfusion.pipelines import latency_ledger
+from tsfusion.pipelines import latency_ledger, run_files
 from tsfusion.wire import keyframe_times
 from tsfusion.wire.keyframe_times import KeyframeTimes
 
@@ -76,3 +78,12 @@ def test_plot_is_a_picture(tmp_path) -> None:
     image = cv2.imread(str(tmp_path / "delay.png"))
     assert image.shape[0] > 300
     assert len(np.unique(image.reshape(-1, 3), axis=0)) > 8
+
+
+def test_a_robot_without_matplotlib_has_the_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(run_files, "find_spec", lambda name: None)
+    for name in [name for name in sys.modules if name.startswith("matplotlib")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    run_files.write_ledger(tmp_path, [record(1, 100)])
+    assert [path.name for path in tmp_path.iterdir()] == ["delay.csv"]
