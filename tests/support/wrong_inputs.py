@@ -70,10 +70,10 @@ replay kitti_no_calib --sequence 06 | in no layout known | `tsfusion datasets`
 check tum_no_poses | groundtruth.txt is missing | expected `timestamp tx ty tz
 check scenes_nan_pose | not finite: nan | expected a 4×4 camera-to-world matrix
 # options of a dataset
-replay tum --sequence 06 | takes no `sequence` | it takes trajectory, intrinsics
-replay tum --option depth_topic=/x | takes no `depth_topic` | it takes trajectory, intrinsics
+replay tum --sequence 06 | takes no `sequence` | it takes trajectory, max_gap_s
+replay tum --option depth_topic=/x | takes no `depth_topic` | it takes trajectory, max_gap_s
 replay tum --option speed | got 'speed' | must be KEY=VALUE, such as
-replay tum --option self=3 | takes no `self` | it takes trajectory, intrinsics
+replay tum --option self=3 | takes no `self` | it takes trajectory, max_gap_s
 replay tum --option posed=maybe | `posed` must be true or false, got 'maybe' | true or false
 scan tum --option posed=maybe | `posed` must be true or false, got 'maybe' | true or false
 scan camera:9 --option spec=3 | takes no `spec` | it takes calibration, intrinsics
