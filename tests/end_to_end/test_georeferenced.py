@@ -15,7 +15,7 @@ from tsfusion.datasets import Synthetic
 from tsfusion.datasets.trajectory_files import write_tum
 from tsfusion.geometry.frame import Frame
 
-ORIGIN = np.array([447_800, 5_411_400, 300])
+ORIGIN = np.array([447_000, 5_411_000, 0])
 COUNT = 4
 
 
@@ -44,16 +44,16 @@ def replayed(tmp_path: Path, *arguments: object) -> tuple[Path, str]:
 def test_a_map_in_utm(tmp_path: Path) -> None:
     utm = recorded(tmp_path / "utm", ORIGIN)
     out, said = replayed(tmp_path, utm, "--option", "crs=EPSG:25832", "--state", tmp_path / "state")
-    assert "positions count from the origin 447800 5411400 300 EPSG:25832" in said
+    assert "positions count from the origin 447000 5411000 0 EPSG:25832" in said
     record = json.loads((out / "run.json").read_text())
     assert record["origin_m"] == ORIGIN.tolist()
     plain = Volume(0.05, sensor="lidar")
     for keyframe in open_dataset(recorded(tmp_path / "plain", 0 * ORIGIN)):
         plain.integrate(keyframe)
     assert record["map_hash"] == plain.map_hash()
-    assert b"comment origin_m 447800 5411400 300 EPSG:25832\n" in (out / "mesh.ply").read_bytes()[:800]
+    assert b"comment origin_m 447000 5411000 0 EPSG:25832\n" in (out / "mesh.ply").read_bytes()[:800]
     info = tsfusion("map", "info", out / "map.tsf")
-    assert "poses given, from the origin 447800 5411400 300 EPSG:25832" in info.stdout
+    assert "poses given, from the origin 447000 5411000 0 EPSG:25832" in info.stdout
 
     made = tsfusion("mesh", out / "map.tsf", tmp_path / "room.las")
     assert made.returncode == 0, made.stderr
@@ -67,15 +67,16 @@ def test_a_map_in_utm(tmp_path: Path) -> None:
     assert json.loads((again / "run.json").read_text())["origin_m"] == ORIGIN.tolist()
     fused = tsfusion("fuse", utm, "--voxel-size", "0.05", "--workers", "1", "--out", tmp_path / "fused")
     assert fused.returncode == 0, fused.stderr
-    assert b"comment origin_m 447800 5411400 300\n" in (tmp_path / "fused" / "mesh.ply").read_bytes()[:800]
+    assert b"comment origin_m 447000 5411000 0\n" in (tmp_path / "fused" / "mesh.ply").read_bytes()[:800]
 
     # A map from another origin is another frame.
-    other, _ = replayed(tmp_path / "other", utm, "--origin", "447000,5411000,0")
+    other, _ = replayed(tmp_path / "other", utm, "--origin", "446000,5411000,0")
     refused = tsfusion("map", "merge", out / "map.tsf", other / "map.tsf", "--out", tmp_path / "sum.tsf")
     assert refused.returncode == 1
-    assert "count from other origins" in refused.stderr
+    cure = "(447000 5411000 0 EPSG:25832 and 446000 5411000 0): give all one (--origin 447000,5411000,0)"
+    assert f"the other map counts from another origin {cure}" in refused.stderr
     refused = tsfusion("fuse", utm, tmp_path / "state", "--out", tmp_path / "none")
-    assert (refused.returncode, "another origin" in refused.stderr) == (1, True)
+    assert (refused.returncode, "counts from another origin" in refused.stderr) == (1, True)
 
 
 def test_every_way_of_giving_poses_has_one_origin(tmp_path: Path) -> None:
@@ -86,7 +87,7 @@ def test_every_way_of_giving_poses_has_one_origin(tmp_path: Path) -> None:
         assert dataset.origin.position == tuple(ORIGIN)
         for view, read in zip(views, dataset, strict=True):
             assert read.T_world_camera == pytest.approx(view.T_world_camera, abs=1e-8)
-    assert open_dataset(inside, origin="447800,5411400,0")[0].T_world_camera[2, 3] == pytest.approx(
+    assert open_dataset(inside, origin="447000,5411000,-300")[0].T_world_camera[2, 3] == pytest.approx(
         views[0].T_world_camera[2, 3] + 300
     )
 
@@ -100,9 +101,9 @@ def test_a_scan_by_a_trajectory_in_utm(tmp_path: Path) -> None:
         T[:3, 3] += ORIGIN
     stamps = [10**9 * (1 + number) for number in range(COUNT)]
     write_tum(tmp_path / "poses.txt", stamps, poses)
-    for given, height in ((None, 0.0), ("447800,5411400,0", 300.0)):
+    for given, height in ((None, 0.0), ("447000,5411000,-300", 300.0)):
         config = ScanConfig(localizer="trajectory", trajectory=str(tmp_path / "poses.txt"), origin=given)
         first = Frame.of(Synthetic("room", sensor="lidar", count=1)[0], "lidar")
         localizer = registry.create_localizer(config, first)
-        assert localizer.origin.position == (447_800, 5_411_400, 0 if given else 300)
-        assert localizer._trajectory.translations[0][2] == pytest.approx(poses[0][2, 3] - 300 + height)
+        assert localizer.origin.position == (447_000, 5_411_000, -300 if given else 0)
+        assert localizer._trajectory.translations[0][2] == pytest.approx(poses[0][2, 3] + height)

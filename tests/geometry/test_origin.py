@@ -21,21 +21,20 @@ def test_the_name_of_a_world_has_the_origin(one: Origin) -> None:
 
     assert re.fullmatch(WORLD_NAME, one.world)
     assert Origin.of_world(one.world) == one
-    assert origin.position_of(one.world) == one.position
 
 
 @pytest.mark.parametrize("world", ["", "f" * 32, "origin_1_2", "origin_1_2_3_4", "EPSG_1_2_3", "yard"])
 def test_other_worlds_have_none(world: str) -> None:
     assert Origin.of_world(world) is None
-    assert origin.position_of(world) is None
 
 
 def test_only_far_positions_get_one() -> None:
-    assert origin.found([UTM]) == Origin((447_800, 5_411_400, 300))
+    assert origin.found([UTM]) == Origin((448_000, 5_411_000, 0))
+    assert origin.found([UTM + 100, UTM]) == origin.found([UTM])  # two drives of a place
     assert origin.found([UTM, UTM * 0]) == origin.found([UTM], "auto")
     assert origin.found([np.array([9000.0, -9000.0, 0.0]), UTM]) is None
     assert origin.found([]) is None
-    assert origin.found([UTM], crs="EPSG:25832") == Origin((447_800, 5_411_400, 300), "EPSG:25832")
+    assert origin.found([UTM], crs="EPSG:25832") == Origin((448_000, 5_411_000, 0), "EPSG:25832")
     assert origin.found([UTM * 0], crs="EPSG:25832") == Origin((0, 0, 0), "EPSG:25832")
     for text in (
         "447000,5411000,0",
@@ -52,10 +51,35 @@ def test_what_is_no_origin_is_refused(text: object) -> None:
         origin.found([UTM], text)
 
 
-@pytest.mark.parametrize("crs", ["25832", "epsg:x", "EPSG:", 5])
+@pytest.mark.parametrize("crs", ["25832", "epsg:x", "EPSG:", "5", "['EPSG:25832']"])
 def test_what_is_no_reference_system_is_refused(crs: str) -> None:
     with pytest.raises(InvalidConfig, match="crs must be EPSG: and a number"):
-        origin.found([UTM], crs=crs)
+        origin.system(crs)
+
+
+@pytest.mark.parametrize(
+    ("crs", "metres"),
+    [
+        ("EPSG:25832", (1.0, 1.0, 1.0)),
+        ("EPSG:2994", (0.3048, 0.3048, 0.3048)),
+        ("EPSG:6880", (1200 / 3937,) * 3),
+        ("EPSG:5555", (1.0, 1.0, 1.0)),  # UTM and a height
+        ("EPSG:8720", (1200 / 3937,) * 3),  # both in US survey feet
+    ],
+)
+def test_units_of_a_reference_system(crs: str, metres: tuple[float, ...]) -> None:
+    pytest.importorskip("pyproj")
+    found = origin.system(crs)
+    assert found.crs == crs
+    assert found.metres == pytest.approx(metres, rel=1e-12)
+
+
+def test_a_reference_system_that_cannot_be() -> None:
+    pytest.importorskip("pyproj")
+    with pytest.raises(InvalidConfig, match="degrees: project points and poses first, such as to UTM"):
+        origin.system("EPSG:4326")
+    with pytest.raises(InvalidConfig, match="pyproj knows no coordinate reference system EPSG:999999"):
+        origin.system("EPSG:999999")
 
 
 def test_a_cloud_in_a_grid_is_no_scan() -> None:

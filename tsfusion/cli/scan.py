@@ -250,11 +250,11 @@ def _open(
     warnings = [] if spec.startswith("synthetic:") else _warnings(dataset)
     if settings["trajectory"] is not None:
         trajectory = Path(settings["trajectory"]).expanduser()
-        if not pairs_by_time(trajectory, dataset):
+        if "crs" in given or not pairs_by_time(trajectory, dataset):
             dataset = WithTrajectory(dataset, trajectory)
-            dataset.take_off_origin(origin)
+            dataset.take_off_origin(origin, given.get("crs"))
             settings |= {"trajectory": None, "localizer": "given"}
-            typer.echo(f"poses: {trajectory}, one a frame in order, as not both have times", err=True)
+            typer.echo(f"poses: {trajectory}, one a frame in order or at its time", err=True)
     return RecordedSource(select(dataset, **part), rate=rate), warnings
 
 

@@ -28,7 +28,7 @@ from tsfusion.datasets.cameras import camera_files
 from tsfusion.datasets.dataset import Dataset, first_frame, pose_of
 from tsfusion.datasets.registry import sweep_doubt
 from tsfusion.geometry.keyframe import Keyframe
-from tsfusion.geometry.origin import Origin, world_of
+from tsfusion.geometry.origin import world_of
 from tsfusion.journal import locations, state_folder
 from tsfusion.journal.journaled_keyframes import JournaledKeyframes
 from tsfusion.tsdf import checkpoint, map_history
@@ -138,13 +138,7 @@ def listed(
                 _check_distinct(seen, keyframes, source)
             left_out.update(keyframes.unreadable)
             here = keyframes.worlds or {""}
-        if worlds is not None and not same_frame and worlds.isdisjoint(here):
-            origin = next(filter(None, map(Origin.of_world, here)), None)
-            own = "another scan that found its poses itself, in a coordinate frame of its own"
-            raise MapError(
-                f"{source} is of {own if origin is None else f'another origin, {origin}'}: they fuse only if "
-                "they are known to be in one frame (--same-frame)"
-            )
+        map_history.check_worlds(worlds or here, here, same_frame=same_frame, name=source)
         worlds = here | (worlds or set())
         found.worlds = frozenset(worlds)
         found.names.append(source)

@@ -16,11 +16,11 @@ from tsfusion.core.errors import DatasetError, InvalidKeyframe, TsfusionError
 from tsfusion.datasets.accelerometer import Accelerometer
 from tsfusion.datasets.depth_files import check_byte_order
 from tsfusion.datasets.point_times import PointTimes, Scan, point_times
-from tsfusion.geometry import origin
+from tsfusion.geometry import origin, se3
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.geometry.object_cards import ShownRecording
-from tsfusion.geometry.origin import Origin
+from tsfusion.geometry.origin import Origin, System
 from tsfusion.geometry.sweeps import Motion, motion_about
 from tsfusion.geometry.trajectory import PoseAt
 
@@ -97,6 +97,7 @@ class Frames(ShownRecording):
     quaternions: bool = False  # whether rotations were recorded as quaternions; else as matrices
     usual: Mapping[str, Any] = MappingProxyType({})  # settings of a map of such a place (`VolumeConfig`)
     origin: Origin | None = None  # what was taken off the poses' positions
+    system: System = System()  # of the positions as they were recorded
     _poses: Sequence[NDArray[np.float64] | None] = ()
     _deskew = True  # whether times of points count
     _between: Callable[[], PoseAt] | None = None  # makes `_pose_at`; None = there are poses of frames alone
@@ -140,17 +141,23 @@ class Frames(ShownRecording):
         return self._poses[index] if self._poses else self.frame(index).T_world_camera
 
     def take_off_origin(self, wanted: object = None, crs: str | None = None) -> None:
-        """Let positions count from an origin, as `origin.found` chooses it.
+        """Let positions count in metres from an origin, as `origin.found` chooses it.
 
         Raises:
             InvalidConfig: for an origin or a reference system that cannot be.
         """
-        there = [T for T in self._poses if T is not None]
-        self.origin = origin.found([T[:3, 3] for T in there], wanted, crs)
-        if self.origin is not None:
-            shift = np.zeros((4, 4))
-            shift[:3, 3] = self.origin.position
-            self._poses = [None if T is None else T - shift for T in self._poses]
+        self.system, self.origin = self.system if crs is None else origin.system(str(crs)), None
+        positions = [self._counted(T[:3, 3]) for T in self._poses if T is not None]
+        self.origin = origin.found(positions, wanted, self.system.crs)
+        self._poses = [self._counted_pose(T) for T in self._poses]
+
+    def _counted(self, positions: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Recorded positions, (…, 3), in metres from the origin."""
+        zero = np.zeros(3) if self.origin is None else np.array(self.origin.position)
+        return np.asarray(positions * np.array(self.system.metres) - zero)
+
+    def _counted_pose(self, T: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
+        return None if T is None else se3.transform(T[:3, :3], self._counted(T[:3, 3]))
 
     def specific_force(self, index: int) -> NDArray[np.float64] | None:
         """(3,) m/s² in the frame's axes, as an accelerometer measured it; None where there is none."""
@@ -230,7 +237,8 @@ class Frames(ShownRecording):
     @cached_property
     def _pose_at(self) -> PoseAt:
         """The pose at a time of the frames' clock, also between frames."""
-        return (lambda _: None) if self._between is None else self._between()
+        recorded: PoseAt = (lambda _: None) if self._between is None else self._between()
+        return lambda stamp_ns: self._counted_pose(recorded(stamp_ns))
 
     def _motion(self, index: int, times_s: NDArray[np.float32] | None) -> Motion | None:
         """Motion of the sensor during a frame's sweep, by the recorded poses; None = not known."""

@@ -71,9 +71,9 @@ class FolderFrames(Frames):
         require_frames(len(files), root, self.expected, self.skipped)
         read = self._recorded_poses if given is None else self._poses_of
         own = partial(read, given or root, files)
-        found = poses_if_any(own, len(files), posed=posed, guessed=self.guesses and given is None)
+        found = poses_if_any(own, len(files), posed=self._posed, guessed=self.guesses and given is None)
         where = root, self._wanted()
-        self._kept = self._keep(range(len(files)), found, where, posed=posed, reason=self._why)
+        self._kept = self._keep(range(len(files)), found, where, posed=self._posed, reason=self._why)
         self._files = [files[index] for index in self._kept]
         self.timestamps_ns = None if self._times is None else self._times[self._kept]
         self.name, self.sensor = f"{self.layout} {root.name}", sensor or self.sensor

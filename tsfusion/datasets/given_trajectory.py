@@ -46,7 +46,8 @@ def poses_of(
             timeless = path.name if times is None else "the recording"
             raise DatasetError(
                 f"{path} has {len(poses)} poses for {count} frames, and {timeless} has no times to pair them "
-                "by: give one pose a frame, or times in both (TUM's format; images named by their seconds)"
+                "by: give one pose a frame, or times in both (TUM's format; images named by seconds; in a "
+                "grid points with gps_time)"
             )
         return [T if np.isfinite(T).all() else None for T in poses]
     trajectory, offset = read_tum(path), round(time_offset_s * 1e9)

@@ -8,7 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tsfusion.geometry.origin import System
 from tsfusion.geometry.sweeps import skewed
+from tsfusion.geometry.trajectory import Trajectory
 
 _FIELD = re.compile(
     r"(?:scalar_?)?(?:t|ts|time_?stamp|(?:gps|point|offset|rel|relative|delta)?_?time(?:_?offset)?)"
@@ -25,10 +27,11 @@ _COARSE = 0.01  # of a sweep: steps of numbers that are too coarse for its times
 class Scan(NamedTuple):
     """Points of one sweep, and their times as they are written."""
 
-    points: NDArray[np.float32]  # (N, 3) metres in the LiDAR's axes; NaN where there was no return
+    points: NDArray[np.floating]  # (N, 3) metres in the LiDAR's axes, or the file's system; NaN = no return
     time_field: str | None = None  # None = there are no times
     moments: NDArray[Any] | None = None  # (N,) of that field
     color: NDArray[np.uint8] | None = None  # (N, 3) BGR
+    system: System | None = None  # that the file names
 
 
 class PointTimes(NamedTuple):
@@ -55,7 +58,7 @@ def point_times(scan: Scan, stamp_ns: int, between_s: float = 1.0) -> PointTimes
         stamp_ns: of the frame; 0 = it has none.
         between_s: seconds between two frames.
     """
-    points, field, moments, _ = scan
+    points, field, moments = scan[:3]
     if field is None or moments is None:
         return PointTimes()
     values = moments.astype(np.float64 if moments.dtype.kind == "f" else np.int64)
@@ -80,3 +83,13 @@ def point_times(scan: Scan, stamp_ns: int, between_s: float = 1.0) -> PointTimes
         start_s -= stamp_ns * 1e-9
     start_s = start_s if abs(start_s) <= _NEAR_S else 0.0
     return PointTimes(np.where(known, start_s + (values - first) * unit, start_s).astype(np.float32))
+
+
+def times_on(scan: Scan, trajectory: Trajectory) -> NDArray[np.float64]:
+    """(N,) nanoseconds of points in the unit in which any is on a trajectory, NaN where it is not."""
+    first, last = trajectory.timestamps_ns[[0, -1]]
+    for unit_s in () if scan.moments is None else _UNITS_S.values():
+        times = np.asarray(scan.moments) * (unit_s * 1e9)
+        if (is_on := (times >= first) & (times <= last)).any():
+            return np.where(is_on, times, np.nan)
+    return np.full(len(scan.points), np.nan)

@@ -36,6 +36,7 @@ from tsfusion.datasets.given_trajectory import WithTrajectory
 from tsfusion.datasets.rosbag import dataset as rosbag_dataset
 from tsfusion.datasets.rosbag.reader import ENDINGS
 from tsfusion.geometry.frame import Frame
+from tsfusion.geometry.origin import System
 
 GROUP = "tsfusion.datasets"
 
@@ -147,7 +148,7 @@ def find(path: str | Path, *, unpack: bool = False) -> Found:
         root = _unpacked(root, unpack=unpack)
     found = _match([root])
     if not found and root.is_file():
-        found = _match([root.absolute().parent]) if root.suffix.lower() in _INDEX else []
+        found = _match([root.absolute().parent]) if root.suffix.lower() in _INDEX else _match([root], SCANS)
     elif not found:
         places = _folders_in(root)
         found = _match(places) or _match([root], SCANS) or _match(places, SCANS)
@@ -228,6 +229,11 @@ def describe(dataset: Dataset) -> str:
     unit = depth_line(dataset, first)
     camera = camera_line(dataset, first)
     seen = f"; {unit}" * bool(unit) + f"; camera {camera}" * bool(camera)
+    system = getattr(dataset, "system", System())
+    if getattr(dataset, "in_world", False):
+        seen += "; points in the frame of the poses" + ", taken for metres" * (system == System())
+    if system.metres != System().metres:
+        seen += f"; units of {system.metres[0]:.9g} m become metres"
     if origin := getattr(dataset, "origin", None):
         seen += f"; positions count from the origin {origin}"
     if doubt := sweep_doubt(first):

@@ -4,6 +4,7 @@
 import re
 from collections.abc import Callable, Iterable
 from io import BufferedReader, BytesIO
+from math import isclose
 from pathlib import Path
 from typing import Any
 
@@ -11,23 +12,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core import read_limits
-from tsfusion.core.errors import DatasetError, MissingDependency, TsfusionError
+from tsfusion.core.errors import DatasetError, InvalidConfig, MissingDependency, TsfusionError
 from tsfusion.datasets.point_times import Scan, time_field
+from tsfusion.geometry import origin
+from tsfusion.geometry.origin import System
 
 SUFFIXES = (".bin", ".pcd", ".ply", ".las", ".laz")
 USUAL_FIELDS = 4  # float32 a point of raw floats: x, y, z and the intensity
 _HEADER_BYTES = 1 << 14
+_WKT, _CODE, _GEOGRAPHIC, _UNIT, _HEIGHT, _HEIGHT_UNIT = 2112, 3072, 2048, 3076, 4096, 4099  # GeoTIFF's keys
+_UNITS = {9001: 1.0, 9002: 0.3048, 9003: 1200 / 3937}  # metres, by EPSG's codes
+_HEIGHTS = {6360: 9003, 8228: 9002}  # units of heights that are no metres
 
 
 def read_scan(path: Path, *, fields: int = USUAL_FIELDS) -> Scan:
-    """Read a scan, in the order of the file.
+    """Read a scan, in the order of the file; float64 where the file has more digits than float32.
 
     Args:
         fields: float32 numbers a point in a `.bin` file, x, y and z first; other formats say it themselves.
 
     Raises:
         DatasetError: the file is missing, empty, cut off, damaged, or holds something else.
-        MissingDependency: for PCD without pypcd4, for LAS and LAZ without laspy.
+        InvalidConfig: its coordinates are degrees, or in a unit that is not known.
+        MissingDependency: for PCD without pypcd4, for LAS without laspy, for its system without pyproj.
     """
     suffix = path.suffix.lower()
     try:
@@ -38,6 +45,8 @@ def read_scan(path: Path, *, fields: int = USUAL_FIELDS) -> Scan:
             scan, promised = _raw(path, fields)
         else:
             scan, promised = _READERS[suffix](path)
+    except InvalidConfig as error:
+        raise InvalidConfig(f"{path}: {error}") from error
     except TsfusionError:
         raise
     except OSError as error:
@@ -51,29 +60,18 @@ def read_scan(path: Path, *, fields: int = USUAL_FIELDS) -> Scan:
         raise DatasetError(f"{path} holds no points; expected x, y and z of a scan")
     if len(points) != promised:
         raise DatasetError(f"{path} was cut off: it has {len(points)} of the {promised} points that it names")
-    return scan._replace(points=np.ascontiguousarray(points, np.float32))
+    kind = np.float32 if points.dtype == np.float32 else np.float64
+    return scan._replace(points=np.ascontiguousarray(points, kind))
 
 
 def _raw(path: Path, fields: int) -> tuple[Scan, int]:
-    more = {3: "", 4: " and the intensity"}.get(fields, f" and {fields - 3} more")
-    hint = "" if fields == 3 else " (--option fields=3 for x, y, z alone)"
-    expected = f"expected float32 x, y, z{more}{hint}"
+    expected = f"expected {fields} float32 a point, x, y and z first (of scans in a folder --option fields=N)"
     if (nbytes := path.stat().st_size) % (4 * fields):
         raise DatasetError(f"{path} has {nbytes} bytes, not {4 * fields} a point; {expected}")
     points = np.fromfile(path, "<f4").reshape(-1, fields)
-    if fields == USUAL_FIELDS:
-        check_intensities(points, path, expected)
-    return Scan(points[:, :3]), len(points)
-
-
-def check_intensities(points: NDArray[np.float32], path: Path, expected: str) -> None:
-    """Refuse (n, 4) numbers of a file whose points are of three or five numbers.
-
-    Raises:
-        DatasetError: an intensity is below 0.
-    """
-    if (points[:, 3] < 0).any():
+    if fields == USUAL_FIELDS and (points[:, 3] < 0).any():
         raise DatasetError(f"{path} has intensities below 0; {expected}")
+    return Scan(points[:, :3]), len(points)
 
 
 # Each reads the points, and how many the file's header names.
@@ -116,7 +114,8 @@ def _ply(path: Path) -> tuple[Scan, int]:
         file.seek(0)
         read = trimesh.load(file, file_type="ply", process=False)
     vertices = read.metadata["_ply_raw"]["vertex"]
-    scan = _timed(np.asarray(read.vertices), vertices["properties"], vertices["data"])
+    points = np.asarray(read.vertices, vertices["properties"]["x"])
+    scan = _timed(points, vertices["properties"], vertices["data"])
     return scan, len(scan.points) if named is None else int(named[1])
 
 
@@ -128,14 +127,28 @@ def _las(path: Path) -> tuple[Scan, int]:
     with laspy.open(path) as opened:
         named = opened.header.point_count  # before it is told what was found
         read_limits.check(path, named * opened.header.point_format.size)
-        read = opened.read()
-        return _timed(np.asarray(read.xyz), read.point_format.dimension_names, read), named
+        system, read = _system_in(opened.header), opened.read()
+        scan = _timed(np.asarray(read.xyz), read.point_format.dimension_names, read)
+        return scan._replace(system=system), named
+
+
+def _system_in(header: Any) -> System | None:
+    """The coordinate reference system that the head of a LAS file names, as WKT or GeoTIFF; None = none."""
+    named = [*header.vlrs, *(header.evlrs or [])]
+    text = next((one.string for one in named if one.record_id == _WKT and getattr(one, "string", "")), "")
+    keys = {key.id: key.value_offset for one in named for key in getattr(one, "geo_keys", ())}
+    if text or not keys:
+        return origin.system(text) if text else None
+    known = origin.system(f"EPSG:{keys.get(_CODE, keys.get(_GEOGRAPHIC, 0))}")
+    unit = _UNITS.get(keys.get(_UNIT, 0), known.metres[0])
+    upward = _UNITS.get(keys.get(_HEIGHT_UNIT) or _HEIGHTS.get(keys.get(_HEIGHT, 0), 0), unit)
+    return System(known.crs if isclose(unit, known.metres[0]) else "", (unit, unit, upward))
 
 
 def _timed(points: NDArray[Any], names: Iterable[str], values: Any) -> Scan:
     """A scan with the times among named values, where there are some."""
     field = time_field(names)
-    return Scan(points) if field is None else Scan(points, field, np.asarray(values[field]))
+    return Scan(points) if field is None else Scan(points, field, np.ravel(values[field]))
 
 
 _READERS: dict[str, Callable[[Path], tuple[Scan, int]]] = {

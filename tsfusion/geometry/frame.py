@@ -54,6 +54,7 @@ class Frame:
     right: NDArray[np.uint8] | None = None
     points: NDArray[np.float32] | None = None
     point_times_s: NDArray[np.float32] | None = None
+    origins: NDArray[np.float32] | None = None
     motion: Motion | None = None
     untimed: str = ""
     color: NDArray[np.uint8] | None = None
@@ -69,9 +70,10 @@ class Frame:
             self._check_pair()
         checked = self._at(np.eye(4) if self.T_world_camera is None else self.T_world_camera)
         put(self, "kind", "pair" if pair else checked.kind)
-        for name in ("depth", "disparity", "points", "point_times_s", "color", "confidence", "intrinsics"):
+        for name in ("depth", "disparity", "points", "point_times_s", "origins", "color", "confidence"):
             if not (pair and name == "disparity"):
                 put(self, name, getattr(checked, name))
+        put(self, "intrinsics", checked.intrinsics)
         if self.T_world_camera is not None:
             put(self, "T_world_camera", checked.T_world_camera)
         if self.specific_force is not None:
@@ -198,6 +200,7 @@ class Frame:
             baseline_fx=self.baseline_fx,
             points=self.points,
             point_times_s=self.point_times_s,
+            origins=self.origins,
             motion=motion,
             color=self.color,
             confidence=self.confidence,

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from tsfusion.core import other_names
 from tsfusion.core.errors import InvalidKeyframe
 from tsfusion.geometry import object_cards, sweeps
+from tsfusion.geometry.origin import FAR
 
 _T = TypeVar("_T")
 Kind = Literal["depth", "disparity", "points"]
@@ -22,7 +23,6 @@ MAX_IMAGE_SIDE = 8192
 MAX_POINTS = 2_000_000
 MAX_BASELINE_M = 5.0  # of a stereo camera; more are millimetres
 MAX_TRANSLATION = 1e6
-_FARTHEST_SCAN = 1e4  # metres
 MAX_SENSOR_NAME = 32
 _LEAST = np.finfo(np.float64).tiny  # smaller numbers stop LAPACK where a library has the processor flush them
 _ROTATION_TOLERANCE = 1e-3
@@ -235,11 +235,11 @@ class Keyframe(object_cards.Shown):
         points = _single("points", self.points, (None, 3))
         object.__setattr__(self, "points", points)
         if len(points) > MAX_POINTS:
-            raise InvalidKeyframe(f"points must be at most {MAX_POINTS}, got {len(points)}")
-        if len(points) and np.abs(points[0]).max() > _FARTHEST_SCAN and _nearest(points) > _FARTHEST_SCAN:
+            raise InvalidKeyframe(f"points must be at most {MAX_POINTS}, got {len(points)}: cut the cloud")
+        if are_far(points):
             raise InvalidKeyframe(
-                f"all points are more than {_FARTHEST_SCAN / 1000:g} km from the sensor, as in a grid: "
-                "give them in the sensor's frame, and where the sensor was in T_world_camera"
+                f"all points are more than {FAR / 1000:g} km from the sensor, as in a grid: give them in the "
+                "sensor's frame, with T_world_camera, its place (of files with --trajectory, in that grid)"
             )
         if self.origins is not None:
             one = np.ndim(self.origins) == 1
@@ -396,11 +396,13 @@ def check_pose(pose: Any, *, farthest: float = MAX_TRANSLATION) -> NDArray[np.fl
     return T
 
 
-def _nearest(points: NDArray[np.float32]) -> float:
-    """Metres along an axis to the nearest of the (n, 3) points; 0 where none is a return."""
+def are_far(points: NDArray[np.floating]) -> bool:
+    """Whether all returns of (n, 3) points are beyond `FAR` along an axis; False = there are none."""
+    if not len(points) or np.abs(points[0]).max() <= FAR:
+        return False
     away = np.abs(points).max(axis=1)
     away = away[np.isfinite(away)]
-    return float(away.min()) if len(away) else 0.0
+    return bool(len(away) and away.min() > FAR)
 
 
 def _nearest_rotation(R: NDArray[np.float64]) -> NDArray[np.float64]:

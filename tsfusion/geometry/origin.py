@@ -10,19 +10,49 @@ two origins are of two worlds.
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core.errors import InvalidConfig
+from tsfusion.core.errors import InvalidConfig, MissingDependency
 
 AUTO = "auto"
 FAR = 1e4  # metres from zero, beyond which poses that begin there are taken to be in a grid
-_STEP = 100  # metres: an origin that was found is a multiple of it
+_STEP = 1000  # metres: an origin that was found is a multiple of it, so that drives of a place have one
 FARTHEST = 1e8  # metres from zero; the Earth is smaller
-_CRS = re.compile(r"EPSG:([0-9]{4,6})")
+_CRS = re.compile(r"EPSG:[0-9]{4,6}|[A-Z_]+\[.*", re.DOTALL)
 _WORLD = re.compile(r"(?:EPSG([0-9]{4,6})|origin)((?:_-?[0-9]{1,9}){3})")
+
+
+class System(NamedTuple):
+    """A coordinate reference system of positions."""
+
+    crs: str = ""  # its code, such as `EPSG:25832`; empty = nobody said, or it has none
+    metres: tuple[float, float, float] = (1.0, 1.0, 1.0)  # of a unit along x, y and z
+    projection: Any = None  # a `pyproj.CRS`
+
+
+@lru_cache(maxsize=64)
+def system(text: str) -> System:
+    """System of a code or WKT; raises InvalidConfig for none or degrees, MissingDependency without pyproj."""
+    if not _CRS.fullmatch(text):
+        raise InvalidConfig(f"crs must be EPSG: and a number, such as EPSG:25832, got {text!r}")
+    try:
+        import pyproj
+
+        read = pyproj.CRS.from_user_input(text)
+    except ImportError as error:
+        raise MissingDependency("for a coordinate reference system: pip install '.[crs]'") from error
+    except pyproj.exceptions.CRSError as error:
+        raise InvalidConfig(f"pyproj knows no coordinate reference system {text[:60]}") from error
+    if read.is_geographic:
+        cure = "project points and poses first, such as to UTM (`pdal translate`, `gdaltransform`)"
+        raise InvalidConfig(f"positions in {read.name} are degrees: {cure}")
+    units = [axis.unit_conversion_factor or 1.0 for axis in read.axis_info] or [1.0]
+    code = read.to_epsg() or (read.sub_crs_list or [read])[0].to_epsg()
+    return System(f"EPSG:{code}" if code else "", (units[0], units[0], units[2 if units[2:] else 0]), read)
 
 
 @dataclass(frozen=True)
@@ -30,7 +60,7 @@ class Origin:
     """Position of a map's zero in the frame of the poses that a recording came with.
 
     Attributes:
-        position: whole metres along the axes of that frame.
+        position: whole metres along the axes of that frame, also where its system counts feet.
         crs: its coordinate reference system, such as `EPSG:25832`; empty = nobody said.
 
     Examples:
@@ -60,40 +90,30 @@ class Origin:
         return " ".join([*map(str, self.position), *filter(None, [self.crs])])
 
 
-def found(
-    positions: Sequence[NDArray[np.float64]], wanted: object = None, crs: str | None = None
-) -> Origin | None:
+def found(positions: Sequence[NDArray[np.float64]], wanted: object = None, crs: str = "") -> Origin | None:
     """The origin of a recording; None = its positions stay as they are.
 
     Args:
         positions: (3,) metres each, in the recording's order.
         wanted: `auto` or None = near the first position where that is farther than `FAR` from zero; `X,Y,Z`
             or three numbers = that place in whole metres.
-        crs: coordinate reference system of the positions, such as `EPSG:25832`.
+        crs: code of their coordinate reference system.
 
     Raises:
         InvalidConfig: for anything else.
     """
-    if crs is not None and (not isinstance(crs, str) or not _CRS.fullmatch(crs)):
-        raise InvalidConfig(f"crs must be EPSG: and a number, such as EPSG:25832, got {crs!r}")
     if wanted is not None and not (isinstance(wanted, str) and wanted == AUTO):
-        return Origin(_parsed(wanted), crs or "")
+        return Origin(_parsed(wanted), crs)
     if not len(positions) or (np.abs(positions[0]).max() <= FAR and not crs):
         return None
     x, y, z = (int(_STEP * round(float(one) / _STEP)) for one in positions[0])
-    return Origin((x, y, z), crs or "")
+    return Origin((x, y, z), crs)
 
 
 def world_of(recording: Any) -> str:
     """Name of the world of a recording's given poses, by its `origin`; empty = it has none."""
     there: Origin | None = getattr(recording, "origin", None)
     return "" if there is None else there.world
-
-
-def position_of(world: str) -> tuple[int, int, int] | None:
-    """Metres of the origin in the name of a world; None = it has none."""
-    there = Origin.of_world(world)
-    return None if there is None else there.position
 
 
 def _parsed(wanted: object) -> tuple[int, int, int]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from tsfusion.core import durable_files
 from tsfusion.core.errors import MissingDependency, OutputError
-from tsfusion.geometry.origin import Origin
+from tsfusion.geometry.origin import Origin, System, system
 
 FORMATS = (".ply", ".pcd", ".las", ".laz")
 ONLY_POINTS = (".pcd", ".las", ".laz")  # formats that hold no triangles
@@ -41,7 +41,7 @@ def save(
         normals: (n, 3) float32.
         colors: (n, 3) uint8 RGB.
         facts: what the file says about them, by name.
-        origin: of the map; LAS and LAZ have the coordinates that its poses came with, and their system.
+        origin: of the map; LAS and LAZ have the system, units and coordinates that its poses came with.
 
     Raises:
         OutputError: for another suffix, no points, or a path that cannot be written.
@@ -124,7 +124,8 @@ def _write_las(
         raise MissingDependency(_INSTALL) from error
     if compressed and not laspy.LazBackend.detect_available():
         raise MissingDependency(_INSTALL)
-    points = rows["point"].astype(np.float64) + origin.position
+    recorded = system(origin.crs) if origin.crs else System()
+    points = (rows["point"].astype(np.float64) + origin.position) / recorded.metres
     middle = np.round((points.min(axis=0) + points.max(axis=0)) / 2)
     if np.abs(points - middle).max() >= _LAS_FARTHEST:
         raise OutputError(
@@ -135,8 +136,8 @@ def _write_las(
     header.scales, header.offsets = np.full(3, _LAS_STEP), middle
     header.global_encoding.wkt = True  # as formats from 6 on must have it, also without a system
     header.generating_software = facts.get("generator", "")[:32]
-    if origin.crs:
-        header.add_crs(_system(origin.crs))
+    if recorded.projection is not None:
+        header.add_crs(recorded.projection)
     text = "".join(f"{name} {fact}\n" for name, fact in facts.items())
     header.vlrs.append(laspy.VLR("tsfusion", _RECORD, "about these points", text.encode()[:65535]))
     if "normal" in names:
@@ -149,15 +150,3 @@ def _write_las(
         for axis, column in zip("xyz", rows["normal"].T, strict=True):
             cloud[f"normal_{axis}"] = column
     cloud.write(file, do_compress=compressed)
-
-
-def _system(crs: str) -> Any:
-    """A coordinate reference system by its code; raises MissingDependency without pyproj."""
-    try:
-        import pyproj
-    except ImportError as error:
-        raise MissingDependency("to write a coordinate reference system: pip install pyproj") from error
-    try:
-        return pyproj.CRS.from_user_input(crs)
-    except pyproj.exceptions.CRSError as error:
-        raise OutputError(f"{crs} is no coordinate reference system that pyproj knows") from error

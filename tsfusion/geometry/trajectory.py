@@ -54,6 +54,15 @@ class Trajectory:
             return _known(self.quaternions[right], self.translations[right])
         return between
 
+    def positions(self, times_ns: NDArray[np.float64], *, max_gap_s: float) -> NDArray[np.float64]:
+        """Interpolate translations at (n,) times: (n, 3), NaN in holes, longer gaps and beyond the ends."""
+        stamps = self.timestamps_ns
+        right = np.clip(np.searchsorted(stamps, times_ns), 1, len(stamps) - 1)
+        begin, end = stamps[right - 1, None], stamps[right, None]
+        share = (times_ns[:, None] - begin) / (end - begin)
+        found = (1 - share) * self.translations[right - 1] + share * self.translations[right]
+        return np.where((share < 0) | (share > 1) | (end - begin > max_gap_s * 1e9), np.nan, found)
+
 
 def _known(quaternion: NDArray[np.float64], translation: NDArray[np.float64]) -> Transform | None:
     return rigid(quaternion, translation) if np.isfinite(quaternion).all() else None

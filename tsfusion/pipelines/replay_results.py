@@ -14,7 +14,7 @@ from tsfusion.client import Client
 from tsfusion.datasets import Dataset
 from tsfusion.datasets.cameras import camera_line
 from tsfusion.geometry.mesh import Mesh
-from tsfusion.geometry.origin import position_of, world_of
+from tsfusion.geometry.origin import Origin, world_of
 from tsfusion.journal.recording import LOST
 from tsfusion.pipelines import latency_ledger, run_files, shortfall
 from tsfusion.pipelines.run_files import Circumstances, WrittenMap
@@ -133,7 +133,7 @@ def summarise(
         delay_slope_ms_per_keyframe=delays.slope_ms_per_keyframe,
         stages_ms=delays.stages_ms,
         clock_bound_ms=delays.clock_bound_ms,
-        origin_m=position_of(world_of(dataset)),
+        origin_m=getattr(Origin.of_world(world_of(dataset)), "position", None),
         mesh=figures,
         accuracy=None if error_mm is None else measure(error_mm),
         peak_rss_bytes={**server_rss(status), "client": peak_rss_bytes},

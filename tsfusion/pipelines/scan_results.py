@@ -14,7 +14,7 @@ from tsfusion.core.config import ScanConfig, VolumeConfig
 from tsfusion.datasets.dataset import UNREADABLE
 from tsfusion.datasets.trajectory_files import write_tum
 from tsfusion.evaluation.trajectory_error import TrajectoryError, absolute_error
-from tsfusion.geometry.origin import position_of
+from tsfusion.geometry.origin import Origin
 from tsfusion.pipelines import latency_ledger, run_files, shortfall
 from tsfusion.pipelines.run_files import Circumstances, WrittenMap
 from tsfusion.pipelines.shortfall import Verdict
@@ -175,7 +175,7 @@ def summarise(
         seconds=round(seconds, 3),
         tracking_cpu_ms=round(scanner.tracking_cpu_ms, 3),
         maps=maps,
-        origin_m=position_of(scanner.submaps[0].client.world),
+        origin_m=getattr(Origin.of_world(scanner.submaps[0].client.world), "position", None),
         delay_ms=latency_ledger.summarise(times).delay_ms,
         peak_rss_bytes={"client": peak_rss_bytes},
         config={name: msgspec.to_builtins(each) for name, each in settings.items()},

@@ -7,7 +7,7 @@ are not added either, unless somebody knows better.
 """
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Set
 from typing import Any
 
 import msgspec
@@ -114,15 +114,21 @@ def check_addable(here: Mapping[str, Any], there: Mapping[str, Any], *, same_fra
     for name in ours:
         if name in theirs:
             _check_distinct(ours[name], theirs[name])
-    if not same_frame and worlds(here).isdisjoint(worlds(there)):
-        origins = [one for each in (here, there) for name in worlds(each) if (one := Origin.of_world(name))]
-        if origins:
-            places = " and ".join(map(str, origins))
-            raise MapError(f"the maps count from other origins ({places}): make them with one --origin")
+    check_worlds(worlds(here), worlds(there), same_frame=same_frame)
+
+
+def check_worlds(here: Set[str], there: Set[str], *, same_frame: bool, name: str = "the other map") -> None:
+    """Raise MapError where two sets of worlds have none in common, and are not known to be in one frame."""
+    if not here.isdisjoint(there):
+        return
+    origins = [one for each in (here, there) for world in sorted(each) if (one := Origin.of_world(world))]
+    if len({one.position for one in origins}) > same_frame:
+        first, places = ",".join(map(str, origins[0].position)), " and ".join(map(str, origins))
+        raise MapError(f"{name} counts from another origin ({places}): give all one (--origin {first})")
+    if not same_frame:
         raise MapError(
-            "the maps are of scans that found their poses themselves, each in a coordinate frame of its own; "
-            "merge them only if they are known to be in one (--same-frame, in Python same_frame=True), or "
-            "after they were aligned"
+            f"{name} is of a scan that found its poses itself, in a coordinate frame of its own; they go "
+            "together only if they are known to be in one (--same-frame, same_frame=True), or were aligned"
         )
 
 

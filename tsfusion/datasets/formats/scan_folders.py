@@ -3,20 +3,28 @@
 
 import logging
 import re
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.dataset import SCAN, NoPoses, Poses, Times
 from tsfusion.datasets.file_names import in_time, series_of
 from tsfusion.datasets.folder_frames import FolderFrames
 from tsfusion.datasets.given_trajectory import poses_between
+from tsfusion.datasets.point_times import Scan, times_on
 from tsfusion.datasets.scan_files import SUFFIXES, USUAL_FIELDS, read_scan
-from tsfusion.datasets.trajectory_files import read_poses
+from tsfusion.datasets.trajectory_files import has_times, read_poses, read_tum
+from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
+from tsfusion.geometry.keyframe import are_far
+from tsfusion.geometry.origin import System
 
 EXPECTED = (
     "scans numbered or named by their times (.bin, .pcd, .ply, .las or .laz) in the folder, velodyne/, "
@@ -27,6 +35,12 @@ _PLACES = ("", "velodyne", "lidar", "scans", "points", "clouds")
 _POSES = ("poses.txt", "*poses_kitti.txt", "*poses_tum.txt", "*_kitti.txt", "*_tum.txt")
 _FEWEST = 2
 _FEW_OTHERS = 4  # files of a series for each of another name, at least
+_IN_GRID = (
+    "where the scanner was, in the grid of the points (--trajectory FILE): one pose a file in order, or "
+    "TUM's format in the clock of the points' times (gps_time; --option time_offset_s is added to these)"
+)
+_TRIED = 10  # scans of which the first that can be read tells whether all are in a grid
+_COARSE = 0.01  # metres: steps of numbers that are too coarse for points
 _RUN = "run.json"  # beside the meshes of a scan
 _HEADER_BYTES = 1 << 14
 
@@ -34,8 +48,9 @@ log = logging.getLogger(__name__)
 
 
 def recognises(path: Path) -> bool:
-    """Whether the folder has scans."""
-    return bool(_all_series(path))
+    """Whether the folder has scans, or the file is a cloud."""
+    is_cloud = path.is_file() and path.suffix.lower() in SUFFIXES[1:] and not _is_mesh(path)
+    return is_cloud or bool(_all_series(path))
 
 
 class ScanFolder(FolderFrames):
@@ -45,6 +60,9 @@ class ScanFolder(FolderFrames):
     that it writes. Names that are decimal seconds or nanoseconds are times; others only give the order, and
     scans have the times of as many poses. Points of PCD, PLY and LAS with times are put where they were then.
 
+    Clouds farther from zero than a LiDAR sees are in the frame of the poses, such as UTM. Each has a pose, or
+    its rays begin where a trajectory was at the times of the points.
+
     Args:
         fields: float32 numbers a point in `.bin` files, x, y and z first.
         deskew: False for points that are put right already, though they have times.
@@ -52,6 +70,7 @@ class ScanFolder(FolderFrames):
     """
 
     layout, expected, sensor, guesses = "LiDAR scans", EXPECTED, "lidar", True
+    _begins: Callable[[Scan], NDArray[np.float64]] | None = None  # of rays; None = at the poses
 
     def __init__(
         self, path: str | Path, *, fields: int = USUAL_FIELDS, deskew: bool = True, **options: Any
@@ -61,16 +80,28 @@ class ScanFolder(FolderFrames):
         self._fields, self._deskew = fields, deskew
         super().__init__(path, **options)
 
+    def _opened(self, path: str | Path, trajectory: str | Path | None) -> tuple[Path, Path | None]:
+        is_cloud = (whole := Path(path)).is_file()
+        root, given = super()._opened(whole.parent if is_cloud else path, trajectory)
+        return (whole if is_cloud else root), given
+
     def _list(self, root: Path) -> tuple[list[Path], Times]:
         series = _series(root)
         if series.others:
             self.skipped["of another name"] = series.others
-        return in_time(series.files, [file.stem for file in series.files])
+        files, times = in_time(series.files, [file.stem for file in series.files])
+        first = next(filter(None, map(self._tried, files[:_TRIED])), Scan(np.zeros((0, 3))))
+        self.in_world, self._named = are_far(first.points), first.system
+        if self.in_world:
+            self._posed, self.system, self.expected = True, first.system or System(), _IN_GRID
+        return files, times
 
     def _recorded_poses(self, root: Path, files: list[Path]) -> Poses:
-        return self._poses_of(_poses(root), files)
+        return self._poses_of(_poses(root, self.expected), files)
 
     def _poses_of(self, path: Path, files: list[Path]) -> Poses:
+        if self.in_world and self._times is None and has_times(path):
+            self._times = self._follow(path, files)
         found = super()._poses_of(path, files)
         times = read_poses(path)[0] if self._times is None else None
         if times is not None and (np.diff(times) > 0).all():  # one pose a scan, in order
@@ -79,7 +110,43 @@ class ScanFolder(FolderFrames):
         return found
 
     def _frame(self, index: int) -> Frame:
-        return self._sweep(index, read_scan(self._files[index], fields=self._fields))
+        scan = read_scan(self._files[index], fields=self._fields)
+        return self._cloud(index, scan) if self.in_world else self._sweep(index, scan)
+
+    def _tried(self, file: Path) -> Scan | None:
+        """A scan; None = it cannot be read, as whoever reads it as a frame says."""
+        with suppress(DatasetError):
+            return read_scan(file, fields=self._fields)
+        return None
+
+    def _follow(self, path: Path, files: list[Path]) -> Times:
+        """Let rays begin on a trajectory: (n,) ns of first points, -1 = not there; None = one pose a file."""
+        along = read_tum(path)
+        if len(along.timestamps_ns) == len(files):
+            return None
+        along = replace(along, timestamps_ns=along.timestamps_ns - round(self._offset_s * 1e9))
+        self._begins = lambda scan: along.positions(times_on(scan, along), max_gap_s=self._gap_s)
+        times = (times_on(scan, along) if (scan := self._tried(file)) else np.zeros(0) for file in files)
+        return np.array([np.append(each[np.isfinite(each)], -1)[0] for each in times], np.int64)
+
+    def _cloud(self, index: int, scan: Scan) -> Frame:
+        """Points in the frame of the poses, brought into the LiDAR's axes in float64."""
+        file, T = self._files[index], self._poses[index]
+        assert T is not None
+        step = np.spacing(np.abs(scan.points[np.isfinite(scan.points)]).max(initial=0))
+        if step > _COARSE:
+            raise DatasetError(f"{file} has float32 in steps of {step:.2g} m; expected float64 or LAS")
+        if scan.system != self._named:
+            raise DatasetError(f"{file} is in another coordinate reference system than the first cloud")
+        points = se3.apply(se3.inverse(T), self._counted(scan.points))
+        points[~scan.points.any(axis=1)] = np.nan  # drivers write 0, 0, 0
+        if self._begins is None:
+            return self._posed_frame(index, points=points)
+        origins = se3.apply(se3.inverse(T), self._counted(self._begins(scan)))
+        if (unknown := np.isnan(origins[:, 0])).any():
+            log.warning("%s: %d points have no pose in time (--option max_gap_s)", file, unknown.sum())
+            points[unknown], origins[unknown] = np.nan, 0
+        return self._posed_frame(index, points=points, origins=origins)
 
 
 class _Series(NamedTuple):
@@ -90,12 +157,12 @@ class _Series(NamedTuple):
 
 
 def _series(root: Path) -> _Series:
-    """The scans of a folder.
+    """The scans of a folder, or the one of a file.
 
     Raises:
         DatasetError: there are none, or which ones are meant is not clear.
     """
-    found = _all_series(root)
+    found = [_Series([root], 0)] if root.is_file() else _all_series(root)
     if len(found) > 1:
         places = " and ".join(f"{one.files[0].parent}/*{one.files[0].suffix}" for one in found)
         raise DatasetError(f"{root} holds several series of scans ({places}); move the others away")
@@ -139,12 +206,12 @@ def _is_mesh(file: Path) -> bool:
     return re.search(rb"^element\s+face\s+0*[1-9]", head, re.MULTILINE) is not None
 
 
-def _poses(root: Path) -> Path:
+def _poses(root: Path, expected: str) -> Path:
     """The file of poses in a folder, by preference; raises NoPoses where there is none."""
     named = (path for pattern in _POSES for path in sorted(root.glob(pattern)) if path.is_file())
     found = next((path for path in named if not path.name.startswith(".")), None)
     if found is None:
-        raise NoPoses(f"{root} has no poses; expected {EXPECTED}; {SCAN}")
+        raise NoPoses(f"{root} has no poses; expected {expected}" + f"; {SCAN}" * (expected == EXPECTED))
     if (root / "calib.txt").is_file():
         raise DatasetError(
             f"{root} has KITTI's calib.txt, so {found.name} may be the camera's poses; open the "
