@@ -125,7 +125,7 @@ def _root(
 _DISK_REFUSES = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
 
 # Packages that a robot's light installation does not have.
-_NOT_OF_THE_CLIENT = ("matplotlib", "prometheus_client", "taichi")
+_NOT_OF_THE_CLIENT = ("matplotlib", "prometheus_client", "pykitti", "taichi")
 
 
 def main(arguments: list[str] | None = None) -> NoReturn:

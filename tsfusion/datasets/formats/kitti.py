@@ -7,13 +7,16 @@ files by their place in a sorted list, so that one missing image shifts all late
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from functools import partial
+from functools import cache, partial
+from importlib.machinery import PathFinder
+from importlib.util import find_spec, module_from_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core.errors import DatasetError
+from tsfusion.core.errors import DatasetError, MissingDependency
 from tsfusion.datasets.cameras import RecordedCamera
 from tsfusion.datasets.dataset import (
     SCAN,
@@ -185,6 +188,19 @@ def _trajectory(root: Path, sequence: str, poses: str | Path | None, frames: lis
         raise NoPoses(f"{path} is missing; expected 12 numbers a line; {SCAN}")
     found = read_kitti(path)
     return [found[number] if number < len(found) else None for number in frames]
+
+
+@cache
+def pykitti_utils() -> Any:
+    """The module `pykitti.utils` without its package, which loads pandas and matplotlib: 0.3 s and 35 MB."""
+    package = find_spec("pykitti")
+    folders = None if package is None else package.submodule_search_locations
+    spec = None if folders is None else PathFinder.find_spec("pykitti.utils", folders)
+    if spec is None or spec.loader is None:
+        raise MissingDependency("KITTI's layouts are read with pykitti; install it with: pip install pykitti")
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 def read_calibration(path: Path, wanted: dict[str, int]) -> Mapping[str, NDArray[np.float64]]:

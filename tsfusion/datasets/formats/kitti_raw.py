@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """KITTI's raw recordings: rectified stereo pairs or Velodyne scans, with poses of the GPS/IMU unit.
 
-Files go by the frame number in their names: `pykitti.raw` goes by their place in a sorted list, and several
-drives lack some scans.
+GPS packets become poses by pykitti's function; files are chosen here, by the frame number in their names:
+`pykitti.raw` goes by their place in a sorted list, and several drives lack some scans.
 """
 
 from functools import partial
@@ -18,17 +18,17 @@ from tsfusion.datasets.formats.kitti import (
     KITTIFrames,
     files_by_frame,
     frames_of,
+    pykitti_utils,
     read_calibration,
 )
 from tsfusion.datasets.readers import intrinsics_of, read_numbers
 from tsfusion.datasets.trajectory_files import checked_pose, usable
 from tsfusion.geometry.keyframe import Intrinsics
-from tsfusion.geometry.se3 import Transform, exp, inverse, transform
+from tsfusion.geometry.se3 import Transform, inverse, transform
 
 EXPECTED = "DATE/DATE_drive_NNNN_sync/{image_00..03,velodyne_points,oxts}/data and DATE/calib_*.txt"
 _CAMERAS = {"grey": ("00", "01"), "color": ("02", "03")}
 _PACKET = 30  # numbers of an oxts line
-_EARTH_M = 6378137.0  # radius
 _ALONG = 0.9  # cosine of the angle between axes that point forward
 
 
@@ -148,21 +148,20 @@ def _cameras(drive: Path, cameras: str | None) -> tuple[str, str]:
 
 
 def _imu_poses(place: Path, frames: list[int]) -> Poses:
-    """T_world_imu of frames by the Mercator projection of KITTI's kit; the first packet is the origin."""
+    """T_world_imu of frames, by pykitti's Mercator projection; the first packet is the origin."""
     files = files_by_frame(place, ".txt")
     if not files:
         raise NoPoses(f"{place} has no packets (*.txt); expected {EXPECTED}")
+    pykitti = pykitti_utils()
     scale, origin = None, None
 
     def read(file: Path) -> Transform:
         nonlocal scale, origin
-        packet = read_numbers(file, "30 numbers of a GPS/IMU packet", columns=_PACKET)[0]
-        (latitude, longitude), altitude, angles = np.radians(packet[:2]), packet[2], packet[3:6]
-        scale = _EARTH_M * np.cos(latitude) if scale is None else scale
-        t = np.array([scale * longitude, scale * np.log(np.tan(np.pi / 4 + latitude / 2)), altitude])
+        packet = pykitti.OxtsPacket(*read_numbers(file, "30 numbers of a GPS/IMU packet", columns=_PACKET)[0])
+        scale = np.cos(np.radians(packet.lat)) if scale is None else scale
+        R, t = pykitti.pose_from_oxts_packet(packet, scale)
         origin = t if origin is None else origin
-        roll, pitch, yaw = (exp(np.append(np.zeros(3), each)) for each in np.diag(angles))
-        return checked_pose(transform((yaw @ pitch @ roll)[:3, :3], t - origin), file)
+        return checked_pose(transform(R, t - origin), file)
 
     poses = dict(zip(files, usable(place, files.values(), read), strict=True))
     return [poses.get(number) for number in frames]
