@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: MIT
 """KITTI odometry: rectified grey stereo pairs or Velodyne scans, with poses.
 
-A file's name is its frame number, and a frame's pose and time are the lines of that number: pykitti pairs
-files by their place in a sorted list, so that one missing image shifts all later ones unnoticed.
+Calibration is read by pykitti, files are chosen here: pykitti pairs them by their place in a sorted list, so
+that one missing image shifts all later ones unnoticed. A file's name is its frame number, and a frame's pose
+and time are the lines of that number.
 """
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from functools import cache, partial
 from importlib.machinery import PathFinder
 from importlib.util import find_spec, module_from_spec
@@ -205,13 +205,13 @@ def pykitti_utils() -> Any:
 
 def read_calibration(path: Path, wanted: dict[str, int]) -> Mapping[str, NDArray[np.float64]]:
     """`name: numbers` a line; each wanted name must be there with so many finite numbers."""
-    found: dict[str, NDArray[np.float64]] = {}
     for number, line in read_lines(path, f"KITTI's calibration with the lines {', '.join(wanted)}"):
-        name, colon, words = line.partition(":")
-        if not colon:
+        if ":" not in line:
             raise DatasetError(f"{path}:{number}: {line!r}; expected `name: numbers`")
-        with suppress(ValueError):  # the day it was made
-            found[name] = np.array(words.split(), np.float64)
+    try:
+        found: dict[str, NDArray[np.float64]] = pykitti_utils().read_calib_file(path)
+    except ValueError as error:
+        raise DatasetError(f"{path}: {error}; expected `name: numbers` a line") from error
     for name, count in wanted.items():
         values = found.get(name)
         if values is None or len(values) != count or not np.isfinite(values).all():

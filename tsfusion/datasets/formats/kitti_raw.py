@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """KITTI's raw recordings: rectified stereo pairs or Velodyne scans, with poses of the GPS/IMU unit.
 
-GPS packets become poses by pykitti's function; files are chosen here, by the frame number in their names:
-`pykitti.raw` goes by their place in a sorted list, and several drives lack some scans.
+Calibration and GPS packets are read by pykitti's functions; files are chosen here, by the frame number in
+their names: `pykitti.raw` goes by their place in a sorted list, and several drives lack some scans.
 """
 
 from functools import partial
