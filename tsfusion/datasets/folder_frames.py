@@ -104,7 +104,7 @@ class FolderFrames(Frames):
         return poses_of(path, len(files), self._times, posed=self._posed, **where)
 
     def _wanted(self) -> str:
-        """What frames with poses need."""
+        """Files or times that frames with poses need, in words."""
         if self._why == WITHOUT_POSE:
             return self.expected
         return (

@@ -303,7 +303,7 @@ class SliceSettings(TypedDict, total=False):
 
 
 class OwnSliceSettings(SliceSettings, total=False):
-    """The same of a map that can find up and its floor."""
+    """Names and types of a slice of a map that can find up and its floor, for type checkers."""
 
     up: Up | str | None
     above_floor: bool
