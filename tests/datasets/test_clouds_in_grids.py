@@ -12,7 +12,7 @@ from pypcd4 import PointCloud
 from small_recordings import one_line
 
 from tsfusion import open_dataset
-from tsfusion.core.errors import InvalidConfig
+from tsfusion.core.errors import DatasetError, InvalidConfig
 from tsfusion.datasets.registry import describe
 from tsfusion.datasets.trajectory_files import write_tum
 from tsfusion.geometry.origin import Origin
@@ -170,6 +170,15 @@ def test_degrees_are_refused(tmp_path):
         save(tmp_path / f"{number}.las", points - ORIGIN, times, "EPSG:4326")
     with pytest.raises(InvalidConfig, match=r"0\.las: positions in WGS 84 are degrees: project points and"):
         open_dataset(tmp_path, posed=False)
+
+
+def test_feet_near_zero_are_refused(tmp_path):
+    """Nobody can tell whether they are a sensor's metres under a foreign name."""
+    points, times = measured(0)
+    for number in range(2):
+        save(tmp_path / f"{number}.las", points - places_at(times), times, "EPSG:6880", FOOT)
+    with pytest.raises(DatasetError, match=r"units of 0\.30480061 m.*lie near zero"):
+        open_dataset(tmp_path, posed=False)[0]
 
 
 def geotiff(path: Path, keys: dict[int, int]) -> None:

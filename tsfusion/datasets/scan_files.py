@@ -15,6 +15,7 @@ from tsfusion.core import read_limits
 from tsfusion.core.errors import DatasetError, InvalidConfig, MissingDependency, TsfusionError
 from tsfusion.datasets.point_times import Scan, time_field
 from tsfusion.geometry import origin
+from tsfusion.geometry.keyframe import are_far
 from tsfusion.geometry.origin import System
 
 SUFFIXES = (".bin", ".pcd", ".ply", ".las", ".laz")
@@ -60,6 +61,12 @@ def read_scan(path: Path, *, fields: int = USUAL_FIELDS) -> Scan:
         raise DatasetError(f"{path} holds no points; expected x, y and z of a scan")
     if len(points) != promised:
         raise DatasetError(f"{path} was cut off: it has {len(points)} of the {promised} points that it names")
+    if scan.system is not None and scan.system.metres != System().metres and not are_far(points):
+        unit = max(scan.system.metres, key=lambda one: abs(one - 1))
+        raise DatasetError(
+            f"{path} names a system with units of {unit:.9g} m, but its points lie near zero, as a "
+            "sensor's do; expected metres there"
+        )
     kind = np.float32 if points.dtype == np.float32 else np.float64
     return scan._replace(points=np.ascontiguousarray(points, kind))
 
