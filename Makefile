@@ -18,7 +18,7 @@ docs-serve:  ## the site at 127.0.0.1:8000, built anew when a page is saved
 	NO_MKDOCS_2_WARNING=1 $(PYTHON) -m mkdocs serve --no-strict
 
 bench:  ## one JSON line a case
-	$(PYTHON) scripts/bench.py $(ARGS)
+	$(PYTHON) lab/bench/bench.py $(ARGS)
 
 accuracy:  ## every row, then the tables and plots of docs/accuracy.md
 	$(PYTHON) scripts/accuracy.py --output out/accuracy --write-docs $(ARGS)
@@ -33,5 +33,5 @@ nightly:  ## the long forms of what the tests try: about two hours
 	$(PYTHON) scripts/soak.py --keyframes 10000 --kills 12
 	$(PYTHON) scripts/faults.py
 	$(PYTHON) scripts/plant_faults.py
-	$(PYTHON) scripts/delivery.py
-	$(PYTHON) scripts/cluster.py --kills 20
+	$(PYTHON) lab/reliability/delivery.py
+	$(PYTHON) lab/bench/cluster.py --kills 20

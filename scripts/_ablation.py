@@ -9,9 +9,9 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from _peers import DATA, Open3D, VDBFusion, surroundings, timed_keyframes
 from numpy.typing import NDArray
 
+from lab.bench.peers import DATA, Open3D, VDBFusion, surroundings, timed_keyframes
 from lab.evaluation import stanford_bunny, surface_error
 from lab.evaluation.known_surfaces import (
     COMPLETE_WITHIN,

@@ -17,10 +17,12 @@ import msgspec
 import numpy as np
 from _paper_runs import MAPS
 from _paper_worlds import INDOORS, PaperWorld
-from _peers import Open3D, VDBFusion
 from msgspec import Struct
 from numpy.typing import NDArray
 
+sys.path.append(str(Path(__file__).parents[1]))  # lab is not installed
+
+from lab.bench.peers import Open3D, VDBFusion
 from lab.evaluation import surface_error
 from lab.evaluation.known_surfaces import COMPLETE_WITHIN, KnownSurface, WorldSurface, measure
 from lab.worlds.named_worlds import open_world

@@ -31,11 +31,12 @@ os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"
 
 import _odometry_peers
 import msgspec
-from _peers import DATA, surroundings
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
+sys.path.append(str(Path(__file__).parents[1]))  # lab is not installed
 from drifting_localizer import Drifting
 
+from lab.bench.peers import DATA, surroundings
 from tsfusion import open_dataset
 from tsfusion.cli.ate import table
 from tsfusion.core import process

@@ -30,6 +30,9 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+sys.path.append(str(Path(__file__).parents[1]))  # lab is not installed
+
+
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import _paper_again
@@ -45,8 +48,8 @@ from _paper_runs import AGAIN, Limits, Machine, Run, plan, source_of
 from _paper_surface import PEERS, MapJob, SweepJob
 from _paper_verdicts import Findings, Verdict, verdicts
 from _paper_worlds import PaperWorld, sweep_worlds, worlds
-from _peers import unimportable
 
+from lab.bench.peers import unimportable
 from tsfusion.core import process
 from tsfusion.core.errors import OutputError, TsfusionError
 

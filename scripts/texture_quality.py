@@ -18,6 +18,7 @@ poses and exposures of single images are no property of a map. `_bright`: only b
 
 import argparse
 import json
+import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -26,9 +27,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from _peers import Open3D, surroundings
 from numpy.typing import NDArray
 
+sys.path.append(str(Path(__file__).parents[1]))  # lab is not installed
+
+from lab.bench.peers import Open3D, surroundings
 from lab.evaluation import view_colors
 from tsfusion import Keyframe, Volume, open_dataset
 from tsfusion.geometry.mesh import Mesh

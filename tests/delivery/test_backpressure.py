@@ -298,8 +298,8 @@ def test_the_server_is_told(tmp_path: Path) -> None:
 
 
 def simulated(*arguments: object) -> dict[str, dict[str, Any]]:
-    """The rows of scripts/backpressure.py, by policy."""
-    command = [sys.executable, ROOT / "scripts" / "backpressure.py", "--json", *map(str, arguments)]
+    """The rows of lab/bench/backpressure.py, by policy."""
+    command = [sys.executable, ROOT / "lab" / "bench" / "backpressure.py", "--json", *map(str, arguments)]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     return {row["policy"]: row for row in map(json.loads, done.stdout.splitlines())}
 

@@ -59,7 +59,7 @@ def test_the_commands_for_contributors_exist() -> None:
     blocks = re.findall(r"^```sh\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
     commands = [shlex.split(line, comments=True) for line in "".join(blocks).splitlines()]
     assert len(commands) >= 8
-    for word in (word for command in commands for word in command if word.startswith(("tests/", "scripts/"))):
+    for word in (word for command in commands for word in command if word.startswith(("lab/", "tests/"))):
         assert (ROOT / word).exists(), word
 
 

@@ -14,7 +14,14 @@ from repository import ROOT
 PIP = re.compile(r"pip install ((?:-e |--upgrade )?(?:'\.(?:\[[\w,]+\])?'|\.)(?=[\s`\"]|$))", re.MULTILINE)
 SOURCES = sorted(
     path
-    for pattern in ("*.md", "docs/**/*.md", "contrib/**/*.md", "tsfusion/**/*.py", "scripts/*.py")
+    for pattern in (
+        "*.md",
+        "docs/**/*.md",
+        "contrib/**/*.md",
+        "tsfusion/**/*.py",
+        "scripts/*.py",
+        "lab/**/*.py",
+    )
     for path in ROOT.glob(pattern)
     if path.name != "CHANGELOG.md"
 )

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from tsfusion.tsdf.volume import Volume
 
 _MARGIN = 128  # voxels around a box that its surface depends on
-# Memory of a step beside the map and in its sizes, the most that scripts/mesh_sharing.py --memory found
+# Memory of a step beside the map and in its sizes, the most that lab/bench/mesh_sharing.py --memory found
 _FILLING, _SIMPLIFYING, _TEXTURING = 3.0, 6.0, 4.0
 Box = tuple[float, float, float, float, float, float]
 

@@ -4,7 +4,7 @@
 A hall of 20 × 20 m with pillars at 5 cm (time), and the synthetic room at 2 cm (what is known of free space,
 beside the map without space carving). CPU time, best and median of several runs.
 
-    python scripts/distance_fields.py
+    python lab/bench/distance_fields.py
 """
 
 import argparse

@@ -18,7 +18,7 @@ from tsfusion.core.process import peak_rss_bytes
 from tsfusion.geometry.measured_points import depth_metres, points_world
 from tsfusion.geometry.mesh import Mesh
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 sys.path.append(str(ROOT))  # lab is not installed
 DATA = Path(os.environ.get("TSFUSION_DATA", ROOT.parent / "shared" / "data"))
 WARM_UP = 5  # keyframes not counted

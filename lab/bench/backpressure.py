@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Behaviour of each policy when the sensor is faster than the server, and the link is down for a while.
 
-    python scripts/backpressure.py                                      a slow map, and ten seconds without it
-    python scripts/backpressure.py --server 12.5 --seconds 30 --outage 2 --outages 2             two restarts
-    python scripts/backpressure.py --server 12.5 --seconds 600 --outage 60          a minute without the link
-    python scripts/backpressure.py --seconds 3600 --outages 0                           an hour of a slow map
+    python lab/bench/backpressure.py                                   a slow map, and ten seconds without it
+    python lab/bench/backpressure.py --server 12.5 --seconds 30 --outage 2 --outages 2          two restarts
+    python lab/bench/backpressure.py --server 12.5 --seconds 600 --outage 60       a minute without the link
+    python lab/bench/backpressure.py --seconds 3600 --outages 0                        an hour of a slow map
 
 The client's own code on a clock of its own; the server journals at once and fuses one keyframe after the
 other. `fused`: share of the captured keyframes that are in the map in the end. `delay`: captured to fused.

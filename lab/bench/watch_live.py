@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
 """Cost of a watcher of a live map, and its effect on the delay of keyframes.
 
-    python scripts/watch_live.py                                keyframes at 2 cm, 8 a second, for 30 s
-    python scripts/watch_live.py --watchers 3 --stalled 1 --rate 5 --voxel-size 0.05
-    python scripts/watch_live.py --watchers 0 --pages 1 --rate 10       live pages, each read by a browser
+    python lab/bench/watch_live.py                                keyframes at 2 cm, 8 a second, for 30 s
+    python lab/bench/watch_live.py --watchers 3 --stalled 1 --rate 5 --voxel-size 0.05
+    python lab/bench/watch_live.py --watchers 0 --pages 1 --rate 10       live pages, each read by a browser
 
-The keyframes are those of `scripts/ask_live.py`. Two servers run, and a scanner turns from one to the other
+The keyframes are those of `lab/bench/ask_live.py`. Two servers run, and a scanner turns from one to the other
 every few seconds: the one is watched, the other is not. A JSON line for each watcher (a process of its own):
 CPU seconds a second, updates, triangles and bytes a second, and whether it holds the map in the end. A line
 for each page (`tsfusion view`): CPU seconds a second of its process while the watched server gets keyframes,
@@ -28,16 +28,17 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-from _peers import surroundings
-from ask_live import FIRST, TURN, Scanner
-from delivery import PATIENCE, _keyframes
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "support"))
+sys.path.append(str(Path(__file__).parents[2]))  # lab is not installed
 from headless_browser import browser
 from keyframes_and_servers import serving
 from live_pages import address_of, viewing
 from reading_browser import ReadingBrowser
 
+from lab.bench.ask_live import FIRST, TURN, Scanner
+from lab.bench.peers import surroundings
+from lab.reliability.delivery import PATIENCE, _keyframes
 from tsfusion import VolumeConfig
 from tsfusion.wire.map_events import MapEvent, ScannerSeen, SurfaceUpdate
 from tsfusion.wire.map_watcher import MapWatcher

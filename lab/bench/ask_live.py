@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """How long a live map takes to answer, quiet and while keyframes come, and what the keyframes pay for it.
 
-    python scripts/ask_live.py                                  keyframes at 2 cm, 8 a second, for 30 s
-    python scripts/ask_live.py --rate 5 --voxel-size 0.05 --seconds 60 --ask-rate 50
+    python lab/bench/ask_live.py                                  keyframes at 2 cm, 8 a second, for 30 s
+    python lab/bench/ask_live.py --rate 5 --voxel-size 0.05 --seconds 60 --ask-rate 50
 
 The keyframes are recorded ones (640×480 depth and colour, from TSFUSION_DATA, default ../shared/data) or,
 where these are missing, rendered ones. Two servers run, and a scanner, a process of its own, turns from one
@@ -30,12 +30,13 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from _peers import surroundings
-from delivery import PATIENCE, _keyframes
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "support"))
+sys.path.append(str(Path(__file__).parents[2]))  # lab is not installed
 from keyframes_and_servers import serving
 
+from lab.bench.peers import surroundings
+from lab.reliability.delivery import PATIENCE, _keyframes
 from tsfusion import Client, Keyframe, MapClient, TransportError, VolumeConfig
 from tsfusion.core.config import ClientConfig
 from tsfusion.wire.keyframe_times import spread

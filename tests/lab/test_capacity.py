@@ -10,7 +10,7 @@ import pytest
 from repository import ROOT
 
 POINTS = ROOT / "docs" / "scale-points.jsonl"
-SCRIPT = ROOT / "scripts" / "capacity.py"
+SCRIPT = ROOT / "lab" / "bench" / "capacity.py"
 
 
 def capacity(*arguments: object) -> "subprocess.CompletedProcess[str]":

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: MIT
 """How fast and how exactly a map answers in process: one JSON line a question.
 
-    python scripts/map_questions.py                          # the synthetic room, whose distances are known
-    python scripts/map_questions.py --source DATA/7scenes/redkitchen --frames 125
+    python lab/bench/map_questions.py                          # the synthetic room, whose distances are known
+    python lab/bench/map_questions.py --source DATA/7scenes/redkitchen --frames 125
 
 Questions: distances at points near the surface, in random order and block by block; views of 640×480 pixels
 from places of the recording. Where Open3D is installed its RaycastingScene (on the same mesh) and

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
 """Measure fusion: CPU milliseconds a keyframe and a stage, with accuracy beside the speed.
 
-    python scripts/bench.py                      every case, one JSON line each, a fresh process each
-    python scripts/bench.py --list               the cases
-    python scripts/bench.py --only 7scenes       those whose name holds a word
-    python scripts/bench.py --repeat 5           so often, and a line with least and median ratio at the end
-    python scripts/bench.py --arch cuda          also fused on a device beside, where there is one
+    python lab/bench/bench.py                      every case, one JSON line each, a fresh process each
+    python lab/bench/bench.py --list               the cases
+    python lab/bench/bench.py --only 7scenes       those whose name holds a word
+    python lab/bench/bench.py --repeat 5           so often, and a line with least and median ratio at the end
+    python lab/bench/bench.py --arch cuda          also fused on a device beside, where there is one
 
 Open3D's VoxelBlockGrid runs beside, where `open3d` is installed (`pip install '.[bench]'`): in the same
 process, the same keyframes in turn, with the same range and truncation; its mesh is of voxels of weight 1 and
@@ -29,12 +29,16 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from _floor import floor
-from _peers import DATA, Open3D, surroundings, timed_keyframes, unimportable
 from numpy.typing import NDArray
+
+sys.path.append(str(Path(__file__).parents[2]))  # lab is not installed
+
+from lab.bench.floor import floor
+from lab.bench.peers import DATA, Open3D, surroundings, timed_keyframes, unimportable
 
 MAX_RANGE, TRUNCATION = 4.0, 4.0  # metres, voxels: the same for every system
 HOLD_OUT = 5  # every fifth recorded keyframe is not fused but predicted

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """A model of what servers hold and of what `tsfusion fuse` takes, simulated with SimPy, checked against what
-scripts/fleet.py and scripts/cluster.py measured.
+lab/bench/fleet.py and lab/bench/cluster.py measured.
 
-    python scripts/capacity.py                          the committed points, the check, a city
-    python scripts/capacity.py points.jsonl --json      other points: lines that scripts/fleet.py printed
-    python scripts/capacity.py --fuse lines.jsonl       … that scripts/cluster.py printed
+    python lab/bench/capacity.py                          the committed points, the check, a city
+    python lab/bench/capacity.py points.jsonl --json      other points: lines that lab/bench/fleet.py printed
+    python lab/bench/capacity.py --fuse lines.jsonl       … that lab/bench/cluster.py printed
 
 A gateway is one thread: it takes up to 16 keyframes that came, works on each, waits once for the disk, and
 answers. The wait for the disk is the floor that was measured without a server, and what the run added to it
@@ -31,7 +31,7 @@ from msgspec.structs import replace
 
 from tsfusion.cluster import mesh_runs
 
-DOCS = Path(__file__).parents[1] / "docs"
+DOCS = Path(__file__).parents[2] / "docs"
 POINTS, FUSE_POINTS = DOCS / "scale-points.jsonl", DOCS / "fuse-points.jsonl"
 FIT, FIT_DISK_WAIT_MS = (1, 10), 5  # scanners
 TOLERANCE = 0.15
@@ -272,13 +272,13 @@ def main() -> int:
         fusing, runs = check_fusing(lines)
     except (KeyError, StopIteration, TypeError, ValueError, ZeroDivisionError):
         parser.error(
-            f"{options.fuse} needs lines of scripts/cluster.py: one worker with two numbers of keyframes, "
+            f"{options.fuse} needs lines of cluster.py: one worker with two numbers of keyframes, "
             "and two workers with the larger one"
         )
     try:
         gateway, table = check(rows)
     except (KeyError, TypeError, ValueError):
-        parser.error(f"{options.points} needs lines of scripts/fleet.py, with {FIT[0]} and {FIT[1]} scanners")
+        parser.error(f"{options.points} needs lines of fleet.py, with {FIT[0]} and {FIT[1]} scanners")
     if not (errors := [abs(row["error"]) for row in table + runs if not row["fitted"]]):
         parser.error("all points are fitted, and none is left to predict; give more of them")
     cities = [city(machines, rows[0]["keyframe_bytes"]) for machines in (1, 2, 4, 8, 16, 32, 64)]

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: MIT
 """Load on one server: simulated scanners on loopback, a JSON line a case.
 
-    python scripts/fleet.py                                  1, 10, 50 and 200 scanners at 0.5 keyframes/s
-    python scripts/fleet.py --scanners 50 --maps 4           four maps, each with a fuser of its own
-    python scripts/fleet.py --scanners 50 --maps 4 --spare 3 the same, with fusers that wait for three of them
-    python scripts/fleet.py --scanners 10 --flood --no-fuser as fast as the gateway makes them durable
-    python scripts/fleet.py --flood --no-fuser --disk-wait 5 --state /dev/shm
-                                                             the same with a disk whose waits are known
-    python scripts/fleet.py --scanners 4 --rate 2 --move     real clients, whose map moves to another server
-    python scripts/fleet.py --scanners 50 --profile out.txt  where the gateway's time goes
+    python lab/bench/fleet.py                                  1, 10, 50 and 200 scanners at 0.5 keyframes/s
+    python lab/bench/fleet.py --scanners 50 --maps 4           four maps, each with a fuser of its own
+    python lab/bench/fleet.py --scanners 50 --maps 4 --spare 3 the same, with fusers that wait for three
+    python lab/bench/fleet.py --scanners 10 --flood --no-fuser as fast as the gateway makes them durable
+    python lab/bench/fleet.py --flood --no-fuser --disk-wait 5 --state /dev/shm
+                                                               the same with a disk whose waits are known
+    python lab/bench/fleet.py --scanners 4 --rate 2 --move     real clients, whose map moves to another server
+    python lab/bench/fleet.py --scanners 50 --profile out.txt  where the gateway's time goes
 
 Every case has a new server. `lost`: keyframes that a scanner took and that are not once in the journal, read
 from the disk when the server has ended; `doubled`: those that are there twice. `jain`: fairness over the
@@ -31,14 +31,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from _fleet_scanners import Scanner, bodies, drive
-from _peers import surroundings
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
-from _fleet_move import measure as measure_move
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "support"))
+sys.path.append(str(Path(__file__).parents[2]))  # lab is not installed
 from idle_fuser import keeping
 from keyframes_and_servers import Server
 
+from lab.bench.fleet_move import measure as measure_move
+from lab.bench.fleet_scanners import Scanner, bodies, drive
+from lab.bench.peers import surroundings
 from tsfusion import VolumeConfig, journal
 from tsfusion.core import process
 from tsfusion.journal import state_folder

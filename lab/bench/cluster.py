@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Fuse the journal of a street with one worker and with several: throughput, cost of adding, equal hashes.
 
-    python scripts/cluster.py                        400 keyframes; 1, 2 and 8 workers; a JSON line each
-    python scripts/cluster.py --kills 20             20 more runs of 4 workers, of which one is killed
-    python scripts/cluster.py --ray --workers 1 2    the same by a Ray cluster of this machine
-    python scripts/cluster.py --worker-memory 700MB  a map that is larger than a worker
+    python lab/bench/cluster.py                        400 keyframes; 1, 2 and 8 workers; a JSON line each
+    python lab/bench/cluster.py --kills 20             20 more runs of 4 workers, of which one is killed
+    python lab/bench/cluster.py --ray --workers 1 2    the same by a Ray cluster of this machine
+    python lab/bench/cluster.py --worker-memory 700MB  a map that is larger than a worker
 
 Forty stereo keyframes of the synthetic street are rendered once and repeated, 40 m further along each time.
 Each run is the command `tsfusion fuse`: nothing else should run then. `rate` is keyframes
@@ -25,8 +25,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from memory import recording
+sys.path.append(str(Path(__file__).parents[2]))  # lab is not installed
 
+from lab.bench.memory import recording
 from tsfusion.journal import Journal
 from tsfusion.wire import codec
 

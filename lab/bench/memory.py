@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Fuse a street that does not fit into the memory it may have, and watch what the process takes.
 
-    python scripts/memory.py                              400 keyframes: a table, then one JSON line
-    python scripts/memory.py --keyframes 2000 --plot docs/images/memory.png
-    python scripts/memory.py --world room --keyframes 120 --voxel-size 0.01
+    python lab/bench/memory.py                              400 keyframes: a table, then one JSON line
+    python lab/bench/memory.py --keyframes 2000 --plot docs/images/memory.png
+    python lab/bench/memory.py --world room --keyframes 120 --voxel-size 0.01
 
 Forty stereo keyframes of the synthetic street are rendered once and repeated, 40 m further along each time.
 The room is the worst case: a Kinect goes round it again and again, and every block comes back each time.
@@ -30,6 +30,8 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+
+sys.path.append(str(Path(__file__).parents[2]))  # lab is not installed
 
 from tsfusion.core import process
 from tsfusion.geometry.keyframe import Keyframe
@@ -130,7 +132,7 @@ def _volume(options: argparse.Namespace, budget: int) -> Any:
 
 
 def _open3d(options: argparse.Namespace) -> Any:
-    from _peers import Open3D
+    from lab.bench.peers import Open3D
 
     return Open3D(options.voxel_size, max_range=30.0, truncation=10.0, color=True)
 

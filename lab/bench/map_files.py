@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: MIT
 """How fast a large map is saved and loaded, and how large its file is: one JSON line a direction.
 
-    python scripts/map_files.py                        # 200 000 blocks, 2 GB of voxels
-    python scripts/map_files.py --blocks 20000 --source synthetic:room
+    python lab/bench/map_files.py                        # 200 000 blocks, 2 GB of voxels
+    python lab/bench/map_files.py --blocks 20000 --source synthetic:room
 
 A recording is fused, and copies of its map are put side by side until there are so many blocks. Rates are
 bytes of voxels a second of wall clock, and of CPU. `taskset -c 0` before it gives the figure of one core.

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Measure what is done to a mesh before it is shared: how right a closed hole is, what thinning costs.
 
-    python scripts/mesh_sharing.py                    the synthetic room: a table, then one JSON line
-    python scripts/mesh_sharing.py --map my-map.tsf   thin the mesh of a map, too
-    python scripts/mesh_sharing.py --memory DATASET   instead of all that, what each step takes of memory
+    python lab/bench/mesh_sharing.py                    the synthetic room: a table, then one JSON line
+    python lab/bench/mesh_sharing.py --map my-map.tsf   thin the mesh of a map, too
+    python lab/bench/mesh_sharing.py --memory DATASET   instead of all that, what each step takes of memory
 
 Holes: discs are cut out of every depth image of the synthetic room, in the wall, in the sphere and across an
 edge of the box, and closed with `fill_holes`. The distance of the guessed vertices from the true surface

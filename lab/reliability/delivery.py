@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """How long a keyframe takes until it is safe, and what keys cost: a JSON line without, one with, one of both.
 
-    python scripts/delivery.py                         300 keyframes of each kind at 10 a second
-    python scripts/delivery.py --keyframes 1000 --rate 30
+    python lab/reliability/delivery.py                         300 keyframes of each kind at 10 a second
+    python lab/reliability/delivery.py --keyframes 1000 --rate 30
 
 The keyframes are recorded ones (640×480 depth and colour, from TSFUSION_DATA, default ../shared/data) or,
 where these are missing, rendered ones of that size. Two servers run, one with keys and one without, and the
@@ -25,11 +25,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from _peers import DATA, surroundings
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "support"))
+sys.path.append(str(Path(__file__).parents[2]))  # lab is not installed
 from keyframes_and_servers import UNSECURED, Server, secured, serving
 
+from lab.bench.peers import DATA, surroundings
 from tsfusion import Client, Keyframe, VolumeConfig
 from tsfusion.core.config import ClientConfig, override
 from tsfusion.datasets import open_dataset
