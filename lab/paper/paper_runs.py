@@ -5,9 +5,9 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 import msgspec
-from _paper_worlds import PaperWorld
 from msgspec import Struct
 
+from lab.paper.paper_worlds import PaperWorld
 from tsfusion.core.config import VolumeConfig, make_settings
 
 Mode = Literal[

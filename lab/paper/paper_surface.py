@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Surfaces: a run's map measured and drawn, and λ and support swept over three sensors.
 
-    python scripts/_paper_surface.py JOB.json OUT.json
+    python lab/paper/paper_surface.py JOB.json OUT.json
 
 Fusion alone is judged with true poses. How far a run's own map is off is another figure, and mostly drift.
 """
@@ -15,16 +15,16 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
-from _paper_runs import MAPS
-from _paper_worlds import INDOORS, PaperWorld
 from msgspec import Struct
 from numpy.typing import NDArray
 
-sys.path.append(str(Path(__file__).parents[1]))  # lab is not installed
+sys.path.append(str(Path(__file__).parents[2]))  # lab is not installed
 
 from lab.bench.peers import Open3D, VDBFusion
 from lab.evaluation import surface_error
 from lab.evaluation.known_surfaces import COMPLETE_WITHIN, KnownSurface, WorldSurface, measure
+from lab.paper.paper_runs import MAPS
+from lab.paper.paper_worlds import INDOORS, PaperWorld
 from lab.worlds.named_worlds import open_world
 from tsfusion.core import process
 from tsfusion.core.config import SENSORS, VolumeConfig, make_settings

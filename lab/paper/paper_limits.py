@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Small machines, simulated on this one: a share of the time, and memory whose end is death.
 
-    python scripts/_paper_limits.py PID SHARE      stop and continue a process and its children in turn
+    python lab/paper/paper_limits.py PID SHARE      stop and continue a process and its children in turn
 
 The share is kept by SIGSTOP and SIGCONT many times a second, in a process of its own that lets them go on
 when whoever started it ends.

@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from _paper_outcome import DELAY, MEMORY, Outcome
-from _paper_runs import LIVE, MODES
-from _paper_worlds import PaperWorld
 from numpy.typing import NDArray
+
+from lab.paper.paper_outcome import DELAY, MEMORY, Outcome
+from lab.paper.paper_runs import LIVE, MODES
+from lab.paper.paper_worlds import PaperWorld
 
 PAPER_MS = 500.0
 _COLORS: dict[str, str] = dict(

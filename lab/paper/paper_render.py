@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Rendered frames kept in a folder, so that a run reads them as a camera would give them.
 
-    python scripts/_paper_render.py WORLD.json FOLDER
+    python lab/paper/paper_render.py WORLD.json FOLDER
 
 Rendering takes processor time and Taichi, and neither belongs to a front end.
 """
@@ -17,16 +17,16 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+sys.path.append(str(Path(__file__).parents[2]))  # lab is not installed
+
+from lab.worlds import rendered_recordings
+from lab.worlds.named_worlds import open_world
+from lab.worlds.street_drive import StreetDrive
 from tsfusion.core import durable_files, process
 from tsfusion.datasets import Dataset
 from tsfusion.datasets.dataset import frame_of, pose_of
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics, Keyframe
-
-sys.path.append(str(Path(__file__).parents[1]))  # lab is not installed
-from lab.worlds import rendered_recordings
-from lab.worlds.named_worlds import open_world
-from lab.worlds.street_drive import StreetDrive
 
 _ARRAYS = ("depth", "disparity", "left", "right", "points", "color", "T_world_camera")
 _NUMBERS = ("depth_scale", "disparity_scale", "baseline_fx")
@@ -115,7 +115,7 @@ def _file(folder: Path, index: int) -> Path:
 
 def main() -> int:
     process.on_parent_end(signal.SIGKILL)
-    from _paper_worlds import PaperWorld
+    from lab.paper.paper_worlds import PaperWorld
 
     world = msgspec.json.decode(Path(sys.argv[1]).read_bytes(), type=PaperWorld)
     shown = 0.0

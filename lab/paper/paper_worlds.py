@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from _paper_render import RenderedRecording
 from msgspec import Struct
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
+from lab.paper.paper_render import RenderedRecording
 from lab.worlds.named_worlds import open_world
 from tsfusion.core.config import LocalizerName, ScanConfig, SensorName
 from tsfusion.datasets import Dataset, open_dataset, select
@@ -19,7 +19,7 @@ from tsfusion.datasets.dataset import NOMINAL_NS, pose_of
 from tsfusion.geometry.frame import Frame
 from tsfusion.scanner.keyframe_selection import OUTDOORS, KeyframeSelector
 
-DATA = Path(os.environ.get("TSFUSION_DATA", Path(__file__).parents[2] / "shared" / "data"))
+DATA = Path(os.environ.get("TSFUSION_DATA", Path(__file__).parents[3] / "shared" / "data"))
 INDOORS = ("kinect", "tof")
 _LEAST_DISTANCE = 0.02  # metres between keyframes
 _HALVINGS = 30

@@ -5,10 +5,11 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from _paper_outcome import Outcome
-from _paper_runs import AGAIN, MODES
-from _paper_worlds import PaperWorld
 from msgspec import Struct
+
+from lab.paper.paper_outcome import Outcome
+from lab.paper.paper_runs import AGAIN, MODES
+from lab.paper.paper_worlds import PaperWorld
 
 DELAY_MS, TARGET_MS, TARGET_P99_MS = 500.0, 100.0, 500.0
 BOUNDED_P99_MS = 2000.0
@@ -41,7 +42,7 @@ class Findings(Struct, kw_only=True):
 
     Attributes:
         cuts: ATE RMSE up to the baseline's end, by run; as the full one where it never ended.
-        sweep: rows of `_paper_surface.sweep`.
+        sweep: rows of `paper_surface.sweep`.
     """
 
     worlds: list[PaperWorld]

@@ -5,12 +5,11 @@ import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
-from _paper_report import AteRow
-from _paper_verdicts import Findings, Verdict
-
+from lab.paper.paper_report import AteRow
+from lab.paper.paper_verdicts import Findings, Verdict
 from tsfusion.pipelines import run_files
 
-BEGIN, END = "<!-- table: python scripts/reproduce_paper.py --write-docs -->", "<!-- end of table -->"
+BEGIN, END = "<!-- table: python lab/paper/reproduce_paper.py --write-docs -->", "<!-- end of table -->"
 _STATE = {True: "met", False: "**not met**", None: "not measured"}
 
 

@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from _paper_events import EventLog
 from numpy.typing import NDArray
 
+from lab.paper.paper_events import EventLog
 from tsfusion.core.config import VolumeConfig
 from tsfusion.core.errors import MapError
 from tsfusion.delivery.outcomes import ClientStats

@@ -8,11 +8,11 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from _paper_events import SeenFrame, Story
-from _paper_limits import Death, Sample
 from msgspec import Struct
 from numpy.typing import NDArray
 
+from lab.paper.paper_events import SeenFrame, Story
+from lab.paper.paper_limits import Death, Sample
 from tsfusion.core.errors import DatasetError
 from tsfusion.evaluation.trajectory_error import TrajectoryError, absolute_error
 from tsfusion.pipelines import latency_ledger

@@ -9,13 +9,13 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import _paper_figures
 import msgspec
 import numpy as np
-from _paper_outcome import DELAY, MEMORY, POSES, Outcome, error_until
-from _paper_runs import MODES, Limits
-from _paper_verdicts import Findings, Verdict
 
+from lab.paper import paper_figures
+from lab.paper.paper_outcome import DELAY, MEMORY, POSES, Outcome, error_until
+from lab.paper.paper_runs import MODES, Limits
+from lab.paper.paper_verdicts import Findings, Verdict
 from tsfusion.core import durable_files
 from tsfusion.evaluation.trajectory_error import TrajectoryError
 from tsfusion.pipelines import run_files
@@ -151,18 +151,18 @@ def draw(folder: Path, found: Findings) -> dict[str, Path]:
     runs, drawn = folder / "runs", {}
     outdoors = [world for world in found.worlds if world.sensor == "stereo" or "KITTI" in world.stands_for]
     others = [world for world in found.worlds if world not in outdoors]
-    jobs = [("figure 3", _paper_figures.delays, outdoors), ("figure 4", _paper_figures.delays, others)]
+    jobs = [("figure 3", paper_figures.delays, outdoors), ("figure 4", paper_figures.delays, others)]
     for name, function, worlds in jobs:
         path = folder / f"{name.replace(' ', '')}.png"
         if function(worlds, found.outcomes, runs, path):
             drawn[name] = path
     for world in found.worlds:
         path = folder / f"memory-{world.name}.png"
-        if _paper_figures.memory(world, found.outcomes, runs, path):
+        if paper_figures.memory(world, found.outcomes, runs, path):
             drawn[f"memory, {world.name}"] = path
-    if _paper_figures.versatility(found.sweep, folder / "versatility.png"):
+    if paper_figures.versatility(found.sweep, folder / "versatility.png"):
         drawn["versatility"] = folder / "versatility.png"
-    if _paper_figures.surfaces(found.sweep, folder / "surfaces.png"):
+    if paper_figures.surfaces(found.sweep, folder / "surfaces.png"):
         drawn["surfaces"] = folder / "surfaces.png"
     return drawn
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""scripts/reproduce_paper.py: its plan, its verdicts, its figures' data, and two modes from end to end."""
+"""lab/paper/reproduce_paper.py: its plan, its verdicts, its figures' data, and two modes from end to end."""
 
 import hashlib
 import json
@@ -16,27 +16,27 @@ import numpy as np
 import pytest
 from repository import ROOT
 
+from lab.paper import (
+    paper_events,
+    paper_figures,
+    paper_limits,
+    paper_outcome,
+    paper_report,
+    paper_runs,
+    paper_verdicts,
+    paper_worlds,
+    reproduce_paper,
+)
+from lab.paper.paper_frontend import LiveRecording, PlannedKeyframes
+from lab.paper.paper_outcome import Outcome
+from lab.paper.paper_verdicts import Findings, Verdict
+from lab.paper.paper_worlds import PaperWorld
 from tsfusion.datasets import Synthetic
 from tsfusion.datasets.dataset import frame_of
 from tsfusion.evaluation.trajectory_error import TrajectoryError
 from tsfusion.wire.keyframe_times import Spread
 
-sys.path.insert(0, str(ROOT / "scripts"))
-import _paper_events
-import _paper_figures
-import _paper_limits
-import _paper_outcome
-import _paper_report
-import _paper_runs
-import _paper_verdicts
-import _paper_worlds
-import reproduce_paper
-from _paper_frontend import LiveRecording, PlannedKeyframes
-from _paper_outcome import Outcome
-from _paper_verdicts import Findings, Verdict
-from _paper_worlds import PaperWorld
-
-SCRIPT = ROOT / "scripts" / "reproduce_paper.py"
+SCRIPT = ROOT / "lab" / "paper" / "reproduce_paper.py"
 WORLD = PaperWorld(
     name="kitti06", title="a street", stands_for="06_KITTI", source="synthetic:street:stereo",
     sensor="stereo", localizer="stereo", voxel_size=0.15, died_at=60, published_rmse=0.8, loops=True,
@@ -67,7 +67,7 @@ SMALL = "simulated small machine: 1 core, 1024 MiB"
 
 
 def judged(*outcomes: Outcome, **more: Any) -> dict[str, Verdict]:
-    return _paper_verdicts.verdicts(Findings(worlds=[WORLD], outcomes=list(outcomes), **more))
+    return paper_verdicts.verdicts(Findings(worlds=[WORLD], outcomes=list(outcomes), **more))
 
 
 def test_a_run_that_went_well_meets_its_claims() -> None:
@@ -124,7 +124,7 @@ def test_the_control_decides_what_explains_the_gain(
     assert verdict.met is met
     assert says in verdict.words
     for mode in ("traditional-unbounded", "traditional-bounded", "decentralised"):
-        assert _paper_runs.MODES[mode] in verdict.words
+        assert paper_runs.MODES[mode] in verdict.words
 
 
 def test_a_smaller_machine_explains_nothing() -> None:
@@ -169,7 +169,7 @@ def test_the_baseline_is_said_to_die_where_it_did() -> None:
 
 
 def test_another_map_is_not_the_same() -> None:
-    name = _paper_runs.MODES["two-robots"]
+    name = paper_runs.MODES["two-robots"]
     run = {"map_hash": "a", "expected_hash": "a"}
     assert judged(outcome("two-robots", **run))[name].met is True
     assert judged(outcome("two-robots", **run | {"map_hash": "b"}))[name].met is False
@@ -211,16 +211,16 @@ def shifted(count: int, *, wrong_from: int) -> tuple[np.ndarray, np.ndarray]:
 def test_the_error_is_cut_at_the_frame_where_the_baseline_died(tmp_path: Path) -> None:
     estimate, truth = shifted(30, wrong_from=20)
     kept = np.delete(np.arange(30), [3, 4, 25])  # late frames have no pose
-    path = tmp_path / _paper_outcome.POSES
+    path = tmp_path / paper_outcome.POSES
     np.savez(path, indices=kept, poses=estimate[kept], truth=truth[kept])
-    full, cut = _paper_outcome.error_until(path), _paper_outcome.error_until(path, 19)
+    full, cut = paper_outcome.error_until(path), paper_outcome.error_until(path, 19)
     assert full is not None
     assert cut is not None
     assert full.rmse > 1
     assert cut.rmse < 1e-9
     assert cut.count == 18
-    assert _paper_outcome.error_until(path, 0) is None  # one pose has no error
-    assert _paper_outcome.error_until(tmp_path / "none.npz") is None
+    assert paper_outcome.error_until(path, 0) is None  # one pose has no error
+    assert paper_outcome.error_until(tmp_path / "none.npz") is None
 
 
 def test_the_cut_is_that_of_the_small_machine_where_both_died() -> None:
@@ -229,14 +229,14 @@ def test_the_cut_is_that_of_the_small_machine_where_both_died() -> None:
         outcome("traditional-unbounded", died_frame=700, name="whole"),
         outcome("traditional-bounded", died_frame=9, name="control"),
     ]
-    assert _paper_report.cut_frames(runs) == {("kitti06", "regularised", 1): 100}
-    assert _paper_report.cut_frames(runs[1:]) == {("kitti06", "regularised", 1): 700}
-    assert _paper_report.cut_frames([outcome()]) == {}
+    assert paper_report.cut_frames(runs) == {("kitti06", "regularised", 1): 100}
+    assert paper_report.cut_frames(runs[1:]) == {("kitti06", "regularised", 1): 700}
+    assert paper_report.cut_frames([outcome()]) == {}
 
 
 def test_a_series_ends_with_a_cross_where_its_mode_died() -> None:
     rows = [{"seq": str(n), "delay_ms": f"{10 * n}"} for n in range(1, 5)] + [{"seq": "5", "delay_ms": ""}]
-    series = _paper_figures.series_of(
+    series = paper_figures.series_of(
         outcome("traditional-unbounded", machine=SMALL, death="killed", died_of="memory"), rows
     )
     assert series.number.tolist() == [1, 2, 3, 4]
@@ -244,7 +244,7 @@ def test_a_series_ends_with_a_cross_where_its_mode_died() -> None:
     assert series.end == (4, 40.0)
     assert series.died_of == "memory"
     assert not series.dashed
-    alive = _paper_figures.series_of(outcome("traditional-bounded"), rows)
+    alive = paper_figures.series_of(outcome("traditional-bounded"), rows)
     assert alive.end is None
     assert alive.dashed  # the control on the whole machine
 
@@ -258,12 +258,12 @@ def test_what_a_killed_front_end_wrote_is_told() -> None:
         {"event": "keyframe", "t": 20, "seq": 2, "captured_ns": 15, "sent_ns": 20},
         {"event": "fused", "t": 30, "seq": 1, "fuse_start_ns": 11, "map_bytes": 4096},
     ]
-    story = _paper_events.of([*map(json.dumps, lines), '{"event":"fused","t":4'])
+    story = paper_events.of([*map(json.dumps, lines), '{"event":"fused","t":4'])
     assert story.fused == 1
     assert [record.fused_ns for record in story.times] == [30, 0]
     assert story.map_bytes == [(30, 4096)]
     assert not story.ended
-    fields = _paper_outcome.of_story(story, [], _paper_limits.Death("memory", "killed"))
+    fields = paper_outcome.of_story(story, [], paper_limits.Death("memory", "killed"))
     assert (fields["died_at"], fields["died_frame"], fields["sent"], fields["lost"]) == (1, 0, 2, 1)
 
 
@@ -280,27 +280,27 @@ def test_a_localizer_that_lost_its_way_for_long_is_the_end() -> None:
                 told.append({"event": "fused", "t": 10 * n + 5, "seq": n, "fuse_start_ns": 1, "map_bytes": 1})
         return [json.dumps(event) for event in told]
 
-    starved = _paper_outcome.of_story(_paper_events.of(lines(25)), [], None)
+    starved = paper_outcome.of_story(paper_events.of(lines(25)), [], None)
     assert (starved["died_of"], starved["died_frame"], starved["lost"]) == ("a lost sensor", 8, 25)
     assert "behind frame 8, and never found it again" in starved["death"]
-    assert _paper_outcome.of_story(_paper_events.of(lines(15)), [], None)["death"] == ""
-    late = _paper_outcome.of_story(_paper_events.of(lines(25, found=30)), [], None)
+    assert paper_outcome.of_story(paper_events.of(lines(15)), [], None)["death"] == ""
+    late = paper_outcome.of_story(paper_events.of(lines(25, found=30)), [], None)
     assert (late["died_frame"], late["died_at"], late["fused"]) == (8, 4, 35)
     assert "found it again at frame 60 only" in late["death"]
-    assert _paper_outcome.of_story(_paper_events.of(lines(15, found=30)), [], None)["death"] == ""
+    assert paper_outcome.of_story(paper_events.of(lines(15, found=30)), [], None)["death"] == ""
 
 
 def test_memory_without_map_and_queue_is_what_grows() -> None:
-    rows = [_paper_outcome.MemoryRow(s, "server", (100 + s) << 20, s << 20, 0) for s in range(21)]
-    assert _paper_outcome.growth_mib(rows) == pytest.approx(0.0, abs=1e-6)  # the map alone grows
-    rows = [_paper_outcome.MemoryRow(s, "robot", (100 + s) << 20, 0, 0) for s in range(21)]
-    assert _paper_outcome.growth_mib(rows) == pytest.approx(10.0)
+    rows = [paper_outcome.MemoryRow(s, "server", (100 + s) << 20, s << 20, 0) for s in range(21)]
+    assert paper_outcome.growth_mib(rows) == pytest.approx(0.0, abs=1e-6)  # the map alone grows
+    rows = [paper_outcome.MemoryRow(s, "robot", (100 + s) << 20, 0, 0) for s in range(21)]
+    assert paper_outcome.growth_mib(rows) == pytest.approx(10.0)
 
 
 def test_keyframes_are_chosen_to_be_as_many_as_wanted() -> None:
     dataset = msgspec.structs.replace(WORLD, options={"count": 60}).open()
-    assert len(_paper_worlds.planned_keyframes(dataset, 20, outdoors=True)) == 20
-    usual = _paper_worlds.planned_keyframes(dataset, None, outdoors=True)
+    assert len(paper_worlds.planned_keyframes(dataset, 20, outdoors=True)) == 20
+    usual = paper_worlds.planned_keyframes(dataset, None, outdoors=True)
     assert usual[0] == 0
     assert 25 <= len(usual) <= 31  # every 2 m
 
@@ -322,52 +322,52 @@ def test_a_planned_keyframe_that_was_dropped_is_the_next_frame() -> None:
 def test_a_process_that_outgrows_its_machine_is_killed() -> None:
     command = "import time\nkept = bytearray(300 << 20)\ntime.sleep(60)"
     with subprocess.Popen([sys.executable, "-c", command]) as child:
-        watch = _paper_limits.MemoryWatch(child, 150 << 20, _paper_outcome_rss)
+        watch = paper_limits.MemoryWatch(child, 150 << 20, _rss_of_outcome)
         code = child.wait(60)
         watch.stop()
-    death = _paper_limits.death_of(code, watch, "")
+    death = paper_limits.death_of(code, watch, "")
     assert death is not None
     assert death.of == "memory"
     assert "of 150 there are" in death.words
 
 
-def _paper_outcome_rss(pid: int) -> int:
+def _rss_of_outcome(pid: int) -> int:
     from tsfusion.core import process
 
     return process.tree_rss_bytes(pid)
 
 
 def test_a_share_of_the_time_is_a_share_of_the_work() -> None:
-    assert _paper_limits.calibrate(0.1) < 0.6
+    assert paper_limits.calibrate(0.1) < 0.6
 
 
 def test_runs_have_names_of_their_own_and_come_after_what_they_need() -> None:
-    worlds = _paper_worlds.worlds(quick=False)
-    runs = _paper_runs.plan(worlds, _paper_runs.Limits(), quick=False, runs=2)
+    worlds = paper_worlds.worlds(quick=False)
+    runs = paper_runs.plan(worlds, paper_runs.Limits(), quick=False, runs=2)
     names = [run.name for run in runs]
     assert len(set(names)) == len(names)
     for place, run in enumerate(runs):
-        if run.mode in _paper_runs.AGAIN:
-            assert _paper_runs.source_of(run).name in names[:place]
-    only = _paper_runs.plan(worlds, _paper_runs.Limits(), quick=False, only=["two-robots"])
+        if run.mode in paper_runs.AGAIN:
+            assert paper_runs.source_of(run).name in names[:place]
+    only = paper_runs.plan(worlds, paper_runs.Limits(), quick=False, only=["two-robots"])
     assert [run.mode for run in only] == ["decentralised", "two-robots"]
 
 
 def test_with_one_run_a_mode_the_plain_map_is_made_in_one_world() -> None:
-    worlds = _paper_worlds.worlds(quick=False)
+    worlds = paper_worlds.worlds(quick=False)
     for runs, expected in ((1, {worlds[0].name}), (2, {world.name for world in worlds})):
-        planned = _paper_runs.plan(worlds, _paper_runs.Limits(), quick=False, runs=runs)
+        planned = paper_runs.plan(worlds, paper_runs.Limits(), quick=False, runs=runs)
         assert {run.world.name for run in planned if run.map == "off"} == expected
         assert {run.world.name for run in planned if run.map == "regularised"} == {w.name for w in worlds}
 
 
 def test_frames_that_are_read_ahead_are_those_of_the_recording(tmp_path: Path) -> None:
     dataset = Synthetic("room", count=6, width=64)
-    log = _paper_events.EventLog(tmp_path / "events.jsonl")
+    log = paper_events.EventLog(tmp_path / "events.jsonl")
     recording = LiveRecording(dataset, log, pace=0.1)
     seen = []
     for frame in recording:
-        assert frame.timestamp_ns == _paper_worlds.stamps_ns(dataset)[recording.index]
+        assert frame.timestamp_ns == paper_worlds.stamps_ns(dataset)[recording.index]
         np.testing.assert_array_equal(frame.depth, frame_of(dataset, recording.index).depth)
         seen.append(recording.index)
         if recording.index == 2:
@@ -490,7 +490,7 @@ def test_a_mistake_is_one_line(arguments: tuple[str, ...], message: str, tmp_pat
 
 @pytest.mark.parametrize("taken", ["out", "world"])
 def test_what_cannot_be_written_is_one_line(taken: str, tmp_path: Path) -> None:
-    world = _paper_worlds.worlds(quick=True, frames=2)[1]
+    world = paper_worlds.worlds(quick=True, frames=2)[1]
     (tmp_path / "worlds").mkdir()
     digest = hashlib.sha256(msgspec.json.encode(world)).hexdigest()[:12]
     file = tmp_path / {"out": "out", "world": f"worlds/{world.name}-{digest}"}[taken]

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Run the paper's experiments again, with the control that it lacks, and check its claims.
 
-    python scripts/reproduce_paper.py --out DIR            all of it, one run a mode (an hour on 2 cores)
-    python scripts/reproduce_paper.py --out DIR --quick    short recordings (5 minutes)
-    python scripts/reproduce_paper.py --out DIR --runs 5   for tables with a spread
-    python scripts/reproduce_paper.py --list               the runs, and about how long each takes
+    python lab/paper/reproduce_paper.py --out DIR            all of it, one run a mode (an hour on 2 cores)
+    python lab/paper/reproduce_paper.py --out DIR --quick    short recordings (5 minutes)
+    python lab/paper/reproduce_paper.py --out DIR --runs 5   for tables with a spread
+    python lab/paper/reproduce_paper.py --list               the runs, and about how long each takes
 
 A mode is a way to put localisation and fusion onto machines: in one process with an unbounded queue, as the
 paper's baseline, or with a bounded one, which is the control; as scanner and server; with a slow server; over
@@ -30,26 +30,21 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-sys.path.append(str(Path(__file__).parents[1]))  # lab is not installed
-
-
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "support"))
+sys.path.append(str(Path(__file__).parents[2]))  # lab is not installed
 
-import _paper_again
-import _paper_conduct
-import _paper_docs
-import _paper_outcome
-import _paper_report
 import msgspec
-from _paper_limits import calibrate
-from _paper_outcome import Outcome
-from _paper_render import RECORD as RENDERED
-from _paper_runs import AGAIN, Limits, Machine, Run, plan, source_of
-from _paper_surface import PEERS, MapJob, SweepJob
-from _paper_verdicts import Findings, Verdict, verdicts
-from _paper_worlds import PaperWorld, sweep_worlds, worlds
 
 from lab.bench.peers import unimportable
+from lab.paper import paper_again, paper_conduct, paper_docs, paper_outcome, paper_report
+from lab.paper.paper_limits import calibrate
+from lab.paper.paper_outcome import Outcome
+from lab.paper.paper_render import RECORD as RENDERED
+from lab.paper.paper_runs import AGAIN, Limits, Machine, Run, plan, source_of
+from lab.paper.paper_surface import PEERS, MapJob, SweepJob
+from lab.paper.paper_verdicts import Findings, Verdict, verdicts
+from lab.paper.paper_worlds import PaperWorld, sweep_worlds, worlds
 from tsfusion.core import process
 from tsfusion.core.errors import OutputError, TsfusionError
 
@@ -166,7 +161,7 @@ def reproduce(options: argparse.Namespace, limits: Limits, found: list[PaperWorl
         print(f"{name}: {state}. {verdict.words} (wanted: {verdict.wanted})")
     for name, why in failures.items():
         say(f"not made: {name}: {why}")
-    say(f"written: {out / _paper_report.REPORT}")
+    say(f"written: {out / paper_report.REPORT}")
     expected = [verdict for name, verdict in made.items() if not options.only or verdict.met is not None]
     return int(bool(failures) or any(verdict.met is None for verdict in expected))
 
@@ -185,7 +180,7 @@ def rendered(world: PaperWorld, cache: Path) -> PaperWorld:
         said = folder.with_suffix(".log")
         say(f"rendering {world.title} into {folder} (once; not part of any run)")
         try:
-            child([str(HERE / "_paper_render.py"), str(orders), str(folder)], said, _RENDERING_S)
+            child([str(HERE / "paper_render.py"), str(orders), str(folder)], said, _RENDERING_S)
         except subprocess.SubprocessError as error:
             why = f"{world.title} cannot be rendered into {folder}: {error}; see {said}"
             raise OutputError(f"{why}; is another run of this command rendering it?") from error
@@ -199,10 +194,10 @@ def make_all(runs: list[Run], out: Path, limits: Limits, failures: dict[str, str
     needed = journals_needed(runs, out, limits)
     for number, run in enumerate(runs, 1):
         folder = out / "runs" / run.name
-        settings = _paper_conduct.fingerprint(run, limits)
+        settings = paper_conduct.fingerprint(run, limits)
         title = f"[{number}/{len(runs)}] {run.name}"
-        done = _paper_outcome.read(folder, settings)
-        if done is not None and (run.name not in needed or (folder / _paper_conduct.STATE).is_dir()):
+        done = paper_outcome.read(folder, settings)
+        if done is not None and (run.name not in needed or (folder / paper_conduct.STATE).is_dir()):
             outcomes[run.name] = done
             continue
         say(f"{title}: {run.seconds * limits.pace:.0f} s or so")
@@ -226,19 +221,19 @@ def journals_needed(runs: list[Run], out: Path, limits: Limits) -> set[str]:
         source_of(run).name
         for run in runs
         if run.mode in AGAIN
-        and _paper_outcome.read(out / "runs" / run.name, _paper_conduct.fingerprint(run, limits)) is None
+        and paper_outcome.read(out / "runs" / run.name, paper_conduct.fingerprint(run, limits)) is None
     }
 
 
 def make(run: Run, folder: Path, limits: Limits, outcomes: dict[str, Outcome], settings: str) -> Outcome:
     tell = progress()
     if run.mode not in AGAIN:
-        return _paper_conduct.conduct(run, folder, limits, tell)
+        return paper_conduct.conduct(run, folder, limits, tell)
     source = source_of(run)
     if source.name not in outcomes:
         raise ValueError(f"{source.name} was not made")
-    state = folder.with_name(source.name) / _paper_conduct.STATE
-    return _paper_again.conduct(
+    state = folder.with_name(source.name) / paper_conduct.STATE
+    return paper_again.conduct(
         run, outcomes[source.name], folder, state=state, limits=limits, tell=tell, settings=settings
     )
 
@@ -246,7 +241,7 @@ def make(run: Run, folder: Path, limits: Limits, outcomes: dict[str, Outcome], s
 def drop_journals(out: Path, outcomes: dict[str, Outcome], needed: set[str]) -> None:
     """Remove journals and spools that no run that is still to be made needs."""
     for name in outcomes.keys() - needed:
-        for part in (_paper_conduct.STATE, "spool"):
+        for part in (paper_conduct.STATE, "spool"):
             shutil.rmtree(out / "runs" / name / part, ignore_errors=True)
 
 
@@ -259,7 +254,7 @@ def measure_surfaces(
         folder = options.out / "runs" / run.name
         if run.mode in ("decentralised", "loops") and run.number == 1 and (folder / "map.tsf").is_file():
             job = MapJob(
-                world=run.world, map=str(folder / "map.tsf"), poses=str(folder / _paper_outcome.POSES),
+                world=run.world, map=str(folder / "map.tsf"), poses=str(folder / paper_outcome.POSES),
                 pictures=str(folder / "picture"),
             )  # fmt: skip
             mapped[run.name] = job, f"the map of {run.name}"
@@ -317,7 +312,7 @@ def answer(job: Job, out: Path, title: str, failures: dict[str, str]) -> Any:
         orders.write_bytes(told)
         partial = found.with_suffix(".partial")
         try:
-            child([str(HERE / "_paper_surface.py"), str(orders), str(partial)], place / f"{name}.log")
+            child([str(HERE / "paper_surface.py"), str(orders), str(partial)], place / f"{name}.log")
         except subprocess.SubprocessError as error:
             failures[title] = f"{error}; see {place / f'{name}.log'}"
             return None
@@ -329,15 +324,15 @@ def conclude(
     out: Path, findings: Findings, limits: Limits, told: dict[str, Any], *, write_docs: bool
 ) -> dict[str, Verdict]:
     """Judge, and write everything but what the runs wrote themselves."""
-    rows = list(_paper_report.ate_rows(findings.outcomes, out / "runs"))
-    findings.cuts = _paper_report.cut_errors(rows)
+    rows = list(paper_report.ate_rows(findings.outcomes, out / "runs"))
+    findings.cuts = paper_report.cut_errors(rows)
     made = verdicts(findings)
-    _paper_report.write_tables(out, findings, rows, told["maps"])
-    drawn = _paper_report.draw(out, findings)
-    _paper_report.write_record(out, findings, made, limits=limits, told=told)
-    _paper_report.write_page(out, findings, made, rows, limits=limits, told=told, drawn=drawn)
+    paper_report.write_tables(out, findings, rows, told["maps"])
+    drawn = paper_report.draw(out, findings)
+    paper_report.write_record(out, findings, made, limits=limits, told=told)
+    paper_report.write_page(out, findings, made, rows, limits=limits, told=told, drawn=drawn)
     if write_docs:
-        _paper_docs.write(HERE.parent / "docs", findings, made, rows, drawn)
+        paper_docs.write(HERE.parents[1] / "docs", findings, made, rows, drawn)
     return made
 
 

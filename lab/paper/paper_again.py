@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """The keyframes of a live run, sent once more by other ways: the map in the end must be the same.
 
-python scripts/_paper_again.py ORDERS.json        a robot that sends its share of them
-python scripts/_paper_again.py STATE VOLUME.json  the hash of the map that they make, fused here at once
+python lab/paper/paper_again.py ORDERS.json        a robot that sends its share of them
+python lab/paper/paper_again.py STATE VOLUME.json  the hash of the map that they make, fused here at once
 """
 
 import shutil
@@ -16,14 +16,15 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-from _paper_outcome import Outcome, write
-from _paper_runs import Limits, Run
 from msgspec import Struct
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "support"))
+sys.path.append(str(Path(__file__).parents[2]))  # lab is not installed
 from bad_network import Proxy
 from keyframes_and_servers import lasting_address
 
+from lab.paper.paper_outcome import Outcome, write
+from lab.paper.paper_runs import Limits, Run
 from tsfusion.core import process
 from tsfusion.core.config import DEFAULT_MAP, ClientConfig, ServerConfig, VolumeConfig
 from tsfusion.core.errors import TransportError, TsfusionError

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The front end of one run, as a process of its own: a camera, the localizer, and what it hands keyframes to.
 
-    python scripts/_paper_frontend.py PLAN.json
+    python lab/paper/paper_frontend.py PLAN.json
 
 The recording plays at its own times. A camera has room for one frame: what came while the localizer was busy
 is dropped and counted. In the traditional modes the map is in this process too.
@@ -19,11 +19,13 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from _paper_events import EventLog
-from _paper_worlds import PaperWorld, planned_keyframes, stamps_ns
 from msgspec import Struct
 from numpy.typing import NDArray
 
+sys.path.append(str(Path(__file__).parents[2]))  # lab is not installed
+
+from lab.paper.paper_events import EventLog
+from lab.paper.paper_worlds import PaperWorld, planned_keyframes, stamps_ns
 from tsfusion.core import process
 from tsfusion.core.config import ClientConfig, ScanConfig, VolumeConfig
 from tsfusion.core.errors import FlushTimeout
@@ -199,7 +201,7 @@ def run(plan: FrontEndPlan) -> None:
 
 def _sink(plan: FrontEndPlan, folder: Path, log: EventLog) -> Any:
     if plan.address is None:
-        from _paper_fusion import FusionBeside
+        from lab.paper.paper_fusion import FusionBeside
 
         return FusionBeside(plan.volume, bounded=plan.bounded, log=log)
     from tsfusion.client import Client

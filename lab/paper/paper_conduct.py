@@ -12,14 +12,16 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-import _paper_events
 import msgspec
 import numpy as np
-from _paper_again import fresh_hash
-from _paper_events import Story
-from _paper_frontend import CORRECTED, MAP, OUTDOORS, FrontEndPlan
-from _paper_limits import Death, MemoryWatch, death_of, share_of_time
-from _paper_outcome import (
+from bad_network import Proxy
+
+from lab.paper import paper_events
+from lab.paper.paper_again import fresh_hash
+from lab.paper.paper_events import Story
+from lab.paper.paper_frontend import CORRECTED, MAP, OUTDOORS, FrontEndPlan
+from lab.paper.paper_limits import Death, MemoryWatch, death_of, share_of_time
+from lab.paper.paper_outcome import (
     DELAY,
     MEMORY,
     POSES,
@@ -31,12 +33,8 @@ from _paper_outcome import (
     write,
     write_memory,
 )
-from _paper_runs import Limits, Run
-from _paper_worlds import planned_keyframes, stamps_ns
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
-from bad_network import Proxy
-
+from lab.paper.paper_runs import Limits, Run
+from lab.paper.paper_worlds import planned_keyframes, stamps_ns
 from tsfusion.core import process
 from tsfusion.core.config import DEFAULT_MAP, ServerConfig
 from tsfusion.core.errors import TsfusionError
@@ -45,7 +43,7 @@ from tsfusion.datasets.dataset import pose_of
 from tsfusion.pipelines import latency_ledger, map_growth, target_server
 from tsfusion.pipelines.map_growth import Row
 
-FRONT_END = Path(__file__).with_name("_paper_frontend.py")
+FRONT_END = Path(__file__).with_name("paper_frontend.py")
 STATE = "state"
 _START_S = 300.0  # for a front end to get ready: cold kernels on a busy machine
 _POLL_S = 0.1
@@ -72,7 +70,7 @@ def conduct(run: Run, folder: Path, limits: Limits, tell: Tell) -> Outcome:
         grown: list[Row] = []
     else:
         watch, death, grown, status = _decentralised(run, folder, limits, tell)
-    story = _paper_events.read(folder / "events.jsonl")
+    story = paper_events.read(folder / "events.jsonl")
     latency_ledger.write_csv(story.times, folder / DELAY)
     rows = memory_rows(story, watch.samples, grown)
     write_memory(rows, folder / MEMORY)
