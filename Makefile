@@ -25,13 +25,13 @@ accuracy:  ## every row, then the tables and plots of docs/accuracy.md
 
 nightly:  ## the long forms of what the tests try: about two hours
 	$(PYTHON) -m pytest --nightly -m nightly
-	$(PYTHON) scripts/chaos.py --seeds 20
-	$(PYTHON) scripts/hostile.py
-	$(PYTHON) scripts/hostile.py --access stranger
-	$(PYTHON) scripts/hostile.py --access allowed
-	$(PYTHON) scripts/fuzz.py --cases 1000000
-	$(PYTHON) scripts/soak.py --keyframes 10000 --kills 12
-	$(PYTHON) scripts/faults.py
-	$(PYTHON) scripts/plant_faults.py
+	$(PYTHON) lab/reliability/chaos.py --seeds 20
+	$(PYTHON) lab/reliability/hostile.py
+	$(PYTHON) lab/reliability/hostile.py --access stranger
+	$(PYTHON) lab/reliability/hostile.py --access allowed
+	$(PYTHON) lab/reliability/fuzz.py --cases 1000000
+	$(PYTHON) lab/reliability/soak.py --keyframes 10000 --kills 12
+	$(PYTHON) lab/reliability/faults.py
+	$(PYTHON) lab/reliability/plant_faults.py
 	$(PYTHON) lab/reliability/delivery.py
 	$(PYTHON) lab/bench/cluster.py --kills 20

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""No keyframe is lost when processes are killed and the network is bad. The long form: `scripts/chaos.py`."""
+"""No keyframe is lost when processes are killed and the network is bad. Long: lab/reliability/chaos.py."""
 
 from pathlib import Path
 
 import pytest
-from chaos_run import run
+
+from lab.reliability.chaos_run import run
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""System calls that fail once, on the way of a keyframe. All of them: `python scripts/faults.py`."""
+"""System calls that fail once, on the way of a keyframe. All of them: `python lab/reliability/faults.py`."""
 
 import json
 import subprocess
@@ -34,7 +34,7 @@ CASES = [
 @pytest.mark.skipif(not syscall_faults.is_possible(), reason="needs seccomp's user notification")
 def test_a_call_that_fails_once_costs_nothing_but_what_is_said() -> None:
     arguments = [word for case in CASES for word in ("--case", case)]
-    command = [sys.executable, ROOT / "scripts/faults.py", *arguments]
+    command = [sys.executable, ROOT / "lab/reliability/faults.py", *arguments]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     outcomes = [json.loads(line) for line in done.stdout.splitlines()]
     assert {one["case"]: one["problems"] for one in outcomes} == {case: [] for case in CASES}, done.stderr

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: MIT
-"""Mutated messages, segments, saved maps and folders of recordings. The long form: `scripts/fuzz.py`."""
+"""Mutated messages, segments, saved maps and folders of recordings. Long: lab/reliability/fuzz.py."""
 
 import contextlib
 import random
 import tracemalloc
 
-import fuzz_mutate
 import pytest
-from fuzz_engine import fuzz
-from fuzz_folders import FOLDERS
-from fuzz_targets import TARGETS
 
+from lab.reliability import fuzz_mutate
+from lab.reliability.fuzz_engine import fuzz
+from lab.reliability.fuzz_folders import FOLDERS
+from lab.reliability.fuzz_targets import TARGETS
 from tsfusion.wire import codec
 from tsfusion.wire.record_header import Refused
 

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""A server under attack lives, keeps its memory bound, fuses what others send. Long: `scripts/hostile.py`."""
+"""A server under attack lives, keeps to its memory, fuses other scans. Long: lab/reliability/hostile.py."""
 
 from pathlib import Path
 
 import pytest
 from attack_target import Access
 from attacks import ATTACKS_OF
-from hostile_run import Bounds, run, table
 
+from lab.reliability.hostile_run import Bounds, run, table
 from tsfusion.core import process
 from tsfusion.gateway.memory_guard import MemoryGuard
 

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Kills and a full disk lose nothing, and nothing grows afterwards. The long form: `scripts/soak.py`."""
+"""Kills and a full disk lose nothing, and nothing grows afterwards. Long: lab/reliability/soak.py."""
 
 from pathlib import Path
 
 import pytest
-from soak_run import run
+
+from lab.reliability.soak_run import run
 
 
 @pytest.mark.parametrize("keyframes", [1500, pytest.param(5000, marks=pytest.mark.nightly)])

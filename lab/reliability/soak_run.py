@@ -2,6 +2,7 @@
 """Keyframes of three scanners for a long time, kills and a full disk among them; what grows, what is lost."""
 
 import contextlib
+import functools
 import os
 import threading
 import time
@@ -10,12 +11,12 @@ from pathlib import Path
 
 import numpy as np
 import small_disks
-from hostile_watch import rss_bytes
 from keyframes_and_servers import connected, lasting_address, map_hash, until
 from msgspec import Struct
 from scanner_process import plan_in, save_room, source
 from supervisors import Daemon, Scanner
 
+from lab.reliability.hostile_watch import rss_bytes
 from tsfusion import VolumeConfig
 from tsfusion.core.config import ClientConfig
 from tsfusion.core.errors import TsfusionError
@@ -150,18 +151,21 @@ class _Trouble:
         self.problems: list[str] = []
         self._daemon, self._scanners, self._filler, self._started = daemon, scanners, filler, started
 
+    def _has_durable(self, keyframes: float) -> bool:
+        return self.durable >= keyframes
+
     def work(self, keyframes: int, kills: int) -> None:
         """Do it all; blocks."""
         shares = np.linspace(0.0, _KILLS_UNTIL, kills + 1)[1:]
         due: list[tuple[float, Callable[[], None]]] = []
         for number, share in enumerate(shares):
             kind = (self._kill_server, self._kill_fuser, self._kill_scanner)[number % 3]
-            due.append((share, lambda kind=kind, number=number: kind(number)))
+            due.append((share, functools.partial(kind, number)))
         if self._filler is not None:
             due.append((_FULL_AT, self._fill_disk))
         try:
             for share, act in sorted(due, key=lambda one: one[0]):
-                until(lambda share=share: self.durable >= share * keyframes, 10 * _PATIENCE)
+                until(functools.partial(self._has_durable, share * keyframes), 10 * _PATIENCE)
                 act()
         except AssertionError:
             self.problems.append(f"after {self.events} nothing more could be done")

@@ -11,15 +11,16 @@ import threading
 import time
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 from bad_network import Proxy
-from chaos_plan import KINDS, Attack, Forgetting, Kind, fault, on_map, on_scanners, on_server
 from delivery_verdict import client_problems, server_problems, verify
 from keyframes_and_servers import NUMBERED_NS, UNSECURED, Secured, secured, until, wall
 from msgspec import Struct
 from scanner_process import Plan, journals, plan_in
 from supervisors import PATIENCE, Daemon, Scanner
 
+from lab.reliability.chaos_plan import KINDS, Attack, Forgetting, Kind, fault, on_map, on_scanners, on_server
 from tsfusion import journal
 from tsfusion.core.config import ClientConfig, override
 from tsfusion.core.errors import TransportError, TsfusionError
@@ -149,7 +150,7 @@ class Killer:
         """Carry out the attacks one after the other."""
         for number, attack in enumerate(attacks):
             scanner = self._scanners[number % len(self._scanners)]
-            until(lambda attack=attack, scanner=scanner: self._is_time(attack, scanner), PATIENCE)
+            until(functools.partial(self._is_time, attack, scanner), PATIENCE)
             time.sleep(attack.wait)
             if attack.hold:
                 self._proxy.freeze(True)
@@ -203,7 +204,7 @@ class Forgetter:
     def _work(self, acts: list[Forgetting]) -> None:
         for act in acts:
             with contextlib.suppress(AssertionError):
-                until(lambda act=act: self._is_time(act), PATIENCE)
+                until(functools.partial(self._is_time, act), PATIENCE)
             selection, deadline = None, time.monotonic() + PATIENCE
             while time.monotonic() < deadline:
                 with contextlib.suppress(TransportError):
@@ -255,7 +256,7 @@ class Forgetter:
         self.told += [(bytes.fromhex(one.session), one.numbers, erase) for one in done.sessions]
         return True
 
-    def _forget(self, selection: Selection, **how: bool) -> Forgotten:
+    def _forget(self, selection: Selection, **how: Any) -> Forgotten:
         server = self._daemon.server
         if not server.address:
             raise TransportError("it starts")
@@ -291,7 +292,7 @@ class Forgetter:
         (folder,) = journals(self._daemon.state)
         forgotten = _forgotten(folder)
         # Also where the answer was lost on its way, and nothing was left to forget when it was asked again
-        sessions = {session for session, *_ in (*self.told, *self._walls())}
+        sessions = {session for session, *_ in self.told} | {session for session, _ in self._walls()}
         return sum(len(forgotten.of(session)) for session in sessions)
 
 

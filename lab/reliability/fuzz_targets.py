@@ -8,13 +8,14 @@ import tempfile
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
-import fuzz_mutate
 import msgspec
 import numpy as np
 from keyframes_and_servers import CAMERA, SHAPE, pose, wall
 from msgspec import Struct
 
+from lab.reliability import fuzz_mutate
 from tsfusion import Keyframe, journal
 from tsfusion.core.config import ServerConfig, VolumeConfig
 from tsfusion.core.errors import CheckpointError, DecodeError, InvalidKeyframe, JournalError
@@ -55,7 +56,7 @@ class Target(Struct, frozen=True):
 def _keyframes() -> list[Keyframe]:
     rng = np.random.default_rng(0)
     image, points = (6, 8), rng.normal(size=(20, 3)).astype(np.float32)
-    camera = {"intrinsics": CAMERA, "T_world_camera": pose(1.0)}
+    camera: dict[str, Any] = {"intrinsics": CAMERA, "T_world_camera": pose(1.0)}
     depth = rng.integers(0, 5000, image).astype(np.uint16)
     color = rng.integers(0, 256, (*image, 3)).astype(np.uint8)
     mask = rng.integers(0, 256, image).astype(np.uint8)
@@ -116,7 +117,7 @@ def run_message(content: bytes) -> str:
 
 # --- control messages ---
 
-_POINT = memoryview(np.zeros(3, "<f4")).cast("B")  # that comes with a question
+_POINT = np.zeros(3, "<f4").data.cast("B")  # that comes with a question
 
 
 def _control_seeds() -> list[bytes]:

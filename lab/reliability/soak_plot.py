@@ -4,7 +4,7 @@
 from pathlib import Path
 from typing import Any
 
-from soak_run import Outcome
+from lab.reliability.soak_run import Outcome
 
 _MOST_POINTS = 400  # a curve
 _COLORS = {"server killed": "#d62728", "fuser killed": "#ff7f0e", "scanner killed": "#9467bd"}

@@ -133,7 +133,8 @@ def join(frames: Sequence[bytes]) -> bytes:
 
 def split(content: bytes) -> list[bytes]:
     """The frames again; any string has some."""
-    frames, at = [], 0
+    frames: list[bytes] = []
+    at = 0
     while at + 4 <= len(content) and len(frames) < 64:
         (length,) = struct.unpack_from("<I", content, at)
         frames.append(content[at + 4 : at + 4 + length])

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: MIT
 """Take guarding lines away, one at a time, in a copy of the sources, and see that a test notices each.
 
-    python scripts/plant_faults.py                  all of them: a JSON line each
-    python scripts/plant_faults.py --only spool     those whose file or line matches
-    python scripts/plant_faults.py --first 10 --limit 5
+    python lab/reliability/plant_faults.py                  all of them: a JSON line each
+    python lab/reliability/plant_faults.py --only spool     those whose file or line matches
+    python lab/reliability/plant_faults.py --first 10 --limit 5
 
 The guards are those of journal, checkpoints, sessions, admission, spool, questions, pages, moves, jobs, the
-map's sums, recordings, verdicts and files for others (tests/support/planted_faults.py). The tests that they
+map's sums, recordings, verdicts and files for others (lab/reliability/planted_faults.py). The tests that they
 name have to pass with all guards there; then each runs with its guard away. The exit status is 1 when one
 passes all the same: it needs a test.
 """
@@ -22,11 +22,12 @@ import tempfile
 import time
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
-from planted_faults import FAULTS, Fault
+sys.path.append(str(Path(__file__).parents[2]))  # lab is not installed
 
-_ROOT = Path(__file__).parents[1]
-_COPIED = ("tsfusion", "tests", "scripts", "docs", "contrib", "pyproject.toml", "README.md")
+from lab.reliability.planted_faults import FAULTS, Fault
+
+_ROOT = Path(__file__).parents[2]
+_COPIED = ("tsfusion", "lab", "tests", "scripts", "docs", "contrib", "pyproject.toml", "README.md")
 _LONGEST_S = 300.0  # that a test may take; a fault may make one hang, which is noticed, too
 
 

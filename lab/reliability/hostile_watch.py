@@ -6,6 +6,7 @@ import threading
 import time
 from pathlib import Path
 
+import zmq
 from keyframes_and_servers import Secured, Server, connected
 from msgspec import Struct
 
@@ -78,16 +79,16 @@ class Watch:
 
     def well(self, since: float) -> bool:
         """Whether the server answers at once, is ready, and has fused what the first client sent."""
-        healths = [one for one in self._answers if one.asked >= since and one.health]
+        healths = [(one.waited, one.health) for one in self._answers if one.asked >= since and one.health]
         if not healths or (self._asked and time.monotonic() - self._asked > _ANSWERED_S):
             return False
-        last = healths[-1]
+        waited, health = healths[-1]
         first = next(
             (client.session for one in self._answers if one.health for client in one.health.clients), ""
         )
-        own = [one for one in last.health.clients if one.session == first]
+        own = [one for one in health.clients if one.session == first]
         lag = [one.durable - one.fused + one.waiting for one in own]
-        return last.waited <= _ANSWERED_S and last.health.ready and bool(lag) and lag[0] <= _LAG
+        return waited <= _ANSWERED_S and health.ready and bool(lag) and lag[0] <= _LAG
 
     def _pids(self) -> list[int]:
         with contextlib.suppress(OSError):
@@ -117,9 +118,9 @@ class Watch:
         """Send a question until there is an answer; whether it was sent more than once."""
         self._asked, sent = time.monotonic(), 0
         while not self._over.is_set():
-            if link.poll(_AGAIN_MS, sockets.zmq.POLLOUT):
-                with contextlib.suppress(sockets.zmq.Again):
-                    link.send(question, sockets.zmq.NOBLOCK)
+            if link.poll(_AGAIN_MS, zmq.POLLOUT):
+                with contextlib.suppress(zmq.Again):
+                    link.send(question, zmq.NOBLOCK)
                     sent += 1
             if link.poll(_AGAIN_MS):
                 reply = messages.decode_to_client(link.recv_multipart()[0])

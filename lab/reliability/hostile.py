@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Attack a server in many ways and show what a well-behaved scanner notices of it.
 
-    python scripts/hostile.py                     each attack for 5 s, each at a server of its own; a table
-    python scripts/hostile.py --seconds 20 --form json
-                                                  a JSON line an attack, longer attacks
-    python scripts/hostile.py --only unfinished tiny
+    python lab/reliability/hostile.py                     each attack for 5 s at a server of its own; a table
+    python lab/reliability/hostile.py --seconds 20 --form json
+                                                          a JSON line an attack, longer attacks
+    python lab/reliability/hostile.py --only unfinished tiny
 
 Each line is one attack and the time until everything is as before: the delay of the scanner's keyframes from
 capture to map, the longest wait for an answer of the control port, the highest memory of gateway and fuser,
@@ -22,10 +22,12 @@ from pathlib import Path
 
 import msgspec
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "support"))
+sys.path.append(str(Path(__file__).parents[2]))  # lab is not installed
 from attack_target import ACCESS
 from attacks import ATTACKS, ATTACKS_OF
-from hostile_run import HEADING, MEMORY_BYTES, Bounds, Outcome, markdown_row, row, run
+
+from lab.reliability.hostile_run import HEADING, MEMORY_BYTES, Bounds, Outcome, markdown_row, row, run
 
 _MB = 1 << 20
 

@@ -9,11 +9,11 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import msgspec
 from attack_target import Access, Target
 from attacks import ATTACKS
-from hostile_watch import Seen, Watch
 from keyframes_and_servers import (
     NUMBERED_NS,
     UNSECURED,
@@ -26,9 +26,11 @@ from keyframes_and_servers import (
     wall,
 )
 from msgspec import Struct
+from repository import SUPPORT
 from scanner_process import Plan, Report, journals, plan_in
 from supervisors import PATIENCE, SCANNER
 
+from lab.reliability.hostile_watch import Seen, Watch
 from tsfusion import journal
 from tsfusion.core.config import ClientConfig, ServerConfig, override
 from tsfusion.pipelines import latency_ledger
@@ -42,7 +44,7 @@ RATE = 8.0  # keyframes a second of the well-behaved one
 MEMORY_BYTES = ServerConfig().memory_bytes  # the bound on the gateway
 FUSER_MEMORY_BYTES = 2 << 30
 _LOGS = 'from tsfusion.core import logs\nlogs.configure("text", "warning")\n'  # cut short, as `serve` does
-_ATTACKS = Path(__file__).with_name("attacks.py")
+_ATTACKS = SUPPORT / "attacks.py"
 _FILES = 8192
 _MORE_FILES = 30  # of maps that were opened meanwhile
 _PEACE_S = 2.0
@@ -107,9 +109,9 @@ def run(
     given, target = _secured(folder / "keys", access)
     names = ("", *attacks, "")
     _raise_file_limit()
-    limits = {"memory_bytes": MEMORY_BYTES, "fuser_memory_bytes": FUSER_MEMORY_BYTES}
+    limits: dict[str, Any] = {"memory_bytes": MEMORY_BYTES, "fuser_memory_bytes": FUSER_MEMORY_BYTES}
     with contextlib.ExitStack() as stack:
-        server = stack.enter_context(serving(folder / "state", code=_LOGS, **limits, **given.server))
+        server = stack.enter_context(serving(folder / "state", code=_LOGS, **{**limits, **given.server}))
         target = msgspec.structs.replace(
             target, data=server.address, control=server.control, publish=server.publish
         )
@@ -134,7 +136,7 @@ def run(
             until(lambda: _files(server) <= files + _MORE_FILES, 15.0)
         if (left := _files(server)) > files + _MORE_FILES:
             problems.append(f"{left - files} connections were left behind")
-        found = _outcome(folder, server, spans, problems, given, bounds)
+        found = _outcome(folder, server, spans, problems, given=given, bounds=bounds)
     if found.map_hash:
         found.problems += _inexact(folder / "state", found.keyframes, found.map_hash, access)
     return found
@@ -188,6 +190,8 @@ def _attack(
 ) -> _Span:
     hostile = 0
     if name:
+        assert attacker.stdin is not None
+        assert attacker.stdout is not None
         attacker.stdin.write(f"{seconds} {name}\n")
         attacker.stdin.flush()
         attacker.stdout.readline()
@@ -206,7 +210,7 @@ def _attack(
 
 
 def _outcome(
-    folder: Path, server: Server, spans: list[_Span], problems: list[str], given: Secured, bounds: Bounds
+    folder: Path, server: Server, spans: list[_Span], problems: list[str], *, given: Secured, bounds: Bounds
 ) -> Outcome:
     report = _report(folder)
     phases = [_phase(span, report.times if report else [], bounds) for span in spans]

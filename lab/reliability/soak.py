@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Keep a server busy with three scanners, kill processes, fill its disk, and watch what grows.
 
-    python scripts/soak.py                             10 000 keyframes: a table, then one JSON line
-    python scripts/soak.py --keyframes 50000 --kills 24 --plot docs/images/soak.png
+    python lab/reliability/soak.py                             10 000 keyframes: a table, then one JSON line
+    python lab/reliability/soak.py --keyframes 50000 --kills 24 --plot docs/images/soak.png
 
 Each scanner is a process that sends small keyframes of one room as fast as they are fused; another client
 views the mesh. In the first half server, fuser and a scanner are killed in turn, and the server's disk is
@@ -21,9 +21,10 @@ from pathlib import Path
 
 import msgspec
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
-from soak_plot import plot
-from soak_run import TOLERANCE_MB, run, table
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "support"))
+sys.path.append(str(Path(__file__).parents[2]))  # lab is not installed
+from lab.reliability.soak_plot import plot
+from lab.reliability.soak_run import TOLERANCE_MB, run, table
 
 
 def main() -> int:

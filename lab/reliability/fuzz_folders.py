@@ -12,17 +12,18 @@ from collections.abc import Callable, Sequence
 from functools import cache, partial
 from hashlib import blake2b
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 import cv2
 import msgspec
 import numpy as np
 import rig_recordings
-from fuzz_targets import Broken, Target, scratch
 from numpy.typing import NDArray
 from rosbag_scenes import COLOR, DEPTH, infos, records
 from rosbag_writing import OPTICAL, writing
 
+from lab.reliability.fuzz_targets import Broken, Target, scratch
 from tsfusion.core.errors import TsfusionError
 from tsfusion.datasets import Dataset, open_dataset, registry
 from tsfusion.datasets.dataset import UnreadableRecording
@@ -196,7 +197,7 @@ def _clouds(suffix: str, root: Path) -> None:
 
 
 def _pcd(path: Path, points: NDArray[np.float32], frame: int) -> None:
-    from pypcd4 import Encoding, PointCloud
+    from pypcd4.pypcd4 import Encoding, PointCloud
 
     path.parent.mkdir(parents=True, exist_ok=True)
     kinds = (Encoding.ASCII, Encoding.BINARY, Encoding.BINARY_COMPRESSED)
@@ -416,7 +417,7 @@ def run(layout: str, content: bytes) -> str:
         return "; ".join(_opened(work, wanted, **each) for each in options)
 
 
-def _opened(root: Path, wanted: Poses | None, **options: object) -> str:
+def _opened(root: Path, wanted: Poses | None, **options: Any) -> str:
     try:
         dataset = open_dataset(root, **options)
         found = _frames(dataset)

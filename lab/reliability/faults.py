@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
 """Let every system call on the way of a keyframe fail once, each in a run of its own, and see what is left.
 
-    python scripts/faults.py                          all of them: a JSON line each, then a table
-    python scripts/faults.py --only "client.*ENOSPC"  those whose `process call place number kind` matches
-    python scripts/faults.py --first 120 --limit 50   the 120th to the 169th of them; --list names them only
-    python scripts/faults.py --case "client flock spool/lock 1 ENOLCK"     this one, with no counting run
-    python scripts/faults.py --real                   with the real map, in place of a sum that starts at once
+    python lab/reliability/faults.py                          all of them: a JSON line each, then a table
+    python lab/reliability/faults.py --only "client.*ENOSPC"  whose `process call place number kind` matches
+    python lab/reliability/faults.py --first 120 --limit 50   the 120th to the 169th; --list only names them
+    python lab/reliability/faults.py --case "client flock spool/lock 1 ENOLCK"  this one, with no counting run
+    python lab/reliability/faults.py --real                   with the real map, not a sum that starts at once
 
 A counting run of client, gateway and fuser lists their calls on spool, state folder, temporary folder and
 sockets. A run is good when each keyframe that `send` returned a number for is in journal and map exactly
@@ -25,9 +25,11 @@ from pathlib import Path
 
 import msgspec
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "support"))
+sys.path.append(str(Path(__file__).parents[2]))  # lab is not installed
 import syscall_faults
-from fault_run import PROCESSES, Case, Outcome, Run, cases
+
+from lab.reliability.fault_run import PROCESSES, Case, Outcome, Run, cases
 
 
 def live(case: Case | None, process: str, real: bool) -> Outcome:

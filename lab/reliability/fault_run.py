@@ -18,19 +18,21 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
-import faulty_client
 import msgspec
 import sum_map
 import syscall_faults
 from clients_and_spools import NOBODY
-from faulty_client import REFUSED, REJECTED, Orders
 from forked_processes import Forked, answer
 from keyframes_and_servers import VOLUME, lasting_address, map_hash
 from msgspec import Struct
+from repository import SUPPORT
 from scanner_process import numbers
 from syscall_faults import SHORT, Call, Watcher
 
+from lab.reliability import faulty_client
+from lab.reliability.faulty_client import REFUSED, REJECTED, Orders
 from tsfusion import server
 from tsfusion.core import logs
 from tsfusion.core.config import ServerConfig
@@ -312,18 +314,18 @@ class Run:
     def _serve(self) -> None:
         logs.configure("text", "warning")
         if self._real:
-            own = f"sys.path.append({str(Path(__file__).parent)!r}); import syscall_faults"
+            own = f"sys.path.append({str(SUPPORT)!r}); import syscall_faults"
             install = f"syscall_faults.install({self._watcher.address!r}, 'fuser')"
             lines = ["import sys, tsfusion.tsdf.volume", "from tsfusion.fuser.__main__ import main"]
             lines += [own, install] * (self._watched == "fuser")
             fuser_process.COMMAND = (sys.executable, "-c", "\n".join([*lines, "sys.exit(main())"]))
         else:
-            fuser_process.subprocess = SimpleNamespace(  # type: ignore[attr-defined]
+            fuser_process.subprocess = SimpleNamespace(  # type: ignore[attr-defined,assignment]
                 Popen=self._fuser, PIPE=None, DEVNULL=None, TimeoutExpired=subprocess.TimeoutExpired
             )
         self._enter("server", "limit")
-        limit = {"journal_bytes": 1 << 20} if self._watched == "limit" else {}
-        config = ServerConfig(listen=self._address, state=str(self.state), **SERVER, **limit)
+        limit: dict[str, Any] = {"journal_bytes": 1 << 20} if self._watched == "limit" else {}
+        config = ServerConfig(listen=self._address, state=str(self.state), **{**SERVER, **limit})
         sys.exit(server.run(config, VOLUME, lambda _: (self.folder / "ready").touch()))
 
     def _fuser(self, command: list[str], *, pass_fds: Iterable[int], **_: object) -> "ForkedFuser":

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""The faults of scripts/plant_faults.py are still those of the sources; the script itself takes long."""
+"""The faults of lab/reliability/plant_faults.py still fit the sources; the script itself takes long."""
 
-from planted_faults import FAULTS
 from repository import ROOT
+
+from lab.reliability.planted_faults import FAULTS
 
 
 def test_each_guard_stands_once_and_its_test_is_there() -> None:

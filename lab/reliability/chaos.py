@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Kill scanner, gateway and fuser at seeded moments over a bad network, and see that no keyframe is lost.
 
-    python scripts/chaos.py --seeds 20                20 runs of 300 keyframes and 12 kills, a JSON line each
-    python scripts/chaos.py --first 7 --seeds 1       one of them again; --keep FOLDER leaves its files there
+    python lab/reliability/chaos.py --seeds 20           20 runs of 300 keyframes and 12 kills, in JSON lines
+    python lab/reliability/chaos.py --first 7 --seeds 1  one of them again; --keep FOLDER keeps its files
 
 Meanwhile the server is told to forget keyframes, and to erase some of them. A run is good when the journal
 has every keyframe exactly once and in order, less those that were erased, and the map's hash is that of a
@@ -17,8 +17,9 @@ from pathlib import Path
 
 import msgspec
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
-from chaos_run import run
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "support"))
+sys.path.append(str(Path(__file__).parents[2]))  # lab is not installed
+from lab.reliability.chaos_run import run
 
 
 def main() -> int:

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Feed mutated messages, journal segments, saved maps and recordings to what reads them; a line of JSON each.
 
-    python scripts/fuzz.py                            10⁶ cases over messages, segments and maps
-    python scripts/fuzz.py --only journal --cases 5000000 --seed 7
-    python scripts/fuzz.py --only folder-tum --cases 1000
-    python scripts/fuzz.py --corpus FOLDER            go on with what was found there, and add to it
+    python lab/reliability/fuzz.py                            10⁶ cases over messages, segments and maps
+    python lab/reliability/fuzz.py --only journal --cases 5000000 --seed 7
+    python lab/reliability/fuzz.py --only folder-tum --cases 1000
+    python lab/reliability/fuzz.py --corpus FOLDER            go on with what was found there, and add to it
 
 With `atheris` (`pip install '.[fuzz]'`) guided by coverage; without it, and for control messages, by the
 outcomes: what leads to a new one is mutated further. Only the named errors may come out, no case may take a
@@ -24,7 +24,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-TESTS = Path(__file__).parents[1] / "tests" / "support"
+ROOT = Path(__file__).parents[2]
 SHARES = {"message": 0.35, "control": 0.25, "corrections": 0.1, "journal": 0.25, "checkpoint": 0.05}
 LAYOUTS = (
     *("euroc", "flat", "hololens", "kitti", "kitti-raw", "lidar-keyframes", "nerfstudio", "plain", "redwood"),
@@ -134,12 +134,13 @@ def _work(options: argparse.Namespace) -> int:
 
     logging.disable(logging.CRITICAL)  # damage is logged; here it is the rule
     warnings.simplefilter("error", RuntimeWarning)  # of NumPy, about numbers that nobody expected
-    sys.path.insert(0, str(TESTS))
+    sys.path.insert(0, str(ROOT / "tests" / "support"))
+    sys.path.append(str(ROOT))  # lab is not installed
     options.crashes.mkdir(parents=True, exist_ok=True)
     if options.engine == "atheris":
         _with_atheris(options)
         return 0  # never: libFuzzer ends the process
-    from fuzz_engine import fuzz
+    from lab.reliability.fuzz_engine import fuzz
 
     found = fuzz(options.worker, options.cases, options.seed, crashes=options.crashes)
     if found.peak_rss_mb > options.memory:
@@ -161,8 +162,8 @@ def _with_atheris(options: argparse.Namespace) -> None:
     import atheris
 
     with atheris.instrument_imports(include=INSTRUMENTED):
-        import fuzz_targets
-    from fuzz_engine import timed
+        from lab.reliability import fuzz_targets
+    from lab.reliability.fuzz_engine import timed
 
     target = fuzz_targets.TARGETS[options.worker]
     seeds = target.seeds()

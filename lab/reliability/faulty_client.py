@@ -42,11 +42,11 @@ class Orders(Struct, kw_only=True):
 
 def noisy_wall(i: int) -> Keyframe:
     """Wall number i, with so much noise that three fill a file of 64 kB."""
-    fields: dict[str, Any] = {
+    wrong: dict[int, dict[str, Any]] = {
         REFUSED: {"T_world_camera": pose(9e5)},
         REJECTED: {"captured_ns": TOO_MUCH},
-    }.get(i, {})
-    plain = wall(i, **fields)
+    }
+    plain = wall(i, **wrong.get(i, {}))
     assert plain.depth is not None
     noise = np.random.default_rng(i).integers(0, 256, (*NOISY, 3), np.uint8)
     return replace(plain, depth=np.tile(plain.depth, (2, 2)), color=noise)

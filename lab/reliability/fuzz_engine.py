@@ -8,9 +8,10 @@ import time
 from collections import Counter
 from pathlib import Path
 
-from fuzz_folders import FOLDERS
-from fuzz_targets import MAX_BYTES, TARGETS, Broken, Target
 from msgspec import Struct
+
+from lab.reliability.fuzz_folders import FOLDERS
+from lab.reliability.fuzz_targets import MAX_BYTES, TARGETS, Broken, Target
 
 _MAX_CORPUS = 4096
 
