@@ -170,7 +170,7 @@ class Client {
         out.pack_map(3);
         out.pack("type"), out.pack("hello");
         out.pack("session"), pack_session(out);
-        out.pack("version"), out.pack(2);
+        out.pack("version"), out.pack(3);
         zmq_send(control_, buffer.data(), buffer.size(), ZMQ_DONTWAIT);
     }
 
@@ -214,7 +214,7 @@ class Client {
         handle.get().convert(message);
         auto type = message.at("type").as<std::string>();
         if (type == "welcome") {
-            if (message.at("version").as<int>() != 2) throw std::runtime_error("the server speaks another version");
+            if (message.at("version").as<int>() != 3) throw std::runtime_error("the server speaks another version");
             epoch_ = message.at("epoch").as<std::string>();
             window_ = message.at("window_keyframes").as<std::size_t>();
             is_welcome_ = true;

@@ -224,7 +224,9 @@ def test_a_client_of_another_version_says_so(shared: Server, monkeypatch: pytest
     monkeypatch.setattr(control_session, "PROTOCOL_VERSION", messages.PROTOCOL_VERSION - 1)
     with (
         Client(shared.address) as client,
-        pytest.raises(ServerUnreachable, match=r"version 2 of the wire format, this client 1"),
+        pytest.raises(
+            ServerUnreachable, match=r"version 3 of the wire format, this client 2: update the older one"
+        ),
     ):
         client.connect(timeout=2.0)
 

@@ -55,6 +55,10 @@ def serving(answer: Answer) -> Iterator[tuple[str, list[Command]]]:
             if router.poll(20):
                 identity, frame = router.recv_multipart()
                 command = messages.decode_to_server(frame)
+                if isinstance(command, Command) and command.name == "ping":
+                    pong = Reply(name="ping", version=messages.PROTOCOL_VERSION)
+                    router.send_multipart([identity, messages.encode(pong)])
+                    continue
                 asked.append(command)  # type: ignore[arg-type]
                 reply = answer(command)  # type: ignore[arg-type]
                 if reply is not None:

@@ -36,7 +36,7 @@ class Redirecting:
             identity, content, *_ = self._socket.recv_multipart()
             command = messages.decode_to_server(content)
             assert isinstance(command, Command)
-            reply = Reply(name="ping", asks=True)
+            reply = Reply(name="ping", version=messages.PROTOCOL_VERSION)
             if command.name != "ping":
                 self.asked += 1
                 elsewhere = self.elsewhere or Elsewhere(self.control, self.control)

@@ -212,11 +212,8 @@ class ControlSession:
         log.debug("the server sent %s", error)
 
     def _on_welcome(self, welcome: messages.Welcome) -> None:
-        if welcome.version != PROTOCOL_VERSION:
-            self._refuse(
-                f"the server speaks version {welcome.version} of the wire format, "
-                f"this client {PROTOCOL_VERSION}"
-            )
+        if other := messages.other_version(server=welcome.version, client=PROTOCOL_VERSION):
+            self._refuse(other)
         elif not self._is_foreign(welcome.durable):
             self._outbox.change_link_state(self._outbox.link_state.welcomed())
             self.welcome = welcome

@@ -372,7 +372,7 @@ class Outbox:
     def reject(self, seq: int, reason: str, message: str = "") -> tuple[str, bool] | None:
         """Count a record that the server has and the map will not take.
 
-        An older server may tell that it has answered a record before it tells that it rejected it: then that
+        It may hear that the map has answered a record before it hears that this one was rejected: then that
         was counted as fused, and is no more.
 
         Returns its kind in words, and whether it is the first of this session for that reason; None = it was

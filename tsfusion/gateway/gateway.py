@@ -266,7 +266,7 @@ class Gateway:
     ) -> None:
         maps = self._admission.maps_of(client)
         if command.name == "ping":
-            self.ports.reply(identity, messages.Reply(name="ping", asks=True, watches=True))
+            self.ports.reply(identity, messages.Reply(name="ping", version=messages.PROTOCOL_VERSION))
         elif command.name == "health":
             elsewhere = self._elsewhere(command.map) if command.map in maps else None
             reply = messages.Reply(name="health", health=self.health(maps), elsewhere=elsewhere)

@@ -57,9 +57,8 @@ class Greetings:
 
     def _denial(self, identity: bytes, hello: messages.Hello, client: str) -> tuple[str, ...] | None:
         """The fields of the answer to a session that is not opened; None = it is, and its route is made."""
-        if hello.version != messages.PROTOCOL_VERSION:
-            speaks = f"the server speaks version {messages.PROTOCOL_VERSION} of the wire format"
-            return "version", f"{speaks}, this client {hello.version}"
+        if version := messages.other_version(server=messages.PROTOCOL_VERSION, client=hello.version):
+            return "version", version
         if forbidden := self._admission.denial_of_map(client, hello.map, sends=True):
             return "map", forbidden
         try:

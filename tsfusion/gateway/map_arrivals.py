@@ -245,7 +245,7 @@ class MapArrival:
         self._number += 1
         command = messages.Command(name="hand_over", map=self.name, hand_over=question, number=self._number)
         name = f"{self.request.source} (control {link.address})"
-        exchange = Exchange(link, [[messages.encode_sealed(command)]], name)
+        exchange = Exchange(link, [messages.encode_sealed(command)], name)
         while True:
             reply, frames = exchange.reply(_ANSWER_S)
             if reply.number == self._number:  # else it is late, of a question that was asked twice

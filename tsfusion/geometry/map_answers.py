@@ -27,8 +27,7 @@ class Samples:
             beyond the band around the surface.
         weight: (n,) float32 votes in full-confidence samples; 0 where there are none.
         gradient: (n, 3) float32, how the distance grows along x, y, z; NaN where unseen.
-        reach: metres before a surface, up to which distances are known; 0 = a server of an earlier version
-            does not tell.
+        reach: metres before a surface, up to which distances are known.
 
     Examples:
         >>> wall = tsfusion.Keyframe(

@@ -12,7 +12,7 @@ from tsfusion.wire.keyframe_times import Spread
 class MeshLayout(Struct, frozen=True, kw_only=True):
     """Row counts of the frames that follow: vertices float32, faces int32, normals float32, colors uint8.
 
-    `up` is of a whole map; None = not known, or the server is of an earlier version.
+    `up` is of a whole map; None = not known.
     """
 
     vertices: int

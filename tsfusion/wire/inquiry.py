@@ -29,7 +29,7 @@ class Inquiry:
 
     Attributes:
         map: whose other server is asked about with the health, where it has one.
-        watches: whether the server's maps can be watched; None = not known yet.
+        version: the server's `PROTOCOL_VERSION`; None = not known yet.
     """
 
     def __init__(
@@ -37,7 +37,7 @@ class Inquiry:
     ) -> None:
         self._connection: Connection = open_connection(context, sockets.connect_address(address), keys)
         self.address, self.map = address, map_name
-        self.watches: bool | None = None
+        self.version: int | None = None
         self._greeted = 0  # on which connection
         self._seen = time.monotonic()  # when there was a connection, or none could be yet
         self._health_due = 0.0
@@ -73,7 +73,11 @@ class Inquiry:
 
     @property
     def may_ask(self) -> bool:
-        return bool(self.watches) and self._connection.is_made and self._asked_until is None
+        return (
+            self.version == messages.PROTOCOL_VERSION
+            and self._connection.is_made
+            and self._asked_until is None
+        )
 
     def ask(self, map_name: str, question: Question, *, compress: bool) -> None:
         """Ask; the reply comes by `step`, or never: then it is over after some seconds."""
@@ -93,7 +97,7 @@ class Inquiry:
     def move_to(self, address: str) -> None:
         """Ask another server from now on."""
         self.drop_question()
-        self.address, self.watches, self._health_asked = address, None, None
+        self.address, self.version, self._health_asked = address, None, None
         self._seen = time.monotonic()
         self._connection.move_to(address)
 
@@ -116,7 +120,7 @@ class Inquiry:
             return
         self._seen = now
         if connection.made > self._greeted:
-            self._greeted, self.watches = connection.made, None
+            self._greeted, self.version = connection.made, None
             self._asked_until = self._health_asked = None
             self._health_due = now
             self._send(Command(name="ping"))
@@ -149,7 +153,7 @@ class Inquiry:
 
     def _is_expected(self, reply: Reply) -> bool:
         if reply.name == "ping":
-            self.watches = reply.watches
+            self.version = reply.version
         elif reply.name == "health":
             self._health_asked = None
             return reply.health is not None

@@ -181,12 +181,8 @@ class MapClient:
         )
         answer, arrays, delay = self._ask(question, [], timeout)
         found_colors = arrays.pop("colors", None)  # some maps have none
-        names = ["depth"]
-        if normals:
-            names.append("normals")
-        else:
-            arrays.pop("normals", None)  # of a server of an earlier version
-        view = View(**_all(arrays, *names), colors=found_colors if colors else None)
+        names = ["depth", "normals"] if normals else ["depth"]
+        view = View(**_all(arrays, *names), colors=found_colors)
         return _answered(view, answer, delay)
 
     def occupancy_slice(
@@ -302,7 +298,7 @@ class MapClient:
             timeout_s=seconds,
             compress=self._compress,
         )
-        sent = [messages.encode_sealed(Command(name="ping"))], [messages.encode_sealed(command), *frames]
+        sent = [messages.encode_sealed(command), *frames]
         reply, arrays = self._exchange(sent, began + seconds, seconds)
         for _ in range(_MOST_HOPS):
             if reply.elsewhere is None:
@@ -322,30 +318,20 @@ class MapClient:
         except DecodeError as error:
             raise TransportError(f"the server at {self.address}: {error}") from error
 
-    def _exchange(
-        self, sent: Sequence[list[Any]], deadline: float, seconds: float
-    ) -> tuple[Reply, list[memoryview]]:
-        """Send the messages; the reply to the last one.
-
-        A ping goes before each question: an older server answers that one, and never the other.
-        """
-        exchange, is_there = Exchange(self._connection, sent), False
+    def _exchange(self, sent: list[Any], deadline: float, seconds: float) -> tuple[Reply, list[memoryview]]:
+        """Send a message; the reply to it."""
+        exchange = Exchange(self._connection, sent)
         while True:
             try:
                 reply, frames = exchange.reply(max(deadline - time.monotonic(), 0.0))
             except ServerUnreachable as error:
-                if is_there:
+                if exchange.is_there:
                     raise AnswerLate(
                         f"the map {self.map} at {self.address} did not answer within {seconds:g} s: ask "
                         "again, or give it longer (timeout)"
                     ) from error
                 self._connection.reopen()  # what stands may lead nowhere, and nobody would notice
                 raise
-            if reply.name == "ping" and not reply.asks:
-                raise TransportError(
-                    f"the server at {self.address} is older and cannot answer questions: update it"
-                )
-            is_there = True
             if reply.name == "ask" and reply.number == self._number:
                 return reply, frames
 

@@ -21,7 +21,7 @@ from tsfusion.wire.health import Health
 from tsfusion.wire.inquiry import Inquiry
 from tsfusion.wire.map_client import MapClient
 from tsfusion.wire.map_events import HealthSeen, LinkSeen, MapEvent
-from tsfusion.wire.messages import Elsewhere, Reply
+from tsfusion.wire.messages import PROTOCOL_VERSION, Elsewhere, Reply, other_version
 from tsfusion.wire.queries import place_of
 from tsfusion.wire.questions import MOST_POINTS, Answer, Cells, Keyframes
 
@@ -280,9 +280,10 @@ class MapWatcher:
         """Reason why there is nothing to see; empty = there is, None = nobody knows yet."""
         if problem := self._inquiry.problem:
             return problem
-        if self._inquiry.watches is False:
-            return f"the server at {self.address} is older and cannot be watched: update it"
-        if self._inquiry.watches is None or self._health is None:
+        version = self._inquiry.version
+        if version is not None and (other := other_version(server=version, client=PROTOCOL_VERSION)):
+            return f"the map at {self.address} cannot be watched: {other}"
+        if version is None or self._health is None:
             return None
         own = self._health.maps.get(self._map)
         if own is None:

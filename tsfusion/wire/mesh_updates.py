@@ -17,7 +17,7 @@ from tsfusion.wire.record_header import SessionId, TransformRows
 
 
 class MeshUpdate(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """Facts about a mesh update. An older server sends none.
+    """Facts about a mesh update.
 
     Attributes:
         epoch: process of the server that fuses the map; a new one begins all numbers again.

@@ -20,7 +20,7 @@ from tsfusion.wire.questions import Answer, Question
 from tsfusion.wire.record_header import SessionId, WorldName
 from tsfusion.wire.seal import is_damaged, seal
 
-PROTOCOL_VERSION = 2  # of these messages and of which kinds of records a server takes
+PROTOCOL_VERSION = 3  # of these messages and of which kinds of records a server takes
 # Why a client never sends a keyframe: the reasons in `Ping.skipped`, in words
 SKIP_REASONS = {
     "thinned": "the map was too far behind",
@@ -30,6 +30,15 @@ SKIP_REASONS = {
     "disk": "the spool's disk was full or failed",
 }
 Counts = dict[Annotated[str, Meta(max_length=32)], Annotated[int, Meta(ge=0)]]  # by reason
+
+
+def other_version(*, server: int, client: int) -> str:
+    """Reason why a server and a client do not talk; empty = they speak one version."""
+    if server == client:
+        return ""
+    return (
+        f"the server speaks version {server} of the wire format, this client {client}: update the older one"
+    )
 
 
 def explained(counts: dict[str, int]) -> str:
@@ -150,8 +159,7 @@ class Ping(Struct, frozen=True, tag="ping", omit_defaults=True):
 class Pong(Struct, frozen=True, tag="pong"):
     """The answer to a Ping.
 
-    `corrections_waiting`: as in `MapHealth`, when the map had everything up to `fused`; None = not known, or
-    the server is of an earlier version.
+    `corrections_waiting`: as in `MapHealth`, when the map had everything up to `fused`; None = not known.
     """
 
     epoch: str
@@ -188,7 +196,7 @@ class Elsewhere(Struct, frozen=True):
     control: str = ""
 
 
-class Reply(Struct, frozen=True, tag="reply", kw_only=True):
+class Reply(Struct, frozen=True, tag="reply", kw_only=True, omit_defaults=True):
     """The answer to a Command; arrays of a mesh follow as raw frames."""
 
     name: str
@@ -202,8 +210,7 @@ class Reply(Struct, frozen=True, tag="reply", kw_only=True):
     moved: Moved | None = None
     elsewhere: Elsewhere | None = None  # where the command's map is, if another server has it
     parcel: Parcel | None = None  # of `hand_over`
-    asks: bool = False  # of a ping: whether this server's maps can be asked; an older one's cannot
-    watches: bool = False  # likewise: whether its maps can be watched (`questions.Cells` and `Keyframes`)
+    version: int = 2  # of a ping: the server's `PROTOCOL_VERSION`, which servers of version 2 leave out
     number: int = 0  # of the question
     late: bool = False  # whether its time was over
     answer: Answer | None = None  # arrays follow as frames

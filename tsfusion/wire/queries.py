@@ -2,7 +2,6 @@
 """Queries to a running server: its health, the status of a map, the mesh of a map."""
 
 import time
-from collections.abc import Sequence
 from contextlib import closing, suppress
 from typing import Any
 
@@ -202,7 +201,7 @@ def _request_if_present(
     *,
     follow: bool = True,
 ) -> tuple[Reply, list[memoryview]]:
-    """Send a command that may take long to answer, after a ping has shown that the server is there.
+    """Send a command, also to the server that its map has moved to.
 
     Args:
         follow: ask the server that the map is at, where the first one says so.
@@ -211,8 +210,6 @@ def _request_if_present(
     for hops_left in reversed(range(_MOST_HOPS + 1)):
         place = control_address(address, control)
         name = f"{address} (control {place})"
-        if timeout > _PING_TIMEOUT:
-            request(place, Command(name="ping"), timeout=_PING_TIMEOUT, keys=keys, name=name)
         try:
             reply, frames = request(place, command, timeout=timeout, keys=keys, name=name)
         except CommandRefused as error:
@@ -292,7 +289,7 @@ def request(
     """
     address = sockets.connect_address(address)
     with sockets.open_context() as context, closing(open_connection(context, address, keys)) as connection:
-        exchange = Exchange(connection, [[messages.encode_sealed(command)]], name)
+        exchange = Exchange(connection, [messages.encode_sealed(command)], name)
         reply, frames = exchange.reply(timeout)
     if reply.error is not None:
         raise CommandRefused(name or address, reply.error, retry=reply.retry, elsewhere=reply.elsewhere)
@@ -308,12 +305,18 @@ def open_connection(context: "zmq.Context[Any]", address: str, keys: ClientKeys 
 
 
 class Exchange:
-    """Messages sent on each connection that is made, until the replies to them have come."""
+    """A ping and a message, sent on each connection that is made, until the reply to the message has come.
 
-    def __init__(self, connection: Connection, sent: Sequence[list[Any]], name: str = "") -> None:
-        self._connection, self._sent = connection, sent
+    Attributes:
+        is_there: whether the server has answered the ping; it is never too busy for that.
+    """
+
+    def __init__(self, connection: Connection, sent: list[Any], name: str = "") -> None:
+        self.is_there = False
+        self._connection, self._sent = connection, ([messages.encode_sealed(Command(name="ping"))], sent)
         self._name = name or connection.address  # of the server, in errors
         self._asked = 0  # on which connection
+        self._pings = False  # whether the ping's answer is still to come
         self._why = ""  # there is none
 
     def reply(self, timeout: float) -> tuple[Reply, list[memoryview]]:
@@ -321,9 +324,20 @@ class Exchange:
 
         Raises:
             NotAllowed: as soon as the server turns the connection away.
-            ServerUnreachable: when nobody answered within `timeout` seconds.
-            TransportError: when what answers is no tsfusion server.
+            ServerUnreachable: when nobody answered within `timeout` seconds, or the ping in a few.
+            TransportError: when what answers is no tsfusion server, or one of another version.
         """
+        deadline = time.monotonic() + timeout
+        while True:
+            left = max(deadline - time.monotonic(), 0.0)
+            reply, frames = self._next(left if self.is_there else min(left, _PING_TIMEOUT))
+            if reply.name != "ping" or not self._pings:
+                return reply, frames
+            if other := messages.other_version(server=reply.version, client=messages.PROTOCOL_VERSION):
+                raise TransportError(f"cannot ask {self._name}: {other}")
+            self.is_there, self._pings = True, False
+
+    def _next(self, timeout: float) -> tuple[Reply, list[memoryview]]:
         address = self._name
         try:
             head, *frames = self._receive(min(timeout, _MAX_TIMEOUT_S))
@@ -344,7 +358,7 @@ class Exchange:
             if events & zmq.POLLIN:
                 return link.recv_multipart(copy=False)
             if events & zmq.POLLOUT:
-                self._asked = connection.made
+                self._asked, self._pings = connection.made, True
                 with suppress(zmq.Again):  # the connection has ended: all is sent on the next one
                     for message in self._sent:
                         link.send_multipart(message, zmq.NOBLOCK)
@@ -354,6 +368,6 @@ class Exchange:
                 raise (NotAllowed if connection.refused else TransportError)(self._why)
         reason = f": {self._why}" if self._why else ""
         raise ServerUnreachable(
-            f"no server answered at {self._name} within {timeout:.3g} s{reason}; is `tsfusion serve` "
+            f"no server answered at {self._name} within {round(timeout, 2):g} s{reason}; is `tsfusion serve` "
             "running there, and is the port right?"
         )

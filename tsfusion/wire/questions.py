@@ -79,7 +79,7 @@ class Raycast(Struct, frozen=True, tag="raycast", omit_defaults=True):
         pose: the 16 numbers of T_world_camera, row by row.
         shape: height, width, pixels.
         max_age: seconds since which the state of the map that is shown may not be the newest any more.
-        normals, colors: whether with them. A server of an earlier version sends them anyway.
+        normals, colors: whether with them.
     """
 
     intrinsics: tuple[float, float, float, float]

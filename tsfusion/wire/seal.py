@@ -3,7 +3,7 @@
 
 TCP's own checksum misses one damaged segment in 65536, and a relay may damage what it carries between two
 connections. Keys authenticate every byte; without keys, a number or a pose would be changed unnoticed.
-Readers that do not know the entry skip it; a message without one is an older version's.
+Readers that do not know the entry skip it; a message may be without one.
 """
 
 import zlib
