@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Two overlapping halves of a recording, the second from an unknown start, aligned and merged.
 
-    python scripts/alignment.py RECORDING [--voxel-size 0.02] [--overlap 0.12] [--seeds 3] [--picture PNG]
-    python scripts/alignment.py RECORDING --other RECORDING
+    python lab/evaluation/alignment.py RECORDING [--voxel-size 0.02] [--overlap 0.12] [--seeds 3]
+                                                  [--picture PNG]
+    python lab/evaluation/alignment.py RECORDING --other RECORDING
 
 Every other frame is fused; what the frames between them measured is the reference. Prints one JSON line a
 seed: overlap and contradictions, the mean distance of the second half from where the recording's own poses
@@ -29,8 +30,8 @@ from tsfusion.evaluation.surface_fit import nearest
 from tsfusion.geometry import se3
 from tsfusion.pipelines import map_alignment, mesh_preview
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
-sys.path.append(str(Path(__file__).parents[1]))  # lab is not installed
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "support"))
+sys.path.append(str(Path(__file__).parents[2]))  # lab is not installed
 from journaled_maps import recorded, unknown_start
 
 from lab.evaluation import surface_error

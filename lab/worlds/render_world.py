@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Render a synthetic world into files, once: a drive along a KITTI path, or a desk filmed by hand.
 
-    python scripts/render_world.py kitti07 --kitti ~/kitti --out ~/drives/kitti07
+    python lab/worlds/render_world.py kitti07 --kitti ~/kitti --out ~/drives/kitti07
     tsfusion scan ~/drives/kitti07
-    python scripts/render_world.py desk --out ~/drives/desk
+    python lab/worlds/render_world.py desk --out ~/drives/desk
 
 A drive is written in the layout of KITTI's odometry benchmark, the desk in CoRBS'. The folder appears when
 it is whole; a run that was interrupted goes on where it stopped. 1101 pairs take ten minutes on one core.
@@ -15,7 +15,7 @@ import sys
 import time
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
+sys.path.append(str(Path(__file__).parents[2]))  # lab is not installed
 
 from lab.worlds.desk_world import STEPS, Desk
 from lab.worlds.rendered_recordings import record

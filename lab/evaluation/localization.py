@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Trajectory error of every localizer on every scene, in one table.
 
-    python scripts/localization.py                  all scenes
-    python scripts/localization.py --only kitchen   those whose name holds it
-    python scripts/localization.py --json           a JSON line a scene instead
-    python scripts/localization.py --write-docs     the tables of docs/localization.md
+    python lab/evaluation/localization.py                  all scenes
+    python lab/evaluation/localization.py --only kitchen   those whose name holds it
+    python lab/evaluation/localization.py --json           a JSON line a scene instead
+    python lab/evaluation/localization.py --write-docs     the tables of docs/localization.md
 
 Recorded scenes are found under TSFUSION_DATA (default ../shared/data); missing ones are reported.
 Every scene runs in a fresh process, with one thread: `cpu_ms` is processor time of the localizer a frame,
@@ -29,14 +29,14 @@ from typing import Any, NamedTuple
 
 os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"))
 
-import _odometry_peers
 import msgspec
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
-sys.path.append(str(Path(__file__).parents[1]))  # lab is not installed
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "support"))
+sys.path.append(str(Path(__file__).parents[2]))  # lab is not installed
 from drifting_localizer import Drifting
 
 from lab.bench.peers import DATA, surroundings
+from lab.evaluation import odometry_peers
 from tsfusion import open_dataset
 from tsfusion.cli.ate import table
 from tsfusion.core import process
@@ -50,8 +50,8 @@ from tsfusion.scanner.localization.loop_closure.loop_closing import LoopClosing
 from tsfusion.scanner.sources.recorded import RecordedSource
 from tsfusion.scanner.tracked_trajectory import TrackedTrajectory
 
-DOCS = Path(__file__).parents[1] / "docs" / "localization.md"
-BEGIN, END = "<!-- table: python scripts/localization.py --write-docs -->", "<!-- end of table -->"
+DOCS = Path(__file__).parents[2] / "docs" / "localization.md"
+BEGIN, END = "<!-- table: python lab/evaluation/localization.py --write-docs -->", "<!-- end of table -->"
 
 
 class Scene(NamedTuple):
@@ -61,7 +61,7 @@ class Scene(NamedTuple):
         loops: whether loops are closed.
         drifting: the true poses with drift added, as the tests of loop closure add it, instead of a
             tracker's.
-        peer: another library's odometry instead, by its class in _odometry_peers.py.
+        peer: another library's odometry instead, by its class in odometry_peers.py.
         bar: metres of RMSE, or percent of drift for `stereo`, that it must stay under; None = none is set.
     """
 
@@ -202,7 +202,7 @@ def _localizer(scene: Scene, first: Frame) -> Localizer:
     if scene.drifting:
         return LoopClosing(Drifting())
     if scene.peer:
-        made: Localizer = getattr(_odometry_peers, scene.peer)()
+        made: Localizer = getattr(odometry_peers, scene.peer)()
         return made
     return registry.create_localizer(ScanConfig(localizer=scene.localizer, loop_closure=scene.loops), first)
 

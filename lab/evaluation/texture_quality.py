@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: MIT
 """How sharp a map's colours are: what it shows a camera against what that camera saw, one JSON line a method.
 
-    python scripts/texture_quality.py DATASET                      # every fifth frame is held out
-    python scripts/texture_quality.py DATASET --open3d --pictures views
-    python scripts/texture_quality.py synthetic:room --voxel-size 0.04
-    python scripts/texture_quality.py DATASET --choose             # settings are chosen on views of their own
+    python lab/evaluation/texture_quality.py DATASET                      # every fifth frame is held out
+    python lab/evaluation/texture_quality.py DATASET --open3d --pictures views
+    python lab/evaluation/texture_quality.py synthetic:room --voxel-size 0.04
+    python lab/evaluation/texture_quality.py DATASET --choose             # settings chosen on other views
 
 The frames held out are in no map and in no texture. All methods are compared on the same pixels: those where
 the mesh lies within 5 cm of the depth measured there, at least two pixels from an edge of that depth, where
@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-sys.path.append(str(Path(__file__).parents[1]))  # lab is not installed
+sys.path.append(str(Path(__file__).parents[2]))  # lab is not installed
 
 from lab.bench.peers import Open3D, surroundings
 from lab.evaluation import view_colors
