@@ -27,6 +27,21 @@ ROWS = (
     ("core",),
 )
 
+# Folders of a wing, top to bottom. A room imports from those behind it, and from the folder that holds it.
+ROOMS = {
+    "datasets": ("formats", "rosbag", "synthetic", "download"),
+    "pipelines": ("report",),
+    "scanner": ("sources", "localization"),
+    "scanner.localization": ("rgbd", "stereo", "loop_closure", "pose_feed"),
+}
+
+# Files that import one another in a circle, types included. A circle that is opened leaves the list.
+CIRCLES = [
+    "geometry: mesh mesh_cropping mesh_encoding mesh_simplification up_direction",
+    "tsdf: block_store device_blocks device_integrator device_trial integrator",
+    "viewer: browser_panel live_page",
+]
+
 # All others run where there is no Taichi, and answer while kernels run.
 MAY_REACH_TAICHI = (
     *(
@@ -71,13 +86,13 @@ def is_for_types(node: ast.AST) -> bool:
 
 
 @cache
-def imports(name: str, *, loading: bool = False) -> frozenset[str]:
-    """Every absolute name it imports, type-only ones left out; `loading`: those inside functions too."""
+def imports(name: str, *, loading: bool = False, types: bool = False) -> frozenset[str]:
+    """Every absolute name it imports; `loading`: none inside functions; `types`: those for types too."""
     tree = parsed(name)
     left_out = {
         id(inner)
         for node in ast.walk(tree)
-        if is_for_types(node) or (loading and isinstance(node, ast.FunctionDef))
+        if (is_for_types(node) and not types) or (loading and isinstance(node, ast.FunctionDef))
         for statement in node.body
         for inner in ast.walk(statement)
     }
@@ -94,10 +109,10 @@ def imports(name: str, *, loading: bool = False) -> frozenset[str]:
     return frozenset(found)
 
 
-def own_imports(name: str, *, loading: bool = False) -> set[str]:
+def own_imports(name: str, *, loading: bool = False, types: bool = False) -> set[str]:
     """The package's modules it imports, by dotted name inside the package."""
     found = set()
-    for target in imports(name, loading=loading):
+    for target in imports(name, loading=loading, types=types):
         head, *parts = target.split(".")
         if head != "tsfusion":
             continue
@@ -149,6 +164,48 @@ def test_imports_go_down() -> None:
         if wing(target) != wing(name) and row(target) <= row(name)
     ]
     assert not upward
+
+
+def rooms_of(name: str) -> dict[str, str]:
+    """Folder → the room of it that a module stands in."""
+    parts = name.split(".")[:-1]
+    return {".".join(parts[:depth]): parts[depth] for depth in range(1, len(parts))}
+
+
+def test_rooms_import_down() -> None:
+    found = {(folder, room) for name in INSIDE for folder, room in rooms_of(name).items()}
+    assert found == {(folder, room) for folder, rooms in ROOMS.items() for room in rooms}
+    upward = [
+        f"tsfusion.{name} imports {target}, whose room is above"
+        for name in INSIDE
+        for target in sorted(own_imports(name, types=True))
+        for folder, room in rooms_of(name).items()
+        if (there := rooms_of(target).get(folder)) and ROOMS[folder].index(there) < ROOMS[folder].index(room)
+    ]
+    assert not upward
+
+
+def test_files_import_one_another_in_no_new_circle() -> None:
+    """Imports inside functions and for types count."""
+    direct = {name: own_imports(name, types=True) for name in INSIDE}
+
+    @cache
+    def reached(start: str) -> frozenset[str]:
+        seen: set[str] = set()
+        waiting = [start]
+        while waiting:
+            new = direct[waiting.pop()] - seen
+            seen |= new
+            waiting.extend(new)
+        return frozenset(seen)
+
+    circles = {
+        tuple(sorted(other for other in reached(name) if name in reached(other)))
+        for name in INSIDE
+        if name in reached(name)
+    }
+    shown = [f"{wing(one[0])}: {' '.join(name.partition('.')[2] for name in one)}" for one in circles]
+    assert sorted(shown) == CIRCLES
 
 
 def test_no_module_needs_what_is_not_installed() -> None:

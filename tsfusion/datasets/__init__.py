@@ -2,6 +2,12 @@
 """Recorded and synthetic datasets: sequences of keyframes, loaded one at a time.
 
 Any object with `__len__` and `__getitem__` that follows the `Dataset` protocol can be replayed.
+
+Rooms:
+    formats: readers of recording layouts, one file each.
+    rosbag: ROS 1 and ROS 2 bags and MCAP files as datasets, without ROS.
+    synthetic: worlds with a known surface, rendered as keyframes.
+    download: public recordings: downloaded, checked and unpacked.
 """
 
 from pathlib import Path

@@ -1,2 +1,0 @@
-# SPDX-License-Identifier: MIT
-"""Download public recordings, check and unpack them."""

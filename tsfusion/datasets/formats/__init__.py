@@ -1,2 +1,0 @@
-# SPDX-License-Identifier: MIT
-"""Readers of recording layouts, one file each."""

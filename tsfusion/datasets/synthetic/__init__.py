@@ -1,2 +1,0 @@
-# SPDX-License-Identifier: MIT
-"""Synthetic worlds with a known surface, rendered as keyframes."""

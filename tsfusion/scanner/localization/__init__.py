@@ -1,2 +1,0 @@
-# SPDX-License-Identifier: MIT
-"""Localizers: where the sensor is, frame by frame."""

@@ -1,2 +1,0 @@
-# SPDX-License-Identifier: MIT
-"""Poses that another process publishes over ZeroMQ."""

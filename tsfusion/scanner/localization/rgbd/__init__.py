@@ -1,2 +1,0 @@
-# SPDX-License-Identifier: MIT
-"""The localizer of RGB-D cameras: corners and planes together."""

@@ -1,2 +1,0 @@
-# SPDX-License-Identifier: MIT
-"""The localizer of stereo pairs, with a check of their rectification."""
