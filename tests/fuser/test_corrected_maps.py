@@ -18,7 +18,7 @@ from hypothesis import settings as given_settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, rule, run_state_machine_as_test
 from keyframes_and_servers import VOLUME, pose, wall
-from test_fuser import Link, opened
+from test_fuser import Link, is_due, opened
 
 from tsfusion import Keyframe, Volume, journal
 from tsfusion.core.config import SERVER_SESSION
@@ -74,8 +74,8 @@ class Recorded:
 def find(fuser: Fuser, link: Link, **selection: Any) -> messages.Found:
     """The keyframes of a selection."""
     fuser.handle(messages.Find(7, Selection(**selection)))
-    while fuser.search_due(idle=True):
-        fuser.search()
+    while is_due(fuser, "search"):
+        fuser.chores["search"].do()
     found = link.last()
     assert isinstance(found, messages.Found)
     return found
@@ -105,8 +105,8 @@ def positions(found: messages.Found) -> list[Position]:
 def settle(fuser: Fuser) -> int:
     """Move what waits; the number of moves."""
     moves = 0
-    while fuser.move_due(idle=True):
-        fuser.move()
+    while is_due(fuser, "move"):
+        fuser.chores["move"].do()
         moves += 1
     return moves
 
@@ -141,7 +141,7 @@ def test_corrected_keyframes_are_fused_where_they_were_taken(recorded: Recorded)
     assert (last.waiting, last.keyframes, last.removed, last.moved) == (0, 4, 1, 3)
     assert fuser._volume.map_hash() == recorded.fresh().map_hash()
     assert fuser._volume.color_hash() == recorded.fresh().color_hash()
-    assert fuser.mesh_due(idle=True)
+    assert is_due(fuser, "mesh")
 
 
 def test_what_was_removed_comes_back_where_a_later_correction_says(recorded: Recorded) -> None:
@@ -161,16 +161,16 @@ def test_the_farthest_move_first_and_none_that_is_none(recorded: Recorded) -> No
     order = []
     while (move := fuser._map.poses.next()) is not None:
         order.append(move.seq)
-        fuser.move()
+        fuser.chores["move"].do()
     assert order == [3, 4, 2]
 
 
 def test_a_checkpoint_knows_where_each_keyframe_was_fused(recorded: Recorded) -> None:
     recorded.correct({1: pose(0.5), 2: pose(0.7), 4: pose(-0.4)}, removed=(3,), T=pose(0, 1.0))
     fuser, _ = fused(recorded)
-    fuser.move()
+    fuser.chores["move"].do()
     fuser.handle(messages.Save())
-    fuser.move()  # this one is lost
+    fuser.chores["move"].do()  # this one is lost
     recorded.add()
     again, _ = fused(recorded, first=5)
     assert again.ready().moves is not None
@@ -186,9 +186,9 @@ def test_moves_wait_for_keyframes_and_take_a_part_of_the_time(
     fuser, _ = fused(recorded)
     now = 1000.0
     monkeypatch.setattr("tsfusion.fuser.pose_mover.time.monotonic", lambda: now)
-    fuser.move()
+    fuser.chores["move"].do()
     monkeypatch.setattr("tsfusion.fuser.pose_mover.time.monotonic", lambda: now + 100.0)
-    assert fuser.move_due(idle=False)
+    assert is_due(fuser, "move", idle=False)
 
 
 def test_a_keyframe_that_left_the_journal_stays_and_is_counted(
@@ -219,10 +219,10 @@ def test_a_journal_folder_without_any_segment_is_waited_for_and_then_given_up(
     fuser, link = fused(recorded)
     for path in (recorded.state / "journal").iterdir():
         path.unlink()
-    fuser.move()
+    fuser.chores["move"].do()
     assert fuser._mover.waiting == 1
     monkeypatch.setattr("tsfusion.fuser.pose_mover._PATIENCE_S", 0.0)
-    fuser.move()
+    fuser.chores["move"].do()
     assert (progress(link).waiting, progress(link).unavailable) == (0, 1)
 
 
@@ -232,7 +232,7 @@ def test_what_the_journal_deleted_takes_no_room(tmp_path: Path) -> None:
         recorded.add()
     recorded.correct({1: pose(0.5), 2: pose(0.6)}, removed=(3,))
     fuser, link = fused(recorded)
-    fuser.move()
+    fuser.chores["move"].do()
     recorded.journal.close()
     for number in range(1, 5):
         (tmp_path / "journal" / f"{number:06d}.mcap").unlink()
@@ -240,7 +240,7 @@ def test_what_the_journal_deleted_takes_no_room(tmp_path: Path) -> None:
     poses = fuser._map.poses
     assert poses._sessions[SESSIONS[0]].seqs.tolist() == [5, 6]
     assert (poses.waiting, poses.unavailable, poses.removed, poses.next()) == (0, 2, 1, None)
-    assert not fuser.move_due(idle=True)
+    assert not is_due(fuser, "move")
     again, _ = opened(tmp_path)
     assert again.ready().moves == msgspec.structs.replace(progress(link), moved=0, seconds=0.0)
     again._map.poses.correct(SESSIONS[0], corrections.checked({4: pose(1.0), 5: pose(1.0)}))
@@ -258,10 +258,11 @@ def test_a_journal_that_cannot_be_read_for_now_is_waited_for(
         patch.setattr(
             journal.segments_module if hasattr(journal, "segments_module") else journal, "read", _eio
         )
-        fuser.move()
-    assert not fuser.move_due(idle=True)
-    assert fuser.wait_ms is not None
-    assert 0 < fuser.wait_ms < 1000
+        fuser.chores["move"].do()
+    assert not is_due(fuser, "move")
+    wait = fuser.chores["move"].wait(True)
+    assert wait is not None
+    assert 0 < wait < 1
     monkeypatch.setattr("tsfusion.fuser.pose_mover._RETRY_S", 0.0)
     fuser._mover._next = 0.0
     assert settle(fuser) == 1
@@ -405,9 +406,9 @@ def expired(link: Link) -> messages.Found | None:
 
 def journal_expired(recorded: Recorded, fuser: Fuser, link: Link) -> None:
     """Do as the gateway does with keyframes that are to leave."""
-    while fuser.search_due(idle=True):
+    while is_due(fuser, "search"):
         before = len(link.sent)
-        fuser.search()
+        fuser.chores["search"].do()
         for found in (one for one, _ in link.sent[before:] if isinstance(one, messages.Found)):
             for session, seqs in found_numbers(found).items():
                 recorded.forget(session, seqs)
@@ -555,8 +556,8 @@ class Life(RuleBasedStateMachine):
     @rule(count=st.integers(1, 3))
     def move(self, count: int) -> None:
         for _ in range(count):
-            if self.fuser.move_due(idle=True):
-                self.fuser.move()
+            if is_due(self.fuser, "move"):
+                self.fuser.chores["move"].do()
 
     @rule()
     def save(self) -> None:

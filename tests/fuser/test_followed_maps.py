@@ -78,7 +78,7 @@ class Process:
 
     def settle(self) -> None:
         """Do what the fuser does while nothing comes."""
-        if self.live.is_due(idle=True):
+        if self.live.wait(idle=True) == 0:
             self.live.update()
         while self.live.refine_waits:
             self.live.refine()

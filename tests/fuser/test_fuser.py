@@ -34,7 +34,7 @@ from tsfusion.core.config import CacheConfig, override
 from tsfusion.fuser import __main__ as fuser_main
 from tsfusion.fuser import messages, opened_map
 from tsfusion.fuser.current_keyframe import CurrentKeyframe
-from tsfusion.fuser.fuser import Fuser
+from tsfusion.fuser.fuser import Chore, Fuser
 from tsfusion.fuser.map_checkpoints import MapCheckpoints
 from tsfusion.journal import Journal, Position, segment_path
 from tsfusion.journal.state_folder import MAP_FILE, PREVIOUS_FILE
@@ -96,6 +96,29 @@ def opened(state: Path, volume: VolumeConfig = VOLUME, **settings: Any) -> tuple
     return Fuser(link, begin), link  # type: ignore[arg-type]
 
 
+def is_due(fuser: Fuser, chore: str, *, idle: bool = True) -> bool:
+    return fuser.chores[chore].wait(idle) == 0
+
+
+def test_the_first_chore_that_is_due_is_done(tmp_path: Path) -> None:
+    fuser, _ = opened(tmp_path)
+    assert list(fuser.chores) == ["mesh", "search", "move", "prepare", "warm", "refine", "retry"]
+    assert [name for name, chore in fuser.chores.items() if not chore.when_idle] == ["mesh", "search", "move"]
+    done: list[str] = []
+    waits: dict[str, float | None] = {"late": 3.0, "never": None, "idle": 0.0, "always": 0.0, "behind": 0.0}
+
+    def chore(name: str) -> Chore:
+        return Chore(lambda _: waits[name], lambda: done.append(name), when_idle=name == "idle")
+
+    fuser.chores = {name: chore(name) for name in waits}
+    assert [fuser.do_chore(idle=idle) for idle in (False, True)] == [0.0, 0.0]
+    assert done == ["always", "idle"]
+    waits.update(idle=2.0, always=None, behind=None)
+    assert [fuser.do_chore(idle=idle) for idle in (False, True)] == [3.0, 2.0]
+    waits.update(late=None, idle=None)
+    assert fuser.do_chore(idle=True) is None
+
+
 def test_kernels_of_questions_are_compiled_while_there_is_nothing_else(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -110,18 +133,19 @@ def test_kernels_of_questions_are_compiled_while_there_is_nothing_else(
 
     monkeypatch.setattr(tsfusion.Volume, "warming_up", warming_up)
     position, fuser, _ = opened_with_one(tmp_path)
-    assert not fuser_main._do_some(fuser, idle=True)  # a keyframe may be near
-    assert fuser.warm_wait_ms is not None
-    assert 0 < fuser.warm_wait_ms <= 1001
+    assert fuser.do_chore(idle=True) != 0  # a keyframe may be near
+    wait = fuser.chores["warm"].wait(True)
+    assert wait is not None
+    assert 0 < wait <= 1
     monkeypatch.setattr("tsfusion.fuser.live_mesh._QUIET_S", 0.0)
     fuser.handle(order(0, position))
-    fuser.mesh()
-    assert not fuser_main._do_some(fuser, idle=False)
+    fuser.chores["mesh"].do()
+    assert fuser.do_chore(idle=False) != 0
     assert compiled == ["keyframes"]
-    while fuser.warm_due:
-        assert fuser_main._do_some(fuser, idle=True)
+    while is_due(fuser, "warm"):
+        assert fuser.do_chore(idle=True) == 0
     assert compiled == ["keyframes", "questions", "slices"]
-    assert not fuser_main._do_some(fuser, idle=True)
+    assert fuser.do_chore(idle=True) != 0
 
 
 def opened_with_one(state: Path) -> tuple[Position, Fuser, Link]:
@@ -141,13 +165,13 @@ def test_keyframes_are_fused_meshed_and_checkpointed(tmp_path: Path) -> None:
     positions = fill(tmp_path, 3)
     fuser, link = opened(tmp_path)
     assert fuser.ready().done == {}
-    assert not fuser.mesh_due(idle=True)
+    assert not is_due(fuser, "mesh")
     for index, position in enumerate(positions):
         fuser.handle(order(index, position))
         done = link.last()
         assert (done.index, done.reason, done.fused_ns > done.fuse_start_ns > 0) == (index, None, True)
-    assert fuser.mesh_due(idle=True)
-    fuser.mesh()
+    assert is_due(fuser, "mesh")
+    fuser.chores["mesh"].do()
     assert (link.last().count, link.sent[-1][1]) == (3, [])
     fuser.handle(messages.Finish())
     assert fuser.exit_status == 0
@@ -173,7 +197,7 @@ def test_a_map_whose_blocks_wait_on_the_disk_is_the_same_and_goes_on(
     fuser, link = opened(tmp_path, fine, **limits)
     for index, position in enumerate(positions[:2]):
         fuser.handle(order(index, position))
-    fuser.mesh()
+    fuser.chores["mesh"].do()
     fuser.handle(messages.Finish())
     again, link = opened(tmp_path, fine, **limits)
     for index, position in enumerate(positions):
@@ -201,7 +225,7 @@ def test_watchers_get_the_triangles(tmp_path: Path) -> None:
     position, fuser, link = opened_with_one(tmp_path)
     fuser.handle(messages.Publish(True))
     fuser.handle(order(0, position))
-    fuser.mesh()
+    fuser.chores["mesh"].do()
     meshed, frames = link.sent[-1]
     assert isinstance(meshed, Meshed)
     assert meshed.layout is not None
@@ -213,7 +237,7 @@ def test_nothing_is_meshed_while_nobody_watches(tmp_path: Path, monkeypatch: pyt
     with monkeypatch.context() as patched:
         patched.setattr(tsfusion.Volume, "mesh_cells", raising(AssertionError("meshed for nobody")))
         fuser.handle(order(0, position))
-        fuser.mesh()
+        fuser.chores["mesh"].do()
     meshed, frames = link.sent[-1]
     assert isinstance(meshed, Meshed)
     assert (meshed.layout, frames) == (None, [])
@@ -229,19 +253,19 @@ def test_what_was_meshed_as_fused_is_refined_bit_by_bit(
     position, fuser, link = opened_with_one(tmp_path)
     fuser.handle(messages.Publish(True))
     fuser.handle(order(0, position))
-    fuser.mesh()
+    fuser.chores["mesh"].do()
     before = len(link.sent)
-    while fuser.refine_due:
-        fuser.refine()
+    while is_due(fuser, "refine"):
+        fuser.chores["refine"].do()
     refined = link.sent[before:]
     assert len(refined) > 1
     whole = fuser._volume.extract_mesh()
     assert sum(meshed.layout.faces for meshed, _ in refined) == len(whole.faces) > 0
     cells = np.concatenate([np.frombuffer(frames[0], np.int32).reshape(-1, 3) for _, frames in refined])
     assert len(np.unique(cells, axis=0)) == len(cells)
-    fuser.mesh()
+    fuser.chores["mesh"].do()
     fuser.handle(messages.Publish(False))
-    assert not fuser.refine_due
+    assert not is_due(fuser, "refine")
 
 
 def test_what_cannot_be_fused_is_counted_also_after_a_restart(tmp_path: Path) -> None:
@@ -269,7 +293,7 @@ def test_corrections_are_answered_before_they_move_the_map(tmp_path: Path) -> No
     for index, reason in ((1, None), (2, "header")):
         fuser.handle(msgspec.structs.replace(order(index, positions[index]), is_correction=True))
         assert link.done().reason == reason
-    fuser.mesh()
+    fuser.chores["mesh"].do()
     assert link.last().count == 3
     assert status(fuser, link) == before
     again, link_again = opened(tmp_path)

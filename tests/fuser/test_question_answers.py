@@ -297,7 +297,7 @@ class Growing:
 
     def prepare(self) -> None:
         deadline = time.monotonic() + 60
-        while self.views.wait_s is not None:
+        while self.views.wait() is not None:
             assert time.monotonic() < deadline
             self.views.prepare()
 
@@ -348,9 +348,9 @@ def test_views_are_prepared_only_while_somebody_asks_for_such() -> None:
     map_.add(0)
     map_.assert_shows(0.0, 1)
     map_.add(1)
-    assert map_.views.wait_s is None
+    assert map_.views.wait() is None
     map_.assert_shows(5.0, 1)
-    assert map_.views.wait_s is not None
+    assert map_.views.wait() is not None
     map_.volume.retract(wall(1))
     map_.volume.release_empty()  # blocks have gone: nothing is kept of before
     map_.assert_shows(5.0, 1)
@@ -364,11 +364,11 @@ def test_preparing_gives_way_to_a_question(desk: Desk, volume: Volume) -> None:
     try:
         desk.put(asked(1))
         desk.answers.prepare()
-        assert desk.answers.views.wait_s is not None  # not done
+        assert desk.answers.views.wait() is not None  # not done
         assert not desk.numbers
         desk.answers.give()
         assert desk.numbers == [1]
-        while desk.answers.views.wait_s is not None:
+        while desk.answers.views.wait() is not None:
             desk.answers.prepare()
     finally:
         volume.set_pause(lambda: None)

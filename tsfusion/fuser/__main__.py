@@ -50,10 +50,7 @@ def _remove_scratch_folder(endpoint: str) -> None:
 
 
 def _serve(link: sockets.AnySocket) -> int:
-    """Handle messages, mesh when it is time, refine the mesh and compile when there is nothing else to do.
-
-    Questions come before all that.
-    """
+    """Answer questions, do the fuser's chores and handle messages, in this order (`Fuser.chores`)."""
     poller = zmq.Poller()
     poller.register(link, zmq.POLLIN)
     poller.register(sys.stdin.fileno(), zmq.POLLIN)
@@ -63,18 +60,16 @@ def _serve(link: sockets.AnySocket) -> int:
         if fuser is not None:
             fuser.answer()
         idle = not inbox.orders and not poller.poll(fuser.idle_after_ms if fuser is not None else 0)
-        if fuser is not None and _do_some(fuser, idle=idle):
+        wait = None if fuser is None else fuser.do_chore(idle=idle)
+        if wait == 0:
             continue
         if not inbox.orders:
             process.on_parent_end(signal.SIGCONT)  # a stopped process would not notice the gateway's end
-            waits = () if fuser is None else (fuser.wait_ms, fuser.warm_wait_ms)
-            events = dict(poller.poll(min((wait for wait in waits if wait is not None), default=None)))
+            events = dict(poller.poll(None if wait is None else round(1000 * wait) + 1))
             if sys.stdin.fileno() in events:  # nothing is ever written there: the gateway has ended
                 return 1
             if fuser is not None:
                 process.on_parent_end(signal.SIGKILL)
-                if not events:
-                    fuser.go_on()
             inbox.read()
         if not inbox.orders:
             continue
@@ -92,25 +87,6 @@ def _serve(link: sockets.AnySocket) -> int:
             process.on_parent_end(signal.SIGKILL)
             fuser.handle(message)
     return fuser.exit_status
-
-
-def _do_some(fuser: Fuser, *, idle: bool) -> bool:
-    """Do a piece of the work that nobody waits for, if one is due; whether there was one."""
-    if fuser.mesh_due(idle):
-        fuser.mesh()
-    elif fuser.search_due(idle):
-        fuser.search()
-    elif fuser.move_due(idle):
-        fuser.move()
-    elif idle and fuser.prepare_due:
-        fuser.prepare()
-    elif idle and fuser.warm_due:
-        fuser.warm()
-    elif idle and fuser.refine_due:
-        fuser.refine()
-    else:
-        return False
-    return True
 
 
 class _Ahead:

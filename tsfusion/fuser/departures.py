@@ -15,7 +15,7 @@ from tsfusion.journal.keyframe_poses import KeyframePoses
 
 
 class Departures:
-    """The searches of one map. Call `look` when it `is_due`. What is found the gateway writes to the journal.
+    """The searches of one map. Call `look` when `wait` is over: the gateway journals what is found.
 
     Args:
         done: how far the map is with each session.
@@ -48,17 +48,9 @@ class Departures:
         else:
             self.window.expire(message.before_segment)
 
-    @property
-    def wait_ms(self) -> int | None:
-        """Milliseconds to wait for a message at most; None = for ever."""
-        if self._searches:
-            return 0
-        return self.window.wait_ms
-
-    def is_due(self, *, idle: bool) -> bool:
-        if self._searches:
-            return self._searches[0].is_due(idle=idle)
-        return self.window.is_due(idle=idle)
+    def wait(self, idle: bool) -> float | None:
+        """Seconds until it is time to `look`; None = for ever."""
+        return self._searches[0].wait(idle) if self._searches else self.window.wait(idle)
 
     def look(self) -> bool:
         """Look for a moment, and send what was found; whether it was the window that was looked at."""

@@ -8,15 +8,16 @@ the system ends it (Linux), however long the work would take.
 
 import errno
 import logging
+import math
 import os
 import platform
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
 
@@ -51,13 +52,27 @@ _FOR_KEYFRAMES = 256 << 20  # bytes of working memory that meshes leave free
 _FOR_A_CHECKPOINT = 64 << 20  # bytes beyond both
 LOCK = "fuser.lock"  # in the map's folder
 _PATIENCE_S = 10.0  # for a record that the system refuses to read, or whose segment is not there
-_RETRY_MS = 500  # until it is tried again
+_RETRY_S = 0.5  # until it is tried again
 _CARVING = 10  # times `quota_cost` where rays also vote for the free space before them
 # Where keyframes leave as they come, each costs as much as another that comes: half of the time for moves
 _WINDOW_REST_FACTOR = 1.0
 _MORE_MS = 50  # milliseconds within which the next record comes, if the gateway said that one waits
 
 log = logging.getLogger(__name__)
+
+
+class Chore(NamedTuple):
+    """Work that no message asks for, done a piece at a time.
+
+    Attributes:
+        wait: takes whether nothing else is to be done; seconds until a piece is due, 0 = now, None = never.
+        do: does the piece.
+        when_idle: whether it is done only then.
+    """
+
+    wait: Callable[[bool], float | None]
+    do: Callable[[], Any]
+    when_idle: bool = True
 
 
 class Fuser:
@@ -81,6 +96,7 @@ class Fuser:
         self._since_checkpoint = 0
         self._orders: deque[fuser_messages.Fuse] = deque()  # not answered; the first cannot be read for now
         self._held_since: float | None = None  # time.monotonic(); None = nothing is held
+        self._retry_at = 0.0  # time.monotonic(), of what is held
         self._answered = 0  # records of this process
         self._more_waits = False  # at the gateway
         self._epoch = f"{time.monotonic_ns():x}"  # of the answers of this process
@@ -106,13 +122,11 @@ class Fuser:
             epoch=self._epoch,
             on_taken=self._note_taken,
         )
-        self._answers: QuestionAnswers | None = None
-        if inbox is not None:
-            watched = WatchedMap(self._volume, self._map.poses, self._touched_by, self._live_mesh)
-            self._answers = QuestionAnswers(
-                self._volume, inbox, watched, state=self._state, at_work=self._current, send=self._send
-            )
-            self._volume.set_pause(self._answers.give_between)
+        watched = WatchedMap(self._volume, self._map.poses, self._touched_by, self._live_mesh)
+        self._answers = QuestionAnswers(
+            self._volume, inbox or Inbox(), watched, state=self._state, at_work=self._current, send=self._send
+        )
+        self._volume.set_pause(self._answers.give_between)
         self._departures = Departures(begin, self._map.poses, self._map.done, send=self._send)
         window = self._departures.window
         self._mover = PoseMover(
@@ -127,6 +141,40 @@ class Fuser:
             expects=lambda: int(window.is_behind),
             rest_factor=_WINDOW_REST_FACTOR if window.is_set else REST_FACTOR,
         )
+        self.chores = self._chores()
+
+    def _chores(self) -> dict[str, Chore]:
+        """The chores in the order in which they are looked at.
+
+        The process answers questions first, then does a piece of the first chore that is due, and goes round
+        again; with none due it does the work for one message. So those that are done while records wait come
+        from time to time, and the others wait until nothing else is to be done.
+        """
+        mesh, views = self._live_mesh, self._answers.views
+        return {
+            "mesh": Chore(
+                lambda idle: mesh.wait(idle=idle and not self._mover.waiting), mesh.update, when_idle=False
+            ),
+            "search": Chore(self._departures.wait, self._search, when_idle=False),
+            "move": Chore(self._mover.wait, self._move, when_idle=False),
+            "prepare": Chore(lambda _: views.wait(), self._answers.prepare),
+            "warm": Chore(lambda _: None if self._warming is None else mesh.quiet_wait, self._warm),
+            "refine": Chore(lambda _: mesh.refine_wait(), mesh.refine),
+            "retry": Chore(
+                lambda _: max(self._retry_at - time.monotonic(), 0.0) if self.is_held else None, self.go_on
+            ),
+        }
+
+    def do_chore(self, *, idle: bool) -> float | None:
+        """Do a piece of the first chore that is due: 0. Else seconds until one may be; None = never."""
+        waits = []
+        for chore in self.chores.values():
+            wait = chore.wait(idle) if idle or not chore.when_idle else None
+            if wait == 0:
+                chore.do()
+                return 0.0
+            waits.append(math.inf if wait is None else wait)
+        return None if min(waits) == math.inf else min(waits)
 
     def ready(self) -> fuser_messages.Ready:
         """The message that the map is open, and how far it is."""
@@ -140,20 +188,17 @@ class Fuser:
             self._mover.progress(),
         )
 
-    def _note_taken(self, blocks: "NDArray[np.int32]") -> None:
-        if self._answers is not None:
-            self._answers.slices.note_taken(blocks)
-
     def _note_next(self, session: bytes) -> None:
         """Note whose keyframe changes the map next."""
         self._touched_by.note(self._volume.stamp + 1, session)
-        if self._answers is not None:
-            self._answers.views.note_change()
+        self._answers.views.note_change()
+
+    def _note_taken(self, blocks: "NDArray[np.int32]") -> None:
+        self._answers.slices.note_taken(blocks)
 
     def answer(self) -> None:
         """Answer the questions that wait, before anything else is done."""
-        if self._answers is not None:
-            self._answers.give()
+        self._answers.give()
 
     def handle(self, message: fuser_messages.ToFuser) -> None:
         """Do the work for a message of the gateway."""
@@ -173,7 +218,7 @@ class Fuser:
 
     @property
     def is_held(self) -> bool:
-        """Whether records wait for one that cannot be read for now: call `go_on` again and again."""
+        """Whether records wait for one that cannot be read for now."""
         return bool(self._orders)
 
     def go_on(self) -> None:
@@ -183,72 +228,17 @@ class Fuser:
             self._held_since = None
 
     @property
-    def wait_ms(self) -> int | None:
-        """Milliseconds to wait for a message at most; None = for ever."""
-        if self.is_held:
-            return _RETRY_MS
-        waits = [self._departures.wait_ms]
-        if self._live_mesh.refine_waits:
-            waits.append(round(1000 * self._live_mesh.refine_wait) + 1)
-        if self._mover.waiting:
-            waits.append(round(1000 * self._mover.seconds_left) + 1)
-        if self._answers is not None and (wait_s := self._answers.views.wait_s) is not None:
-            waits.append(round(1000 * wait_s) + 1)
-        return min((wait for wait in waits if wait is not None), default=None)
-
-    @property
     def idle_after_ms(self) -> int:
         """Milliseconds without a message after which nothing is to be done but to mesh."""
         return _MORE_MS if self._more_waits else 0
 
-    def mesh_due(self, idle: bool) -> bool:
-        """Whether it is time to call `mesh`: at once when there is nothing else to do."""
-        return self._live_mesh.is_due(idle=idle and not self._mover.waiting)
-
-    def mesh(self) -> None:
-        """Bring the mesh up to date."""
-        self._live_mesh.update()
-
-    @property
-    def warm_due(self) -> bool:
-        """Whether kernels that no keyframe needs are not compiled yet, and none is near that would wait."""
-        return self._warming is not None and not self._live_mesh.quiet_wait
-
-    @property
-    def warm_wait_ms(self) -> int | None:
-        """Milliseconds until `warm` may be due; None = never."""
-        return None if self._warming is None else round(1000 * self._live_mesh.quiet_wait) + 1
-
-    def warm(self) -> None:
-        """Compile some of them, which takes a second at the first start. Call it only while nothing waits."""
+    def _warm(self) -> None:
+        """Compile some kernels that no keyframe needs, which takes a second at the first start."""
         assert self._warming is not None
         if next(self._warming, True):  # the steps yield None
             self._warming = None
 
-    @property
-    def refine_due(self) -> bool:
-        """Whether it is time to mesh some cells again with the surface that the settings ask for."""
-        return self._live_mesh.refine_waits and not self._live_mesh.refine_wait
-
-    def refine(self) -> None:
-        """Mesh some cells again. Call it only while there is nothing else to do."""
-        self._live_mesh.refine()
-
-    @property
-    def prepare_due(self) -> bool:
-        """Whether to work ahead of a question now."""
-        return self._answers is not None and self._answers.views.wait_s == 0.0
-
-    def prepare(self) -> None:
-        """Work ahead of a question. Call it only while there is nothing else to do."""
-        if self._answers is not None:
-            self._answers.prepare()
-
-    def move_due(self, idle: bool) -> bool:
-        """Whether a corrected keyframe is to be fused at its new pose now."""
-        return self._mover.is_due(idle=idle)
-
-    def move(self) -> None:
+    def _move(self) -> None:
         """Fuse a corrected keyframe at its new pose."""
         self._current.set(fuser_messages.MOVING)
         is_done = self._mover.move()
@@ -257,11 +247,7 @@ class Fuser:
             self._live_mesh.note_move()
             self._note_change()
 
-    def search_due(self, idle: bool) -> bool:
-        """Whether to look now for keyframes that are to leave the map."""
-        return self._departures.is_due(idle=idle)
-
-    def search(self) -> None:
+    def _search(self) -> None:
         """Look for keyframes that are to leave the map, for a moment."""
         if self._departures.look():
             self._mover.say()
@@ -361,6 +347,7 @@ class Fuser:
             log.error("%s: another process tries again, from the checkpoint", error)
             self.exit_status = 1  # marked as at work on it
             return True
+        self._retry_at = now + _RETRY_S
         self._current.set(fuser_messages.NOT_WORKING)
         self._send(fuser_messages.Held(str(error)))
         return True

@@ -12,16 +12,20 @@ from tsfusion.wire import sockets
 
 
 class Inbox:
-    """Messages that came over the socket and were not handled yet."""
+    """Messages that came over the socket and were not handled yet.
 
-    def __init__(self, link: sockets.AnySocket) -> None:
+    Args:
+        link: the socket; None = nobody sends any.
+    """
+
+    def __init__(self, link: sockets.AnySocket | None = None) -> None:
         self.orders: deque[ToFuser] = deque()  # in the order of their coming
         self.questions: deque[tuple[FuserQuestion, Sequence[zmq.Frame]]] = deque()
         self._link = link
 
     def read(self) -> None:
         """Take all that has come; never waits."""
-        while int(self._link.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
+        while self._link is not None and int(self._link.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
             head, *frames = self._link.recv_multipart(copy=False)
             message = fuser_messages.to_fuser.decode(head.buffer)
             if isinstance(message, FuserQuestion):

@@ -21,7 +21,7 @@ _PATIENCE_S = 5.0  # for that record to come back
 class KeepWindow:
     """The bounds of a map in time, number and space, all of them against its newest keyframe.
 
-    Call `look` when it `is_due`: what is beyond a bound is told to the gateway, which writes a record that
+    Call `look` when `wait` is over: what is beyond a bound is told to the gateway, which writes a record that
     removes it, as for `tsfusion map forget`. The cost of a look is bounded by what the window holds.
 
     Args:
@@ -71,16 +71,12 @@ class KeepWindow:
         self._before_segment = max(before_segment, self._before_segment)
         self._is_behind = self.is_set
 
-    @property
-    def wait_ms(self) -> int | None:
-        """Milliseconds until `is_due` has to be asked again although nothing comes; None = for ever."""
-        return round(1000 * _INTERVAL_S) if self._is_behind else None
-
-    def is_due(self, *, idle: bool) -> bool:
-        now = time.monotonic()
-        if not self._is_behind or (self._asked is not None and now < self._asked + _PATIENCE_S):
-            return False
-        return idle or now >= self._next
+    def wait(self, idle: bool) -> float | None:
+        """Seconds until it is time for a `look`; None = nothing has come since the last one."""
+        if not self._is_behind:
+            return None
+        from_s = [0.0 if idle else self._next, 0.0 if self._asked is None else self._asked + _PATIENCE_S]
+        return max(max(from_s) - time.monotonic(), 0.0)
 
     def look(self) -> None:
         """Tell which keyframes are beyond a bound."""

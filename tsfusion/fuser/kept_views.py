@@ -63,8 +63,7 @@ class KeptViews:
         self._how, self._kept = how, (self._volume.stamp, self._state())
         return view, self._kept[1]
 
-    @property
-    def wait_s(self) -> float | None:
+    def wait(self) -> float | None:
         """Seconds until there is something to prepare; None = nothing."""
         now = time.monotonic()
         if self._kept is None or self._is_newest or now >= self._wanted_s:

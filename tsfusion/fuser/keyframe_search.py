@@ -26,7 +26,7 @@ _INSIDE = 0.9  # share of a keyframe's points: noise, or a look out of a window,
 
 
 class KeyframeSearch:
-    """One search. Call `go_on` when it `is_due`, until it gives the answer.
+    """One search. Call `go_on` when `wait` is over, until it gives the answer.
 
     Args:
         folder: the map's.
@@ -44,8 +44,9 @@ class KeyframeSearch:
         self._since_ns: int | None = None
         self._first_ns: int | None = None  # of the first record in the journal
 
-    def is_due(self, *, idle: bool) -> bool:
-        return idle or time.monotonic() >= self._next
+    def wait(self, idle: bool) -> float:
+        """Seconds until it is time to go on."""
+        return 0.0 if idle else max(self._next - time.monotonic(), 0.0)
 
     def go_on(self) -> Found | None:
         """Search for a while; the answer when all was looked at."""

@@ -82,9 +82,11 @@ class LiveMesh:
         """Note that a keyframe was moved."""
         self._is_behind = True
 
-    def is_due(self, *, idle: bool) -> bool:
-        """Whether the mesh is behind and it is time for it: at once when idle, otherwise after a pause."""
-        return self._is_behind and (idle or time.monotonic() >= self._next)
+    def wait(self, *, idle: bool) -> float | None:
+        """Seconds until it is time for `update`: at once when idle, otherwise after a pause; None = never."""
+        if not self._is_behind:
+            return None
+        return 0.0 if idle else max(self._next - time.monotonic(), 0.0)
 
     def update(self) -> None:
         """Bring the mesh up to date with the raw surface: it is fast, and the next keyframe may be near.
@@ -137,9 +139,10 @@ class LiveMesh:
         """Seconds until no record has come for so long that the next one is not near."""
         return max(self._quiet_from - time.monotonic(), 0.0)
 
-    @property
-    def refine_wait(self) -> float:
-        """Seconds until it is time to refine some: a keyframe that comes meanwhile would have to wait."""
+    def refine_wait(self) -> float | None:
+        """Seconds until it is time for `refine`, during which a keyframe would have to wait; None = never."""
+        if not self.refine_waits:
+            return None
         return max(min(self._quiet_from, self._next_refined) - time.monotonic(), 0.0)
 
     def refine(self) -> None:

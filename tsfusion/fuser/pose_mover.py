@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 
 
 class PoseMover:
-    """The work that corrections make. Call `move` when it is `is_due`.
+    """The work that corrections make. Call `move` when `wait` is over.
 
     Args:
         integrate: adds a keyframe of a session to the map, within the bounds of its client.
@@ -72,16 +72,11 @@ class PoseMover:
         """Number of keyframes whose newest pose is not fused yet."""
         return self._poses.waiting if self._moves else 0
 
-    def is_due(self, *, idle: bool) -> bool:
-        """Whether there is a move to do now: at once when idle, otherwise after a pause."""
+    def wait(self, idle: bool) -> float | None:
+        """Seconds until there is a move to do: at once when idle, otherwise after a pause; None = never."""
         if not self.waiting:
-            return False
-        return (idle and self._held_since is None) or time.monotonic() >= self._next
-
-    @property
-    def seconds_left(self) -> float:
-        """Seconds until `is_due` has to be asked again although nothing comes."""
-        return max(self._next - time.monotonic(), 0.0)
+            return None
+        return 0.0 if idle and self._held_since is None else max(self._next - time.monotonic(), 0.0)
 
     def progress(self) -> CorrectionProgress:
         """Progress of the map with corrected poses."""

@@ -174,11 +174,12 @@ def _catch_up(fuser: Fuser, records: list[journal.RecordEntry], watch: Watch) ->
         watch(index + 1, len(records))
     waiting = fuser.ready().moves
     total = moved = waiting.waiting if waiting is not None else 0
-    while fuser.move_due(idle=True) or fuser.wait_ms is not None:
-        if not fuser.move_due(idle=True):
+    move = fuser.chores["move"]
+    while (wait := move.wait(True)) is not None:
+        if wait:
             time.sleep(_POLL_S)
             continue
-        fuser.move()
+        move.do()
         moves = fuser.ready().moves
         moved = total - (moves.waiting if moves is not None else 0)
         watch(len(records) + moved, len(records) + total)

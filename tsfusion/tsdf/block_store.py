@@ -3,6 +3,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -370,7 +371,7 @@ class BlockStore:
                 self._keys.array, first, self.count - first, first, self._hash_keys, self._hash_slots
             )
 
-    @property
+    @cached_property
     def bytes_per_block(self) -> int:
         """Memory of one block in all arrays, without the hash."""
         return sum(array.item_bytes for array in self._arrays())

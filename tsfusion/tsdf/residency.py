@@ -6,6 +6,7 @@ import os
 import sys
 from collections.abc import Collection, Iterator
 from contextlib import suppress
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +31,7 @@ class Residency:
         self._measured = 0  # bytes of the layers that were in memory when it was last looked at,
         self._shared = process.shared_rss_bytes()  # and of all files then
 
-    @property
+    @cached_property
     def row_bytes(self) -> int:
         """Size of a block, bytes."""
         return sum(layer.item_bytes for layer in self._layers)
