@@ -89,14 +89,14 @@ def sizes(node: ast.ClassDef) -> tuple[int, int]:
 
 @pytest.mark.parametrize("name", sorted(groups()))
 def test_the_house_does_not_grow(name: str) -> None:
-    """A budget also follows what was saved: at most 300 lines and 5 files are left of it."""
+    """A budget also follows what was saved: 300 lines, or 1 %, and 4 files may be left of it."""
     paths = groups()[name]
     lines = sum(text(path).count("\n") for path in paths)
     most_files, most_lines = HOUSE["budget"][name]
     assert len(paths) <= most_files, f"{name} has {len(paths)} files: join one with its neighbour"
     assert lines <= most_lines, f"{name} has {lines} lines: take as many away as you bring"
     assert len(paths) > most_files - 5, f"lower the files of {name} in house.toml to {len(paths)}"
-    assert lines > most_lines - 300, f"lower the lines of {name} in house.toml to {lines}"
+    assert lines > most_lines - max(300, most_lines // 100), f"lower the lines of {name} in house.toml to {lines}"
 
 
 def test_the_budget_names_each_wing() -> None:
