@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import tsfusion
-from tsfusion.core.versions import version_of
+from tsfusion.core.process import version_of
 
 SOURCES = Path(tsfusion.__file__).parents[1]
 # Of its own package a process finds no metadata then.

@@ -14,7 +14,7 @@ import zmq
 from keyframes_and_servers import CAMERA, SHAPE, VOLUME, wall
 
 from tsfusion import Volume
-from tsfusion.core.token_bucket import Bucket
+from tsfusion.core.rates import Bucket
 from tsfusion.fuser import question_answers
 from tsfusion.fuser.current_keyframe import CurrentKeyframe
 from tsfusion.fuser.inbox import Inbox

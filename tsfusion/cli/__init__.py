@@ -15,6 +15,7 @@ from typing import Annotated, NoReturn
 
 import typer
 
+from tsfusion import __version__
 from tsfusion.cli import (
     ask,
     ate,
@@ -39,7 +40,6 @@ from tsfusion.cli import (
     view,
 )
 from tsfusion.core.errors import TsfusionError
-from tsfusion.core.versions import version_of
 
 INTERRUPTED = 128 + signal.SIGINT
 TERMINATED = 128 + signal.SIGTERM
@@ -116,7 +116,7 @@ def _root(
     version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False,
 ) -> None:
     if version:
-        typer.echo(f"tsfusion {version_of('tsfusion')}")
+        typer.echo(f"tsfusion {__version__}")
     elif context.invoked_subcommand is None:
         typer.echo(context.get_help())
 

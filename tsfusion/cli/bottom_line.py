@@ -10,8 +10,8 @@ from rich.console import Console
 from rich.text import Text
 
 from tsfusion.cli.progress_rows import styled
-from tsfusion.core.counts import count_of
 from tsfusion.core.rates import Rates
+from tsfusion.core.readable_numbers import count_of
 from tsfusion.wire.health import Health
 from tsfusion.wire.health_headline import headline
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tsfusion.cli import options, verbs
-from tsfusion.core.counts import count_of
+from tsfusion.core.readable_numbers import count_of
 
 if TYPE_CHECKING:
     from tsfusion.wire.forgetting import Forgotten, Selection

@@ -116,7 +116,7 @@ def _scheduler(workers: int, ray: str | None) -> "Scheduler":
 def _print(result: "FusedRun") -> None:
     import msgspec
 
-    from tsfusion.core.counts import count_of
+    from tsfusion.core.readable_numbers import count_of
     from tsfusion.geometry.mesh import summarise
     from tsfusion.geometry.up_direction import Up
 

@@ -7,9 +7,9 @@ from typing import Any
 import msgspec
 from msgspec import Struct
 
-from tsfusion.core.counts import count_of
 from tsfusion.core.errors import ServerUnreachable, TransportError
 from tsfusion.core.rates import Rates
+from tsfusion.core.readable_numbers import count_of
 from tsfusion.wire.health import Health, MapHealth, Status
 from tsfusion.wire.queries import CommandRefused, fetch_health, fetch_status
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tsfusion.cli import forget, map_align, map_convert, map_view, opened_maps, options, verbs
-from tsfusion.core.counts import count_of
+from tsfusion.core.readable_numbers import count_of
 
 if TYPE_CHECKING:
     from tsfusion.tsdf.volume import Volume

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tsfusion.cli import options
-from tsfusion.core.counts import count_of
+from tsfusion.core.readable_numbers import count_of
 
 if TYPE_CHECKING:
     from tsfusion.pipelines.saved_maps import MapSummary, SessionSummary

@@ -237,7 +237,7 @@ def _of_server(
     from dataclasses import replace
 
     from tsfusion.core.config import DEFAULT_MAP
-    from tsfusion.core.counts import count_of
+    from tsfusion.core.readable_numbers import count_of
     from tsfusion.geometry.provenance import Provenance
     from tsfusion.wire.queries import fetch_health, fetch_mesh
 
@@ -337,8 +337,8 @@ def _map(
     """The saved map where it is complete; otherwise a new map of every keyframe of the journal."""
     from tsfusion.cli import opened_maps, progress
     from tsfusion.core.config import VIEW_SETTINGS
-    from tsfusion.core.counts import count_of
     from tsfusion.core.errors import DatasetError
+    from tsfusion.core.readable_numbers import count_of
     from tsfusion.journal import state_folder
     from tsfusion.pipelines import journal_fusion
     from tsfusion.tsdf.volume import Volume

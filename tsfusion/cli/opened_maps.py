@@ -8,9 +8,9 @@ from pathlib import Path
 
 import typer
 
-from tsfusion.core.counts import count_of
 from tsfusion.core.durable_files import size_of
 from tsfusion.core.errors import IncompleteRun
+from tsfusion.core.readable_numbers import count_of
 
 JOURNAL = "reading the journal"
 _LARGE_BYTES = 64 << 20  # of a file: reading it takes seconds

@@ -5,11 +5,10 @@ import time
 from typing import TYPE_CHECKING, NamedTuple
 
 from tsfusion.cli.output import size
-from tsfusion.core.counts import count_of
 from tsfusion.core.headline import Headline
 from tsfusion.core.logs import printable
 from tsfusion.core.rates import Rates
-from tsfusion.core.readable_numbers import span
+from tsfusion.core.readable_numbers import count_of, span
 from tsfusion.wire.messages import explained
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tsfusion.cli import options, output
-from tsfusion.core.counts import count_of
+from tsfusion.core.readable_numbers import count_of
 
 if TYPE_CHECKING:
     from tsfusion.datasets import Dataset

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 from tsfusion.cli import output
 from tsfusion.cli.output import counted, grouped, size
-from tsfusion.core.counts import count_of
 from tsfusion.core.headline import MARKS
+from tsfusion.core.readable_numbers import count_of
 from tsfusion.wire.messages import explained
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tsfusion.cli import options, verbs
-from tsfusion.core.counts import count_of
+from tsfusion.core.readable_numbers import count_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable

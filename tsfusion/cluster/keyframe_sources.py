@@ -19,10 +19,10 @@ import numpy as np
 from tsfusion import journal
 from tsfusion.cluster.jobs import DatasetKeyframes, JournalKeyframes, Keyframes
 from tsfusion.core.config import VolumeConfig
-from tsfusion.core.counts import count_of
 from tsfusion.core.durable_files import size_of
 from tsfusion.core.errors import CheckpointError, DatasetError, InvalidConfig, JournalError, MapError
 from tsfusion.core.output_folder import RECORD
+from tsfusion.core.readable_numbers import count_of
 from tsfusion.datasets import open_dataset
 from tsfusion.datasets.cameras import camera_files
 from tsfusion.datasets.dataset import Dataset, first_frame, pose_of

@@ -5,8 +5,7 @@ from typing import Literal
 
 from msgspec import Struct
 
-from tsfusion.core.counts import count_of
-from tsfusion.core.readable_numbers import span
+from tsfusion.core.readable_numbers import count_of, span
 
 Level = Literal["good", "notice", "bad"]
 MARKS: dict[Level, str] = {"good": "✓", "notice": "!", "bad": "✗"}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Memory, limits, signals and the end of this process, as the operating system offers them."""
+"""Memory, limits, signals and the end of this process, as the operating system offers them; versions."""
 
 import _signal  # type: ignore[import-not-found]  # `signal` makes enumerations of numbers: 5 µs a call
 import ctypes
@@ -13,6 +13,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 from typing import Any
+
+import tsfusion
 
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # malloc.h
@@ -223,3 +225,15 @@ def uninterrupted() -> Iterator[None]:
             handler(number, frame)
         elif handler == signal.SIG_DFL:
             signal.raise_signal(number)
+
+
+def version_of(package: str) -> str:
+    """Version of a package, or `missing`. tsfusion also runs where it is not installed, from its sources."""
+    if package == "tsfusion":
+        return tsfusion.__version__
+    from importlib import metadata
+
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return "missing"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Numbers as a person reads them."""
+"""Numbers and counts as a person reads them."""
 
 from decimal import Decimal
 
@@ -34,3 +34,8 @@ def span(seconds: float) -> str:
         if seconds >= 2 * size:
             return f"{seconds / size:.0f} {name}"
     return f"{seconds:.0f} s"
+
+
+def count_of(number: int, one: str, many: str = "") -> str:
+    """`1 keyframe`, `3 keyframes`; give both forms where a verb follows: `keyframe is`, `keyframes are`."""
+    return f"{number} {one if number == 1 else many or f'{one}s'}"

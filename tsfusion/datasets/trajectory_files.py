@@ -10,8 +10,8 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core.counts import count_of
 from tsfusion.core.errors import DatasetError, InvalidKeyframe
+from tsfusion.core.readable_numbers import count_of
 from tsfusion.datasets.dataset import require_one_clock
 from tsfusion.datasets.readers import numbers, read_lines, read_numbers
 from tsfusion.geometry.keyframe import check_pose

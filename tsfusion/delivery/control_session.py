@@ -8,8 +8,8 @@ from collections.abc import Callable
 
 from msgspec.structs import replace
 
-from tsfusion.core.counts import count_of
 from tsfusion.core.errors import DecodeError
+from tsfusion.core.readable_numbers import count_of
 from tsfusion.delivery.link_state import LinkState
 from tsfusion.delivery.outbox import Outbox
 from tsfusion.delivery.refused_keyframes import RefusedFolder

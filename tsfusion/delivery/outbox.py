@@ -12,8 +12,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core.counts import count_of
 from tsfusion.core.errors import InvalidKeyframe
+from tsfusion.core.readable_numbers import count_of
 from tsfusion.delivery.link_state import LinkState
 from tsfusion.delivery.number_runs import NumberRuns
 from tsfusion.delivery.outcomes import ClientStats, Outcomes

@@ -5,7 +5,7 @@ from collections import Counter, OrderedDict
 
 from msgspec import Struct
 
-from tsfusion.core.counts import count_of
+from tsfusion.core.readable_numbers import count_of
 from tsfusion.delivery.spool import Waiting
 
 _MOST_REMEMBERED = 65536  # numbers of rejected records

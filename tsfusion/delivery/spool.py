@@ -19,10 +19,10 @@ from msgspec import Struct
 
 from tsfusion import journal
 from tsfusion.core.config import DEFAULT_MAP
-from tsfusion.core.counts import count_of
 from tsfusion.core.durable_files import size_of
 from tsfusion.core.errors import MISSING, DecodeError, JournalError
 from tsfusion.core.folder_lock import lock_folder
+from tsfusion.core.readable_numbers import count_of
 from tsfusion.delivery.tombstones import Tombstones
 from tsfusion.wire.record_header import RecordHeader, is_correction, unpack
 

@@ -24,7 +24,7 @@ import msgspec
 from tsfusion import journal
 from tsfusion.core import process
 from tsfusion.core.errors import JournalError, TsfusionError
-from tsfusion.core.versions import version_of
+from tsfusion.core.process import version_of
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.fuser.current_keyframe import CurrentKeyframe
 from tsfusion.fuser.departures import Departures

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import InvalidConfig, TsfusionError
-from tsfusion.core.token_bucket import Bucket
+from tsfusion.core.rates import Bucket
 from tsfusion.fuser.current_keyframe import CurrentKeyframe
 from tsfusion.fuser.inbox import Inbox
 from tsfusion.fuser.kept_slices import KeptSlices

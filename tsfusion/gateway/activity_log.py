@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 
 from tsfusion.core import logs
-from tsfusion.core.counts import count_of
+from tsfusion.core.readable_numbers import count_of
 from tsfusion.gateway.client_routes import ABANDONED_AFTER
 from tsfusion.wire.health import ClientHealth, Health, MapHealth
 from tsfusion.wire.health_headline import headline

@@ -8,7 +8,7 @@ from collections import Counter
 import zmq
 
 from tsfusion.core import logs
-from tsfusion.core.counts import count_of
+from tsfusion.core.readable_numbers import count_of
 from tsfusion.gateway.access_control import AccessControl
 from tsfusion.gateway.memory_guard import MemoryGuard
 from tsfusion.gateway.ports import Flood, Ports

@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core import logs
-from tsfusion.core.counts import count_of
 from tsfusion.core.errors import JournalError
 from tsfusion.core.number_ranges import NumberRanges
+from tsfusion.core.readable_numbers import count_of
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.fuser.messages import EXPIRED, Find, Found, FoundKeyframes, Saved
 from tsfusion.gateway import moved_maps

@@ -16,8 +16,8 @@ import zmq
 
 from tsfusion.core import logs, process
 from tsfusion.core.config import ServerConfig
-from tsfusion.core.counts import count_of
 from tsfusion.core.errors import DecodeError, JournalError
+from tsfusion.core.readable_numbers import count_of
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.gateway import fuser_queries
 from tsfusion.gateway.access_control import AccessControl

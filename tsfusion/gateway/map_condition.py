@@ -3,7 +3,7 @@
 
 import time
 
-from tsfusion.core.counts import count_of
+from tsfusion.core.readable_numbers import count_of
 from tsfusion.gateway.checkpoint_orders import CheckpointOrders
 from tsfusion.gateway.disk_pause import DiskPause
 from tsfusion.gateway.fuser_backlog import FuserBacklog

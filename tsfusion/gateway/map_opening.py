@@ -7,7 +7,7 @@ from pathlib import Path
 
 from tsfusion.core import logs
 from tsfusion.core.config import ServerConfig
-from tsfusion.core.counts import count_of
+from tsfusion.core.readable_numbers import count_of
 from tsfusion.fuser.messages import Ready
 from tsfusion.gateway.sessions import Sessions
 from tsfusion.journal import Journal, ReadingWatcher, state_folder

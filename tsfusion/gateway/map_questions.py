@@ -14,7 +14,7 @@ from itertools import count
 import zmq
 from msgspec import Struct
 
-from tsfusion.core.token_bucket import Bucket
+from tsfusion.core.rates import Bucket
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.gateway.hosted_map import HostedMap
 from tsfusion.gateway.memory_guard import PendingReplies

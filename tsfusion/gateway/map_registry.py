@@ -13,8 +13,8 @@ import zmq
 
 from tsfusion.core import logs
 from tsfusion.core.config import DEFAULT_MAP, MAP_NAME_LENGTH, ServerConfig, VolumeConfig
-from tsfusion.core.counts import count_of
 from tsfusion.core.errors import JournalError, TsfusionError
+from tsfusion.core.readable_numbers import count_of
 from tsfusion.gateway import map_arrivals, moved_maps
 from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.fuser_supervisor import FuserSupervisor

@@ -15,7 +15,7 @@ from prometheus_client.registry import Collector
 
 from tsfusion.core.config import ServerConfig
 from tsfusion.core.logs import printable
-from tsfusion.core.versions import version_of
+from tsfusion.core.process import version_of
 from tsfusion.gateway import metrics_families
 from tsfusion.gateway.metrics_http import HttpResponse, MetricsPage
 from tsfusion.wire.health import Health

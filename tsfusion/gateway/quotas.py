@@ -10,7 +10,7 @@ import numpy as np
 
 from tsfusion.core.config import ServerConfig, VolumeConfig
 from tsfusion.core.errors import InvalidConfig
-from tsfusion.core.token_bucket import Bucket
+from tsfusion.core.rates import Bucket
 from tsfusion.wire import corrections
 from tsfusion.wire.codec import measurement
 from tsfusion.wire.record_header import CorrectionHeader, KeyframeHeader, RecordHeader, Refused

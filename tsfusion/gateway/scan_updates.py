@@ -12,7 +12,7 @@ from typing import Any
 
 import msgspec
 
-from tsfusion.core.token_bucket import Bucket
+from tsfusion.core.rates import Bucket
 from tsfusion.gateway.ports import Ports, Subscriptions
 from tsfusion.wire import mesh_updates
 from tsfusion.wire.mesh_updates import Scanned

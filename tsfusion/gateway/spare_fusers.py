@@ -9,7 +9,7 @@ from typing import Any
 import zmq
 
 from tsfusion.core.config import ServerConfig, VolumeConfig
-from tsfusion.core.counts import count_of
+from tsfusion.core.readable_numbers import count_of
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.gateway.fuser_process import FuserProcess
 

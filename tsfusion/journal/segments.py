@@ -11,8 +11,8 @@ from pathlib import Path
 
 from msgspec import Struct
 
-from tsfusion.core.counts import count_of
 from tsfusion.core.errors import JournalError
+from tsfusion.core.readable_numbers import count_of
 from tsfusion.journal import mcap_layout, segment_file
 from tsfusion.journal.mcap_layout import Position, Record
 from tsfusion.journal.record_scan import Damage, Erased, journal_error, scan_records, segment_number

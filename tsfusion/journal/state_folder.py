@@ -9,9 +9,9 @@ from pathlib import Path
 from msgspec import Struct
 
 from tsfusion.core.config import MAP_NAME
-from tsfusion.core.counts import count_of
 from tsfusion.core.durable_files import size_of
 from tsfusion.core.errors import JournalError, OutputError
+from tsfusion.core.readable_numbers import count_of
 from tsfusion.journal.mcap_layout import Position, Record
 from tsfusion.journal.quarantine import quarantined_files
 from tsfusion.journal.record_scan import Damage, journal_error, scan_records, segment_number

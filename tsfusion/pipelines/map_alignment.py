@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.config import VolumeConfig
-from tsfusion.core.counts import count_of
 from tsfusion.core.errors import AlignmentRefused, JournalError, MapError
+from tsfusion.core.readable_numbers import count_of
 from tsfusion.evaluation.surface_fit import SampledSurface, SeenDepth, SurfaceFit, fit, parts_spread
 from tsfusion.evaluation.surface_registration import Registration
 from tsfusion.geometry import se3

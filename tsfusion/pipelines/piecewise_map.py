@@ -7,10 +7,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core.counts import count_of
 from tsfusion.core.distinct_integers import distinct
 from tsfusion.core.errors import DecodeError, JournalError
-from tsfusion.core.readable_numbers import counted
+from tsfusion.core.readable_numbers import count_of, counted
 from tsfusion.pipelines.map_rewinding import RewoundMap
 from tsfusion.tsdf import map_history
 from tsfusion.tsdf.block_store import cells_of, pack_keys, unpack_keys

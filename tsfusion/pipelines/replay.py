@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from tsfusion.client import Client, ClientStats
 from tsfusion.core import process
 from tsfusion.core.config import ClientConfig, ServerConfig, VolumeConfig
-from tsfusion.core.counts import count_of
 from tsfusion.core.errors import DatasetError, JournalError, OutputError
 from tsfusion.core.output_folder import results
+from tsfusion.core.readable_numbers import count_of
 from tsfusion.datasets import Dataset
 from tsfusion.datasets.dataset import UnreadableFrame, force_of, readable
 from tsfusion.geometry.keyframe import Keyframe

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from tsfusion.client import ClientStats
 from tsfusion.core import process
 from tsfusion.core.output_folder import RECORD
-from tsfusion.core.versions import version_of
+from tsfusion.core.process import version_of
 from tsfusion.datasets.dataset import NOMINAL_NS
 from tsfusion.datasets.trajectory_files import write_tum
 from tsfusion.geometry import up_direction

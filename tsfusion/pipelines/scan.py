@@ -18,7 +18,6 @@ import numpy as np
 from tsfusion.client import Client, ClientStats
 from tsfusion.core import process
 from tsfusion.core.config import ClientConfig, ScanConfig, ServerConfig, VolumeConfig, override
-from tsfusion.core.counts import count_of
 from tsfusion.core.errors import (
     AlignmentRefused,
     DatasetError,
@@ -28,6 +27,7 @@ from tsfusion.core.errors import (
     WorldRefused,
 )
 from tsfusion.core.output_folder import results
+from tsfusion.core.readable_numbers import count_of
 from tsfusion.datasets.cameras import described
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.mesh import Mesh

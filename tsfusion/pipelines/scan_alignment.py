@@ -16,8 +16,8 @@ import numpy as np
 
 from tsfusion.core import process
 from tsfusion.core.config import VolumeConfig
-from tsfusion.core.counts import count_of
 from tsfusion.core.errors import AlignmentRefused
+from tsfusion.core.readable_numbers import count_of
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Keyframe

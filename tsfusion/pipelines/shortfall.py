@@ -14,9 +14,8 @@ from typing import Any
 import msgspec
 
 from tsfusion.client import Client, ClientStats
-from tsfusion.core.counts import count_of
 from tsfusion.core.headline import Level
-from tsfusion.core.readable_numbers import counted
+from tsfusion.core.readable_numbers import count_of, counted
 from tsfusion.datasets.dataset import CLOCK, UNREADABLE, WITHOUT_POSE
 from tsfusion.geometry.sample_ranges import NO_SAMPLES
 from tsfusion.geometry.sweeps import skewed

@@ -17,7 +17,7 @@ import msgspec
 
 from tsfusion.client import Client
 from tsfusion.core.config import MAP_NAME_LENGTH, ScanConfig
-from tsfusion.core.counts import count_of
+from tsfusion.core.readable_numbers import count_of
 from tsfusion.delivery.outcomes import ClientStats
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.sweeps import Motion

@@ -16,8 +16,8 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from tsfusion.core.config import SERVER_SESSION
-from tsfusion.core.counts import count_of
 from tsfusion.core.errors import MapError
+from tsfusion.core.readable_numbers import count_of
 from tsfusion.geometry.origin import Origin
 from tsfusion.geometry.up_direction import HeldSensor
 

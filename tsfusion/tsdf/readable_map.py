@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.config import Surface, VolumeConfig
-from tsfusion.core.counts import count_of
 from tsfusion.core.distinct_integers import distinct
 from tsfusion.core.errors import InvalidConfig, MapError
+from tsfusion.core.readable_numbers import count_of
 from tsfusion.geometry import object_cards
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.mesh_parts import MeshParts, joined

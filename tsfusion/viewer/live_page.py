@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core import process
+from tsfusion.core.rates import Bucket
 from tsfusion.core.readable_numbers import grouped
-from tsfusion.core.token_bucket import Bucket
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.viewer import map_views, pointed_surface
 from tsfusion.viewer.browser_panel import BrowserPanel, set_theme

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsfusion.core.token_bucket import Bucket
+from tsfusion.core.rates import Bucket
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.viewer import tile_glb
 from tsfusion.viewer.clipping import Clipping, Side

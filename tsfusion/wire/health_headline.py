@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: MIT
 """A server's health as one line: is it working, is it keeping up, is anything lost?"""
 
-from tsfusion.core.counts import count_of
 from tsfusion.core.headline import Headline
-from tsfusion.core.readable_numbers import span
+from tsfusion.core.readable_numbers import count_of, span
 from tsfusion.wire.health import ClientHealth, Health, MapHealth
 
 _RECENT = 10.0  # seconds since the last keyframe in which a server counts as working

@@ -18,7 +18,7 @@ from typing import IO, Any
 from tsfusion.core import durable_files, folder_lock
 from tsfusion.core.durable_files import size_of
 from tsfusion.core.errors import DatasetError, OutputError
-from tsfusion.core.versions import version_of
+from tsfusion.core.process import version_of
 
 Watcher = Callable[[int, int], None]  # bytes there, bytes of all (0 = unknown)
 

@@ -5,8 +5,7 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
-from tsfusion.core.counts import count_of
-from tsfusion.core.readable_numbers import counted, grouped, size
+from tsfusion.core.readable_numbers import count_of, counted, grouped, size
 from tsfusion.journal import inspection, state_folder
 from tsfusion.journal.inspection import JournalInfo
 from tsfusion.journal.journaled_keyframes import JournaledKeyframes

@@ -4,8 +4,7 @@
 from pathlib import Path
 from typing import Any
 
-from tsfusion.core.counts import count_of
-from tsfusion.core.readable_numbers import counted, figure, grouped, size
+from tsfusion.core.readable_numbers import count_of, counted, figure, grouped, size
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.pipelines import shortfall
 from tsfusion.pipelines.report import findings, map_sections, page, run_sections
