@@ -25,8 +25,7 @@ from lab.evaluation.view_prediction import compare_views
 from lab.worlds import benchmark_worlds
 from tsfusion.core.config import SENSORS
 from tsfusion.datasets import Synthetic, open_dataset
-from tsfusion.geometry.keyframe import Intrinsics, Keyframe
-from tsfusion.geometry.measured_points import points_world
+from tsfusion.geometry.keyframe import Intrinsics, Keyframe, points_world
 from tsfusion.kernels import runtime
 
 # metres, for every system; else the sensor preset's. 2.8: the things in the middle, not the walls behind

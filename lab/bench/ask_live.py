@@ -92,7 +92,7 @@ class Planner:
 
 def kinds(keyframes: list[Keyframe], voxel_size: float) -> dict[str, Ask]:
     """The questions: points near the surface, a view, a slice and a box around the first sensor."""
-    from tsfusion.geometry.measured_points import points_world
+    from tsfusion.geometry.keyframe import points_world
 
     clouds = [points_world(one)[::97] for one in keyframes]
     cloud = np.concatenate([one[np.isfinite(one).all(axis=1)] for one in clouds]).astype(np.float32)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.process import peak_rss_bytes
-from tsfusion.geometry.measured_points import depth_metres, points_world
+from tsfusion.geometry.keyframe import depth_metres, points_world
 from tsfusion.geometry.mesh import Mesh
 
 ROOT = Path(__file__).parents[2]

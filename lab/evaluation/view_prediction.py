@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.geometry.keyframe import Intrinsics, Keyframe
-from tsfusion.geometry.measured_points import depth_metres
+from tsfusion.geometry.keyframe import Intrinsics, Keyframe, depth_metres
 from tsfusion.geometry.mesh import Mesh
 
 

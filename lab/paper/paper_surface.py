@@ -29,8 +29,7 @@ from lab.worlds.named_worlds import open_world
 from tsfusion.core import process
 from tsfusion.core.config import SENSORS, VolumeConfig, make_settings
 from tsfusion.datasets import Synthetic
-from tsfusion.geometry.keyframe import Keyframe
-from tsfusion.geometry.measured_points import points_world
+from tsfusion.geometry.keyframe import Keyframe, points_world
 from tsfusion.geometry.mesh import Mesh
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from tsfusion.datasets import open_dataset
 from tsfusion.datasets.depth_files import check_metres, read_depth
 from tsfusion.datasets.readers import read_color, read_image
 from tsfusion.datasets.rosbag import messages
-from tsfusion.geometry.measured_points import depth_metres
+from tsfusion.geometry.keyframe import depth_metres
 from tsfusion.viewer.scanner_marks import small_picture
 from tsfusion.wire.array_encoding import unpack_image
 

@@ -17,10 +17,8 @@ from lab.worlds.desk_world import desk
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets import Synthetic
 from tsfusion.datasets.synthetic import worlds
-from tsfusion.datasets.synthetic.dataset import DEPTH_SCALE, kinect, stereo
-from tsfusion.datasets.synthetic.ray_tiles import RayTiles
-from tsfusion.geometry.keyframe import Keyframe
-from tsfusion.geometry.measured_points import depth_metres, points_world
+from tsfusion.datasets.synthetic.dataset import DEPTH_SCALE, RayTiles, kinect, stereo
+from tsfusion.geometry.keyframe import Keyframe, depth_metres, points_world
 from tsfusion.scanner.localization.rgbd.tracker import RGBDLocalizer
 
 

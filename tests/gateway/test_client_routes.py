@@ -6,8 +6,7 @@ from typing import cast
 import pytest
 
 from tsfusion.gateway.access_control import AccessControl
-from tsfusion.gateway.admission import Admission
-from tsfusion.gateway.client_routes import ClientRoutes
+from tsfusion.gateway.client_routes import Admission, ClientRoutes
 from tsfusion.gateway.ports import Ports, Subscriptions
 from tsfusion.gateway.sessions import Sessions
 from tsfusion.wire import sockets

@@ -15,9 +15,9 @@ from keyframes_and_servers import Server, pose, until, wall
 
 from tsfusion import Client
 from tsfusion.core import process
-from tsfusion.gateway import fuser_silence, gateway, recent_fates
+from tsfusion.gateway import fuser_supervisor, gateway, recent_fates
 from tsfusion.gateway.client_routes import ClientRoute
-from tsfusion.gateway.fuser_silence import FuserSilence
+from tsfusion.gateway.fuser_supervisor import FuserSilence
 from tsfusion.gateway.problems import Problem, ProblemTimes, span
 from tsfusion.gateway.recent_fates import RecentFates
 from tsfusion.wire.queries import fetch_health
@@ -36,7 +36,7 @@ class Clock:
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     """The clock of what measures here."""
     made = Clock()
-    for module in (recent_fates, fuser_silence):
+    for module in (recent_fates, fuser_supervisor):
         monkeypatch.setattr(module.time, "monotonic", made)
     return made
 
@@ -169,7 +169,7 @@ def test_only_time_in_which_it_could_work_is_a_processes_own(
     clock: Clock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     letter = "R"
-    monkeypatch.setattr(fuser_silence.process, "state", lambda _: letter)
+    monkeypatch.setattr(fuser_supervisor.process, "state", lambda _: letter)
     silence = FuserSilence(os.getpid())
 
     def pass_time(seconds: int, state: str, *, owes: bool = True) -> tuple[float, float, float]:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from tsfusion import Intrinsics, Keyframe
-from tsfusion.geometry.measured_points import depth_metres, points_world
+from tsfusion.geometry.keyframe import depth_metres, points_world
 
 CAMERA = Intrinsics(200.0, 200.0, 79.5, 59.5)
 SHAPE = (120, 160)

@@ -19,7 +19,7 @@ from saved_maps import ANNA, correct, make_map
 from tsfusion import Keyframe
 from tsfusion.core.errors import JournalError, MissingDependency, OutputError
 from tsfusion.datasets import Dataset, open_dataset
-from tsfusion.geometry.measured_points import points_camera, points_world
+from tsfusion.geometry.keyframe import points_camera, points_world
 from tsfusion.journal import Journal, read, records, segment_path
 from tsfusion.journal.ros2_export import Export, export
 from tsfusion.journal.ros2_messages import depth_image

@@ -10,7 +10,7 @@ from lab.worlds import benchmark_worlds
 from tsfusion import Mesh
 from tsfusion.datasets import Synthetic
 from tsfusion.datasets.synthetic import worlds
-from tsfusion.geometry.measured_points import points_world
+from tsfusion.geometry.keyframe import points_world
 
 VOXEL = 0.02
 

@@ -14,7 +14,7 @@ from lab.worlds.desk_world import Desk
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets import layouts, open_dataset, registry
 from tsfusion.datasets.synthetic.dataset import DEPTH_SCALE
-from tsfusion.geometry.measured_points import points_world
+from tsfusion.geometry.keyframe import points_world
 
 if sys.version_info >= (3, 11):
     import tomllib

@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from tsfusion.geometry.mesh import Mesh
-from tsfusion.pipelines import mesh_files
+from tsfusion.pipelines import mesh_finishing
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +32,7 @@ def test_which_files_have_islands(
     drawn: list[Mesh] = []
     monkeypatch.setattr("tsfusion.pipelines.mesh_preview.render", lambda mesh, _file: drawn.append(mesh))
     files = [tmp_path / f"m{suffix}" for suffix in (".ply", ".obj", ".glb", ".png")]
-    left_out = mesh_files.write(scattered, files, keep_islands=keep)
+    left_out = mesh_finishing.write(scattered, files, keep_islands=keep)
     assert left_out["files"] == without
     assert (left_out["islands"], left_out["triangles"]) == ((2, 24) if without else (0, 0))
     surfaces = {file.name: trimesh.load(file, force="mesh", process=False).vertices for file in files[:3]}
@@ -41,5 +41,5 @@ def test_which_files_have_islands(
 
 
 def test_a_mesh_without_islands_says_nothing(scattered: Mesh, tmp_path: Path) -> None:
-    left_out = mesh_files.write(scattered.without_islands(), [tmp_path / "m.glb"])
+    left_out = mesh_finishing.write(scattered.without_islands(), [tmp_path / "m.glb"])
     assert left_out == {"islands": 0, "triangles": 0, "files": []}

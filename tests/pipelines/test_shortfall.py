@@ -10,7 +10,7 @@ import pytest
 from tsfusion import Intrinsics, InvalidConfig, Keyframe, VolumeConfig
 from tsfusion.client import ClientStats
 from tsfusion.datasets.dataset import UNREADABLE
-from tsfusion.pipelines import map_size, shortfall
+from tsfusion.pipelines import map_growth, shortfall
 
 STATS = ClientStats(
     sent=10, durable=10, fused=10, refused={}, rejected={}, skipped={}, waiting=0, waiting_bytes=0, state="ok"
@@ -102,13 +102,13 @@ def test_a_voxel_size_that_a_keyframe_cannot_have_is_refused_with_a_proposal() -
         depth=depth, intrinsics=Intrinsics(525.0, 525.0, 320.0, 240.0), T_world_camera=np.eye(4)
     )
     with pytest.raises(InvalidConfig, match=r"would need some [0-9.]+ GB .*; use 0.002 or more"):
-        map_size.check_fits(keyframe, VolumeConfig(voxel_size=0.0001))
+        map_growth.check_fits(keyframe, VolumeConfig(voxel_size=0.0001))
     for size in (0.002, 0.02):
-        map_size.check_fits(keyframe, VolumeConfig(voxel_size=size))
+        map_growth.check_fits(keyframe, VolumeConfig(voxel_size=size))
     angle, distance = np.random.default_rng(0).uniform(0, [[2 * np.pi], [100.0]], (2, 1_500_000))
     ground = np.stack([distance * np.cos(angle), distance * np.sin(angle), 0 * angle], 1).astype(np.float32)
     disc = Keyframe(points=ground, T_world_camera=np.eye(4))
     with pytest.raises(InvalidConfig, match=r"use 0.2 or more"):  # larger than what was refused
-        map_size.check_fits(disc, VolumeConfig(voxel_size=0.05, sensor="lidar"))
+        map_growth.check_fits(disc, VolumeConfig(voxel_size=0.05, sensor="lidar"))
     blank = Keyframe(depth=np.zeros_like(depth), intrinsics=keyframe.intrinsics, T_world_camera=np.eye(4))
-    map_size.check_fits(blank, VolumeConfig(voxel_size=0.0001))
+    map_growth.check_fits(blank, VolumeConfig(voxel_size=0.0001))

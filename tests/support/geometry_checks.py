@@ -5,8 +5,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.geometry.keyframe import Keyframe
-from tsfusion.geometry.measured_points import depth_metres, points_camera
+from tsfusion.geometry.keyframe import Keyframe, depth_metres, points_camera
 
 
 def move(T: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from tsfusion.datasets import Dataset, Synthetic
 from tsfusion.datasets.synthetic import worlds
 from tsfusion.geometry.calibration import Camera
-from tsfusion.geometry.keyframe import Intrinsics, Keyframe
-from tsfusion.geometry.measured_points import depth_metres
+from tsfusion.geometry.keyframe import Intrinsics, Keyframe, depth_metres
 from tsfusion.geometry.se3 import inverse
 
 STEPS = 40  # keyframes of the whole circle

@@ -246,13 +246,13 @@ def diff(
     from tsfusion.cli import output
     from tsfusion.core.output_folder import check_writable
     from tsfusion.geometry.mesh import FORMATS
-    from tsfusion.pipelines import mesh_files
+    from tsfusion.pipelines import mesh_finishing
 
     if out is not None:
-        check_writable(out, (*FORMATS, mesh_files.PICTURE))
+        check_writable(out, (*FORMATS, mesh_finishing.PICTURE))
     found = _load(earlier, quiet=json).diff(_load(later, quiet=json), tolerance=tolerance)
     if out is not None:
-        mesh_files.write(found.mesh, [out], keep_islands=True)
+        mesh_finishing.write(found.mesh, [out], keep_islands=True)
     figures = {
         "same": found.is_same,
         "blocks": found.blocks,
@@ -292,7 +292,7 @@ def convert(
     more choices.
     """
     from tsfusion.cli import output, progress
-    from tsfusion.pipelines import mesh_files
+    from tsfusion.pipelines import mesh_finishing
 
     suffix, files = out.suffix.lower(), [out]
     given = {"heights": heights, "above_floor": above_floor, "box": box, "up": up, "resolution": resolution}
@@ -309,7 +309,7 @@ def convert(
         with progress.reading(f"writing {out}", quiet=json) as watch:
             volume.save_voxels(out, dense=dense, field=field or "tsdf", watch=watch, **chosen)
     else:
-        mesh_files.write(volume.extract_mesh(), [out])
+        mesh_finishing.write(volume.extract_mesh(), [out])
     if json:
         output.as_json({"path": str(out), "files": [str(file) for file in files], **map_view.figures(volume)})
     else:

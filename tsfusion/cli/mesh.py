@@ -104,7 +104,7 @@ def mesh(
     from tsfusion.core import process
     from tsfusion.core.errors import InvalidConfig
     from tsfusion.core.output_folder import check_writable
-    from tsfusion.pipelines import mesh_files, mesh_finishing
+    from tsfusion.pipelines import mesh_finishing
 
     if texture and color_by is not None:
         raise InvalidConfig("--texture shows what the cameras saw, --color-by who saw it: give one of them")
@@ -115,7 +115,7 @@ def mesh(
 
         texture_atlas.check_installed()
     given_up = options.up_direction(up)
-    check_writable(out, mesh_files.SURFACES)
+    check_writable(out, mesh_finishing.SURFACES)
     if preview is not None:
         check_writable(preview, (".png",))
     finishing = mesh_finishing.checked(
@@ -169,7 +169,7 @@ def mesh(
     if texture:  # a live server has none
         made = _textured(made, Path(source), map_, found, size=texture_size, view=view, quiet=json)
     files = [out] if preview is None else [out, preview]
-    left_out = mesh_files.write(made, files, keep_islands=keep_islands if min_component is None else True)
+    left_out = mesh_finishing.write(made, files, keep_islands=keep_islands if min_component is None else True)
     written = made.without_islands() if out.name in left_out["files"] else made
     left_out = (
         left_out

@@ -35,7 +35,7 @@ from tsfusion.geometry.mesh_parts import joined
 from tsfusion.geometry.provenance import Provenance
 from tsfusion.geometry.up_direction import HeldSensor
 from tsfusion.kernels import runtime
-from tsfusion.pipelines import mesh_files
+from tsfusion.pipelines import mesh_finishing
 from tsfusion.tsdf import checkpoint, mesh_tiles
 from tsfusion.tsdf.map_history import HELD
 from tsfusion.tsdf.readable_map import map_provenance
@@ -226,7 +226,7 @@ def _written(job: jobs.MeshMap, folder: Path, mesh: Mesh, origin: Provenance) ->
     mesh = replace(mesh, known_up=up, provenance=origin)
     prefix = _new(folder, job.name, "")
     made = [prefix.with_suffix(suffix) for suffix in (".ply", ".glb")]
-    left_out = mesh_files.write(mesh, made, keep_islands=job.keep_islands)
+    left_out = mesh_finishing.write(mesh, made, keep_islands=job.keep_islands)
     left_out["files"] = [Path(name).suffix for name in left_out["files"]]
     figures = _plain(mesh.figures, is_whole=True, left_out=left_out)
     return {"files": [file.name for file in made], "figures": figures}

@@ -14,7 +14,7 @@ from tsfusion import journal
 from tsfusion.core.config import SERVER_SESSION
 from tsfusion.core.errors import DecodeError, InvalidConfig, InvalidKeyframe, JournalError
 from tsfusion.fuser.messages import Find, Found, FoundKeyframes, SessionProgress
-from tsfusion.geometry.measured_points import points_world
+from tsfusion.geometry.keyframe import points_world
 from tsfusion.journal import Record, state_folder
 from tsfusion.journal.keyframe_poses import KeyframePoses
 from tsfusion.wire import codec

@@ -22,8 +22,7 @@ from tsfusion.fuser import messages as fuser_messages
 from tsfusion.gateway import fuser_queries
 from tsfusion.gateway.access_control import AccessControl
 from tsfusion.gateway.activity_log import ActivityLog
-from tsfusion.gateway.admission import Admission
-from tsfusion.gateway.client_routes import ClientRoutes
+from tsfusion.gateway.client_routes import Admission, ClientRoutes
 from tsfusion.gateway.connection_limits import ConnectionLimits
 from tsfusion.gateway.forgetting import Request
 from tsfusion.gateway.fuser_queries import FuserQueries

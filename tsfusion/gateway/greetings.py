@@ -9,8 +9,7 @@ import zmq
 from tsfusion.core import logs
 from tsfusion.core.config import SERVER_SESSION, ServerConfig
 from tsfusion.core.errors import JournalError
-from tsfusion.gateway.admission import Admission
-from tsfusion.gateway.client_routes import ClientRoutes
+from tsfusion.gateway.client_routes import Admission, ClientRoutes
 from tsfusion.gateway.map_registry import MapRegistry
 from tsfusion.gateway.ports import Ports
 from tsfusion.gateway.sessions import Sessions

@@ -24,9 +24,8 @@ from tsfusion.gateway.fuser_supervisor import FuserSupervisor
 from tsfusion.gateway.journal_retention import JournalRetention
 from tsfusion.gateway.keyframe_index import KeyframeIndex
 from tsfusion.gateway.keyframe_outcomes import KeyframeOutcomes
-from tsfusion.gateway.map_condition import MapCondition
+from tsfusion.gateway.map_condition import MapCondition, QuestionCounts
 from tsfusion.gateway.metrics import Metrics
-from tsfusion.gateway.question_counts import QuestionCounts
 from tsfusion.gateway.sessions import Sessions
 from tsfusion.gateway.spare_fusers import SpareFusers
 from tsfusion.journal import Position, ReadingWatcher, Unwritten, state_folder

@@ -16,8 +16,7 @@ import zmq
 from tsfusion.core import logs
 from tsfusion.core.config import ServerConfig
 from tsfusion.core.errors import JournalError
-from tsfusion.gateway.admission import Admission
-from tsfusion.gateway.client_routes import ClientRoutes
+from tsfusion.gateway.client_routes import Admission, ClientRoutes
 from tsfusion.gateway.hosted_map import Checked, HostedMap
 from tsfusion.gateway.map_registry import MapRegistry
 from tsfusion.gateway.quotas import Quotas

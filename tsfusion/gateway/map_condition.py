@@ -1,7 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Condition of a map: in a word, in lines for a person, and in numbers."""
+"""Condition of a map: in a word, in lines for a person, and in numbers, with its questions."""
 
 import time
+from collections import Counter, deque
+from typing import Literal
+
+import numpy as np
 
 from tsfusion.core.readable_numbers import count_of
 from tsfusion.gateway.checkpoint_orders import CheckpointOrders
@@ -9,15 +13,38 @@ from tsfusion.gateway.disk_pause import DiskPause
 from tsfusion.gateway.fuser_backlog import FuserBacklog
 from tsfusion.gateway.fuser_supervisor import FuserSupervisor
 from tsfusion.gateway.keyframe_outcomes import KeyframeOutcomes
-from tsfusion.gateway.question_counts import QuestionCounts
 from tsfusion.gateway.sessions import Sessions
 from tsfusion.journal import Journal
 from tsfusion.journal.quarantine import Quarantine
+from tsfusion.wire import keyframe_times
 from tsfusion.wire.health import MapHealth, MapState
+from tsfusion.wire.keyframe_times import Spread
 from tsfusion.wire.mesh_updates import MeshUpdate
 
 _FOR_GONE = "what no checkpoint holds of them is lost, unless they are put back"
 _STALLED_AFTER = 10.0  # seconds in which keyframes wait and none is fused
+_NEWEST = 1024  # answers, whose delays count
+# refused: not passed on to the fuser; late: their time was over; failed: the fuser could not
+Outcome = Literal["answered", "refused", "late", "failed"]
+
+
+class QuestionCounts:
+    """The figures of one map."""
+
+    def __init__(self) -> None:
+        self.by_outcome: Counter[str] = Counter()
+        self._delays_ms: deque[float] = deque(maxlen=_NEWEST)
+
+    def add(self, outcome: Outcome, seconds: float | None = None) -> None:
+        """Count a question; with the seconds that its answer took."""
+        self.by_outcome[outcome] += 1
+        if seconds is not None:
+            self._delays_ms.append(1e3 * seconds)
+
+    @property
+    def delay_ms(self) -> Spread:
+        """From when the newest questions came to when their answers left, milliseconds."""
+        return keyframe_times.spread(np.array(self._delays_ms))
 
 
 class MapCondition:

@@ -17,10 +17,10 @@ from msgspec import Struct
 from tsfusion.core.rates import Bucket
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.gateway.hosted_map import HostedMap
+from tsfusion.gateway.map_condition import QuestionCounts
 from tsfusion.gateway.memory_guard import PendingReplies
 from tsfusion.gateway.metrics import Metrics
 from tsfusion.gateway.ports import Ports
-from tsfusion.gateway.question_counts import QuestionCounts
 from tsfusion.wire import messages, questions
 
 MOST_WAITING = 32  # questions of all clients, of a map: it looks at each of their answers

@@ -11,8 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.geometry.keyframe import Intrinsics, Keyframe
-from tsfusion.geometry.measured_points import depth_metres
+from tsfusion.geometry.keyframe import Intrinsics, Keyframe, depth_metres
 from tsfusion.geometry.trajectory import quaternion
 from tsfusion.journal.mcap_layout import Record
 from tsfusion.wire.record_header import KeyframeHeader

@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""Last steps before a mesh is shared: cut to a box, freed of small pieces, with fewer triangles."""
+"""Last steps before a mesh is shared: cut to a box, freed of small pieces, thinned, and written."""
 
 import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tsfusion.core.errors import InvalidConfig, OutputError
-from tsfusion.geometry import mesh_cropping, mesh_islands, mesh_simplification
-from tsfusion.geometry.mesh import GUESS_COLOR, Mesh
+from tsfusion.geometry import mesh_cropping, mesh_islands, mesh_simplification, point_files
+from tsfusion.geometry.mesh import FORMATS, GUESS_COLOR, Mesh
+from tsfusion.pipelines import mesh_preview
 
 if TYPE_CHECKING:
     from tsfusion.tsdf.volume import Volume
@@ -15,6 +18,9 @@ _MARGIN = 128  # voxels around a box that its surface depends on
 # Memory of a step beside the map and in its sizes, the most that lab/bench/mesh_sharing.py --memory found
 _FILLING, _SIMPLIFYING, _TEXTURING = 3.0, 6.0, 4.0
 Box = tuple[float, float, float, float, float, float]
+PICTURE = ".png"
+SURFACES = (*FORMATS, *point_files.ONLY_POINTS)
+_EXACT = (".ply", ".obj", *point_files.ONLY_POINTS)  # the whole map
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -187,3 +193,34 @@ def _not_empty(mesh: Mesh, why: str) -> Mesh:
     if not len(mesh.faces):
         raise OutputError(f"nothing to write: {why}")
     return mesh
+
+
+def write(mesh: Mesh, files: Sequence[Path], *, keep_islands: bool | None = None) -> dict[str, Any]:
+    """Write a surface, its points (PCD, LAS, LAZ) or a picture (PNG) by each file's suffix.
+
+    Args:
+        keep_islands: None = PLY, OBJ and points keep them; GLB, STL and pictures do not.
+
+    Returns:
+        Number of `islands` left out, their `triangles`, and the names of the `files` without them.
+
+    Raises:
+        OutputError: for an empty mesh or a place that cannot be written.
+    """
+    tidy, without = mesh.without_islands(), list[str]()
+    for file in files:
+        suffix = file.suffix.lower()
+        keeps = suffix in _EXACT if keep_islands is None else keep_islands
+        chosen = mesh if keeps else tidy
+        if chosen is not mesh:
+            without.append(file.name)
+        if suffix == PICTURE:
+            mesh_preview.render(chosen, file)
+        elif suffix in point_files.ONLY_POINTS:
+            chosen.save_points(file)
+        else:
+            chosen.save(file)
+    if not without:
+        return {"islands": 0, "triangles": 0, "files": []}
+    figures = mesh.figures
+    return {"islands": figures["islands"], "triangles": figures["island_triangles"], "files": without}

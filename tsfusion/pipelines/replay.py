@@ -22,7 +22,7 @@ from tsfusion.datasets.dataset import UnreadableFrame, force_of, readable
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.geometry.origin import world_of
 from tsfusion.geometry.up_direction import HeldSensor, Up
-from tsfusion.pipelines import engine, map_growth, map_size, replay_results, run_files, target_server
+from tsfusion.pipelines import engine, map_growth, replay_results, run_files, target_server
 from tsfusion.pipelines.engine import AHEAD, Engine, Progress
 from tsfusion.pipelines.replay_results import ReplaySummary
 from tsfusion.pipelines.target_server import Target
@@ -93,7 +93,7 @@ def replay(
         # A dataset that cannot be read is an error before a server starts.
         begin, first = next(readable(dataset.__getitem__, range(len(dataset))), None) or (0, dataset[0])
         if connect is None:
-            map_size.check_fits(first, volume)
+            map_growth.check_fits(first, volume)
         progress.stage(engine.STARTING if connect is None else f"connecting to {connect}")
         with (
             target_server.opened(

@@ -29,7 +29,7 @@ from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.provenance import Provenance
 from tsfusion.geometry.up_direction import HeldSensor, Up
 from tsfusion.journal.state_folder import check_no_map_of_a_server
-from tsfusion.pipelines import latency_ledger, mesh_files, shortfall
+from tsfusion.pipelines import latency_ledger, mesh_finishing, shortfall
 from tsfusion.pipelines.target_server import Target
 from tsfusion.wire.health import Status
 from tsfusion.wire.keyframe_times import KeyframeTimes
@@ -90,7 +90,7 @@ def write_map(
         world: name of the coordinate frame of the poses; empty = that of poses given from elsewhere.
         up: away from the ground, in the map's frame; None = it is found.
         min_weight: full-confidence samples a voxel needs to be meshed; None = the sensor's.
-        keep_islands: see `mesh_files.write`.
+        keep_islands: see `mesh_finishing.write`.
     """
     status = target.status(map_name)
     mesh = target.mesh(map_name, min_weight=min_weight)
@@ -102,7 +102,7 @@ def write_map(
             provenance=_provenance(status, target, world),
         )
         files = [work / f"{name}{suffix}{ending}" for name, ending in _MESH_FILES]
-        left_out = mesh_files.write(mesh, files, keep_islands=keep_islands)
+        left_out = mesh_finishing.write(mesh, files, keep_islands=keep_islands)
     return WrittenMap(status, mesh, {**mesh.figures, "left_out": left_out})
 
 

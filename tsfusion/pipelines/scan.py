@@ -38,7 +38,6 @@ from tsfusion.geometry.up_direction import HeldSensor, Up
 from tsfusion.pipelines import (
     engine,
     map_growth,
-    map_size,
     run_files,
     scan_alignment,
     scan_results,
@@ -131,7 +130,7 @@ def scan(
         if first.left is not None and first.right is not None and exchanged(first.left, first.right):
             raise SourceError(f"{source.name}: {EXCHANGED}")
         if own and first.kind != "pair":
-            map_size.check_fits(first.keyframe(np.eye(4)), volume)
+            map_growth.check_fits(first.keyframe(np.eye(4)), volume)
         localizer = registry.create_localizer(config, first)
         stack.callback(getattr(localizer, "close", lambda: None))
         if own:

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.geometry import se3
-from tsfusion.geometry.keyframe import Keyframe
-from tsfusion.geometry.measured_points import depth_metres
+from tsfusion.geometry.keyframe import Keyframe, depth_metres
 
 _SMALLEST = 8  # pixels of an image's side
 _EDGE = 4.0  # pixels from an edge of the depth at which colour is trusted wholly: registration ends there

@@ -9,7 +9,7 @@ from geometry_checks import move
 from small_recordings import LeftOut, one_line_of, put
 
 from tsfusion.datasets import LidarDump, open_dataset
-from tsfusion.geometry.measured_points import points_camera
+from tsfusion.geometry.keyframe import points_camera
 
 
 def test_lidar_keyframes_meet_by_their_poses(data):

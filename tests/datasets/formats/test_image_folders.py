@@ -25,8 +25,7 @@ from written_recordings import check, matrix, millimetres, replica, scannet, vie
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets import HoloLens, Redwood, Replica, ScanNet, SevenScenes, open_dataset
-from tsfusion.geometry.keyframe import Intrinsics
-from tsfusion.geometry.measured_points import depth_metres
+from tsfusion.geometry.keyframe import Intrinsics, depth_metres
 
 SECOND_POSE = "frame-000001.pose.txt"
 

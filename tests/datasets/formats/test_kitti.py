@@ -16,7 +16,7 @@ from tsfusion.core.errors import DatasetError
 from tsfusion.datasets import KITTI, open_dataset, select
 from tsfusion.datasets.dataset import NO_HALF
 from tsfusion.datasets.given_trajectory import WithTrajectory
-from tsfusion.geometry.measured_points import depth_metres, points_world
+from tsfusion.geometry.keyframe import depth_metres, points_world
 from tsfusion.geometry.stereo_matching import Matcher
 from tsfusion.scanner.sources.recorded import RecordedSource
 

@@ -15,7 +15,7 @@ from written_recordings import fits_together
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets import KITTIRaw, open_dataset
-from tsfusion.geometry.measured_points import points_camera
+from tsfusion.geometry.keyframe import points_camera
 from tsfusion.geometry.se3 import inverse
 
 scipy_spatial = pytest.importorskip("scipy.spatial")

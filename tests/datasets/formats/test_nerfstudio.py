@@ -15,8 +15,7 @@ from written_recordings import check, fits_together, transforms, views
 
 from tsfusion.datasets import Nerfstudio, open_dataset
 from tsfusion.geometry.calibration import Camera
-from tsfusion.geometry.keyframe import Intrinsics
-from tsfusion.geometry.measured_points import depth_metres
+from tsfusion.geometry.keyframe import Intrinsics, depth_metres
 
 
 def rewrite(root: Path, change: Callable[[dict], object]) -> None:

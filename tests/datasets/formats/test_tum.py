@@ -14,8 +14,7 @@ from tsfusion.core.errors import DatasetError
 from tsfusion.datasets import TUM, open_dataset
 from tsfusion.datasets.trajectory_files import nanoseconds, read_tum
 from tsfusion.geometry import up_direction
-from tsfusion.geometry.keyframe import Intrinsics
-from tsfusion.geometry.measured_points import points_camera
+from tsfusion.geometry.keyframe import Intrinsics, points_camera
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.up_direction import HeldSensor
 

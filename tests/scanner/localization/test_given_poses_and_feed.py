@@ -32,8 +32,8 @@ from tsfusion.geometry.trajectory import quaternion, rigid, slerp
 from tsfusion.scanner.localization.given_poses import GivenPoses, TrajectoryFilePoses
 from tsfusion.scanner.localization.localizer import Lost, Pose
 from tsfusion.scanner.localization.pose_feed.feed import PoseFeed
+from tsfusion.scanner.localization.pose_feed.map_deformation import PoseHistory
 from tsfusion.scanner.localization.pose_feed.messages import MAX_BYTES, decode
-from tsfusion.scanner.localization.pose_feed.pose_history import PoseHistory
 
 SENDER = ROOT / "contrib" / "pose_sender.py"
 DEADLINE = 20.0  # seconds

@@ -7,9 +7,17 @@ from typing import Any
 import numpy as np
 
 from tsfusion.core.errors import DatasetError, InvalidConfig, InvalidKeyframe
-from tsfusion.datasets.accelerometer import Accelerometer, read_table
 from tsfusion.datasets.cameras import RecordedCamera
-from tsfusion.datasets.dataset import NO_HALF, NO_POSE_IN_TIME, SCAN, NoPoses, Poses, Times
+from tsfusion.datasets.dataset import (
+    NO_HALF,
+    NO_POSE_IN_TIME,
+    SCAN,
+    Accelerometer,
+    NoPoses,
+    Poses,
+    Times,
+    read_table,
+)
 from tsfusion.datasets.folder_frames import FolderFrames
 from tsfusion.datasets.readers import listed_file, read_lines
 from tsfusion.datasets.stereo_pairs import PairedImages

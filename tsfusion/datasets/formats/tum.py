@@ -7,9 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tsfusion.datasets.accelerometer import read_table
 from tsfusion.datasets.cameras import DepthUnit, PublishedCamera
-from tsfusion.datasets.dataset import SCAN, NoPoses, Poses, Times
+from tsfusion.datasets.dataset import SCAN, NoPoses, Poses, Times, read_table
 from tsfusion.datasets.formats.image_folders import DepthImages
 from tsfusion.datasets.formats.tum_lists import ASSOCIATIONS, read_recording
 from tsfusion.geometry.keyframe import Intrinsics

@@ -19,8 +19,7 @@ from tsfusion.datasets.dataset import CLOCK, NO_POSE_IN_TIME, Frames, clock_part
 from tsfusion.datasets.depth_files import check_metres
 from tsfusion.datasets.rosbag import messages
 from tsfusion.datasets.rosbag.cameras import CameraWatch
-from tsfusion.datasets.rosbag.imu import ImuTopics
-from tsfusion.datasets.rosbag.poses import PoseFinder, pose_streams
+from tsfusion.datasets.rosbag.poses import ImuTopics, PoseFinder, pose_streams
 from tsfusion.datasets.rosbag.reader import ENDINGS, BagRecording, Message, MessageLocation, recording
 from tsfusion.datasets.rosbag.topics import Modality, TopicChooser, recorded_scale
 from tsfusion.geometry import se3

@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: MIT
-"""The pose of a recording's sensor at a time: from its transforms, or from a topic of poses."""
+"""The pose of a recording's sensor at a time, from transforms or a topic of poses; its accelerometer."""
 
+from array import array
+from collections import defaultdict
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets.dataset import SCAN
-from tsfusion.datasets.rosbag.reader import BagRecording, Message, Stream
+from tsfusion.datasets.dataset import SCAN, Accelerometer
+from tsfusion.datasets.rosbag.reader import BagRecording, Message, Stream, frame_id, stamp_ns
 from tsfusion.datasets.rosbag.transforms import (
     OLD_TF,
     PATH,
@@ -19,6 +21,10 @@ from tsfusion.datasets.rosbag.transforms import (
     TransformTree,
 )
 from tsfusion.geometry.se3 import Transform
+
+IMU = "sensor_msgs/msg/Imu"
+_NOT_MEASURED = -1.0  # as first covariance: sensor_msgs/Imu.msg
+_LEAST, _MOST = 8.0, 12.0  # m/s²: the median length of what an accelerometer at rest measures
 
 
 def pose_streams(recording: BagRecording, pose_topic: str | None) -> list[Stream]:
@@ -154,3 +160,36 @@ class PoseFinder:
             return posed
 
         return at
+
+
+class ImuTopics:
+    """Linear accelerations of every topic of IMU messages, collected message by message."""
+
+    def __init__(self, recording: BagRecording) -> None:
+        self.streams = [one for one in recording.streams if one.kind == IMU]
+        self._frames: dict[Stream, str] = {}
+        self._stamps: defaultdict[Stream, array[int]] = defaultdict(lambda: array("q"))
+        self._forces: defaultdict[Stream, array[float]] = defaultdict(lambda: array("d"))
+
+    def add(self, message: Message) -> None:
+        """Take a message of one of `streams` into account."""
+        content, stream = message.content, message.stream
+        if content.linear_acceleration_covariance[0] == _NOT_MEASURED:
+            return
+        self._frames.setdefault(stream, frame_id(content))
+        force = content.linear_acceleration
+        self._stamps[stream].append(stamp_ns(content))
+        self._forces[stream].extend((force.x, force.y, force.z))
+
+    def accelerometer(self, leads: Callable[[str], Transform | None]) -> Accelerometer | None:
+        """The first topic that measures gravity, and whose frame's place is known.
+
+        Args:
+            leads: gives the transform from a frame to the camera or LiDAR; None = not known.
+        """
+        for stream, stamps in self._stamps.items():
+            forces = np.array(self._forces[stream]).reshape(-1, 3)
+            T_sensor_imu = leads(self._frames[stream])
+            if T_sensor_imu is not None and _LEAST < np.median(np.linalg.norm(forces, axis=1)) < _MOST:
+                return Accelerometer(stamps, forces, T_sensor_imu[:3, :3])
+        return None

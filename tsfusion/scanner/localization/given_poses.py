@@ -14,8 +14,7 @@ from tsfusion.geometry import origin as origins
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.sweeps import motion_about
 from tsfusion.geometry.trajectory import Trajectory
-from tsfusion.scanner.localization.localizer import Localizer, Lost, Pose
-from tsfusion.scanner.localization.tracking_keyframes import TrackingKeyframes
+from tsfusion.scanner.localization.localizer import Localizer, Lost, Pose, TrackingKeyframes
 
 
 class TrajectoryFilePoses(Localizer):

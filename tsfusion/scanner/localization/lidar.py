@@ -13,8 +13,7 @@ from tsfusion.core.distinct_integers import distinct
 from tsfusion.core.errors import InvalidKeyframe, MissingDependency
 from tsfusion.geometry import se3, sweeps
 from tsfusion.geometry.frame import Frame
-from tsfusion.scanner.localization.localizer import Localizer, Lost, Pose
-from tsfusion.scanner.localization.tracking_keyframes import TrackingKeyframes
+from tsfusion.scanner.localization.localizer import Localizer, Lost, Pose, TrackingKeyframes
 
 Points = NDArray[np.float64]  # (n, 3) metres
 

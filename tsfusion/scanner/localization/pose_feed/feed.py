@@ -14,11 +14,9 @@ from functools import partial
 from tsfusion.core.errors import DecodeError, InvalidConfig, TransportError
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.sweeps import motion_about
-from tsfusion.scanner.localization.localizer import Lost, Pose, PoseCorrections
-from tsfusion.scanner.localization.pose_feed.map_deformation import MapDeformation
+from tsfusion.scanner.localization.localizer import Lost, Pose, PoseCorrections, TrackingKeyframes
+from tsfusion.scanner.localization.pose_feed.map_deformation import MapDeformation, PoseHistory
 from tsfusion.scanner.localization.pose_feed.messages import MAX_BYTES, decode
-from tsfusion.scanner.localization.pose_feed.pose_history import PoseHistory
-from tsfusion.scanner.localization.tracking_keyframes import TrackingKeyframes
 from tsfusion.wire import sockets
 
 log = logging.getLogger(__name__)

@@ -12,10 +12,9 @@ from tsfusion.core.errors import InvalidKeyframe
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
 from tsfusion.scanner.localization import features
-from tsfusion.scanner.localization.localizer import Localizer, Lost, Pose
+from tsfusion.scanner.localization.localizer import Localizer, Lost, Pose, TrackingKeyframes
 from tsfusion.scanner.localization.stereo.rectification_check import RectificationCheck, RectificationMonitor
 from tsfusion.scanner.localization.stereo.reprojection import StereoCamera, refine
-from tsfusion.scanner.localization.tracking_keyframes import TrackingKeyframes
 
 MAX_CORNERS = 1000
 MIN_POINTS = 25  # that must agree
