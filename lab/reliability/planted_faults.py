@@ -115,7 +115,7 @@ FAULTS = (
         "journal/test_bad_disks.py::test_the_oldest_segments_go_and_no_other",
     ),
     Fault(
-        "journal/free_space.py",
+        "journal/writer.py",
         "            if nbytes > spare:",
         "            if False:",
         "journal/test_bad_disks.py::test_append_stops_before_the_disk_is_full",

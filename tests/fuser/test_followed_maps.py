@@ -20,8 +20,7 @@ from tsfusion import Keyframe, Volume
 from tsfusion.core.config import Surface, override
 from tsfusion.core.errors import DecodeError
 from tsfusion.fuser import live_mesh
-from tsfusion.fuser.live_mesh import LiveMesh
-from tsfusion.fuser.touched_by import TouchedBy
+from tsfusion.fuser.live_mesh import LiveMesh, TouchedBy
 from tsfusion.fuser.watched_map import WatchedMap
 from tsfusion.journal.keyframe_poses import KeyframePoses
 from tsfusion.wire import mesh_updates, questions

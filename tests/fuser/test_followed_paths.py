@@ -11,7 +11,7 @@ from keyframes_and_servers import CAMERA, SHAPE, pose, wall
 
 from tsfusion.core.errors import DecodeError
 from tsfusion.fuser import watched_map
-from tsfusion.fuser.touched_by import TouchedBy
+from tsfusion.fuser.live_mesh import TouchedBy
 from tsfusion.fuser.watched_map import WatchedMap
 from tsfusion.geometry.up_direction import HeldSensor
 from tsfusion.journal import Position

@@ -32,10 +32,10 @@ from tsfusion import VolumeConfig
 from tsfusion.core import durable_files, errors, folder_lock, process
 from tsfusion.core.config import CacheConfig, override
 from tsfusion.fuser import __main__ as fuser_main
-from tsfusion.fuser import messages, opened_map
-from tsfusion.fuser.current_keyframe import CurrentKeyframe
+from tsfusion.fuser import map_checkpoints, messages
 from tsfusion.fuser.fuser import Chore, Fuser
 from tsfusion.fuser.map_checkpoints import MapCheckpoints
+from tsfusion.fuser.messages import CurrentKeyframe
 from tsfusion.journal import Journal, Position, segment_path
 from tsfusion.journal.state_folder import MAP_FILE, PREVIOUS_FILE
 from tsfusion.wire import codec, corrections, record_header
@@ -525,7 +525,7 @@ def test_a_process_and_its_map_keep_to_their_memory(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(process, "limit_memory", limits.append)
     fill(tmp_path, 1)
     fuser, _ = opened(tmp_path, memory_bytes=1 << 30)
-    assert limits == [1000 + opened_map._WORKING_MEMORY + (1 << 30)]
+    assert limits == [1000 + map_checkpoints._WORKING_MEMORY + (1 << 30)]
     most = fuser._volume.most_blocks
     assert opened(tmp_path, memory_bytes=1 << 29)[0]._volume.most_blocks < most
 

@@ -16,13 +16,20 @@ from keyframes_and_servers import CAMERA, SHAPE, VOLUME, wall
 from tsfusion import Volume
 from tsfusion.core.rates import Bucket
 from tsfusion.fuser import question_answers
-from tsfusion.fuser.current_keyframe import CurrentKeyframe
 from tsfusion.fuser.inbox import Inbox
 from tsfusion.fuser.kept_slices import KeptSlices
 from tsfusion.fuser.kept_views import KeptViews
-from tsfusion.fuser.messages import NOT_WORKING, Finish, FuserAnswer, FuserQuestion, Publish, encode
+from tsfusion.fuser.live_mesh import TouchedBy
+from tsfusion.fuser.messages import (
+    NOT_WORKING,
+    CurrentKeyframe,
+    Finish,
+    FuserAnswer,
+    FuserQuestion,
+    Publish,
+    encode,
+)
 from tsfusion.fuser.question_answers import QuestionAnswers
-from tsfusion.fuser.touched_by import TouchedBy
 from tsfusion.fuser.watched_map import WatchedMap
 from tsfusion.journal.keyframe_poses import KeyframePoses
 from tsfusion.wire import questions

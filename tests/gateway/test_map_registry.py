@@ -26,7 +26,7 @@ from tsfusion.gateway.map_registry import MapRegistry
 from tsfusion.gateway.metrics import Metrics
 from tsfusion.journal import Journal, quarantine, state_folder
 from tsfusion.wire import messages, sockets
-from tsfusion.wire.allowed_maps import AllowedMaps
+from tsfusion.wire.allow_list import AllowedMaps
 from tsfusion.wire.messages import Command, Denied, Nack, Welcome
 
 

@@ -7,7 +7,7 @@ from test_map_tiles import RADIUS, grown
 
 from tsfusion.viewer.clipping import Clipping
 from tsfusion.viewer.map_tiles import MapTiles
-from tsfusion.viewer.pointed_surface import first_hit
+from tsfusion.viewer.map_views import first_hit
 
 
 @pytest.fixture(scope="module")

@@ -15,11 +15,11 @@ from tsfusion.core import logs, process
 from tsfusion.core.config import LogFormat, LogLevel
 from tsfusion.core.errors import MapError, TsfusionError
 from tsfusion.core.folder_lock import lock_folder
+from tsfusion.fuser import map_checkpoints
 from tsfusion.fuser import messages as fuser_messages
-from tsfusion.fuser import opened_map
 from tsfusion.fuser.fuser import LOCK, Fuser
 from tsfusion.fuser.inbox import Inbox
-from tsfusion.fuser.opened_map import OpenedMap
+from tsfusion.fuser.map_checkpoints import OpenedMap
 from tsfusion.wire import sockets
 
 _LOCK_WAIT_S = 60.0  # for another fuser to end: it may be reading a large map
@@ -100,7 +100,7 @@ class _Ahead:
         """Do it and say so; False where a map cannot be opened, and that is said."""
         try:
             if isinstance(message, fuser_messages.Warm):
-                opened_map.warm(message.volume)
+                map_checkpoints.warm(message.volume)
             else:
                 _lock(message.begin)
                 self.opened = OpenedMap(message.begin)

@@ -26,14 +26,13 @@ from tsfusion.core import process
 from tsfusion.core.errors import JournalError, TsfusionError
 from tsfusion.core.process import version_of
 from tsfusion.fuser import messages as fuser_messages
-from tsfusion.fuser.current_keyframe import CurrentKeyframe
 from tsfusion.fuser.departures import Departures
 from tsfusion.fuser.inbox import Inbox
-from tsfusion.fuser.live_mesh import LiveMesh, mesh_frames
-from tsfusion.fuser.opened_map import OpenedMap
+from tsfusion.fuser.live_mesh import LiveMesh, TouchedBy, mesh_frames
+from tsfusion.fuser.map_checkpoints import OpenedMap
+from tsfusion.fuser.messages import CurrentKeyframe
 from tsfusion.fuser.pose_mover import REST_FACTOR, PoseMover
 from tsfusion.fuser.question_answers import QuestionAnswers
-from tsfusion.fuser.touched_by import TouchedBy
 from tsfusion.fuser.watched_map import WatchedMap
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.geometry.sample_ranges import NO_SAMPLES

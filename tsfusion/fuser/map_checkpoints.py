@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""The checkpoints of a map on a server's disk: the last, the one before, and how far each session was."""
+"""The checkpoints of a map on a server's disk, and a map that one of them opened."""
 
 import logging
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from tsfusion import journal
-from tsfusion.core import durable_files
+from tsfusion.core import durable_files, process
 from tsfusion.core.config import LIMIT_SETTINGS, RUN_SETTINGS, VIEW_SETTINGS, VolumeConfig
 from tsfusion.core.errors import CheckpointError, DamagedCheckpoint, InvalidConfig, TsfusionError
-from tsfusion.fuser.messages import SessionProgress
+from tsfusion.fuser.messages import Begin, SessionProgress
 from tsfusion.journal import state_folder
 from tsfusion.journal.keyframe_poses import KeyframePoses
 from tsfusion.tsdf import map_history
@@ -29,6 +29,7 @@ _NEW_FILE = "map.new.tsf"
 _PARTS = r"map\.new\.tsf|\.map\.new\.tsf\.partial"
 
 log = logging.getLogger(__name__)
+_WORKING_MEMORY = 768 << 20  # bytes for keyframes and meshes, beyond those of the map
 
 
 class MapCheckpoints:
@@ -181,3 +182,43 @@ def _set_aside(path: Path, error: DamagedCheckpoint) -> None:
         error,
         aside,
     )
+
+
+class OpenedMap:
+    """The map in the folder of a `Begin`.
+
+    Attributes:
+        checkpoints: the map, and where it is saved.
+        memory_limit: of the process, bytes.
+        warming: the kernels that no keyframe needs, which are not compiled yet.
+
+    Raises:
+        TsfusionError, MemoryError: as `MapCheckpoints`.
+    """
+
+    def __init__(self, begin: Begin) -> None:
+        from tsfusion.kernels import runtime
+
+        runtime.start(begin.volume.threads)  # it reserves a GB, and more for each thread, and hardly uses it
+        self.memory_limit = process.data_bytes() + _WORKING_MEMORY + begin.memory_bytes
+        process.limit_memory(self.memory_limit)
+        # A map of any size opens, as long as there is memory; from then on it may not outgrow its own.
+        self.checkpoints = MapCheckpoints(
+            Path(begin.folder),
+            begin.volume,
+            keep_previous=begin.keep_previous,
+            kept={"memory_bytes": begin.memory_bytes, "cache": begin.cache} if begin.cache else {},
+        )
+        volume = self.checkpoints.volume
+        self.warming: Iterator[None] = volume.warming_up()
+        next(self.warming, None)
+        volume.limit_memory(begin.memory_bytes)
+
+
+def warm(config: VolumeConfig) -> None:
+    """Compile all kernels of maps with these settings: such a map opens at once then."""
+    from tsfusion.kernels import runtime
+    from tsfusion.tsdf.volume import Volume
+
+    runtime.start(config.threads)
+    Volume(config).warm_up()

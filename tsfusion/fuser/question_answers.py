@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 
 from tsfusion.core.errors import InvalidConfig, TsfusionError
 from tsfusion.core.rates import Bucket
-from tsfusion.fuser.current_keyframe import CurrentKeyframe
 from tsfusion.fuser.inbox import Inbox
 from tsfusion.fuser.kept_slices import KeptSlices
 from tsfusion.fuser.kept_views import KeptViews
-from tsfusion.fuser.messages import FuserAnswer, FuserQuestion
+from tsfusion.fuser.messages import CurrentKeyframe, FuserAnswer, FuserQuestion
 from tsfusion.fuser.watched_map import WatchedMap
 from tsfusion.wire import questions
 from tsfusion.wire.questions import (

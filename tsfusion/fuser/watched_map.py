@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.fuser.live_mesh import LiveMesh
-from tsfusion.fuser.touched_by import TouchedBy
+from tsfusion.fuser.live_mesh import LiveMesh, TouchedBy
 from tsfusion.journal.keyframe_poses import KeyframePoses
 from tsfusion.wire.questions import CELLS_AT_ONCE, KEYFRAMES_AT_ONCE, REFINED_AT_ONCE, Cells, Keyframes
 

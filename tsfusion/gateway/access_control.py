@@ -12,8 +12,7 @@ import zmq
 from zmq.utils import z85
 
 from tsfusion.core.errors import InvalidConfig
-from tsfusion.wire.allow_list import AllowList
-from tsfusion.wire.allowed_maps import ALL_MAPS, AllowedMaps
+from tsfusion.wire.allow_list import ALL_MAPS, AllowedMaps, AllowList
 from tsfusion.wire.curve import DOMAIN, ServerKeys, server_keys
 
 log = logging.getLogger(__name__)

@@ -13,7 +13,7 @@ from tsfusion.gateway.ports import Ports
 from tsfusion.gateway.problems import Problem
 from tsfusion.gateway.recent_fates import RecentFates
 from tsfusion.gateway.sessions import Session, Sessions
-from tsfusion.wire.allowed_maps import AllowedMaps
+from tsfusion.wire.allow_list import AllowedMaps
 from tsfusion.wire.health import ClientHealth, ClientState
 from tsfusion.wire.messages import Ping, ToClient
 

@@ -38,7 +38,7 @@ from tsfusion.gateway.ports import Flood, Ports, Subscriptions, receive_some
 from tsfusion.gateway.problems import Problem, ProblemTimes
 from tsfusion.gateway.scan_updates import ScanUpdates
 from tsfusion.wire import messages, questions, sockets
-from tsfusion.wire.allowed_maps import ALL_MAPS, AllowedMaps
+from tsfusion.wire.allow_list import ALL_MAPS, AllowedMaps
 from tsfusion.wire.forgetting import Forgotten
 from tsfusion.wire.health import Health, MapHealth
 from tsfusion.wire.sockets import mesh_topic

@@ -26,7 +26,7 @@ from tsfusion.gateway.sessions import Session
 from tsfusion.gateway.spare_fusers import SpareFusers
 from tsfusion.journal import state_folder
 from tsfusion.journal.record_scan import journal_error
-from tsfusion.wire.allowed_maps import ALL_MAPS, AllowedMaps
+from tsfusion.wire.allow_list import ALL_MAPS, AllowedMaps
 from tsfusion.wire.health import MapHealth
 from tsfusion.wire.messages import Denied, Hello
 from tsfusion.wire.record_header import RecordHeader

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from tsfusion import journal
 from tsfusion.core.errors import CheckpointError, DecodeError, InvalidKeyframe, JournalError, MapError
-from tsfusion.fuser.touched_by import TouchedBy
+from tsfusion.fuser.live_mesh import TouchedBy
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.journal import state_folder
 from tsfusion.journal.journaled_keyframes import JournaledKeyframes, JournaledSession, KeyframePlace

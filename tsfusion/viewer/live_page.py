@@ -16,7 +16,7 @@ from tsfusion.core import process
 from tsfusion.core.rates import Bucket
 from tsfusion.core.readable_numbers import grouped
 from tsfusion.geometry.mesh import Mesh
-from tsfusion.viewer import map_views, pointed_surface
+from tsfusion.viewer import map_views
 from tsfusion.viewer.browser_panel import BrowserPanel, set_theme
 from tsfusion.viewer.calm_callbacks import calm
 from tsfusion.viewer.map_feed import MapFeed
@@ -288,7 +288,7 @@ class LivePage:
         self, look: TileLook, origin: NDArray[np.float64], direction: NDArray[np.float64]
     ) -> NDArray[np.float64] | None:
         """(3,) the point of the shown surface that a ray meets."""
-        return pointed_surface.first_hit(self._tiles, look.nodes.clipping, origin, direction)
+        return map_views.first_hit(self._tiles, look.nodes.clipping, origin, direction)
 
     def shown_mesh(self, look: TileLook) -> Mesh:
         """Mesh of what is shown, in the map's frame."""
