@@ -21,7 +21,7 @@ bench:  ## one JSON line a case
 	$(PYTHON) lab/bench/bench.py $(ARGS)
 
 accuracy:  ## every row, then the tables and plots of docs/accuracy.md
-	$(PYTHON) scripts/accuracy.py --output out/accuracy --write-docs $(ARGS)
+	$(PYTHON) lab/evaluation/accuracy.py --output out/accuracy --write-docs $(ARGS)
 
 nightly:  ## the long forms of what the tests try: about two hours
 	$(PYTHON) -m pytest --nightly -m nightly

@@ -59,7 +59,7 @@ def test_missing_poses_are_one_clear_line(opened, tmp_path, monkeypatch):
         opened("synthetic:kitti08")
 
 
-def test_scripts_need_no_installed_laboratory(monkeypatch):
+def test_measurements_need_no_installed_laboratory(monkeypatch):
     monkeypatch.setattr(registry, "entry_points", lambda group: EntryPoints())
     with pytest.raises(DatasetError, match="`pip install -e lab` adds kitti06, kitti07 and desk"):
         open_dataset("synthetic:desk")

@@ -137,7 +137,7 @@ class Server:
 
     Attributes:
         FUSER: command of fusers where none is chosen; None = the server's own. Tests set another one
-            (tests/conftest.py), scripts that measure do not.
+            (tests/conftest.py), measurements do not.
     """
 
     FUSER: ClassVar[tuple[str, ...] | None] = None

@@ -10,7 +10,7 @@ from tsfusion.core import durable_files
 
 Rows = dict[str, dict[str, Any]]  # by name
 ROWS, TABLES = "rows.jsonl", "tables.md"
-BEGIN, END = "<!-- tables: python scripts/accuracy.py --write-docs -->", "<!-- end of tables -->"
+BEGIN, END = "<!-- tables: python lab/evaluation/accuracy.py --write-docs -->", "<!-- end of tables -->"
 
 
 class Column(NamedTuple):
@@ -107,7 +107,7 @@ def write_docs(docs: Path, rows: Rows, order: list[str]) -> list[Path]:
     _, _, after = rest.partition(END)
     page.write_text(f"{before}{BEGIN}\n\n" + "\n".join(parts) + f"\n{END}{after}", encoding="utf-8")
     tables = [f"## {QUESTIONS[key].title}\n\n{full_table(group)}" for key, group in _questions(chosen)]
-    says = "Written by `python scripts/accuracy.py`; [accuracy.md](accuracy.md) says what it is."
+    says = "Written by `python lab/evaluation/accuracy.py`; [accuracy.md](accuracy.md) says what it is."
     head = f"# Every row\n\n{says}\n"
     every.write_text("\n".join([head, *tables]), encoding="utf-8")
     return [page, every, *images.values()]

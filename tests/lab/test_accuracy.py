@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""scripts/accuracy.py: its rows, its files and a tiny slice from end to end."""
+"""lab/evaluation/accuracy.py: its rows, its files and a tiny slice from end to end."""
 
 import json
 import os
@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from repository import ROOT
 
-SCRIPT = ROOT / "scripts" / "accuracy.py"
+SCRIPT = ROOT / "lab" / "evaluation" / "accuracy.py"
 
 
 def accuracy(*arguments: str | Path, **environment: str) -> "subprocess.CompletedProcess[str]":

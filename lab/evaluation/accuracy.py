@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
 """Measure what is fused: error, completeness, normals, edges and unseen views, by method, scene and noise.
 
-    python scripts/accuracy.py --output FOLDER         every row, its tables and plots (25 min on 2 cores)
-    python scripts/accuracy.py --quick                 20 keyframes of one room, two noises (a minute)
-    python scripts/accuracy.py --list                  the names of the rows
-    python scripts/accuracy.py --only kitchen bunny    those whose name holds one of these words
-    python scripts/accuracy.py --output FOLDER --tables --write-docs    what FOLDER holds, into docs/
+    python lab/evaluation/accuracy.py --output FOLDER         every row, tables and plots (25 min on 2 cores)
+    python lab/evaluation/accuracy.py --quick                 20 keyframes of one room, two noises (a minute)
+    python lab/evaluation/accuracy.py --list                  the names of the rows
+    python lab/evaluation/accuracy.py --only kitchen bunny    those whose name holds one of these words
+    python lab/evaluation/accuracy.py --output FOLDER --tables --write-docs    what FOLDER holds, into docs/
 
 A row is a scene, a noise, a number of keyframes and a method; each runs in a process of its own. Without
 --output each row is one JSON line on stdout. A folder keeps its rows: a later run replaces those it measures
@@ -29,12 +29,11 @@ from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
-import _report
-from _ablation import PEERS, Row, missing_data, rows, run
-
-sys.path.append(str(Path(__file__).parents[1]))  # lab is not installed
+sys.path.append(str(Path(__file__).parents[2]))  # lab is not installed
 
 from lab.bench.peers import ROOT, unimportable
+from lab.evaluation import accuracy_report
+from lab.evaluation.ablation import PEERS, Row, missing_data, rows, run
 
 
 def main() -> int:
@@ -50,7 +49,7 @@ def main() -> int:
         return 0
     if (options.tables or options.write_docs or options.missing) and not options.output:
         parser.error("--tables, --write-docs and --missing need the rows of an --output folder")
-    known = _report.read(options.output) if options.output else {}
+    known = accuracy_report.read(options.output) if options.output else {}
     if options.missing:
         chosen = [row for row in chosen if row.name not in known]
     try:
@@ -60,9 +59,9 @@ def main() -> int:
         status = 130
     if options.output and known:
         order = [row.name for row in rows()]
-        written = _report.write(options.output, known, order)
+        written = accuracy_report.write(options.output, known, order)
         if options.write_docs and status != 130:
-            written += _report.write_docs(ROOT / "docs", known, order)
+            written += accuracy_report.write_docs(ROOT / "docs", known, order)
         say("written: " + ", ".join(str(path) for path in written))
     return status
 
@@ -122,7 +121,7 @@ def measure(chosen: list[Row], options: argparse.Namespace, known: dict[str, dic
                 continue
             known[line["row"]] = line
             if options.output:
-                _report.keep(options.output, known)
+                accuracy_report.keep(options.output, known)
             else:
                 print(json.dumps(line), flush=True)
             say(name)
