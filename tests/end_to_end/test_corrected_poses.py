@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from clients_and_spools import NOBODY, QUICK
 from corrected_maps import final_keyframes, fresh_map
-from delivery_verdict import VOXEL_SIZE
 from hostile_messages import hostile_corrections
 from keyframes_and_servers import (
     DEADLINE,
@@ -30,6 +29,7 @@ from keyframes_and_servers import (
 from quick_fusers import SUMS
 from sum_map import hash_of
 
+from lab.reliability.delivery_verdict import VOXEL_SIZE
 from tsfusion import Client, journal
 from tsfusion.core.errors import FlushTimeout, InvalidKeyframe, KeyframeRefused
 from tsfusion.geometry import se3
