@@ -213,18 +213,18 @@ def _run(
     truth: str | None = None,
     **settings: Any,
 ) -> None:
-    from tsfusion.cli import progress, run_page, run_summary
+    from tsfusion.cli import progress, run_summary
     from tsfusion.pipelines.replay import replay as run
 
     end = Event()
     with progress.ended_by_signals(end.set), progress.shown(quiet=json) as display:
         result = run(
-            dataset, out, viewer=run_page.beside(view, display, truth=truth), progress=display,
+            dataset, out, viewer=progress.page_beside(view, display, truth=truth), progress=display,
             ended=end.is_set, **settings,
         )  # fmt: skip
     if json:
         output.as_json(result)
     else:
         run_summary.print_replay(result)
-        run_page.print_again(view, result.folder, settings.get("connect"))
+        progress.print_page_again(view, result.folder, settings.get("connect"))
     run_summary.check(result)

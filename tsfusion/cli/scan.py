@@ -108,7 +108,7 @@ def scan(
 
         options.refuse(context, ("same_frame",), "and --align exclude each other: one says that it is known")
         check_installed()
-    from tsfusion.cli import output, progress, run_page, run_summary
+    from tsfusion.cli import output, progress, run_summary
     from tsfusion.pipelines.scan import scan as run
 
     _choose_poses(context, settings)
@@ -138,14 +138,14 @@ def scan(
             volume=options.own_volume(chosen, client, settings),
             server=options.own_server(chosen, state), client=client, connect=connect, spool=spool,
             same_frame=same_frame, align=align, min_weight=settings["min_weight"], up=given_up,
-            keep_islands=keep_islands, viewer=run_page.beside(view, display), progress=display,
+            keep_islands=keep_islands, viewer=progress.page_beside(view, display), progress=display,
             warnings=warnings, sensor=settings["sensor"],
         )  # fmt: skip
     if json:
         output.as_json(result)
     else:
         run_summary.print_scan(result, spool, connect)
-        run_page.print_again(view, result.folder, connect)
+        progress.print_page_again(view, result.folder, connect)
     run_summary.check(result)
 
 
