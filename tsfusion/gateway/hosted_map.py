@@ -15,12 +15,13 @@ from tsfusion.core.config import SERVER_SESSION, ServerConfig, VolumeConfig
 from tsfusion.core.errors import JournalError
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.gateway import map_opening, moved_maps
+from tsfusion.gateway.checkpoint_orders import CheckpointOrders
 from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.disk_pause import DiskPause
 from tsfusion.gateway.forgetting import Forgetting
 from tsfusion.gateway.fuser_backlog import FuserBacklog
 from tsfusion.gateway.fuser_supervisor import FuserSupervisor
-from tsfusion.gateway.journal_retention import CheckpointOrders, JournalRetention
+from tsfusion.gateway.journal_retention import JournalRetention
 from tsfusion.gateway.keyframe_index import KeyframeIndex
 from tsfusion.gateway.keyframe_outcomes import KeyframeOutcomes
 from tsfusion.gateway.map_condition import MapCondition, QuestionCounts

@@ -8,10 +8,10 @@ from typing import Literal
 import numpy as np
 
 from tsfusion.core.readable_numbers import count_of
+from tsfusion.gateway.checkpoint_orders import CheckpointOrders
 from tsfusion.gateway.disk_pause import DiskPause
 from tsfusion.gateway.fuser_backlog import FuserBacklog
 from tsfusion.gateway.fuser_supervisor import FuserSupervisor
-from tsfusion.gateway.journal_retention import CheckpointOrders
 from tsfusion.gateway.keyframe_outcomes import KeyframeOutcomes
 from tsfusion.gateway.sessions import Sessions
 from tsfusion.journal import Journal
