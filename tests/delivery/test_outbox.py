@@ -12,7 +12,7 @@ from keyframes_and_servers import wall
 
 from tsfusion.core.errors import InvalidKeyframe
 from tsfusion.delivery import outcomes
-from tsfusion.delivery.number_runs import NumberRuns
+from tsfusion.delivery.delivery_progress import NumberRuns
 from tsfusion.delivery.outbox import Outbox
 from tsfusion.delivery.spool import Spool, Waiting
 from tsfusion.journal import Position
@@ -93,7 +93,7 @@ def test_lost_corrections_and_rejected_keyframes_count_once(outbox: Outbox) -> N
     for _ in range(4):
         send(outbox)
     outbox.acknowledge(4, 2)
-    outbox.reject(2, "no_samples")  # told late, as by older servers
+    outbox.reject(2, "no_samples")  # told late
     outbox.reject(3, "no_samples")
     outbox.acknowledge(4, 4)
     before = outbox.stats()
@@ -131,10 +131,9 @@ def test_a_rejection_counts_once_and_few_are_remembered(
 
 
 def test_a_rejection_behind_its_acknowledgement_counts_once(tmp_path: Path) -> None:
-    """An older server tells whoever was silent how far its session is, and then what was rejected of it."""
+    """Who was silent may hear how far its session is, and then what was rejected of it."""
     spool = Spool(tmp_path, 1 << 20)
     outbox = Outbox(spool)
-    outbox._corrections.add(4)
     for seq in range(1, 7):
         spool.add(Waiting(seq, Position(1, 0), 100, is_correction=seq == 4))
     outbox.acknowledge(6, 5)
@@ -155,10 +154,15 @@ def test_numbers_of_fused_keyframes_take_no_room() -> None:
     for number in (1, 2, 3, 5, 6, 9):
         runs.append(number)
     assert [number in runs for number in range(11)] == [n in (1, 2, 3, 5, 6, 9) for n in range(11)]
-    runs.keep_newest(2)
-    assert (runs.first, len(runs), 3 in runs, 6 in runs) == (5, 3, False, True)
-    runs.keep_newest(0)
-    assert (runs.first, len(runs), 9 in runs) == (None, 0, False)
+    assert [list(runs.between(after, 6)) for after in (0, 2, 5, 6)] == [[1, 2, 3, 5, 6], [3, 5, 6], [6], []]
+    assert [runs.count(most) for most in (0, 2, 3, 4, 5, 8, 9)] == [6, 4, 3, 3, 2, 1, 0]
+    runs.keep_newest(1, after=2)  # none that is not answered
+    assert len(runs) == 6
+    runs.keep_newest(2, after=9)
+    assert (len(runs), 3 in runs, 6 in runs) == (3, False, True)
+    assert (runs.cut(5), len(runs), 5 in runs, 6 in runs) == ([6, 9], 1, True, False)
+    runs.keep_newest(0, after=9)
+    assert (len(runs), 5 in runs) == (0, False)
 
 
 def test_what_the_map_has_not_answered_takes_no_room(tmp_path: Path) -> None:

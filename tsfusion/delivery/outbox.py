@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from tsfusion.core.errors import InvalidKeyframe
 from tsfusion.core.readable_numbers import count_of
+from tsfusion.delivery.delivery_progress import DeliveryProgress
 from tsfusion.delivery.link_state import LinkState
-from tsfusion.delivery.number_runs import NumberRuns
 from tsfusion.delivery.outcomes import ClientStats, Outcomes
 from tsfusion.delivery.spool import Spool, Waiting
 from tsfusion.delivery.timing import KeyframeTimesTable, Lag, TakingRate
@@ -23,7 +23,6 @@ from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.wire.keyframe_times import KeyframeTimes, Stamps
 
 _CHECK_INTERVAL = 0.5  # seconds between two calls of what `wait` was given to check
-_FUSED_RUNS = 4096  # of numbers without a gap, that are remembered as fused: a rejection may come behind
 
 
 class Outbox:
@@ -45,18 +44,12 @@ class Outbox:
         self.state = "ok"  # of the spool, as in `ClientStats`; set by the one thread that writes to it
         self.spool_problem = ""  # why the spool cannot keep what comes; empty = it can
         self._outstanding = 0  # of the oldest in the spool, so many are on their way
-        self._unfused = NumberRuns()  # durable, and not answered by the map
-        self._fused = NumberRuns()  # keyframes that were counted as fused, the newest ones
-        self._durable = NumberRuns()  # likewise those that were acknowledged
-        self._durable_corrections = NumberRuns()  # likewise
-        self._last_fused = self._last_meshed = 0  # numbers
-        self._settled = 0  # the map has everything up to this number, each keyframe at its newest pose
+        self._progress = DeliveryProgress()  # of what is durable
         self._corrections_waiting = 0
         self._times = KeyframeTimesTable()
         self._outcomes = Outcomes()
         for _ in range(spool.damaged):
             self._outcomes.skip("damaged", "")
-        self._corrections = {entry.seq for entry in spool.waiting if entry.is_correction}  # not noted yet
         # Of what a dead scanner left, any may have been sent; and what a power cut took of it, too.
         self._perhaps_sent = spool.waiting[-1].seq if spool.waiting else 0
         self._used_before = spool.next_seq - 1
@@ -109,7 +102,7 @@ class Outbox:
     def behind(self) -> int:
         """Number of keyframes that the map has yet to get: in the spool, or durable and unfused."""
         with self._lock:
-            return len(self._spool.waiting) + len(self._unfused) - len(self._corrections)
+            return self.keyframes_waiting + self._progress.unfused_keyframes
 
     @property
     def lag(self) -> Lag:
@@ -121,9 +114,7 @@ class Outbox:
     def keyframes_waiting(self) -> int:
         """Number of keyframes in the spool."""
         with self._lock:
-            waiting = self._spool.waiting
-            oldest = waiting[0].seq if waiting else 0
-            return len(waiting) - sum(bool(waiting) and seq >= oldest for seq in self._corrections)
+            return len(self._spool.waiting) - self._spool.corrections
 
     @property
     def next_seq(self) -> int:
@@ -146,7 +137,6 @@ class Outbox:
             self._spool.add(entry)
             if keyframe is None:
                 self._outcomes.corrections_sent += 1
-                self._corrections.add(entry.seq)
                 return
             self._outcomes.sent += 1
             self._times.add(entry.seq, timestamp_ns=keyframe.timestamp_ns, captured_ns=keyframe.captured_ns)
@@ -232,7 +222,7 @@ class Outbox:
             waiting, count = self._spool.waiting, self._outstanding
             if count >= min(max(window_keyframes, 1), len(waiting)):
                 return None
-            if ahead is not None and count + len(self._unfused) >= ahead:
+            if ahead is not None and count + self._progress.unfused >= ahead:
                 return None
             entry = waiting[count]
             under_way = sum(waiting[i].nbytes for i in range(count))
@@ -289,14 +279,8 @@ class Outbox:
 
     def _lose_beyond(self, durable: int) -> str:
         """Count what was acknowledged beyond a number as lost, and tell it. The lock is held."""
-        lost, fused = self._durable.cut(durable), self._fused.cut(durable)
-        corrections = self._durable_corrections.cut(durable)
-        if not lost and not corrections:
-            return ""
-        self._unfused.cut(durable)
-        self._corrections.difference_update(corrections)
-        self._last_fused = min(self._last_fused, durable)
-        return self._outcomes.lose(lost, fused, len(corrections))
+        keyframes, fused, corrections = self._progress.lose(durable)
+        return self._outcomes.lose(keyframes, fused, corrections) if keyframes or corrections else ""
 
     def is_foreign(self, durable: int) -> bool:
         """Whether the server has records of this session that were never sent from here."""
@@ -320,24 +304,13 @@ class Outbox:
         with self._lock:
             dropped = self._spool.drop(durable)
             self._outstanding = max(self._outstanding - len(dropped), 0)
-            corrections = len(self._corrections.intersection(dropped))
+            corrections = sum(entry.is_correction for entry in dropped)
             self._outcomes.corrections_durable += corrections
             self._outcomes.durable += len(dropped) - corrections
-            for seq in dropped:
-                self._unfused.append(seq)
-                (self._durable_corrections if seq in self._corrections else self._durable).append(seq)
-            self._durable.keep_newest(_FUSED_RUNS)
-            self._durable_corrections.keep_newest(_FUSED_RUNS)
-            taken = 0
-            for seq in self._unfused.take(fused):
-                self._last_fused = seq
-                if seq in self._corrections:
-                    self._corrections.remove(seq)
-                else:
-                    taken += 1
-                    self._count_fused(seq)
-            if taken:
-                self._rate.note(self.clock(), taken, is_more_waiting=self.behind > 0)
+            self._progress.acknowledge(dropped)
+            if taken := self._progress.answer(fused):
+                self._outcomes.fused += sum(not self._outcomes.is_rejected(seq) for seq in taken)
+                self._rate.note(self.clock(), len(taken), is_more_waiting=self.behind > 0)
             for one in stamps:
                 if not self._outcomes.is_rejected(one.seq):
                     self._times.stamp(one, offset_ns, bound_ns)
@@ -346,17 +319,10 @@ class Outbox:
             self._changed.notify_all()
             return bool(dropped)
 
-    def _count_fused(self, seq: int) -> None:
-        """Count a keyframe that the map has answered, unless it was rejected. The lock is held."""
-        if not self._outcomes.is_rejected(seq):
-            self._outcomes.fused += 1
-            self._fused.append(seq)
-            self._fused.keep_newest(_FUSED_RUNS)
-
     def note_meshed(self, seq: int) -> None:
         """Note that the mesh shows everything up to `seq`."""
         with self._lock:
-            self._last_meshed = max(self._last_meshed, seq)
+            self._progress.meshed = max(self._progress.meshed, seq)
             self._changed.notify_all()
 
     def note_moves(self, fused: int, waiting: int) -> None:
@@ -364,7 +330,7 @@ class Outbox:
         with self._lock:
             self._corrections_waiting = waiting
             if not waiting:
-                self._settled = fused
+                self._progress.settled = fused
             self._changed.notify_all()
 
     # --- turned away ---
@@ -379,11 +345,12 @@ class Outbox:
         counted before.
         """
         with self._lock:
-            was_fused, first = seq in self._fused, self._fused.first
-            was_corrected = first is not None and first <= seq <= self._last_fused and not was_fused
-            is_correction = seq in self._corrections or was_corrected
+            entry = self.find_sent(seq)
+            is_correction = entry.is_correction if entry is not None else self._progress.is_correction(seq)
             is_first = self._outcomes.reject(seq, reason, message, is_correction=is_correction)
-            self._outcomes.fused -= was_fused and is_first is not None
+            self._outcomes.fused -= (
+                is_first is not None and not is_correction and self._progress.is_fused(seq)
+            )
             return None if is_first is None else ("correction" if is_correction else "keyframe", is_first)
 
     @property
@@ -407,7 +374,6 @@ class Outbox:
             place = self._spool.waiting.index(entry)
             self._outstanding = min(self._outstanding, place)
             self._spool.remove(place)
-            self._corrections.discard(entry.seq)
             self._claimed = 0
             self._outcomes.refuse(entry, reason, message)
             self._changed.notify_all()
@@ -424,25 +390,24 @@ class Outbox:
     def is_fused(self) -> bool:
         """Whether the map has answered for everything sent."""
         with self._lock:
-            return not self._spool.waiting and not self._unfused
+            return not self._spool.waiting and not self._progress.unfused
 
     @property
     def is_settled(self) -> bool:
         """Whether the map has everything sent, and each keyframe at its newest pose."""
         with self._lock:
-            return self.is_fused and self._settled >= self._last_fused
+            return self.is_fused and self._progress.settled >= self._progress.fused
 
     @property
     def is_meshed(self) -> bool:
         """Whether the mesh shows everything sent."""
         with self._lock:
-            return self.is_fused and self._last_fused <= self._last_meshed
+            return self.is_fused and self._progress.meshed >= self._progress.fused
 
     def describe_waiting(self) -> str:
         """The records in the spool, counted: `3 keyframes and 1 correction`."""
         with self._lock:
-            corrections = sum(entry.is_correction for entry in self._spool.waiting)
-            keyframes = len(self._spool.waiting) - corrections
+            keyframes, corrections = self.keyframes_waiting, self._spool.corrections
         counts = [count_of(keyframes, "keyframe")] if keyframes or not corrections else []
         return " and ".join([*counts, *([count_of(corrections, "correction")] if corrections else [])])
 

@@ -132,6 +132,8 @@ class Spool:
                 place = (record.seq, record.position, record.nbytes)
                 self.waiting.append(Waiting(*place, record.is_correction))
         self.waiting_bytes = sum(entry.nbytes for entry in self.waiting)
+        self.corrections = sum(entry.is_correction for entry in self.waiting)  # that wait
+        self._newest: tuple[journal.Position, list[bytes]] | None = None  # the record that was just written
         last = max([record.seq for record in found] + [*self._tombstones.numbers], default=0)
         self.left = last  # the last number that an earlier scanner used; 0 = there was none
         self.next_seq = last + _RESTART_GAP + secrets.randbelow(_RESTART_SPREAD) if last else 1
@@ -177,12 +179,14 @@ class Spool:
         except JournalError:
             self._tombstones.add(seq)
             raise
+        self._newest = position, frames
         return Waiting(seq, position, sum(map(len, frames)), is_correction(frames[0]))
 
     def add(self, entry: Waiting) -> None:
         """Queue a written record."""
         self.waiting.append(entry)
         self.waiting_bytes += entry.nbytes
+        self.corrections += entry.is_correction
         number = entry.position.segment
         segment = self._segments.setdefault(number, Segment())
         segment.waiting += 1
@@ -197,6 +201,9 @@ class Spool:
         Raises:
             JournalError: when the disk has lost it.
         """
+        newest = self._newest
+        if newest is not None and newest[0] == entry.position:
+            return [memoryview(frame) for frame in newest[1]]
         try:
             return journal.read(self.folder, entry.position).frames
         except JournalError as error:
@@ -210,12 +217,11 @@ class Spool:
         """Whether the folder is not to be found, or an empty one is in its place. From any thread."""
         return self._journal.is_away
 
-    def drop(self, durable: int) -> list[int]:
-        """Let go of everything up to `durable`; the numbers of the records that waited."""
+    def drop(self, durable: int) -> list[Waiting]:
+        """Let go of everything up to `durable`; the records that waited."""
         dropped = []
         while self.waiting and self.waiting[0].seq <= durable:
-            dropped.append(self.waiting[0].seq)
-            self._let_go(0)
+            dropped.append(self._let_go(0))
         if dropped:
             self._delete_segments()
         return dropped
@@ -238,6 +244,7 @@ class Spool:
         entry = self.waiting[place]
         del self.waiting[place]
         self.waiting_bytes -= entry.nbytes
+        self.corrections -= entry.is_correction
         segment = self._segments[entry.position.segment]
         segment.waiting -= 1
         if not segment.waiting:
