@@ -15,7 +15,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -47,6 +47,7 @@ if TYPE_CHECKING:
 
     from tsfusion.tsdf.volume import IntegrateStats
 
+_JOURNAL = state_folder.JOURNAL_FOLDER
 _FOR_KEYFRAMES = 256 << 20  # bytes of working memory that meshes leave free
 _FOR_A_CHECKPOINT = 64 << 20  # bytes beyond both
 LOCK = "fuser.lock"  # in the map's folder
@@ -103,9 +104,9 @@ class Fuser:
         self._hashes: tuple[int, str, str] | None = None  # changes, map hash, colour hash
         self._current = CurrentKeyframe(begin.working)
         self.exit_status: int | None = None  # of the process, which has to end; None = it goes on
-        self._home, self._journal_home = os.stat(self._folder), None
+        self._homes: dict[str, os.stat_result] = {"": os.stat(self._folder)}  # as they were at first
         with suppress(OSError):
-            self._journal_home = os.stat(self._folder / state_folder.JOURNAL_FOLDER)
+            self._homes[_JOURNAL] = os.stat(self._folder / _JOURNAL)
         opened = opened or OpenedMap(begin)
         self._memory_limit, self._map = opened.memory_limit, opened.checkpoints
         self._map.move_to(self._folder)
@@ -131,7 +132,7 @@ class Fuser:
         self._mover = PoseMover(
             self._volume,
             self._map.poses,
-            self._folder / state_folder.JOURNAL_FOLDER,
+            self._folder / _JOURNAL,
             integrate=lambda keyframe, session: self._integrate(keyframe, self._map.done[session].client),
             is_away=self._journal_is_away,
             say=self._send,
@@ -140,9 +141,9 @@ class Fuser:
             expects=lambda: int(window.is_behind),
             rest_factor=_WINDOW_REST_FACTOR if window.is_set else REST_FACTOR,
         )
-        self.chores = self._chores()
 
-    def _chores(self) -> dict[str, Chore]:
+    @cached_property
+    def chores(self) -> dict[str, Chore]:
         """The chores in the order in which they are looked at.
 
         The process answers questions first, then does a piece of the first chore that is due, and goes round
@@ -292,7 +293,7 @@ class Fuser:
         Raises:
             TsfusionError: when it cannot be read or fused.
         """
-        record = journal.read(self._folder / state_folder.JOURNAL_FOLDER, order.position)
+        record = journal.read(self._folder / _JOURNAL, order.position)
         found, poses = codec.decode(record.frames), self._map.poses
         self.answer()
         if isinstance(found, Keyframe):
@@ -352,7 +353,7 @@ class Fuser:
         return True
 
     def _journal_is_away(self) -> bool:
-        return journal.is_away(self._folder / state_folder.JOURNAL_FOLDER, self._journal_home)
+        return journal.is_away(self._folder / _JOURNAL, self._homes.get(_JOURNAL))
 
     @contextmanager
     def _memory_beyond(self, nbytes: int) -> Iterator[None]:
@@ -398,7 +399,7 @@ class Fuser:
     def _is_home(self) -> bool:
         """Whether the folder is the one that was opened: another may be the place of a disk that is away."""
         try:
-            return os.path.samestat(os.stat(self._folder), self._home) or (self._folder / LOCK).exists()
+            return os.path.samestat(os.stat(self._folder), self._homes[""]) or (self._folder / LOCK).exists()
         except OSError:
             return False
 

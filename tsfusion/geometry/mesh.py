@@ -4,7 +4,7 @@
 import dataclasses
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core import durable_files, process
+from tsfusion.core import durable_files
 from tsfusion.core.errors import OutputError
 from tsfusion.geometry import (
     mesh_cropping,
@@ -21,18 +21,16 @@ from tsfusion.geometry import (
     mesh_simplification,
     object_cards,
     point_files,
-    up_direction,
 )
 from tsfusion.geometry.map_answers import import_open3d
-from tsfusion.geometry.provenance import Provenance
-from tsfusion.geometry.up_direction import HeldSensor, Up
+from tsfusion.geometry.mesh_arrays import MeshArrays
 
 FORMATS = tuple(mesh_encoding.FORMATS)
 GUESS_COLOR = (230, 40, 190)  # RGB, seldom seen indoors or out
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Mesh(object_cards.Shown):
+class Mesh(MeshArrays, object_cards.Shown):
     """Triangles in world coordinates; the outside is the side the normals point to.
 
     Attributes:
@@ -54,22 +52,6 @@ class Mesh(object_cards.Shown):
         >>> mesh.cropped((-1, -1, 0, 1, 1, 1)).save("part.glb").name
         'part.glb'
     """
-
-    vertices: NDArray[np.float32]
-    faces: NDArray[np.int32]
-    normals: NDArray[np.float32]
-    colors: NDArray[np.uint8] | None = None
-    known_up: Up | None = field(default=None, kw_only=True)
-    held: HeldSensor | None = field(default=None, kw_only=True, repr=False)
-    guessed: NDArray[np.bool_] | None = field(default=None, kw_only=True)
-    provenance: Provenance | None = field(default=None, kw_only=True)
-
-    @cached_property
-    def up(self) -> Up | None:
-        """Direction away from the ground, as given or found; None = not known."""
-        if self.known_up is not None or self.held is None:
-            return self.known_up
-        return up_direction.find(self, self.held)
 
     def _facts(self) -> dict[str, str]:
         colored = "grey" if self.colors is None else "coloured"
@@ -132,15 +114,6 @@ class Mesh(object_cards.Shown):
             suffix: `.ply`, `.glb`, `.obj` or `.stl`.
         """
         return mesh_encoding.encode(self, suffix)
-
-    def to_trimesh(self) -> Any:
-        """Make a `trimesh.Trimesh` in the map's frame, with normals and colours; nothing is merged."""
-        with process.uninterrupted():  # trimesh ignores exceptions while it is imported
-            import trimesh
-
-        return trimesh.Trimesh(
-            self.vertices, self.faces, vertex_normals=self.normals, vertex_colors=self.colors, process=False
-        )
 
     def to_open3d(self) -> Any:
         """Make an `open3d.t.geometry.TriangleMesh` in the map's frame, with `normals` and `colors` (0 to 1).
@@ -230,27 +203,6 @@ class Mesh(object_cards.Shown):
             colors=np.concatenate(colors),
             guessed=np.repeat((False, True), (len(seen.faces), len(guess.faces))),
             known_up=self.up,
-        )
-
-    def of_faces(self, kept: NDArray[np.bool_] | NDArray[np.integer]) -> "Mesh":
-        """A mesh of some of the faces and the vertices that they use, in the same order.
-
-        Args:
-            kept: (m,) bool for each face, or the numbers of faces.
-        """
-        chosen = np.flatnonzero(kept) if kept.dtype == np.bool_ else kept
-        faces = np.take(self.faces, chosen, axis=0)
-        first, last = (int(faces.min()), int(faces.max())) if len(faces) else (0, -1)
-        is_used = np.zeros(last + 1 - first, bool)  # of a part of the mesh these are few of all vertices
-        is_used[faces - first] = True
-        used, number = first + np.flatnonzero(is_used), np.cumsum(is_used, dtype=np.int32) - np.int32(1)
-        return dataclasses.replace(
-            self,
-            vertices=np.take(self.vertices, used, axis=0),
-            faces=np.take(number, faces - first),
-            normals=np.take(self.normals, used, axis=0),
-            colors=None if self.colors is None else np.take(self.colors, used, axis=0),
-            guessed=None if self.guessed is None else self.guessed[chosen],
         )
 
     @property

@@ -3,15 +3,12 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import InvalidConfig
-
-if TYPE_CHECKING:
-    from tsfusion.geometry.mesh import Mesh
+from tsfusion.geometry.mesh_arrays import AnyMesh
 
 
 def checked_box(box: Sequence[float]) -> NDArray[np.float64]:
@@ -22,7 +19,7 @@ def checked_box(box: Sequence[float]) -> NDArray[np.float64]:
     return corners.reshape(2, 3)
 
 
-def cropped(mesh: "Mesh", box: Sequence[float]) -> "Mesh":
+def cropped(mesh: AnyMesh, box: Sequence[float]) -> AnyMesh:
     """See `Mesh.cropped`."""
     low, high = checked_box(box)
     for axis in range(3):
@@ -31,12 +28,12 @@ def cropped(mesh: "Mesh", box: Sequence[float]) -> "Mesh":
     return mesh
 
 
-def cut(mesh: "Mesh", normal: NDArray[np.float64], offset: float) -> "Mesh":
+def cut(mesh: AnyMesh, normal: NDArray[np.float64], offset: float) -> AnyMesh:
     """The part of a mesh where `normal · p ≤ offset`, metres; triangles across that plane are cut there."""
     return _cut(mesh, np.float32(offset) - mesh.vertices @ normal.astype(np.float32))
 
 
-def _cut(mesh: "Mesh", height: NDArray[np.float32], plane: tuple[int, np.float32] | None = None) -> "Mesh":
+def _cut(mesh: AnyMesh, height: NDArray[np.float32], plane: tuple[int, np.float32] | None = None) -> AnyMesh:
     """Part of a mesh above a plane, where vertices have a height ≥ 0.
 
     Args:
@@ -68,11 +65,11 @@ def _cut(mesh: "Mesh", height: NDArray[np.float32], plane: tuple[int, np.float32
 
 
 def _with_cuts(
-    mesh: "Mesh",
+    mesh: AnyMesh,
     edges: NDArray[np.int32],
     height: NDArray[np.float32],
     plane: tuple[int, np.float32] | None,
-) -> tuple["Mesh", NDArray[np.int64]]:
+) -> tuple[AnyMesh, NDArray[np.int64]]:
     """The mesh with a vertex where each edge meets the plane, and their numbers; an edge has one.
 
     Where an edge ends on the plane this is its end.

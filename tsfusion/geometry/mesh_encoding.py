@@ -8,16 +8,14 @@ attribute in STL.
 
 import dataclasses
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tsfusion.geometry.mesh_arrays import MeshArrays
 from tsfusion.geometry.provenance import generator
 from tsfusion.geometry.up_direction import Up
-
-if TYPE_CHECKING:
-    from tsfusion.geometry.mesh import Mesh
 
 _STL_HEADER = 80  # bytes
 _STL_FACET = np.dtype([("floats", "<f4", 12), ("attribute", "<u2")])
@@ -28,12 +26,12 @@ TURNED_BY_NODE = "turned to +y by the node"  # what an object's note ends with
 _MATTE = {"name": "matte", "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}}
 
 
-def encode(mesh: "Mesh", suffix: str) -> bytes:
+def encode(mesh: MeshArrays, suffix: str) -> bytes:
     """The content of a file with this suffix, one of `FORMATS`."""
     return FORMATS[suffix](mesh)
 
 
-def _ply(mesh: "Mesh") -> bytes:
+def _ply(mesh: MeshArrays) -> bytes:
     if mesh.guessed is not None:  # a property of faces ends readers that know lists alone
         order = np.argsort(mesh.guessed, kind="stable")
         mesh = dataclasses.replace(mesh, faces=mesh.faces[order], guessed=mesh.guessed[order])
@@ -42,12 +40,12 @@ def _ply(mesh: "Mesh") -> bytes:
     return b"".join((head, before, comments(mesh, b"comment "), rest))
 
 
-def _obj(mesh: "Mesh") -> bytes:
+def _obj(mesh: MeshArrays) -> bytes:
     shape = mesh.to_trimesh() if mesh.guessed is None else _scene(mesh)
     return comments(mesh, b"# ") + str(shape.export(file_type="obj", include_normals=True)).encode()
 
 
-def _stl(mesh: "Mesh") -> bytes:
+def _stl(mesh: MeshArrays) -> bytes:
     content = bytes(mesh.to_trimesh().export(file_type="stl"))
     facts = facts_of(mesh)
     head = f"{facts['generator']}, metre, up {facts['up']}, map {facts.get('map_hash', 'unknown')}"
@@ -59,7 +57,7 @@ def _stl(mesh: "Mesh") -> bytes:
     return content[: _STL_HEADER + 4] + bytes(facets.tobytes())
 
 
-def _glb(mesh: "Mesh") -> bytes:
+def _glb(mesh: MeshArrays) -> bytes:
     from trimesh.visual import ColorVisuals
 
     scene = _scene(mesh)
@@ -71,7 +69,7 @@ def _glb(mesh: "Mesh") -> bytes:
     return glb_of(scene, mesh)
 
 
-def glb_of(scene: Any, mesh: "Mesh") -> bytes:
+def glb_of(scene: Any, mesh: MeshArrays) -> bytes:
     """The content of a GLB with a mesh's objects, which are in the map's frame.
 
     Each node turns its object so that up is +Y. Objects without a picture get a material that is no metal.
@@ -98,7 +96,7 @@ def glb_of(scene: Any, mesh: "Mesh") -> bytes:
     return bytes(scene.export(file_type="glb", include_normals=True, tree_postprocessor=describe))
 
 
-def _scene(mesh: "Mesh") -> Any:
+def _scene(mesh: MeshArrays) -> Any:
     """Seen and guessed triangles as objects of these names; one, `mesh`, where none is guessed."""
     import trimesh
 
@@ -114,10 +112,10 @@ def _scene(mesh: "Mesh") -> Any:
     return scene
 
 
-FORMATS: dict[str, Callable[["Mesh"], bytes]] = {".ply": _ply, ".glb": _glb, ".obj": _obj, ".stl": _stl}
+FORMATS: dict[str, Callable[[MeshArrays], bytes]] = {".ply": _ply, ".glb": _glb, ".obj": _obj, ".stl": _stl}
 
 
-def facts_of(mesh: "Mesh") -> dict[str, str]:
+def facts_of(mesh: MeshArrays) -> dict[str, str]:
     """Notes in a file about its mesh: by name, a line each."""
     facts = {
         "generator": generator(),
@@ -132,7 +130,7 @@ def facts_of(mesh: "Mesh") -> dict[str, str]:
     return facts
 
 
-def comments(mesh: "Mesh", comment: bytes) -> bytes:
+def comments(mesh: MeshArrays, comment: bytes) -> bytes:
     """Comments with what the file says about itself."""
     lines = [f"{name} {value}".encode() for name, value in facts_of(mesh).items()]
     return b"".join(comment + line + b"\n" for line in lines)

@@ -4,15 +4,13 @@ the library `fast-simplification`. Borders stay as they are; each vertex gets th
 those that became one with it. No edge has more than two triangles afterwards."""
 
 import dataclasses
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import InvalidConfig, MissingDependency
-
-if TYPE_CHECKING:
-    from tsfusion.geometry.mesh import Mesh
+from tsfusion.geometry.mesh_arrays import AnyMesh
 
 _INSTALL = "to simplify a mesh: pip install fast-simplification (or '.[mesh]')"
 _RISE = 5.0  # how fast the allowed error rises when a number of triangles is wanted
@@ -21,8 +19,8 @@ _CHUNK = 1 << 18  # vertices whose deviation is measured at once
 
 
 def simplified(
-    mesh: "Mesh", *, ratio: float | None, triangles: int | None, max_error: float | None
-) -> "Mesh":
+    mesh: AnyMesh, *, ratio: float | None, triangles: int | None, max_error: float | None
+) -> AnyMesh:
     """See `Mesh.simplified`."""
     if [ratio, triangles, max_error].count(None) != 2:
         raise InvalidConfig("a mesh is simplified to a ratio, a number of triangles or a max_error: give one")
@@ -51,7 +49,7 @@ def library() -> Any:
     return fast_simplification
 
 
-def _reduced(mesh: "Mesh", ratio: float | None, max_error: float | None) -> "Mesh":
+def _reduced(mesh: AnyMesh, ratio: float | None, max_error: float | None) -> AnyMesh:
     """One part with its border locked."""
     fast_simplification = library()
     points = mesh.vertices.astype(np.float64)
@@ -74,8 +72,8 @@ def _reduced(mesh: "Mesh", ratio: float | None, max_error: float | None) -> "Mes
 
 
 def _with_means(
-    full: "Mesh", vertices: NDArray[np.float32], faces: NDArray[np.int32], became: NDArray[np.int64]
-) -> "Mesh":
+    full: AnyMesh, vertices: NDArray[np.float32], faces: NDArray[np.int32], became: NDArray[np.int64]
+) -> AnyMesh:
     """The simplified mesh; each vertex with the mean of the vertices that became it."""
     used = became >= 0
     count = np.bincount(became[used], minlength=len(vertices))
@@ -96,7 +94,7 @@ def _with_means(
     return result.of_faces(np.ones(len(faces), bool))
 
 
-def _joined(parts: list["Mesh"], like: "Mesh") -> "Mesh":
+def _joined(parts: list[AnyMesh], like: AnyMesh) -> AnyMesh:
     """Seen and guessed triangles as one mesh; vertices at the same place are one again."""
     if len(parts) == 1:
         return parts[0]
@@ -120,7 +118,7 @@ def _joined(parts: list["Mesh"], like: "Mesh") -> "Mesh":
     )
 
 
-def _unfolded(mesh: "Mesh") -> "Mesh":
+def _unfolded(mesh: AnyMesh) -> AnyMesh:
     """The mesh with at most two triangles at each edge, and none twice.
 
     Collapsed edges can fold a surface onto itself. Two triangles with the same corners that face each other

@@ -3,7 +3,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import msgspec
 import numpy as np
@@ -11,9 +11,6 @@ from numpy.typing import NDArray
 
 from tsfusion.core.errors import InvalidConfig
 from tsfusion.geometry import se3
-
-if TYPE_CHECKING:
-    from tsfusion.geometry.mesh import Mesh
 
 GRAVITY = 9.81  # m/s²
 # Of the mean of how a sensor was held, in which the floor's normal is looked for. A wall is 90° from a floor:
@@ -31,6 +28,17 @@ _USUAL = np.array(((0.0, 0, 1), (0, -1, 0), (0, 1, 0)))  # robots' and surveyors
 _SHORT = 0.1  # relative difference of a mean specific force from gravity
 _FITS = 3  # of a plane, each to what the one before has found
 _AXES = ("x", "y", "z")
+
+
+class SurfaceArrays(Protocol):
+    """Arrays of a mesh: (n, 3) vertices in metres, (m, 3) faces, (n, 3) unit normals."""
+
+    @property
+    def vertices(self) -> NDArray[np.float32]: ...
+    @property
+    def faces(self) -> NDArray[np.int32]: ...
+    @property
+    def normals(self) -> NDArray[np.float32]: ...
 
 
 class Up(msgspec.Struct, frozen=True):
@@ -147,7 +155,7 @@ class HeldSensor:
         return mean
 
 
-def find(mesh: "Mesh", held: HeldSensor, *, given: Up | None = None) -> Up | None:
+def find(mesh: SurfaceArrays, held: HeldSensor, *, given: Up | None = None) -> Up | None:
     """Find up from a mesh and from how the sensors that saw it were held.
 
     An accelerometer decides, where its mean over the scan is as long as gravity. Otherwise the plane with the
@@ -176,7 +184,7 @@ def find(mesh: "Mesh", held: HeldSensor, *, given: Up | None = None) -> Up | Non
     return _up(held.up, "cameras") if floor is None else _up(floor, "floor")
 
 
-def floor_height(mesh: "Mesh", up: Up, held: HeldSensor) -> float | None:
+def floor_height(mesh: SurfaceArrays, up: Up, held: HeldSensor) -> float | None:
     """Height of the floor along `up` from the map's origin, metres.
 
     The floor is the lowest of the large level surfaces that face up, below the mean place of the sensors:
@@ -193,7 +201,7 @@ def floor_height(mesh: "Mesh", up: Up, held: HeldSensor) -> float | None:
 class _Surface:
     """A sample of a mesh's triangles: centres (n, 3), unit normals (n, 3), areas (n,) of sum 1."""
 
-    def __init__(self, mesh: "Mesh") -> None:
+    def __init__(self, mesh: SurfaceArrays) -> None:
         faces = mesh.faces[:: max(1, len(mesh.faces) // SAMPLE)]
         corners, normals = mesh.vertices[faces].astype(np.float64), mesh.normals[faces].astype(np.float64)
         edges = np.diff(corners, axis=1)

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,15 +19,56 @@ from tsfusion.tsdf.checkpoint import LAYER_DTYPES
 from tsfusion.tsdf.growing_array import MAX_ITEMS, FileArray, GrowingArray
 from tsfusion.tsdf.residency import Residency
 
-if TYPE_CHECKING:
-    from tsfusion.tsdf.device_blocks import DeviceBlocks
-
 MESHED, ASKED = 1, 2  # who follows the changes of blocks: `Volume.take_dirty`, what is kept of answers
 _FIRST_CAPACITY = 1024
 _CHUNK = 1024  # blocks read at a time where a whole layer would be copied
 _HASH_BYTES = 4 * 12  # most that a block takes in the hash, which is a quarter full or fuller
 # What the keys of a block and of its neighbours towards −x, −y, −z are smaller by
 CELL_STEPS = np.array([x << 42 | y << 21 | z for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+
+
+class DeviceRows:
+    """Rows of a store on a device as well; these are on none, and `DeviceBlocks` on one.
+
+    Attributes:
+        first_blocks: number of blocks for which a store has room at first.
+        is_none: whether there is no device.
+        sends_blocks: when `insert` tells the device; later = with the next call, never = it has them.
+    """
+
+    first_blocks = _FIRST_CAPACITY
+    is_none = True
+    sends_blocks: Literal["now", "later", "never"] = "never"
+
+    def fetch(self, layers: dict[str, GrowingArray]) -> None:
+        """Bring the store's rows up to date."""
+
+    def send(self, layers: dict[str, GrowingArray], count: int) -> None:
+        """Bring the device's rows of `count` blocks up to date."""
+
+    def note_written(self, slots: NDArray[Any]) -> None:
+        """Note that the store's rows have been written to."""
+
+    def note_added(self, slots: NDArray[np.int32], count: int) -> None:
+        """Note that the device has added to blocks, of `count` in all."""
+
+    def insert(
+        self,
+        count: int,
+        places: NDArray[np.int32],
+        hash_keys: NDArray[np.int64],
+        hash_slots: NDArray[np.int32],
+    ) -> None:
+        """Let the device have `count` blocks: new are those at these places of the hash, or all of another
+        size of it.
+
+        Raises:
+            MemoryError: there is no room for them; the device has those that it had. Where they are sent
+                later, the next call raises it.
+        """
+
+    def drop(self, count: int, hash_keys: NDArray[np.int64], hash_slots: NDArray[np.int32]) -> None:
+        """Let the device have `count` blocks, as the hash has them, and no others."""
 
 
 class BlockStore:
@@ -56,7 +97,7 @@ class BlockStore:
         hits: bool = False,
         carved_band: float = 0.0,
         cache: CacheConfig | None = None,
-        device: "DeviceBlocks | None" = None,
+        device: DeviceRows | None = None,
     ) -> None:
         self.voxel_size = voxel_size
         self.carved_band = carved_band  # half-width of bands that end in carved space, voxels; 0 = it varies
@@ -66,8 +107,8 @@ class BlockStore:
         self.stamp = 0  # number of the last keyframe, added or taken away; a map that is opened begins at 0
         self.most_blocks = MAX_ITEMS
         self.pause: Callable[[], None] = lambda: None  # between two steps of a long pass that only reads
-        # Blocks that fit into the memory that is there
-        self._room = device.first_blocks if device else _FIRST_CAPACITY
+        self._device = device or DeviceRows()
+        self._room = self._device.first_blocks  # that fit into the memory that is there
         self._hash_keys = np.zeros(4 * self._room, np.int64)
         self._hash_slots = np.zeros(4 * self._room, np.int32)
         self._hashed = 0  # blocks that are in the hash; the others follow when somebody asks
@@ -76,7 +117,6 @@ class BlockStore:
         self._stamps, self._places, self._bounds = (GrowingArray((), np.int32, self._room) for _ in range(3))
         present = {"sums": True, "color_rgn": color, "color_b": color, "correction": corrected, "hits": hits}
         self._present = [name for name, there in present.items() if there]
-        self._device = device
         self._layers = {name: self._layer(name, cache) for name in present}
         self._residency: Residency | None = None
         self._memory_bytes = 0
@@ -185,22 +225,18 @@ class BlockStore:
         return self._layers[layer].array
 
     def _fetch(self) -> None:
-        if self._device is not None:
-            self._device.fetch({name: self._layers[name].array for name in self._present})
+        self._device.fetch(self._layers)
 
     def send(self) -> None:
         """Bring what was written to rows to the device."""
-        if self._device is not None:
-            self._device.send({name: self._layers[name].array for name in self._present}, self.count)
+        self._device.send(self._layers, self.count)
 
     def note_written(self, slots: NDArray[Any]) -> None:
         """Note that rows have been written to, from outside."""
-        if self._device is not None:
-            self._device.note_written(slots)
+        self._device.note_written(slots)
 
     def note_touched(self, slots: NDArray[np.int32]) -> None:
         """Note that the current keyframe has changed blocks on the device."""
-        assert self._device is not None
         self._device.note_added(slots, self.count)
         self.stamps[slots], self.dirty[slots] = self.stamp, CHANGED
 
@@ -272,7 +308,7 @@ class BlockStore:
         self.reserve(count)
         self._keys.array[first:count] = keys
         self.count = count
-        if self._device is not None and self._device.sends_blocks != "never":
+        if self._device.sends_blocks != "never":
             places = np.empty(len(keys), np.int32)
             block_hash.find_places(keys, self.hash_keys, places)
             try:
@@ -289,7 +325,7 @@ class BlockStore:
         self.drops += 1
         self._hash_keys[:] = self._hash_slots[:] = 0
         self._hashed = 0
-        if self._device is not None:
+        if not self._device.is_none:
             self._device.drop(count, self.hash_keys, self.hash_slots)
 
     def release(self, slots: NDArray[np.int64]) -> None:

@@ -1,23 +1,48 @@
 # SPDX-License-Identifier: MIT
 """Whether a device fuses as the CPU does: tried before a map trusts it, because drivers have errors."""
 
+import logging
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core.config import VolumeConfig
+from tsfusion.core.config import Arch, VolumeConfig
 from tsfusion.geometry.keyframe import Intrinsics, Keyframe
 from tsfusion.kernels import runtime
 from tsfusion.tsdf.block_store import BlockStore
 from tsfusion.tsdf.device_blocks import DeviceBlocks
 from tsfusion.tsdf.device_integrator import DeviceIntegrator, DeviceRayBuffers
-from tsfusion.tsdf.device_link import DeviceLink
+from tsfusion.tsdf.device_link import DeviceLink, link_to, refuse
 from tsfusion.tsdf.integrator import Integrator
 from tsfusion.tsdf.ray_buffers import RayBuffers
 
+log = logging.getLogger(__name__)
+
 _CONFIG = VolumeConfig(voxel_size=0.05, regularizer="off", space_carving=True)
 _LAYERS = ("sums", "color_rgn", "color_b", "hits")
+
+
+def device_for(arch: Arch, *, color: bool, hits: bool, smooths: bool) -> DeviceBlocks | None:
+    """The blocks of a new map on a device; None = it is on the CPU, by its settings or because there is no
+    such device, which a warning says.
+
+    Raises:
+        MemoryError: the device has no memory for another map.
+    """
+    if smooths and arch != "cpu":
+        log.warning("smoothing along rays (regularizer) needs the CPU; keyframes are fused there")
+        return None
+    link = link_to(arch)
+    if link is not None and not link.is_trusted:
+        link.is_trusted = agrees(link)
+        if not link.is_trusted:
+            refuse(link, "it does not compute the map that the CPU does: update its driver")
+            return None
+    if link is None:
+        return None
+    names = {"sums": True, "color_rgn": color, "color_b": color, "hits": hits}
+    return DeviceBlocks(link, tuple(name for name, there in names.items() if there))
 
 
 def agrees(link: DeviceLink) -> bool:

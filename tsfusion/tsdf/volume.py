@@ -40,8 +40,9 @@ from tsfusion.tsdf import (
 )
 from tsfusion.tsdf.askable_map import AskableMap
 from tsfusion.tsdf.block_store import MESHED, BlockStore, unpack_keys
-from tsfusion.tsdf.device_blocks import DeviceBlocks, device_for
+from tsfusion.tsdf.device_blocks import DeviceBlocks
 from tsfusion.tsdf.device_integrator import DeviceIntegrator, DeviceRayBuffers
+from tsfusion.tsdf.device_trial import device_for
 from tsfusion.tsdf.integrator import Integrator, KeyframeQuota
 from tsfusion.tsdf.map_crop import Part
 from tsfusion.tsdf.map_history import HELD

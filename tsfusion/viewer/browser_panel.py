@@ -5,7 +5,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from tsfusion.viewer.tile_look import MOST_UNREAD, OwnLook, TileLook
 if TYPE_CHECKING:
     import viser
 
-    from tsfusion.viewer.live_page import LivePage
+    from tsfusion.geometry.mesh import Mesh
 
 WHOLE, BY_HAND, _FOLLOW = "Whole map", "By hand", "Follow "
 _SETTLED = 10.0  # seconds after a move of ours, in which a slow browser may still tell older places
@@ -32,6 +32,22 @@ _RENDER = 30.0  # seconds that a browser may take for a picture
 _UPRIGHT = 0.6
 _COVERED = 0.5
 _MARK = (213, 94, 0)
+
+
+class ShownPage(Protocol):
+    """The page that a browser shows, as its panel needs it (`LivePage`)."""
+
+    map_name: str
+    shared: TileLook
+
+    def scanners(self) -> list[tuple[bytes, str]]: ...
+    def whole_view(self, aspect: float, covered: float) -> View | None: ...
+    def scanner_view(self, session: bytes) -> View | None: ...
+    def new_look(self, client: "viser.ClientHandle") -> OwnLook: ...
+    def shown_mesh(self, look: TileLook) -> "Mesh": ...
+    def hit(
+        self, look: TileLook, origin: NDArray[np.float64], direction: NDArray[np.float64]
+    ) -> NDArray[np.float64] | None: ...
 
 
 class BrowserPanel:
@@ -49,7 +65,7 @@ class BrowserPanel:
     def __init__(
         self,
         client: "viser.ClientHandle",
-        shown: "LivePage",
+        shown: ShownPage,
         view: AbstractContextManager[Any],
         cut: AbstractContextManager[Any],
         modes: Sequence[str],
