@@ -21,6 +21,7 @@ from tsfusion.core.config import ServerConfig
 from tsfusion.core.errors import InvalidConfig, TransportError
 from tsfusion.gateway import metrics_families, metrics_http
 from tsfusion.gateway.metrics import BUCKETS, FRESH, FRESH_START, STAGES, Metrics
+from tsfusion.wire.health import MapHealth
 
 HOSTILE = 'x" } evil 1\n\\'
 Figures = dict[tuple[str, ...], float]
@@ -384,3 +385,22 @@ def test_closing_ends_the_thread_and_frees_the_port(metrics: Metrics) -> None:
     assert metrics.serve(address) == address
     metrics.close()
     gc.collect()  # what was left open would be a warning, and a failure
+
+
+def test_every_field_of_a_map_is_a_figure_or_has_a_reason() -> None:
+    elsewhere = {
+        "state": "a figure for each state",
+        "last_keyframe_s": "with the age of the snapshot",
+        "delay_ms": "a histogram, as each keyframe comes",
+        "question_ms": "likewise",
+        "keyframes_moved": "since a fuser began, which may be any time",
+        "moving_s": "likewise",
+        "checkpoints": "of no use for an alert: a failure is a problem",
+        "journal_put_back": "a problem",
+        "fusing_s": "a problem when it is long",
+        "mesh_epoch": "for viewers",
+        "mesh_number": "for viewers",
+    }
+    figures = set(metrics_families._OF_MAPS)
+    assert figures.isdisjoint(elsewhere)
+    assert figures | set(elsewhere) == set(MapHealth.__struct_fields__)

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import msgspec
 import zmq
-from msgspec import Struct
+from msgspec import Struct, structs
 
 from tsfusion.core import process
 from tsfusion.core.config import ServerConfig
@@ -19,7 +19,7 @@ from tsfusion.gateway.hosted_map import HostedMap
 from tsfusion.gateway.memory_guard import PendingReplies
 from tsfusion.gateway.ports import Ports
 from tsfusion.wire import health, messages
-from tsfusion.wire.health import Health, Status
+from tsfusion.wire.health import Health, MapCounts, Status
 
 _MAX_PENDING = 32
 _REST_FACTOR = 3  # no mesh for three times as long as the last took: a quarter of a busy fuser's time
@@ -151,34 +151,19 @@ def status(
 ) -> Status:
     """A map's status: what its fuser knows, and what the gateway knows."""
     own = health.maps[hosted.name]
+    counts = {name: getattr(own, name) for name in MapCounts.__struct_fields__}
+    found = counts | structs.asdict(fuser)  # which has the counts of now
+    found |= {
+        "peak_rss_bytes": {"server": process.peak_rss_bytes(), "fuser": fuser.peak_rss_bytes},
+        "config": {"server": msgspec.to_builtins(server), "volume": fuser.config},
+    }
     return Status(
         epoch=health.epoch,
         map=hosted.name,
         state=str(hosted.folder),
         fuser="idle" if hosted.drained else "busy",
         uptime_s=health.uptime_s,
-        keyframes_durable=own.keyframes_durable,
-        keyframes_fused=fuser.keyframes_fused,
-        keyframes_rejected=fuser.keyframes_rejected,
         messages_refused=health.refused,
         duplicates=health.duplicates,
-        sessions=own.sessions,
-        blocks=fuser.blocks,
-        voxels=fuser.voxels,
-        map_bytes=fuser.map_bytes,
-        map_hash=fuser.map_hash,
-        color_hash=fuser.color_hash,
-        journal_bytes=own.journal_bytes,
-        journal_damaged=own.journal_damaged,
-        fuser_restarts=own.fuser_restarts,
-        peak_rss_bytes={"server": process.peak_rss_bytes(), "fuser": fuser.peak_rss_bytes},
-        delay_ms=own.delay_ms,
-        delay_bound_ms=own.delay_bound_ms,
-        config={"server": msgspec.to_builtins(server), "volume": fuser.config},
-        versions=fuser.versions,
-        corrections_waiting=own.corrections_waiting,
-        corrections_unavailable=own.corrections_unavailable,
-        keyframes_moved=own.keyframes_moved,
-        moving_s=own.moving_s,
-        keyframes_forgotten=own.keyframes_forgotten,
+        **found,
     )

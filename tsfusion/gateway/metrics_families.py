@@ -10,12 +10,12 @@ import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import TypeAlias, get_args
+from typing import Any, TypeAlias, get_args, get_type_hints
 
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 
 from tsfusion.core.config import ServerConfig
-from tsfusion.wire.health import ClientHealth, Health, MapHealth, MapState
+from tsfusion.wire.health import ClientHealth, Figure, Health, MapHealth, MapState
 from tsfusion.wire.messages import SKIP_REASONS
 
 NAMELESS = "-"  # clients without keys; no name looks like this
@@ -25,31 +25,11 @@ RECENT = 30.0  # seconds; older figures of a session do not count: its client ma
 
 Rows: TypeAlias = Iterable[tuple[tuple[str, ...], float]]
 
-_OF_MAPS: tuple[tuple[str, str, Callable[[MapHealth], float]], ...] = (
-    ("keyframes_durable", "Keyframes that were journaled.", lambda one: one.keyframes_durable),
-    ("keyframes_fused", "Keyframes in the map.", lambda one: one.keyframes_fused),
-    ("keyframes_waiting", "Keyframes journaled and not yet fused.", lambda one: one.waiting),
-    (
-        "corrections_waiting",
-        "Keyframes not yet at their new pose.",
-        lambda one: one.corrections_waiting,
-    ),
-    (
-        "corrections_unavailable",
-        "Keyframes that a correction cannot move any more.",
-        lambda one: one.corrections_unavailable,
-    ),
-    ("keyframes_forgotten", "Keyframes taken out of the map for good.", lambda one: one.keyframes_forgotten),
-    ("keyframes_quarantined", "Keyframes kept aside for inspection.", lambda one: one.quarantined),
-    ("sessions", "Sessions that sent keyframes.", lambda one: one.sessions),
-    ("journal_bytes", "Bytes of the journal.", lambda one: one.journal_bytes),
-    ("journal_damaged", "Records of the journal that could not be read.", lambda one: one.journal_damaged),
-    ("journal_missing", "Segments of the journal that are gone.", lambda one: one.journal_missing),
-    ("map_blocks", "Blocks of 8³ voxels.", lambda one: one.blocks),
-    ("map_bytes", "Bytes of the map's blocks.", lambda one: one.map_bytes),
-    ("map_problem", "Whether something keeps it from taking or fusing.", lambda one: bool(one.problem)),
-    ("delay_bound_seconds", "The total delays are right to within ±.", lambda one: one.delay_bound_ms / 1e3),
-)
+_OF_MAPS: dict[str, Figure] = {
+    field: figure
+    for field, hint in get_type_hints(MapHealth, include_extras=True).items()
+    for figure in getattr(hint, "__metadata__", ())
+}
 _OF_CLIENTS: tuple[tuple[str, str, Callable[[list[ClientHealth]], float]], ...] = (
     ("sessions", "Sessions that were connected since the start.", len),
     ("connected_sessions", "Sessions that are connected now.", lambda own: len(_recent(own))),
@@ -93,18 +73,11 @@ def of_disk(state: Path, server: ServerConfig) -> Iterator[Metric]:
 
 
 def _of_maps(maps: dict[str, MapHealth], age: float) -> Iterator[Metric]:
-    for name, help_, value in _OF_MAPS:
-        yield _gauge(name, help_, ("map",), (((key,), value(one)) for key, one in maps.items()))
-    rejected = [(name, reason, n) for name, one in maps.items() for reason, n in one.rejected.items()]
-    rows = (((name, reason), n) for name, reason, n in rejected)
-    yield _gauge("keyframes_rejected", "Keyframes journaled, but not fusable.", ("map", "reason"), rows)
-    asked = [(name, outcome, n) for name, one in maps.items() for outcome, n in one.questions.items()]
-    rows = (((name, outcome), n) for name, outcome, n in asked)
-    yield _counter("questions", "Questions to the map, by what became of them.", ("map", "outcome"), rows)
-    restarts = (((name,), one.fuser_restarts) for name, one in maps.items())
-    yield _counter("fuser_restarts", "Fusers that took over from a dead one.", ("map",), restarts)
-    corrections = (((name,), one.corrections) for name, one in maps.items())
-    yield _counter("corrections", "Corrections of keyframes' poses in the journal.", ("map",), corrections)
+    for field, one in _OF_MAPS.items():
+        family = _counter if one.grows else _gauge
+        labels = ("map", one.by) if one.by else ("map",)
+        rows = (row for key, health in maps.items() for row in _rows(key, getattr(health, field), one.unit))
+        yield family(one.name or field, one.words, labels, rows)
     ages = (
         ((name,), one.last_keyframe_s + age) for name, one in maps.items() if one.last_keyframe_s is not None
     )
@@ -113,6 +86,13 @@ def _of_maps(maps: dict[str, MapHealth], age: float) -> Iterator[Metric]:
         ((name, state), one.state == state) for name, one in maps.items() for state in get_args(MapState)
     )
     yield _gauge("map_state", "1 for the state a map is in.", ("map", "state"), states)
+
+
+def _rows(key: str, found: Any, unit: float) -> Rows:
+    """Rows of one map: of a count, of whether there is a text, or of counts by reason."""
+    if isinstance(found, dict):
+        return [((key, reason), count) for reason, count in found.items()]
+    return [((key,), (bool(found) if isinstance(found, str) else found) * unit)]
 
 
 def _of_clients(clients: Iterable[ClientHealth], age: float) -> Iterator[Metric]:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Health and status of a server and its maps, as they are sent to whoever asks."""
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 from msgspec import Struct
 
@@ -24,39 +24,73 @@ class MeshLayout(Struct, frozen=True, kw_only=True):
 MapState = Literal["opening", "idle", "busy", "restarting", "failed"]
 
 
-class MapHealth(Struct, frozen=True, kw_only=True):
+class Figure(NamedTuple):
+    """Figure of `/metrics` that a field of `MapHealth` is, for each map.
+
+    Attributes:
+        words: sentence that explains it.
+        name: without `tsfusion_`; empty = the field's.
+        by: name of the label, where the field is a count by reason.
+        grows: whether it never falls while the server runs: a counter.
+        unit: what one of the field is of the figure.
+    """
+
+    words: str
+    name: str = ""
+    by: str = ""
+    grows: bool = False
+    unit: float = 1.0
+
+
+class MapCounts(Struct, frozen=True, kw_only=True):
+    """Counts of one map that both its health and its status have."""
+
+    keyframes_durable: Annotated[int, Figure("Keyframes that were journaled.")]
+    keyframes_fused: Annotated[int, Figure("Keyframes in the map.")]
+    sessions: Annotated[int, Figure("Sessions that sent keyframes.")]
+    journal_bytes: Annotated[int, Figure("Bytes of the journal.")]
+    journal_damaged: Annotated[int, Figure("Records of the journal that could not be read.")]
+    fuser_restarts: Annotated[int, Figure("Fusers that took over from a dead one.", grows=True)]
+    blocks: Annotated[int, Figure("Blocks of 8³ voxels.", "map_blocks")]
+    map_bytes: Annotated[int, Figure("Bytes of the map's blocks.")]
+    delay_ms: Spread  # capture to fused, of the last 1024 keyframes
+    # Half the best round trip of the worst client
+    delay_bound_ms: Annotated[
+        float, Figure("The total delays are right to within ±.", "delay_bound_seconds", unit=1e-3)
+    ]
+    # Those whose newest pose is not fused yet; 0 = the map is settled
+    corrections_waiting: Annotated[int, Figure("Keyframes not yet at their new pose.")] = 0
+    # They stay where they were fused: the journal has them no more
+    corrections_unavailable: Annotated[int, Figure("Keyframes that a correction cannot move any more.")] = 0
+    keyframes_moved: int = 0  # fused at a corrected pose, or taken out, since the fuser began
+    moving_s: float = 0.0  # seconds of the fuser for that
+    # By `tsfusion map forget` or a setting
+    keyframes_forgotten: Annotated[int, Figure("Keyframes taken out of the map for good.")] = 0
+
+
+class MapHealth(MapCounts, frozen=True, kw_only=True):
     """Health of one map, as far as the gateway knows it without asking the fuser."""
 
     state: MapState
-    problem: str  # reason why keyframes are not accepted or not fused; empty = they are
-    keyframes_durable: int
-    keyframes_fused: int
-    waiting: int  # number of keyframes that are durable, but not yet fused or rejected
-    rejected: dict[str, int]  # number of journaled keyframes that could not be fused, by reason
-    quarantined: int  # number of keyframes kept aside for inspection
-    sessions: int
-    journal_bytes: int
-    journal_damaged: int  # records the recovery scan could not read
-    fuser_restarts: int
-    blocks: int
-    map_bytes: int
+    # Reason why keyframes are not accepted or not fused; empty = they are
+    problem: Annotated[str, Figure("Whether something keeps it from taking or fusing.", "map_problem")]
+    waiting: Annotated[int, Figure("Keyframes journaled and not yet fused.", "keyframes_waiting")]
+    rejected: Annotated[
+        dict[str, int], Figure("Keyframes journaled, but not fusable.", "keyframes_rejected", "reason")
+    ]
+    quarantined: Annotated[int, Figure("Keyframes kept aside for inspection.", "keyframes_quarantined")]
     # Seconds since the last keyframe was journaled; None = none since the server began
     last_keyframe_s: float | None
-    delay_ms: Spread
-    delay_bound_ms: float  # error bound of the delays (half the best round trip of the worst client)
-    corrections: int = 0  # records of corrected poses: in the journal at the start, and journaled since
+    # Records of corrected poses: in the journal at the start, and journaled since
+    corrections: Annotated[int, Figure("Corrections of keyframes' poses in the journal.", grows=True)] = 0
     checkpoints: int = 0  # written since the server began
-    journal_missing: int = 0  # segments of the journal that are gone, at the start or since
+    journal_missing: Annotated[int, Figure("Segments of the journal that are gone.")] = 0
     journal_put_back: int = 0  # times that the segment being written was taken away, and written again
     fusing_s: float = 0.0  # seconds since the fuser's last answer, while keyframes wait for one
-    corrections_waiting: int = 0  # keyframes whose newest pose is not fused yet; 0 = the map is settled
-    corrections_unavailable: int = (
-        0  # keyframes that stay where they were fused: the journal has them no more
-    )
-    keyframes_moved: int = 0  # fused at a corrected pose, or taken out, since the fuser began
-    moving_s: float = 0.0  # seconds of the fuser for that
-    keyframes_forgotten: int = 0  # taken out of the map for good, by `tsfusion map forget` or a setting
-    questions: dict[str, int] = {}  # by outcome: answered, refused, late, failed; since the map was opened
+    # By outcome: answered, refused, late, failed; since the map was opened
+    questions: Annotated[
+        dict[str, int], Figure("Questions to the map, by what became of them.", by="outcome", grows=True)
+    ] = {}
     mesh_epoch: str = ""  # of the newest mesh update (`wire.mesh_updates.MeshUpdate`); empty = none yet
     mesh_number: int = 0
     question_ms: Spread = Spread()  # from question to answer, in the server, of the newest 1024
@@ -109,7 +143,7 @@ class Health(Struct, frozen=True, kw_only=True):
     clients: tuple[ClientHealth, ...]
 
 
-class Status(Struct, frozen=True, kw_only=True):
+class Status(MapCounts, frozen=True, kw_only=True):
     """Status of a map. Counts are of the whole journal and map, the delay is of this process."""
 
     epoch: str
@@ -117,27 +151,12 @@ class Status(Struct, frozen=True, kw_only=True):
     state: str  # the map's folder
     fuser: Literal["starting", "idle", "busy"]
     uptime_s: float
-    keyframes_durable: int
-    keyframes_fused: int
     keyframes_rejected: dict[str, int]  # journaled, but not fusable: reason → count
     messages_refused: dict[str, int]  # never journaled: reason → count
     duplicates: int
-    sessions: int
-    blocks: int
     voxels: int
-    map_bytes: int
     map_hash: str
     color_hash: str
-    journal_bytes: int
-    journal_damaged: int  # records the recovery scan could not read
-    fuser_restarts: int
     peak_rss_bytes: dict[str, int]  # server (gateway), fuser
-    delay_ms: Spread  # capture to fused, of the last 1024 keyframes
-    delay_bound_ms: float  # error bound of the delay
     config: dict[str, Any]  # server and volume settings
     versions: dict[str, str]
-    corrections_waiting: int = 0  # as in MapHealth, with what follows
-    corrections_unavailable: int = 0
-    keyframes_moved: int = 0
-    moving_s: float = 0.0
-    keyframes_forgotten: int = 0
