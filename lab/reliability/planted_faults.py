@@ -250,7 +250,7 @@ FAULTS = (
         "end_to_end/test_damaged_links.py::test_what_is_damaged_on_the_way_is_sent_again",
     ),
     Fault(
-        "gateway/hosted_map.py",
+        "gateway/map_records.py",
         "            self.disk.begin(error)\n            raise\n",
         "            raise\n",
         "gateway/test_journaled_together.py::test_a_disk_that_refuses_holds_every_client_and_loses_nothing",

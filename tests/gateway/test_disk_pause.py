@@ -7,8 +7,8 @@ from typing import cast
 import pytest
 
 from tsfusion.core.errors import JournalError
-from tsfusion.gateway import disk_pause
-from tsfusion.gateway.disk_pause import DiskPause
+from tsfusion.gateway import map_records
+from tsfusion.gateway.map_records import DiskPause
 from tsfusion.journal import Journal
 
 
@@ -29,7 +29,7 @@ def disk() -> Disk:
 
 @pytest.fixture
 def pause(disk: Disk, monkeypatch: pytest.MonkeyPatch) -> DiskPause:
-    monkeypatch.setattr(disk_pause, "_DISK_PAUSE", 0.0)
+    monkeypatch.setattr(map_records, "_DISK_PAUSE", 0.0)
     return DiskPause(cast(Journal, disk), "yard")
 
 

@@ -412,7 +412,7 @@ def test_nothing_is_deleted_from_a_journal_that_is_away(
     start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With an empty folder in its place its segments would count as deleted, and nobody would miss them."""
-    monkeypatch.setattr("tsfusion.gateway.disk_pause._DISK_PAUSE", 0.01)
+    monkeypatch.setattr("tsfusion.gateway.map_records._DISK_PAUSE", 0.01)
     gateway = drained(start(fusing("pass")))
     (hosted,) = gateway.maps
     journal_folder(tmp_path).rename(tmp_path / "aside")
@@ -420,10 +420,10 @@ def test_nothing_is_deleted_from_a_journal_that_is_away(
     stepped(gateway, lambda: hosted.disk.is_away)
     hosted._retention._max_bytes, hosted._retention._in_previous = 1, 2
     gateway.step()
-    assert hosted._journal.first == 1
+    assert hosted.records.journal.first == 1
     journal_folder(tmp_path).rmdir()
     (tmp_path / "aside").rename(journal_folder(tmp_path))
-    stepped(gateway, lambda: hosted._journal.first == 2)
+    stepped(gateway, lambda: hosted.records.journal.first == 2)
 
 
 def test_segments_that_vanish_are_named_and_the_map_is_saved_at_once(start: Start, tmp_path: Path) -> None:
@@ -475,7 +475,7 @@ def test_a_gap_in_the_journal_is_said_from_the_start(start: Start, tmp_path: Pat
 def test_a_checkpoint_that_cannot_be_written_is_a_problem_and_tried_again(
     start: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("tsfusion.gateway.checkpoint_orders._SAVE_PAUSE", 0.0)
+    monkeypatch.setattr("tsfusion.gateway.journal_retention._SAVE_PAUSE", 0.0)
     gateway = start(f"""{fusing("pass")}
         say(fuser_messages.Saved(False, "No space left on device"))
     if isinstance(message, fuser_messages.Save):
@@ -582,10 +582,9 @@ def test_an_answer_is_of_the_moment_at_which_it_was_given(start: Start, tmp_path
     go.touch()
     until(said.exists)
     until(lambda: hosted.fuser.socket.poll(10) > 0)
-    ((reply, _),) = hosted.step()
-    assert isinstance(reply, fuser_messages.FuserReply)
-    assert not hosted.drained
-    assert hosted.step() == []
+    passed: list[tuple[type, bool]] = []
+    hosted.step(lambda message, _frames: passed.append((type(message), hosted.drained)))
+    assert passed == [(fuser_messages.FuserReply, False)]
     stepped(gateway, lambda: hosted.drained)
 
 

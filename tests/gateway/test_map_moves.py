@@ -138,7 +138,7 @@ def test_a_move_that_cannot_begin_leaves_the_map_as_it_was(
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as full:
-        full.setattr(hosted._journal, "rotate", fails)
+        full.setattr(hosted.records.journal, "rotate", fails)
         assert "cannot close a file" in str(asking.ask("list").error)
     assert not hosted.is_leaving
     assert asking.parcel("list").files

@@ -280,7 +280,7 @@ def test_no_free_name_is_guessed_where_the_maps_cannot_be_listed(
     hosted = SimpleNamespace(
         name="hall",
         sessions=SimpleNamespace(shares_frame=lambda *_: False),
-        health=lambda: SimpleNamespace(keyframes_durable=1),
+        keyframes_durable=1,
     )
     (tmp_path / "maps").mkdir()
     monkeypatch.setattr(os, "listdir", refuse(errno.EIO))

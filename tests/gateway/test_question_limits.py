@@ -10,7 +10,7 @@ import zmq
 
 from tsfusion.fuser.messages import FuserAnswer, FuserQuestion
 from tsfusion.gateway import map_questions
-from tsfusion.gateway.map_condition import QuestionCounts
+from tsfusion.gateway.keyframe_outcomes import QuestionCounts
 from tsfusion.gateway.map_questions import MOST_OF_A_CLIENT, MOST_UNREAD, MOST_WAITING, MapQuestions
 from tsfusion.gateway.memory_guard import PendingReplies
 from tsfusion.gateway.metrics import Metrics

@@ -41,7 +41,7 @@ def open_map(served: Served, name: str) -> int:
     ):
         served.greet(link, name)
         push.send_multipart(record(1, name))
-        served.until(lambda: (opened := served.gateway.maps.get(name)) and opened.health().keyframes_fused)
+        served.until(lambda: (opened := served.gateway.maps.get(name)) and opened.outcomes.fused)
     hosted: Any = served.gateway.maps.get(name)
     return int(hosted.fuser.pid)
 

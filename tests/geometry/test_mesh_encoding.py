@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from tsfusion import Mesh
 from tsfusion.geometry import up_direction
-from tsfusion.geometry.provenance import Provenance
+from tsfusion.geometry.mesh_arrays import Provenance
 
 KNOWN = Provenance(source="room.tsf", keyframes=6, map_hash="ab" * 16, world="w1", voxel_size=0.02)
 

@@ -15,8 +15,8 @@ from tsfusion import Mesh, MissingDependency
 from tsfusion.core.errors import OutputError
 from tsfusion.geometry import point_files
 from tsfusion.geometry.map_answers import PointCloud
+from tsfusion.geometry.mesh_arrays import Provenance
 from tsfusion.geometry.origin import Origin
-from tsfusion.geometry.provenance import Provenance
 
 
 @pytest.fixture(scope="module")

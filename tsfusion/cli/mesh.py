@@ -238,7 +238,7 @@ def _of_server(
 
     from tsfusion.core.config import DEFAULT_MAP
     from tsfusion.core.readable_numbers import count_of
-    from tsfusion.geometry.provenance import Provenance
+    from tsfusion.geometry.mesh_arrays import Provenance
     from tsfusion.wire.queries import fetch_health, fetch_mesh
 
     name = map_name or DEFAULT_MAP

@@ -31,8 +31,8 @@ from tsfusion.core.errors import (
 from tsfusion.datasets.dataset import UNREADABLE, UnreadableFrame
 from tsfusion.geometry import up_direction
 from tsfusion.geometry.mesh import Mesh
+from tsfusion.geometry.mesh_arrays import Provenance
 from tsfusion.geometry.mesh_parts import joined
-from tsfusion.geometry.provenance import Provenance
 from tsfusion.geometry.up_direction import HeldSensor
 from tsfusion.kernels import runtime
 from tsfusion.pipelines import mesh_finishing

@@ -171,7 +171,7 @@ class Thinning:
 
         So nothing is left out while the spool is not half full: it may be small and empty again soon.
         """
-        waiting, nbytes = self._outbox.waiting()
+        _, waiting, nbytes = self._outbox.usage()
         if not waiting:
             return 0.0
         if room < nbytes / waiting:
@@ -220,15 +220,15 @@ class SpoolLimits:
 
     def is_full(self, nbytes: int) -> bool:
         """Whether the spool would pass its own limit with so many bytes more."""
-        used, _ = self._outbox.usage()
+        used, *_ = self._outbox.usage()
         if used + nbytes > self._spool_bytes:
             self._outbox.tidy()
-        used, waiting = self._outbox.usage()
+        used, waiting, _ = self._outbox.usage()
         return used + nbytes > self._spool_bytes or waiting >= _MAX_WAITING
 
     def room(self) -> int:
         """Bytes that the spool may still take."""
-        used, _ = self._outbox.usage()
+        used, *_ = self._outbox.usage()
         room = self._spool_bytes - used
         if self._min_free_bytes:
             now = time.monotonic()
@@ -268,7 +268,7 @@ class SpoolLimits:
     def on_write(self, nbytes: int) -> None:
         """Note that the disk took a record."""
         self._written += nbytes
-        state, (used, _) = self._outbox.state, self._outbox.usage()
+        state, (used, *_) = self._outbox.state, self._outbox.usage()
         if state == "disk" or (state == "spool" and used < 0.9 * self._spool_bytes):
             self._outbox.state, self._outbox.spool_problem = "ok", ""
             log.info("the spool %s takes every keyframe again", self._outbox.spool_folder)

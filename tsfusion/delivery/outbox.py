@@ -152,15 +152,10 @@ class Outbox:
         """Whether the spool's folder is not to be found, or an empty one is in its place."""
         return self._spool.is_away
 
-    def usage(self) -> tuple[int, int]:
-        """Bytes of the disk that the spool takes, and records in it."""
+    def usage(self) -> tuple[int, int, int]:
+        """Bytes of the disk that the spool takes, records in it, and their bytes."""
         with self._lock:
-            return self._spool.used_bytes, len(self._spool.waiting)
-
-    def waiting(self) -> tuple[int, int]:
-        """Records in the spool, and their bytes."""
-        with self._lock:
-            return len(self._spool.waiting), self._spool.waiting_bytes
+            return self._spool.used_bytes, len(self._spool.waiting), self._spool.waiting_bytes
 
     def tidy(self) -> None:
         """Delete files that hold nothing any more. For the one thread that writes."""

@@ -7,7 +7,7 @@ message is checked, journaled and acknowledged in one step; a map's fuser gets o
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -145,8 +145,7 @@ class Gateway:
             self._intake.finish()
         self.ports.step()
         self._limits.step()
-        for hosted, message in self.maps.step():
-            self._pass_to_people(hosted, message)
+        self.maps.step(self._pass_on)
         self.moves.step()
         self._questions.step()
         now = time.monotonic()
@@ -209,9 +208,8 @@ class Gateway:
             if changed and hosted.fuser.send(fuser_messages.Publish(watched)):
                 self._publishing[hosted.name] = watched
 
-    def _pass_to_people(self, hosted: HostedMap, passed: ForPeople) -> None:
+    def _pass_on(self, hosted: HostedMap, message: ForPeople, frames: Sequence[zmq.Frame]) -> None:
         """Pass a fuser's message to its map's viewers, or to whoever asked."""
-        message, frames = passed
         if isinstance(message, fuser_messages.FuserReply):
             own = message.status
             status = fuser_queries.status(hosted, own, self.health(), self._server) if own else None

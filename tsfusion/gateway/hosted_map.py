@@ -3,8 +3,8 @@
 
 import logging
 import time
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import zmq
@@ -14,39 +14,26 @@ from tsfusion.core import logs
 from tsfusion.core.config import SERVER_SESSION, ServerConfig, VolumeConfig
 from tsfusion.core.errors import JournalError
 from tsfusion.fuser import messages as fuser_messages
-from tsfusion.gateway import map_opening, moved_maps
-from tsfusion.gateway.checkpoint_orders import CheckpointOrders
+from tsfusion.gateway import map_opening
 from tsfusion.gateway.client_routes import ClientRoutes
-from tsfusion.gateway.disk_pause import DiskPause
 from tsfusion.gateway.forgetting import Forgetting
 from tsfusion.gateway.fuser_backlog import FuserBacklog
 from tsfusion.gateway.fuser_supervisor import FuserSupervisor
-from tsfusion.gateway.journal_retention import JournalRetention
-from tsfusion.gateway.keyframe_index import KeyframeIndex
-from tsfusion.gateway.keyframe_outcomes import KeyframeOutcomes
-from tsfusion.gateway.map_condition import MapCondition, QuestionCounts
+from tsfusion.gateway.journal_retention import CheckpointOrders, JournalRetention
+from tsfusion.gateway.keyframe_outcomes import KeyframeOutcomes, QuestionCounts
+from tsfusion.gateway.map_records import Checked, MapRecords
 from tsfusion.gateway.metrics import Metrics
-from tsfusion.gateway.sessions import Sessions
+from tsfusion.gateway.sessions import Session
 from tsfusion.gateway.spare_fusers import SpareFusers
-from tsfusion.journal import Position, ReadingWatcher, Unwritten, state_folder
-from tsfusion.journal.quarantine import Quarantine
+from tsfusion.journal import ReadingWatcher, state_folder
 from tsfusion.wire import corrections, keyframe_times
-from tsfusion.wire.health import MapHealth
-from tsfusion.wire.mesh_updates import Meshed
-from tsfusion.wire.record_header import CorrectionHeader, RecordHeader, unpack
+from tsfusion.wire.mesh_updates import Meshed, MeshUpdate
+from tsfusion.wire.record_header import CorrectionHeader, unpack
 
 log = logging.getLogger(__name__)
 
-ForPeople = tuple[Meshed | fuser_messages.FuserReply | fuser_messages.FuserAnswer, Sequence[zmq.Frame]]
-
-
-class Checked(NamedTuple):
-    """A message that was found to be the next record of its session."""
-
-    header: RecordHeader
-    frames: Sequence[Any]
-    client: str  # name that its sender's key is allowed under
-    received_ns: int
+ForPeople = Meshed | fuser_messages.FuserReply | fuser_messages.FuserAnswer
+PassOn = Callable[[ForPeople, Sequence[zmq.Frame]], None]
 
 
 class HostedMap:
@@ -57,6 +44,14 @@ class HostedMap:
         fuser: that read the map ahead; None = one begins now.
         spares: processes that it may take.
         waits: for `fuser.begin`, until when nothing is fused.
+
+    Attributes:
+        warm: the fuser has been ready once: from then on it is known what the map has.
+        moved: when the fuser answered, or had nothing to answer (`time.monotonic()`).
+        last_keyframe: when the last one came (likewise); None = none did.
+        loss: what is neither in a checkpoint nor in the journal; empty = nothing.
+        newest_mesh: that viewers were told of; None = there is none.
+        corrections: number of those in the journal.
     """
 
     def __init__(
@@ -75,72 +70,49 @@ class HostedMap:
     ) -> None:
         self.name, self.volume = name, volume
         self.folder = state_folder.map_folder(server.state, name)
-        self.sessions = Sessions()
+        self.records = MapRecords(name, self.folder, server, watch)
+        self.sessions, self.disk = self.records.sessions, self.records.disk
         self.questions = QuestionCounts()
         self.is_leaving = self.is_frozen = False  # to another server; it takes no records any more
+        self.warm, self.moved, self.loss = False, 0.0, ""
+        self.last_keyframe: float | None = None
+        self.newest_mesh: MeshUpdate | None = None
         self._metrics = metrics
         self._keeps_window = (server.keep_seconds, server.keep_keyframes, server.keep_radius) != (None,) * 3
-        self._is_new = not state_folder.holds_a_map(self.folder)
-        self._journal = map_opening.open_journal(self.folder, server, watch)
-        self.disk = DiskPause(self._journal, name)
-        self._quarantine = Quarantine(self.folder / state_folder.QUARANTINE_FOLDER, server.quarantine_bytes)
-        self._index = KeyframeIndex()
-        self._index.recover(self._journal.found, self.sessions)
-        self._journal.found = []
-        arrived = moved_maps.arrival_of(self.folder)
-        self._has_arrived = arrived is not None
-        for known in () if arrived is None else arrived.sessions:
-            session = self.sessions.open(known.key, known.client, known.world)
-            session.durable = max(session.durable, known.durable)
-        self._backlog = FuserBacklog(self._index, self.sessions)
-        self._corrections = self._backlog.corrections  # in the journal
+        self.backlog = FuserBacklog(self.records.index, self.sessions)
+        self.corrections = self.backlog.corrections  # in the journal
         self.outcomes = KeyframeOutcomes(
             name,
-            self._index,
+            self.records.index,
             self.sessions,
             routes,
             metrics,
-            journal=self._journal.folder,
-            quarantine=self._quarantine,
+            journal=self.records.journal.folder,
+            quarantine=self.records.quarantine,
         )
-        self._retention = JournalRetention(self._journal, self._index, self.sessions, server.journal_bytes)
-        map_opening.warn_of_old_corrections(self.folder)
+        self._retention = JournalRetention(
+            self.records.journal, self.records.index, self.sessions, server.journal_bytes
+        )
         self.fuser = fuser or FuserSupervisor(
             context, self.folder, server, volume, spares=spares, waits=waits
         )
         if fuser is not None:
             fuser.begin_work()
-        self._checkpoints = CheckpointOrders(self.fuser, self._journal)
-        self._condition = MapCondition(
-            self.fuser,
-            self._journal,
-            self._quarantine,
-            disk=self.disk,
-            sessions=self.sessions,
-            backlog=self._backlog,
-            outcomes=self.outcomes,
-            checkpoints=self._checkpoints,
-            questions=self.questions,
-        )
+        self.checkpoints = CheckpointOrders(self.fuser, self.records.journal)
         self._leaving: dict[int, int] = {}  # index of a record that forgets keyframes → how many
         self.forgetting = Forgetting(
             name,
             self.folder,
-            self._journal,
-            self._quarantine,
+            self.records.journal,
+            self.records.quarantine,
             append=self._append_forgotten,
             send=self.fuser.send,
         )
 
     @property
-    def warm(self) -> bool:
-        """Whether the fuser has been ready once: from then on it is known what the map has."""
-        return self._condition.warm
-
-    @property
     def is_saved(self) -> bool:
         """Whether the checkpoint that it was to leave with is written, or cannot be."""
-        return self._checkpoints.is_answered
+        return self.checkpoints.is_answered
 
     @property
     def takes_records(self) -> bool:
@@ -148,18 +120,23 @@ class HostedMap:
 
         Its fuser has read that, or there was nothing, or the server from which it came said it.
         """
-        return (self.warm or self._is_new or self._has_arrived) and not self.is_frozen
+        return (self.warm or self.records.is_new or self.records.has_arrived) and not self.is_frozen
 
     @property
     def is_empty(self) -> bool:
         """Whether it is known that the map has nothing, and never had."""
-        is_known = self.warm or self._is_new
+        is_known = self.warm or self.records.is_new
         return is_known and not (len(self.sessions) or self.outcomes.blocks or self.outcomes.taken)
+
+    @property
+    def keyframes_durable(self) -> int:
+        """Number of keyframes that were journaled."""
+        return self.outcomes.taken + self.outcomes.rejected.total() + self.backlog.keyframes
 
     @property
     def drained(self) -> bool:
         """Whether the map has every keyframe of the journal, where the newest correction of it says."""
-        return self._condition.drained
+        return self.fuser.idle and self.backlog.is_empty and not self.outcomes.moves.waiting
 
     @property
     def corrections_waiting(self) -> int:
@@ -173,9 +150,7 @@ class HostedMap:
 
     def idle_since(self, since: float) -> bool:
         """Whether no keyframe waits, nor came since then (`time.monotonic()`)."""
-        return self.drained and (
-            self._condition.last_keyframe is None or self._condition.last_keyframe < since
-        )
+        return self.drained and (self.last_keyframe is None or self.last_keyframe < since)
 
     def close(self, *, wait: bool = True) -> None:
         """End the fuser and finish the journal. A journal that cannot be finished is logged.
@@ -185,7 +160,7 @@ class HostedMap:
         """
         self.fuser.close(wait=wait)
         try:
-            self._journal.close()
+            self.records.journal.close()
         except JournalError as error:  # its index only: every keyframe is on the disk
             log.error("%s", error, extra=logs.about(map=self.name))
 
@@ -211,41 +186,23 @@ class HostedMap:
         Raises:
             JournalError: when the disk refuses.
         """
-        unwritten = [Unwritten(one.frames, one.header.session, one.header.seq, one.client) for one in records]
-        try:
-            positions = self._journal.append_all(unwritten)
-        except JournalError as error:
-            self.disk.begin(error)
-            raise
-        self.disk.end()
-        durable_ns = time.monotonic_ns()
-        return [self._add(one, place, durable_ns) for one, place in zip(records, positions, strict=True)]
+        indices, durable_ns = self.records.append(records)
+        for record, index in zip(records, indices, strict=True):
+            self._note_durable(record, self.sessions.numbered(self.records.index[index].session), durable_ns)
+        return indices
 
-    def _add(self, record: Checked, position: Position, durable_ns: int) -> int:
-        header, _, client, received_ns = record
-        session = self.sessions.open(header.session, client, header.world)
-        session.durable = header.seq
-        is_correction = isinstance(header, CorrectionHeader)
-        index = self._index.add(
-            position,
-            session,
-            header.seq,
-            captured_ns=0 if isinstance(header, CorrectionHeader) else header.captured_ns,
-            received_ns=received_ns,
-            durable_ns=durable_ns,
-            is_correction=is_correction,
-        )
-        if self._backlog.is_empty:
-            self._condition.moved = time.monotonic()
-        self._backlog.add(session, is_correction=is_correction)
+    def _note_durable(self, record: Checked, session: Session, durable_ns: int) -> None:
+        header, is_correction = record.header, isinstance(record.header, CorrectionHeader)
+        if self.backlog.is_empty:
+            self.moved = time.monotonic()
+        self.backlog.add(session, is_correction=is_correction)
         if is_correction:
-            self._corrections += 1
+            self.corrections += 1
         else:
-            self._condition.last_keyframe = durable_ns / 1e9
-            self._metrics.observe(self.name, "journal", (durable_ns - received_ns) / 1e9)
-        stamps = keyframe_times.Stamps(header.seq, received_ns, durable_ns)
+            self.last_keyframe = durable_ns / 1e9
+            self._metrics.observe(self.name, "journal", (durable_ns - record.received_ns) / 1e9)
+        stamps = keyframe_times.Stamps(header.seq, record.received_ns, durable_ns)
         self.outcomes.acknowledge(header.session, [stamps])
-        return index
 
     # --- another server ---
 
@@ -255,75 +212,79 @@ class HostedMap:
         Raises:
             JournalError: when the disk refuses.
         """
-        self._close_segment()
+        self.records.close_segment()
         self.is_leaving = True  # not where that fails: nobody would have it stay
-        self._checkpoints.ask()
+        self.checkpoints.ask()
 
     def freeze(self) -> None:
         """Take no records any more, and close the journal's last file; raises JournalError."""
         self.is_frozen = True
-        self._close_segment()
+        self.records.close_segment()
 
     def stay(self) -> None:
         """Go on as before."""
         self.is_leaving = self.is_frozen = False
 
-    def _close_segment(self) -> None:
-        try:
-            self._journal.rotate()
-        except OSError as error:
-            raise JournalError(f"cannot close a file of {self._journal.folder}: {error}") from error
-
     # --- fuser ---
 
-    def step(self) -> list[ForPeople]:
+    def step(self, pass_on: PassOn) -> None:
         """Read the fuser's messages, replace it if it died, give it work, keep the journal to its limit.
 
-        Returns:
-            The messages for viewers and for those who asked, with their frames.
+        In this order: whether it has ended is asked before its last messages are read, and what it answered
+        is out of the way before the next one begins, or work is handed out.
+
+        Args:
+            pass_on: takes the messages for viewers and for those who asked, with their frames.
 
         Raises:
             TsfusionError: when the map cannot be opened.
         """
-        for_people: list[ForPeople] = []
-        ended = self.fuser.ended()  # before its last messages are read
+        ended = self.fuser.ended()
         while (received := self.fuser.receive()) is not None:
-            message, frames = received
-            if isinstance(message, fuser_messages.Done):
-                self._condition.moved = time.monotonic()
-                self._backlog.on_done(message.index, (message.fused_ns - message.fuse_start_ns) / 1e9)
-                self._leaving.pop(message.index, None)
-                self.outcomes.on_done(message)
-            elif isinstance(message, fuser_messages.CorrectionProgress):
-                self.outcomes.on_moves(message)
-            elif isinstance(message, fuser_messages.Ready):
-                self._on_ready(message)
-            elif isinstance(message, fuser_messages.Saved):
-                self._on_saved(message)
-            elif isinstance(message, fuser_messages.Found):
-                self.forgetting.on_found(message)
-            elif isinstance(message, Meshed):
-                self.outcomes.on_meshed(message)
-                self._condition.newest_mesh = message.update or self._condition.newest_mesh
-                for_people.append((message, frames))
-            elif isinstance(message, fuser_messages.FuserAnswer):
-                for_people.append((message, frames))
-            elif isinstance(message, fuser_messages.FuserReply):
-                for_people.append((message, frames))
-                if not ended:
-                    break  # it is passed on before what was fused after it is counted
+            self._dispatch(*received, pass_on)
         if ended and not self.fuser.finishing:
             self.disk.look()
             if not self.disk.is_away:  # another one would find an empty map
                 self.fuser.restart()
-        self._backlog.hand_out(self.fuser)
+        self.backlog.hand_out(self.fuser)
         self.disk.step()
         if not self.disk.is_away and not self.is_leaving:
             needed = self.outcomes.moves.first_segment if self._keeps_window else None
             self._retention.step(self.fuser, self.outcomes.unmeshed, window_from=needed)
-        self._checkpoints.step()
+        self.checkpoints.step()
         self._forget()
-        return for_people
+
+    def _dispatch(
+        self, message: fuser_messages.ToGateway, frames: Sequence[zmq.Frame], pass_on: PassOn
+    ) -> None:
+        """Give a fuser's message to all whom it concerns, after `FuserSupervisor.receive` had it.
+
+        An answer is passed on here, before what was fused after it is counted.
+        """
+        match message:
+            case fuser_messages.Done():
+                self.moved = time.monotonic()
+                self.backlog.on_done(message.index, (message.fused_ns - message.fuse_start_ns) / 1e9)
+                self._leaving.pop(message.index, None)
+                self.outcomes.on_done(message)
+            case fuser_messages.CorrectionProgress():
+                self.outcomes.on_moves(message)
+            case fuser_messages.Ready():
+                self._on_ready(message)
+            case fuser_messages.Saved():
+                if message.written:
+                    self.outcomes.on_checkpoint()
+                self.checkpoints.on_saved(message)
+                self._retention.on_saved(message)
+                self.forgetting.on_saved(message)
+            case fuser_messages.Found():
+                self.forgetting.on_found(message)
+            case Meshed():
+                self.outcomes.on_meshed(message)
+                self.newest_mesh = message.update or self.newest_mesh
+                pass_on(message, frames)
+            case fuser_messages.FuserAnswer() | fuser_messages.FuserReply():
+                pass_on(message, frames)
 
     def _forget(self) -> None:
         if self.fuser.failed and not self.fuser.ready:
@@ -337,45 +298,22 @@ class HostedMap:
                 unavailable=moves.unavailable,
             )
 
-    def _on_saved(self, saved: fuser_messages.Saved) -> None:
-        if saved.written:
-            self.outcomes.on_checkpoint()
-        self._checkpoints.on_saved(saved)
-        self._retention.on_saved(saved)
-        self.forgetting.on_saved(saved)
-
     def _on_ready(self, ready: fuser_messages.Ready) -> None:
         if not self.warm:
-            map_opening.compare(self.name, self._journal, self.sessions, ready)
+            map_opening.compare(self.name, self.records.journal, self.sessions, ready)
         for key, progress in ready.done.items():
             session = self.sessions.open(key, progress.client, progress.world)
             session.durable = max(session.durable, progress.seq)
             if progress.seq > session.fused:
                 session.fused = progress.seq
-                session.answered = self._index.keyframes_up_to(session, progress.seq)
-        self._backlog.restart(ready.done)
+                session.answered = self.records.index.keyframes_up_to(session, progress.seq)
+        self.backlog.restart(ready.done)
         self.outcomes.on_ready(ready)
         self._retention.on_ready()
         self.forgetting.on_ready()
         if not self.warm:
-            self._condition.warm = True
-            self._condition.moved = time.monotonic()
-            found = map_opening.contents(ready, self._backlog.keyframes)
+            self.warm = True
+            self.moved = time.monotonic()
+            found = map_opening.contents(ready, self.backlog.keyframes)
             log.info("%s", found, extra=logs.about(map=self.name))
-        self._condition.loss = map_opening.loss(self.name, self._journal, ready)
-
-    # --- health ---
-
-    @property
-    def problem(self) -> str:
-        """Reason why keyframes are not accepted or not fused, and what to do; empty = they are."""
-        return self._condition.problem
-
-    @property
-    def notices(self) -> list[str]:
-        """Problems that a person should know of, though keyframes are taken and will be fused."""
-        return self._condition.notices
-
-    def health(self) -> MapHealth:
-        """Health of the map, as far as it is known without asking the fuser."""
-        return self._condition.health(self._corrections, self.corrections_waiting)
+        self.loss = map_opening.loss(self.name, self.records.journal, ready)

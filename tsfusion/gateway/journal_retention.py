@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The limit of a map's journal: segments that two checkpoints hold are deleted, oldest first."""
+"""The limit of a map's journal, and checkpoints that the gateway asks for.
+
+Segments that two checkpoints hold are deleted, oldest first. A fuser writes most checkpoints by itself.
+"""
 
 import logging
 import time
@@ -14,6 +17,7 @@ from tsfusion.journal import Journal
 
 log = logging.getLogger(__name__)
 
+_SAVE_PAUSE = 10.0  # seconds until a checkpoint is tried again that could not be written
 _SAVE_INTERVAL = 10.0  # seconds between checkpoints that are made only for the journal's sake
 
 
@@ -93,3 +97,45 @@ class JournalRetention:
         is_due = window_from < self._journal.segment and before > self._expired
         if is_due and fuser.ready and fuser.send(fuser_messages.Expire(before)):
             self._expired = before
+
+
+class CheckpointOrders:
+    """Ask again where a checkpoint failed, where segments of the journal have gone, and before a map leaves.
+
+    Attributes:
+        written: number of checkpoints since the map was opened.
+        problem: why none can be written; empty = one can.
+        is_answered: nothing that `ask` asked for is to come any more.
+    """
+
+    def __init__(self, fuser: FuserSupervisor, journal: Journal) -> None:
+        self._fuser, self._journal = fuser, journal
+        self.written = 0
+        self.problem = ""
+        self.is_answered = True
+        self._ask_at = 0.0  # time.monotonic()
+        self._missing = 0  # segments of the journal that were missing when one was asked for
+
+    def ask(self) -> None:
+        """Have one written now, if there is a fuser."""
+        self.is_answered = not (self._fuser.ready and self._fuser.send(fuser_messages.Save()))
+
+    def on_saved(self, saved: fuser_messages.Saved) -> None:
+        """Take what the fuser says of one."""
+        self.is_answered = True
+        self.written += saved.written
+        self.problem = saved.problem
+        self._ask_at = time.monotonic() + _SAVE_PAUSE
+
+    def step(self) -> None:
+        """Ask for one where that is due."""
+        now, missing = time.monotonic(), len(self._journal.missing)
+        is_due = self.problem and now >= self._ask_at
+        if (
+            self._fuser.ready
+            and (is_due or missing > self._missing)
+            and self._fuser.send(fuser_messages.Save())
+        ):
+            self._ask_at = now + _SAVE_PAUSE
+            self._missing = missing
+        self._missing = min(self._missing, missing)

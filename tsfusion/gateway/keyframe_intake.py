@@ -17,7 +17,8 @@ from tsfusion.core import logs
 from tsfusion.core.config import ServerConfig
 from tsfusion.core.errors import JournalError
 from tsfusion.gateway.client_routes import Admission, ClientRoutes
-from tsfusion.gateway.hosted_map import Checked, HostedMap
+from tsfusion.gateway.hosted_map import HostedMap
+from tsfusion.gateway.map_records import Checked
 from tsfusion.gateway.map_registry import MapRegistry
 from tsfusion.gateway.quotas import Quotas
 from tsfusion.wire import codec, corrections, messages, sockets

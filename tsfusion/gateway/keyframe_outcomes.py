@@ -6,6 +6,7 @@ import time
 from collections import Counter, OrderedDict, deque
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 import msgspec
 import numpy as np
@@ -220,7 +221,7 @@ class KeyframeOutcomes:
         self.acknowledge(self._sessions.numbered(entry.session).key, [stamps])
 
 
-_DELAYS = 1024
+_DELAYS = 1024  # the newest ones count
 _LONGEST_DELAY_NS = 86_400 * 10**9  # a day
 
 
@@ -245,3 +246,26 @@ class DelayStatistics:
     def summary(self) -> Spread:
         """Mean, percentiles and maximum of the delays, milliseconds."""
         return keyframe_times.spread(np.array([delay for delay, _ in self._recent_ms]))
+
+
+# refused: not passed on to the fuser; late: their time was over; failed: the fuser could not
+Outcome = Literal["answered", "refused", "late", "failed"]
+
+
+class QuestionCounts:
+    """Questions that a map was asked, what became of them, and how long the answers took."""
+
+    def __init__(self) -> None:
+        self.by_outcome: Counter[str] = Counter()
+        self._delays_ms: deque[float] = deque(maxlen=_DELAYS)
+
+    def add(self, outcome: Outcome, seconds: float | None = None) -> None:
+        """Count a question; with the seconds that its answer took."""
+        self.by_outcome[outcome] += 1
+        if seconds is not None:
+            self._delays_ms.append(1e3 * seconds)
+
+    @property
+    def delay_ms(self) -> Spread:
+        """From when the newest questions came to when their answers left, milliseconds."""
+        return keyframe_times.spread(np.array(self._delays_ms))

@@ -17,7 +17,7 @@ from msgspec import Struct
 from tsfusion.core.rates import Bucket
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.gateway.hosted_map import HostedMap
-from tsfusion.gateway.map_condition import QuestionCounts
+from tsfusion.gateway.keyframe_outcomes import QuestionCounts
 from tsfusion.gateway.memory_guard import PendingReplies
 from tsfusion.gateway.metrics import Metrics
 from tsfusion.gateway.ports import Ports

@@ -4,7 +4,7 @@
 import logging
 import re
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from tsfusion.gateway import map_arrivals, moved_maps
 from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.fuser_supervisor import FuserSupervisor
 from tsfusion.gateway.hosted_map import ForPeople, HostedMap
+from tsfusion.gateway.map_condition import health_of, notices_of, problem_of
 from tsfusion.gateway.map_directory import MapDirectory, Place
 from tsfusion.gateway.metrics import Metrics
 from tsfusion.gateway.problems import Problem
@@ -279,7 +280,7 @@ class MapRegistry:
         """
         if hosted.sessions.shares_frame(record.session, record):
             return None
-        keyframes = count_of(hosted.health().keyframes_durable, "keyframe")
+        keyframes = count_of(hosted.keyframes_durable, "keyframe")
         why = f"map {hosted.name} has {keyframes} of another session, in another coordinate frame"
         try:
             free = self.free_name(hosted.name, maps)
@@ -360,19 +361,18 @@ class MapRegistry:
         if hosted is not None:
             hosted.close(wait=False)
 
-    def step(self) -> list[tuple[HostedMap, ForPeople]]:
+    def step(self, pass_on: Callable[[HostedMap, ForPeople, Sequence[zmq.Frame]], None]) -> None:
         """Step every map.
 
-        Returns:
-            The fusers' messages for viewers and for those who asked.
+        Args:
+            pass_on: takes the fusers' messages for viewers and for those who asked.
 
         Raises:
             TsfusionError: when a map that was to be opened at the start cannot be.
         """
-        for_people: list[tuple[HostedMap, ForPeople]] = []
         for hosted in list(self):
             try:
-                for_people += ((hosted, one) for one in hosted.step())
+                hosted.step(partial(pass_on, hosted))
             except TsfusionError as error:
                 if not self._started or hosted.warm:
                     raise
@@ -382,7 +382,6 @@ class MapRegistry:
             self._spares.step(self._volumes[DEFAULT_MAP], may_start=self.warm and waiting is None)
             if waiting is not None and self.warm and not self.is_ending:
                 self.open_for_client(waiting.name)
-        return for_people
 
     @property
     def warm(self) -> bool:
@@ -424,16 +423,16 @@ class MapRegistry:
 
     def health(self) -> dict[str, MapHealth]:
         """Health of each map, by name."""
-        return {hosted.name: hosted.health() for hosted in self}
+        return {hosted.name: health_of(hosted) for hosted in self}
 
     def problems(self) -> list[Problem]:
         """Problems of the maps; those that keep them from taking or fusing keyframes come first."""
         problems = [
             Problem(problem, hosted.name, is_logged=bool(hosted.disk.problem))
             for hosted in self
-            if (problem := hosted.problem)
+            if (problem := problem_of(hosted))
         ]
-        problems += [Problem(notice, hosted.name) for hosted in self for notice in hosted.notices]
+        problems += [Problem(notice, hosted.name) for hosted in self for notice in notices_of(hosted)]
         before = time.monotonic() - _UNOPENED_KEPT
         self._unopened = {name: one for name, one in self._unopened.items() if one[1] > before}
         problems += [Problem(f"cannot be opened: {why}", name) for name, (why, _) in self._unopened.items()]

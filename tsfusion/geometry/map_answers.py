@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tsfusion.core.errors import InvalidConfig, InvalidKeyframe, MissingDependency
 from tsfusion.geometry import point_files
 from tsfusion.geometry.keyframe import MAX_IMAGE_SIDE, Intrinsics, check_intrinsics, check_pose, intrinsics_of
-from tsfusion.geometry.provenance import generator
+from tsfusion.geometry.mesh_arrays import generator
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.geometry.mesh_arrays import MeshArrays
-from tsfusion.geometry.provenance import generator
+from tsfusion.geometry.mesh_arrays import MeshArrays, generator
 from tsfusion.geometry.up_direction import Up
 
 _STL_HEADER = 80  # bytes

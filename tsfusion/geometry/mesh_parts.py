@@ -16,7 +16,7 @@ from tsfusion.core import durable_files
 from tsfusion.core.errors import OutputError
 from tsfusion.geometry import mesh_part_islands, up_direction
 from tsfusion.geometry.mesh import Mesh
-from tsfusion.geometry.provenance import Provenance
+from tsfusion.geometry.mesh_arrays import Provenance
 from tsfusion.geometry.up_direction import HeldSensor, Up
 
 FORMATS = (".ply", ".glb")

@@ -26,7 +26,7 @@ from tsfusion.datasets.dataset import NOMINAL_NS
 from tsfusion.datasets.trajectory_files import write_tum
 from tsfusion.geometry import up_direction
 from tsfusion.geometry.mesh import Mesh
-from tsfusion.geometry.provenance import Provenance
+from tsfusion.geometry.mesh_arrays import Provenance
 from tsfusion.geometry.up_direction import HeldSensor, Up
 from tsfusion.journal.state_folder import check_no_map_of_a_server
 from tsfusion.pipelines import latency_ledger, mesh_finishing, shortfall

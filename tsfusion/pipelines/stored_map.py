@@ -15,6 +15,7 @@ from tsfusion.core.folder_lock import lock_folder
 from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.forgetting import Request
 from tsfusion.gateway.hosted_map import HostedMap
+from tsfusion.gateway.map_condition import problem_of
 from tsfusion.gateway.metrics import Metrics
 from tsfusion.gateway.ports import Ports
 from tsfusion.journal import state_folder
@@ -74,14 +75,14 @@ class StoredMap:
         well = time.monotonic()
         while not reached():
             self._step()
-            problem = self._hosted.problem
+            problem = problem_of(self._hosted)
             well = well if problem else time.monotonic()
             if problem and time.monotonic() - well > _PATIENCE_S:
                 raise MapError(problem)
 
     def _step(self) -> None:
         zmq.zmq_poll([(self._hosted.fuser.socket, zmq.POLLIN)], _TICK_MS)
-        self._hosted.step()
+        self._hosted.step(lambda _message, _frames: None)
 
 
 @contextmanager

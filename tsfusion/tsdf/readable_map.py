@@ -21,8 +21,8 @@ from tsfusion.core.errors import InvalidConfig, MapError
 from tsfusion.core.readable_numbers import count_of
 from tsfusion.geometry import object_cards
 from tsfusion.geometry.mesh import Mesh
+from tsfusion.geometry.mesh_arrays import Provenance
 from tsfusion.geometry.mesh_parts import MeshParts, joined
-from tsfusion.geometry.provenance import Provenance
 from tsfusion.geometry.up_direction import HeldSensor, Up
 from tsfusion.kernels import integrate, runtime
 from tsfusion.kernels.sensor_noise import WEIGHT_ONE

@@ -28,7 +28,7 @@ from numpy.typing import DTypeLike, NDArray
 from tsfusion.core import durable_files
 from tsfusion.core.errors import InvalidConfig, MissingDependency, OutputError
 from tsfusion.geometry import openvdb_files
-from tsfusion.geometry.provenance import generator
+from tsfusion.geometry.mesh_arrays import generator
 from tsfusion.kernels.integrate import MAX_DISTANCE, QUANTA_PER_VOXEL, WEIGHT_MASK
 from tsfusion.kernels.sensor_noise import WEIGHT_ONE
 from tsfusion.tsdf import distance_fields
