@@ -164,7 +164,7 @@ def test_a_map_is_not_merged_with_itself(
 def test_without_a_journal_the_surface_is_resampled(
     maps: tuple[AlignedMap, AlignedMap], here: Here, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(map_alignment._Pair, "turned", lambda *_: [])  # it looks much alike by four sides
+    monkeypatch.setattr(map_alignment._MapPair, "turned", lambda *_: [])  # it looks much alike by four sides
     for name, one in zip("ab", maps, strict=True):
         one.volume.save(tmp_path / f"{name}.tsf")
     done = here("map", "align", "a.tsf", "b.tsf", "--out", "c.tsf")

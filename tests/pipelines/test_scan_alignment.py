@@ -25,7 +25,7 @@ from tsfusion.journal import state_folder
 from tsfusion.journal.recording import JournalRecording
 from tsfusion.pipelines import scan as pipelines_scan
 from tsfusion.pipelines import scan_alignment
-from tsfusion.pipelines.scan_alignment import Answer, ExistingMap, PlacedLocalizer, find_place
+from tsfusion.pipelines.scan_alignment import ExistingMap, PlacedLocalizer, PlacementTry, find_place
 from tsfusion.pipelines.scan_results import ScanSummary
 from tsfusion.scanner.keyframe_selection import KeyframeSelector
 from tsfusion.scanner.localization.localizer import Lost, Pose, PoseCorrections
@@ -63,9 +63,9 @@ def tries(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Numbers of keyframes with which the place was looked for; it is found with 14 or more."""
     counts: list[int] = []
 
-    def locate(_: ExistingMap, __: VolumeConfig, keyframes: list[Keyframe]) -> Answer:
+    def locate(_: ExistingMap, __: VolumeConfig, keyframes: list[Keyframe]) -> PlacementTry:
         counts.append(len(keyframes))
-        return Answer(T, "") if len(keyframes) >= 14 else Answer(None, "too little")
+        return PlacementTry(T, "") if len(keyframes) >= 14 else PlacementTry(None, "too little")
 
     monkeypatch.setattr(concurrent.futures, "ProcessPoolExecutor", Inline)
     monkeypatch.setattr(scan_alignment, "locate", locate)
@@ -147,11 +147,11 @@ def test_the_last_try_is_with_all_there_is(tries: list[int]) -> None:
 
 
 def test_keyframes_that_wait_are_limited(tries: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(scan_alignment, "locate", lambda *_: Answer(None, "too little"))
+    monkeypatch.setattr(scan_alignment, "locate", lambda *_: PlacementTry(None, "too little"))
     placing = found(Straight(), 10_000)
     assert len(placing.keyframes) == scan_alignment.MOST_KEYFRAMES
 
-    def dies(*_: Any) -> Answer:
+    def dies(*_: Any) -> PlacementTry:
         raise BrokenExecutor
 
     monkeypatch.setattr(scan_alignment, "locate", dies)
@@ -191,7 +191,7 @@ def test_a_placed_scan_is_of_the_maps_frame(
 ) -> None:
     scan("hall", align=False)
     before = poses(server, "hall")
-    monkeypatch.setattr(scan_alignment, "locate", lambda *_: Answer(T, ""))
+    monkeypatch.setattr(scan_alignment, "locate", lambda *_: PlacementTry(T, ""))
     second = scan("hall", align=True)  # without: refused, as it is of another world
     assert (second.frames, second.complete) == (FRAMES, True)
     sent = poses(server, "hall")[len(before) :]
@@ -204,7 +204,7 @@ def test_an_unplaced_scan_goes_into_a_map_of_its_own(
 ) -> None:
     scan("yard", align=False)
     before = poses(server, "yard")
-    monkeypatch.setattr(scan_alignment, "locate", lambda *_: Answer(None, "they share too little"))
+    monkeypatch.setattr(scan_alignment, "locate", lambda *_: PlacementTry(None, "they share too little"))
     with pytest.raises(AlignmentRefused, match=r"the scan is in the map yard-2, as .* they share too little"):
         scan("yard", align=True)
     assert len(poses(server, "yard")) == len(before)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from tsfusion.journal.ros2_export import Export
     from tsfusion.journal.state_folder import JournalPlace, Watcher
 
-_Result = TypeVar("_Result")
+_Returned = TypeVar("_Returned")
 _MOST_LINES = 20  # printed of one kind; --json has all
 
 app = typer.Typer(
@@ -26,20 +26,20 @@ app = typer.Typer(
     "None of this changes a journal, and all of it works while a server runs.",
 )
 
-Where = Annotated[
+JournalArgument = Annotated[
     Path,
     typer.Argument(
         metavar="PATH",
         help="A server's state folder, the folder of one of its maps, a journal or spool folder, an .mcap.",
     ),
 ]
-Map = Annotated[
+JournalMapFlag = Annotated[
     str | None, typer.Option("--map", metavar="NAME", help="Which map of a state folder with several.")
 ]
 
 
 @verbs.verb(app, "tsfusion journal info my-maps", "tsfusion journal info my-maps --map yard --json")
-def info(path: Where, map_: Map = None, json: options.Json = False) -> None:
+def info(path: JournalArgument, map_: JournalMapFlag = None, json: options.Json = False) -> None:
     """Describe what a journal holds: segments, sessions, keyframes, damage, quarantine.
 
     Checks the CRC of each keyframe and decodes none: as fast as the disk.
@@ -57,7 +57,7 @@ def info(path: Where, map_: Map = None, json: options.Json = False) -> None:
 
 
 @verbs.verb(app, "tsfusion journal verify my-maps", "tsfusion journal verify tsfusion-spool/default")
-def verify(path: Where, map_: Map = None, json: options.Json = False) -> None:
+def verify(path: JournalArgument, map_: JournalMapFlag = None, json: options.Json = False) -> None:
     """Read and decode every keyframe; exit status 1 when anything is damaged.
 
     Each bad place is named by segment and byte. `damage`: the bytes are not
@@ -76,11 +76,11 @@ def verify(path: Where, map_: Map = None, json: options.Json = False) -> None:
     app, "tsfusion journal recover my-maps saved", "tsfusion journal recover my-maps/maps/yard saved-yard"
 )
 def recover(
-    path: Where,
+    path: JournalArgument,
     out: Annotated[
         Path, typer.Argument(metavar="OUT", help="A folder that does not exist yet, or is empty.")
     ],
-    map_: Map = None,
+    map_: JournalMapFlag = None,
     json: options.Json = False,
 ) -> None:
     """Write every whole keyframe of a damaged or unfinished journal into a new one.
@@ -110,11 +110,11 @@ def recover(
     "tsfusion journal export my-maps yard.mcap --points",
 )
 def export(
-    path: Where,
+    path: JournalArgument,
     out: Annotated[
         Path, typer.Argument(metavar="OUT.mcap", help="The file to write; replaced if it exists.")
     ],
-    map_: Map = None,
+    map_: JournalMapFlag = None,
     points: Annotated[
         bool, typer.Option("--points", help="Depth as points, too: Foxglove draws no depth in 3-D.")
     ] = False,
@@ -149,11 +149,11 @@ def _run(
     doing: str,
     path: Path,
     map_name: str | None,
-    work: Callable[["JournalPlace", "Watcher"], _Result],
-    describe: Callable[[_Result], str],
+    work: Callable[["JournalPlace", "Watcher"], _Returned],
+    describe: Callable[[_Returned], str],
     *,
     json: bool,
-) -> _Result:
+) -> _Returned:
     """Do one verb's work on a journal, with progress on stderr, and print its result."""
     from tsfusion.cli import output, progress
     from tsfusion.journal.state_folder import find_journal

@@ -27,7 +27,7 @@ app = typer.Typer(
     A secret key never leaves the machine that made it.
     """,
 )
-Dir = Annotated[
+KeysFlag = Annotated[
     Path,
     typer.Option(
         "--dir", metavar="DIR", envvar="TSFUSION_KEYS", help="The folder of keys; only its owner may read it."
@@ -41,7 +41,7 @@ _FOLDER = Path("tsfusion-keys")
 def new(
     name: Name,
     *,
-    folder: Dir = _FOLDER,
+    folder: KeysFlag = _FOLDER,
     force: Annotated[bool, typer.Option("--force", help="Replace a pair that exists already.")] = False,
 ) -> None:
     """Make a pair of keys: NAME.key_secret stays here, NAME.key is for the other side.
@@ -94,7 +94,7 @@ def allow(
             help="It may make the server forget keyframes of others, too (`tsfusion map forget`).",
         ),
     ] = None,
-    folder: Dir = _FOLDER,
+    folder: KeysFlag = _FOLDER,
 ) -> None:
     """Let a scanner connect; a running server lets it in at once.
 
@@ -118,7 +118,7 @@ def allow(
 
 
 @verbs.verb(app, "tsfusion keys revoke robot1", "tsfusion keys revoke robot1 --dir /etc/tsfusion/keys")
-def revoke(name: Name, *, folder: Dir = _FOLDER) -> None:
+def revoke(name: Name, *, folder: KeysFlag = _FOLDER) -> None:
     """Keep a scanner out; a running server closes its connections at once."""
     from tsfusion.wire import key_folder
 
@@ -127,7 +127,7 @@ def revoke(name: Name, *, folder: Dir = _FOLDER) -> None:
 
 
 @verbs.verb(app, "tsfusion keys list", "tsfusion keys list --json", name="list")
-def list_(*, folder: Dir = _FOLDER, json: options.Json = False) -> None:
+def list_(*, folder: KeysFlag = _FOLDER, json: options.Json = False) -> None:
     """List the folder's own public keys, and on a server who is allowed and who was revoked."""
     from tsfusion.wire import key_folder
 

@@ -16,11 +16,11 @@ if TYPE_CHECKING:
 _STAYS = "give the state folder, whose journal can move what was corrected"
 _TWICE = "a recording that was sent twice counts twice"
 
-Where = Annotated[
+MapArgument = Annotated[
     Path, typer.Argument(metavar="MAP", help="A .tsf file, a state folder, or a map's folder in it.")
 ]
-Out = Annotated[Path, typer.Option("--out", metavar="FILE", help="The map to write (.tsf).")]
-Map = Annotated[
+MapOutFlag = Annotated[Path, typer.Option("--out", metavar="FILE", help="The map to write (.tsf).")]
+StateMapFlag = Annotated[
     str | None, typer.Option("--map", metavar="NAME", help="Which map of a state folder with several.")
 ]
 
@@ -77,7 +77,7 @@ def move(
 
 
 @verbs.verb(app, "tsfusion map info out/latest/map.tsf", "tsfusion map info my-maps --map yard --json")
-def info(path: Where, map_: Map = None, json: options.Json = False) -> None:
+def info(path: MapArgument, map_: StateMapFlag = None, json: options.Json = False) -> None:
     """Describe a saved map: size, hash, extent, whose keyframes it holds, and its settings.
 
     Each byte of the file is checked. Of a state folder this is the last
@@ -97,7 +97,7 @@ def info(path: Where, map_: Map = None, json: options.Json = False) -> None:
 
 
 @verbs.verb(app, "tsfusion map hash out/latest/map.tsf", "tsfusion map hash my-maps --map yard", name="hash")
-def hash_(path: Where, map_: Map = None, json: options.Json = False) -> None:
+def hash_(path: MapArgument, map_: StateMapFlag = None, json: options.Json = False) -> None:
     """Print the hash of a map: equal for the same keyframes at the same poses.
 
     Neither their order nor how often the server was restarted changes it;
@@ -124,7 +124,7 @@ def merge(
         list[Path], typer.Argument(metavar="MAP MAP…", help="Files (.tsf), state folders, maps' folders.")
     ],
     *,
-    out: Out,
+    out: MapOutFlag,
     same_frame: Annotated[
         bool, typer.Option("--same-frame", help="The maps are in one frame; this is not checked.")
     ] = False,
@@ -180,14 +180,14 @@ def merge(
     "tsfusion map crop my-maps --map yard --box 0 0 -1 40 25 10 --out yard.tsf",
 )  # fmt: skip
 def crop(
-    path: Where,
+    path: MapArgument,
     *,
     box: Annotated[
         tuple[float, float, float, float, float, float],
         typer.Option(metavar="X0 Y0 Z0 X1 Y1 Z1", help="Metres in the map's frame."),
     ],
-    out: Out,
-    map_: Map = None,
+    out: MapOutFlag,
+    map_: StateMapFlag = None,
     overwrite: options.OverwriteMap = False,
     json: options.Json = False,
 ) -> None:
@@ -267,7 +267,7 @@ def diff(
 
 @verbs.verb(app, *map_convert.EXAMPLES)
 def convert(
-    path: Where,
+    path: MapArgument,
     out: map_convert.Out,
     *,
     dense: map_convert.Dense = False,
@@ -278,7 +278,7 @@ def convert(
     box: map_convert.SliceBox = None,
     up: options.UpDirection = None,
     resolution: map_convert.Resolution = None,
-    map_: Map = None,
+    map_: StateMapFlag = None,
     overwrite: options.OverwriteMap = False,
     json: options.Json = False,
 ) -> None:
@@ -321,7 +321,7 @@ def convert(
     "tsfusion map resume house.tsf --state my-maps --map house",
 )  # fmt: skip
 def resume(
-    path: Where,
+    path: MapArgument,
     *,
     state: Annotated[Path, typer.Option(metavar="DIR", help="State folder; made where there is none.")],
     map_: Annotated[

@@ -11,7 +11,7 @@ from tsfusion.cli import options, verbs
 if TYPE_CHECKING:
     from tsfusion.pipelines.map_alignment import AlignedMap, Alignment
 
-Where = "A map (.tsf), a state folder, one map's folder in it, or a journal."
+MAP_HELP = "A map (.tsf), a state folder, one map's folder in it, or a journal."
 _EXAMPLES = (
     "tsfusion map align my-maps robot2-maps --out both.tsf",
     "tsfusion map align a.tsf b.tsf --json",
@@ -24,7 +24,7 @@ def register(app: typer.Typer) -> None:
 
 
 def align(
-    first: Annotated[Path, typer.Argument(metavar="A", help=Where)],
+    first: Annotated[Path, typer.Argument(metavar="A", help=MAP_HELP)],
     second: Annotated[Path, typer.Argument(metavar="B", help="The same, of another frame.")],
     *,
     out: Annotated[

@@ -27,7 +27,7 @@ app = typer.Typer(
     for, when that map has the same world or is new; else it waits until you send it elsewhere or drop it.
     """,
 )
-Dir = Annotated[
+SpoolFlag = Annotated[
     Path, typer.Option("--spool", metavar="DIR", envvar="TSFUSION_SPOOL", help="The folder of spools.")
 ]
 _FOLDER = Path("tsfusion-spool")
@@ -39,7 +39,7 @@ _AGES = ((86400.0, "d"), (3600.0, "h"), (60.0, "min"), (1.0, "s"))
 def list_(
     folder: Annotated[Path | None, typer.Argument(metavar="[DIR]", help="The folder of spools.")] = None,
     *,
-    spool: Dir = _FOLDER,
+    spool: SpoolFlag = _FOLDER,
     json: options.Json = False,
 ) -> None:
     """List the spools in which keyframes wait: map, world, keyframes, bytes, age; oldest first.
@@ -103,7 +103,7 @@ def send(
         typer.Argument(metavar="[DIR] [SPOOL]...", help="As `list` shows them; default: all."),
     ] = None,
     *,
-    spool: Dir = _FOLDER,
+    spool: SpoolFlag = _FOLDER,
     connect: options.Connect = None,
     control: options.Control = None,
     map_: options.NewMap = None,
@@ -229,7 +229,7 @@ def _wait(client: "Client", watch: "Callable[[int, int], None]", address: str, p
 def drop(
     name: Annotated[str, typer.Argument(metavar="SPOOL", help="As `list` shows it.")],
     *,
-    spool: Dir = _FOLDER,
+    spool: SpoolFlag = _FOLDER,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
 ) -> None:
     """Delete the keyframes that wait in a spool: no server will get them."""

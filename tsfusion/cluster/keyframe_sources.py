@@ -353,10 +353,10 @@ def reading(keyframes: Sequence[Keyframes]) -> Iterator[Callable[[], Keyframe]]:
             yield from _of_journal(one)
         else:
             dataset = open_dataset(one.path, **one.options)
-            yield from (_Frame(dataset, index) for index in range(one.first, one.stop))
+            yield from (_LazyFrame(dataset, index) for index in range(one.first, one.stop))
 
 
-class _Frame:
+class _LazyFrame:
     """A keyframe of a dataset."""
 
     def __init__(self, dataset: Dataset, index: int) -> None:

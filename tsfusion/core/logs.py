@@ -181,13 +181,13 @@ class Limiter:
     ) -> None:
         self._most, self._period, self._clock = most, period, clock
         # The key is the place and not the message: places are few, whatever peers send.
-        self._places: dict[tuple[str, int], _Place] = {}
+        self._places: dict[tuple[str, int], _LogPlace] = {}
 
     def allows(self, record: logging.LogRecord) -> bool:
         """Whether to write a record; if not, it is counted."""
         if record.levelno >= logging.CRITICAL:
             return True
-        place = self._places.setdefault((record.pathname, record.lineno), _Place(self._clock()))
+        place = self._places.setdefault((record.pathname, record.lineno), _LogPlace(self._clock()))
         place.count += 1
         if place.count <= self._most:
             return True
@@ -204,7 +204,7 @@ class Limiter:
                     yield _summary(place.last, place.count - self._most, self._period)
 
 
-class _Place:
+class _LogPlace:
     def __init__(self, began: float) -> None:
         self.began = began
         self.count = 0

@@ -20,7 +20,7 @@ from tsfusion.geometry.calibration_files import read_rig
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import MAX_BASELINE_M, Intrinsics
 
-_Key = TypeVar("_Key", int, str)
+_FrameKey = TypeVar("_FrameKey", int, str)
 log = logging.getLogger(__name__)
 
 # A folder as a calibration: the files of the left and the right camera, or of intrinsics and extrinsics.
@@ -162,8 +162,8 @@ def pair_of(left: NDArray[Any], right: NDArray[Any], pairs: PairRectifier) -> di
 
 
 def paired(
-    left: dict[_Key, Path], right: dict[_Key, Path], skipped: dict[str, int]
-) -> dict[_Key, tuple[Path, Path]]:
+    left: dict[_FrameKey, Path], right: dict[_FrameKey, Path], skipped: dict[str, int]
+) -> dict[_FrameKey, tuple[Path, Path]]:
     """Images of both cameras by name or number; those of one camera alone are counted."""
     alone = [(left | right)[key] for key in left.keys() ^ right.keys()]
     if alone:

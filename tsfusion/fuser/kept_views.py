@@ -22,7 +22,7 @@ class _How(TypedDict):
     surface: Surface | None
 
 
-class _Shown(TypedDict):
+class _ViewOptions(TypedDict):
     normals: bool
     colors: bool
 
@@ -49,7 +49,7 @@ class KeptViews:
         """The view, and the state that it is of."""
         how = _How(min_weight=question.min_weight, surface=question.surface)
         camera = question.intrinsics, question.matrix, question.shape
-        shown = _Shown(normals=question.normals, colors=question.colors)
+        shown = _ViewOptions(normals=question.normals, colors=question.colors)
         now = time.monotonic()
         if question.max_age > 0:
             self._wanted_s = now + _WANTED_S

@@ -11,7 +11,6 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tsfusion.core.errors import InvalidConfig, TsfusionError
 from tsfusion.core.rates import Bucket
@@ -32,6 +31,7 @@ from tsfusion.wire.questions import (
     Sample,
     Slice,
 )
+from tsfusion.wire.surface_parts import Arrays
 
 if TYPE_CHECKING:
     from tsfusion.geometry.map_grids import SliceGrid
@@ -43,7 +43,6 @@ _BURST_S = 0.2  # seconds of time whose share may come at once
 # Seconds of processor time of an answer while keyframes wait; and where the share is used up already
 _LONGEST_S, _SHORTEST_S = 0.4, 0.1
 _LOOK_S = 0.001  # seconds of a long pass until questions are looked for again
-_Arrays = dict[str, NDArray[Any]]
 
 
 class AnswerGivenUp(TsfusionError):
@@ -194,7 +193,7 @@ def answer_of(
     slices: KeptSlices,
     question: Sample | Slice | Field,
     frames: list[memoryview],
-) -> _Arrays:
+) -> Arrays:
     """Answer of a map, by name: the fields of `geometry.map_answers` and `geometry.map_grids`."""
     if isinstance(question, Slice):
         return _slice_of(slices.get(question), question.kind)
@@ -206,7 +205,7 @@ def answer_of(
     return {"distance": samples.distance, "weight": samples.weight, "gradient": samples.gradient}
 
 
-def _slice_of(current: "CurrentSlice", kind: str) -> _Arrays:
+def _slice_of(current: "CurrentSlice", kind: str) -> Arrays:
     if kind == "occupancy":
         occupancy = current.occupancy()
         own = {"cells": occupancy.cells, "knows_free_space": np.asarray(occupancy.knows_free_space)}
@@ -216,11 +215,11 @@ def _slice_of(current: "CurrentSlice", kind: str) -> _Arrays:
     return {**own, "max_distance": np.float64(found.max_distance), **_figures(found.grid)}
 
 
-def _figures(grid: "SliceGrid") -> _Arrays:
+def _figures(grid: "SliceGrid") -> Arrays:
     return {name: np.asarray(value, np.float64) for name, value in grid.figures.items()}
 
 
-def _field_of(volume: "Volume", asked: Field) -> _Arrays:
+def _field_of(volume: "Volume", asked: Field) -> Arrays:
     edge = volume.config.voxel_size
     sides = np.diff(np.reshape(asked.box, (2, 3)), axis=0)[0] / edge + 2 * asked.max_distance / edge
     if not np.prod(np.maximum(sides, 1)) <= MOST_VOXELS:

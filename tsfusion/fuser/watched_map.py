@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 from tsfusion.fuser.live_mesh import LiveMesh, TouchedBy
 from tsfusion.journal.keyframe_poses import KeyframePoses
 from tsfusion.wire.questions import CELLS_AT_ONCE, KEYFRAMES_AT_ONCE, REFINED_AT_ONCE, Cells, Keyframes
+from tsfusion.wire.surface_parts import Arrays
 
 if TYPE_CHECKING:
     from tsfusion.tsdf.volume import Volume
 
-_Arrays = dict[str, NDArray[Any]]
 _SESSION = 16  # bytes
 
 
@@ -26,11 +26,11 @@ class WatchedMap:
         self._volume, self._poses = volume, poses
         self._touched_by, self._live_mesh = touched_by, live_mesh
 
-    def answer(self, asked: Cells | Keyframes) -> _Arrays:
+    def answer(self, asked: Cells | Keyframes) -> Arrays:
         """The arrays of an answer, by name."""
         return self._cells(asked) if isinstance(asked, Cells) else self._keyframes(asked)
 
-    def _cells(self, asked: Cells) -> _Arrays:
+    def _cells(self, asked: Cells) -> Arrays:
         """Arrays as `wire.mesh_updates.MeshUpdate` describes them, and `next`: where the others begin.
 
         `state`: stamp, drops, and the number of the newest mesh update: all later changes come in later ones.
@@ -59,7 +59,7 @@ class WatchedMap:
         }
         return {name: np.asarray(array) for name, array in arrays.items()}
 
-    def _keyframes(self, asked: Keyframes) -> _Arrays:
+    def _keyframes(self, asked: Keyframes) -> Arrays:
         """Arrays as `FusedKeyframes` describes them."""
         found = self._poses.fused_after(asked.session, asked.after, KEYFRAMES_AT_ONCE)
         session, number = found.last or (b"", 0)

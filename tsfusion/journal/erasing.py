@@ -62,23 +62,23 @@ def erase(path: Path, offsets: Collection[int]) -> Iterator[int]:
         raise journal_error("erase records of", path, error) from error
 
 
-class _Place(NamedTuple):
+class _RecordPlace(NamedTuple):
     offset: int
     nbytes: int
     mark: bytes  # the first of them, from then on
 
 
-def _place(source: SegmentFile, offset: int) -> _Place:
+def _place(source: SegmentFile, offset: int) -> _RecordPlace:
     raw = source.read(offset, mcap_layout.HEAD_BYTES)
     if (erased := mcap_layout.parse_erased(raw)) is not None:
-        return _Place(offset, erased.nbytes, raw[: mcap_layout.ERASED_BYTES])
+        return _RecordPlace(offset, erased.nbytes, raw[: mcap_layout.ERASED_BYTES])
     head = mcap_layout.parse_head(raw)
     if head is None or offset + head.nbytes > source.size:
         raise JournalError(f"{source.path} holds no whole record at byte {offset}: it is not erased")
     index = head.message_index
     has_index = source.read(offset + head.nbytes, len(index)) == index
     nbytes = head.nbytes + (len(index) if has_index else 0)
-    return _Place(offset, nbytes, mcap_layout.erased_mark(head, nbytes))
+    return _RecordPlace(offset, nbytes, mcap_layout.erased_mark(head, nbytes))
 
 
 def _write(file: FileIO, content: bytes, at: int) -> None:
@@ -88,7 +88,7 @@ def _write(file: FileIO, content: bytes, at: int) -> None:
         at, view = at + written, view[written:]
 
 
-def _clear(file: FileIO, places: list[_Place]) -> Iterator[int]:
+def _clear(file: FileIO, places: list[_RecordPlace]) -> Iterator[int]:
     """Overwrite all but the marks with zeros."""
     unsynced = 0
     for number, one in enumerate(places, 1):

@@ -63,7 +63,7 @@ def scan_records(path: Path, on_read: Callable[[], None] = lambda: None) -> Iter
     """
     try:
         with SegmentFile(path, on_read) as source:
-            yield from _Scan(source, segment_number(path)).steps()
+            yield from _RecordScan(source, segment_number(path)).steps()
     except OSError as error:
         raise journal_error("read", path, error) from error
 
@@ -83,7 +83,7 @@ def _was_index(raw: bytes) -> bool:
     return mcap_layout.INDEX_START[:1] == raw[:1] or mcap_layout.INDEX_START[1:9] == raw[1:9]
 
 
-class _Scan:
+class _RecordScan:
     def __init__(self, source: SegmentFile, number: int) -> None:
         self._source = source
         self._number = number

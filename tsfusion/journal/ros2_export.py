@@ -57,7 +57,7 @@ def export(place: JournalPlace, out: Path, watch: Watcher, *, clouds: bool = Fal
     try:
         with durable_files.replacing(out) as stream:
             final = JournaledKeyframes(place, tells=False)
-            exporter = _Exporter(_Bag(stream, store), Converter(store.types, clouds=clouds), final)
+            exporter = _Exporter(_BagWriter(stream, store), Converter(store.types, clouds=clouds), final)
             exporter.run(place, watch)
     except OSError as error:
         raise OutputError(f"cannot write {out}: {error.strerror}") from error
@@ -77,7 +77,7 @@ def _type_store() -> Any:
     return get_typestore(Stores.ROS2_HUMBLE)
 
 
-class _Bag:
+class _BagWriter:
     """An MCAP file whose channels appear as they are used."""
 
     def __init__(self, stream: IO[bytes], store: Any) -> None:
@@ -112,7 +112,7 @@ class _Bag:
 
 
 class _Exporter:
-    def __init__(self, bag: _Bag, converter: Converter, final: JournaledKeyframes) -> None:
+    def __init__(self, bag: _BagWriter, converter: Converter, final: JournaledKeyframes) -> None:
         self._bag = bag
         self._converter = converter
         self._final = final

@@ -132,7 +132,7 @@ def align(a: AlignedMap, b: AlignedMap) -> Alignment:
     for one in (a, b):
         if not len(one.mesh.faces):
             raise AlignmentRefused(f"{one.name} has no surface (yet), so nothing can be aligned with it")
-    pair = _Pair(a, b)
+    pair = _MapPair(a, b)
     answers = sorted((pair.judged(T) for T in pair.candidates()), key=lambda one: -one.score)
     if not answers:
         raise AlignmentRefused(f"no part of {b.name} looks like a part of {a.name}")
@@ -202,7 +202,7 @@ class _Looks(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class _Answer:
+class _JudgedTransform:
     """A transform, and what speaks for and against it."""
 
     T: Transform
@@ -228,7 +228,7 @@ class _Answer:
         )
 
 
-class _Pair:
+class _MapPair:
     """Two maps that are to be aligned."""
 
     def __init__(self, a: AlignedMap, b: AlignedMap) -> None:
@@ -272,12 +272,12 @@ class _Pair:
         """A transform that was refined, refined by every voxel of the surfaces."""
         return Registration(*self._sampled(self._voxel)).refined(T, _LAST_REACHES)
 
-    def judged(self, T: Transform, *, fine: bool = False) -> _Answer:
+    def judged(self, T: Transform, *, fine: bool = False) -> _JudgedTransform:
         """Evidence for and against a transform; `fine`: by every voxel of the surfaces."""
         surfaces = self._sampled(self._voxel) if fine else self._coarse
         moved = self._coarse[0].moved(se3.inverse(T))[0], self._coarse[1].moved(T)[0]
         looks = self._looks_at(moved[1], moved[0])
-        return _Answer(T, fit(*surfaces, T, _TOLERANCE * self._voxel), looks, self._tilt(T))
+        return _JudgedTransform(T, fit(*surfaces, T, _TOLERANCE * self._voxel), looks, self._tilt(T))
 
     def spread(self, T: Transform) -> float:
         """Distance between the places where parts of the common surface want the second map, metres."""
@@ -291,7 +291,7 @@ class _Pair:
             through, seen = through + sum(one[0] for one in looks), seen + sum(one[1] for one in looks)
         return _Looks(through, seen)
 
-    def check(self, best: _Answer) -> None:
+    def check(self, best: _JudgedTransform) -> None:
         """Raise AlignmentRefused unless an answer is beyond doubt, but for others that are as good."""
         found, a, b = best.fit, self._a.name, self._b.name
         if found.matches < _MIN_MATCHES and found.overlap >= MIN_OVERLAP:
@@ -317,7 +317,7 @@ class _Pair:
                 f"{found.constraint:.4f}, {MIN_CONSTRAINT} is needed); scan corners that both show"
             )
 
-    def is_rival(self, one: _Answer, best: _Answer) -> bool:
+    def is_rival(self, one: _JudgedTransform, best: _JudgedTransform) -> bool:
         """Whether an answer is another than the best, and about as good."""
         return (
             one.fit.overlap >= _RIVAL * best.fit.overlap

@@ -39,7 +39,7 @@ class ExistingMap(NamedTuple):
     voxel_size: float
 
 
-class Answer(NamedTuple):
+class PlacementTry(NamedTuple):
     """Result of a try: where the scan's world lies in the map, or why that is not known."""
 
     T_map_world: Transform | None
@@ -65,7 +65,7 @@ class Placing:
     keyframes: list[Keyframe] = field(default_factory=list)
 
 
-def locate(existing: ExistingMap, config: VolumeConfig, keyframes: Sequence[Keyframe]) -> Answer:
+def locate(existing: ExistingMap, config: VolumeConfig, keyframes: Sequence[Keyframe]) -> PlacementTry:
     """Find where the world of some keyframes lies in a map. Runs in a process of its own."""
     from tsfusion.pipelines import map_alignment
     from tsfusion.tsdf.volume import Volume
@@ -79,9 +79,9 @@ def locate(existing: ExistingMap, config: VolumeConfig, keyframes: Sequence[Keyf
         name=f"the map {existing.name}", mesh=existing.mesh.without_islands(), voxel_size=existing.voxel_size
     )
     try:
-        return Answer(np.array(map_alignment.align(there, scan).T_a_b), "")
+        return PlacementTry(np.array(map_alignment.align(there, scan).T_a_b), "")
     except AlignmentRefused as error:
-        return Answer(None, str(error))
+        return PlacementTry(None, str(error))
 
 
 def find_place(
@@ -107,9 +107,9 @@ def find_place(
     from multiprocessing import get_context
 
     placing, next_try = Placing(), FIRST_TRY
-    running: Future[Answer] | None = None
+    running: Future[PlacementTry] | None = None
 
-    def begin() -> Future[Answer]:
+    def begin() -> Future[PlacementTry]:
         keyframes = list(placing.keyframes)
         tell(f"looking for the place of {count_of(len(keyframes), 'keyframe')} in the map {existing.name}")
         return worker.submit(locate, existing, config, keyframes)
@@ -150,11 +150,11 @@ def _take(frame: Frame, localizer: Localizer, selector: KeyframeSelector, placin
     return is_lost
 
 
-def _answer(running: "Future[Answer]") -> Answer:
+def _answer(running: "Future[PlacementTry]") -> PlacementTry:
     try:
         return running.result()
     except BrokenExecutor:
-        return Answer(None, "the process that looked for it ended; was there memory enough?")
+        return PlacementTry(None, "the process that looked for it ended; was there memory enough?")
 
 
 class PlacedLocalizer:

@@ -103,12 +103,12 @@ class MapTiles:
         for number, at in enumerate(places.tolist()):
             rows = order[ends[number] : ends[number + 1]]
             faces = _ranges(first_face[rows], counts[rows])
-            part = _Part(local[rows], client[rows], np.repeat(local[rows], counts[rows]), mesh, faces)
+            part = _TileUpdate(local[rows], client[rows], np.repeat(local[rows], counts[rows]), mesh, faces)
             self._put((at[0], at[1], at[2]), part, now_s)
             changed.add((at[0], at[1], at[2]))
         return changed
 
-    def _put(self, key: Key, part: "_Part", now_s: float) -> None:
+    def _put(self, key: Key, part: "_TileUpdate", now_s: float) -> None:
         old = self.tiles.get(key)
         if old is None:
             changed_s = np.zeros(self.edge**3, np.float32)
@@ -141,7 +141,7 @@ class MapTiles:
 
 
 @dataclass(frozen=True, eq=False)
-class _Part:
+class _TileUpdate:
     """Part of an update for one tile: cells, who saw them, each face's cell, and which faces of a mesh."""
 
     cells: NDArray[np.int16]

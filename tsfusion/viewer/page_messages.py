@@ -17,35 +17,35 @@ _MOST_BYTES = 4096  # of a message that is no picture
 _FAR = 1e12  # metres, and any other number
 _PNG_SIZE = slice(16, 24)  # bytes of width and height, the high one first
 
-_Pixels = Annotated[int, Meta(ge=0, le=1 << 16)]
-_Point = tuple[float, float, float]
+_PixelCount = Annotated[int, Meta(ge=0, le=1 << 16)]
+_Vector = tuple[float, float, float]
 
 
 class _FromBrowser(Struct, tag_field="type", forbid_unknown_fields=True):
     """A message as viser's page sends it."""
 
 
-class _Camera(_FromBrowser, tag="ViewerCameraMessage"):
+class _CameraMoved(_FromBrowser, tag="ViewerCameraMessage"):
     wxyz: tuple[float, float, float, float]
-    position: _Point
+    position: _Vector
     fov: float
     near: float
     far: float
-    image_height: _Pixels
-    image_width: _Pixels
-    look_at: _Point
-    up_direction: _Point
+    image_height: _PixelCount
+    image_width: _PixelCount
+    look_at: _Vector
+    up_direction: _Vector
 
 
 class _Click(_FromBrowser, tag="ScenePointerMessage"):
     event_type: Literal["click"]
-    ray_origin: _Point
-    ray_direction: _Point
+    ray_origin: _Vector
+    ray_direction: _Vector
     screen_pos: tuple[tuple[float, float]]
     modifier: str | None
 
 
-class _Picture(_FromBrowser, tag="GetRenderResponseMessage"):
+class _PictureTaken(_FromBrowser, tag="GetRenderResponseMessage"):
     payload: bytes
     render_uuid: str
 
@@ -59,7 +59,7 @@ class _NewValue(_FromBrowser, tag="GuiUpdateMessage"):
     updates: _Updates
 
 
-_decoder = msgpack.Decoder(_Camera | _Click | _Picture | _NewValue)
+_decoder = msgpack.Decoder(_CameraMoved | _Click | _PictureTaken | _NewValue)
 
 
 def checked(message: str | bytes, control: Callable[[str], Any]) -> bytes | None:
@@ -72,7 +72,7 @@ def checked(message: str | bytes, control: Callable[[str], Any]) -> bytes | None
         msgspec.MsgspecError, RecursionError, TypeError: for what no page of ours sends.
     """
     read = _decoder.decode(message)  # type: ignore[arg-type]  # TypeError for text
-    if len(message) > _MOST_BYTES and not isinstance(read, _Picture):
+    if len(message) > _MOST_BYTES and not isinstance(read, _PictureTaken):
         raise ValidationError(f"{len(message)} bytes")
     match read:
         case _NewValue():
@@ -80,11 +80,11 @@ def checked(message: str | bytes, control: Callable[[str], Any]) -> bytes | None
             if value is None:
                 return None
             read.updates.value = value
-        case _Picture():
+        case _PictureTaken():
             width, height = (int.from_bytes(read.payload[_PNG_SIZE][i : i + 4], "big") for i in (0, 4))
             if width * height > _MOST_PIXELS:
                 return None
-        case _Camera():
+        case _CameraMoved():
             places = (read.wxyz, read.position, read.look_at, read.up_direction)
             numbers = (read.fov, read.near, read.far, *chain.from_iterable(places))
             if not _are_usual(numbers) or not 0 < read.image_height * read.image_width <= _MOST_PIXELS:

@@ -29,7 +29,7 @@ _MOST_PIXELS = 1 << 26
 
 
 @dataclass
-class _Scanner:
+class _ScannerMark:
     """A session: its newest keyframe, and where its keyframes are and were."""
 
     number: int
@@ -51,7 +51,7 @@ class ScannerMarks:
 
     def __init__(self, scene: "viser.SceneApi") -> None:
         self._scene = scene
-        self._scanners: dict[bytes, _Scanner] = {}
+        self._scanners: dict[bytes, _ScannerMark] = {}
         self.voxel_size = 0.02
         self.shows = {"scanners": True, "paths": True, "first paths": True}
 
@@ -141,10 +141,10 @@ class ScannerMarks:
                 if kind == what or (what == "scanners" and kind == "name"):
                     node.visible = wanted
 
-    def _scanner(self, session: bytes) -> _Scanner:
-        return self._scanners.setdefault(session, _Scanner(len(self._scanners)))
+    def _scanner(self, session: bytes) -> _ScannerMark:
+        return self._scanners.setdefault(session, _ScannerMark(len(self._scanners)))
 
-    def _place(self, session: bytes, scanner: _Scanner) -> None:
+    def _place(self, session: bytes, scanner: _ScannerMark) -> None:
         if scanner.pose is None:
             if (gone := scanner.nodes.pop("scanners", None)) is not None:
                 gone.remove()
@@ -155,7 +155,7 @@ class ScannerMarks:
             node = self._add(session, scanner)
         node.wxyz, node.position = wxyz, position
 
-    def _hang_picture(self, scanner: _Scanner, now: float) -> None:
+    def _hang_picture(self, scanner: _ScannerMark, now: float) -> None:
         """Show what it saw last, if that is new."""
         node = scanner.nodes.get("scanners")
         is_due = scanner.picture is not None and now >= scanner.picture_at + _PICTURE_PAUSE
@@ -163,7 +163,7 @@ class ScannerMarks:
             scanner.picture_at = now
             node.image, scanner.picture = small_picture(scanner.picture), None
 
-    def _add(self, session: bytes, scanner: _Scanner) -> Any:
+    def _add(self, session: bytes, scanner: _ScannerMark) -> Any:
         name, color = f"/scanners/{session.hex()}", of_number(scanner.number)
         size, newest = 10 * self.voxel_size, scanner.newest
         shown = self.shows["scanners"]
@@ -192,7 +192,7 @@ class ScannerMarks:
         scanner.nodes["scanners"] = node
         return node
 
-    def _draw_paths(self, session: bytes, scanner: _Scanner) -> None:
+    def _draw_paths(self, session: bytes, scanner: _ScannerMark) -> None:
         color = np.array(of_number(scanner.number), np.float64)
         seqs = sorted(scanner.now)
         now = np.array([scanner.now[seq] for seq in seqs]).reshape(-1, 3)
@@ -204,7 +204,7 @@ class ScannerMarks:
         self._line(scanner, f"/first-paths/{name}", first if moved else first[:0], faded)
 
     def _line(
-        self, scanner: _Scanner, name: str, points: NDArray[np.float64], color: NDArray[np.float64]
+        self, scanner: _ScannerMark, name: str, points: NDArray[np.float64], color: NDArray[np.float64]
     ) -> None:
         kind = name.split("/")[1].replace("-", " ")
         segments = _segments(points, _LOST * self.voxel_size)

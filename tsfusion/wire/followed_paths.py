@@ -15,7 +15,7 @@ from tsfusion.wire.mesh_updates import Scanned
 from tsfusion.wire.questions import Keyframes
 
 _PAUSE_S = 2.0  # for each answer of the last time, until all are asked for again
-_Page = tuple[NDArray[np.int64], NDArray[np.float64]]
+_PathRows = tuple[NDArray[np.int64], NDArray[np.float64]]
 
 
 class FollowedPaths:
@@ -26,7 +26,7 @@ class FollowedPaths:
         self._next = 0.0  # time.monotonic()
         self._asked: Keyframes | None = None
         self._answers = 0  # of this time, or the last
-        self._pages: dict[bytes, list[_Page]] = defaultdict(list)
+        self._pages: dict[bytes, list[_PathRows]] = defaultdict(list)
         self._epoch = ""
         self._moved: dict[bytes, NDArray[np.float64]] = {}  # T_map_odometry by session
         self._counts: tuple[int, ...] | None = None
@@ -117,6 +117,6 @@ class FollowedPaths:
         self._is_due |= came_alone or before not in (None, counts)
 
 
-def _joined(pages: list[_Page]) -> _Page:
+def _joined(pages: list[_PathRows]) -> _PathRows:
     seqs, poses = zip(*pages, strict=True)
     return np.concatenate(seqs), np.concatenate(poses)

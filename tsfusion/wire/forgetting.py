@@ -11,9 +11,9 @@ from tsfusion.wire.record_header import RecordNumber
 
 _MAX_RANGES = 10_000
 _WallClock = Annotated[int, Meta(ge=-(1 << 63), le=(1 << 63) - 1)]
-_Session = Annotated[str, Meta(pattern=r"\A[0-9a-f]{0,32}\Z")]
+_SessionHex = Annotated[str, Meta(pattern=r"\A[0-9a-f]{0,32}\Z")]
 _Range = tuple[RecordNumber, RecordNumber]
-_Box = tuple[float, float, float, float, float, float]
+_Bounds = tuple[float, float, float, float, float, float]
 
 
 class Selection(Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -29,12 +29,12 @@ class Selection(Struct, frozen=True, kw_only=True, omit_defaults=True):
             nearly all that it measured; None = anywhere.
     """
 
-    session: _Session = ""
+    session: _SessionHex = ""
     client: Annotated[str, Meta(max_length=32)] | None = None
     since_ns: _WallClock | None = None
     until_ns: _WallClock | None = None
     numbers: Annotated[tuple[_Range, ...], Meta(max_length=_MAX_RANGES)] | None = None
-    box: _Box | None = None
+    box: _Bounds | None = None
 
     @property
     def is_empty(self) -> bool:

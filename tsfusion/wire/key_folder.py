@@ -48,13 +48,13 @@ class Allowed(Struct, frozen=True):
     forget: tuple[str, ...] = ()  # names that may make the server forget keyframes of other clients
 
 
-_Key = Annotated[str, Meta(max_length=64)]
+_KeyText = Annotated[str, Meta(max_length=64)]
 
 
 class _Entry(Struct, frozen=True, forbid_unknown_fields=True):
     """A client in the file that may not use every map, or may make the server forget."""
 
-    key: _Key
+    key: _KeyText
     maps: Annotated[tuple[MapPattern, ...], Meta(max_length=256)] = ("*",)
     forget: bool = False
 
@@ -62,7 +62,7 @@ class _Entry(Struct, frozen=True, forbid_unknown_fields=True):
 class _ListFile(Struct, frozen=True, forbid_unknown_fields=True):
     """The allow-list as it stands in its file."""
 
-    allowed: dict[ClientName, _Key | _Entry] = {}
+    allowed: dict[ClientName, _KeyText | _Entry] = {}
     revoked: dict[str, ClientName] = {}
 
 

@@ -13,7 +13,7 @@ from tsfusion.wire.held_cells import SurfacePart
 from tsfusion.wire.mesh_updates import Meshed
 from tsfusion.wire.queries import mesh_of
 
-_Arrays = dict[str, NDArray[Any]]
+Arrays = dict[str, NDArray[Any]]
 
 
 def part_of_update(meshed: Meshed, frames: Sequence[Any]) -> SurfacePart:
@@ -44,7 +44,7 @@ def part_of_update(meshed: Meshed, frames: Sequence[Any]) -> SurfacePart:
     )
 
 
-def part_of_answer(arrays: _Arrays, *, is_raw: bool) -> SurfacePart:
+def part_of_answer(arrays: Arrays, *, is_raw: bool) -> SurfacePart:
     """The part that an answer about cells brings.
 
     Args:

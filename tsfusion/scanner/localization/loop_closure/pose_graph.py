@@ -83,7 +83,7 @@ def optimise(
     Raises:
         MissingDependency: without scipy.
     """
-    problem = _Problem(nodes, edges)
+    problem = _NormalEquations(nodes, edges)
     T = np.array([nodes[key] for key in nodes], dtype=np.float64)
     weights = np.ones(len(edges))
     if not edges:
@@ -124,7 +124,7 @@ def _truncated(chi2: NDArray[np.float64], trusted: float, control: float) -> NDA
     return np.where(chi2 <= inner, 1.0, np.where(chi2 >= outer, 0.0, np.clip(between, 0, 1)))
 
 
-class _Problem:
+class _NormalEquations:
     """The edges as arrays, and the sparsity of their normal equations."""
 
     def __init__(self, nodes: Mapping[int, se3.Transform], edges: Sequence[PoseGraphEdge]) -> None:

@@ -55,7 +55,7 @@ class _Reference:
 
 
 @dataclass(frozen=True, eq=False)
-class _View:
+class _StereoView:
     """One frame as the tracker sees it; its corners are found when they are asked for."""
 
     frame: Frame
@@ -63,7 +63,7 @@ class _View:
     rig: StereoCamera
 
     @classmethod
-    def of(cls, frame: Frame) -> "_View":
+    def of(cls, frame: Frame) -> "_StereoView":
         """Make the view of a frame. Raises InvalidKeyframe without an image or without depth."""
         gray = frame.gray
         if gray is None or (frame.depth_m is None and frame.right is None):
@@ -120,7 +120,7 @@ class StereoLocalizer(Localizer):
         self._reference: _Reference | None = None
         self._velocity: NDArray[np.float64] | None = None  # twist a second; a frame without timestamps
         # The last frame, with its pose where it may be the next reference, until `prepare`.
-        self._newest: tuple[_View, se3.Transform | None] | None = None
+        self._newest: tuple[_StereoView, se3.Transform | None] | None = None
 
     @property
     def rectification(self) -> RectificationCheck | None:
@@ -131,7 +131,7 @@ class StereoLocalizer(Localizer):
     def track(self, frame: Frame) -> Pose | Lost:
         """Find the left camera's pose in the axes of the first one."""
         self.prepare()
-        view = _View.of(frame)
+        view = _StereoView.of(frame)
         if self._reference is None:
             return self._start(view)
         found = self._compare(self._reference, view.gray, frame.timestamp_ns)
@@ -163,7 +163,7 @@ class StereoLocalizer(Localizer):
         self._reference = self._velocity = self._newest = None
         self._anchors.reset()
 
-    def _start(self, view: _View) -> Pose | Lost:
+    def _start(self, view: _StereoView) -> Pose | Lost:
         """Make a frame the first of a world, if it has enough corners with depth."""
         self._newest = view, np.eye(4)
         self.prepare()
@@ -231,7 +231,7 @@ class StereoLocalizer(Localizer):
         self._check_disparity(motion.T_old_new, reference, followed, new)
         return motion.T_old_new, share, float(np.median(np.abs(new - old)[agree].max(axis=1)))
 
-    def _check_rows(self, view: _View, right: NDArray[np.uint8]) -> None:
+    def _check_rows(self, view: _StereoView, right: NDArray[np.uint8]) -> None:
         """Add a pair to the check, also corners without disparity: bad rectification may be the reason."""
         pixels, disparity = view.corners
         matched = disparity > 0
