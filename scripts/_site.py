@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import griffe
 import typer
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
@@ -31,6 +32,18 @@ MORE = "Guides"  # heading of the navigation for pages that it does not list
 _LINK = re.compile(r"(?<!!)\[([^\]]+)\]\(([^)#\s]+)(#[^)\s]*)?\)")
 _SETTING = re.compile(r"(?:# )?(\w+) = ?(.*?) *(?:# (.*))?")
 _DRAWING = re.compile(r'<p><img alt="[^"]*" src="([^"]*assets/[\w-]+\.svg)" ?/?></p>')
+
+
+class Rooms(griffe.Extension):
+    """Folders of a wing, which have no `__init__`: griffe passes over such a folder, and over all in it."""
+
+    def on_module_members(self, *, mod: griffe.Module, **_: Any) -> None:
+        """Add a wing's rooms before its other files are read, those within rooms too."""
+        here = mod.filepath
+        if mod.parent and isinstance(here, Path) and here.name == "__init__.py":
+            for folder in sorted({path.parent for path in here.parent.rglob("*.py")} - {here.parent}):
+                room = griffe.Module(folder.name, filepath=folder / here.name)
+                mod.set_member(folder.relative_to(here.parent).parts, room)
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
