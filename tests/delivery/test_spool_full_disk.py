@@ -335,7 +335,23 @@ def test_a_pinned_keyframe_does_not_keep_the_files_behind_it(tmp_path: Path) -> 
     spool.close()
 
 
-# --- reading it back ---
+# --- reading it back: all but the record that was just written ---
+
+
+def left(spool: Path, count: int) -> None:
+    """Keyframes of a scanner that found no server."""
+    with Client(NOBODY, spool=spool, config=ALL) as client:
+        send_all(client, range(count))
+
+
+def test_the_newest_record_is_not_read_from_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    spool = Spool(tmp_path, 1 << 20)
+    first, last = (spool.write([b"head", bytes([number])]) for number in range(2))
+    monkeypatch.setattr(journal, "read", refuse(errno.EIO))
+    assert [bytes(frame) for frame in spool.read(last)] == [b"head", b"\1"]
+    with pytest.raises(OSError, match="Input/output error"):
+        spool.read(first)
+    spool.close()
 
 
 def test_a_shortage_of_descriptors_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -347,9 +363,9 @@ def test_a_shortage_of_descriptors_loses_nothing(tmp_path: Path, monkeypatch: py
         return read(folder, position)
 
     monkeypatch.setattr("tsfusion.delivery.sender._MAX_READS", 1)  # of a disk that fails
+    left(tmp_path, 3)
+    monkeypatch.setattr(journal, "read", scarce)
     with scripted() as server, joined(server, spool=tmp_path) as client:
-        monkeypatch.setattr(journal, "read", scarce)
-        send_all(client, range(3))
         with pytest.raises(FlushTimeout):
             client.flush(0.2)
         until(lambda: client._outbox._claimed == 0)  # it may still be dropped
@@ -370,9 +386,9 @@ def test_a_keyframe_that_stays_unreadable_is_given_up(
             raise JournalError("cannot read", errno.EIO)
         return record
 
+    left(tmp_path, 4)
+    monkeypatch.setattr(journal, "read", damaged)
     with scripted() as server, joined(server, spool=tmp_path) as client:
-        monkeypatch.setattr(journal, "read", damaged)
-        send_all(client, range(4))
         until(lambda: not client.stats.waiting)
         assert client.stats.refused == {"spool": 1}
         assert server.numbers == [0, 2, 3]
