@@ -20,6 +20,7 @@ from scipy.ndimage import distance_transform_edt
 
 from tsfusion import Intrinsics, Keyframe, Volume
 from tsfusion.datasets.synthetic.dataset import Synthetic
+from tsfusion.geometry.map_grids import FREE
 
 K, SHAPE = Intrinsics(160.0, 160.0, 159.5, 119.5), (240, 320)
 PILLARS = [(x, y) for x in np.arange(-7.5, 8, 5) for y in np.arange(-7.5, 8, 5)]
@@ -115,7 +116,10 @@ def free_space() -> None:
         taken = [cpu_ms(partial(volume.integrate, one), 1)["best_ms"] for one in keyframes]
         vertices = volume.extract_mesh().vertices
         points = np.random.default_rng(0).uniform(vertices.min(0), vertices.max(0), (400_000, 3))
-        truth, known = recording.distance(points), volume.signed_distance(points) > 0.01
+        field = volume.distance_field(max_distance=0.02)
+        cells = np.floor((points - field.origin) / field.voxel_size).astype(int)
+        cells = np.clip(cells, 0, np.array(field.occupancy.shape) - 1)  # what is outside was not seen
+        truth, known = recording.distance(points), field.occupancy[tuple(cells.T)] == FREE
         report(
             "free space", space_carving=carves, keyframe_ms=float(np.median(taken)),
             map_mb=round(volume.stats().bytes / 1e6, 1), known=round(float(known[truth > 0.02].mean()), 3),

@@ -62,6 +62,8 @@ def both(arch: Arch, keyframes: list[Keyframe], **settings: Any) -> tuple[Volume
 def assert_equal(here: Volume, there: Volume) -> None:
     assert (here.map_hash(), here.color_hash()) == (there.map_hash(), there.color_hash())
     assert here.map_hash() != Volume(0.05).map_hash()
+    for one, other in zip(here._store.clear.counts(), there._store.clear.counts(), strict=True):
+        assert (one == other).all()
     if here.config.counts_hits:
         for one, other in zip(here._store.in_order("hits"), there._store.in_order("hits"), strict=True):
             assert (one[0] == other[0]).all()

@@ -253,7 +253,7 @@ def _write_slice(answer: "Answered[Any]", out: Path, *, json: bool) -> None:
         return
     said = ", ".join(f"{100 * share:.0f} % {name}" for name, share in shares.items())
     if not getattr(found, "knows_free_space", True):
-        said += " (fused without --space-carving: free space is known near surfaces alone)"
+        said += " (free space is known near surfaces alone)"
     if hasattr(found, "reach"):
         said += f", horizontal distances up to {found.reach:g} m"
     cells = f"{columns}×{rows} cells of {found.grid.resolution:g} m"

@@ -105,8 +105,10 @@ def write_slice(
         )
     where = "the map's origin" if floor is None else f"the floor, {found.grid.floor_in_words}"
     notes = [f"heights count from {where}; the map lies between {low:.2f} and {high:.2f} m"]
-    if field != "distance" and not volume.config.space_carving:
-        notes.append("the map was made without --space-carving: it knows free space near surfaces alone")
+    if field != "distance" and not volume.knows_free_space:
+        notes.append(
+            "no keyframe of the map looks through a whole block: it knows free space near surfaces alone"
+        )
     for note in notes:
         typer.echo(f"note: {note}", err=True)
     return (found.distances() if field == "distance" else found.occupancy()).save(out)

@@ -112,8 +112,8 @@ class OccupancySlice:
 
     Attributes:
         grid: where the cells are.
-        knows_free_space: whether the map was fused with `space_carving`; without it free space is known
-            only near surfaces.
+        knows_free_space: whether free space is known away from surfaces: in all maps but those of earlier
+            versions that were fused without `space_carving`.
 
     Examples:
         >>> volume = tsfusion.Volume(0.05)
@@ -125,7 +125,7 @@ class OccupancySlice:
 
     grid: SliceGrid
     cells: NDArray[np.int8]
-    knows_free_space: bool  # whether the map was made with space_carving; else it knows it near surfaces
+    knows_free_space: bool  # else it is known near surfaces alone
 
     def save(self, path: str | Path) -> list[Path]:
         """Write files for ROS's map_server, a picture or arrays. Returns the files.

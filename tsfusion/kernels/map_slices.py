@@ -3,12 +3,12 @@
 
 import taichi as ti
 
-from tsfusion.kernels import F32, I32, I64, F32x2, I32x2, I64x2
+from tsfusion.kernels import F32, I32, I64, U8, F32x2, I32x2, I64x2
 from tsfusion.kernels.block_hash import map_find
 from tsfusion.kernels.integrate import QUANTA_PER_VOXEL, lane_weight
 from tsfusion.kernels.run_loop import runs, unit_of
 from tsfusion.kernels.voxel_traversal import VOXEL_LIMIT, block_key, offset_in_block, vec3i
-from tsfusion.kernels.voxel_values import BANDS, distance_as_float, held
+from tsfusion.kernels.voxel_values import BANDS, distance_as_float, held, is_clear
 
 vec3d = ti.types.vector(3, ti.f64)
 
@@ -17,11 +17,11 @@ vec3d = ti.types.vector(3, ti.f64)
 def read_columns(
     cells: I32, width: ti.i32, row: ti.i32, column: ti.i32, across: ti.i32, heights: ti.i32, corner: vec3d,
     along_row: vec3d, along_column: vec3d, along_height: vec3d, map_keys: I64, map_slots: I32, sums: I64x2,
-    correction: F32x2, corrected: ti.i32, color_rgn: I64x2, hits: I32x2, layers: ti.i32, min_weight: ti.i32,
-    values: F32, seen: I32,
+    correction: F32x2, corrected: ti.i32, color_rgn: I64x2, hits: I32x2, layers: ti.i32, shows_surface: U8,
+    clear_keys: I64, clear_slots: I32, clear_counts: I32, min_weight: ti.i32, values: F32, seen: I32,
 ):  # fmt: skip
     """`values`: the smallest signed distance in voxels (`held`) among the samples of each of the `cells`
-    that were seen, NaN where none was; `seen`: how many were.
+    that were seen, NaN where none was; `seen`: how many were, or lie in a block that is free as a whole.
 
     Cell n is (`row` + n // `width`, `column` + n % `width`). It has `across`² columns of `heights` samples;
     these are `along_row`, `along_column`, `along_height` apart, in voxels, from `corner` on.
@@ -31,7 +31,7 @@ def read_columns(
         band = unit_of(run, BANDS)
         if band < BANDS:
             count = cells.shape[0]
-            last, slot = vec3i(2147483647), -1
+            last, slot, clear = vec3i(2147483647), -1, 0
             for n in range(count * band // BANDS, count * (band + 1) // BANDS):
                 cell = cells[n]
                 first_row = (row + cell // width) * across
@@ -47,7 +47,12 @@ def read_columns(
                             block = voxel >> 3
                             if block[0] != last[0] or block[1] != last[1] or block[2] != last[2]:
                                 last = block
-                                slot = map_find(map_keys, map_slots, mask, block_key(voxel))
+                                key = block_key(voxel)
+                                slot = map_find(map_keys, map_slots, mask, key)
+                                clear = is_clear(
+                                    key, slot, shows_surface, clear_keys, clear_slots, clear_counts
+                                )
+                            is_seen = 0
                             if slot >= 0:
                                 o = offset_in_block(voxel)
                                 packed = sums[slot, o]
@@ -58,7 +63,8 @@ def read_columns(
                                         distance += correction[slot, o]
                                     value = distance / ti.cast(w, ti.f32) / QUANTA_PER_VOXEL
                                     value = held(value, slot, o, color_rgn, hits, layers)
-                                    number += 1
+                                    is_seen = 1
                                     if not value >= least:  # also where none was seen before
                                         least = value
+                            number += is_seen | clear
                 values[cell], seen[cell] = least, number

@@ -14,7 +14,7 @@ the one that they are counted from.
 
 import taichi as ti
 
-from tsfusion.kernels import F64, I32, I64, U8, F32x2, I32x2, I64x2, U8x2
+from tsfusion.kernels import F32, F64, I32, I64, U8, F32x2, I32x2, I64x2, U8x2
 from tsfusion.kernels.integrate import (
     CHANGED,
     CUBE,
@@ -25,9 +25,12 @@ from tsfusion.kernels.integrate import (
 )
 from tsfusion.kernels.quick_launch import QuickLaunch
 from tsfusion.kernels.rays_from_images import depth_at, depth_of, reading_of
+from tsfusion.kernels.rays_from_points import confidence_at, row
 from tsfusion.kernels.run_loop import runs, unit_of
 from tsfusion.kernels.sensor_noise import (
     DROPS_LONE_SAMPLES,
+    MAX_RANGE,
+    MIN_RANGE,
     MODEL_FIELDS,
     VOXEL_SIZE,
     bundle_weight,
@@ -53,7 +56,10 @@ BLOCKS, VOXELS = 0, 1  # in `counts`
 # become column · depth, row · depth (patches, voxels) and depth (voxels), three numbers each; the depth up to
 # which it carves (voxels); how many units these have, a power of two; fx, fy, cx, cy.
 CENTRE, COLUMN, ROW, DEPTH, FAR, SCALE, FX, FY, CX, CY = 0, 3, 6, 9, 12, 13, 14, 15, 16, 17
+VIEW_FIELDS = 18
 FINEST = 1 << 14  # units a voxel
+VIEWS = 6  # of points: both ways along x, y and z
+VIEW_TANGENT = 1.25  # of half of such a view's angle: views overlap, so that no cube lies in none as a whole
 
 # Column · depth, row · depth and depth of a voxel, in units; what a step along each axis adds to these.
 Place = ti.types.struct(column=ti.i32, row=ti.i32, depth=ti.i32)
@@ -64,9 +70,32 @@ Reach = ti.types.struct(near=ti.i32, far=ti.i32, rows=ti.i32, columns=ti.i32, hi
 
 
 @ti.func
-def view_row(view: ti.template(), first: ti.template()):
+def view_row(view: ti.template(), first):
     """Three neighbouring numbers of a view."""
     return vec3(view[first], view[first + 1], view[first + 2])
+
+
+@ti.func
+def whole(number):
+    """The nearest integer, of numbers or of each component."""
+    return ti.cast(ti.floor(number + 0.5), ti.i32)
+
+
+@ti.func
+def begin_cube(first, view: ti.template(), v, height, width, rows, columns):
+    """Place, steps and reach of a cube's first voxel in view v of images of (height, width) pixels and
+    (rows, columns) patches."""
+    at = VIEW_FIELDS * v
+    scale, away = view[at + SCALE], ti.cast(first * SIDE, ti.f64) + 0.5 - view_row(view, at + CENTRE)
+    column, row = view_row(view, at + COLUMN), view_row(view, at + ROW)
+    depth = view_row(view, at + DEPTH)
+    steps = Steps(whole(column * scale), whole(row * scale), whole(depth * scale))
+    corner = Place(
+        whole(dot(column, away) * scale), whole(dot(row, away) * scale), whole(dot(depth, away) * scale)
+    )
+    near, far = ti.cast(NEAREST * scale, ti.i32), ti.cast(view[at + FAR] * scale, ti.i32)
+    high, wide = ti.cast(height, ti.f32) / PATCH, ti.cast(width, ti.f32) / PATCH
+    return corner, steps, Reach(near, far, rows, columns, high, wide), scale
 
 
 @ti.func
@@ -96,22 +125,37 @@ def clear_up_to(model: ti.template(), nearest, second, cosine, far, scale):
 
 
 @ti.func
-def fill_level(n, levels: ti.template(), clear: ti.template(), least: ti.template(), most: ti.template()):
-    """Fill the n-th level of squares from the one below it, or from the patches."""
+def fill_level(
+    n, levels: ti.template(), clear: ti.template(), v, base, least: ti.template(), most: ti.template()
+):
+    """Fill the n-th level of squares of image v from the one below it, or from the patches."""
+    rows = levels[0, 3]
     for y in range(levels[n, 1]):
         for x in range(levels[n, 2]):
             low, high = NO_SAMPLE, 0
             for k in ti.static(range(4)):
                 i, j = 2 * y + k // 2, 2 * x + k % 2
                 if n == 0:
-                    i, j = ti.min(i, clear.shape[0] - 1), ti.min(j, clear.shape[1] - 1)
+                    i, j = v * rows + ti.min(i, rows - 1), ti.min(j, clear.shape[1] - 1)
                     low, high = ti.min(low, clear[i, j]), ti.max(high, clear[i, j])
                 else:
                     i, j = ti.min(i, levels[n - 1, 1] - 1), ti.min(j, levels[n - 1, 2] - 1)
-                    at = levels[n - 1, 0] + i * levels[n - 1, 2] + j
+                    at = base + levels[n - 1, 0] + i * levels[n - 1, 2] + j
                     low, high = ti.min(low, least[at]), ti.max(high, most[at])
-            at = levels[n, 0] + y * levels[n, 2] + x
+            at = base + levels[n, 0] + y * levels[n, 2] + x
             least[at], most[at] = low, high
+
+
+@QuickLaunch
+@ti.kernel
+def fill_levels(clear: I32x2, levels: I32x2, least: I32, most: I32):
+    """Fill the squares of some images, whose patches have their rows one below the other in `clear`."""
+    views = clear.shape[0] // levels[0, 3]
+    for run in range(runs(views)):  # run loop: kernels/run_loop.py
+        v = unit_of(run, views)
+        if v < views:
+            for n in range(levels.shape[0]):
+                fill_level(n, levels, clear, v, v * (least.shape[0] // views), least, most)
 
 
 @QuickLaunch
@@ -125,7 +169,7 @@ def find_clear_depths(
     """Fill `clear`, (rows, columns) of patches, with the depths up to which these are clear, and `least` and
     `most` with those of squares of 2×2 patches, of 4×4, and so on.
 
-    `levels`, (n, 3): where the numbers of a level begin, its rows and columns.
+    `levels`, (n, 4): where the numbers of a level begin, its rows and columns, and the rows of patches.
     """
     for run in range(runs(clear.shape[0])):  # run loop: kernels/run_loop.py
         r = unit_of(run, clear.shape[0])
@@ -167,13 +211,7 @@ def find_clear_depths(
                     clear[r, group * GROUP + p] = found[p]
     for _ in range(1):  # one thread: it takes less time than a launch
         for n in range(levels.shape[0]):
-            fill_level(n, levels, clear, least, most)
-
-
-@ti.func
-def whole(number):
-    """The nearest integer, of numbers or of each component."""
-    return ti.cast(ti.floor(number + 0.5), ti.i32)
+            fill_level(n, levels, clear, 0, 0, least, most)
 
 
 @ti.func
@@ -187,9 +225,9 @@ def moved(place, steps, x, y, z):
 
 
 @ti.func
-def look(place, steps, side, reach, levels: ti.template(), least: ti.template(), most: ti.template()):
+def look(place, steps, side, reach, levels: ti.template(), base, least: ti.template(), most: ti.template()):
     """Whether a cube of `side` voxels, the first of them at a place, is hidden, clear, or may be clear in
-    part."""
+    part. Numbers of squares begin at `base`."""
     nearest, farthest = NO_SAMPLE, -NO_SAMPLE
     left, right, top, bottom = 1e9, -1e9, 1e9, -1e9
     # by how much the cube is on the inner side of each of the image's edges, if at all
@@ -225,14 +263,33 @@ def look(place, steps, side, reach, levels: ti.template(), least: ti.template(),
             low, high = NO_SAMPLE, 0
             for y in range(y0 >> up, (y1 >> up) + 1):
                 for x in range(x0 >> up, (x1 >> up) + 1):
-                    at = levels[n, 0] + y * levels[n, 2] + x
+                    at = base + levels[n, 0] + y * levels[n, 2] + x
                     low, high = ti.min(low, least[at]), ti.max(high, most[at])
+                if low <= farthest and high > nearest:
+                    break  # whatever the others are
             if high > nearest:
                 found = PARTLY
                 is_inside = left >= MARGIN and top >= MARGIN
                 is_inside &= right < reach.wide - MARGIN and bottom < reach.high - MARGIN
                 if low > farthest and is_inside:
                     found = CLEAR
+    return found
+
+
+@ti.func
+def look_at_middle(place, steps, side, reach, clear: ti.template(), top):
+    """The same of the patch in which the middle of a cube lies alone: what is clear there is hidden or clear
+    as a whole, or partly; what is partly clear there is so. The image's rows begin at `top`."""
+    middle = moved(place, steps, side // 2, side // 2, side // 2)
+    inverse = 1.0 / ti.cast(ti.max(middle.depth, 1), ti.f32)
+    x, y = ti.cast(middle.column * inverse, ti.i32), ti.cast(middle.row * inverse, ti.i32)
+    found = CLEAR
+    if x >= 0 and y >= 0 and x < reach.columns and y < reach.rows and middle.depth > reach.near:
+        n, up_to = side - 1, clear[top + y, x]
+        if up_to <= place.depth + n * ti.min(steps.depth, vec3i(0)).sum():
+            found = HIDDEN
+        elif up_to <= place.depth + n * ti.max(steps.depth, vec3i(0)).sum():
+            found = PARTLY
     return found
 
 
@@ -302,16 +359,9 @@ def list_free_blocks(
                 cubes[0] + n // (cubes[4] * cubes[5]), cubes[1] + n // cubes[5] % cubes[4],
                 cubes[2] + n % cubes[5],
             )  # fmt: skip
-            scale, away = view[SCALE], ti.cast(first * SIDE, ti.f64) + 0.5 - view_row(view, CENTRE)
-            column, row, depth = view_row(view, COLUMN), view_row(view, ROW), view_row(view, DEPTH)
-            steps = Steps(whole(column * scale), whole(row * scale), whole(depth * scale))
-            corner = Place(
-                whole(dot(column, away) * scale), whole(dot(row, away) * scale),
-                whole(dot(depth, away) * scale),
-            )  # fmt: skip
-            near, far = ti.cast(NEAREST * scale, ti.i32), ti.cast(view[FAR] * scale, ti.i32)
-            high, wide = ti.cast(height, ti.f32) / PATCH, ti.cast(width, ti.f32) / PATCH
-            reach = Reach(near, far, clear.shape[0], clear.shape[1], high, wide)
+            corner, steps, reach, scale = begin_cube(
+                first, view, 0, height, width, clear.shape[0], clear.shape[1]
+            )
             depths, patches = ti.Vector([0] * BITS), ti.Vector([0] * BITS)
             words = ti.Vector([0] * WORDS, dt=ti.i64)
             columns_by, rows_by = ti.Vector([0] * BITS), ti.Vector([0] * BITS)
@@ -328,7 +378,7 @@ def list_free_blocks(
                 place = moved(corner, steps, 8 * block[0], 8 * block[1], 8 * block[2])
                 found, passed = PARTLY, 1
                 while side >= 8 and found != HIDDEN:
-                    found = look(place, steps, side, reach, levels, least, most)
+                    found = look(place, steps, side, reach, levels, 0, least, most)
                     if found == HIDDEN:
                         passed = (side >> 3) ** 3
                     side >>= 1
@@ -350,6 +400,96 @@ def list_free_blocks(
                         for x in ti.static(range(WORDS)):
                             masks[at, x] = words[x]
                 b += passed
+
+
+@QuickLaunch
+@ti.kernel
+def list_clear_blocks(
+    clear: I32x2, height: ti.i32, width: ti.i32, levels: I32x2, least: I32, most: I32, views: F64,
+    cubes: I32x2, least_power: ti.i32, keys: I64, counts: I32,
+):  # fmt: skip
+    """List the keys of the blocks that some images look through as a whole, once for each image, and how many
+    they are: those of clear cubes of 8 · 2^`least_power` voxels a side or more.
+
+    `clear` has the images' rows one below the other, `least` and `most` their squares one after the other.
+    `cubes`: of each image where those of 64 voxels begin in the list of all, the first of them, and how many
+    on each axis. At its end is where the list ends.
+    """
+    images = cubes.shape[0] - 1
+    units, rows, squares = cubes[images, 0], clear.shape[0] // images, least.shape[0] // images
+    for run in range(runs(units)):  # run loop: kernels/run_loop.py
+        unit = unit_of(run, units)
+        if unit < units:
+            v = 0
+            while cubes[v + 1, 0] <= unit:
+                v += 1
+            n = unit - cubes[v, 0]
+            first = vec3i(
+                cubes[v, 1] + n // (cubes[v, 5] * cubes[v, 6]), cubes[v, 2] + n // cubes[v, 6] % cubes[v, 5],
+                cubes[v, 3] + n % cubes[v, 6],
+            )  # fmt: skip
+            corner, steps, reach, _ = begin_cube(first, views, v, height, width, rows, clear.shape[1])
+            b = 0
+            while b < CUBE:
+                block, power = block_in_cube(b), least_power
+                while power < 3 and b & ((8 << (3 * power)) - 1) == 0:
+                    power += 1  # a larger cube begins here
+                place = moved(corner, steps, 8 * block[0], 8 * block[1], 8 * block[2])
+                found, passed = PARTLY, 1 << (3 * least_power)
+                while power >= least_power and found == PARTLY:
+                    found = look_at_middle(place, steps, 8 << power, reach, clear, rows * v)
+                    if found == CLEAR or (found == HIDDEN and power > least_power):
+                        found = look(place, steps, 8 << power, reach, levels, squares * v, least, most)
+                    if found != PARTLY:
+                        passed = 1 << (3 * power)
+                    power -= 1
+                if found == CLEAR:
+                    at = ti.atomic_add(counts[BLOCKS], passed)
+                    for i in range(ti.min(passed, keys.shape[0] - at)):
+                        key = first * WORDS + block_in_cube(b + i)
+                        keys[at + i] = pack(key[0], key[1], key[2])
+                b += passed
+
+
+@QuickLaunch
+@ti.kernel
+def see_points(
+    points: F32x2, starts: F32x2, confidence: U8, has_confidence: ti.i32, step: ti.i32, centre: F32,
+    model: F64, units: ti.f64, ends: I32x2, seen: I32,
+):  # fmt: skip
+    """Draw every `step`-th of some points into six square images around `centre`, towards both sides along x,
+    y and z: the depth up to which the nearest one of a patch leaves it clear, of so many `units` a voxel.
+
+    `ends` has the images' rows one below the other, `NO_SAMPLE` where no point is; `seen` says which images
+    have any. A point too near to be one of the map ends its patch at once.
+    """
+    near, far = ti.cast(model[MIN_RANGE] ** 2, ti.f32), ti.cast(model[MAX_RANGE] ** 2, ti.f32)
+    own_starts = ti.select(starts.shape[0] == 1, 0, 1)
+    for run in range(runs(VIEWS)):  # run loop: kernels/run_loop.py
+        v = unit_of(run, VIEWS)
+        if v < VIEWS:
+            side = ends.shape[1]
+            along, sign = v >> 1, ti.cast(1 - 2 * (v & 1), ti.f32)
+            across, down = (along + 1) % 3, (along + 2) % 3
+            for n in range((points.shape[0] + step - 1) // step):
+                i = n * step
+                depth = sign * (points[i, along] - centre[along])
+                x, y = points[i, across] - centre[across], points[i, down] - centre[down]
+                if depth > 0.0 and ti.max(ti.abs(x), ti.abs(y)) < VIEW_TANGENT * depth:
+                    q, o = row(points, i), row(starts, i * own_starts)
+                    away = dot(q - o, q - o)
+                    trusted = confidence_at(q, o, near, far, confidence, has_confidence, i) > 0
+                    if trusted or away < near:
+                        u = ti.cast((x / depth + VIEW_TANGENT) * (side / (2 * VIEW_TANGENT)), ti.i32)
+                        v_down = ti.cast((y / depth + VIEW_TANGENT) * (side / (2 * VIEW_TANGENT)), ti.i32)
+                        at = v * side + ti.min(v_down, side - 1), ti.min(u, side - 1)
+                        reach = ti.sqrt(ti.cast(away, ti.f64))
+                        half = half_width(model, noise_sigma(model, reach)) * model[VOXEL_SIZE] / 256.0
+                        clear = depth / model[VOXEL_SIZE] * ti.max(1.0 - half / reach, 0.0) * units
+                        if not trusted:
+                            clear = 0.0
+                        ends[at] = ti.min(ends[at], ti.cast(ti.min(clear, NO_SAMPLE - 1.0), ti.i32))
+                        seen[v] = 1
 
 
 @QuickLaunch

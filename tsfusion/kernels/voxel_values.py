@@ -3,9 +3,9 @@
 
 import taichi as ti
 
-from tsfusion.kernels import I32, I64, F32x2, I32x2, I64x2
+from tsfusion.kernels import I32, I64, U8, F32x2, I32x2, I64x2
 from tsfusion.kernels.block_hash import map_find
-from tsfusion.kernels.integrate import CUBE, WEIGHT_BITS, lane_weight
+from tsfusion.kernels.integrate import CUBE, QUANTA_PER_VOXEL, WEIGHT_BITS, lane_weight
 from tsfusion.kernels.quick_launch import QuickLaunch
 from tsfusion.kernels.run_loop import runs, unit_of
 
@@ -41,6 +41,42 @@ def held(value, slot, o, color_rgn: ti.template(), hits: ti.template(), layers):
         ended += hits[slot, o]
     near = ti.select(value > 1.0, 0.0, ti.min(value, 0.5))
     return ti.select((ended >= SEVERAL) & (value > 0.5), near, value)
+
+
+@ti.func
+def is_clear(
+    key, slot, shows_surface: ti.template(), keys: ti.template(), slots: ti.template(), counts: ti.template()
+):
+    """Whether a block is free as a whole: a keyframe looks through it, and its voxels show no surface."""
+    found = 0
+    if slot < 0 or shows_surface[slot] == 0:
+        own = map_find(keys, slots, keys.shape[0] - 1, key)
+        if own >= 0:
+            found = ti.cast(counts[own] > 0, ti.i32)
+    return found
+
+
+@QuickLaunch
+@ti.kernel
+def find_surfaces(slots: I32, sums: I64x2, color_rgn: I64x2, hits: I32x2, layers: ti.i32, shows_surface: U8):
+    """Note of blocks whether a ray has ended in a voxel of theirs, or one is at a surface or behind it."""
+    for run in range(runs(BANDS)):  # run loop: kernels/run_loop.py
+        band = unit_of(run, BANDS)
+        if band < BANDS:
+            count = slots.shape[0]
+            for r in range(count * band // BANDS, count * (band + 1) // BANDS):
+                slot, found = slots[r], 0
+                for o in range(CUBE):
+                    packed = sums[slot, o]
+                    near = (packed >> WEIGHT_BITS) <= ti.cast(lane_weight(packed), ti.i64) * QUANTA_PER_VOXEL
+                    found |= ti.cast((lane_weight(packed) > 0) & near, ti.i32)
+                if layers & 1 != 0:
+                    for o in range(CUBE):
+                        found |= ti.cast((color_rgn[slot, o] & 65535) > 0, ti.i32)
+                if layers & 2 != 0:
+                    for o in range(CUBE):
+                        found |= ti.cast(hits[slot, o] > 0, ti.i32)
+                shows_surface[slot] = ti.cast(found, ti.u8)
 
 
 @ti.kernel

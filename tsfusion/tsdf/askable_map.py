@@ -251,9 +251,14 @@ class AskableMap(ReadableMap):
             resolution=resolution,
             max_distance=max_distance,
             min_weight=self._checked_min_weight(min_weight),
-            knows_free_space=self.config.space_carving,
+            carved=self.config.space_carving,
             most_cells=most_cells,
         )
+
+    @property
+    def knows_free_space(self) -> bool:
+        """Whether the map knows free space that is not near surfaces: all but maps of earlier versions do."""
+        return self.config.space_carving or len(self._store.clear) > 0
 
     def occupancy_slice(
         self, low: float, high: float, *, need_free: bool = False, **options: "Unpack[OwnSliceSettings]"
@@ -262,19 +267,20 @@ class AskableMap(ReadableMap):
 
         A cell is occupied where a surface, or what lies behind one, was seen between the heights; free where
         half of its samples or more were seen, and no surface. Made without `space_carving`, a map knows free
-        space in a band before surfaces alone.
+        space in a band before surfaces, and blocks of 8³ voxels that a keyframe looks through as a whole.
 
         Args:
             low, high, options: as for `distance_slice`.
-            need_free: refuse a map that was made without `space_carving`.
+            need_free: refuse a map that knows free space near surfaces alone: one of an earlier version,
+                made without `space_carving`.
 
         Raises:
             InvalidConfig, MapError: as `distance_slice`; MapError also for such a map.
         """
-        if need_free and not self.config.space_carving:
+        if need_free and not self.knows_free_space:
             raise MapError(
-                "the map was made without space_carving: it knows free space near surfaces alone; fuse it "
-                "anew with space_carving=True (--space-carving)"
+                "no keyframe of the map looks through a whole block, so it knows free space near surfaces "
+                "alone: fuse it anew with space_carving=True (--space-carving)"
             )
         options.setdefault("max_distance", self.config.voxel_size)  # nobody asks for distances
         return self.current_slice(low, high, **options).occupancy()

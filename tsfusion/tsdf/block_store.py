@@ -10,16 +10,19 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from tsfusion.core import process
 from tsfusion.core.config import CacheConfig
 from tsfusion.core.distinct_integers import distinct
 from tsfusion.core.errors import MapFull
-from tsfusion.kernels import block_hash, runtime
+from tsfusion.kernels import block_hash, runtime, voxel_values
 from tsfusion.kernels.integrate import CHANGED, CUBE, WEIGHT_MASK
 from tsfusion.tsdf.checkpoint import LAYER_DTYPES
+from tsfusion.tsdf.clear_blocks import ClearBlocks
 from tsfusion.tsdf.growing_array import MAX_ITEMS, FileArray, GrowingArray
 from tsfusion.tsdf.residency import Residency
 
-MESHED, ASKED = 1, 2  # who follows the changes of blocks: `Volume.take_dirty`, what is kept of answers
+# Who follows the changes of blocks: `Volume.take_dirty`, what is kept of answers, `shows_surface`
+MESHED, ASKED, SURFACES = 1, 2, 4
 _FIRST_CAPACITY = 1024
 _CHUNK = 1024  # blocks read at a time where a whole layer would be copied
 _HASH_BYTES = 4 * 12  # most that a block takes in the hash, which is a quarter full or fuller
@@ -117,12 +120,12 @@ class BlockStore:
         self._stamps, self._places, self._bounds = (GrowingArray((), np.int32, self._room) for _ in range(3))
         present = {"sums": True, "color_rgn": color, "color_b": color, "correction": corrected, "hits": hits}
         self._present = [name for name, there in present.items() if there]
+        self.clear = ClearBlocks()
         self._layers = {name: self._layer(name, cache) for name in present}
         self._residency: Residency | None = None
         self._memory_bytes = 0
-        self._disk_bytes = cache.disk_bytes if cache else 0
         if cache:
-            self._residency = Residency(self._files)
+            self._residency = Residency(self._files, cache.disk_bytes)
             self.most_blocks = min(MAX_ITEMS, cache.disk_bytes // self._residency.row_bytes)
 
     def _layer(self, name: str, cache: CacheConfig | None) -> GrowingArray:
@@ -198,6 +201,20 @@ class BlockStore:
         """Layers that count the rays which end in a voxel, and which of them the map has
         (`voxel_values.held`)."""
         return self.color_rgn, self.hits, self.color + 2 * self.counts_hits
+
+    @property
+    def clear_blocks(self) -> tuple[NDArray[Any], ...]:
+        """By slot, whether a block shows a surface or hits; and the blocks that keyframes look through
+        (`voxel_values.is_clear`)."""
+        clear = self.clear
+        if len(clear):
+            with process.uninterrupted():
+                slots = clear.take_unknown(self.drops, self.count, self.take_dirty(SURFACES))
+                for i in range(0, len(slots), _CHUNK):
+                    chunk = slots[i : i + _CHUNK]
+                    voxel_values.find_surfaces(chunk, self.sums, *self.ray_ends, clear.shows_surface)
+                    self.keep_within_memory()
+        return clear.shows_surface, *clear.table
 
     @property
     def dirty(self) -> NDArray[np.uint8]:
@@ -279,7 +296,7 @@ class BlockStore:
         """
         if count > max(self.most_blocks, self.count) and self._residency is not None:
             raise MapFull(
-                f"the map may take disk_bytes = {self._disk_bytes} bytes on the disk, which are "
+                f"the map may take disk_bytes = {self._residency.disk_bytes} bytes on the disk, which are "
                 f"{self.most_blocks} blocks; it has {self.count}, and {count - self.count} more are needed"
             )
         if count > max(self.most_blocks, self.count):
@@ -361,6 +378,7 @@ class BlockStore:
                 mine.array[chunk] = theirs.array[chunk]
                 self.keep_within_memory()
                 other.keep_within_memory()
+        self.clear.replace(other.clear.counts())
         self.stamp, self.drops = other.stamp, other.drops
         self.note_written(np.arange(self.count))
 
@@ -419,7 +437,8 @@ class BlockStore:
     @property
     def nbytes(self) -> int:
         """Size of the blocks and their hash, bytes."""
-        return self.count * self.bytes_per_block + self._hash_keys.nbytes + self._hash_slots.nbytes
+        clear = self.clear.nbytes
+        return self.count * self.bytes_per_block + self._hash_keys.nbytes + self._hash_slots.nbytes + clear
 
     @property
     def resident_bytes(self) -> int:

@@ -26,7 +26,7 @@ from tsfusion.core import durable_files
 from tsfusion.core.config import VolumeConfig
 from tsfusion.core.errors import CheckpointError, DamagedCheckpoint
 from tsfusion.core.side_thread import SideThread
-from tsfusion.tsdf import map_history
+from tsfusion.tsdf import clear_blocks, map_history
 
 MAGIC = b"TSFMAP1\n"
 CHUNK = 1024  # blocks
@@ -51,6 +51,14 @@ class CheckpointHeader(msgspec.Struct, kw_only=True):
     layers: list[str]
     meta: dict[str, Any]
     blocks: int = 0
+    clear: bytes = b""  # blocks that keyframes look through (`clear_blocks.encoded`)
+
+    def clear_blocks(self, path: Path) -> "clear_blocks.ClearCounts":
+        """The blocks that keyframes look through, and by how many. Raises DamagedCheckpoint."""
+        try:
+            return clear_blocks.decoded(self.clear, self.config.max_blocks)
+        except ValueError as error:
+            raise DamagedCheckpoint(f"{path} is malformed: {error}") from error
 
 
 class Chunk(NamedTuple):

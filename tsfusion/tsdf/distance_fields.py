@@ -75,11 +75,13 @@ def in_box(
         0, np.empty((1, 3), np.float32), size, reach.metres, distance,
     )  # fmt: skip
     inside = tuple(slice(a, a + n) for a, n in zip(low, extent, strict=True))
+    occupancy = occupancy_of(values.reshape(shape)[inside])
+    occupancy[(occupancy == UNSEEN) & _clear(store, begin // 8, shape)[inside]] = FREE
     return DistanceField(
         origin=first.astype(np.float64) * size,
         voxel_size=size,
         distance=distance.reshape(extent),
-        occupancy=occupancy_of(values.reshape(shape)[inside]),
+        occupancy=occupancy,
         max_distance=reach.metres,
     )
 
@@ -170,6 +172,17 @@ def _read(
         voxel_values.hold_hits(store.slots_of(keys[i : i + _PART]), *store.ray_ends, part)
         grid[x, :, y, :, z] = part.reshape(-1, 8, 8, 8)
     return grid.reshape(-1)
+
+
+def _clear(store: BlockStore, first: NDArray[np.int64], shape: Shape) -> NDArray[np.bool_]:
+    """Which voxels of a box of whole blocks lie in blocks that are free as a whole."""
+    keys, counts = store.clear.counts()
+    found, places = np.zeros([side // 8 for side in shape], bool), unpack_keys(keys) - first
+    inside = ((places >= 0) & (places < found.shape)).all(axis=1) & (counts > 0)
+    slots = store.slots_of(keys[inside])
+    shown = (slots >= 0) & (store.clear_blocks[0][slots] > 0)
+    found[tuple(places[inside][~shown].T)] = True
+    return found.repeat(8, axis=0).repeat(8, axis=1).repeat(8, axis=2)
 
 
 def _nearest_sites(

@@ -66,6 +66,7 @@ class Integrator:
         self._affordable = 0  # blocks that it may still add, for what they cost
         self._most_cost = NO_LIMIT  # of its rays and these
         self._has_carved = False  # its votes for free space are in the map
+        self._has_cleared = False  # it counts in the blocks that it looks through
         self.units = min(runtime.threads(), BANDS)  # which add at the same time
 
     def apply(self, sign: int, quota: KeyframeQuota | None = None) -> int:
@@ -82,7 +83,7 @@ class Integrator:
         if quota is not None and sign > 0:
             self._room, self._most_cost = quota.blocks, quota.cost
         before = self._admitted = self._store.count
-        self._has_carved = False
+        self._has_carved = self._has_cleared = False
         self._begin(sign)
         if not self._buffers.samples:  # one without a usable sample changes nothing
             self._buffers.carved.forget()
@@ -99,6 +100,8 @@ class Integrator:
                 updates += int(self._buffers.bands[part[0] : part[1], UPDATES].sum())
             if len(self._buffers.carved):
                 updates += self._carve(sign)
+            if len(self._buffers.carved.clear):
+                self._clear(sign)
             if self._model.regularizer != "off":
                 self._smooth(sign)  # paper eq. 3
         except BaseException:
@@ -112,6 +115,8 @@ class Integrator:
         """Bring back the map of `before` blocks, whatever failed."""
         if self._store.count > self._admitted:  # blocks that nothing was added to yet
             self._store.drop(self._admitted)
+        if self._has_cleared:
+            self._clear(-sign)
         if self._has_carved:
             self._add_free(self._store.slots_of(self._buffers.carved.keys), -sign)
         for part in added:
@@ -256,6 +261,12 @@ class Integrator:
         self._note_admitted(len(missing))
         self._check(MAX_BUNDLE_WEIGHT, sign)
         return carved.voxels
+
+    def _clear(self, sign: int) -> None:
+        """Count the keyframe in the blocks that it looks through."""
+        most = min(self._config.max_blocks, max(self._store.most_blocks, 0))
+        self._store.clear.add(self._buffers.carved.clear, sign, most)
+        self._has_cleared = True
 
     def _add_free(self, slots: NDArray[np.int32], sign: int) -> None:
         """Add what is carved to the blocks in these slots."""

@@ -13,6 +13,7 @@ from tsfusion.core import process
 from tsfusion.core.errors import MapFull, WeightOverflow
 from tsfusion.kernels.integrate import CHANGED, COLOR_LIMIT, WEIGHT_LIMIT, WEIGHT_MASK
 from tsfusion.kernels.sensor_noise import WEIGHT_ONE
+from tsfusion.tsdf import clear_blocks
 from tsfusion.tsdf.block_store import BlockStore
 
 _CHUNK = 256  # blocks at a time
@@ -21,11 +22,12 @@ _LANE = (1 << 24) - 1  # of Σ R and Σ G in `color_rgn`
 _VOTES = (1 << 16) - 1
 
 
-def add(store: BlockStore, other: BlockStore, max_blocks: int) -> None:
+def add(store: BlockStore, other: BlockStore, max_blocks: int, *, are_parts: bool = False) -> None:
     """Add the blocks of `other`, which has the same voxel size and layers; it may lack hits.
 
     Args:
         max_blocks: that `store` may have.
+        are_parts: both are parts of one map, of whose keyframes each is in both.
 
     Raises:
         MapFull: when it would have more.
@@ -42,10 +44,14 @@ def add(store: BlockStore, other: BlockStore, max_blocks: int) -> None:
         raise MapFull(
             f"the map may hold at most max_blocks = {max_blocks} blocks; together they have {count}"
         )
+    both = [store.clear.counts(), other.clear.counts()]
+    clear = clear_blocks.summed(both, np.maximum if are_parts else np.add)
+    clear_blocks.check_count(len(clear[0]), max_blocks)
     room = np.empty(_SCRATCH_BYTES, np.uint8)  # or MemoryError, before anything is added
     with process.uninterrupted():
         store.insert(keys[missing])
         del room
+        store.clear.replace(clear)
         slots = store.slots_of(keys)
         for i in range(0, len(keys), _CHUNK):
             chunk = slice(i, i + _CHUNK)

@@ -89,5 +89,9 @@ def copy(store: BlockStore, into: BlockStore, first: NDArray[np.int64], end: NDA
             layer[here : into.count] = np.where(inside, store.layers()[name][slots], 0)
         into.note_written(np.arange(here, into.count))
         store.keep_within_memory()
+    keys, counts = store.clear.counts()
+    corners = 8 * unpack_keys(keys).astype(np.int64)
+    whole = ((corners >= first) & (corners + 8 <= end)).all(axis=1)  # others may lack what they show
+    into.clear.replace((keys[whole], counts[whole]))
     into.measure_bounds()
     into.dirty[: into.count] = CHANGED

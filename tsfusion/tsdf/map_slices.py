@@ -63,17 +63,18 @@ class CurrentSlice:
         resolution: float | None,
         max_distance: float,
         min_weight: float,
-        knows_free_space: bool,
+        carved: bool,
         floor: float | None = None,
         most_cells: int = MOST_CELLS,
     ) -> None:
         low, high = (one + (floor or 0.0) for one in _checked_heights(heights))
         self._store, self._least = store, max(1, math.ceil(min_weight * WEIGHT_ONE))
-        self._knows_free_space = knows_free_space
+        self._carved = carved
+        self._noted = store.clear.noted  # blocks of free space that it has followed
         edge = _checked_resolution(resolution, store.voxel_size)
         self._reach = Reach(max_distance, edge)
         first, end = _cell_range(_box_around(store, axes) if box is None else box, edge)
-        self._margin = margin = self._reach.margin
+        margin = self._reach.margin
         self._first = first - margin  # row, column of the first cell that is read
         self._shape = rows, columns = _checked_shape(end - first + 2 * margin, most_cells)
         self.grid = SliceGrid(
@@ -113,7 +114,7 @@ class CurrentSlice:
         Args:
             blocks: (n, 3) int32, those of `Volume.take_dirty`.
         """
-        cells = self._cells_above(np.asarray(blocks, np.float64).reshape(-1, 3))
+        cells = self._changed_cells(np.asarray(blocks, np.float64).reshape(-1, 3))
         if not len(cells):
             return False
         before = self._values[cells], self._seen[cells]
@@ -125,9 +126,17 @@ class CurrentSlice:
             self._count((int(row.min()), int(column.min()), int(row.max()) + 1, int(column.max()) + 1))
         return bool(len(moved)) or bool((self._seen[cells] != before[1]).any())
 
+    def _changed_cells(self, blocks: NDArray[np.float64]) -> NDArray[np.int32]:
+        """Cells above changed blocks, and above those that are looked through since, or not any more."""
+        others = self._store.clear.changed_since(self._noted)
+        self._noted = self._store.clear.noted
+        if others is None:
+            return np.arange(len(self._seen), dtype=np.int32)
+        return self._cells_above(np.concatenate([blocks, unpack_keys(others)]))
+
     def occupancy(self) -> OccupancySlice:
         """The slice's occupancy."""
-        return OccupancySlice(self.grid, self._cells(), self._knows_free_space)
+        return OccupancySlice(self.grid, self._cells(), self._carved or len(self._store.clear) > 0)
 
     def distances(self, *, unseen_is_free: bool = False) -> DistanceSlice:
         """The slice's distances; 0 where nothing was seen, unless that is to count as free."""
@@ -143,7 +152,7 @@ class CurrentSlice:
         return cells
 
     def _inside(self, flat: NDArray[Any]) -> NDArray[Any]:
-        m = self._margin
+        m = self._reach.margin
         return flat.reshape(self._shape)[m:-m, m:-m]
 
     def _read(self, cells: NDArray[np.int32]) -> None:
@@ -158,8 +167,8 @@ class CurrentSlice:
             kernels.read_columns(
                 part, self._shape[1], int(self._first[0]), int(self._first[1]), n, self._heights,
                 corner, along_row, along_column, along_height, store.hash_keys, store.hash_slots,
-                store.sums, store.correction, int(store.corrected), *store.ray_ends, self._least,
-                self._values, self._seen,
+                store.sums, store.correction, int(store.corrected), *store.ray_ends, *store.clear_blocks,
+                self._least, self._values, self._seen,
             )  # fmt: skip
             store.rest()
             # kernel: voxels; here: cells
@@ -191,7 +200,7 @@ class CurrentSlice:
         # cells beside them may become sites, or have their surface elsewhere
         top, bottom = max(top - 1, 0), min(bottom + 1, rows)
         left, right = max(left - 1, 0), min(right + 1, columns)
-        reach = self._margin
+        reach = self._reach.margin
         sites = self._marked[1].reshape(self._shape)[top:bottom]
         before = sites.copy()
         transform.mark_sites(self._values, rows, columns, 1, top, bottom, 1, *self._marked)

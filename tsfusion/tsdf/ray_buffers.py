@@ -18,7 +18,7 @@ from tsfusion.kernels.integrate import (
     UNIT_SCRATCH,
 )
 from tsfusion.kernels.voxel_traversal import BAND_FIELDS, COST, RAY_FIELDS, SAMPLES, UNIT
-from tsfusion.tsdf.carved_blocks import CarvedBlocks
+from tsfusion.tsdf.carved_blocks import CarvedBlocks, PointRays
 from tsfusion.tsdf.growing_array import GrowingArray
 
 _FEW_MISSING = 1 << 15  # entries of the set for the blocks that a usual keyframe finds missing
@@ -29,7 +29,7 @@ _NOTHING = {len(shape): np.zeros(shape, np.uint8) for shape in ((1,), (1, 3))}
 
 class RayBuffers:
     """Rays of the current keyframe (`rays`, by `bands`), the slots of the blocks they touch (`touched`), the
-    keys of those that the map does not have (`missing`, a hash set), and what its image carves (`carved`)."""
+    keys of those that the map does not have (`missing`, a hash set), and what it looks through (`carved`)."""
 
     def __init__(self, *, color: bool, regularised: bool) -> None:
         self._modelled: tuple[Any, ...] = ()  # what `_parameters` are of
@@ -102,11 +102,15 @@ class RayBuffers:
             origins = keyframe.origins
             if origins is None or not len(origins):
                 origins = np.zeros(3, np.float32)
+            starts, confidence = origins.reshape(-1, 3), _optional(keyframe.confidence, 1)
             self._rays_of_points(
-                keyframe.points, origins.reshape(-1, 3),
-                *_optional(keyframe.color if self.colored else None, 2), *_optional(keyframe.confidence, 1),
+                keyframe.points, starts, *_optional(keyframe.color if self.colored else None, 2), *confidence,
                 pose, parameters, bundle,
             )  # fmt: skip
+            if not config.space_carving:
+                most = config.max_blocks_per_keyframe
+                points = PointRays(keyframe.measurement, starts, *confidence)
+                self.carved.find_clear_of_points(points, T, parameters, most)
         else:
             height = keyframe.shape[0]
             color = keyframe.color if self.colored else None
@@ -116,9 +120,8 @@ class RayBuffers:
                 image, *read_as, *_optional(None if color is None else color.reshape(height, -1), 2),
                 *confidence, _camera(keyframe, voxel_size), parameters, bundle,
             )  # fmt: skip
-            if config.space_carving:
-                read = RayBuffers.as_read(image), *read_as, *confidence
-                self.carved.find(keyframe, read, parameters, config.max_blocks_per_keyframe)
+            find = self.carved.find if config.space_carving else self.carved.find_clear
+            find(keyframe, (image, *read_as, *confidence), parameters, config.max_blocks_per_keyframe)
 
     def _model(
         self, config: VolumeConfig, sensor: str | None, baseline_fx: float | None

@@ -26,8 +26,8 @@ _PRESENT = np.uint64(63)  # bit of an entry: the page is in memory
 class Residency:
     """Keeps the pages of some layers that are in this process's memory within a budget."""
 
-    def __init__(self, layers: Collection[FileArray]) -> None:
-        self._layers = layers
+    def __init__(self, layers: Collection[FileArray], disk_bytes: int = 0) -> None:
+        self._layers, self.disk_bytes = layers, disk_bytes
         self._measured = 0  # bytes of the layers that were in memory when it was last looked at,
         self._shared = process.shared_rss_bytes()  # and of all files then
 

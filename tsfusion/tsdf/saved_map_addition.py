@@ -21,7 +21,7 @@ from tsfusion.core.side_thread import SideThread
 from tsfusion.geometry.up_direction import HeldSensor
 from tsfusion.kernels.integrate import WEIGHT_LIMIT
 from tsfusion.kernels.sensor_noise import WEIGHT_ONE
-from tsfusion.tsdf import checkpoint, map_history
+from tsfusion.tsdf import checkpoint, clear_blocks, map_history
 from tsfusion.tsdf.checkpoint import CHUNK, CUBE, CheckpointHeader, Chunk, Piece
 from tsfusion.tsdf.map_addition import added_colors
 from tsfusion.tsdf.map_history import HELD
@@ -44,7 +44,7 @@ def add_files(paths: Sequence[Path], target: Path) -> CheckpointHeader:
     """
     headers, keys = zip(*(checkpoint.keys_of(path) for path in paths), strict=True)
     blocks = len(distinct(np.concatenate(keys)))
-    header = _header(headers, blocks)
+    header = _header(paths, headers, blocks)
     with ExitStack() as opened:
         streams = [
             _Stream(own, opened.enter_context(checkpoint.reading(path, is_checked=True)))
@@ -74,7 +74,7 @@ def checked_keys(path: Path) -> tuple[CheckpointHeader, NDArray[np.int64]]:
     return header, keys
 
 
-def _header(headers: Sequence[CheckpointHeader], blocks: int) -> CheckpointHeader:
+def _header(paths: Sequence[Path], headers: Sequence[CheckpointHeader], blocks: int) -> CheckpointHeader:
     """Header of the sum."""
     first = headers[0]
     for other in headers[1:]:
@@ -85,6 +85,8 @@ def _header(headers: Sequence[CheckpointHeader], blocks: int) -> CheckpointHeade
             f"the map may hold at most max_blocks = {first.config.max_blocks} blocks; together they have "
             f"{blocks}: choose larger voxels, or fuse parts of the journal"
         )
+    clear = clear_blocks.summed([one.clear_blocks(path) for one, path in zip(headers, paths, strict=True)])
+    clear_blocks.check_count(len(clear[0]), first.config.max_blocks)
     held, meta = HeldSensor(), dict[str, Any]()
     for number, one in enumerate(headers):
         own = dict(one.meta)
@@ -96,6 +98,7 @@ def _header(headers: Sequence[CheckpointHeader], blocks: int) -> CheckpointHeade
         map_hash="0" * len(first.map_hash),  # until it is known
         meta={**meta, HELD: held.numbers},
         layers=first.layers,
+        clear=clear_blocks.encoded(clear),
     )
 
 

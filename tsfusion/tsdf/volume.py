@@ -31,6 +31,7 @@ from tsfusion.kernels.integrate import CUBE
 from tsfusion.kernels.voxel_traversal import COUNT, VOXEL_LIMIT
 from tsfusion.tsdf import (
     checkpoint,
+    clear_blocks,
     map_addition,
     map_crop,
     map_history,
@@ -289,7 +290,7 @@ class Volume(AskableMap):
 
     def _join(self, other: "Volume", one: Part, two: Part) -> None:
         """Add another part of the same map, of whose keyframes each is in both."""
-        map_addition.add(self._store, other._store, self.config.max_blocks)
+        map_addition.add(self._store, other._store, self.config.max_blocks, are_parts=True)
         self.keyframes = max(self.keyframes, other.keyframes)
         own = self.map_hash()
         joined = Part(one.whole, own, one.boxes + two.boxes)
@@ -431,6 +432,7 @@ class Volume(AskableMap):
             map_hash="",
             meta={**(self.meta if meta is None else meta), HELD: self.held.numbers},
             layers=list(layers),
+            clear=clear_blocks.encoded(self._store.clear.counts()),
         )
         used = self._store.used()
         keys, rest = self._store.keys[used], self._store.rest
@@ -468,6 +470,7 @@ class Volume(AskableMap):
             opening.enter_context(store.opening(header.blocks))
             digest = begin_hash(header.config.voxel_size)
             saved_map.fill(store, Path(path), header, chunks, digest)
+            store.clear.replace(header.clear_blocks(Path(path)))
             volume.keyframes = header.keyframes
             volume.held = HeldSensor(header.meta.pop(HELD, None))
             volume.meta = header.meta
