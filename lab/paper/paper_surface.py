@@ -144,7 +144,7 @@ def sweep(job: SweepJob) -> list[dict[str, Any]]:
 def _settings(job: SweepJob) -> Iterator[dict[str, Any]]:
     """Settings of each row of per-ray integration alone."""
     for support in job.supports:
-        width = {"min_support": support, "max_support": support, "surface": "raw"}
+        width = {"min_support": support, "max_support": support, "min_behind": support, "surface": "raw"}
         yield {"regularizer": "off", "smoothness": 0.0, **width}
         for smoothness in job.smoothness:
             yield {"regularizer": "ray", "smoothness": smoothness, **width}

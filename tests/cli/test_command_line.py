@@ -404,8 +404,9 @@ def test_ctrl_c_while_modules_load_is_no_traceback() -> None:
 @pytest.mark.parametrize(
     ("flags", "expected"),
     [
-        ({"truncation": 4.0}, {"min_support": 4.0, "max_support": 4.0}),
-        ({"support": "3:6.5"}, {"min_support": 3.0, "max_support": 6.5}),
+        ({"truncation": 4.0}, {"min_support": 4.0, "max_support": 4.0, "min_behind": 4.0}),
+        ({"support": "3:6.5"}, {"min_support": 3.0, "max_support": 6.5, "min_behind": None}),
+        ({"support": "3:6:2"}, {"min_support": 3.0, "max_support": 6.0, "min_behind": 2.0}),
         ({"min_weight": 0.5, "max_range": 3.0}, {"min_weight": 0.5, "max_range": 3.0}),
         ({"lambda_": 7.0}, {"smoothness": 7.0}),
         ({"space_carving": True}, {"space_carving": True}),

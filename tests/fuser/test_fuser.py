@@ -310,7 +310,7 @@ def saved(state: Path) -> Path:
 def test_a_map_of_other_settings_is_one_clear_error(tmp_path: Path) -> None:
     saved(tmp_path)
     with pytest.raises(
-        errors.InvalidConfig, match=r"was made with voxel_size = 0\.04, got 0\.05: use another"
+        errors.InvalidConfig, match=r"was made with voxel_size = 0\.04, got 0\.05: go on with"
     ) as raised:
         opened(tmp_path, VolumeConfig(voxel_size=0.05))
     assert "remove" not in str(raised.value)  # the journal may not go back to the start

@@ -19,13 +19,15 @@ MAX_DISTANCE = 1023
 NEVER = 1 << 30
 
 
-def sample(parameters: NDArray[np.float64], z: float, trust: float) -> tuple[int, int]:
-    """(weight, half-width in 2⁻⁸ voxel) of samples at depth z whose confidences sum to `trust`."""
+def sample(parameters: NDArray[np.float64], z: float, trust: float) -> tuple[int, int, int]:
+    """Weight of samples at depth z whose confidences sum to `trust`; half-width of their band, and its
+    support, 2⁻⁸ voxel."""
     floor, slope, z0, low, high, voxel_size, full = parameters[:7]
     sigma = floor + slope * (z - z0) * (z - z0)
     weight = int(WEIGHT_ONE * trust / 255.0 * min(1.0, max((full / sigma) ** 2, 1 / WEIGHT_ONE)) + 0.5)
-    half = int(min(max(3.0 * sigma / voxel_size, low), high) * 256.0)
-    return min(max(weight, 1), MAX_BUNDLE_WEIGHT), half
+    support = int(min(max(3.0 * sigma / voxel_size, low), high) * 256.0)
+    half = int(min(max(3.0 * sigma / voxel_size, parameters[12]) * 256.0, support))
+    return min(max(weight, 1), MAX_BUNDLE_WEIGHT), half, support
 
 
 def make_ray(
@@ -36,10 +38,12 @@ def make_ray(
     color: int = 0,
     normal: Any = None,
     before: int = 0,
+    support: int = 0,
 ) -> NDArray[np.int32]:
     """One ray; `end` int 2⁻¹⁰ voxel, `direction` float of any length, `half` 2⁻⁸ voxel; with the `normal` of
-    the plane it ends on, or none. Where it begins further `before` its end than its band, it carves."""
-    before = max(before, half)
+    the plane it ends on, or none. Where it begins further `before` its end than its `support`, it carves."""
+    support = max(support, half)
+    before = max(before, support)
     u = np.asarray(direction, np.float64) / np.linalg.norm(direction)
     unit = [int(x) for x in np.floor(u * 65536 + 0.5)]
     gradient = u if normal is None else np.asarray(normal) / (np.asarray(normal) @ u)
@@ -57,7 +61,7 @@ def make_ray(
     downward = sum(1 << a for a in range(3) if unit[a] < 0)
     loss = [-g if x < 0 else g for g, x in zip(loss, unit, strict=True)]
     packed = np.uint32(weight << 24 | color).astype(np.int32)
-    last = (distance, before + half << 8, before << 8 | downward, packed)
+    last = (distance, before + half << 8 | support & 255, before << 8 | support >> 8 << 3 | downward, packed)
     return np.array([*voxel, *crossing, *interval, *loss, *last], np.int32)
 
 
@@ -68,9 +72,15 @@ def weight_of(ray: NDArray[np.int32]) -> int:
 def end_of(ray: NDArray[np.int32]) -> Voxel:
     """The voxel in which the ray ends."""
     for (voxel, _), leaves in crossed_until(ray):
-        if leaves > int(ray[14]):
+        if leaves > parts_of(ray)[0]:
             return voxel
     raise AssertionError
+
+
+def parts_of(ray: NDArray[np.int32]) -> tuple[int, int, int]:
+    """Where along the ray its end lies, the half-width of its band and its support, 2⁻¹⁶ voxel."""
+    length, end = int(ray[13]), int(ray[14])
+    return end & ~255, (length & ~255) - (end & ~255), (end & 248) << 13 | (length & 255) << 8
 
 
 def fixed(p: Any) -> NDArray[np.int64]:
@@ -109,12 +119,13 @@ def integrate(rays: NDArray[np.int32], quanta_per_voxel: int) -> dict[Voxel, tup
     """(Σ w·m, Σ w) of every voxel the rays cross."""
     sums: dict[Voxel, tuple[int, int]] = defaultdict(lambda: (0, 0))
     for ray in rays:
-        length, end = int(ray[13]) & ~255, int(ray[14]) & ~7
-        half = length - end
+        end, half, support = parts_of(ray)
         for (voxel, distance), leaves in crossed_until(ray):
             w, m, (s, total) = weight_of(ray), quantize(distance, quanta_per_voxel), sums[voxel]
             if leaves < end - half:  # free space
-                w, m = max(w >> 1, 1), quantize(half, quanta_per_voxel)
+                most = quantize(support, quanta_per_voxel)
+                m = min(max(m, 0), most) if half < support else most
+                w = max(w >> 1, 1)
             sums[voxel] = (s + w * m, total + w)
     return dict(sums)
 
@@ -199,8 +210,8 @@ def smooth(
     added = integrate(rays, quanta_per_voxel)
     votes = defaultdict(list)
     for ray in rays:
-        length, end = int(ray[13]) & ~255, int(ray[14]) & ~7
-        voxels = [found for found, leaves in crossed_until(ray) if leaves >= end - (length - end)]
+        end, half, _ = parts_of(ray)
+        voxels = [found for found, leaves in crossed_until(ray) if leaves >= end - half]
         t = [distance * quanta_per_voxel / 65536 for _, distance in voxels]
         w, y = [], []
         for voxel, _ in voxels:

@@ -169,6 +169,32 @@ def test_a_forged_file_is_refused_before_it_asks_for_memory(saved: Path, tmp_pat
         Volume.load(path)
 
 
+def without_reach_behind(path: Path) -> None:
+    """Let a saved map be one of a version that knew no `min_behind`: its rays reached as far as before."""
+    whole = path.read_bytes()[:-16]
+    size = int.from_bytes(whole[8:12], "little")
+    header = msgspec.msgpack.decode(whole[12 : 12 + size])
+    del header["config"]["min_behind"]
+    altered = msgspec.msgpack.encode(header)
+    forge(path, whole[:8] + struct.pack("<I", len(altered)) + altered + whole[12 + size :])
+
+
+def test_a_map_of_rays_that_reached_as_far_behind_goes_on_so(tmp_path: Path) -> None:
+    symmetric, usual = small(min_behind=16), small()
+    assert symmetric.map_hash() != usual.map_hash()
+    path = symmetric.save(tmp_path / "map.tsf")
+    without_reach_behind(path)
+    loaded = Volume.load(path)
+    assert loaded.config.min_behind == 16
+    for either in (symmetric, loaded):
+        either.integrate(VIEWS[3])
+        either.retract(VIEWS[0])
+    assert loaded.map_hash() == symmetric.map_hash()
+    again = Volume.load(loaded.save(tmp_path / "again.tsf"))
+    assert (again.config.min_behind, again.map_hash()) == (16, symmetric.map_hash())
+    assert Volume.load(usual.save(tmp_path / "usual.tsf")).config.min_behind is None
+
+
 def test_blocks_that_are_empty_or_out_of_order_are_refused(tmp_path: Path) -> None:
     volume = small()
     store = volume._store

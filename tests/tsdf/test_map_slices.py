@@ -52,10 +52,11 @@ def test_distances_are_those_from_the_body_between_the_heights(sphere: Volume, u
 
 def test_heights_leave_out_what_is_above_and_below(sphere: Volume) -> None:
     assert (sphere.occupancy_slice(0.5, 0.7, box=BOX, up="z").cells != 100).all()
-    low, high = (
-        sphere.occupancy_slice(*heights, box=BOX, up="z").cells for heights in ((-0.05, 0.05), (0.3, 0.4))
-    )
-    assert 0 < (high == 100).sum() < (low == 100).sum()
+    for heights, radius in (((-0.05, 0.05), RADIUS), ((0.3, 0.4), np.sqrt(RADIUS**2 - 0.3**2))):
+        found = sphere.occupancy_slice(*heights, box=BOX, up="z")
+        centres = found.grid.centres()[found.cells == 100]
+        farthest = np.hypot(centres[:, 0], centres[:, 1]).max()
+        assert farthest == pytest.approx(radius, abs=1.5 * VOXEL)
 
 
 @settings(max_examples=12, deadline=None)

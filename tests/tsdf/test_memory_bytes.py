@@ -85,7 +85,7 @@ def test_questions_are_answered_in_no_more_memory(
     camera = views[0].intrinsics, views[0].T_world_camera, (120, 160)
     found, wanted = (one.raycast(*camera).depth for one in (volume, unbounded))
     assert np.array_equal(found, wanted)
-    assert (found > 0).sum() > 100
+    assert (found > 0).sum() > 50
 
 
 def test_meshes_and_checkpoints_are_the_same_in_no_more_memory(

@@ -6,12 +6,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from formula_scenes import CAMERA, SHAPE, directions, look_at, plane_keyframe, volume_of
+import trimesh
+from formula_scenes import CAMERA, SHAPE, directions, look_at, plane_keyframe, volume_of, with_noise
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from tsfusion import Intrinsics, Keyframe, Volume
+from tsfusion import Intrinsics, Keyframe, Mesh, Volume
 from tsfusion.datasets import Synthetic
-from tsfusion.tsdf import mesh_extraction
+from tsfusion.kernels.integrate import QUANTA_PER_VOXEL
+from tsfusion.kernels.surface_cells import NO_LIMITS
 from tsfusion.tsdf.block_store import unpack_keys
 
 WALL = plane_keyframe(np.eye(4), np.array([0.0, 0.0, 1.0]), 2.0)
@@ -80,7 +83,7 @@ def board_view(eye: NDArray[np.float64], target: NDArray[np.float64]) -> Keyfram
 
 
 @pytest.mark.parametrize("surface", ["raw", "field"])
-def test_what_is_seen_behind_a_thing_is_not_its_back(monkeypatch: pytest.MonkeyPatch, surface: str) -> None:
+def test_what_is_seen_behind_a_thing_is_not_its_back(surface: str) -> None:
     """A board, seen from its front and by somebody who looks past its edge: the band behind it ends beside
     free space there, and nobody has measured a surface."""
     views = [
@@ -101,7 +104,7 @@ def test_what_is_seen_behind_a_thing_is_not_its_back(monkeypatch: pytest.MonkeyP
         return int(behind.sum()), int((~behind).sum())
 
     behind, others = faces()
-    monkeypatch.setattr(mesh_extraction, "_CLEAR", 1e9)
+    volume._store.back_limits = NO_LIMITS
     ghosts, all_others = faces()
     assert ghosts > 300
     assert behind < 0.8 * ghosts
@@ -145,6 +148,28 @@ def plate_views(thickness: float) -> list[Keyframe]:
             depth = np.where(inside, keyframe.measurement, 0)
             views.append(replace(keyframe, depth=depth.astype(np.float32)))
     return views
+
+
+def share_found(mesh: Mesh, z: float, reach: float) -> float:
+    """Share of a face of the plate, at this z, that has the mesh within `reach` metres."""
+    steps = np.arange(-0.25, 0.25, reach)
+    face = np.stack([*map(np.ravel, np.meshgrid(steps, steps)), np.full(steps.size**2, z)], axis=1)
+    solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    points, _ = trimesh.sample.sample_surface(solid, 100_000, seed=1)
+    return float((cKDTree(points).query(face)[0] <= reach).mean())
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.0025])
+@pytest.mark.parametrize("voxel_size", [0.01, 0.02, 0.05])
+def test_both_faces_of_a_wall_of_two_voxels_are_where_they_are(voxel_size: float, noise: float) -> None:
+    """A door of 4 cm at 2 cm, a wall of 10 cm at 5 cm: no face is pulled through by the other one."""
+    random = np.random.default_rng(5)
+    views = [with_noise(view, noise, random) for view in plate_views(2 * voxel_size)]
+    mesh = volume_of(views, voxel_size=voxel_size, color=False).extract_mesh()
+    symmetric = volume_of(views, voxel_size=voxel_size, color=False, min_behind=16).extract_mesh()
+    for z in (-voxel_size, voxel_size):
+        assert share_found(mesh, z, voxel_size / 2) > 0.95
+        assert share_found(symmetric, z, voxel_size / 2) < 0.5
 
 
 @pytest.mark.parametrize("voxels", [1.5, 3.0, 8.0])
@@ -216,14 +241,17 @@ def test_what_is_very_far_away_carves_what_is_next_to_the_camera() -> None:
 
 
 @pytest.mark.parametrize(
-    ("settings", "band"),
+    ("settings", "limits"),
     [
-        ({"sensor": "kinect"}, 3.0), ({"sensor": "kinect", "space_carving": False}, 0.0),
-        ({"sensor": "kinect", "voxel_size": 0.005}, 0.0),  # where noise is wider than the band
-        ({"sensor": "stereo", "voxel_size": 0.15}, 0.0), ({"sensor": "lidar", "voxel_size": 0.1}, 0.0),
-        ({"sensor": "kinect", "min_support": 4.0}, 4.0),
+        ({"sensor": "kinect"}, (-1.0, 2.91)), ({"sensor": "kinect", "space_carving": False}, None),
+        ({"sensor": "kinect", "voxel_size": 0.005}, None),  # where noise is wider than the band
+        ({"sensor": "stereo", "voxel_size": 0.15}, None), ({"sensor": "lidar", "voxel_size": 0.1}, None),
+        ({"sensor": "kinect", "min_support": 4.0, "min_behind": 6.0}, (-4 * 2 / 3, 3.88)),
     ],
 )  # fmt: skip
-def test_backs_are_left_out_where_bands_are_narrow(settings: dict[str, Any], band: float) -> None:
+def test_backs_are_left_out_where_bands_are_narrow(
+    settings: dict[str, Any], limits: tuple[float, float] | None
+) -> None:
     volume = Volume(**{"voxel_size": 0.02, "space_carving": True, **settings})
-    assert volume._store.carved_band == band
+    found = volume._store.back_limits
+    assert found == (NO_LIMITS if limits is None else pytest.approx(np.array(limits) * QUANTA_PER_VOXEL))

@@ -161,7 +161,7 @@ def test_a_wall_is_as_far_as_it_is(volume: Volume) -> None:
     origins = wall - np.array((0, 0, 0.5), np.float32)
     wall_map = Volume(VOXEL, sensor="scanner", threads=2, bundle=False)
     wall_map.integrate(Keyframe(points=wall, origins=origins, T_world_camera=np.eye(4)))
-    points = np.random.default_rng(5).uniform((-0.4, -0.4, 0.9), (0.4, 0.4, 1.1), (200, 3))
+    points = np.random.default_rng(5).uniform((-0.4, -0.4, 0.88), (0.4, 0.4, 1.02), (200, 3))
     found = wall_map.sample(points)
     np.testing.assert_allclose(found.distance, 1 - points[:, 2], atol=2e-3)
     np.testing.assert_allclose(found.gradient, np.tile([0, 0, -1], (200, 1)), atol=0.05)

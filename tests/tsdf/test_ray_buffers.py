@@ -87,9 +87,9 @@ def expected_rays(
                 if plane is not None:
                     right, down = T[:3, 0] / K.fx * z + ray * plane[0], T[:3, 1] / K.fy * z + ray * plane[1]
                     normal = np.cross(right, down)
-                weight, half = kernel_twins.sample(parameters, z, 255 * layer.sum())
+                weight, half, support = kernel_twins.sample(parameters, z, 255 * layer.sum())
                 end = kernel_twins.fixed((ray * z + T[:3, 3]) / voxel_size)
-                rays.append(kernel_twins.make_ray(end, ray, half, weight, normal=normal))
+                rays.append(kernel_twins.make_ray(end, ray, half, weight, normal=normal, support=support))
                 used += int(layer.sum())
     return rays, used
 
@@ -197,8 +197,9 @@ def test_rays_from_points_equal_the_twin(own_origins: bool, bundled: bool) -> No
         valid = np.flatnonzero(np.isfinite(p).all(axis=1))
         for run in kernel_twins.runs(p, voxel_size) if bundled else [[i] for i in valid]:
             end, start = p[run].mean(axis=0), o[run].mean(axis=0)
-            weight, half = kernel_twins.sample(parameters, float(np.linalg.norm(end - start)), 255 * len(run))
+            direction, trust = end - start, 255 * len(run)
+            weight, half, support = kernel_twins.sample(parameters, float(np.linalg.norm(direction)), trust)
             end = kernel_twins.fixed((end + pose[:3, 3]) / voxel_size)
-            expected.append(kernel_twins.make_ray(end, p[run].mean(axis=0) - start, half, weight))
+            expected.append(kernel_twins.make_ray(end, direction, half, weight, support=support))
     assert buffers.samples == 699
     close(rays_of(buffers), expected)

@@ -52,7 +52,8 @@ MAP_OPTIONS: dict[str, Any] = {
         "--truncation", "VOXELS", "Half-width of every ray's band, instead of 3 sigma of its noise.",
         rare=True)],
     "support": Annotated[str | None, _map_option(
-        "--support", "LEAST:MOST", "Bounds of that half-width, such as 3:6.", rare=True)],
+        "--support", "LEAST:MOST", "Bounds of a ray's begin before its end, such as 3:6; a third number "
+        "is its least reach behind it.", rare=True)],
     "arch": Annotated[str | None, _map_option(
         "--arch", "NAME", "Fuse on cpu, cuda or vulkan; on the CPU where that is missing.", rare=True,
         autocompletion=lambda: ["cpu", "cuda", "vulkan", "metal"])],
@@ -392,11 +393,14 @@ def _band(truncation: float | None, support: str | None) -> dict[str, float]:
     if truncation is not None:
         if not 1 <= truncation <= 16:
             raise InvalidConfig(f"--truncation must be from 1 to 16 voxels, got {truncation:g}")
-        return {"min_support": truncation, "max_support": truncation}
+        return {"min_support": truncation, "max_support": truncation, "min_behind": truncation}
     if support is None:
         return {}
-    least, _, most = support.partition(":")
+    names = "min_support", "max_support", "min_behind"
     try:
-        return {"min_support": float(least), "max_support": float(most)}
+        numbers = [float(number) for number in support.split(":")]
+        return dict(zip(names[: max(len(numbers), 2)], numbers, strict=True))
     except ValueError as error:
-        raise InvalidConfig(f"--support must be LEAST:MOST, such as 3:6, got {support!r}") from error
+        raise InvalidConfig(
+            f"--support must be LEAST:MOST, such as 3:6, or LEAST:MOST:BEHIND, got {support!r}"
+        ) from error

@@ -48,6 +48,7 @@ MapPattern = Annotated[str, Meta(pattern=rf"\A({MAP_NAME}|({MAP_NAME})?\*)\Z")]
 LEAST_VOXELS = 10
 MOST_SAMPLES = 1 << 22  # full-confidence ones that a voxel can count
 LEAST_VOXEL_SIZE = 0.00001  # metres: finer than any sensor
+SYMMETRIC = 16.0  # `min_behind`, voxels: a ray reaches as far behind its end as before it
 ClientName = Annotated[str, Meta(pattern=r"\A[A-Za-z0-9][A-Za-z0-9_.-]{0,31}\Z")]
 Bytes = Annotated[int, Meta(ge=1 << 20)]
 
@@ -68,7 +69,8 @@ class SensorModel(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     σ(z) = sigma_floor + sigma_slope · (z − sigma_z0)², metres; z = depth along the optical axis
     (ray length for points). With a known baseline·fx, `disparity_sigma` px replaces the slope:
     σ(z) = sigma_floor + disparity_sigma · z² / baseline_fx.
-    The support half-width of a ray is `3 σ(z)`, held between `min_support` and `max_support` voxels.
+    A ray begins `3 σ(z)` before its end, held between `min_support` and `max_support` voxels: its support. It
+    reaches `3 σ(z)` behind it, at least `min_behind` voxels and at most its support.
     """
 
     sigma_floor: NonNegative
@@ -79,6 +81,7 @@ class SensorModel(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     max_range: Positive = 10.0
     min_support: Annotated[float, Meta(ge=1, le=16)] = 3.0
     max_support: Annotated[float, Meta(ge=1, le=16)] = 6.0
+    min_behind: Annotated[float, Meta(ge=1, le=16)] = 1.5
     regularizer: Regularizer = "off"
     smoothness: Smoothness = 1.0
     feedback: bool = False
@@ -104,13 +107,16 @@ SENSORS: dict[str, SensorModel] = {
         max_range=30.0,
         min_support=6.0,
         max_support=10.0,
+        min_behind=SYMMETRIC,
         smoothness=10.0,
         feedback=True,
         min_weight=0.5,
         field_smoothness=1000.0,
         field_reweightings=4,
     ),
-    "lidar": SensorModel(sigma_floor=0.02, min_range=1.0, max_range=100.0, min_support=4.0),
+    "lidar": SensorModel(
+        sigma_floor=0.02, min_range=1.0, max_range=100.0, min_support=4.0, min_behind=SYMMETRIC
+    ),
     "scanner": SensorModel(sigma_floor=0.0002, min_range=0.0, max_range=100.0),
 }
 # Metres, of the maps that commands make where nobody says; with another sensor `VolumeConfig`'s. Points of a
@@ -135,6 +141,7 @@ class VolumeConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     smoothness: Smoothness | None = None  # λ of eq. 3
     min_support: Annotated[float, Meta(ge=1, le=16)] | None = None  # voxels
     max_support: Annotated[float, Meta(ge=1, le=16)] | None = None  # voxels
+    min_behind: Annotated[float, Meta(ge=1, le=16)] | None = None  # voxels; 16 = as far as min_support says
     min_range: NonNegative | None = None  # metres
     max_range: Positive | None = None  # metres
     min_weight: Annotated[float, Meta(ge=0, le=MOST_SAMPLES)] | None = (
@@ -245,6 +252,7 @@ class VolumeSettings(LoadSettings, total=False):
     regularizer: Regularizer | None
     min_support: float | None
     max_support: float | None
+    min_behind: float | None
     min_range: float | None
     max_range: float | None
     feedback: bool | None

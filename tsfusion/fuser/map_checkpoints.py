@@ -143,8 +143,9 @@ def _resume(path: Path, wanted: VolumeConfig, kept: dict[str, Any]) -> "Volume |
         here, there = getattr(wanted, name), getattr(volume.config, name)
         if name not in _FREE_SETTINGS and here != there:
             raise InvalidConfig(
-                f"the map in {path.parent} was made with {name} = {there}, got {here}: use another state "
-                f"folder or map (only a journal that is whole can build this one anew)"
+                f"the map in {path.parent} was made with {name} = {there}, got {here}: go on with "
+                f"{name} = {there}, or use another state folder or map (only a journal that is whole can "
+                f"build this one anew)"
             )
     return volume
 

@@ -38,15 +38,14 @@ from tsfusion.kernels.integrate import (
     TOUCHED_MISSING,
     TOUCHED_OVERFLOW,
     WEIGHT_BITS,
+    free_bounds,
     quantize,
 )
 from tsfusion.kernels.quick_launch import QuickLaunch
 from tsfusion.kernels.rays_from_images import TILE_SAMPLES
 from tsfusion.kernels.voxel_traversal import (
     CROSSING,
-    END,
     INTERVAL,
-    LENGTH,
     UPDATES,
     WEIGHT_COLOR,
     advance,
@@ -55,6 +54,7 @@ from tsfusion.kernels.voxel_traversal import (
     next_step,
     offset_in_block,
     pack,
+    parts_of,
     ray_weight,
     vec3i,
 )
@@ -137,7 +137,7 @@ def shares_place(k, places: ti.template(), claims: ti.template()):
 @ti.func
 def crossed(rays: ti.template(), r):
     """Number of voxels that ray `r` crosses."""
-    n, length = 1, rays[r, LENGTH]
+    n, length = 1, parts_of(rays, r)[0]
     for a in ti.static(range(3)):
         if rays[r, CROSSING + a] < length:
             n += 1 + (length - 1 - rays[r, CROSSING + a]) // rays[r, INTERVAL + a]
@@ -153,10 +153,9 @@ def list_updates(
     from place `base` on, `most` in all; returns the numbers of updates and of those in missing blocks, and
     where the update is whose voxel takes the colour, or −1."""
     walk, weight = begin_walk(rays, r), ray_weight(rays, r)
-    ends = rays[r, END]
-    length, end = rays[r, LENGTH], ends & ~7
-    band_begins = end - (length - end)  # before it is free space
-    free_weight, free_distance = ti.max(weight >> FREE_SHIFT, 1), quantize(length - end)
+    length, end, support = parts_of(rays, r)
+    half = length - end
+    least, most_free = free_bounds(half, support)
     last, slot, key = vec3i(2147483647), -1, ti.i64(0)
     added, lacking, colored, n = 0, 0, -1, 0
     is_colored = ti.select(end + 1 == length, 1, 0)  # or is to have none
@@ -167,9 +166,9 @@ def list_updates(
             key = pack(block[0], block[1], block[2])
             slot = map_find(hash_keys, hash_slots, hash_keys.shape[0] - 1, key)
         step, leaves = next_step(walk.crossing)
-        is_free = leaves < band_begins
-        w = ti.select(is_free, free_weight, weight)
-        m = ti.select(is_free, free_distance, ti.max(quantize(walk.distance), -MAX_DISTANCE))
+        m, w = ti.max(quantize(walk.distance), -MAX_DISTANCE), weight
+        if leaves < end - half:  # before the band
+            m, w = ti.min(ti.max(m, least), most_free), ti.max(weight >> FREE_SHIFT, 1)
         offset = offset_in_block(walk.voxel)
         at = ti.select(slot >= oldest, slot * CUBE + offset, SKIPPED)
         at = ti.select(slot < 0, -1 - offset, at)

@@ -3,7 +3,7 @@
 
 A voxel's sum is one int64, (Σ w·m) · 2²⁷ + Σ w: m = signed distance along the ray in sixtieths of a voxel,
 |m| ≤ 1023, which is beyond the widest band there can be. Voxels before the band, where the sensor looks
-through (space carving), get a band's half-width for m.
+through, get half the weight, and at most the support for m.
 Colour is (Σ R) · 2⁴⁰ + (Σ G) · 2¹⁶ + n in an int64 and Σ B in an int32, one vote a ray, in the voxel where
 it ends. In maps that count hits a ray without a colour is counted there instead, in an int32.
 Addition modulo 2⁶⁴ is a group: any order gives the same bytes, and subtracting restores them.
@@ -57,6 +57,7 @@ from tsfusion.kernels.voxel_traversal import (
     UPDATES,
     WEIGHT_COLOR,
     pack,
+    parts_of,
     ray_weight,
     voxel_of,
 )
@@ -112,6 +113,14 @@ def lane_distance(packed):
 def quantize(distance):
     """Distance in 2⁻¹⁶ voxel → quanta."""
     return ti.min((distance * QUANTA_PER_VOXEL + 32768) >> 16, MAX_DISTANCE)
+
+
+@ti.func
+def free_bounds(half, support):
+    """Least and greatest distance that is told to a voxel before the band of this half-width, quanta: its
+    own, up to the support; where the band is as wide as that, no other."""
+    most = quantize(support)
+    return ti.select(half < support, 0, most), most
 
 
 @ti.func
@@ -218,9 +227,9 @@ def add_votes(
 
 @ti.func
 def list_updates(
-    walks: ti.template(), k, listed: ti.template(), weight_color, sign_, scratch: ti.template(), base,
-    colors: ti.template(), voxels: ti.template(), amounts: ti.template(), count: ti.template(), oldest, mark,
-    stamp, most_missing, hash_keys: ti.template(), hash_slots: ti.template(), missing: ti.template(),
+    walks: ti.template(), k, listed: ti.template(), weight_color, support, sign_, scratch: ti.template(),
+    base, colors: ti.template(), voxels: ti.template(), amounts: ti.template(), count: ti.template(), oldest,
+    mark, stamp, most_missing, hash_keys: ti.template(), hash_slots: ti.template(), missing: ti.template(),
     owners: ti.template(), stamps: ti.template(), places: ti.template(), dirty: ti.template(),
     touched: ti.template(), of_others: ti.template(),
 ):  # fmt: skip
@@ -230,10 +239,8 @@ def list_updates(
     """
     weight = (weight_color >> 24) & 255
     vote, free_vote = sign_ * weight, sign_ * ti.max(weight >> FREE_SHIFT, 1)
-    # both sums in one addition; their quotient minimises Σ w (x − m)²: paper eq. 2
     half = walks[RAY_LENGTH + k] - ((walks[RAY_LENGTH + k] + walks[BAND + k]) >> 1)
-    free = (ti.cast(quantize(half) * free_vote, ti.i64) << WEIGHT_BITS) + free_vote
-    per_quantum = ti.cast(vote, ti.i64) << WEIGHT_BITS
+    least, most = free_bounds(half, support)
     before, uncolored = walks[FREE + k], walks[UNCOLORED + k]
     number = walks[ODD + k]
     window = window_of(walks, k, number)
@@ -260,8 +267,11 @@ def list_updates(
             met |= ti.select(first < 0, first, 0)
         if first >= 0:
             at = first + (place & (CUBE - 1))
-            amount = ti.cast(place >> DISTANCE_AT, ti.i64) * per_quantum + vote
-            voxels[count], amounts[count] = at, ti.select(i < before, free, amount)
+            m, w = place >> DISTANCE_AT, vote
+            if i < before:
+                m, w = ti.min(ti.max(m, least), most), free_vote
+            # both sums in one addition; their quotient minimises Σ w (x − m)²: paper eq. 2
+            voxels[count], amounts[count] = at, (ti.cast(m * w, ti.i64) << WEIGHT_BITS) + w
             count += 1
             if i == uncolored:
                 scratch[colors] = (ti.cast(at, ti.i64) << 32) | (weight_color & 0xFFFFFF)
@@ -344,9 +354,10 @@ def add_bands(
                     if r != NOBODY:
                         added -= updates
                         walks[MET + k] |= list_updates(
-                            walks, k, listed, rays[r, WEIGHT_COLOR], sign_, scratch, base, colors,
-                            voxels, amounts, updates, oldest, mark, stamp, most_missing, hash_keys,
-                            hash_slots, missing, owners, stamps, places, dirty, touched, of_others,
+                            walks, k, listed, rays[r, WEIGHT_COLOR], parts_of(rays, r)[2], sign_,
+                            scratch, base, colors, voxels, amounts, updates, oldest, mark, stamp,
+                            most_missing, hash_keys, hash_slots, missing, owners, stamps, places,
+                            dirty, touched, of_others,
                         )  # fmt: skip
                         added += updates
                         if updates > LISTED_UPDATES - STRETCH:

@@ -14,10 +14,10 @@ from tsfusion.kernels.voxel_traversal import (
     DISTANCE,
     END,
     INTERVAL,
-    LENGTH,
     LOSS,
     NEVER,
     VOXEL,
+    parts_of,
     ray_vector,
     steps,
     vec3i,
@@ -52,9 +52,8 @@ HALF_A_QUANTUM = 1 << 15  # of `OFF`, whose upper bits are rounded so
 @ti.func
 def begin(rays: ti.template(), r, per_voxel: ti.template(), colors, walks: ti.template(), k):
     """Let ray `r` begin at place `k`; `per_voxel`: units of `OFF` for one of the ray's distance."""
-    ends = rays[r, END]
-    length, end = rays[r, LENGTH], ends & ~7
-    voxel, towards = ray_vector(rays, r, VOXEL), steps(ends)
+    length, end, _ = parts_of(rays, r)
+    voxel, towards = ray_vector(rays, r, VOXEL), steps(rays[r, END])
     at = 0
     for a in ti.static(range(3)):
         walks[NEXT + a * ABREAST + k] = rays[r, CROSSING + a]

@@ -19,12 +19,13 @@ from tsfusion.kernels.sensor_noise import (
     MAX_RANGE,
     MIN_RANGE,
     VOXEL_SIZE,
+    behind_width,
     bundle_weight,
     fixed_point,
-    half_width,
     in_reach,
     layer_depth,
     noise_sigma,
+    support_width,
     vec3,
 )
 from tsfusion.kernels.unfused import cross, dot, norm, product, quotient
@@ -406,8 +407,11 @@ def write_layer_ray(
             )
         sigma = noise_sigma(model, z)
         weight = bundle_weight(model, sigma, trust)
-        half = half_width(model, sigma)
-        cost = write_ray(rays, r, first, fixed_point(p), direction, gradient, half, half, weight, rgb)
+        support = support_width(model, sigma)
+        behind = behind_width(model, sigma, support)
+        cost = write_ray(
+            rays, r, first, fixed_point(p), direction, gradient, support, support, behind, weight, rgb
+        )
     return weight, cost
 
 

@@ -15,11 +15,12 @@ from tsfusion.kernels.sensor_noise import (
     MIN_RANGE,
     VOXEL_SIZE,
     before_width,
+    behind_width,
     bundle_weight,
     fixed_point,
-    half_width,
     in_reach,
     noise_sigma,
+    support_width,
     vec3,
     vec3f,
 )
@@ -85,11 +86,14 @@ def write_bundle_ray(rays: ti.template(), r, first, model: ti.template(), pose: 
     if in_reach(end) and in_reach(origin):
         sigma = noise_sigma(model, norm(mean - start))
         weight = bundle_weight(model, sigma, bundle.trust)
-        half = half_width(model, sigma)
+        support = support_width(model, sigma)
+        behind = behind_width(model, sigma, support)
         rgb = ((bundle.red // n) << 16) | ((bundle.green // n) << 8) | (bundle.blue // n)
         direction, across = end - origin, vec3(0.0)
-        before = before_width(model, half, norm(direction))
-        cost = write_ray(rays, r, first, fixed_point(end), direction, across, before, half, weight, rgb)
+        before = before_width(model, support, norm(direction))
+        cost = write_ray(
+            rays, r, first, fixed_point(end), direction, across, before, support, behind, weight, rgb
+        )
     return weight, cost
 
 

@@ -10,16 +10,17 @@ import taichi as ti
 from tsfusion.kernels.unfused import product
 from tsfusion.kernels.voxel_traversal import VOXEL_LIMIT, vec3i
 
-MODEL_FIELDS = 12
+MODEL_FIELDS = 13
 # σ(z) = SIGMA_FLOOR + SIGMA_SLOPE · (z − SIGMA_Z0)², metres
 SIGMA_FLOOR, SIGMA_SLOPE, SIGMA_Z0 = 0, 1, 2
-LEAST_SUPPORT, MOST_SUPPORT = 3, 4  # half-width of the band, voxels
+LEAST_SUPPORT, MOST_SUPPORT = 3, 4  # how far a ray begins before its end, voxels
 VOXEL_SIZE = 5  # metres
 FULL_WEIGHT_SIGMA = 6  # metres: a sample with less noise has its full weight
 MIN_RANGE, MAX_RANGE = 7, 8  # metres
 DROPS_LONE_SAMPLES = 9  # 1 or 0
-SUPPORT_PER_SIGMA = 10  # half-width for σ = 1 m, 2⁻⁸ voxel: three σ
+SUPPORT_PER_SIGMA = 10  # for σ = 1 m, 2⁻⁸ voxel: three σ
 CARVES_SPACE = 11  # 1 or 0
+LEAST_BEHIND = 12  # how far a ray reaches behind its end, voxels
 
 WEIGHT_ONE = 16  # a full-confidence sample
 MAX_BUNDLE_WEIGHT = 255  # more samples of one cell are not independent evidence
@@ -50,8 +51,8 @@ def bundle_weight(model: ti.template(), sigma, trust):
 
 
 @ti.func
-def half_width(model: ti.template(), sigma):
-    """Support half-width, 2⁻⁸ voxel: three sigma, held between the preset's bounds."""
+def support_width(model: ti.template(), sigma):
+    """Support of a ray, 2⁻⁸ voxel: three sigma, held between the preset's bounds."""
     width = ti.min(
         ti.max(sigma * model[SUPPORT_PER_SIGMA], model[LEAST_SUPPORT] * 256.0), model[MOST_SUPPORT] * 256.0
     )
@@ -59,13 +60,21 @@ def half_width(model: ti.template(), sigma):
 
 
 @ti.func
-def before_width(model: ti.template(), half, length):
-    """How far before its end the ray of a point, of `length` voxels, begins, 2⁻⁸ voxel: its band, or with
+def behind_width(model: ti.template(), sigma, support):
+    """Half-width of a ray's band, 2⁻⁸ voxel: three sigma, at least the preset's, at most the support. A wider
+    one hides the other face of a thin thing; one that ends within the noise moves the surface."""
+    width = ti.max(sigma * model[SUPPORT_PER_SIGMA], model[LEAST_BEHIND] * 256.0)
+    return ti.cast(ti.min(width, ti.cast(support, ti.f64)), ti.i32)
+
+
+@ti.func
+def before_width(model: ti.template(), support, length):
+    """How far before its end the ray of a point, of `length` voxels, begins, 2⁻⁸ voxel: its support, or with
     space carving all but what is next to the sensor."""
-    before = half
+    before = support
     if model[CARVES_SPACE] > 0.0:
         carved = ti.min(length, MAX_CARVED) - NEVER_CARVED
-        before = ti.max(half, ti.cast(carved * 256.0, ti.i32))
+        before = ti.max(support, ti.cast(carved * 256.0, ti.i32))
     return before
 
 

@@ -34,8 +34,8 @@ from tsfusion.kernels.sensor_noise import (
     MODEL_FIELDS,
     VOXEL_SIZE,
     bundle_weight,
-    half_width,
     noise_sigma,
+    support_width,
     vec3,
 )
 from tsfusion.kernels.unfused import dot, product
@@ -117,7 +117,7 @@ def clear_up_to(model: ti.template(), nearest, second, cosine, far, scale):
     """
     unit = model[VOXEL_SIZE] / 1024.0  # metres
     least = ti.select(second < NO_SAMPLE, second, nearest)
-    half = half_width(model, noise_sigma(model, least * unit)) * 4  # 2⁻¹⁰ voxel
+    half = support_width(model, noise_sigma(model, least * unit)) * 4  # 2⁻¹⁰ voxel
     depth = ti.max(least - ti.cast(product(half, cosine), ti.i32), 0)
     clear = ti.cast(ti.min(product(depth, scale / 1024.0), far * scale), ti.i32)
     is_known = ti.select(model[DROPS_LONE_SAMPLES] > 0.0, second, nearest) < NO_SAMPLE
@@ -309,7 +309,7 @@ def free_vote(model: ti.template(), view: ti.template(), depth):
     sigma = noise_sigma(model, depth * model[VOXEL_SIZE])
     pixel = depth / ti.min(view[FX], ti.abs(view[FY]))  # voxels that it spans
     weight = bundle_weight(model, sigma, 255.0 / ti.max(product(pixel, pixel), 1e-3))
-    distance = (half_width(model, sigma) * QUANTA_PER_VOXEL + 128) >> 8
+    distance = (support_width(model, sigma) * QUANTA_PER_VOXEL + 128) >> 8
     return (ti.cast(distance * weight, ti.i64) << WEIGHT_BITS) + weight
 
 
@@ -484,8 +484,8 @@ def see_points(
                         v_down = ti.cast((y / depth + VIEW_TANGENT) * (side / (2 * VIEW_TANGENT)), ti.i32)
                         at = v * side + ti.min(v_down, side - 1), ti.min(u, side - 1)
                         reach = ti.sqrt(ti.cast(away, ti.f64))
-                        half = half_width(model, noise_sigma(model, reach)) * model[VOXEL_SIZE] / 256.0
-                        clear = depth / model[VOXEL_SIZE] * ti.max(1.0 - half / reach, 0.0) * units
+                        support = support_width(model, noise_sigma(model, reach)) * model[VOXEL_SIZE] / 256.0
+                        clear = depth / model[VOXEL_SIZE] * ti.max(1.0 - support / reach, 0.0) * units
                         if not trusted:
                             clear = 0.0
                         ends[at] = ti.min(ends[at], ti.cast(ti.min(clear, NO_SAMPLE - 1.0), ti.i32))

@@ -23,6 +23,7 @@ AROUND = 27
 HERE = 13  # of the 27 blocks around: (x + 1)·9 + (y + 1)·3 + z + 1
 PLANES = 24  # of edges: 3·x + axis
 NEVER = 1e9  # quanta
+NO_LIMITS = 0.0, NEVER  # of `behind` and `clear`, where maps are not carved
 Z0 = 0x0101010101010101  # the voxels of a plane with z = 0, and all but those with z = 7
 Z06 = 0x7F7F7F7F7F7F7F7F
 
@@ -284,7 +285,7 @@ def find_cells(
     table: I64,  # the keys' hash
     table_rows: I32, values: F32x2,
     behind: ti.f32,  # quanta, as `is_between`
-    clear: ti.f32,  # `NEVER`, where maps are not carved
+    clear: ti.f32,  # or `NO_LIMITS`
     triangle_count: I32,
     around: I32x2,  # (row, 27): rows of the blocks around
     seen: U64x2,  # (row, 8): planes

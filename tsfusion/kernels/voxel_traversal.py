@@ -13,8 +13,9 @@ from tsfusion.kernels.unfused import dot, norm, product
 
 # First voxel of the band (3), next crossing an axis (3), crossing interval an axis (3), what the distance
 # loses with a step an axis (3), signed distance of the first voxel's centre to the surface along the ray
-# (positive before it), length of the band, where in it the end point lies (its low 3 bits: which axes go
-# down), weight << 24 | 0xRRGGBB.
+# (positive before it), length of the ray, where in it the end point lies, weight << 24 | 0xRRGGBB. The band
+# is as wide before the end point as behind it. The low 3 bits of `END` are the axes that go down; the next 5,
+# above the low 8 of `LENGTH`, are the support, 2⁻⁸ voxel.
 RAY_FIELDS = 16
 VOXEL, CROSSING, INTERVAL, LOSS = 0, 3, 6, 9
 DISTANCE, LENGTH, END, WEIGHT_COLOR = 12, 13, 14, 15
@@ -65,14 +66,17 @@ def hash_key(key):
 
 
 @ti.func
-def write_ray(rays: ti.template(), r, first, end, direction, gradient, before, behind, weight, color):
+def write_ray(
+    rays: ti.template(), r, first, end, direction, gradient, before, support, behind, weight, color
+):
     """Write ray `r` of a band that begins with ray `first`; returns what it costs to add it.
 
     That is the most voxels it can cross, `FAR_COST` times if it begins away from the ray before it: then no
     block that it crosses is in the processor's cache.
 
-    `end` int32 2⁻¹⁰ voxel; `direction` float64 of any length; the band reaches `before` and `behind` the
-    end point, int32 2⁻⁸ voxel. A ray without a direction gets no weight.
+    `end` int32 2⁻¹⁰ voxel; `direction` float64 of any length; the ray reaches `before` and `behind` the
+    end point, int32 2⁻⁸ voxel. A ray without a direction gets no weight. `support`, likewise: the distance
+    that is told before the band.
     `gradient`, float64, is what the distance along the ray to the surface loses with a voxel along each axis:
     n / (n·u) for a plane of normal n; zero stands for the plane across the ray, whose gradient is u.
     """
@@ -113,8 +117,8 @@ def write_ray(rays: ti.template(), r, first, end, direction, gradient, before, b
             loss = -loss
         rays[r, LOSS + a] = loss
     rays[r, DISTANCE] = ti.cast(distance >> 16, ti.i32)
-    rays[r, LENGTH] = (before + behind) << 8
-    rays[r, END] = (before << 8) | downward
+    rays[r, LENGTH] = ((before + behind) << 8) | (support & 255)
+    rays[r, END] = (before << 8) | (support >> 8 << 3) | downward
     rays[r, WEIGHT_COLOR] = (usable << 24) | color
     cost = 4 + ti.cast((ti.cast(across, ti.i64) * (before + behind)) >> 24, ti.i32)
     if is_apart(rays, r, ti.max(r - 1, first)):
@@ -144,6 +148,13 @@ def write_band(bands: ti.template(), band, first, end, samples, weight, cost):
 def ray_weight(rays: ti.template(), r):
     """Weight of ray `r`, 0 … 255."""
     return (rays[r, WEIGHT_COLOR] >> 24) & 255
+
+
+@ti.func
+def parts_of(rays: ti.template(), r):
+    """Length of ray `r`, where its end point lies, and its support, 2⁻¹⁶ voxel."""
+    length, end = rays[r, LENGTH], rays[r, END]
+    return length & ~255, end & ~255, (end & 248) << 13 | (length & 255) << 8
 
 
 @ti.func

@@ -16,6 +16,7 @@ from tsfusion.core.distinct_integers import distinct
 from tsfusion.core.errors import MapFull
 from tsfusion.kernels import block_hash, runtime, voxel_values
 from tsfusion.kernels.integrate import CHANGED, CUBE, WEIGHT_MASK
+from tsfusion.kernels.surface_cells import NO_LIMITS
 from tsfusion.tsdf.checkpoint import LAYER_DTYPES
 from tsfusion.tsdf.clear_blocks import ClearBlocks
 from tsfusion.tsdf.growing_array import MAX_ITEMS, FileArray, GrowingArray
@@ -98,12 +99,12 @@ class BlockStore:
         color: bool,
         corrected: bool,
         hits: bool = False,
-        carved_band: float = 0.0,
+        back_limits: tuple[float, float] = NO_LIMITS,
         cache: CacheConfig | None = None,
         device: DeviceRows | None = None,
     ) -> None:
         self.voxel_size = voxel_size
-        self.carved_band = carved_band  # half-width of bands that end in carved space, voxels; 0 = it varies
+        self.back_limits = back_limits  # of a mesh (`mesh_extraction.back_limits`)
         self.color, self.corrected, self.counts_hits = color, corrected, hits
         self.count = 0
         self.drops = 0  # how often blocks have gone, or moved to other slots

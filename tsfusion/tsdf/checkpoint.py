@@ -23,7 +23,7 @@ import zstandard
 from numpy.typing import NDArray
 
 from tsfusion.core import durable_files
-from tsfusion.core.config import VolumeConfig
+from tsfusion.core.config import SYMMETRIC, VolumeConfig
 from tsfusion.core.errors import CheckpointError, DamagedCheckpoint
 from tsfusion.core.side_thread import SideThread
 from tsfusion.tsdf import clear_blocks, map_history
@@ -59,6 +59,12 @@ class CheckpointHeader(msgspec.Struct, kw_only=True):
             return clear_blocks.decoded(self.clear, self.config.max_blocks)
         except ValueError as error:
             raise DamagedCheckpoint(f"{path} is malformed: {error}") from error
+
+
+class _SavedSettings(msgspec.Struct):
+    """The settings of a header as its writer named them."""
+
+    config: dict[str, Any]
 
 
 class Chunk(NamedTuple):
@@ -311,8 +317,12 @@ def _check_magic(file: BinaryIO, path: Path) -> None:
 
 def _read_header(file: BinaryIO, path: Path) -> CheckpointHeader:
     (length,) = struct.unpack("<I", _read_exactly(file, 4, path))
+    encoded = _read_exactly(file, length, path)
     try:
-        header = msgspec.msgpack.decode(_read_exactly(file, length, path), type=CheckpointHeader)
+        header = msgspec.msgpack.decode(encoded, type=CheckpointHeader)
+        if "min_behind" not in msgspec.msgpack.decode(encoded, type=_SavedSettings).config:
+            # of a version whose rays reach as far behind their ends as before them: so do those to come
+            header.config = msgspec.structs.replace(header.config, min_behind=SYMMETRIC)
     except msgspec.ValidationError as error:  # the digest agrees: it is as its writer meant it
         raise CheckpointError(f"{path} is of another version: {error}") from error
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:

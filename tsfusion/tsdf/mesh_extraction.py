@@ -16,7 +16,7 @@ from tsfusion.tsdf.field_regularizer import around
 from tsfusion.tsdf.growing_array import GrowingArray
 from tsfusion.tsdf.surface_values import SurfaceView, values_of
 
-_BEHIND, _CLEAR = 2 / 3, 0.97  # of a band's half-width
+_BEHIND, _CLEAR = 2 / 3, 0.97  # of a band's half-width, of the support
 KEPT_BLOCKS = 1 << 14  # working memory for so many is kept for the next mesh: 45 MB
 
 
@@ -76,8 +76,9 @@ class MeshBuffers:
         )  # fmt: skip
 
 
-def carved_band(config: VolumeConfig) -> float:
-    """Half-width of a carved map's bands, voxels; 0 where it varies, or nothing is carved.
+def back_limits(config: VolumeConfig) -> tuple[float, float]:
+    """From where on voxels are far behind a surface, and clear: quanta. A voxel that all looked through has
+    the least support or more. No voxel is either where bands vary, or nothing is carved.
 
     Seen at a grazing angle, a street far ahead has voxels with quite different distances side by side: where
     noise widens the bands, as of stereo pairs, and where no planes are known, as of points, whose noise does
@@ -86,17 +87,10 @@ def carved_band(config: VolumeConfig) -> float:
     model = config.model()
     away = model.max_range / 2 - model.sigma_z0
     noise = 3 * (model.sigma_floor + model.sigma_slope * away**2) / config.voxel_size
-    is_narrow = model.sigma_slope > 0 and noise <= model.min_support
-    return model.min_support if config.space_carving and is_narrow else 0.0
-
-
-def _limits(store: BlockStore) -> tuple[float, float]:
-    """From where on voxels are far behind a surface, and clear: quanta. A voxel that all looked through has
-    the half-width of a band, the least of them or more."""
-    if not store.carved_band:
-        return 0.0, surface_cells.NEVER
-    band = store.carved_band * QUANTA_PER_VOXEL
-    return -_BEHIND * band, _CLEAR * band
+    if not config.space_carving or model.sigma_slope == 0 or noise > model.min_support:
+        return surface_cells.NO_LIMITS
+    band = min(model.min_behind, model.min_support)
+    return -_BEHIND * band * QUANTA_PER_VOXEL, _CLEAR * model.min_support * QUANTA_PER_VOXEL
 
 
 def extract(
@@ -150,7 +144,7 @@ def extract_rows(
     around, inside, active = buffers.around.array, buffers.inside.array, buffers.active.array
     edges, starts, first = buffers.edges.array, buffers.starts.array, buffers.first.array
     surface_cells.find_cells(
-        count, keys, len(wanted), wanted, table, table_rows, values, *_limits(store),
+        count, keys, len(wanted), wanted, table, table_rows, values, *store.back_limits,
         marching_tables.TRIANGLE_COUNT, around, buffers.seen.array, inside, active, edges, starts,
         buffers.state.array, first,
     )  # fmt: skip

@@ -224,6 +224,7 @@ def model_parameters(
     parameters[sensor_noise.DROPS_LONE_SAMPLES] = outlier_filter
     parameters[sensor_noise.SUPPORT_PER_SIGMA] = 3 * 256 / voxel_size
     parameters[sensor_noise.CARVES_SPACE] = space_carving
+    parameters[sensor_noise.LEAST_BEHIND] = model.min_behind
     return parameters
 
 

@@ -155,7 +155,7 @@ class Volume(AskableMap):
             color=config.color,
             corrected=smooths,
             hits=config.counts_hits,
-            carved_band=mesh_extraction.carved_band(config),
+            back_limits=mesh_extraction.back_limits(config),
             cache=None if memory_bytes is None else checked_cache(memory_bytes, cache),
             device=device,
         )
