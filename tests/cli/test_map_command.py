@@ -390,7 +390,7 @@ def test_convert_writes_slices_and_fields(here: Here, state: Path) -> None:
     how = ("--heights", 0.5, 1.2, "--up", "z")
     done = here("map", "convert", yard, "room.yaml", *how, "--json")
     assert json.loads(done.stdout)["files"] == ["room.yaml", "room.pgm"]
-    assert "made without --space-carving" in done.stderr
+    assert "near surfaces alone" not in done.stderr
     expected = volume.occupancy_slice(0.5, 1.2, up="z")
     assert Path("room.pgm").read_bytes().endswith(expected.pixels().tobytes())
     assert here("map", "convert", yard, "room.npz", *how, "--field", "distance").returncode == 0
