@@ -328,14 +328,15 @@ class Exchange:
             TransportError: when what answers is no tsfusion server, or one of another version.
         """
         deadline = time.monotonic() + timeout
+        left = timeout if self.is_there else min(timeout, _PING_TIMEOUT)
         while True:
-            left = max(deadline - time.monotonic(), 0.0)
-            reply, frames = self._next(left if self.is_there else min(left, _PING_TIMEOUT))
+            reply, frames = self._next(left)
             if reply.name != "ping" or not self._pings:
                 return reply, frames
             if other := messages.other_version(server=reply.version, client=messages.PROTOCOL_VERSION):
                 raise TransportError(f"cannot ask {self._name}: {other}")
             self.is_there, self._pings = True, False
+            left = max(deadline - time.monotonic(), 0.0)
 
     def _next(self, timeout: float) -> tuple[Reply, list[memoryview]]:
         address = self._name
