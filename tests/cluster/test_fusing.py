@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from command_processes import Here, alive, descendants, end, eventually, read_until, started, tsfusion
 from corrected_maps import fresh_map
+from formula_scenes import free_space
 from keyframes_and_servers import VOLUME, pose, wall
 from saved_maps import make_map
 from silent_display import Silent
@@ -113,6 +114,7 @@ def test_the_map_is_that_of_one_machine(state: Path, tmp_path: Path, expected: V
     made = Volume.load(tmp_path / "out/map.tsf")
     assert run.map_hash == made.map_hash() == expected.map_hash()
     assert made.color_hash() == expected.color_hash()
+    assert free_space(made) == free_space(expected) != {}
     assert (run.keyframes, run.keyframes_fused, made.held.numbers) == (11, 11, expected.held.numbers)
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
         "map.tsf", "mesh.glb", "mesh.ply", "run.json",

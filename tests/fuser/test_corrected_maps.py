@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 import pytest
 from corrected_maps import final_keyframes, fresh_map
-from formula_scenes import volume_of
+from formula_scenes import free_space, volume_of
 from hypothesis import settings as given_settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, rule, run_state_machine_as_test
@@ -141,6 +141,7 @@ def test_corrected_keyframes_are_fused_where_they_were_taken(recorded: Recorded)
     assert (last.waiting, last.keyframes, last.removed, last.moved) == (0, 4, 1, 3)
     assert fuser._volume.map_hash() == recorded.fresh().map_hash()
     assert fuser._volume.color_hash() == recorded.fresh().color_hash()
+    assert free_space(fuser._volume) == free_space(recorded.fresh())
     assert is_due(fuser, "mesh")
 
 
@@ -580,6 +581,7 @@ class Life(RuleBasedStateMachine):
         settle(self.fuser)
         assert self.fuser._volume.map_hash() == self.recorded.fresh().map_hash()
         assert self.fuser._volume.color_hash() == self.recorded.fresh().color_hash()
+        assert free_space(self.fuser._volume) == free_space(self.recorded.fresh())
         final = final_keyframes(self.recorded.state / "journal")
         assert self.fuser._volume.keyframes == len(final)
         self.fuser.handle(messages.Finish())

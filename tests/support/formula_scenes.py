@@ -65,6 +65,12 @@ def volume_of(keyframes: Iterable[Keyframe], **settings: object) -> Volume:
     return volume
 
 
+def free_space(volume: Volume) -> dict[int, int]:
+    """How many keyframes look through each block, by its key."""
+    keys, counts = volume._store.clear.counts()
+    return dict(zip(keys.tolist(), counts.tolist(), strict=True))
+
+
 def tilted_plane(noise: float = 0.0) -> tuple[NDArray[np.float64], list[Keyframe]]:
     """The normal of a plane 0.1 m from the origin, and four views of it with `noise` metres of noise."""
     normal, random = np.array([0.3, -0.2, 0.93]), np.random.default_rng(0)
