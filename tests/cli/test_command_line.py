@@ -407,6 +407,7 @@ def test_ctrl_c_while_modules_load_is_no_traceback() -> None:
         ({"truncation": 4.0}, {"min_support": 4.0, "max_support": 4.0, "min_behind": 4.0}),
         ({"support": "3:6.5"}, {"min_support": 3.0, "max_support": 6.5, "min_behind": None}),
         ({"support": "3:6:2"}, {"min_support": 3.0, "max_support": 6.0, "min_behind": 2.0}),
+        ({"support": "::16"}, {"min_support": None, "max_support": None, "min_behind": 16.0}),
         ({"min_weight": 0.5, "max_range": 3.0}, {"min_weight": 0.5, "max_range": 3.0}),
         ({"lambda_": 7.0}, {"smoothness": 7.0}),
         ({"space_carving": True}, {"space_carving": True}),
@@ -422,6 +423,8 @@ def test_map_flags_become_settings(flags: dict[str, object], expected: dict[str,
     [
         ({"truncation": 4.0, "support": "3:6"}, "exclude each other"),
         ({"support": "3-6"}, "LEAST:MOST"),
+        ({"support": "3:"}, "LEAST:MOST"),
+        ({"support": "3:6:2:1"}, "LEAST:MOST"),
         ({"support": "3:99"}, "max_support must be <= 16"),
     ],
 )

@@ -53,7 +53,7 @@ MAP_OPTIONS: dict[str, Any] = {
         rare=True)],
     "support": Annotated[str | None, _map_option(
         "--support", "LEAST:MOST", "Bounds of a ray's begin before its end, such as 3:6; a third number "
-        "is its least reach behind it.", rare=True)],
+        "is its least reach behind it (::16 sets that alone).", rare=True)],
     "arch": Annotated[str | None, _map_option(
         "--arch", "NAME", "Fuse on cpu, cuda or vulkan; on the CPU where that is missing.", rare=True,
         autocompletion=lambda: ["cpu", "cuda", "vulkan", "metal"])],
@@ -398,8 +398,9 @@ def _band(truncation: float | None, support: str | None) -> dict[str, float]:
         return {}
     names = "min_support", "max_support", "min_behind"
     try:
-        numbers = [float(number) for number in support.split(":")]
-        return dict(zip(names[: max(len(numbers), 2)], numbers, strict=True))
+        numbers = support.split(":")
+        found = zip(names[: max(len(numbers), 2)], numbers, strict=True)
+        return {name: float(number) for name, number in found if number or len(numbers) == 2}
     except ValueError as error:
         raise InvalidConfig(
             f"--support must be LEAST:MOST, such as 3:6, or LEAST:MOST:BEHIND, got {support!r}"
