@@ -276,7 +276,7 @@ class Client:
 
     @property
     def is_of_other_world(self) -> bool:
-        """Whether the server said that the map has keyframes of another world; nothing is sent then."""
+        """True if the server said that the map has keyframes of another world: nothing is sent then."""
         return self.link_state.kind == "other_world"
 
     def check_world(self) -> None:
@@ -337,7 +337,7 @@ class Client:
 
     @property
     def is_settled(self) -> bool:
-        """Whether the map has everything sent, and each keyframe at its newest pose (`wait_settled`)."""
+        """True if the map has everything sent, and each keyframe at its newest pose (`wait_settled`)."""
         return self._outbox.is_settled
 
     def wait_meshed(self, timeout: float = 60.0) -> None:
@@ -374,7 +374,7 @@ class Client:
 
     @property
     def connected(self) -> bool:
-        """Whether the server answered and has not fallen silent."""
+        """True if the server has answered and has not fallen silent."""
         return self._outbox.link_state.is_connected
 
     @property

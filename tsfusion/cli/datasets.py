@@ -81,7 +81,7 @@ def _layouts() -> list[dict[str, Any]]:
 
 
 def _is_one(path: Path) -> bool:
-    """Whether a path is in a known layout, or holds one such folder."""
+    """True if a path has a known layout, or holds a folder with one."""
     from tsfusion.core.errors import DatasetError
     from tsfusion.datasets.registry import find
 

@@ -133,7 +133,7 @@ class ServerWatcher:
 
     @property
     def unwell(self) -> bool:
-        """Whether the newest snapshot was not ready, nor any in the `stall_after` seconds before it."""
+        """True if no snapshot of the last `stall_after` seconds was ready, the newest included."""
         return self._asked - self._well >= self._stall_after
 
     def _health(self) -> Health:

@@ -153,7 +153,7 @@ KeepIslands = Annotated[
 
 
 def is_typed(context: typer.Context, name: str) -> bool:
-    """Whether a parameter was typed; else it is its default, or the environment sets it."""
+    """True if a parameter was typed, False if it is its default or set by the environment."""
     source = context.get_parameter_source(name)
     return source is not None and source.name == "COMMANDLINE"
 

@@ -141,7 +141,7 @@ def _refuse_own_journal(dataset: "Dataset", state: Path, map_name: str) -> None:
 
 
 def _is_synthetic(path: Path) -> bool:
-    """Whether it is a synthetic dataset: what there is to say of one would have to be rendered first."""
+    """True for a synthetic dataset, which would have to be rendered before it can be described."""
     return str(path).startswith("synthetic:")
 
 

@@ -121,7 +121,7 @@ def _remarks(one: ClientHealth) -> Text:
 
 
 def _presence(one: ClientHealth) -> Text:
-    """Whether a client is there; else for how long it has not been heard."""
+    """State of a client; unless it is connected, also the time since it was last heard."""
     if one.state == "connected":
         return Text(one.state, style="green")
     return Text(f"{one.state} {span(one.heard_s)}", style="yellow" if one.state == "silent" else "")

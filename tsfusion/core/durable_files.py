@@ -117,7 +117,7 @@ def require_room(folder: Path, nbytes: int) -> None:
 
 
 def is_in_memory(folder: Path) -> bool:
-    """Whether a folder is a RAM disk (Linux; elsewhere nobody tells): what lies there takes memory."""
+    """True if a folder is a RAM disk, where files take memory (Linux; always False elsewhere)."""
     with suppress(OSError):
         device = os.stat(folder).st_dev
         number = f"{os.major(device)}:{os.minor(device)}"
@@ -165,5 +165,5 @@ def size_of(path: Path) -> int:
 
 
 def others_can_write(mode: int) -> bool:
-    """Whether a file or folder of this mode can be changed by others than its owner."""
+    """True if others than the owner can change a file or folder of this mode."""
     return bool(mode & _OTHERS_WRITE)

@@ -75,7 +75,7 @@ class JournalError(TsfusionError):
 
     @property
     def temporary(self) -> bool:
-        """Whether a record may be readable later: the system refused to read it now, or did not find it."""
+        """True if a record may be readable later: the system refused to read it now, or did not find it."""
         return self.errno is not None
 
 

@@ -32,7 +32,7 @@ class Headline(Struct, frozen=True, kw_only=True):
 
     @property
     def is_behind(self) -> bool:
-        """Whether more waits than is on its way anyway."""
+        """True if more keyframes wait than are always on their way."""
         return self.waiting > _FEW and (not self.rate or self.waiting / self.rate > _SOON)
 
     @property
@@ -44,7 +44,7 @@ class Headline(Struct, frozen=True, kw_only=True):
 
     @property
     def pace(self) -> str:
-        """Whether it keeps up; else how much waits, and for how long where that is known."""
+        """Words for the pace: keeping up, or how much waits, and for how long where that is known."""
         if not self.is_behind:
             return "keeping up"
         seconds = f", about {span(self.waiting / self.rate)}" if self.rate else ""

@@ -184,7 +184,7 @@ class Limiter:
         self._places: dict[tuple[str, int], _LogPlace] = {}
 
     def allows(self, record: logging.LogRecord) -> bool:
-        """Whether to write a record; if not, it is counted."""
+        """Let a record pass, or count it and return False."""
         if record.levelno >= logging.CRITICAL:
             return True
         place = self._places.setdefault((record.pathname, record.lineno), _LogPlace(self._clock()))

@@ -27,7 +27,7 @@ def load(point: EntryPoint, error: type[TsfusionError]) -> Any:
 
 
 def takes(function: Callable[..., Any], option: str) -> bool:
-    """Whether a function has a parameter of that name, or takes any."""
+    """True if a function has a parameter of that name, or takes any."""
     parameters = inspect.signature(function).parameters
     return option in parameters or any(each.kind is each.VAR_KEYWORD for each in parameters.values())
 

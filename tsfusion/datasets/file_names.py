@@ -122,7 +122,7 @@ def _times(names: Sequence[str]) -> NDArray[np.int64] | None:
 
 
 def _counts(steps: NDArray[np.int64]) -> bool:
-    """Whether numbers with these steps count on, holes among them, whatever number is before them."""
+    """True if numbers with these steps count on, with holes or not, after any number before them."""
     return not len(steps) or bool(steps.min() > 0 and np.median(steps) == 1)
 
 

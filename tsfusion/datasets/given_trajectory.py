@@ -78,7 +78,7 @@ def poses_between(
 
 
 def pairs_by_time(path: Path, dataset: Dataset) -> bool:
-    """Whether a scan pairs poses and frames by their times: both have them.
+    """True if a scan pairs poses and frames by their times: both have times.
 
     Frames without times have a scan's nominal ones; as many poses as frames are theirs in order.
     """

@@ -257,12 +257,12 @@ def read_poses(path: Path) -> tuple[NDArray[np.int64] | None, NDArray[np.float64
 
 
 def has_times(path: Path) -> bool:
-    """Whether a trajectory is in TUM's format, or RTAB-Map's."""
+    """True for a trajectory in TUM's format or RTAB-Map's."""
     return _columns(path) in _TUM_COLUMNS
 
 
 def is_log(path: Path) -> bool:
-    """Whether a trajectory is a Redwood `.log`, or nothing that `read_poses` reads."""
+    """True for a Redwood `.log` trajectory, and for a file that `read_poses` cannot read."""
     return _columns(path) not in (*_TUM_COLUMNS, 12, 16)
 
 

@@ -38,7 +38,7 @@ class Backpressure:
 
     @property
     def must_wait(self) -> bool:
-        """Whether the policy lets no keyframe in for now."""
+        """True if the policy lets no keyframe in for now."""
         return self._config.policy == "block" and self._outbox.behind >= self._config.backlog
 
     def put(self, keyframe: Keyframe) -> int | None:
@@ -219,7 +219,7 @@ class SpoolLimits:
         self._look_due = self._retry_due = 0.0
 
     def is_full(self, nbytes: int) -> bool:
-        """Whether the spool would pass its own limit with so many bytes more."""
+        """True if the spool would pass its own limit with `nbytes` more."""
         used, *_ = self._outbox.usage()
         if used + nbytes > self._spool_bytes:
             self._outbox.tidy()
@@ -242,7 +242,7 @@ class SpoolLimits:
         self._enter("spool", f"it has reached its limit of {self._spool_bytes} bytes (spool_bytes)")
 
     def disk_refuses(self, nbytes: int) -> bool:
-        """Whether the disk has failed just now, or would have too little left with so many bytes more."""
+        """True if the disk has failed just now, or would have too little left with `nbytes` more."""
         now = time.monotonic()
         if now < self._retry_due:
             return True

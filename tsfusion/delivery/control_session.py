@@ -81,7 +81,7 @@ class ControlSession:
 
     @property
     def held(self) -> bool:
-        """Whether the server wants nothing for now."""
+        """True if the server wants nothing for now."""
         return self._held_until > 0
 
     @property
@@ -317,7 +317,7 @@ class ControlSession:
         return moved
 
     def _is_foreign(self, durable: int) -> bool:
-        """Whether somebody else sends under our session; then nothing the server has of it is of ours."""
+        """Refuse our session if somebody else sends under it. Returns True then: no record of it is ours."""
         foreign = self._outbox.is_foreign(durable)
         if foreign:
             self._refuse(

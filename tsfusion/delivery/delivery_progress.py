@@ -104,11 +104,11 @@ class DeliveryProgress:
         return keyframes, answered, len(corrections)
 
     def is_correction(self, seq: int) -> bool:
-        """Whether a record that the server has is a correction."""
+        """True if a record that the server has is a correction."""
         return seq in self._corrections
 
     def is_fused(self, seq: int) -> bool:
-        """Whether the map has answered a record that the server has."""
+        """True if the map has answered a record that the server has."""
         return seq <= self.fused and seq in self._durable
 
     @property

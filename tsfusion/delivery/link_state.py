@@ -40,7 +40,7 @@ class LinkState(Struct, frozen=True):
 
     @property
     def is_connected(self) -> bool:
-        """Whether the server answers and has let this client in."""
+        """True if the server answers and has let this client in."""
         return self.kind in ("connected", "held")
 
     @property

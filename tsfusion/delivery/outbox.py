@@ -149,7 +149,7 @@ class Outbox:
 
     @property
     def spool_is_away(self) -> bool:
-        """Whether the spool's folder is not to be found, or an empty one is in its place."""
+        """True if the spool's folder is not to be found, or an empty one is in its place."""
         return self._spool.is_away
 
     def usage(self) -> tuple[int, int, int]:
@@ -278,7 +278,7 @@ class Outbox:
         return self._outcomes.lose(keyframes, fused, corrections) if keyframes or corrections else ""
 
     def is_foreign(self, durable: int) -> bool:
-        """Whether the server has records of this session that were never sent from here."""
+        """True if the server has records of this session that were never sent from here."""
         with self._lock:
             return durable > max(self._perhaps_sent, self._used_before)
 
@@ -377,25 +377,25 @@ class Outbox:
 
     @property
     def is_durable(self) -> bool:
-        """Whether everything sent is on the server's disk, or was given up."""
+        """True if everything sent is on the server's disk, or was given up."""
         with self._lock:
             return not self._spool.waiting
 
     @property
     def is_fused(self) -> bool:
-        """Whether the map has answered for everything sent."""
+        """True if the map has answered for everything sent."""
         with self._lock:
             return not self._spool.waiting and not self._progress.unfused
 
     @property
     def is_settled(self) -> bool:
-        """Whether the map has everything sent, and each keyframe at its newest pose."""
+        """True if the map has everything sent, and each keyframe at its newest pose."""
         with self._lock:
             return self.is_fused and self._progress.settled >= self._progress.fused
 
     @property
     def is_meshed(self) -> bool:
-        """Whether the mesh shows everything sent."""
+        """True if the mesh shows everything sent."""
         with self._lock:
             return self.is_fused and self._progress.meshed >= self._progress.fused
 

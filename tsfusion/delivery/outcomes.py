@@ -144,7 +144,7 @@ class Outcomes:
         return counts[reason] == 1
 
     def is_rejected(self, seq: int) -> bool:
-        """Whether the map did not take a record, one of the last that it did not take."""
+        """True for one of the last records that the map did not take."""
         return seq in self._rejected_seqs
 
     def stats(self, *, waiting: int, waiting_bytes: int, state: str, corrections_waiting: int) -> ClientStats:

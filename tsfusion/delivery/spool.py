@@ -214,7 +214,7 @@ class Spool:
 
     @property
     def is_away(self) -> bool:
-        """Whether the folder is not to be found, or an empty one is in its place. From any thread."""
+        """True if the folder is not to be found, or an empty one is in its place. From any thread."""
         return self._journal.is_away
 
     def drop(self, durable: int) -> list[Waiting]:

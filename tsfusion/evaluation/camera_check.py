@@ -58,12 +58,12 @@ def centre_doubt(K: Intrinsics | None, shape: tuple[int, ...]) -> str | None:
 
 
 def is_outside(K: Intrinsics, shape: tuple[int, ...]) -> bool:
-    """Whether the principal point is at the image's border or beyond, which no camera's is."""
+    """True if the principal point is at the image's border or beyond, which no camera's is."""
     return _off_centre(K, shape, OUTSIDE)
 
 
 def centre_fits(pairs: Sequence[FramePair], motions: Sequence[Motion], given: Fits) -> bool:
-    """Whether a principal point far from the centre is confirmed: frames fit worse with the likely ones."""
+    """True if a principal point far from the centre is confirmed: frames fit worse with the likely ones."""
     view = pairs[0].first_view
     if view.camera is None:
         return True

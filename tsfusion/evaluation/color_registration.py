@@ -98,7 +98,7 @@ def misplaced_color(frames: Mapping[int, Outlines | None]) -> str | None:
 
 
 def _other_time(seen: Mapping[int, Outlines]) -> str | None:
-    """Whether the colour of the frame after, or before, lies better on the depth."""
+    """Sentence on colour that lies better on the depth of the frame after, or before; None = it does not."""
     neighbours = [(seen[index], seen[index + 1]) for index in seen if index + 1 in seen]
     if len(neighbours) < 2:
         return None
@@ -121,7 +121,7 @@ def _agreement(depth: Outlines, color: Outlines) -> float:
 
 
 def _other_place(seen: list[Outlines]) -> str | None:
-    """Whether the colour lies clearly better on the depth when it is moved or scaled."""
+    """Sentence on colour that lies clearly better on the depth when moved or scaled; None = it does not."""
     if len(seen) < 2:
         return None
     unscaled = _agreement_by_shift(seen, 1.0)
@@ -148,7 +148,7 @@ def _other_place(seen: list[Outlines]) -> str | None:
 
 
 def _is_sure(leads: NDArray[np.floating], least: float) -> bool:
-    """Whether edges agree better elsewhere in nearly all frames, and by more than chance."""
+    """True if edges agree better elsewhere in nearly all frames, and by more than chance."""
     error = float(leads.std(ddof=1)) / np.sqrt(len(leads))
     mean = float(leads.mean())
     return bool(mean > max(least, MIN_ERRORS * error) and (leads > 0).mean() >= MIN_VOTES)

@@ -59,7 +59,7 @@ class DepthView(Protocol):
 
     @property
     def stereo(self) -> bool:
-        """Whether depth is proportional to the focal length."""
+        """True if depth is proportional to the focal length."""
         ...
 
     def deviation(self, points: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -338,13 +338,13 @@ def _camera_report(
 
 
 def _as_likely(other: Fits, best: Fits, given: Fits) -> bool:
-    """Whether other fits explain what was misfit about as well as the best ones do."""
+    """True if other fits explain what was misfit about as well as the best ones do."""
     evidence = np.maximum(other, best) >= MIN_FIT
     return bool((other - given)[evidence].mean() > AS_LIKELY * (best - given)[evidence].mean())
 
 
 def _cannot_improve(pairs: Sequence[FramePair], motions: Sequence[Motion]) -> bool:
-    """Whether small corrections make motions fit hardly better."""
+    """True if small corrections hardly improve the fit of the motions."""
     return share_of_best(fits_of(pairs, motions), best_fits_near(pairs, motions)) >= MIN_SHARE_OF_BEST
 
 

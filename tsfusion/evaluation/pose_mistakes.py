@@ -33,7 +33,7 @@ class Content:
     kitti: bool = False
 
     def holds(self, mistake: str) -> bool:
-        """Whether the dataset holds what a mistake is about."""
+        """True if the dataset holds what a mistake is about."""
         return self.quaternions or not mistake.startswith("quaternion")
 
 

@@ -218,7 +218,7 @@ class Fuser:
 
     @property
     def is_held(self) -> bool:
-        """Whether records wait for one that cannot be read for now."""
+        """True if records wait for one that cannot be read for now."""
         return bool(self._orders)
 
     def go_on(self) -> None:
@@ -328,7 +328,7 @@ class Fuser:
             self._checkpoint()
 
     def _hold(self, error: JournalError) -> bool:
-        """Whether to wait with a record that cannot be read: its folder, its file or the disk may come back.
+        """True if a record that cannot be read is worth waiting for: its folder, file or disk may come back.
 
         When the system refuses to read it for long, another process tries again, and the gateway gives the
         record up after a few of them. One whose segment alone is missing for long is rejected.
@@ -397,7 +397,7 @@ class Fuser:
 
     @property
     def _is_home(self) -> bool:
-        """Whether the folder is the one that was opened: another may be the place of a disk that is away."""
+        """True if the folder is the one that was opened: another may be the place of a disk that is away."""
         try:
             return os.path.samestat(os.stat(self._folder), self._homes[""]) or (self._folder / LOCK).exists()
         except OSError:

@@ -50,12 +50,12 @@ class KeepWindow:
 
     @property
     def is_set(self) -> bool:
-        """Whether there is a bound."""
+        """True if a bound is set."""
         return (self._seconds, self._keyframes, self._radius) != (None, None, None)
 
     @property
     def is_behind(self) -> bool:
-        """Whether keyframes came since the last look."""
+        """True if keyframes came since the last look."""
         return self._is_behind
 
     def note_keyframe(self) -> None:

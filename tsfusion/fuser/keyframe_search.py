@@ -86,7 +86,7 @@ class KeyframeSearch:
         ) and (selection.box is None or self._lies_in(np.array(selection.box).reshape(2, 3), record))
 
     def _lies_in(self, corners: NDArray[np.float64], record: Record) -> bool:
-        """Whether the sensor was in the box, and so is nearly all that it measured."""
+        """True if the sensor was in the box, and so is nearly all that it measured."""
         low, high = corners.min(axis=0), corners.max(axis=0)
         try:
             keyframe = codec.decode_keyframe(record.frames)

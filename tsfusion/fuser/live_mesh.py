@@ -158,7 +158,7 @@ class LiveMesh:
 
     @property
     def refine_waits(self) -> bool:
-        """Whether viewers have cells that do not yet show the surface that the settings ask for."""
+        """True if viewers have cells that do not yet show the surface that the settings ask for."""
         return len(self._unrefined) > 0
 
     @property

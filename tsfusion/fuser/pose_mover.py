@@ -147,7 +147,7 @@ class PoseMover:
                 raise
 
     def _waits_for(self, error: JournalError, move: Move) -> bool:
-        """Whether a record that cannot be read may be, later: its folder, file or disk may come back."""
+        """True if a record that cannot be read may be, later: its folder, file or disk may come back."""
         if not error.temporary:
             return False
         now = time.monotonic()
@@ -162,7 +162,7 @@ class PoseMover:
         return now - self._held_since < _PATIENCE_S
 
     def _is_deleted(self, segment: int) -> bool:
-        """Whether a segment was deleted to keep the journal to its limit: then a later one is the first."""
+        """True if a segment was deleted to keep the journal to its limit: then a later one is the first."""
         try:
             return any(number > segment for number in journal.segments(self._folder)[:1])
         except JournalError:

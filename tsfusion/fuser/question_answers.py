@@ -144,11 +144,11 @@ class QuestionAnswers:
 
     @property
     def _keyframes_wait(self) -> bool:
-        """Whether one is under way, or something is ordered."""
+        """True if a keyframe is under way, or something is ordered."""
         return bool(self._inbox.orders) or self._at_work.is_set
 
     def _may(self) -> bool:
-        """Whether the time of a question has come: keyframes that wait have had theirs."""
+        """True if the time of a question has come: keyframes that wait have had theirs."""
         return not self._keyframes_wait or not self._share.wait(1e-6, time.monotonic())
 
     def _answer(self, asked: FuserQuestion, frames: list[memoryview]) -> None:

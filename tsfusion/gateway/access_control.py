@@ -100,7 +100,7 @@ class AccessControl:
 
     @property
     def limits_maps(self) -> bool:
-        """Whether there is a client that may not use every map."""
+        """True if some client may not use every map."""
         return self._allowed is not None and self._allowed.limits_maps
 
     def maps_of(self, client: str) -> AllowedMaps:
@@ -110,7 +110,7 @@ class AccessControl:
         )
 
     def may_forget_all(self, client: str) -> bool:
-        """Whether a client may forget keyframes of others, too: without keys everybody may."""
+        """True if a client may forget keyframes of others, too: without keys everybody may."""
         return self._allowed is None or client == SERVER or self._allowed.may_forget_all(client)
 
     def close(self) -> None:

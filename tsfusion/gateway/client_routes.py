@@ -55,7 +55,7 @@ class ClientRoute(Struct, eq=False):
         return self.map, self.session
 
     def open_to(self, client: str) -> bool:
-        """Whether a client may go on with the session: it is its own, or the other client is long silent."""
+        """True if a client may go on with the session: its own, or one whose client is long silent."""
         return self.client == client or time.monotonic() - self.last_message >= ABANDONED_AFTER
 
     def update(self, ping: Ping) -> None:
@@ -65,7 +65,7 @@ class ClientRoute(Struct, eq=False):
         self.offset_ns, self.bound_ns = (ping.offset_ns, ping.bound_ns) if possible else (None, 0)
 
     def state(self, now: float) -> ClientState:
-        """Whether the client is there (`time.monotonic()`)."""
+        """State of the client at `now` (`time.monotonic()`)."""
         silence = now - self.last_message
         if self.left or silence >= ABANDONED_AFTER:
             return "gone"
@@ -243,6 +243,6 @@ class Admission:
         return "this key may only watch" if client == GUEST else maps.denial(map_name)
 
     def owns(self, sessions: Sessions, key: bytes, client: str) -> bool:
-        """Whether a client may go on with a session: no other client has journaled it, or is connected."""
+        """True if a client may go on with a session: no other client has journaled it, or is connected."""
         session, route = sessions.get(key), self._routes.get(key)
         return (session is None or session.belongs_to(client)) and (route is None or route.open_to(client))

@@ -75,7 +75,7 @@ class ConnectionLimits:
         self._ports.cut_off(first)
 
     def all_must_go(self, uncounted: int) -> bool:
-        """Whether every connection has to be made anew: a key was revoked, or they hold too much memory.
+        """True if every connection must be made anew: a key was revoked, or they hold too much memory.
 
         ZeroMQ limits a frame and a queue of whole messages, not a message that never ends.
 

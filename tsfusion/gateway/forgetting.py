@@ -60,7 +60,7 @@ class Request:
         self.erased = self.quarantined = 0
 
     def is_answered(self, in_map: Callable[[bytes], int]) -> bool:
-        """Whether the fuser has answered every record that was found; `in_map` as of `Forgetting.step`."""
+        """True if the fuser has answered every record that was found; `in_map` as of `Forgetting.step`."""
         return all(
             in_map(one.session) >= max(np.frombuffer(one.seqs, np.int64), default=0)
             for one in self.found.sessions

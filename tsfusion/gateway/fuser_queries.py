@@ -114,7 +114,7 @@ class FuserQueries:
         return ""
 
     def _has_memory_for(self, maps: list[str]) -> bool:
-        """Whether meshes of these maps, as large as their last, may be added to the unread ones."""
+        """True if meshes of these maps, as large as their last, may be added to the unread ones."""
         waiting = self._unread.nbytes
         if not waiting and len(maps) == 1:
             return True

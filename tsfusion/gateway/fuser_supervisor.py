@@ -220,7 +220,7 @@ class FuserSupervisor:
 
     @property
     def idle(self) -> bool:
-        """Whether the process is ready and has answered every keyframe that was handed out."""
+        """True if the process is ready and has answered every keyframe that was handed out."""
         return self.ready and not self.in_flight
 
     @property
@@ -230,7 +230,7 @@ class FuserSupervisor:
 
     @property
     def wants_work(self) -> bool:
-        """Whether another keyframe may be handed out."""
+        """True if another keyframe may be handed out."""
         return self.ready and not self.finishing and len(self.in_flight) < _MAX_IN_FLIGHT
 
     def send(self, message: fuser_messages.ToFuser, frames: Sequence[zmq.Frame] = ()) -> bool:
@@ -294,7 +294,7 @@ class FuserSupervisor:
         return message, frames
 
     def ended(self) -> bool:
-        """Whether the process has ended; one that hangs is killed here."""
+        """Kill a process that hangs. Returns True once the process has ended."""
         if self._process.status is not None:
             return True
         busy = bool(self.in_flight) or self._finish_sent
@@ -389,7 +389,7 @@ class FuserSupervisor:
 
     @property
     def finished_well(self) -> bool:
-        """Whether the process has ended with its checkpoint on the disk."""
+        """True if the process has ended with its checkpoint on the disk."""
         return self.finishing and self._process.status == 0
 
     def close(self, *, wait: bool = True) -> None:

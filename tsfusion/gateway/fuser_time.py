@@ -40,7 +40,7 @@ class FuserTime:
         return max(account.taken, self._now), account.expected
 
     def has_room_for(self, client: str) -> bool:
-        """Whether a record of a client may wait in the fuser's queue."""
+        """True if a record of a client may wait in the fuser's queue."""
         ahead = sum(seconds for _, seconds in self._charged.values())
         return not self._charged or ahead + self._account(client).expected <= _AHEAD
 

@@ -248,7 +248,7 @@ class Gateway:
             self._greetings.on_ping(identity.bytes, message, client, self.epoch)
 
     def _opens(self, name: str) -> bool:
-        """Whether a map is here and its fuser will soon be ready."""
+        """True if a map is here and its fuser will soon be ready."""
         hosted = self.maps.get(name)
         return hosted is not None and not hosted.fuser.ready and not hosted.fuser.failed
 
@@ -408,5 +408,5 @@ class Gateway:
 
 
 def all_blocked(maps: dict[str, MapHealth]) -> bool:
-    """Whether no map takes and fuses keyframes: one that does is a reason to go on sending to this server."""
+    """True if no map takes and fuses keyframes: one that does is a reason to go on sending to this server."""
     return bool(maps) and all(one.problem for one in maps.values())

@@ -111,12 +111,12 @@ class HostedMap:
 
     @property
     def is_saved(self) -> bool:
-        """Whether the checkpoint that it was to leave with is written, or cannot be."""
+        """True if the checkpoint for the map's departure is written, or cannot be."""
         return self.checkpoints.is_answered
 
     @property
     def takes_records(self) -> bool:
-        """Whether it is known what the map has, and it stays here.
+        """True if the content of the map is known, and the map stays here.
 
         Its fuser has read that, or there was nothing, or the server from which it came said it.
         """
@@ -124,7 +124,7 @@ class HostedMap:
 
     @property
     def is_empty(self) -> bool:
-        """Whether it is known that the map has nothing, and never had."""
+        """True if the map is known to have nothing, and never to have had any."""
         is_known = self.warm or self.records.is_new
         return is_known and not (len(self.sessions) or self.outcomes.blocks or self.outcomes.taken)
 
@@ -135,7 +135,7 @@ class HostedMap:
 
     @property
     def drained(self) -> bool:
-        """Whether the map has every keyframe of the journal, where the newest correction of it says."""
+        """True if the map has every keyframe of the journal, each at its newest corrected pose."""
         return self.fuser.idle and self.backlog.is_empty and not self.outcomes.moves.waiting
 
     @property
@@ -145,11 +145,11 @@ class HostedMap:
 
     @property
     def settled(self) -> bool:
-        """Whether the map is drained, or will not be soon: its fuser cannot be kept alive, or read."""
+        """True if the map is drained, or will not be soon: its fuser cannot be kept alive, or read."""
         return self.drained or bool(self.fuser.failed or self.fuser.held) or self.disk.is_away
 
     def idle_since(self, since: float) -> bool:
-        """Whether no keyframe waits, nor came since then (`time.monotonic()`)."""
+        """True if no keyframe waits, nor came after `since` (`time.monotonic()`)."""
         return self.drained and (self.last_keyframe is None or self.last_keyframe < since)
 
     def close(self, *, wait: bool = True) -> None:

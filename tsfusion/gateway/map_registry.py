@@ -121,7 +121,7 @@ class MapRegistry:
     # --- other servers ---
 
     def has(self, name: str) -> bool:
-        """Whether a map is open here, and not an empty one."""
+        """True if a map is open here and not empty."""
         hosted = self.get(name)
         return hosted is not None and not hosted.is_empty
 
@@ -385,7 +385,7 @@ class MapRegistry:
 
     @property
     def warm(self) -> bool:
-        """Whether every open map can take keyframes, but for those whose fusers wait."""
+        """True if every open map can take keyframes, but for those whose fusers wait."""
         return all(hosted.warm for hosted in self._begun)
 
     @property
@@ -395,12 +395,12 @@ class MapRegistry:
 
     @property
     def drained(self) -> bool:
-        """Whether every map that has begun has every keyframe of its journal."""
+        """True if every map that has begun has every keyframe of its journal."""
         return all(hosted.drained for hosted in self._begun)
 
     @property
     def settled(self) -> bool:
-        """Whether every map that has begun is drained, or never will be."""
+        """True if every map that has begun is drained, or never will be."""
         return all(hosted.settled for hosted in self._begun)
 
     def finish(self) -> bool:
@@ -412,7 +412,7 @@ class MapRegistry:
 
     @property
     def finished_well(self) -> bool:
-        """Whether every checkpoint is on the disk."""
+        """True if every checkpoint is on the disk."""
         return all(hosted.fuser.finished_well for hosted in self._begun)
 
     def close(self) -> None:

@@ -51,7 +51,7 @@ class PendingReplies:
         self._trackers: dict[bytes, tuple[zmq.MessageTracker, int]] = {}
 
     def pending(self, reader: bytes) -> bool:
-        """Whether an earlier reply still waits for this reader. None waits for a reader that disconnected."""
+        """True if an earlier reply still waits for this reader. None waits for a reader that disconnected."""
         self._forget()
         return reader in self._trackers
 

@@ -89,7 +89,7 @@ class Ports:
         return self._sockets["viewers"]
 
     def is_served(self, socket: sockets.AnySocket) -> bool:
-        """Whether a socket of these is not being made anew."""
+        """True unless the socket is being made anew."""
         return all(self._sockets[name] is not socket for name in self._unbound)
 
     def bind(self) -> Addresses:
@@ -116,7 +116,7 @@ class Ports:
 
     @property
     def grants_topics(self) -> bool:
-        """Whether viewers get only what `grant_topics` says."""
+        """True if viewers get only what `grant_topics` says."""
         return self._is_manual
 
     def grant_topics(self, topics: Iterable[bytes]) -> None:
@@ -130,7 +130,7 @@ class Ports:
             self.viewers.setsockopt(zmq.UNSUBSCRIBE, topic)
 
     def knows_viewer(self, *, after_rubbish: bool = False) -> bool:
-        """Whether topics would be granted to the viewer whose message was received last.
+        """True if topics would be granted to the viewer whose message was received last.
 
         ZeroMQ takes subscriptions that wait behind rubbish for others' than those that sent them, until none
         waits.
@@ -281,5 +281,5 @@ class Subscriptions:
         self._denied.clear()
 
     def watched(self, topic: bytes) -> bool:
-        """Whether any viewer gets what is published under a map's topic."""
+        """True if any viewer gets what is published under a map's topic."""
         return any(topic.startswith(wanted) for wanted in self._granted)

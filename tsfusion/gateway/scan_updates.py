@@ -75,7 +75,7 @@ class ScanUpdates:
             self._publish(topic, msgspec.structs.replace(scanned, late=True), picture)
 
     def _take(self, picture: Any) -> bool:
-        """Whether there is room for a picture, which is its own then."""
+        """Take room for a picture. Returns False if there is none."""
         if self._room.wait(len(picture), time.monotonic()):
             return False
         self._room.spend(len(picture))

@@ -39,7 +39,7 @@ class Session(Struct, eq=False):
         return self.client or self.key.hex()
 
     def belongs_to(self, client: str) -> bool:
-        """Whether a client may go on with the session. One that came without keys is anyone's."""
+        """True if a client may go on with the session. One that came without keys is anyone's."""
         return not self.client or not client or self.client == client
 
 
@@ -70,11 +70,11 @@ class Sessions:
         return self._by_key.get(key)
 
     def room_for(self, key: bytes) -> bool:
-        """Whether a key has a session, or may still get one."""
+        """True if a key has a session, or may still get one."""
         return key in self._by_key or len(self) < _MAX_SESSIONS
 
     def shares_frame(self, key: bytes, record: Hello | RecordHeader) -> bool:
-        """Whether what a session sends is, or is declared to be, in the coordinate frame of this map."""
+        """True if a session's records are, or are declared to be, in the coordinate frame of this map."""
         is_known = not self._all or key in self._by_key or record.world in self._worlds
         return is_known or record.same_frame
 
@@ -94,7 +94,7 @@ class Sessions:
         return session
 
     def admit(self, key: bytes, seq: int, previous: int, taken: int = 0) -> SeqOrder:
-        """Whether keyframe `seq` may be journaled, when the client has none between `previous` and it.
+        """Order of keyframe `seq`, to be journaled if "next"; the client has none between `previous` and it.
 
         Args:
             taken: the highest seq of the session that is about to be journaled; 0 = none is.

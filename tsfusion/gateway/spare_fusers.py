@@ -27,7 +27,7 @@ class _Spare:
         self.problem = ""  # why it cannot be of use; empty = it can
 
     def fits(self, volume: VolumeConfig) -> bool:
-        """Whether a map with these settings can have the process now."""
+        """True if a map with these settings can have the process now."""
         return self.is_warm and self.volume == volume and self.process.status is None
 
     def receive(self) -> None:

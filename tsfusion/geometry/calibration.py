@@ -80,7 +80,7 @@ class Camera:
 
     @property
     def is_pinhole(self) -> bool:
-        """Whether its images need no undistortion."""
+        """True if the images need no undistortion."""
         return self.model == "pinhole" and not self.skew
 
     def resized(self, size: Size) -> "Camera":

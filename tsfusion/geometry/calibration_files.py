@@ -185,7 +185,7 @@ def _json(text: str) -> Any:
 
 
 def _is_too_large(text: str) -> bool:
-    """Whether text is larger or deeper than any calibration: it could crash OpenCV's parser."""
+    """True if text is larger or deeper than any calibration: it could crash OpenCV's parser."""
     if len(text) > _MAX_TEXT or re.search(rf"^ {{{_MAX_INDENTATION}}}", text, re.MULTILINE):
         return True
     depth = 0

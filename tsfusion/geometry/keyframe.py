@@ -397,7 +397,7 @@ def check_pose(pose: Any, *, farthest: float = MAX_TRANSLATION) -> NDArray[np.fl
 
 
 def are_far(points: NDArray[np.floating]) -> bool:
-    """Whether all returns of (n, 3) points are beyond `FAR` along an axis; False = there are none."""
+    """True if all returns of (n, 3) points are beyond `FAR` along an axis; False if there are none."""
     if not len(points) or np.abs(points[0]).max() <= FAR:
         return False
     away = np.abs(points).max(axis=1)

@@ -67,7 +67,7 @@ def quick_disparity(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArra
 
 
 def exchanged(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> bool:
-    """Whether a rectified pair's images are surely each other's: far more pixels match when exchanged."""
+    """True if a rectified pair's images are surely each other's: far more pixels match when exchanged."""
     as_given, swapped = (
         np.mean(quick_disparity(*pair) > _SURE_DISPARITY) for pair in ((left, right), (right, left))
     )
@@ -112,7 +112,7 @@ def _match(matcher: Any, left: NDArray[np.uint8], right: NDArray[np.uint8], sear
 
 
 def _agree(left: NDArray[np.int16], right: NDArray[np.int16], tolerance: float) -> NDArray[np.bool_]:
-    """Whether the right image's disparity, at the pixel the left one points to, is the same: (H, W)."""
+    """True where the right image's disparity, at the pixel the left one points to, is the same: (H, W)."""
     height, width = left.shape
     pixel = np.empty((height, width, 2), np.int16)
     pixel[..., 0] = np.arange(width) - (left + UNITS // 2) // UNITS

@@ -132,7 +132,7 @@ class HeldSensor:
 
     @property
     def is_known(self) -> bool:
-        """Whether any pose was added."""
+        """True if any pose was added."""
         return bool(self._sums[1, 3])
 
     @property

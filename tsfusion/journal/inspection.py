@@ -95,7 +95,7 @@ class JournalInfo(Struct, kw_only=True):
 
 
 class JournalVerdict(Struct, kw_only=True):
-    """Whether a journal is whole. `lost`: keyframes that cannot be had any more, at least."""
+    """Verdict on a journal, intact or not. `lost`: keyframes that cannot be had any more, at least."""
 
     path: str
     intact: bool

@@ -297,7 +297,7 @@ class KeyframePoses:
         return min((one.segments[0] for one in self._sessions.values() if one.segments), default=0)
 
     def is_forgotten(self, session: bytes, seq: int) -> bool:
-        """Whether the server was told to forget a keyframe."""
+        """True if the server was told to forget a keyframe."""
         return session in self._sessions and seq in self._sessions[session].forgotten
 
     def unknown(self) -> Iterator[tuple[bytes, int]]:

@@ -35,7 +35,7 @@ def location(text: str) -> Path:
 
 
 def is_url(path: Path) -> bool:
-    """Whether a path is a URL's."""
+    """True for the path of a URL."""
     return not isinstance(path, Path)
 
 

@@ -85,7 +85,7 @@ class Record(Struct, frozen=True):
 
     @property
     def is_correction(self) -> bool:
-        """Whether the message is a correction, by its first bytes."""
+        """True for a correction, by the first bytes of the message."""
         return bool(self.frames) and is_correction(self.frames[0])
 
     @property
@@ -124,7 +124,7 @@ class ChunkHead(NamedTuple):
 
     @property
     def is_sound(self) -> bool:
-        """Whether this can be the head of a keyframe's chunk: all its lengths agree."""
+        """True if this can be the head of a keyframe's chunk: all its lengths agree."""
         table = _RECORD.size + 4 * self.frame_count
         return (
             self.opcode == Opcode.CHUNK
@@ -253,7 +253,7 @@ class SegmentChunk(NamedTuple):
 
     @property
     def is_ours(self) -> bool:
-        """Whether this version can read the segment."""
+        """True if this version can read the segment."""
         return self.layout == _SEGMENT_MAGIC
 
 

@@ -99,7 +99,7 @@ class OpenSegment:
 
     @property
     def is_in_place(self) -> bool:
-        """Whether its path leads to it; raises OSError when the system does not say."""
+        """True if the path leads to this file; raises OSError when the system does not say."""
         try:
             there = os.stat(self.path)
         except (FileNotFoundError, NotADirectoryError):
@@ -108,7 +108,7 @@ class OpenSegment:
 
     @property
     def is_deleted(self) -> bool:
-        """Whether no path at all leads to it any more."""
+        """True if no path at all leads to this file any more."""
         return os.fstat(self._descriptor).st_nlink == 0
 
     def put_back(self) -> Iterator[None]:

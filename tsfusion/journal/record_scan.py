@@ -79,7 +79,7 @@ def journal_error(verb: str, path: Path, error: OSError) -> JournalError:
 
 
 def _was_index(raw: bytes) -> bool:
-    """Whether these bytes, one of them perhaps damaged, are an index and not the start of a record."""
+    """True if these bytes, one of them perhaps damaged, are an index and not the start of a record."""
     return mcap_layout.INDEX_START[:1] == raw[:1] or mcap_layout.INDEX_START[1:9] == raw[1:9]
 
 
@@ -221,14 +221,14 @@ class _RecordScan:
         return behind if is_there and behind <= self._end else end
 
     def _is_zero(self, at: int, end: int | None = None) -> bool:
-        """Whether nothing was ever written there: a file may grow before its bytes reach the disk."""
+        """True if nothing was ever written there: a file may grow before its bytes reach the disk."""
         end = self._end if end is None else end
         starts = range(at, end, _WINDOW_BYTES)
         rest = any(self._source.read(start, _WINDOW_BYTES, end).strip(b"\0") for start in starts)
         return not rest and not self._source.failed
 
     def _ends_behind(self, at: int) -> bool:
-        """Whether the file's last bytes are behind a place: it was closed, and has grown since."""
+        """True if the mark of a closed file is behind a place: the file has grown since."""
         magic, size = mcap_layout.MAGIC, self._source.size
         count = _WINDOW_BYTES + len(magic) - 1
         return any(magic in self._source.read(start, count) for start in range(at, size, _WINDOW_BYTES))

@@ -65,7 +65,7 @@ def export(place: JournalPlace, out: Path, watch: Watcher, *, clouds: bool = Fal
 
 
 def _is_one(path: Path) -> bool:
-    """Whether a file that is there is a journal's segment."""
+    """True for an existing file that is a journal's segment and not empty."""
     return path.is_file() and durable_files.size_of(path) > 0 and is_segment(path)
 
 

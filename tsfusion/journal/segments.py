@@ -52,7 +52,7 @@ def segments(folder: Path) -> list[int]:
 
 
 def is_away(folder: Path, home: os.stat_result | None) -> bool:
-    """Whether a folder of segments is not to be found, or an empty one is in its place: it may come back.
+    """True if a folder of segments is not to be found, or an empty one is in its place: it may come back.
 
     Args:
         home: of the folder as it was; None = it was not there.
@@ -109,7 +109,7 @@ def read_at(path: Path, offset: int) -> Record:
 
 
 def has_another(folder: Path, session: bytes, seq: int, position: Position, *, until_ns: int) -> bool:
-    """Whether a journal has another record where it had this one. Damage and missing files show nothing.
+    """True if a journal has another record where it had this one. Damage and missing files show nothing.
 
     Args:
         until_ns: when the journal had it: one that was logged later begins a journal anew.
@@ -221,7 +221,7 @@ def describe(path: Path, damage: Damage) -> str:
 
 
 def is_segment(path: Path) -> bool:
-    """Whether an `.mcap` file is a journal's, damaged or not, and no recording of another program."""
+    """True for an `.mcap` file of a journal, damaged or not, and False for another program's recording."""
     if path.suffix != ".mcap":
         return False
     try:
@@ -234,7 +234,7 @@ def is_segment(path: Path) -> bool:
 
 
 def is_closed(path: Path) -> bool:
-    """Whether a segment ends with an index, as normal MCAP readers need it; False when it cannot be read."""
+    """True if a segment ends with an index, as normal MCAP readers need it; False when it cannot be read."""
     try:
         with SegmentFile(path) as source:
             return segment_file.read_segment_end(source).state == "whole"

@@ -54,7 +54,7 @@ def map_names(state: str | Path) -> list[str]:
 
 
 def holds_a_map(folder: Path) -> bool:
-    """Whether a map's folder holds more than its lock: a record, a checkpoint, or what a person put there.
+    """True if a map's folder holds more than its lock: a record, a checkpoint, or what a person put there.
 
     Raises:
         JournalError: when it cannot be listed.
@@ -68,7 +68,7 @@ def holds_a_map(folder: Path) -> bool:
 
 
 def holds_records(folder: Path) -> bool:
-    """Whether a map's folder holds a checkpoint, or a segment of a journal that is not empty.
+    """True if a map's folder holds a checkpoint, or a segment of a journal that is not empty.
 
     Raises:
         JournalError: when it cannot be listed.
@@ -159,7 +159,7 @@ class JournalPlace(Struct, frozen=True):
 
     @property
     def is_a_maps(self) -> bool:
-        """Whether it is a map's journal, of which segments are deleted oldest first alone."""
+        """True for a map's journal, of which segments are deleted oldest first alone."""
         beside = self.path.parent
         is_there = (beside / MAP_FILE).exists() or (beside / LOCK_FILE).exists()
         return self.quarantine is not None or (self.path.name == JOURNAL_FOLDER and is_there)
@@ -220,7 +220,7 @@ def find_journal(path: Path, map_name: str | None = None) -> JournalPlace:
 
 
 def is_journal(path: Path) -> bool:
-    """Whether there is something to read at a path that `find_journal` takes.
+    """True if there is something to read at a path that `find_journal` takes.
 
     Raises:
         JournalError: when a folder cannot be listed.

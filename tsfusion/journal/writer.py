@@ -315,7 +315,7 @@ class Journal:
 
     @property
     def is_away(self) -> bool:
-        """Whether the folder is not to be found, or an empty one is in its place. From any thread."""
+        """True if the folder is not to be found, or an empty one is in its place. From any thread."""
         return is_away(self.folder, self._home)
 
     def _strange_folder(self) -> JournalError:

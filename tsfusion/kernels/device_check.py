@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Whether a device computes as the map needs it: atomics on int64, and float64 as on the CPU."""
+"""Check that a device computes as the map needs it: atomics on int64, and float64 as on the CPU."""
 
 import numpy as np
 
@@ -24,7 +24,7 @@ def _roots(values: F64):
 
 
 def is_exact() -> bool:
-    """Whether sums, the largest of numbers, and rounded quotients of roots come out as NumPy has them."""
+    """True if sums, the largest of numbers, and rounded quotients of roots come out as NumPy has them."""
     sums = ti.ndarray(ti.i64, (2,))
     sums.fill(0)
     _sum_and_largest(sums, _ADDED, _STEP)

@@ -117,7 +117,7 @@ def winner_place(key, table: ti.template()):
 
 @ti.func
 def is_winner(i, listed: ti.template(), winners: ti.template()):
-    """Whether a block is to be listed among the missing ones from place i: nearly always from one place."""
+    """True if a block is to be listed among the missing ones from place i: nearly always from one place."""
     key = missing_key(listed, i)
     first, second = winners[winner_place(key, 0)], winners[winner_place(key, 1)]
     found = 1
@@ -130,7 +130,7 @@ def is_winner(i, listed: ti.template(), winners: ti.template()):
 
 @ti.func
 def shares_place(k, places: ti.template(), claims: ti.template()):
-    """Whether the k-th missing block may share its place in the hash with another one."""
+    """True if the k-th missing block may share its place in the hash with another one."""
     return ti.cast(claims[places[k, HASH_PLACE] & (CLAIMS - 1)] > 1, ti.i32)
 
 

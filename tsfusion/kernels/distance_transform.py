@@ -39,7 +39,7 @@ def value_at(values: ti.template(), shape, at):
 
 @ti.func
 def is_site(values: ti.template(), shape, at, own):
-    """Whether a surface is within half a voxel, or between the voxel and a neighbour no nearer to it."""
+    """True if a surface is within half a voxel, or between the voxel and a neighbour no nearer to it."""
     found = 0
     if ti.abs(own) <= 0.5:
         found = 1
@@ -56,7 +56,7 @@ def is_site(values: ti.template(), shape, at, own):
 
 @ti.func
 def is_rim(values: ti.template(), shape, at, own):
-    """Whether a body ends at a voxel with nothing seen beside it, and no neighbour leads to a surface.
+    """True if a body ends at a voxel with nothing seen beside it, and no neighbour leads to a surface.
 
     So it is at the edge of a table in a slice through its top: its surface is above, not beside.
     """

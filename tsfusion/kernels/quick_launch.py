@@ -96,7 +96,7 @@ class QuickLaunch:
 
 
 def _is_known(argument: Any) -> bool:
-    """Whether an argument is an array or a number; a vector is made of the numbers of an array."""
+    """True for an array or a number; a vector is made of the numbers of an array."""
     annotation = argument.annotation
     numbers = ti.types.primitive_types.type_ids
     return isinstance(annotation, ti.types.ndarray_type.NdarrayType) or id(annotation) in numbers

@@ -74,7 +74,7 @@ def most_rays(height: int, width: int) -> int:
 
 
 def are_given(sums: object) -> bool:
-    """Whether a kernel has made sums of columns (`column_sums`, `color_sums`) for a function to use."""
+    """True if a kernel has made sums of columns (`column_sums`, `color_sums`) for a function to use."""
     return sums is not None
 
 
@@ -320,7 +320,7 @@ def take_nearest(model: ti.template(), unit, depths: ti.template(), cell, rest: 
 
 @ti.func
 def is_supported(image: ti.template(), confidence: ti.template(), reading, cell, layer):
-    """Whether one of the eight neighbours of a layer's only sample has nearly the same depth."""
+    """True if one of the eight neighbours of a layer's only sample has nearly the same depth."""
     v, u = cell.top + layer.sum_y, cell.left + layer.sum_x
     found = 0
     for k in range(9):

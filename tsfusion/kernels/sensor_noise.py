@@ -86,7 +86,7 @@ def layer_depth(model: ti.template(), z):
 
 @ti.func
 def in_reach(p):
-    """Whether the voxels around p (voxels) have keys."""
+    """True if the voxels around p (voxels) have keys."""
     limit = ti.cast(VOXEL_LIMIT - 64, ti.f64)
     return ti.abs(p[0]) < limit and ti.abs(p[1]) < limit and ti.abs(p[2]) < limit
 

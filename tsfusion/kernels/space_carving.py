@@ -226,7 +226,7 @@ def moved(place, steps, x, y, z):
 
 @ti.func
 def look(place, steps, side, reach, levels: ti.template(), base, least: ti.template(), most: ti.template()):
-    """Whether a cube of `side` voxels, the first of them at a place, is hidden, clear, or may be clear in
+    """State of a cube of `side` voxels, the first of them at a place: hidden, clear, or maybe clear in
     part. Numbers of squares begin at `base`."""
     nearest, farthest = NO_SAMPLE, -NO_SAMPLE
     left, right, top, bottom = 1e9, -1e9, 1e9, -1e9

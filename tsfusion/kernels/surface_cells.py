@@ -165,7 +165,7 @@ def find_around(
 
 @ti.func
 def is_between(r, x, j, around: ti.template(), values: ti.template(), behind, clear):
-    """Whether cell j of a plane lies between a voxel that is `clear` and one far `behind` a surface (quanta).
+    """True if cell j of a plane lies between a voxel that is `clear` and one far `behind` a surface (quanta).
 
     Sensors looked through the one, and it is known what hides the other: no surface was measured in between,
     or its voxels would be near it.

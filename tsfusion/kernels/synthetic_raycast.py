@@ -77,7 +77,7 @@ def to_local(p, cosine, sine):
 
 @ti.func
 def may_meet(solids: ti.template(), s, o, d):
-    """Whether the line passes the ball around a solid: cheaper than `solid_ray`, never wrong about a miss."""
+    """True if the line meets the ball around a solid: cheaper than `solid_ray`, never wrong about a miss."""
     kind = ti.i32(solids[s, 0])
     to_center = vec3(solids[s, 1], solids[s, 2], solids[s, 3]) - o
     half = vec3(solids[s, 4], solids[s, 5], solids[s, 6])

@@ -146,7 +146,7 @@ def pixel(K: ti.template(), p):
 
 @ti.func
 def is_inside(at, height, width):
-    """Whether a pixel can be read between its neighbours."""
+    """True if a pixel can be read between its neighbours."""
     return at.x >= 1.0 and at.y >= 1.0 and at.x < width - 2.0 and at.y < height - 2.0
 
 

@@ -128,7 +128,7 @@ def write_ray(
 
 @ti.func
 def is_apart(rays: ti.template(), r, other):
-    """Whether two rays begin neither in one block nor in blocks side by side."""
+    """True if two rays begin neither in one block nor in blocks side by side."""
     step = abs((ray_vector(rays, r, VOXEL) >> 3) - (ray_vector(rays, other, VOXEL) >> 3))
     return ti.max(step[0], step[1], step[2]) > 1
 

@@ -47,7 +47,7 @@ def held(value, slot, o, color_rgn: ti.template(), hits: ti.template(), layers):
 def is_clear(
     key, slot, shows_surface: ti.template(), keys: ti.template(), slots: ti.template(), counts: ti.template()
 ):
-    """Whether a block is free as a whole: a keyframe looks through it, and its voxels show no surface."""
+    """True if a block is free as a whole: a keyframe looks through it, and its voxels show no surface."""
     found = 0
     if slot < 0 or shows_surface[slot] == 0:
         own = map_find(keys, slots, keys.shape[0] - 1, key)

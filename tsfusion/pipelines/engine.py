@@ -112,7 +112,7 @@ class Engine:
             )
 
     def _wait(self, reached: Callable[[ClientStats], bool], timeout: float) -> bool:
-        """Whether it was reached; False = nothing has moved for `timeout` seconds. Logs why, once."""
+        """Wait for `reached`. Returns False if nothing has moved for `timeout` seconds. Logs why, once."""
         last, moved, logged = (-1, -1, -1), time.monotonic(), False
         while True:
             stats = self.check()

@@ -199,6 +199,6 @@ def map_of(
 
 
 def _is_of_server(saved: Path) -> bool:
-    """Whether a map says how far it is with the journal beside it; one that was put there does not."""
+    """True if a map says how far it is with the journal beside it; one that was put there does not."""
     with checkpoint.reading(saved) as (header, _):
         return "done" in header.meta

@@ -318,7 +318,7 @@ class _MapPair:
             )
 
     def is_rival(self, one: _JudgedTransform, best: _JudgedTransform) -> bool:
-        """Whether an answer is another than the best, and about as good."""
+        """True if an answer differs from the best and is about as good."""
         return (
             one.fit.overlap >= _RIVAL * best.fit.overlap
             and one.looks.contradicted <= best.looks.contradicted + _RIVAL_CONTRADICTED

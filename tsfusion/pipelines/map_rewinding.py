@@ -145,7 +145,7 @@ class RewoundMap:
 
     @property
     def is_there(self) -> bool:
-        """Whether the map is the one after `target` keyframes."""
+        """True if the map is the one after `target` keyframes."""
         return self._way == "on" and not self._to_remove and not _steps(self._now, self.target)
 
     def keyframes_in(self) -> dict[bytes, tuple[NDArray[np.int64], Poses]]:
@@ -227,7 +227,7 @@ class RewoundMap:
 
     @property
     def knows_clients(self) -> bool:
-        """Whether it is known whose keyframes touched each block last, as far as the journal has them."""
+        """True if the clients that touched each block last are known, as far as the journal has them."""
         is_smoothed = self.header.config.checked_model().regularizer != "off"  # nothing may be taken away
         return self._touched_again is None or is_smoothed or len(self.sessions) < 2
 
@@ -279,7 +279,7 @@ class RewoundMap:
 
 
 def _may_come(history: map_history.SessionHistory | None, seq: int) -> bool:
-    """Whether a keyframe that is not in a saved map can come: the map did not refuse it."""
+    """True if a keyframe that is not in a saved map can come: the map did not refuse it."""
     return history is None or seq > history.last or seq in history.taken_out
 
 

@@ -41,7 +41,7 @@ class Finishing:
 
     @property
     def is_nothing(self) -> bool:
-        """Whether a mesh stays as it is."""
+        """True if a mesh stays as it is."""
         return self == Finishing()
 
     def apply(self, mesh: Mesh) -> tuple[Mesh, dict[str, Any]]:

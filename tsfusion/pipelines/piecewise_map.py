@@ -98,7 +98,6 @@ class PiecewiseMap:
 
     @property
     def _is_raw(self) -> bool:
-        """Whether the raw surface is the one that the map asks for."""
         return self._map.header.config.checked_model().surface == "raw"
 
     def _take(self, volume: Volume) -> None:

@@ -238,7 +238,7 @@ class Target:
             self.child.check()
 
     def has_map(self, map_name: str) -> bool:
-        """Whether a map is open; a new one is made for its first record."""
+        """True if a map is open; a new one is made for its first record."""
         address, control, keys = self.link.address, self.link.control, self.keys
         return map_name in fetch_health(address, control=control, keys=keys).maps
 
@@ -336,7 +336,7 @@ def opened(
 
 
 def _is_saved(folder: Path) -> bool:
-    """Whether a map's last checkpoint has all that its journal holds."""
+    """True if a map's last checkpoint has all that its journal holds."""
     from tsfusion.pipelines import saved_maps  # needs Taichi, which a scanner may lack
 
     try:

@@ -257,7 +257,7 @@ class AskableMap(ReadableMap):
 
     @property
     def knows_free_space(self) -> bool:
-        """Whether the map knows free space that is not near surfaces: all but maps of earlier versions do."""
+        """True if the map knows free space that is not near surfaces: all but maps of earlier versions do."""
         return self.config.space_carving or len(self._store.clear) > 0
 
     def occupancy_slice(

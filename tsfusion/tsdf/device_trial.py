@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Whether a device fuses as the CPU does: tried before a map trusts it, because drivers have errors."""
+"""Check that a device fuses as the CPU does, before a map trusts it: drivers have errors."""
 
 import logging
 from typing import Any
@@ -46,7 +46,7 @@ def device_for(arch: Arch, *, color: bool, hits: bool, smooths: bool) -> DeviceB
 
 
 def agrees(link: DeviceLink) -> bool:
-    """Whether two keyframes, one of them taken away again, make the same map there and on the CPU."""
+    """True if two keyframes, one of them taken away again, make the same map there and on the CPU."""
     runtime.start(None)
     on_cpu = _store(None)
     buffers = RayBuffers(color=True, regularised=False)

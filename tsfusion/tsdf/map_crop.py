@@ -36,7 +36,7 @@ class Part(Struct, frozen=True):
         return Part(self.whole, own, [list(map(int, box)) for box in cut if _overlap(box, box)])
 
     def is_beside(self, other: "Part") -> bool:
-        """Whether both are of one map, and share no voxel."""
+        """True if both parts are of one map, and share no voxel."""
         return self.whole == other.whole and not any(_overlap(a, b) for a in self.boxes for b in other.boxes)
 
 

@@ -57,7 +57,7 @@ class MapDifference:
 
     @property
     def is_same(self) -> bool:
-        """Whether the maps have the same sums and colours."""
+        """True if the maps have the same sums and colours."""
         return not any(count for kind, count in self.blocks.items() if kind != "same")
 
 

@@ -133,7 +133,7 @@ def check_worlds(here: Set[str], there: Set[str], *, same_frame: bool, name: str
 
 
 def are_given(here: Mapping[str, Any], there: Mapping[str, Any]) -> bool:
-    """Whether nothing but poses that were given says that two maps are in one frame: no world, no session."""
+    """True if nothing but given poses says that two maps are in one frame: no world, no session."""
     ours, theirs = (of_clients(sessions(meta)) for meta in (here, there))
     worlds = [{one.world for one in each} or {""} for each in (ours, theirs)]
     names = [{one.session for one in each} for each in (ours, theirs)]

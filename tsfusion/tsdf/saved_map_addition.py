@@ -168,7 +168,7 @@ class _Stream:
 
     @property
     def is_at_chunk(self) -> bool:
-        """Whether nothing of that chunk was taken."""
+        """True if nothing of the current chunk was taken."""
         return self._current().first == self._taken
 
     def _current(self) -> Chunk:

@@ -329,7 +329,7 @@ class Volume(AskableMap):
         return cropped
 
     def _has_content_of(self, other: "Volume") -> bool:
-        """Whether the other map has the same sums; hashed only where the counts do not tell."""
+        """True if the other map has the same sums; hashed only where the counts do not tell."""
         counts = [(one.keyframes, one._store.count) for one in (self, other)]
         return counts[0] == counts[1] and all(
             hash_of(self) == hash_of(other) for hash_of in (Volume.map_hash, Volume.color_hash)

@@ -94,7 +94,7 @@ class PageGuard:
         return None
 
     def is_given(self, path: str) -> bool:
-        """Whether a token is needed, and stands in the address that is asked for."""
+        """True if a token is needed, and stands in the address that is asked for."""
         if self.token is None:
             return False
         given = parse_qs(path.partition("?")[2]).get("token", [""])[0]
@@ -147,7 +147,7 @@ def is_websocket(headers: Headers) -> bool:
 
 
 def _is_from(origins: list[str], host: str) -> bool:
-    """Whether a browser says that a page of `host` sends the request."""
+    """True if a browser says that a page of `host` sends the request."""
     if len(origins) != 1:
         return False
     scheme, _, place = origins[0].lower().partition("://")

@@ -67,7 +67,7 @@ class VertexColors:
 
     @property
     def is_asked_for(self) -> bool:
-        """Whether the values come from elsewhere, later than the triangles."""
+        """True if the values come from elsewhere, later than the triangles."""
         return self.mode in self.values.names
 
     def colors(self, key: Key, tile: Tile) -> NDArray[np.uint8]:

@@ -107,7 +107,7 @@ class AllowList:
 
     @property
     def limits_maps(self) -> bool:
-        """Whether there is a name that may not use every map."""
+        """True if some name may not use every map."""
         return any(maps.patterns is not None for maps in self._maps.values())
 
     def maps_of(self, name: str) -> AllowedMaps:
@@ -115,7 +115,7 @@ class AllowList:
         return self._maps.get(name, AllowedMaps(()))
 
     def may_forget_all(self, name: str) -> bool:
-        """Whether the client of a name may forget keyframes of others, too, in the maps that it may use."""
+        """True if the client of a name may forget keyframes of others, too, in the maps that it may use."""
         return name in self._forget
 
     def rejection_reason(self, key: str) -> str:

@@ -70,7 +70,7 @@ class Connection:
 
     @property
     def gave_up(self) -> bool:
-        """Whether ZeroMQ will not try again: `check` opens a new socket after a while."""
+        """True if ZeroMQ will not try again: `check` opens a new socket after a while."""
         return self._monitor.gave_up
 
     @property
@@ -80,12 +80,12 @@ class Connection:
 
     @property
     def finds_nobody(self) -> bool:
-        """Whether nobody listens, as far as the last attempt to connect shows."""
+        """True if nobody listens, as far as the last attempt to connect shows."""
         return self._monitor.retrying and (self._tried_both or not self._is_name)
 
     @property
     def refused(self) -> bool:
-        """Whether the server has certainly refused this client's key."""
+        """True if the server has certainly refused this client's key."""
         return self._monitor.refused
 
     @property
@@ -160,7 +160,7 @@ class Patience:
         self._ended = 0.0
 
     def has_ended(self, now: float, *, since: float, sign: float) -> bool:
-        """Whether the wait has ended, which then begins anew (all times: `time.monotonic()`).
+        """True if the wait has ended; a new one begins then (all times: `time.monotonic()`).
 
         Args:
             since: when there was something to wait for.

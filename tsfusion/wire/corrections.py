@@ -120,7 +120,7 @@ def forgetting(target: bytes, seqs: Numbers) -> Correction:
 
 
 def is_servers_own(header: RecordHeader) -> bool:
-    """Whether only a server may write such a record."""
+    """True if only a server may write such a record."""
     has_target = isinstance(header, CorrectionHeader) and header.target is not None
     return has_target or header.session == SERVER_SESSION
 

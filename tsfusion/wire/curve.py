@@ -148,7 +148,7 @@ def read_pair(path: Path) -> tuple[str, str]:
 
 
 def is_key(text: str) -> bool:
-    """Whether a text is a key: 40 characters that stand for 32 bytes."""
+    """True for a key: 40 characters that stand for 32 bytes."""
     try:
         return len(z85.decode(text)) == _KEY_BYTES
     except (ValueError, KeyError, struct.error):  # wrong length, other characters, more than 32 bits in five

@@ -48,7 +48,7 @@ class _Sweep:
 
     @property
     def is_first(self) -> bool:
-        """Whether nothing was asked before: the answer is the beginning of everything."""
+        """True if nothing was asked before: the answer is the beginning of everything."""
         return self.is_raw and self.since is None and self.began is None
 
 

@@ -38,12 +38,12 @@ class Selection(Struct, frozen=True, kw_only=True, omit_defaults=True):
 
     @property
     def is_empty(self) -> bool:
-        """Whether nothing is named: it would be every keyframe."""
+        """True if nothing is named, which would be every keyframe."""
         return self == Selection()
 
     @property
     def counts_from_end(self) -> bool:
-        """Whether a time is named as before the last record."""
+        """True if a time is named as before the last record."""
         return any(one is not None and one < 0 for one in (self.since_ns, self.until_ns))
 
     def at_end(self, last_ns: int) -> "Selection":
@@ -53,7 +53,7 @@ class Selection(Struct, frozen=True, kw_only=True, omit_defaults=True):
         return msgspec.structs.replace(self, **past)
 
     def has(self, *, session: bytes, client: str, seq: int, logged_ns: int) -> bool:
-        """Whether a keyframe is selected, as far as that is known without its pose."""
+        """True if a keyframe is selected, as far as that is known without its pose."""
         return (
             session.hex().startswith(self.session)
             and self.client in (None, client)

@@ -185,7 +185,7 @@ def list_pairs(folder: Folder) -> list[Pair]:
 
 
 def has_allow_list(folder: Folder) -> bool:
-    """Whether a folder has an allow-list: whether it is a server's."""
+    """True if a folder has an allow-list, as only a server's has."""
     return os.path.lexists(Path(folder).expanduser() / ALLOWED)
 
 

@@ -86,7 +86,7 @@ class HealthSeen:
 
 @dataclass(frozen=True, eq=False)
 class LinkSeen:
-    """Whether what is watched is there: `problem` says why not, in words; empty = it is."""
+    """Presence of what is watched: `problem` says why it is away, in words; empty = it is there."""
 
     problem: str
 

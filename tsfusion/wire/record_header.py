@@ -164,7 +164,7 @@ def unpack_keyframe(frame: Any) -> KeyframeHeader:
 
 
 def is_correction(frame: Any) -> bool:
-    """Whether frame 0 begins as that of a correction; the rest of it is not looked at."""
+    """True if frame 0 begins as that of a correction; the rest of it is not looked at."""
     return bytes(memoryview(frame)[:MAGIC_BYTES]) == _MAGIC[CorrectionHeader]
 
 

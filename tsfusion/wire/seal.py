@@ -30,7 +30,7 @@ def seal(message: bytes) -> bytes:
 
 
 def is_damaged(message: Any) -> bool:
-    """Whether a message (any bytes-like object) carries a seal that does not fit it.
+    """True if a message (any bytes-like object) carries a seal that does not fit it.
 
     A seal whose mark is changed counts, too: without it nobody would look whether the rest is as it was sent.
     """

@@ -136,7 +136,7 @@ def topics_of(map_name: str) -> list[bytes]:
 
 
 def is_topic(topic: bytes) -> bool:
-    """Whether a subscription is for what comes of one map or of all maps; no other is allowed."""
+    """True if a subscription is for what comes of one map or of all maps; no other is allowed."""
     return any(kind.startswith(topic) for kind in _KINDS) or _MAPS_TOPIC.fullmatch(topic) is not None
 
 
@@ -178,7 +178,7 @@ def _make(
 
 
 def has_message(made: AnySocket) -> bool:
-    """Whether a message can be read at once: asking costs a tenth of an exception."""
+    """True if a message can be read at once: asking costs a tenth of an exception."""
     waiting: Any = made.getsockopt(zmq.EVENTS)
     return bool(waiting & zmq.POLLIN)
 
@@ -229,7 +229,7 @@ def _ip(host: str) -> IPv4Address | IPv6Address | None:
 
 
 def is_name(address: str) -> bool:
-    """Whether the host of an address is a name, which may stand for an IPv4 and an IPv6 address."""
+    """True if the host of an address is a name, which may stand for an IPv4 and an IPv6 address."""
     return _ip(parse_address(address)[0]) is None
 
 
@@ -302,7 +302,7 @@ def check_own_machine(address: str) -> None:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether a host, name or number, is this machine."""
+    """True if a host, name or number, is this machine."""
     found = _ip(host)
     return host == "localhost" if found is None else found.is_loopback
 

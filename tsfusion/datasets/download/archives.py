@@ -18,7 +18,7 @@ _SUFFIXES = (".tar.gz", ".tar.bz2", ".tar.xz", ".tgz", ".tbz2", ".txz", ".tar", 
 
 
 def is_archive(path: Path) -> bool:
-    """Whether the name is an archive's: `.zip`, `.tar` and its compressed kinds."""
+    """True if the name is an archive's: `.zip`, `.tar` and its compressed kinds."""
     return path.name.lower().endswith(_SUFFIXES)
 
 

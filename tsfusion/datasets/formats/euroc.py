@@ -32,7 +32,7 @@ _TRUTH = "state_groundtruth_estimate0/data.csv"
 
 
 def recognises(path: Path) -> bool:
-    """Whether the folder has `mav0/cam0/data.csv`, or is `mav0` itself."""
+    """True for a folder with `mav0/cam0/data.csv`, and for `mav0` itself."""
     return any((root / "cam0" / "data.csv").is_file() for root in (path / "mav0", path))
 
 

@@ -20,7 +20,7 @@ EXPECTED = "NNNNNN/points.bin (float32 x, y, z) and graph.txt (`vK tx ty tz qx q
 
 
 def recognises(path: Path) -> bool:
-    """Whether the folder has numbered folders with `points.bin`."""
+    """True for a folder that has numbered folders with `points.bin`."""
     return any(file.parent.name.isdecimal() for file in path.glob("*/points.bin"))
 
 

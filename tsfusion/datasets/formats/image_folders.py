@@ -270,6 +270,6 @@ def _number(name: str) -> int | None:
 
 
 def _counts_on(numbers: Sequence[int | None]) -> bool:
-    """Whether numbers are consecutive ones, in any order."""
+    """True if numbers are consecutive, in any order."""
     there = [number for number in numbers if number is not None]
     return len(there) == len(numbers) == len(set(there)) == max(there) - min(there) + 1

@@ -40,7 +40,7 @@ EXPECTED = "sequences/NN/{calib.txt,times.txt,image_0,image_1,velodyne} and pose
 
 
 def recognises(path: Path) -> bool:
-    """Whether the folder is the benchmark's root or one of its sequences."""
+    """True for the benchmark's root and for each of its sequences."""
     return any((path / "sequences").glob("*/calib.txt")) or _is_sequence(path)
 
 

@@ -33,7 +33,7 @@ _ALONG = 0.9  # cosine of the angle between axes that point forward
 
 
 def recognises(path: Path) -> bool:
-    """Whether it is a drive, or a day's folder that holds some."""
+    """True for a drive, and for a day's folder that holds drives."""
     return _is_drive(path) or bool(_drives(path))
 
 

@@ -50,7 +50,7 @@ class _ListedFrame:
 
 
 def recognises(path: Path) -> bool:
-    """Whether it is such a file, or a folder with a `transforms.json`."""
+    """True for a `.json` file with `transforms` in its name, and for a folder with a `transforms.json`."""
     if path.is_file():
         return path.suffix == ".json" and "transforms" in path.name
     return (path / "transforms.json").is_file()

@@ -48,21 +48,21 @@ _FEWEST = 2  # images of a series
 
 
 def recognises_hololens(path: Path) -> bool:
-    """Whether the folder has `K.txt`, `depth/`, and `poses.txt` or `images/`."""
+    """True for a folder with `K.txt`, `depth/`, and `poses.txt` or `images/`."""
     if not (path / "K.txt").is_file() or not (path / "depth").is_dir():
         return False
     return (path / "poses.txt").is_file() or (path / "images").is_dir()
 
 
 def recognises_redwood(path: Path) -> bool:
-    """Whether the folder has depth images and a trajectory; or the file is a `.log` of such a folder."""
+    """True for a folder with depth images and a trajectory, and for a `.log` file of such a folder."""
     if path.is_file():
         return path.suffix == ".log" and _root_of(path) is not None
     return bool(_depth_folders(path)) and _log(path) is not None
 
 
 def recognises_plain(path: Path) -> bool:
-    """Whether the folder has one of depth images and one of colour images, or both in one."""
+    """True for a folder with one of depth images and one of colour images, or with both in one."""
     if _depth_folders(path):
         return _color_folder(path) is not None
     return bool(_beside(path))
@@ -195,7 +195,7 @@ def _partner(depth: Path, files: dict[str, Path]) -> Path | None:
 
 
 def _is_deep(file: Path) -> bool:
-    """Whether a PNG image has one channel of 16 bits, by its header; others say what they hold when read."""
+    """True for a PNG image of one 16-bit channel, by its header, and for other formats, judged when read."""
     if file.suffix.lower() != ".png":
         return True
     try:

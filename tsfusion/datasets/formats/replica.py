@@ -21,7 +21,7 @@ _CAMERA = PublishedCamera("NICE-SLAM's Replica", Intrinsics(600.0, 600.0, 599.5,
 
 
 def recognises(path: Path) -> bool:
-    """Whether the folder has `results/depth*.png`."""
+    """True for a folder with `results/depth*.png`."""
     return any((path / "results").glob("depth*.png"))
 
 

@@ -48,7 +48,7 @@ log = logging.getLogger(__name__)
 
 
 def recognises(path: Path) -> bool:
-    """Whether the folder has scans, or the file is a cloud."""
+    """True for a folder with scans, and for a file that is a point cloud."""
     is_cloud = path.is_file() and path.suffix.lower() in SUFFIXES[1:] and not _is_mesh(path)
     return is_cloud or bool(_all_series(path))
 
@@ -195,7 +195,7 @@ def _all_series(root: Path) -> list[_Series]:
 
 
 def _is_mesh(file: Path) -> bool:
-    """Whether a PLY file says at its start that it has faces."""
+    """True for a PLY file whose header declares faces."""
     if file.suffix.lower() != ".ply":
         return False
     try:

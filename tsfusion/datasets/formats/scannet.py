@@ -25,7 +25,7 @@ _PLACES = ("intrinsic/intrinsic_{}.txt", "intrinsics_{}.txt", "intrinsic_{}.txt"
 
 
 def recognises(path: Path) -> bool:
-    """Whether the folder has `depth/` and the depth camera's 4×4 matrix in `intrinsic/` or by `pose/`."""
+    """True for a folder with `depth/` and the depth camera's 4×4 matrix in `intrinsic/` or beside `pose/`."""
     own = (path / "intrinsic").is_dir() or (path / "pose").is_dir()
     return own and (path / "depth").is_dir() and _camera_file(path, "depth") is not None
 

@@ -36,7 +36,7 @@ NOT_MEASURED = 65535  # the original release marks invalid depth so; 0 in re-enc
 
 
 def recognises(path: Path) -> bool:
-    """Whether the folder, or a sequence in it, holds `frame-*.depth.png`."""
+    """True for a folder that holds `frame-*.depth.png`, itself or in a sequence."""
     return any(_frames(sequence, "depth.png") for sequence in _sequences(path))
 
 
@@ -126,7 +126,7 @@ def _pose(depth: Path) -> Transform | None:
 
 
 def _is_own(root: Path) -> bool:
-    """Whether it is a scene of 7-Scenes, or a sequence of one; their names alone are anybody's."""
+    """True for a scene of 7-Scenes or a sequence of one; names alone, free for anybody, decide nothing."""
     root = root.resolve()
     names = root.parts[-3:]
     scene = next((place for place in (root, root.parent) if _SCENES.fullmatch(place.name)), None)

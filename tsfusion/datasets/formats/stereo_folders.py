@@ -21,7 +21,7 @@ _SIDES = ("left", "right")
 
 
 def recognises(path: Path) -> bool:
-    """Whether the folder has `left/` and `right/`, with images."""
+    """True for a folder with images in `left/` and in `right/`."""
     return all((path / side).is_dir() and bool(images(path / side, EXPECTED)) for side in _SIDES)
 
 

@@ -50,7 +50,7 @@ _BENCHMARKS = (
 
 
 def recognises(path: Path) -> bool:
-    """Whether the folder has `depth.txt` or one of the lists of pairs."""
+    """True for a folder with `depth.txt` or one of the lists of pairs."""
     return any((path / name).is_file() for name in ("depth.txt", *ASSOCIATIONS))
 
 

@@ -43,17 +43,17 @@ class ImageTopic(NamedTuple):
 
     @property
     def is_depth(self) -> bool:
-        """Whether these are depth images, by their encoding."""
+        """True for depth images, by their encoding."""
         return messages.is_depth(self.first) and not _NO_COLOR.search(self.base)
 
     @property
     def is_color(self) -> bool:
-        """Whether these are images of visible light, in colour or grey."""
+        """True for images of visible light, in colour or grey."""
         return not messages.is_depth(self.first) and not _NO_COLOR.search(self.base)
 
     @property
     def is_gray(self) -> bool:
-        """Whether these have one channel."""
+        """True for images of one channel."""
         return messages.encoding(self.first) in ("mono8", "8UC1")
 
 
@@ -168,7 +168,7 @@ class Cameras:
         return next((one for one in found.values() if len(found) == 1 and self._is_of(one, images)), None)
 
     def _is_of(self, info: Stream, images: ImageTopic) -> bool:
-        """Whether the only CameraInfo may be that of some images: it names no other frame than theirs."""
+        """True if the only CameraInfo may be that of some images: it names no other frame than theirs."""
         message = self._recording.first(info)
         frame = "" if message is None else frame_id(message)
         return not frame or not images.frame or frame == images.frame or bool(REGISTERED.search(images.base))
@@ -280,7 +280,7 @@ class Cameras:
 
 
 def _is_beside(info_topic: str, base: str) -> bool:
-    """Whether a CameraInfo is of these images alone: in their topic's own folder."""
+    """True if a CameraInfo is of these images alone: in their topic's own folder."""
     place = base.rpartition("/")[0]
     return info_topic.startswith((f"{place}/", f"{base}/"))
 

@@ -38,7 +38,7 @@ _DIFFERENCE_S = {"depth": 0.02, "stereo": 0.005, "lidar": 0.0}
 
 
 def recognises(path: Path) -> bool:
-    """Whether it is a ROS recording or a folder with one. A tsfusion journal, MCAP too, is none."""
+    """True for a ROS recording or a folder with one; False for a tsfusion journal, MCAP too."""
     return recording(path) is not None
 
 

@@ -72,7 +72,7 @@ def encoding(message: Any) -> str:
 
 
 def is_depth(message: Any) -> bool:
-    """Whether an Image or CompressedImage holds 16-bit or floating-point pixels."""
+    """True if an Image or CompressedImage holds 16-bit or floating-point pixels."""
     return encoding(message) in DEPTH_ENCODINGS
 
 

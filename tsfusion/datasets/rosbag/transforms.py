@@ -130,11 +130,11 @@ class TransformTree:
         return chain
 
     def moves(self, frame: str) -> bool:
-        """Whether a transform between the frame and its root changes."""
+        """True if a transform between the frame and its root changes."""
         return any(not self._edges[one].is_constant for one in self.ancestors(frame)[:-1])
 
     def is_dynamic(self, frame: str) -> bool:
-        """Whether a transform between the frame and its root was sent on /tf, not only on /tf_static."""
+        """True if a transform between the frame and its root was sent on /tf, not only on /tf_static."""
         chain = self.ancestors(frame)
         return any((parent, child) in self._dynamic for child, parent in pairwise(chain))
 

@@ -28,7 +28,7 @@ def corners(gray: NDArray[np.uint8], count: int, *, mask: NDArray[np.uint8] | No
 
 
 def stronger_than_noise(gray: NDArray[np.uint8], pixels: Pixels) -> NDArray[np.bool_]:
-    """Whether corners stand out of the image's noise: (n, 2) → (n,).
+    """True where a corner stands out of the image's noise: (n, 2) → (n,).
 
     The noise is estimated after Immerkær ("Fast noise variance estimation", 1996), by the median, so that
     plain walls count.

@@ -230,7 +230,7 @@ def _lost(frame: Frame, reason: str) -> Lost:
 
 
 def _is_upright(points: Points, voxel: float) -> NDArray[np.bool_]:
-    """Whether points lie in columns higher than the ground: (n, 3) → (n,)."""
+    """True where a point lies in a column higher than the ground: (n, 3) → (n,)."""
     cells = np.floor(points[:, :2] / (COLUMN_WIDTH * voxel)).astype(np.int64)
     _, column = np.unique(cells, axis=0, return_inverse=True)
     lowest, highest = np.full(len(points), np.inf), np.full(len(points), -np.inf)

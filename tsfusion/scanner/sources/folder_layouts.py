@@ -72,7 +72,7 @@ def layout_of(root: Path) -> FolderLayout | None:
 
 
 def is_whole(path: Path, *, settled: bool) -> bool:
-    """Whether a file is complete, by the mark at its end; by its `settled` state where it has none."""
+    """True if a file is complete, by the mark at its end; by its `settled` state where it has none."""
     if path.suffix.lower() in _ENDS:
         with path.open("rb") as file:
             file.seek(max(0, path.stat().st_size - len(_PNG_END)))

@@ -194,7 +194,7 @@ class RealSense(LiveSource):
         )
 
     def _is_complete(self, first: Any, second: Any, *, needed: bool) -> bool:
-        """Whether a frameset has a new first image and a second of the same exposure; count those without.
+        """Check a frameset for a new first image and a second of the same exposure; count those without.
 
         Missing frame numbers were dropped; a set may repeat an image beside the next one of the other stream;
         a number that is much smaller comes from a camera that was restarted.

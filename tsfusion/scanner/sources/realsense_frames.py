@@ -28,7 +28,7 @@ class RealSenseStream(Protocol):
         """Wait for the next frameset; None if there is none in time."""
 
     def over(self) -> bool:
-        """Whether no frameset will follow those that are queued."""
+        """True if no frameset will follow those that are queued."""
 
     def profile(self, stream: Any, index: int = -1) -> Any:
         """Video stream profile in use."""

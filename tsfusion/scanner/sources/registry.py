@@ -19,7 +19,7 @@ _FORMS = "realsense, realsense:SERIAL, realsense:FILE.db3, camera:NUMBER|DEVICE|
 
 
 def is_live(spec: str) -> bool:
-    """Whether `spec` names a live source, of tsfusion or an installed package; otherwise it is a path."""
+    """True if `spec` names a live source, of tsfusion or an installed package; otherwise it is a path."""
     name = spec.partition(":")[0]
     return name in _BUILT_IN or name in entry_points(group=GROUP).names
 

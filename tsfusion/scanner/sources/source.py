@@ -69,11 +69,11 @@ class CloseFlag:
         self._wakeups.put(None)
 
     def is_set(self) -> bool:
-        """Whether it was set."""
+        """True once the flag is set."""
         return self._set
 
     def wait(self, timeout: float) -> bool:
-        """Whether it is set within `timeout` seconds; for one thread at a time."""
+        """Wait up to `timeout` seconds for the flag, in one thread at a time. Returns True if it is set."""
         if not self._set:
             with suppress(queue.Empty):
                 self._wakeups.get(timeout=timeout)

@@ -132,7 +132,7 @@ class WatchedFolder(LiveSource):
         return f"{self._root}: {wanted}; ends {ends}"
 
     def _needs_camera(self) -> bool:
-        """Whether the folder holds no camera yet, and none was given."""
+        """True if the folder holds no camera yet, and none was given."""
         if self._intrinsics is not None or self._calibration is not None:
             return False
         if self._layout is not None and self._layout.kind == "points":

@@ -91,7 +91,7 @@ class LoopConsensus:
         return float(np.sqrt(error @ np.linalg.solve(known + covariance, error)))
 
     def unique(self, place: int) -> bool:
-        """Whether no other place looks like this one."""
+        """True if no other place looks like this one."""
         return place not in self._twins
 
     def withdraw(self, loop: Loop) -> None:
@@ -169,7 +169,7 @@ class LoopConsensus:
             del twins[:-MAX_TWINS]
 
     def _ambiguous(self, loops: list[Loop]) -> bool:
-        """Whether one keyframe's loops leave its pose ambiguous."""
+        """True if one keyframe's loops leave its pose ambiguous."""
         for one, two in itertools.combinations(loops, 2):
             if not self._agree(one, two):
                 self._remember_twin(two, [one])
@@ -177,7 +177,7 @@ class LoopConsensus:
         return any(self._has_twin(loop) for loop in loops)
 
     def _has_twin(self, loop: Loop) -> bool:
-        """Whether the loop's place looks like another one where the keyframe could as well be."""
+        """True if the loop's place looks like another one where the keyframe could as well be."""
         for other, T_other_old in self._twins.get(loop.old, []):
             claim = T_other_old @ loop.T_old_new
             if (

@@ -96,7 +96,7 @@ class PlaceIndex:
 
     @property
     def full(self) -> bool:
-        """Whether a place must be forgotten before another is added."""
+        """True if a place must be forgotten before another is added."""
         return len(self.views) >= self._capacity
 
     def add(self, number: int, view: PlaceView) -> None:

@@ -56,7 +56,7 @@ class PoseHistory:
         return Trajectory(stamps[known], rows[known, :3], rows[known, 3:]).at(stamp_ns, max_gap_ns=max_gap_ns)
 
     def decided(self, stamp_ns: int, *, max_gap_ns: int) -> bool:
-        """Whether later messages cannot change the pose: there is an entry at the time or soon after it."""
+        """True if later messages cannot change the pose: there is an entry at the time or soon after it."""
         right = bisect_left(self._stamps, stamp_ns)
         return right < len(self) and self._stamps[right] - stamp_ns <= max_gap_ns
 

@@ -78,7 +78,7 @@ class PlaneImage:
 
 @lru_cache(maxsize=16)
 def _lattice(shape: tuple[int, int], step: int) -> NDArray[np.bool_]:
-    """Whether blocks are on every `step`-th row and column, (rows·columns,)."""
+    """Mask of the blocks on every `step`-th row and column, (rows·columns,)."""
     row, column = np.indices(shape)
     chosen: NDArray[np.bool_] = ((row % step == step // 2) & (column % step == step // 2)).ravel()
     return chosen
