@@ -143,7 +143,7 @@ class Scanner:
 
     @property
     def is_done(self) -> bool:
-        """Whether the map has what was sent."""
+        """True if the map has what was sent."""
         return self._pipe.poll()
 
     def wait(self) -> None:

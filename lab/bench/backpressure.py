@@ -106,7 +106,7 @@ class Run:
 
     @property
     def done(self) -> bool:
-        """Whether everything that was kept is in the map."""
+        """True if everything that was kept is in the map."""
         return not self._outbox.behind
 
     def close(self) -> None:

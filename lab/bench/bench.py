@@ -344,7 +344,7 @@ def missing(case: Case, arch: str) -> str | None:
 
 
 def has_device(arch: str) -> bool:
-    """Whether a map can be on such a device."""
+    """True if a map can be on such a device."""
     from tsfusion import Volume
 
     return bool(Volume(arch=arch).arch == arch)

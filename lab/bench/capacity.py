@@ -198,7 +198,7 @@ def _alone(rows: list[Row]) -> list[Row]:
 
 
 def _is_pair(row: Row, rows: list[Row]) -> bool:
-    """Whether it is the longest run of two workers."""
+    """True for the longest run of two workers."""
     return bool(row["workers"] == 2 and row["keyframes"] == max(map(_keyframes, rows)))
 
 

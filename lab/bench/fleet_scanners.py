@@ -84,7 +84,7 @@ class Scanner:
 
     @property
     def is_done(self) -> bool:
-        """Whether everything that was captured is durable and fused, and nothing more is captured."""
+        """True if everything captured is durable and fused, and nothing more is captured."""
         taken = len(self.captured_ns)
         return time.monotonic() >= self._end and self.durable >= taken <= len(self.fused_ns) + self.refused
 

@@ -210,7 +210,7 @@ def _localizer(scene: Scene, first: Frame) -> Localizer:
 def _verdict(
     scene: Scene, row: dict[str, Any], before: TrajectoryError, after: TrajectoryError
 ) -> dict[str, Any]:
-    """Whether loops reduce the error, or none was found where all rooms are alike."""
+    """Verdict on loops: they reduce the error, or none was found where all rooms are alike."""
     if "identical" in scene.name:
         return {"bar": "no loop", "reached": row["loops"] == 0}
     return {"bar": "0.3 times", "reached": row["loops"] > 0 and after.rmse <= 0.3 * before.rmse}

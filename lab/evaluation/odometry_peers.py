@@ -119,7 +119,7 @@ class Open3DKeyframes(FrameToFrame):
         return step
 
     def is_far(self, T_key_now: NDArray[np.float64]) -> bool:
-        """Whether the camera is so far from the keyframe that its frame becomes the next one."""
+        """True if the camera is so far from the keyframe that its frame becomes the next one."""
         angle = np.arccos(np.clip((np.trace(T_key_now[:3, :3]) - 1) / 2, -1, 1))
         return bool(np.linalg.norm(T_key_now[:3, 3]) > KEYFRAME[0] or angle > KEYFRAME[1])
 

@@ -276,7 +276,7 @@ def _slow(runs: Sequence[Outcome], what: str) -> Verdict | None:
 
 
 def _explanation(found: Findings, world: PaperWorld) -> Verdict | None:
-    """Whether splitting the work in two explains the gain, or merely bounding the queue."""
+    """Verdict on the gain: explained by splitting the work in two, or merely by bounding the queue."""
     ours, bounded = _live(found, world), _live(found, world, "traditional-bounded")
     unbounded, beside = _live(found, world, "traditional-unbounded"), _live(found, world, "one-machine")
     if not ours or not bounded or not unbounded:
@@ -327,7 +327,7 @@ def _explanation(found: Findings, world: PaperWorld) -> Verdict | None:
 
 
 def _is_good(run: Outcome) -> bool:
-    """Whether a run did all that the paper wants: alive, in time, every keyframe, few frames dropped."""
+    """True if a run did all that the paper wants: alive, in time, every keyframe, few frames dropped."""
     late = run.late / max(run.late + run.frames, 1)
     in_time = run.delay_ms.count > 0 and run.delay_ms.mean <= DELAY_MS and run.delay_ms.p99 <= BOUNDED_P99_MS
     return not run.death and in_time and run.fused == run.planned and late <= LATE_SHARE

@@ -58,7 +58,7 @@ class PaperWorld(Struct, frozen=True, kw_only=True):
 
     @property
     def is_rendered(self) -> bool:
-        """Whether its frames are made up, and its surface is known."""
+        """True if the frames are made up, and the surface is known."""
         return self.source.startswith("synthetic:")
 
     def open(self) -> Dataset:

@@ -293,7 +293,7 @@ def sweep_job(world: PaperWorld, *, quick: bool) -> SweepJob:
 
 
 def _can(peer: str, world: PaperWorld) -> bool:
-    """Whether a system takes what the sensor gives: Open3D takes images only."""
+    """True if a system takes what the sensor gives: Open3D takes images only."""
     return peer == "vdbfusion" or world.sensor != "lidar"
 
 

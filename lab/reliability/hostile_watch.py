@@ -78,7 +78,7 @@ class Watch:
         )
 
     def well(self, since: float) -> bool:
-        """Whether the server answers at once, is ready, and has fused what the first client sent."""
+        """True if the server answers at once, is ready, and has fused what the first client sent."""
         healths = [(one.waited, one.health) for one in self._answers if one.asked >= since and one.health]
         if not healths or (self._asked and time.monotonic() - self._asked > _ANSWERED_S):
             return False

@@ -32,7 +32,7 @@ _LONGEST_S = 300.0  # that a test may take; a fault may make one hang, which is 
 
 
 def is_noticed(root: Path, fault: Fault) -> bool:
-    """Whether the test of a fault fails with the fault in the sources below `root`."""
+    """True if the test of a fault fails with the fault in the sources below `root`."""
     path = root / "tsfusion" / fault.file
     whole = path.read_text(encoding="utf-8")
     if whole.count(fault.old) != 1:
@@ -45,7 +45,7 @@ def is_noticed(root: Path, fault: Fault) -> bool:
 
 
 def fails(root: Path, tests: list[str]) -> bool:
-    """Whether one of some tests fails, or does not end."""
+    """True if one of some tests fails, or does not end."""
     command = [sys.executable, "-m", "pytest", "-x", "-q", "-n0", "-p", "no:cacheprovider"]
     command += [f"tests/{test}" for test in tests]
     environment = {**os.environ, "PYTHONPATH": str(root), "PYTHONDONTWRITEBYTECODE": "1"}
