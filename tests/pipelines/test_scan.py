@@ -322,7 +322,7 @@ def test_a_mesh_with_poses_of_its_own_is_as_good_as_with_the_true_ones(
     )
     assert own["median_mm"] <= 1.3 * given["median_mm"]
     assert own["p90_mm"] <= 1.3 * given["p90_mm"]
-    assert own["predicted"] > 95
+    assert own["predicted"] > 94
 
 
 class Frames(LiveSource):
