@@ -107,7 +107,6 @@ SENSORS: dict[str, SensorModel] = {
         max_range=30.0,
         min_support=6.0,
         max_support=10.0,
-        min_behind=SYMMETRIC,
         smoothness=10.0,
         feedback=True,
         min_weight=0.5,
