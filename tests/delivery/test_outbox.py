@@ -131,7 +131,7 @@ def test_a_rejection_counts_once_and_few_are_remembered(
 
 
 def test_a_rejection_behind_its_acknowledgement_counts_once(tmp_path: Path) -> None:
-    """Who was silent may hear how far its session is, and then what was rejected of it."""
+    """A session that was silent may hear how far it is, and then what was rejected of it."""
     spool = Spool(tmp_path, 1 << 20)
     outbox = Outbox(spool)
     for seq in range(1, 7):

@@ -399,8 +399,9 @@ def _band(truncation: float | None, support: str | None) -> dict[str, float]:
     names = "min_support", "max_support", "min_behind"
     try:
         numbers = support.split(":")
-        found = zip(names[: max(len(numbers), 2)], numbers, strict=True)
-        return {name: float(number) for name, number in found if number or len(numbers) == 2}
+        if len(numbers) == 3 and any(numbers):  # of three, those that are left out stay as they are
+            return {name: float(number) for name, number in zip(names, numbers, strict=True) if number}
+        return dict(zip(names[:2], map(float, numbers), strict=True))
     except ValueError as error:
         raise InvalidConfig(
             f"--support must be LEAST:MOST, such as 3:6, or LEAST:MOST:BEHIND, got {support!r}"

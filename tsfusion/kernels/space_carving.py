@@ -278,8 +278,8 @@ def look(place, steps, side, reach, levels: ti.template(), base, least: ti.templ
 
 @ti.func
 def look_at_middle(place, steps, side, reach, clear: ti.template(), top):
-    """The same of the patch in which the middle of a cube lies alone: what is clear there is hidden or clear
-    as a whole, or partly; what is partly clear there is so. The image's rows begin at `top`."""
+    """State, as of `look`, of the one patch in which the middle of a cube lies: what is clear there is hidden
+    or clear as a whole, or partly; what is partly clear there is so. The image's rows begin at `top`."""
     middle = moved(place, steps, side // 2, side // 2, side // 2)
     inverse = 1.0 / ti.cast(ti.max(middle.depth, 1), ti.f32)
     x, y = ti.cast(middle.column * inverse, ti.i32), ti.cast(middle.row * inverse, ti.i32)

@@ -175,7 +175,7 @@ def _read(
 
 
 def _clear(store: BlockStore, first: NDArray[np.int64], shape: Shape) -> NDArray[np.bool_]:
-    """Which voxels of a box of whole blocks lie in blocks that are free as a whole."""
+    """Mask of the voxels of a box of whole blocks that lie in blocks that are free as a whole."""
     keys, counts = store.clear.counts()
     found, places = np.zeros([side // 8 for side in shape], bool), unpack_keys(keys) - first
     inside = ((places >= 0) & (places < found.shape)).all(axis=1) & (counts > 0)

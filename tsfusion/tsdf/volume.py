@@ -231,7 +231,8 @@ class Volume(AskableMap):
 
         Settled colours (32768 votes) are averaged. Smoothed values fall back to the raw ones in blocks that
         both have. Each journal keeps its own keyframes: a server that goes on with the merged map can add
-        keyframes, and move or remove none of those that are in it.
+        keyframes, and move or remove none of those that are in it. `retract` takes a keyframe of `other` out
+        exactly where both maps have the same settings.
 
         Args:
             other: a map of the same voxel size and layers; it stays as it is.
