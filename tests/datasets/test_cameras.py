@@ -24,7 +24,7 @@ from written_recordings import (
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets import TUM, Redwood, describe, open_dataset, select
 from tsfusion.datasets.cameras import camera_line
-from tsfusion.datasets.formats.sevenscenes import KINECT as SEVEN_SCENES
+from tsfusion.datasets.formats.folder_table import KINECT as SEVEN_SCENES
 from tsfusion.geometry.calibration import Camera
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.scanner.sources.recorded import RecordedSource

@@ -4,7 +4,7 @@
 Any object with `__len__` and `__getitem__` that follows the `Dataset` protocol can be replayed.
 
 Rooms:
-    formats: readers of recording layouts, one file each.
+    formats: readers of recording layouts.
     rosbag: ROS 1 and ROS 2 bags and MCAP files as datasets, without ROS.
     synthetic: worlds with a known surface, rendered as keyframes.
     download: public recordings: downloaded, checked and unpacked.
@@ -16,15 +16,12 @@ from typing import Any
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.dataset import Dataset, Selection, select
 from tsfusion.datasets.formats.euroc import EuRoC
+from tsfusion.datasets.formats.folder_table import HoloLens, Redwood, Replica, ScanNet, SevenScenes
 from tsfusion.datasets.formats.gtsam_points import LidarDump
 from tsfusion.datasets.formats.kitti import KITTI
 from tsfusion.datasets.formats.kitti_raw import KITTIRaw
 from tsfusion.datasets.formats.nerfstudio import Nerfstudio
-from tsfusion.datasets.formats.redwood_hololens import HoloLens, Redwood
-from tsfusion.datasets.formats.replica import Replica
 from tsfusion.datasets.formats.scan_folders import ScanFolder
-from tsfusion.datasets.formats.scannet import ScanNet
-from tsfusion.datasets.formats.sevenscenes import SevenScenes
 from tsfusion.datasets.formats.stereo_folders import StereoFolder
 from tsfusion.datasets.formats.tum import TUM
 from tsfusion.datasets.registry import Found, Layout, describe, find, layouts, open_as, world_layout

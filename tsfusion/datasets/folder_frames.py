@@ -24,7 +24,8 @@ class FolderFrames(Frames):
     """Frames of the files in a folder, with the poses that it has or that somebody gave.
 
     A layout is a class: its attributes say what is usual there, `_list` and `_recorded_poses` what its folder
-    holds. `_files` are the files of the frames that stay, `_kept` their places among all.
+    holds. A folder with one file or folder (a name without a dot) of each of its `signs` is in the layout.
+    `_files` are the files of the frames that stay, `_kept` their places among all.
 
     Args:
         path: the recording's folder.
@@ -40,6 +41,7 @@ class FolderFrames(Frames):
 
     layout = ""
     expected = ""
+    signs: tuple[tuple[str, ...], ...] = ()
     usual_gap_s = 0.2
     guesses = False  # whether it finds a file of poses by its name alone
     _files: list[Any]
@@ -82,6 +84,11 @@ class FolderFrames(Frames):
     def __len__(self) -> int:
         return len(self._files)
 
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """True for a folder in this layout, and for a file that stands for one."""
+        return all(any(_is_there(path, sign) for sign in either) for either in cls.signs)
+
     def _opened(self, path: str | Path, trajectory: str | Path | None) -> tuple[Path, Path | None]:
         """The folder, and the file of poses that was given, which may be named from there."""
         root = require_folder(path, self.layout)
@@ -111,3 +118,7 @@ class FolderFrames(Frames):
             f"poses at most {self._gap_s:g} s apart around the frames' times (--option max_gap_s=SECONDS "
             "takes longer gaps, time_offset_s=SECONDS is added to these times)"
         )
+
+
+def _is_there(root: Path, sign: str) -> bool:
+    return any(path.is_file() if path.suffix else path.is_dir() for path in root.glob(sign))

@@ -18,20 +18,22 @@ from tsfusion.core import plugins
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.dataset import Dataset, Frames
 from tsfusion.datasets.download import archives
-from tsfusion.datasets.formats import (
-    euroc,
-    gtsam_points,
-    kitti,
-    kitti_raw,
-    nerfstudio,
-    redwood_hololens,
-    replica,
-    scan_folders,
-    scannet,
-    sevenscenes,
-    stereo_folders,
-    tum,
+from tsfusion.datasets.folder_frames import FolderFrames
+from tsfusion.datasets.formats import kitti, kitti_raw
+from tsfusion.datasets.formats.euroc import EuRoC
+from tsfusion.datasets.formats.folder_table import (
+    PLAIN_EXPECTED,
+    HoloLens,
+    Redwood,
+    Replica,
+    ScanNet,
+    SevenScenes,
 )
+from tsfusion.datasets.formats.gtsam_points import LidarDump
+from tsfusion.datasets.formats.nerfstudio import Nerfstudio
+from tsfusion.datasets.formats.scan_folders import ScanFolder
+from tsfusion.datasets.formats.stereo_folders import StereoFolder
+from tsfusion.datasets.formats.tum import TUM
 from tsfusion.datasets.given_trajectory import WithTrajectory
 from tsfusion.datasets.rosbag import dataset as rosbag_dataset
 from tsfusion.datasets.rosbag.reader import ENDINGS
@@ -84,35 +86,29 @@ class Found(NamedTuple):
         return open_as(self.layout.name, partial(self.layout.open, self.path), options)
 
 
+def _row(layout: type[FolderFrames], name: str = "", also: str = "") -> Layout:
+    return Layout(name or layout.layout, layout.expected + also, layout.recognises, layout)
+
+
 # In the order in which they are tried: specific layouts first.
 BUILT_IN = (
-    Layout("EuRoC", euroc.EXPECTED, euroc.recognises, euroc.EuRoC),
+    _row(EuRoC),
     Layout("KITTI odometry", kitti.EXPECTED, kitti.recognises, kitti.open_kitti),
     Layout("KITTI raw", kitti_raw.EXPECTED, kitti_raw.recognises, kitti_raw.KITTIRaw),
-    Layout("7-Scenes", sevenscenes.EXPECTED, sevenscenes.recognises, sevenscenes.SevenScenes),
-    Layout("ScanNet", scannet.EXPECTED, scannet.recognises, scannet.ScanNet),
-    Layout("Replica", replica.EXPECTED, replica.recognises, replica.Replica),
-    Layout("nerfstudio", nerfstudio.EXPECTED, nerfstudio.recognises, nerfstudio.Nerfstudio),
-    Layout("LiDAR keyframes", gtsam_points.EXPECTED, gtsam_points.recognises, gtsam_points.LidarDump),
-    Layout("TUM RGB-D", f"{tum.EXPECTED} (also CoRBS, ICL-NUIM)", tum.recognises, tum.TUM),
-    Layout("HoloLens", redwood_hololens.HOLOLENS_EXPECTED, redwood_hololens.recognises_hololens,
-           redwood_hololens.HoloLens),
-    Layout("Redwood", redwood_hololens.REDWOOD_EXPECTED, redwood_hololens.recognises_redwood,
-           redwood_hololens.Redwood),
+    _row(SevenScenes),
+    _row(ScanNet),
+    _row(Replica),
+    _row(Nerfstudio),
+    _row(LidarDump),
+    _row(TUM, "TUM RGB-D", " (also CoRBS, ICL-NUIM)"),
+    _row(HoloLens),
+    _row(Redwood),
     Layout("ROS bag", rosbag_dataset.EXPECTED, rosbag_dataset.recognises, rosbag_dataset.Bag),
-)  # fmt: skip
-# Tried where no other layout fits.
-PLAIN = (
-    Layout(
-        "RGB-D folders",
-        redwood_hololens.PLAIN_EXPECTED,
-        redwood_hololens.recognises_plain,
-        redwood_hololens.Redwood,
-    ),
-    Layout("stereo folders", stereo_folders.EXPECTED, stereo_folders.recognises, stereo_folders.StereoFolder),
 )
+# Tried where no other layout fits.
+PLAIN = (Layout("RGB-D folders", PLAIN_EXPECTED, Redwood.recognises_plain, Redwood), _row(StereoFolder))
 # Tried where nothing there is in any other: points beside a recording are often made of it.
-SCANS = (Layout("LiDAR scans", scan_folders.EXPECTED, scan_folders.recognises, scan_folders.ScanFolder),)
+SCANS = (_row(ScanFolder),)
 SYNTHETIC = (
     "synthetic",
     "no files: synthetic:WORLD, or synthetic:WORLD:SENSOR; worlds: room (also -untextured, -plain, -bare), "

@@ -31,11 +31,6 @@ EXPECTED = "mav0/{cam0,cam1}/{data.csv,sensor.yaml,data/*.png} and mav0/state_gr
 _TRUTH = "state_groundtruth_estimate0/data.csv"
 
 
-def recognises(path: Path) -> bool:
-    """True for a folder with `mav0/cam0/data.csv`, and for `mav0` itself."""
-    return any((root / "cam0" / "data.csv").is_file() for root in (path / "mav0", path))
-
-
 class EuRoC(PairedImages, FolderFrames):
     """Stereo pairs in the ASL layout, undistorted and rectified by `sensor.yaml`.
 
@@ -54,6 +49,7 @@ class EuRoC(PairedImages, FolderFrames):
     """
 
     layout, expected, sensor = "EuRoC", EXPECTED, "stereo"
+    signs = (("mav0/cam0/data.csv", "cam0/data.csv"),)
     quaternions = True
 
     def __init__(

@@ -19,11 +19,6 @@ from tsfusion.geometry.trajectory import rigid
 EXPECTED = "NNNNNN/points.bin (float32 x, y, z) and graph.txt (`vK tx ty tz qx qy qz qw` a line)"
 
 
-def recognises(path: Path) -> bool:
-    """True for a folder that has numbered folders with `points.bin`."""
-    return any(file.parent.name.isdecimal() for file in path.glob("*/points.bin"))
-
-
 class LidarDump(FolderFrames):
     """Clouds in the LiDAR's axes with the pose of each in the world's.
 
@@ -32,6 +27,7 @@ class LidarDump(FolderFrames):
     """
 
     layout, expected, sensor = "LiDAR keyframes", EXPECTED, "lidar"
+    signs = (("[0-9]*/points.bin",),)
     quaternions = True
 
     def _list(self, root: Path) -> tuple[list[Path], Times]:

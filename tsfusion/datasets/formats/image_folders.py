@@ -2,10 +2,10 @@
 """Base of layouts with depth images in one folder and colour images in another."""
 
 import logging
-import re
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -13,11 +13,13 @@ from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets import depth_files
-from tsfusion.datasets.cameras import MILLIMETRES, RecordedCamera, find_camera
+from tsfusion.datasets.cameras import MILLIMETRES, PublishedCamera, RecordedCamera, find_camera
+from tsfusion.datasets.dataset import SCAN, NoPoses, Poses, Times
 from tsfusion.datasets.depth_files import check_metres, read_depth
 from tsfusion.datasets.file_names import in_order, numbers_in, series_of
 from tsfusion.datasets.folder_frames import FolderFrames
-from tsfusion.datasets.readers import read_color
+from tsfusion.datasets.readers import read_color, read_lines
+from tsfusion.datasets.trajectory_files import read_matrix, read_matrix_rows, usable
 from tsfusion.geometry.calibration import Size
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
@@ -29,6 +31,72 @@ SUFFIXES = (".png", ".jpg", ".jpeg")
 _SIZES = 3  # images that tell the size of all
 _FIRST_TRIES = 50  # images that cannot be read and none that can: so it is with all
 COLOR = ("color", "colour", "rgb", "image", "images")  # folders beside depth/, by preference
+
+
+class ImagesAt(NamedTuple):
+    """Images of one kind in a layout: their folders by preference, and their names without suffix.
+
+    In a name {} stands for what all files of a frame share.
+    """
+
+    places: tuple[str, ...]
+    name: str = "{}"
+
+    def folders(self, root: Path) -> list[Path]:
+        """Folders of the first place that is there; several where it is a pattern."""
+        found = ([path for path in _places(root, place) if path.is_dir()] for place in self.places)
+        return next(filter(None, found), [])
+
+    def files(self, root: Path, expected: str, suffixes: tuple[str, ...]) -> list[Path]:
+        """Images in the order of the numbers in their names; no hidden files."""
+        where = next(iter(self.folders(root)), root / self.places[0])
+        return _files(where, expected, self.name.format("*" if self.name != "{}" else "[!.]*"), suffixes)
+
+    def shared(self, stem: str) -> str:
+        """Part of an image's name that the other files of its frame share."""
+        before, after = self.name.split("{}")
+        return stem.removeprefix(before).removesuffix(after)
+
+
+class PoseRows(NamedTuple):
+    """A file of one 4×4 matrix a line: of the image of its number, else of the k-th image."""
+
+    file: str
+    by_number: bool = False
+
+    def read(self, root: Path, files: list[Path], images: ImagesAt) -> Poses:
+        """The pose of each image; raises NoPoses where the file is missing."""
+        path = root / self.file
+        if not path.exists():
+            raise NoPoses(f"{path} is missing; expected 16 numbers a line; {SCAN}")
+        poses = read_matrix_rows(path)
+        if self.by_number:
+            return poses_by_number([file.stem for file in files], [*enumerate(poses)], path)
+        if len(poses) != len(files):
+            raise DatasetError(
+                f"{path} has {len(poses)} poses for {len(files)} depth images; "
+                "expected as many: line k belongs to the k-th image"
+            )
+        return poses
+
+
+class PoseFiles(NamedTuple):
+    """A file of one 4×4 matrix for each image: in a folder of their own, or beside the image."""
+
+    file: str  # {} as of `ImagesAt`
+
+    def read(self, root: Path, files: list[Path], images: ImagesAt) -> Poses:
+        """The pose of each image; None where its file is missing, or a tracker wrote that it was lost."""
+        is_apart = "/" in self.file
+
+        def pose(image: Path) -> Transform | None:
+            path = (root if is_apart else image.parent) / self.file.format(images.shared(image.stem))
+            if not path.exists():
+                return None
+            lost = any("inf" in line.lower() for _, line in read_lines(path, "a 4×4 camera-to-world matrix"))
+            return None if lost else read_matrix(path)
+
+        return usable((root / self.file).parent, files, pose)
 
 
 class DepthReader:
@@ -86,7 +154,8 @@ class DepthReader:
 class DepthImages(DepthReader, FolderFrames):
     """Frames of one depth image each, with colour and a pose where they are recorded.
 
-    Of a layout, `_colors` and `_known_camera` say where colour and camera are, `_registered` how colour fits.
+    A layout is a row of attributes: `depth_at`, `color_at`, `poses_at`, `camera_at` (files of the camera by
+    preference) and `published`. What these cannot say is a method: `_registered` says how colour fits.
 
     Args:
         intrinsics, calibration: of the depth images, instead of a file of the camera in the folder
@@ -101,6 +170,11 @@ class DepthImages(DepthReader, FolderFrames):
     """
 
     sensor = "kinect"
+    depth_at = ImagesAt(("depth",))
+    color_at: ImagesAt | None = None
+    poses_at: PoseRows | PoseFiles
+    camera_at: tuple[str, ...] = ()
+    published: PublishedCamera | None = None
 
     def __init__(
         self,
@@ -119,9 +193,17 @@ class DepthImages(DepthReader, FolderFrames):
         camera = self._find_camera(self._root, first_size(self._files), depth_scale, **given)
         self.use_camera(camera, depth_scale)
 
+    def _list(self, root: Path) -> tuple[list[Any], Times]:
+        return depth_images(root, self.depth_at, self.expected), None
+
+    def _recorded_poses(self, root: Path, files: list[Any]) -> Poses:
+        return self.poses_at.read(root, files, self.depth_at)
+
     def _colors(self, root: Path) -> Sequence[Path | None]:
         """A colour image for each depth image, None where there is none; empty where there is no colour."""
-        return []
+        if self.color_at is None:
+            return []
+        return color_images(self._files, root, (self.depth_at, self.color_at), self.expected)
 
     def _find_camera(self, root: Path, size: Size, depth_scale: float | None, **given: Any) -> RecordedCamera:
         """The camera of the depth images; `given` are intrinsics and calibration."""
@@ -129,7 +211,8 @@ class DepthImages(DepthReader, FolderFrames):
 
     def _known_camera(self, root: Path) -> dict[str, Any]:
         """Where the camera is: `places`, `files` and `published` of `find_camera`."""
-        return {}
+        places = (Path(os.path.normpath(root / file)) for file in self.camera_at)
+        return {"files": [path for path in places if path.is_file()][:1], "published": self.published}
 
     def _frame(self, index: int) -> Frame:
         color = self._color[index] if self._color else None
@@ -166,22 +249,23 @@ def resample_for_camera(
     return seen
 
 
-def images(where: Path, expected: str, pattern: str = "[!.]*") -> list[Path]:
+def images(root: Path, place: str, expected: str) -> list[Path]:
     """The images in a folder, in the order of the numbers in their names; no hidden files."""
-    return _files(where, expected, pattern, SUFFIXES)
+    return ImagesAt((place,)).files(root, expected, SUFFIXES)
 
 
-def depth_images(where: Path, expected: str, pattern: str = "[!.]*") -> list[Path]:
-    """The files of depth in a folder, sorted as `images`; one named otherwise than most is left out.
+def depth_images(root: Path, at: ImagesAt, expected: str) -> list[Path]:
+    """The files of depth in a recording, in order; one named otherwise than most is left out.
 
     Raises:
         DatasetError: they are of several kinds.
     """
-    found = _files(where, expected, pattern, depth_files.SUFFIXES)
+    found = at.files(root, expected, depth_files.SUFFIXES)
     kinds = sorted({path.suffix.lower() for path in found})
     if len(kinds) > 1:
         raise DatasetError(
-            f"{where} holds files of {' and '.join(kinds)}; expected depth of one kind: move the others away"
+            f"{found[0].parent} holds files of {' and '.join(kinds)}; expected depth of one kind: "
+            "move the others away"
         )
     alike = max(series_of(found), key=len, default=found)
     lengths = {len(path.stem) for path in found}
@@ -193,6 +277,10 @@ def depth_images(where: Path, expected: str, pattern: str = "[!.]*") -> list[Pat
         f", with {len(found) - len(alike) - 1} more" * (len(found) > len(alike) + 1), len(alike),
     )  # fmt: skip
     return alike
+
+
+def _places(root: Path, place: str) -> list[Path]:
+    return sorted(root.glob(place)) if "*" in place else [root / place]
 
 
 def _files(where: Path, expected: str, pattern: str, suffixes: tuple[str, ...]) -> list[Path]:
@@ -217,24 +305,29 @@ def first_size(files: Sequence[Path], read: Callable[[Path], NDArray[Any]] = rea
     return max(sizes, key=sizes.count)
 
 
-def color_images(depth: list[Path], where: Path, expected: str, word: str = "") -> list[Path]:
+def color_images(depth: list[Path], root: Path, at: tuple[ImagesAt, ImagesAt], expected: str) -> list[Path]:
     """The colour image of each depth image, by file name; of some it may be missing.
 
     Args:
-        word: at the start of colour's names, where those of depth begin with `depth`; empty = they are equal.
+        at: where depth and colour are; of one folder all of colour may be missing.
 
     Raises:
         DatasetError: of most it is.
     """
-    by_stem = {path.stem: path for path in images(where, expected, f"{word}[!.]*")}
-    stems = [re.sub("^depth", word, image.stem) if word else image.stem for image in depth]
+    deep, colored = at
+    found = colored.files(root, expected, SUFFIXES)
+    if not found and colored.places == deep.places:
+        return []
+    by_stem = {path.stem: path for path in found}
+    stems = [colored.name.format(deep.shared(image.stem)) for image in depth]
     missing = [stem for stem in stems if stem not in by_stem]
+    where = next(iter(colored.folders(root)))
     if 2 * len(missing) > len(depth):
         raise DatasetError(
             f"{where / missing[0]}.png or .jpg is missing, but {depth[0].parent} has its depth; "
             f"expected {expected}"
         )
-    suffix = next(iter(by_stem.values()), where / ".png").suffix
+    suffix = found[0].suffix if found else ".png"
     return [by_stem.get(stem, where / f"{stem}{suffix}") for stem in stems]
 
 

@@ -49,13 +49,6 @@ class _ListedFrame:
     where: str
 
 
-def recognises(path: Path) -> bool:
-    """True for a `.json` file with `transforms` in its name, and for a folder with a `transforms.json`."""
-    if path.is_file():
-        return path.suffix == ".json" and "transforms" in path.name
-    return (path / "transforms.json").is_file()
-
-
 class Nerfstudio(DepthImages):
     """Frames with depth of a nerfstudio or instant-ngp capture.
 
@@ -75,6 +68,14 @@ class Nerfstudio(DepthImages):
     """
 
     layout, expected = "nerfstudio", EXPECTED
+    signs = (("transforms.json",),)
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """True also for a `.json` file with `transforms` in its name."""
+        return super().recognises(path) or (
+            path.is_file() and path.suffix == ".json" and "transforms" in path.name
+        )
 
     def _opened(self, path: str | Path, trajectory: str | Path | None) -> tuple[Path, Path | None]:
         path = Path(path).expanduser()

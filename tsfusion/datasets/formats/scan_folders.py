@@ -47,12 +47,6 @@ _HEADER_BYTES = 1 << 14
 log = logging.getLogger(__name__)
 
 
-def recognises(path: Path) -> bool:
-    """True for a folder with scans, and for a file that is a point cloud."""
-    is_cloud = path.is_file() and path.suffix.lower() in SUFFIXES[1:] and not _is_mesh(path)
-    return is_cloud or bool(_all_series(path))
-
-
 class ScanFolder(FolderFrames):
     """Scans in the LiDAR's axes, each with the LiDAR's pose in the world's where one is known.
 
@@ -79,6 +73,12 @@ class ScanFolder(FolderFrames):
             raise DatasetError(f"fields must be from 3 to 64 numbers a point, got {fields}")
         self._fields, self._deskew = fields, deskew
         super().__init__(path, **options)
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """True for a folder with scans, and for a file that is a point cloud."""
+        is_cloud = path.is_file() and path.suffix.lower() in SUFFIXES[1:] and not _is_mesh(path)
+        return is_cloud or bool(_all_series(path))
 
     def _opened(self, path: str | Path, trajectory: str | Path | None) -> tuple[Path, Path | None]:
         is_cloud = (whole := Path(path)).is_file()

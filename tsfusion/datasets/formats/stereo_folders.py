@@ -20,11 +20,6 @@ EXPECTED = (
 _SIDES = ("left", "right")
 
 
-def recognises(path: Path) -> bool:
-    """True for a folder with images in `left/` and in `right/`."""
-    return all((path / side).is_dir() and bool(images(path / side, EXPECTED)) for side in _SIDES)
-
-
 class StereoFolder(PairedImages, FolderFrames):
     """Pairs of images by name, rectified where they are not, in the axes of the rectified left camera.
 
@@ -42,6 +37,12 @@ class StereoFolder(PairedImages, FolderFrames):
     """
 
     layout, expected, sensor = "stereo folders", EXPECTED, "stereo"
+    signs = (("left",), ("right",))
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """True for a folder with images in `left/` and in `right/`."""
+        return super().recognises(path) and all(images(path, side, EXPECTED) for side in _SIDES)
 
     def __init__(
         self,
@@ -60,7 +61,7 @@ class StereoFolder(PairedImages, FolderFrames):
         )
 
     def _list(self, root: Path) -> tuple[list[tuple[Path, Path]], Times]:
-        left, right = ({file.stem: file for file in images(root / side, EXPECTED)} for side in _SIDES)
+        left, right = ({file.stem: file for file in images(root, side, EXPECTED)} for side in _SIDES)
         pairs = paired(left, right, self.skipped)
         files, times = in_time([left[name] for name in pairs], [*pairs])
         return [pairs[file.stem] for file in files], times

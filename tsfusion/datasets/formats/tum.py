@@ -49,11 +49,6 @@ _BENCHMARKS = (
 )
 
 
-def recognises(path: Path) -> bool:
-    """True for a folder with `depth.txt` or one of the lists of pairs."""
-    return any((path / name).is_file() for name in ("depth.txt", *ASSOCIATIONS))
-
-
 class TUM(DepthImages):
     """Lists of time-stamped images and a trajectory, associated by time.
 
@@ -75,6 +70,7 @@ class TUM(DepthImages):
     """
 
     layout, expected, usual_gap_s = "TUM", EXPECTED, 0.1
+    signs = (("depth.txt", *ASSOCIATIONS),)
     usual_unit = DepthUnit(DEPTH_SCALE, "usual for TUM RGB-D", is_stated=False)
     quaternions = True
 

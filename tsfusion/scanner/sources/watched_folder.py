@@ -21,8 +21,8 @@ from tsfusion.datasets.cameras import (
 )
 from tsfusion.datasets.dataset import UNREADABLE
 from tsfusion.datasets.depth_files import read_depth
+from tsfusion.datasets.formats.folder_table import NOT_MEASURED
 from tsfusion.datasets.formats.image_folders import DepthReader
-from tsfusion.datasets.formats.sevenscenes import NOT_MEASURED
 from tsfusion.datasets.point_times import PointTimes, point_times
 from tsfusion.datasets.readers import read_image
 from tsfusion.datasets.scan_files import read_scan
