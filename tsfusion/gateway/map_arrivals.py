@@ -31,7 +31,6 @@ from tsfusion.gateway import moved_maps
 from tsfusion.gateway.moved_maps import Arrival
 from tsfusion.journal import state_folder
 from tsfusion.wire import messages, sockets
-from tsfusion.wire.connection import Connection
 from tsfusion.wire.curve import ClientKeys
 from tsfusion.wire.map_moves import READ_BYTES, HandOver, MapFile, Moved, Parcel
 from tsfusion.wire.queries import CommandRefused, Exchange, open_connection
@@ -105,11 +104,12 @@ class MapArrival:
                 sockets.open_context() as context,
                 closing(open_connection(context, self.request.source_control, self._keys)) as link,
             ):
-                self.outcome = self._fetch(link)
+                name = f"{self.request.source} (control {link.address})"
+                self.outcome = self._fetch(Exchange(link, name))
         except (TsfusionError, OSError) as error:
             self.outcome = f"map {self.name} did not come: {error}"
 
-    def _fetch(self, link: Connection) -> Moved:
+    def _fetch(self, link: Exchange) -> Moved:
         began = time.monotonic()
         frozen_at = began
         if self._resumed is None:
@@ -125,7 +125,7 @@ class MapArrival:
         now = time.monotonic()
         return Moved(self._own[0], self._copied, round(now - began, 3), round(now - frozen_at, 3))
 
-    def _copy(self, link: Connection) -> float:
+    def _copy(self, link: Exchange) -> float:
         """Copy the map while it lives, then freeze it and copy the rest; when it was frozen."""
         self._wait_until_it_can_leave(link)
         self._copy_what_is_there(link)
@@ -141,7 +141,7 @@ class MapArrival:
             file.write(msgspec.json.encode(arrival))
         return frozen_at
 
-    def _copy_what_is_there(self, link: Connection) -> None:
+    def _copy_what_is_there(self, link: Exchange) -> None:
         """Copy until little is new, and the map was read here: what it takes then is short."""
         began, rounds = time.monotonic(), 0
         while rounds < _MOST_ROUNDS:
@@ -159,7 +159,7 @@ class MapArrival:
             if is_little and self._stopping.wait(_ROUND_S):
                 raise JournalError("this server is ending")
 
-    def _wait_until_it_can_leave(self, link: Connection) -> None:
+    def _wait_until_it_can_leave(self, link: Exchange) -> None:
         until = time.monotonic() + _OPENING_S
         while True:
             try:
@@ -169,7 +169,7 @@ class MapArrival:
                 if not error.retry or time.monotonic() > until or self._stopping.wait(_RETRY_S):
                     raise
 
-    def _take_files(self, link: Connection, files: tuple[MapFile, ...]) -> None:
+    def _take_files(self, link: Exchange, files: tuple[MapFile, ...]) -> None:
         missing = sum(one.nbytes for one in files) - sum(have for have, _ in self._have.values())
         durable_files.make_folder(self.folder)
         durable_files.require_room(self.folder, max(missing, 0))
@@ -180,7 +180,7 @@ class MapArrival:
             if have < one.nbytes or one.name not in self._have:
                 self._take_file(link, one, have)
 
-    def _take_file(self, link: Connection, one: MapFile, at: int) -> None:
+    def _take_file(self, link: Exchange, one: MapFile, at: int) -> None:
         """Copy a file from a place on, as far as it goes now; it is on the disk then."""
         path = self.folder / one.name
         path.parent.mkdir(exist_ok=True)
@@ -205,7 +205,7 @@ class MapArrival:
             raise JournalError(f"{one.name} became shorter while it was copied")
         self._have[one.name] = (at, one.version)
 
-    def _commit(self, link: Connection) -> None:
+    def _commit(self, link: Exchange) -> None:
         """Have the other server write down that the map is here; raises CommandRefused when it stays there.
 
         Without an answer nobody knows: it is asked until there is one.
@@ -226,7 +226,7 @@ class MapArrival:
 
     def _ask(
         self,
-        link: Connection,
+        link: Exchange,
         step: str,
         *,
         file: str = "",
@@ -244,12 +244,7 @@ class MapArrival:
         )
         self._number += 1
         command = messages.Command(name="hand_over", map=self.name, hand_over=question, number=self._number)
-        name = f"{self.request.source} (control {link.address})"
-        exchange = Exchange(link, [messages.encode_sealed(command)], name)
-        while True:
-            reply, frames = exchange.reply(_ANSWER_S)
-            if reply.number == self._number:  # else it is late, of a question that was asked twice
-                break
+        reply, frames = link.ask(command, timeout=_ANSWER_S)
         if reply.error is not None:
             raise CommandRefused(self.request.source, reply.error, retry=reply.retry)
         return reply.parcel or Parcel(), frames

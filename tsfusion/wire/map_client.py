@@ -17,7 +17,7 @@ from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.map_answers import Samples, View, checked_camera, checked_points
 from tsfusion.geometry.map_grids import DistanceField, DistanceSlice, OccupancySlice, SliceGrid, blocked
 from tsfusion.geometry.up_direction import Up
-from tsfusion.wire import messages, questions, sockets
+from tsfusion.wire import questions, sockets
 from tsfusion.wire.curve import ClientKeys, client_keys
 from tsfusion.wire.messages import Command, Reply
 from tsfusion.wire.queries import CommandRefused, Exchange, open_connection, place_of
@@ -98,6 +98,7 @@ class MapClient:
         keys = client_keys(key, server_key) if keys is None else keys
         place = sockets.control_address(self.address, control)
         self._connection = open_connection(self._context, sockets.connect_address(place), keys)
+        self._server = Exchange(self._connection)
         self._keys = keys
         self._number = 0
 
@@ -298,14 +299,13 @@ class MapClient:
             timeout_s=seconds,
             compress=self._compress,
         )
-        sent = [messages.encode_sealed(command), *frames]
-        reply, arrays = self._exchange(sent, began + seconds, seconds)
+        reply, arrays = self._exchange(command, frames, began + seconds)
         for _ in range(_MOST_HOPS):
             if reply.elsewhere is None:
                 break
             self.address, place = place_of(reply.elsewhere, self._keys)
             self._connection.move_to(place)
-            reply, arrays = self._exchange(sent, began + seconds, seconds)
+            reply, arrays = self._exchange(command, frames, began + seconds)
         delay = time.monotonic() - began
         if reply.late:
             raise AnswerLate(f"the map {self.map} at {self.address}: {reply.error}")
@@ -318,22 +318,21 @@ class MapClient:
         except DecodeError as error:
             raise TransportError(f"the server at {self.address}: {error}") from error
 
-    def _exchange(self, sent: list[Any], deadline: float, seconds: float) -> tuple[Reply, list[memoryview]]:
-        """Send a message; the reply to it."""
-        exchange = Exchange(self._connection, sent)
-        while True:
-            try:
-                reply, frames = exchange.reply(max(deadline - time.monotonic(), 0.0))
-            except ServerUnreachable as error:
-                if exchange.is_there:
-                    raise AnswerLate(
-                        f"the map {self.map} at {self.address} did not answer within {seconds:g} s: ask "
-                        "again, or give it longer (timeout)"
-                    ) from error
-                self._connection.reopen()  # what stands may lead nowhere, and nobody would notice
-                raise
-            if reply.name == "ask" and reply.number == self._number:
-                return reply, frames
+    def _exchange(
+        self, command: Command, frames: Sequence[Any], deadline: float
+    ) -> tuple[Reply, list[memoryview]]:
+        """Send a question; the reply to it."""
+        left = max(deadline - time.monotonic(), 0.0)
+        try:
+            return self._server.ask(command, frames, timeout=left)
+        except ServerUnreachable as error:
+            if self._server.is_there:
+                raise AnswerLate(
+                    f"the map {self.map} at {self.address} did not answer within {command.timeout_s:g} s: ask "
+                    "again, or give it longer (timeout)"
+                ) from error
+            self._connection.reopen()  # what stands may lead nowhere, and nobody would notice
+            raise
 
 
 def _all(arrays: dict[str, NDArray[Any]], *names: str) -> dict[str, NDArray[Any]]:

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Queries to a running server: its health, the status of a map, the mesh of a map."""
 
+import math
 import time
+from collections.abc import Sequence
 from contextlib import closing, suppress
 from typing import Any
 
@@ -289,8 +291,7 @@ def request(
     """
     address = sockets.connect_address(address)
     with sockets.open_context() as context, closing(open_connection(context, address, keys)) as connection:
-        exchange = Exchange(connection, [messages.encode_sealed(command)], name)
-        reply, frames = exchange.reply(timeout)
+        reply, frames = Exchange(connection, name).ask(command, timeout=timeout)
     if reply.error is not None:
         raise CommandRefused(name or address, reply.error, retry=reply.retry, elsewhere=reply.elsewhere)
     return reply, frames
@@ -305,70 +306,83 @@ def open_connection(context: "zmq.Context[Any]", address: str, keys: ClientKeys 
 
 
 class Exchange:
-    """A ping and a message, sent on each connection that is made, until the reply to the message has come.
+    """Commands to a server, one after the other, each sent again on a connection that is made anew.
+
+    A ping goes before the first one on each connection, and behind one that is not answered at once.
 
     Attributes:
-        is_there: whether the server has answered the ping; it is never too busy for that.
+        is_there: whether the server has answered a ping since the last command; it is never too busy for that.
     """
 
-    def __init__(self, connection: Connection, sent: list[Any], name: str = "") -> None:
+    def __init__(self, connection: Connection, name: str = "") -> None:
         self.is_there = False
-        self._connection, self._sent = connection, ([messages.encode_sealed(Command(name="ping"))], sent)
-        self._name = name or connection.address  # of the server, in errors
-        self._asked = 0  # on which connection
-        self._pings = False  # whether the ping's answer is still to come
-        self._why = ""  # there is none
+        self._connection, self._name = connection, name  # of the server, in errors; empty = the address
+        self._asked = self._greeted = 0  # connections on which the command was sent, and a ping answered
+        self._ping_at = 0.0  # time.monotonic()
+        self._why = ""  # there is no connection
 
-    def reply(self, timeout: float) -> tuple[Reply, list[memoryview]]:
-        """The next reply, and the raw frames that came with it.
+    def ask(
+        self, command: Command, frames: Sequence[Any] = (), *, timeout: float
+    ) -> tuple[Reply, list[memoryview]]:
+        """Send a command and its frames; its reply, and the raw frames that came with it.
 
         Raises:
             NotAllowed: as soon as the server turns the connection away.
             ServerUnreachable: when nobody answered within `timeout` seconds, or the ping in a few.
             TransportError: when what answers is no tsfusion server, or one of another version.
         """
-        deadline = time.monotonic() + timeout
-        left = timeout if self.is_there else min(timeout, _PING_TIMEOUT)
+        began, timeout = time.monotonic(), min(timeout, _MAX_TIMEOUT_S)
+        self.is_there, self._asked, self._ping_at = False, 0, began + min(timeout / 2, _POLL_S)
+        sent = [messages.encode_sealed(command), *frames]
         while True:
-            reply, frames = self._next(left)
-            if reply.name != "ping" or not self._pings:
-                return reply, frames
-            if other := messages.other_version(server=reply.version, client=messages.PROTOCOL_VERSION):
-                raise TransportError(f"cannot ask {self._name}: {other}")
-            self.is_there, self._pings = True, False
-            left = max(deadline - time.monotonic(), 0.0)
+            seconds = timeout if self.is_there else min(timeout, _PING_TIMEOUT)
+            if (left := began + seconds - time.monotonic()) <= 0:
+                raise self._unreachable(seconds)
+            if (message := self._step(sent, left)) is None:
+                continue
+            reply, found = self._read(message)
+            if reply.number == command.number and (reply.name != "ping" or command.name == "ping"):
+                return reply, found
 
-    def _next(self, timeout: float) -> tuple[Reply, list[memoryview]]:
-        address = self._name
+    def _step(self, sent: list[Any], left: float) -> list[zmq.Frame] | None:
+        """Send what is due, and wait a moment for a message."""
+        connection, now = self._connection, time.monotonic()
+        link, is_new = connection.socket, connection.made > self._asked
+        polled = [(link, zmq.POLLIN | (zmq.POLLOUT if is_new else 0)), (connection.events, zmq.POLLIN)]
+        seconds = min(left, _POLL_S, max(self._ping_at - now, 0.0))
+        events = dict(zmq.zmq_poll(polled, int(seconds * 1000) + 1)).get(link, 0)
+        if events & zmq.POLLIN:
+            return link.recv_multipart(copy=False)
+        with suppress(zmq.Again):  # the connection has ended: all is sent on the next one
+            if (events and connection.made > self._greeted) or time.monotonic() >= self._ping_at:
+                self._ping_at = math.inf
+                link.send(messages.encode_sealed(Command(name="ping")), zmq.NOBLOCK)
+            if events & zmq.POLLOUT:
+                self._asked = connection.made
+                link.send_multipart(sent, zmq.NOBLOCK)
+        news, _ = connection.check(time.monotonic())
+        self._why = self._why if news is None else news
+        if connection.gave_up:
+            raise (NotAllowed if connection.refused else TransportError)(self._why)
+        return None
+
+    def _read(self, message: list[zmq.Frame]) -> tuple[Reply, list[memoryview]]:
+        address, (head, *frames) = self._name or self._connection.address, message
         try:
-            head, *frames = self._receive(min(timeout, _MAX_TIMEOUT_S))
             reply = messages.decode_to_client(head.buffer)
         except DecodeError as error:
             raise TransportError(f"what answers at {address} is no tsfusion server: {error}") from error
         if not isinstance(reply, Reply):
             raise TransportError(f"the server at {address} answered a command with a {type(reply).__name__}")
+        if reply.name == "ping":
+            if other := messages.other_version(server=reply.version, client=messages.PROTOCOL_VERSION):
+                raise TransportError(f"cannot ask {address}: {other}")
+            self.is_there, self._greeted = True, self._asked
         return reply, [frame.buffer for frame in frames]
 
-    def _receive(self, timeout: float) -> list[zmq.Frame]:
-        connection, deadline = self._connection, time.monotonic() + timeout
-        while (left := deadline - time.monotonic()) > 0:
-            link = connection.socket
-            wanted = zmq.POLLIN | (zmq.POLLOUT if connection.made > self._asked else 0)
-            polled = [(link, wanted), (connection.events, zmq.POLLIN)]
-            events = dict(zmq.zmq_poll(polled, int(min(left, _POLL_S) * 1000) + 1)).get(link, 0)
-            if events & zmq.POLLIN:
-                return link.recv_multipart(copy=False)
-            if events & zmq.POLLOUT:
-                self._asked, self._pings = connection.made, True
-                with suppress(zmq.Again):  # the connection has ended: all is sent on the next one
-                    for message in self._sent:
-                        link.send_multipart(message, zmq.NOBLOCK)
-            news, _ = connection.check(time.monotonic())
-            self._why = self._why if news is None else news
-            if connection.gave_up:
-                raise (NotAllowed if connection.refused else TransportError)(self._why)
+    def _unreachable(self, seconds: float) -> ServerUnreachable:
         reason = f": {self._why}" if self._why else ""
-        raise ServerUnreachable(
-            f"no server answered at {self._name} within {round(timeout, 2):g} s{reason}; is `tsfusion serve` "
-            "running there, and is the port right?"
+        return ServerUnreachable(
+            f"no server answered at {self._name or self._connection.address} within {round(seconds, 2):g} s"
+            f"{reason}; is `tsfusion serve` running there, and is the port right?"
         )
