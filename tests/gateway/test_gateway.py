@@ -417,8 +417,9 @@ def test_nothing_is_deleted_from_a_journal_that_is_away(
     (hosted,) = gateway.maps
     journal_folder(tmp_path).rename(tmp_path / "aside")
     journal_folder(tmp_path).mkdir()
-    stepped(gateway, lambda: hosted.disk.is_away)
-    hosted._retention._max_bytes, hosted._retention._in_previous = 1, 2
+    stepped(gateway, lambda: hosted.records.disk.is_away)
+    retention = hosted.records.retention
+    retention._max_bytes, retention._in_previous = 1, 2
     gateway.step()
     assert hosted.records.journal.first == 1
     journal_folder(tmp_path).rmdir()

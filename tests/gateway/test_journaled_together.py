@@ -82,10 +82,10 @@ def test_a_disk_that_refuses_holds_every_client_and_loses_nothing(
             holds = [served.heard(link, messages.Hold) for _ in SESSIONS]
         (hosted,) = served.gateway.maps
         assert {one.session for one in holds} == set(SESSIONS)
-        assert {(one.reason, one.message) for one in holds} == {("disk", hosted.disk.problem)}
-        assert os.strerror(errno.EIO) in hosted.disk.problem
+        assert {(one.reason, one.message) for one in holds} == {("disk", hosted.records.disk.problem)}
+        assert os.strerror(errno.EIO) in hosted.records.disk.problem
         assert served.durable == len(SESSIONS)
-        hosted.disk._until = 0.0
+        hosted.records.disk._until = 0.0
         for route in served.gateway._routes:
             route.held_until = 0.0
         for session in SESSIONS:

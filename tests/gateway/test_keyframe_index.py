@@ -14,6 +14,7 @@ from tsfusion.gateway.fuser_supervisor import FuserSupervisor
 from tsfusion.gateway.fuser_time import FuserTime
 from tsfusion.gateway.keyframe_index import KeyframeIndex
 from tsfusion.gateway.keyframe_outcomes import DelayStatistics, KeyframeOutcomes
+from tsfusion.gateway.map_records import MapRecords
 from tsfusion.gateway.metrics import Metrics
 from tsfusion.gateway.recent_fates import RecentFates
 from tsfusion.gateway.sessions import Session, Sessions
@@ -278,10 +279,9 @@ class Told:
 def test_what_a_checkpoint_holds_of_rejected_keyframes_is_not_remembered(tmp_path: Path) -> None:
     index, sessions = index_of(*((1, seq, SESSION, seq) for seq in range(1, 5_001)))
     told = Told()
-    outcomes = KeyframeOutcomes(
-        "default", index, sessions, cast("ClientRoutes", told), Metrics(),
-        journal=tmp_path, quarantine=Quarantine(tmp_path, 1 << 20),
-    )  # fmt: skip
+    quarantine, journal = Quarantine(tmp_path, 1 << 20), SimpleNamespace(folder=tmp_path)
+    records = SimpleNamespace(index=index, sessions=sessions, journal=journal, quarantine=quarantine)
+    outcomes = KeyframeOutcomes("default", cast("MapRecords", records), cast("ClientRoutes", told), Metrics())
     most = 0
     for at in range(len(index)):
         outcomes.on_done(Done(at, 1, 2, NO_SAMPLES))

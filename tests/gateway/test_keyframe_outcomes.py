@@ -2,6 +2,7 @@
 """Rejections are told to their sender at once, or when it is back; a full map is a problem."""
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import cast
 
 import pytest
@@ -10,6 +11,7 @@ from tsfusion.fuser.messages import Done, Ready
 from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.keyframe_index import KeyframeIndex
 from tsfusion.gateway.keyframe_outcomes import KeyframeOutcomes
+from tsfusion.gateway.map_records import MapRecords
 from tsfusion.gateway.metrics import Metrics
 from tsfusion.gateway.ports import Ports
 from tsfusion.gateway.sessions import Sessions
@@ -28,10 +30,13 @@ class Map:
         self.routes = ClientRoutes(cast(Ports, self))
         self._index, self._sessions = KeyframeIndex(), Sessions()
         self._session = self._sessions.open(SESSION, "robot")
-        self.outcomes = KeyframeOutcomes(
-            "yard", self._index, self._sessions, self.routes, Metrics(),
-            journal=folder / "journal", quarantine=Quarantine(folder / "quarantine", 1 << 20),
-        )  # fmt: skip
+        records = SimpleNamespace(
+            index=self._index,
+            sessions=self._sessions,
+            journal=SimpleNamespace(folder=folder / "journal"),
+            quarantine=Quarantine(folder / "quarantine", 1 << 20),
+        )
+        self.outcomes = KeyframeOutcomes("yard", cast(MapRecords, records), self.routes, Metrics())
 
     def reply(self, identity: bytes, message: ToClient) -> None:
         self.told.append(message)

@@ -310,7 +310,7 @@ def test_a_map_in_use_keeps_its_process(tmp_path: Path) -> None:
         assert hosted is not None
         process = hosted.fuser.pid
         served.greet(link, "default")  # a scanner is about to send
-        fuser = served.gateway.maps.open_ahead("yard", tmp_path, hosted.volume)
+        fuser = served.gateway.maps.open_ahead("yard", tmp_path, hosted.fuser.volume)
         pids = hosted.fuser.pid, fuser.pid
         fuser.close()
     assert pids[0] == process != pids[1]

@@ -22,12 +22,14 @@ from tsfusion.gateway import map_registry
 from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.fuser_process import FuserProcess
 from tsfusion.gateway.hosted_map import HostedMap
+from tsfusion.gateway.map_records import IncomingRecord
 from tsfusion.gateway.map_registry import MapRegistry
 from tsfusion.gateway.metrics import Metrics
 from tsfusion.journal import Journal, quarantine, state_folder
 from tsfusion.wire import messages, sockets
 from tsfusion.wire.allow_list import AllowedMaps
 from tsfusion.wire.messages import Command, Denied, Nack, Welcome
+from tsfusion.wire.record_header import unpack
 
 
 @pytest.fixture
@@ -191,8 +193,9 @@ def test_who_is_held_off_is_turned_away_whatever_it_sends(served: Served) -> Non
         push.send_multipart(record(1))
         served.until(lambda: served.gateway.health().refused.get("held") == 1)
         assert served.durable == 0
+        held = IncomingRecord(unpack(record(1)[0]), record(1), "", 0)
         for wanted, told in ((1e9, 10.0), (0.0, 0.25)):  # seconds; neither for ever nor in a frenzy
-            served.gateway._intake._hold(bytes(16), wanted, "disk", "it is full")
+            served.gateway._intake._hold(held, wanted, "disk", "it is full")
             assert served.heard(link, messages.Hold).seconds == told
 
 
@@ -217,7 +220,7 @@ def test_a_disk_that_refuses_is_said_at_once_and_then_left_alone(
             assert (hold.reason, hold.message) == ("disk", "the disk is full")
             (route,), (hosted,) = served.gateway._routes, served.gateway.maps
             route.held_until = 0.0
-            hosted.disk._until = hosted.disk._look_at = time.monotonic() + 1000.0
+            hosted.records.disk._until = hosted.records.disk._look_at = time.monotonic() + 1000.0
         assert len(tried) == 1
 
 
@@ -279,7 +282,7 @@ def test_no_free_name_is_guessed_where_the_maps_cannot_be_listed(
     registry = MapRegistry(nothing, ServerConfig(state=str(tmp_path)), nothing, nothing)
     hosted = SimpleNamespace(
         name="hall",
-        sessions=SimpleNamespace(shares_frame=lambda *_: False),
+        records=SimpleNamespace(sessions=SimpleNamespace(shares_frame=lambda *_: False)),
         keyframes_durable=1,
     )
     (tmp_path / "maps").mkdir()

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The journaled records that a map's fuser has not answered, and the fair order in which it gets them."""
 
+import time
 from collections import OrderedDict, deque
 from collections.abc import Mapping
 
@@ -12,13 +13,20 @@ from tsfusion.gateway.sessions import Session, Sessions
 
 
 class FuserBacklog:
-    """Hand out records of the client that took least of the fuser's time, of each of its sessions in turn."""
+    """Hand out records of the client that took least of the fuser's time, of each of its sessions in turn.
+
+    Attributes:
+        leaving: number of keyframes that a record forgets, by its index.
+        last_progress: when the fuser answered, or had nothing to answer (`time.monotonic()`).
+    """
 
     def __init__(self, index: KeyframeIndex, sessions: Sessions) -> None:
         self._index = index
         self._sessions = sessions
         self._queues: OrderedDict[str, deque[Session]] = OrderedDict()  # by owner, the last one served last
         self._time = FuserTime()
+        self.leaving: dict[int, int] = {}
+        self.last_progress = 0.0
         self._count()
 
     @property
@@ -33,12 +41,16 @@ class FuserBacklog:
 
     def add(self, session: Session, *, is_correction: bool = False) -> None:
         """Add the record of a session that was journaled just now."""
+        if self.is_empty:
+            self.last_progress = time.monotonic()
         self.keyframes += not is_correction
         self.corrections += is_correction
         self._enqueue(session)
 
     def on_done(self, index: int, seconds: float) -> None:
         """Take out a record that the fuser answered, after so many seconds of work."""
+        self.last_progress = time.monotonic()
+        self.leaving.pop(index, None)
         self._time.settle(index, seconds)
         is_correction = self._index[index].is_correction
         self.keyframes -= not is_correction

@@ -160,7 +160,7 @@ def status(
     return Status(
         epoch=health.epoch,
         map=hosted.name,
-        state=str(hosted.folder),
+        state=str(hosted.records.folder),
         fuser="idle" if hosted.drained else "busy",
         uptime_s=health.uptime_s,
         messages_refused=health.refused,

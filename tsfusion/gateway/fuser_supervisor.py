@@ -195,6 +195,17 @@ class FuserSupervisor:
         return self._process.pid
 
     @property
+    def volume(self) -> VolumeConfig:
+        """The settings of the map."""
+        return self._begin.volume
+
+    @property
+    def keeps_window(self) -> bool:
+        """True if the map forgets keyframes that are old, far away, or too many."""
+        begin = self._begin
+        return (begin.keep_seconds, begin.keep_keyframes, begin.keep_radius) != (None,) * 3
+
+    @property
     def problem(self) -> str:
         """Reason why no keyframe is fused now, and what to do; empty = they are."""
         if self.failed or self._restart_at:

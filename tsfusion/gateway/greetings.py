@@ -74,7 +74,7 @@ class Greetings:
             return "opening", f"map {hello.map} {what}"
         if hello.session == SERVER_SESSION:
             return "session", "the session of this spool is the server's own: use another spool folder"
-        sessions = Sessions() if hosted is None else hosted.sessions
+        sessions = Sessions() if hosted is None else hosted.records.sessions
         if not self._admission.owns(sessions, hello.session, client):
             return "session", "the session of this spool is another client's: use another spool folder"
         if not sessions.room_for(hello.session):

@@ -19,16 +19,15 @@ from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.forgetting import Forgetting
 from tsfusion.gateway.fuser_backlog import FuserBacklog
 from tsfusion.gateway.fuser_supervisor import FuserSupervisor
-from tsfusion.gateway.journal_retention import CheckpointOrders, JournalRetention
+from tsfusion.gateway.journal_retention import CheckpointOrders
 from tsfusion.gateway.keyframe_outcomes import KeyframeOutcomes, QuestionCounts
-from tsfusion.gateway.map_records import Checked, MapRecords
+from tsfusion.gateway.map_records import IncomingRecord, MapRecords
 from tsfusion.gateway.metrics import Metrics
-from tsfusion.gateway.sessions import Session
 from tsfusion.gateway.spare_fusers import SpareFusers
-from tsfusion.journal import ReadingWatcher, state_folder
-from tsfusion.wire import corrections, keyframe_times
-from tsfusion.wire.mesh_updates import Meshed, MeshUpdate
-from tsfusion.wire.record_header import CorrectionHeader, unpack
+from tsfusion.journal import ReadingWatcher
+from tsfusion.wire import corrections
+from tsfusion.wire.mesh_updates import Meshed
+from tsfusion.wire.record_header import unpack
 
 log = logging.getLogger(__name__)
 
@@ -46,12 +45,10 @@ class HostedMap:
         waits: for `fuser.begin`, until when nothing is fused.
 
     Attributes:
+        records: what came, on the disk.
+        backlog: the records that the fuser has yet to answer.
+        outcomes: what became of the others, and how clients are told.
         warm: the fuser has been ready once: from then on it is known what the map has.
-        moved: when the fuser answered, or had nothing to answer (`time.monotonic()`).
-        last_keyframe: when the last one came (likewise); None = none did.
-        loss: what is neither in a checkpoint nor in the journal; empty = nothing.
-        newest_mesh: that viewers were told of; None = there is none.
-        corrections: number of those in the journal.
     """
 
     def __init__(
@@ -68,43 +65,24 @@ class HostedMap:
         spares: SpareFusers | None = None,
         waits: bool = False,
     ) -> None:
-        self.name, self.volume = name, volume
-        self.folder = state_folder.map_folder(server.state, name)
-        self.records = MapRecords(name, self.folder, server, watch)
-        self.sessions, self.disk = self.records.sessions, self.records.disk
+        self.name = name
+        self.records = records = MapRecords(name, server, watch)
         self.questions = QuestionCounts()
         self.is_leaving = self.is_frozen = False  # to another server; it takes no records any more
-        self.warm, self.moved, self.loss = False, 0.0, ""
-        self.last_keyframe: float | None = None
-        self.newest_mesh: MeshUpdate | None = None
-        self._metrics = metrics
-        self._keeps_window = (server.keep_seconds, server.keep_keyframes, server.keep_radius) != (None,) * 3
-        self.backlog = FuserBacklog(self.records.index, self.sessions)
-        self.corrections = self.backlog.corrections  # in the journal
-        self.outcomes = KeyframeOutcomes(
-            name,
-            self.records.index,
-            self.sessions,
-            routes,
-            metrics,
-            journal=self.records.journal.folder,
-            quarantine=self.records.quarantine,
-        )
-        self._retention = JournalRetention(
-            self.records.journal, self.records.index, self.sessions, server.journal_bytes
-        )
+        self.warm = False
+        self.backlog = FuserBacklog(records.index, records.sessions)
+        self.outcomes = KeyframeOutcomes(name, records, routes, metrics)
         self.fuser = fuser or FuserSupervisor(
-            context, self.folder, server, volume, spares=spares, waits=waits
+            context, records.folder, server, volume, spares=spares, waits=waits
         )
         if fuser is not None:
             fuser.begin_work()
-        self.checkpoints = CheckpointOrders(self.fuser, self.records.journal)
-        self._leaving: dict[int, int] = {}  # index of a record that forgets keyframes → how many
+        self.checkpoints = CheckpointOrders(self.fuser, records.journal)
         self.forgetting = Forgetting(
             name,
-            self.folder,
-            self.records.journal,
-            self.records.quarantine,
+            records.folder,
+            records.journal,
+            records.quarantine,
             append=self._append_forgotten,
             send=self.fuser.send,
         )
@@ -126,7 +104,7 @@ class HostedMap:
     def is_empty(self) -> bool:
         """True if the map is known to have nothing, and never to have had any."""
         is_known = self.warm or self.records.is_new
-        return is_known and not (len(self.sessions) or self.outcomes.blocks or self.outcomes.taken)
+        return is_known and not (len(self.records.sessions) or self.outcomes.blocks or self.outcomes.taken)
 
     @property
     def keyframes_durable(self) -> int:
@@ -141,16 +119,17 @@ class HostedMap:
     @property
     def corrections_waiting(self) -> int:
         """Number of keyframes whose newest pose is not fused, or that are to be forgotten and are not yet."""
-        return self.outcomes.moves.waiting + sum(self._leaving.values())
+        return self.outcomes.moves.waiting + sum(self.backlog.leaving.values())
 
     @property
     def settled(self) -> bool:
         """True if the map is drained, or will not be soon: its fuser cannot be kept alive, or read."""
-        return self.drained or bool(self.fuser.failed or self.fuser.held) or self.disk.is_away
+        return self.drained or bool(self.fuser.failed or self.fuser.held) or self.records.disk.is_away
 
     def idle_since(self, since: float) -> bool:
         """True if no keyframe waits, nor came after `since` (`time.monotonic()`)."""
-        return self.drained and (self.last_keyframe is None or self.last_keyframe < since)
+        last = self.records.last_keyframe
+        return self.drained and (last is None or last < since)
 
     def close(self, *, wait: bool = True) -> None:
         """End the fuser and finish the journal. A journal that cannot be finished is logged.
@@ -170,17 +149,17 @@ class HostedMap:
         """Write the record to the journal that removes these keyframes of a session."""
         if self.is_frozen:
             raise JournalError(f"map {self.name} moves to another server")
-        durable, _ = self.sessions.progress(SERVER_SESSION)
+        durable, _ = self.records.sessions.progress(SERVER_SESSION)
         frames = corrections.encode(
             corrections.forgetting(target, seqs),
             session=SERVER_SESSION,
             seq=durable + 1,
             map_name=self.name,
         )
-        (index,) = self.accept([Checked(unpack(frames[0]), frames, "", time.monotonic_ns())])
-        self._leaving[index] = len(seqs)
+        (index,) = self.accept([IncomingRecord(unpack(frames[0]), frames, "", time.monotonic_ns())])
+        self.backlog.leaving[index] = len(seqs)
 
-    def accept(self, records: Sequence[Checked]) -> list[int]:
+    def accept(self, records: Sequence[IncomingRecord]) -> list[int]:
         """Write keyframes and corrections to the journal, all or none, and acknowledge them; their indices.
 
         Raises:
@@ -188,21 +167,10 @@ class HostedMap:
         """
         indices, durable_ns = self.records.append(records)
         for record, index in zip(records, indices, strict=True):
-            self._note_durable(record, self.sessions.numbered(self.records.index[index].session), durable_ns)
+            session = self.records.sessions.numbered(self.records.index[index].session)
+            self.backlog.add(session, is_correction=record.is_correction)
+            self.outcomes.on_durable(record, durable_ns)
         return indices
-
-    def _note_durable(self, record: Checked, session: Session, durable_ns: int) -> None:
-        header, is_correction = record.header, isinstance(record.header, CorrectionHeader)
-        if self.backlog.is_empty:
-            self.moved = time.monotonic()
-        self.backlog.add(session, is_correction=is_correction)
-        if is_correction:
-            self.corrections += 1
-        else:
-            self.last_keyframe = durable_ns / 1e9
-            self._metrics.observe(self.name, "journal", (durable_ns - record.received_ns) / 1e9)
-        stamps = keyframe_times.Stamps(header.seq, record.received_ns, durable_ns)
-        self.outcomes.acknowledge(header.session, [stamps])
 
     # --- another server ---
 
@@ -243,14 +211,14 @@ class HostedMap:
         while (received := self.fuser.receive()) is not None:
             self._dispatch(*received, pass_on)
         if ended and not self.fuser.finishing:
-            self.disk.look()
-            if not self.disk.is_away:  # another one would find an empty map
+            self.records.disk.look()
+            if not self.records.disk.is_away:  # another one would find an empty map
                 self.fuser.restart()
         self.backlog.hand_out(self.fuser)
-        self.disk.step()
-        if not self.disk.is_away and not self.is_leaving:
-            needed = self.outcomes.moves.first_segment if self._keeps_window else None
-            self._retention.step(self.fuser, self.outcomes.unmeshed, window_from=needed)
+        self.records.disk.step()
+        if not self.records.disk.is_away and not self.is_leaving:
+            needed = self.outcomes.moves.first_segment if self.fuser.keeps_window else None
+            self.records.retention.step(self.fuser, self.outcomes.unmeshed, window_from=needed)
         self.checkpoints.step()
         self._forget()
 
@@ -263,9 +231,7 @@ class HostedMap:
         """
         match message:
             case fuser_messages.Done():
-                self.moved = time.monotonic()
                 self.backlog.on_done(message.index, (message.fused_ns - message.fuse_start_ns) / 1e9)
-                self._leaving.pop(message.index, None)
                 self.outcomes.on_done(message)
             case fuser_messages.CorrectionProgress():
                 self.outcomes.on_moves(message)
@@ -275,13 +241,12 @@ class HostedMap:
                 if message.written:
                     self.outcomes.on_checkpoint()
                 self.checkpoints.on_saved(message)
-                self._retention.on_saved(message)
+                self.records.retention.on_saved(message)
                 self.forgetting.on_saved(message)
             case fuser_messages.Found():
                 self.forgetting.on_found(message)
             case Meshed():
                 self.outcomes.on_meshed(message)
-                self.newest_mesh = message.update or self.newest_mesh
                 pass_on(message, frames)
             case fuser_messages.FuserAnswer() | fuser_messages.FuserReply():
                 pass_on(message, frames)
@@ -290,30 +255,31 @@ class HostedMap:
         if self.fuser.failed and not self.fuser.ready:
             self.forgetting.give_up(self.fuser.failed)
         elif self.fuser.ready:
-            moves, own = self.outcomes.moves, self.sessions.get(SERVER_SESSION)
+            moves, sessions = self.outcomes.moves, self.records.sessions
+            own = sessions.get(SERVER_SESSION)
             is_answered = own is None or own.in_map >= own.durable
             self.forgetting.step(
                 settled=is_answered and not moves.waiting,
-                in_map=lambda key: session.in_map if (session := self.sessions.get(key)) else 0,
+                in_map=lambda key: session.in_map if (session := sessions.get(key)) else 0,
                 unavailable=moves.unavailable,
             )
 
     def _on_ready(self, ready: fuser_messages.Ready) -> None:
+        records = self.records
         if not self.warm:
-            map_opening.compare(self.name, self.records.journal, self.sessions, ready)
+            map_opening.compare(self.name, records.journal, records.sessions, ready)
         for key, progress in ready.done.items():
-            session = self.sessions.open(key, progress.client, progress.world)
+            session = records.sessions.open(key, progress.client, progress.world)
             session.durable = max(session.durable, progress.seq)
             if progress.seq > session.fused:
                 session.fused = progress.seq
-                session.answered = self.records.index.keyframes_up_to(session, progress.seq)
+                session.answered = records.index.keyframes_up_to(session, progress.seq)
         self.backlog.restart(ready.done)
         self.outcomes.on_ready(ready)
-        self._retention.on_ready()
+        self.records.retention.on_ready()
         self.forgetting.on_ready()
         if not self.warm:
-            self.warm = True
-            self.moved = time.monotonic()
+            self.warm, self.backlog.last_progress = True, time.monotonic()
             found = map_opening.contents(ready, self.backlog.keyframes)
             log.info("%s", found, extra=logs.about(map=self.name))
-        self.loss = map_opening.loss(self.name, self.records.journal, ready)
+        records.loss = map_opening.loss(self.name, records.journal, ready)

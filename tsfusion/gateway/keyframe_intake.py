@@ -18,7 +18,7 @@ from tsfusion.core.config import ServerConfig
 from tsfusion.core.errors import JournalError
 from tsfusion.gateway.client_routes import Admission, ClientRoutes
 from tsfusion.gateway.hosted_map import HostedMap
-from tsfusion.gateway.map_records import Checked
+from tsfusion.gateway.map_records import IncomingRecord
 from tsfusion.gateway.map_registry import MapRegistry
 from tsfusion.gateway.quotas import Quotas
 from tsfusion.wire import codec, corrections, messages, sockets
@@ -57,7 +57,7 @@ class KeyframeIntake:
         self._routes = routes
         self._quotas = Quotas(server)
         self._on_keyframe = on_keyframe
-        self._batch: dict[HostedMap, list[Checked]] = {}  # not yet journaled
+        self._batch: dict[HostedMap, list[IncomingRecord]] = {}  # not yet journaled
         self._batch_bytes = 0
         self._taken: dict[tuple[str, bytes], int] = {}  # map, session → the highest number among them
 
@@ -68,38 +68,42 @@ class KeyframeIntake:
         if client is None:
             return
         buffers = [frame.buffer for frame in frames]
-        nbytes = sum(buffer.nbytes for buffer in buffers)
         try:
             header = unpack(buffers[0])
             if corrections.is_servers_own(header):
                 raise Refused("forgetting", "only the server itself writes such a record")
         except Refused as error:
-            self._refuse(error, client)
+            self._refused[error.reason] += 1
+            subject = logs.about(client=client, reason=error.reason)
+            log.warning("a message is refused: %s", error, extra=subject)
             return
+        record = IncomingRecord(header, buffers, client, received_ns, self._routes.get(header.session))
         if forbidden := self._admission.denial_of_map(client, header.map, sends=True):
-            self._refused["map"] += 1
-            subject = logs.about(map=header.map, session=header.session, seq=header.seq, client=client)
-            log.warning("a %s is refused: %s", header.kind, forbidden, extra=subject)
+            self._turn_away(record, "map", forbidden)
             return
-        hosted = self._maps.get(header.map) or self._make_map(header, buffers, client)
+        hosted = self._maps.get(header.map) or self._make_map(record)
         if hosted is None or not hosted.takes_records:  # its client will say hello, and send it again
-            self._refused["map"] += 1
-        elif not hosted.sessions.room_for(header.session):  # its client is told when it says hello
-            self._refused["session"] += 1
-        elif not self._admission.owns(hosted.sessions, header.session, client):
-            self._refused["session"] += 1
-            subject = logs.about(map=header.map, session=header.session, seq=header.seq, client=client)
-            log.warning("a %s is refused: its session is another client's", header.kind, extra=subject)
+            self._turn_away(record, "map")
+        elif not hosted.records.sessions.room_for(header.session):  # its client is told when it says hello
+            self._turn_away(record, "session")
+        elif not self._admission.owns(hosted.records.sessions, header.session, client):
+            self._turn_away(record, "session", "its session is another client's")
         elif denied := self._maps.denial_of_world(hosted, header, self._admission.maps_of(client)):
-            self._refused["world"] += 1
-            subject = logs.about(map=header.map, session=header.session, seq=header.seq, client=client)
-            log.warning("a %s is refused: %s", header.kind, denied.message, extra=subject)
-            self._routes.send(header.session, denied)
+            self._turn_away(record, "world", denied.message, denied)
         elif hosted.is_empty and (elsewhere := self._claimed_elsewhere(header)) is not None:
-            self._refused["map"] += 1
-            self._routes.send(header.session, elsewhere)
-        elif not self._has_to_wait(hosted, header.session, client, nbytes, sockets.file_of(frames[0])):
-            self._on_checked(hosted, header, buffers, client, received_ns)
+            self._turn_away(record, "map", answer=elsewhere)
+        elif not self._has_to_wait(hosted, record, sockets.file_of(frames[0])):
+            self._on_admitted(hosted, record)
+
+    def _turn_away(
+        self, record: IncomingRecord, reason: str, why: str = "", answer: messages.Denied | None = None
+    ) -> None:
+        """Count a record that its client keeps; log why (empty = nothing is wrong with it), and answer."""
+        self._refused[reason] += 1
+        if why:
+            log.warning("a %s is refused: %s", record.header.kind, why, extra=record.about(reason))
+        if answer is not None:
+            self._routes.send(record.header.session, answer)
 
     def _claimed_elsewhere(self, header: RecordHeader) -> messages.Denied | None:
         """The answer to the first record of a map that another server has; None = it begins here."""
@@ -112,16 +116,15 @@ class KeyframeIntake:
         why = f"map {header.map} is at {place[0]} now"
         return messages.Denied(header.session, "moved", why, address=place[0], control=place[1])
 
-    def _make_map(self, header: RecordHeader, buffers: list[Any], client: str) -> HostedMap | None:
+    def _make_map(self, record: IncomingRecord) -> HostedMap | None:
         """The map that a client was let into, made for its first record; None = it is not, or cannot be."""
-        route = self._routes.get(header.session)
-        if route is None or (route.client, route.map) != (client, header.map):
+        header, route = record.header, record.route
+        if route is None or (route.client, route.map) != (record.client, header.map):
             return None
         try:
-            codec.check(buffers, self._server.max_frame_bytes)
-            self._quotas.check(header, buffers)
+            self._check(record)
         except Refused as error:
-            self._refuse(error, client, header)
+            self._refuse(error, record)
             return None
         if (elsewhere := self._claimed_elsewhere(header)) is not None:
             self._routes.send(header.session, elsewhere)
@@ -132,77 +135,75 @@ class KeyframeIntake:
             self._routes.send(header.session, messages.Denied(header.session, "map", why))
         return hosted
 
-    def _has_to_wait(
-        self, hosted: HostedMap, key: bytes, client: str, nbytes: int, connection: int | None
-    ) -> bool:
-        route = self._routes.get(key)
-        now = time.monotonic()
+    def _check(self, record: IncomingRecord) -> None:
+        """Raise Refused for a record that is wrong, or that asks too much."""
+        codec.check(record.frames, self._server.max_frame_bytes)
+        self._quotas.check(record.header, record.frames)
+
+    def _has_to_wait(self, hosted: HostedMap, record: IncomingRecord, connection: int | None) -> bool:
+        route, now = record.route, time.monotonic()
         if route is not None:
-            route.received_bytes += nbytes
+            route.received_bytes += record.nbytes
             if now < route.held_until:
                 self._refused["held"] += 1
                 return True
-        if seconds := hosted.disk.seconds_left(now):
-            self._hold(key, seconds, "disk", hosted.disk.problem)
+        if seconds := hosted.records.disk.seconds_left(now):
+            self._hold(record, seconds, "disk", hosted.records.disk.problem)
             return True
-        if seconds := self._quotas.wait(client, nbytes, now, connection):
+        if seconds := self._quotas.wait(record.client, record.nbytes, now, connection):
             rates = f"{self._server.quota_keyframes:g} keyframes and {self._server.quota_bytes >> 20} MB"
-            self._hold(
-                key,
-                seconds,
-                "quota",
-                f"the server takes {rates} a second of {'each client' if client else 'all clients together'}",
-            )
+            whose = "each client" if record.client else "all clients together"
+            self._hold(record, seconds, "quota", f"the server takes {rates} a second of {whose}")
             return True
         return False
 
-    def _hold(self, key: bytes, seconds: float, reason: str, message: str) -> None:
+    def _hold(self, record: IncomingRecord, seconds: float, reason: str, message: str) -> None:
         self._refused["held"] += 1
         seconds = min(max(seconds, _SHORTEST_HOLD), _LONGEST_HOLD)
-        route = self._routes.get(key)
-        if route is not None:
+        if (route := record.route) is not None:
             route.hold_reason, route.hold_message = reason, message
             route.held_until = time.monotonic() + seconds
             route.fates.held()
-        self._routes.send(key, messages.Hold(key, seconds, reason, message))
+        session = record.header.session
+        self._routes.send(session, messages.Hold(session, seconds, reason, message))
 
-    def _on_checked(
-        self, hosted: HostedMap, header: RecordHeader, buffers: list[Any], client: str, received_ns: int
-    ) -> None:
+    def _on_admitted(self, hosted: HostedMap, record: IncomingRecord) -> None:
         # Duplicates come first: a keyframe that is journaled must not be refused when it is sent again.
-        place = (header.map, header.session)
-        verdict = hosted.sessions.admit(
-            header.session, header.seq, header.previous, self._taken.get(place, 0)
-        )
+        header = record.header
+        taken = self._taken.get((header.map, header.session), 0)
+        verdict = hosted.records.sessions.admit(header.session, header.seq, header.previous, taken)
         if verdict != "next":
             self.finish()  # so that the answer says how far the session is
             self.duplicates += verdict == "duplicate"
             self._refused["gap"] += verdict == "gap"
-            self._routes.mark_alive(header.session, client, scans=verdict == "duplicate")
+            self._routes.mark_alive(header.session, record.client, scans=verdict == "duplicate")
             hosted.outcomes.acknowledge(header.session, resend=verdict == "gap")
             return
         try:
-            codec.check(buffers, self._server.max_frame_bytes)
-            self._quotas.check(header, buffers)
+            self._check(record)
         except Refused as error:
             self.finish()
-            if isinstance(error, Damaged) and self._comes_again(header):
-                self._ask_again(error, hosted, header, client)
+            if isinstance(error, Damaged) and _comes_again(record):
+                self._refused[error.reason] += 1
+                log.warning(
+                    "a %s is asked for again: %s", header.kind, error, extra=record.about(error.reason)
+                )
+                hosted.outcomes.acknowledge(header.session, resend=True)
             else:
-                self._refuse(error, client, header)
+                self._refuse(error, record)
             return
-        self._routes.mark_alive(header.session, client, scans=True)
-        self._take(hosted, Checked(header, buffers, client, received_ns))
+        self._routes.mark_alive(header.session, record.client, scans=True)
+        self._take(hosted, record)
 
-    def _take(self, hosted: HostedMap, record: Checked) -> None:
+    def _take(self, hosted: HostedMap, record: IncomingRecord) -> None:
         """Put a record into the batch. What a new session may do is known when its first one is journaled."""
-        header, nbytes = record.header, sum(frame.nbytes for frame in record.frames)
-        if self._batch_bytes + nbytes > min(_BATCH_BYTES, self._server.segment_bytes):
+        header = record.header
+        if self._batch_bytes + record.nbytes > min(_BATCH_BYTES, self._server.segment_bytes):
             self.finish()
         self._batch.setdefault(hosted, []).append(record)
-        self._batch_bytes += nbytes
+        self._batch_bytes += record.nbytes
         self._taken[header.map, header.session] = header.seq
-        if hosted.sessions.get(header.session) is None:
+        if hosted.records.sessions.get(header.session) is None:
             self.finish()
 
     def finish(self) -> None:
@@ -215,44 +216,30 @@ class KeyframeIntake:
             try:
                 hosted.accept(records)
             except JournalError:
-                seconds, why = hosted.disk.seconds_left(time.monotonic()), hosted.disk.problem
-                for key in dict.fromkeys(record.header.session for record in records):
-                    self._hold(key, seconds, "disk", why)
+                seconds, why = hosted.records.disk.seconds_left(time.monotonic()), hosted.records.disk.problem
+                for record in {one.header.session: one for one in records}.values():
+                    self._hold(record, seconds, "disk", why)
                 continue
-            for header, frames, client, _ in records:
-                if (route := self._routes.get(header.session)) is not None:
-                    route.fates.taken()
-                if isinstance(header, KeyframeHeader):
-                    self._on_keyframe(header.map, header, frames, client)
+            for record in records:
+                if record.route is not None:
+                    record.route.fates.taken()
+                if isinstance(record.header, KeyframeHeader):
+                    self._on_keyframe(hosted.name, record.header, record.frames, record.client)
 
-    def _comes_again(self, header: RecordHeader) -> bool:
-        """Count that a record came damaged; whether its client, whose copy may be well, sends it again."""
-        route = self._routes.get(header.session)
-        if route is None:
-            return False
-        seq, times = route.damaged
-        route.damaged = (header.seq, times + 1 if seq == header.seq else 1)
-        return route.damaged[1] < _MOST_DAMAGED
+    def _refuse(self, error: Refused, record: IncomingRecord) -> None:
+        """Count a bad record, and tell its client not to send it again."""
+        self._turn_away(record, error.reason, str(error))
+        if record.route is not None:
+            record.route.refused += 1
+            record.route.fates.turned_away(str(error))
+        session, seq = record.header.session, record.header.seq
+        self._routes.send(session, messages.Nack(session, seq, "door", error.reason, str(error)))
 
-    def _ask_again(self, error: Damaged, hosted: HostedMap, header: RecordHeader, client: str) -> None:
-        self._refused[error.reason] += 1
-        subject = logs.about(
-            map=header.map, session=header.session, seq=header.seq, client=client, reason=error.reason
-        )
-        log.warning("a %s is asked for again: %s", header.kind, error, extra=subject)
-        hosted.outcomes.acknowledge(header.session, resend=True)
 
-    def _refuse(self, error: Refused, client: str, header: RecordHeader | None = None) -> None:
-        """Count a bad message; if its session is known, tell the client not to send it again."""
-        self._refused[error.reason] += 1
-        if header is None:
-            subject = logs.about(client=client, reason=error.reason)
-            log.warning("a message is refused: %s", error, extra=subject)
-            return
-        key, seq = header.session, header.seq
-        subject = logs.about(map=header.map, session=key, seq=seq, client=client, reason=error.reason)
-        log.warning("a %s is refused: %s", header.kind, error, extra=subject)
-        if (route := self._routes.get(key)) is not None:
-            route.refused += 1
-            route.fates.turned_away(str(error))
-        self._routes.send(key, messages.Nack(key, seq, "door", error.reason, str(error)))
+def _comes_again(record: IncomingRecord) -> bool:
+    """Count a damaged record. Returns True if its client, whose copy may be well, sends it again."""
+    if (route := record.route) is None:
+        return False
+    seq, times = route.damaged
+    route.damaged = (record.header.seq, times + 1 if seq == record.header.seq else 1)
+    return route.damaged[1] < _MOST_DAMAGED

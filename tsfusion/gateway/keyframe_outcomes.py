@@ -5,7 +5,6 @@ import logging
 import time
 from collections import Counter, OrderedDict, deque
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Literal
 
 import msgspec
@@ -15,15 +14,15 @@ from tsfusion.core import logs
 from tsfusion.core.errors import JournalError
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.gateway.client_routes import ClientRoutes
-from tsfusion.gateway.keyframe_index import IndexEntry, KeyframeIndex
+from tsfusion.gateway.keyframe_index import IndexEntry
+from tsfusion.gateway.map_records import IncomingRecord, MapRecords
 from tsfusion.gateway.metrics import Metrics
-from tsfusion.gateway.sessions import Session, Sessions
+from tsfusion.gateway.sessions import Session
 from tsfusion.geometry.sample_ranges import NO_SAMPLES
 from tsfusion.journal import read
-from tsfusion.journal.quarantine import Quarantine
 from tsfusion.wire import keyframe_times, messages
 from tsfusion.wire.keyframe_times import Spread
-from tsfusion.wire.mesh_updates import Meshed
+from tsfusion.wire.mesh_updates import Meshed, MeshUpdate
 
 log = logging.getLogger(__name__)
 
@@ -38,30 +37,18 @@ _NO_MOVES = fuser_messages.CorrectionProgress(0, 0, 0, 0, 0, 0.0)
 class KeyframeOutcomes:
     """The outcomes of one map's keyframes, over all its fuser processes."""
 
-    def __init__(
-        self,
-        name: str,
-        index: KeyframeIndex,
-        sessions: Sessions,
-        routes: ClientRoutes,
-        metrics: Metrics,
-        *,
-        journal: Path,
-        quarantine: Quarantine,
-    ) -> None:
+    def __init__(self, name: str, records: MapRecords, routes: ClientRoutes, metrics: Metrics) -> None:
         self.fused = 0  # keyframes in the map
         self.moves = _NO_MOVES  # what corrections make of them
         self.rejected: Counter[str] = Counter()  # by reason
         self.unmeshed: deque[int] = deque()  # indices; answered by the present fuser, oldest first
         self.blocks = self.map_bytes = 0  # at the fuser's last message about them
+        self.newest_mesh: MeshUpdate | None = None  # that viewers were told of; None = there is none
         self.delays = DelayStatistics()
         self._name = name
-        self._index = index
-        self._sessions = sessions
+        self._records = records
         self._routes = routes
         self._metrics = metrics
-        self._journal = journal
-        self._quarantine = quarantine
         # Indices of rejected records that were reported: before the last checkpoint, and since then. What a
         # checkpoint holds is never fused again, but a damaged one makes way for that before it.
         self._rejected_before: set[int] = set()
@@ -75,7 +62,16 @@ class KeyframeOutcomes:
         self, key: bytes, stamps: Sequence[keyframe_times.Stamps] = (), *, resend: bool = False
     ) -> None:
         """Tell a client how far its session is."""
-        self._routes.send(key, messages.Ack(key, *self._sessions.progress(key), tuple(stamps), resend))
+        self._routes.send(
+            key, messages.Ack(key, *self._records.sessions.progress(key), tuple(stamps), resend)
+        )
+
+    def on_durable(self, record: IncomingRecord, durable_ns: int) -> None:
+        """Acknowledge a record that was journaled."""
+        header, received_ns = record.header, record.received_ns
+        if not record.is_correction:
+            self._metrics.observe(self._name, "journal", (durable_ns - received_ns) / 1e9)
+        self.acknowledge(header.session, [keyframe_times.Stamps(header.seq, received_ns, durable_ns)])
 
     def on_ready(self, ready: fuser_messages.Ready) -> None:
         """Go back to the counts of the checkpoint that a new fuser began with."""
@@ -89,16 +85,16 @@ class KeyframeOutcomes:
         """Count keyframes that an earlier fuser did not mesh as meshed, unless they are fused once more."""
         now = time.monotonic_ns()
         for index in self.unmeshed:
-            session = self._sessions.numbered(self._index[index].session)
-            if self._index.after(session, self._index[index].stamps.seq) <= session.handed:
+            session = self._records.sessions.numbered(self._records.index[index].session)
+            if self._records.index.after(session, self._records.index[index].stamps.seq) <= session.handed:
                 self._stamp_meshed(index, now)
         self.unmeshed.clear()
         self._meshed = 0
 
     def on_done(self, done: fuser_messages.Done) -> None:
         """Note the fuser's answer to a record, and report it to the client."""
-        entry = self._index[done.index]
-        session = self._sessions.numbered(entry.session)
+        entry = self._records.index[done.index]
+        session = self._records.sessions.numbered(entry.session)
         session.in_map = entry.stamps.seq
         self.unmeshed.append(done.index)
         if not entry.is_correction:
@@ -113,8 +109,8 @@ class KeyframeOutcomes:
         if not entry.is_correction:
             session.answered += 1
             session.rejected += done.reason is not None
-        self._index.set_fused(done.index, done.fuse_start_ns, done.fused_ns)
-        entry = self._index[done.index]
+        self._records.index.set_fused(done.index, done.fuse_start_ns, done.fused_ns)
+        entry = self._records.index[done.index]
         session.fused = max(session.fused, entry.stamps.seq)
         if done.reason is None:
             self._on_fused(session, entry)
@@ -156,10 +152,12 @@ class KeyframeOutcomes:
             self._without_samples.add(session.key)
             return
         try:
-            frames = read(self._journal, entry.position).frames
+            frames = read(self._records.journal.folder, entry.position).frames
         except JournalError:  # which is why it was rejected
             return
-        self._quarantine.keep(frames, session=session.key, seq=seq, client=session.client, reason=done.reason)
+        self._records.quarantine.keep(
+            frames, session=session.key, seq=seq, client=session.client, reason=done.reason
+        )
 
     @property
     def taken(self) -> int:
@@ -209,16 +207,17 @@ class KeyframeOutcomes:
     def on_meshed(self, meshed: Meshed) -> None:
         """Note that the fuser brought the mesh up to date."""
         self.blocks, self.map_bytes = meshed.map_blocks, meshed.map_bytes
+        self.newest_mesh = meshed.update or self.newest_mesh
         for _ in range(meshed.count - self._meshed):
             self._stamp_meshed(self.unmeshed.popleft(), meshed.meshed_ns)
         self._meshed = meshed.count
 
     def _stamp_meshed(self, index: int, meshed_ns: int) -> None:
-        entry = self._index[index]
+        entry = self._records.index[index]
         if entry.stamps.fused_ns and not entry.is_correction:
             self._metrics.observe(self._name, "mesh", (meshed_ns - entry.stamps.fused_ns) / 1e9)
         stamps = msgspec.structs.replace(entry.stamps, meshed_ns=meshed_ns)
-        self.acknowledge(self._sessions.numbered(entry.session).key, [stamps])
+        self.acknowledge(self._records.sessions.numbered(entry.session).key, [stamps])
 
 
 _DELAYS = 1024  # the newest ones count

@@ -136,7 +136,7 @@ class MapDepartures:
             self._on_stay(name)
 
     def _listed(self, one: _Departure) -> Parcel:
-        folder = one.hosted.folder
+        folder = one.hosted.records.folder
         sessions: tuple[MovedSession, ...] = ()
         try:
             files = tuple(sorted(_files(folder), key=lambda file: file.name))
@@ -144,13 +144,14 @@ class MapDepartures:
             raise journal_error("list", folder, error) from error
         if one.hosted.is_frozen:
             sessions = tuple(
-                MovedSession(each.key, each.client, each.world, each.durable) for each in one.hosted.sessions
+                MovedSession(each.key, each.client, each.world, each.durable)
+                for each in one.hosted.records.sessions
             )
-        volume = msgspec.to_builtins(one.hosted.volume)
+        volume = msgspec.to_builtins(one.hosted.fuser.volume)
         return Parcel(files=files, volume=volume, is_saved=one.hosted.is_saved, sessions=sessions)
 
     def _read(self, one: _Departure, question: HandOver) -> tuple[Parcel, list[zmq.Frame]]:
-        path = one.hosted.folder / question.file
+        path = one.hosted.records.folder / question.file
         try:
             if question.offset == 0 and (before := one.files.pop(question.file, None)) is not None:
                 os.close(before)
@@ -171,7 +172,7 @@ class MapDepartures:
         one = self._leaving.get(name)
         if one is None or one.move != question.move or not one.hosted.is_frozen:
             raise JournalError(f"map {name} stays: its move was given up")
-        arrival = moved_maps.arrival_of(one.hosted.folder)
+        arrival = moved_maps.arrival_of(one.hosted.records.folder)
         where = Departed(
             question.move.hex(), arrival.move if arrival else "", question.address, question.control
         )

@@ -4,13 +4,14 @@
 import logging
 import time
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 from tsfusion.core import logs
 from tsfusion.core.config import ServerConfig
 from tsfusion.core.errors import MISSING, JournalError
 from tsfusion.gateway import map_opening, moved_maps
+from tsfusion.gateway.client_routes import ClientRoute
+from tsfusion.gateway.journal_retention import JournalRetention
 from tsfusion.gateway.keyframe_index import KeyframeIndex
 from tsfusion.gateway.problems import Problem
 from tsfusion.gateway.sessions import Sessions
@@ -23,13 +24,29 @@ log = logging.getLogger(__name__)
 _DISK_PAUSE = 1.0  # seconds without keyframes after the disk refused one, and between two looks at it
 
 
-class Checked(NamedTuple):
-    """A message that was found to be the next record of its session."""
+class IncomingRecord(NamedTuple):
+    """A record that came, whose it is, and when."""
 
     header: RecordHeader
     frames: Sequence[Any]
     client: str  # name that its sender's key is allowed under
     received_ns: int
+    route: ClientRoute | None = None  # to its client; None = it is not connected
+
+    @property
+    def is_correction(self) -> bool:
+        return isinstance(self.header, CorrectionHeader)
+
+    @property
+    def nbytes(self) -> int:
+        return sum(frame.nbytes for frame in self.frames)
+
+    def about(self, reason: str = "") -> dict[str, Any]:
+        """The subject of a line of the log."""
+        header = self.header
+        return logs.about(
+            map=header.map, session=header.session, seq=header.seq, client=self.client, reason=reason
+        )
 
 
 class MapRecords:
@@ -41,9 +58,13 @@ class MapRecords:
     Attributes:
         is_new: whether there was nothing of the map.
         has_arrived: whether the server from which it came has said what it has.
+        corrections: number of those in the journal.
+        last_keyframe: when the last one came (`time.monotonic()`); None = none did.
+        loss: what is neither in a checkpoint nor in the journal; empty = nothing.
     """
 
-    def __init__(self, name: str, folder: Path, server: ServerConfig, watch: ReadingWatcher) -> None:
+    def __init__(self, name: str, server: ServerConfig, watch: ReadingWatcher) -> None:
+        self.folder = folder = state_folder.map_folder(server.state, name)
         self.is_new = not state_folder.holds_a_map(folder)
         self.journal = map_opening.open_journal(folder, server, watch)
         map_opening.warn_of_old_corrections(folder)
@@ -52,13 +73,17 @@ class MapRecords:
         self.sessions, self.index = Sessions(), KeyframeIndex()
         self.index.recover(self.journal.found, self.sessions)
         self.journal.found = []
+        self.retention = JournalRetention(self.journal, self.index, self.sessions, server.journal_bytes)
+        self.corrections = sum(session.corrections for session in self.sessions)
+        self.last_keyframe: float | None = None
+        self.loss = ""
         arrived = moved_maps.arrival_of(folder)
         self.has_arrived = arrived is not None
         for known in () if arrived is None else arrived.sessions:
             session = self.sessions.open(known.key, known.client, known.world)
             session.durable = max(session.durable, known.durable)
 
-    def append(self, records: Sequence[Checked]) -> tuple[list[int], int]:
+    def append(self, records: Sequence[IncomingRecord]) -> tuple[list[int], int]:
         """Write records to the journal, all or none; their indices, and when that was done.
 
         Raises:
@@ -74,18 +99,22 @@ class MapRecords:
         now_ns = time.monotonic_ns()
         return [self._add(one, place, now_ns) for one, place in zip(records, positions, strict=True)], now_ns
 
-    def _add(self, record: Checked, position: Position, durable_ns: int) -> int:
-        header, _, client, received_ns = record
-        session = self.sessions.open(header.session, client, header.world)
+    def _add(self, record: IncomingRecord, position: Position, durable_ns: int) -> int:
+        header = record.header
+        if record.is_correction:
+            self.corrections += 1
+        else:
+            self.last_keyframe = durable_ns / 1e9
+        session = self.sessions.open(header.session, record.client, header.world)
         session.durable = header.seq
         return self.index.add(
             position,
             session,
             header.seq,
             captured_ns=0 if isinstance(header, CorrectionHeader) else header.captured_ns,
-            received_ns=received_ns,
+            received_ns=record.received_ns,
             durable_ns=durable_ns,
-            is_correction=isinstance(header, CorrectionHeader),
+            is_correction=record.is_correction,
         )
 
     def close_segment(self) -> None:

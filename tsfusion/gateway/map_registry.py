@@ -79,12 +79,12 @@ class MapRegistry:
     def progress(self, name: str, session: bytes) -> tuple[int, int]:
         """The highest seq of a session that is durable, and that is fused."""
         hosted = self.get(name)
-        return hosted.sessions.progress(session) if hosted else (0, 0)
+        return hosted.records.sessions.progress(session) if hosted else (0, 0)
 
     def session(self, name: str, key: bytes) -> Session | None:
         """A session of a map; None = it has nothing in the journal."""
         hosted = self.get(name)
-        return hosted.sessions.get(key) if hosted else None
+        return hosted.records.sessions.get(key) if hosted else None
 
     def open_at_start(
         self,
@@ -192,7 +192,7 @@ class MapRegistry:
             MapError: when the system cannot start it.
         """
         in_use = {route.map for route in self._routes}
-        idle = (one for one in self if one.is_empty and one.fuser.idle and one.volume == volume)
+        idle = (one for one in self if one.is_empty and one.fuser.idle and one.fuser.volume == volume)
         if not self._spares.has_for(volume):
             unused = sorted((one for one in idle if one.name not in in_use), key=lambda one: one.name != name)
             for hosted in unused[:1]:
@@ -278,7 +278,7 @@ class MapRegistry:
         Every record is asked this, not its session's greeting alone: of two that greet a map nobody has yet,
         the one whose record comes first has it.
         """
-        if hosted.sessions.shares_frame(record.session, record):
+        if hosted.records.sessions.shares_frame(record.session, record):
             return None
         keyframes = count_of(hosted.keyframes_durable, "keyframe")
         why = f"map {hosted.name} has {keyframes} of another session, in another coordinate frame"
@@ -300,7 +300,9 @@ class MapRegistry:
             JournalError: when the state folder cannot be listed.
         """
         now = time.monotonic()
-        in_use = {one.name for one in self if len(one.sessions)} | {route.map for route in self._routes}
+        in_use = {one.name for one in self if len(one.records.sessions)} | {
+            route.map for route in self._routes
+        }
         on_disk = set(state_folder.map_names(self._server.state)) - self._open.keys()
         kept = {name for name, since in self._kept.items() if now - since < _KEPT_SECONDS}
         taken = in_use | on_disk | kept | set(self._unopened)
@@ -428,7 +430,7 @@ class MapRegistry:
     def problems(self) -> list[Problem]:
         """Problems of the maps; those that keep them from taking or fusing keyframes come first."""
         problems = [
-            Problem(problem, hosted.name, is_logged=bool(hosted.disk.problem))
+            Problem(problem, hosted.name, is_logged=bool(hosted.records.disk.problem))
             for hosted in self
             if (problem := problem_of(hosted))
         ]

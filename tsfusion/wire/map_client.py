@@ -328,8 +328,8 @@ class MapClient:
         except ServerUnreachable as error:
             if self._server.is_there:
                 raise AnswerLate(
-                    f"the map {self.map} at {self.address} did not answer within {command.timeout_s:g} s: ask "
-                    "again, or give it longer (timeout)"
+                    f"the map {self.map} at {self.address} did not answer within {command.timeout_s:g} s: "
+                    "ask again, or give it longer (timeout)"
                 ) from error
             self._connection.reopen()  # what stands may lead nowhere, and nobody would notice
             raise

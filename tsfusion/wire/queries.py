@@ -311,7 +311,7 @@ class Exchange:
     A ping goes before the first one on each connection, and behind one that is not answered at once.
 
     Attributes:
-        is_there: whether the server has answered a ping since the last command; it is never too busy for that.
+        is_there: whether the server has answered a ping, for which it is never too busy, since it was asked.
     """
 
     def __init__(self, connection: Connection, name: str = "") -> None:
