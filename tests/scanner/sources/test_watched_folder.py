@@ -25,7 +25,7 @@ from small_recordings import claim_size
 from tsfusion.core.errors import InvalidConfig, SourceError
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
-from tsfusion.scanner.sources import folder_layouts, watched_folder
+from tsfusion.scanner.sources import watched_folder
 from tsfusion.scanner.sources.registry import is_live, open_source
 from tsfusion.scanner.sources.source import Source
 from tsfusion.scanner.sources.watched_folder import WatchedFolder
@@ -382,7 +382,7 @@ def test_files_that_go_away_while_they_are_read(tmp_path: Path, monkeypatch: pyt
     camera(tmp_path)
     for number in (0, 1):
         rgbd(tmp_path, number)
-    is_whole = folder_layouts.is_whole
+    is_whole = watched_folder.is_whole
 
     def then_gone(path: Path, *, settled: bool) -> bool:
         found = is_whole(path, settled=settled)
@@ -390,7 +390,7 @@ def test_files_that_go_away_while_they_are_read(tmp_path: Path, monkeypatch: pyt
             path.unlink()
         return found
 
-    monkeypatch.setattr(folder_layouts, "is_whole", then_gone)
+    monkeypatch.setattr(watched_folder, "is_whole", then_gone)
     source, frames = whole(tmp_path)
     assert numbers(frames) == [1]
     assert source.skipped == {"unreadable": 1}

@@ -11,7 +11,7 @@ from tsfusion.datasets.file_names import in_order
 from tsfusion.datasets.folder_frames import FolderFrames
 from tsfusion.datasets.readers import numbers, read_lines
 from tsfusion.datasets.scan_files import read_scan
-from tsfusion.datasets.trajectory_files import check_quaternion
+from tsfusion.datasets.trajectory_files import check_quaternion, usable
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.se3 import Transform
 from tsfusion.geometry.trajectory import rigid
@@ -38,17 +38,20 @@ class LidarDump(FolderFrames):
         path, content = root / "graph.txt", "`vK tx ty tz qx qy qz qw` a line"
         if not path.exists():
             raise NoPoses(f"{path} is missing; expected {EXPECTED}; {SCAN}")
-        poses: dict[int, Transform] = {}
-        for number, line in read_lines(path, content):
-            name, *words = line.split()
-            if not name.startswith("v"):
-                continue
+        lines = [line for line in read_lines(path, content) if line[1].startswith("v")]
+        numbered: dict[int, Transform] = {}
+
+        def read(line: tuple[int, str]) -> Transform:
+            name, *words = line[1].split()
             if not name[1:].isdecimal():
-                raise DatasetError(f"{path}:{number}: {name!r}; expected {content}")
-            values = np.array(numbers(path, number, words, 7, content))
-            check_quaternion(values[3:], path, number)
-            poses[int(name[1:])] = rigid(values[3:] / np.linalg.norm(values[3:]), values[:3])
-        return [poses.get(int(file.parent.name)) for file in files]
+                raise DatasetError(f"{path}:{line[0]}: {name!r}; expected {content}")
+            values = np.array(numbers(path, line[0], words, 7, content))
+            check_quaternion(values[3:], path, line[0])
+            numbered[int(name[1:])] = T = rigid(values[3:] / np.linalg.norm(values[3:]), values[:3])
+            return T
+
+        usable(path, lines, read)
+        return [numbered.get(int(file.parent.name)) for file in files]
 
     def _frame(self, index: int) -> Frame:
         return self._posed_frame(index, points=read_scan(self._files[index], fields=3).points)

@@ -47,10 +47,15 @@ class ImagesAt(NamedTuple):
         found = ([path for path in _places(root, place) if path.is_dir()] for place in self.places)
         return next(filter(None, found), [])
 
+    def folder(self, root: Path) -> Path:
+        """First of these folders, which may be missing."""
+        return next(iter(self.folders(root)), root / self.places[0])
+
     def files(self, root: Path, expected: str, suffixes: tuple[str, ...]) -> list[Path]:
         """Images in the order of the numbers in their names; no hidden files."""
-        where = next(iter(self.folders(root)), root / self.places[0])
-        return _files(where, expected, self.name.format("*" if self.name != "{}" else "[!.]*"), suffixes)
+        return _files(
+            self.folder(root), expected, self.name.format("*" if self.name != "{}" else "[!.]*"), suffixes
+        )
 
     def shared(self, stem: str) -> str:
         """Part of an image's name that the other files of its frame share."""
@@ -321,7 +326,7 @@ def color_images(depth: list[Path], root: Path, at: tuple[ImagesAt, ImagesAt], e
     by_stem = {path.stem: path for path in found}
     stems = [colored.name.format(deep.shared(image.stem)) for image in depth]
     missing = [stem for stem in stems if stem not in by_stem]
-    where = next(iter(colored.folders(root)))
+    where = colored.folder(root)
     if 2 * len(missing) > len(depth):
         raise DatasetError(
             f"{where / missing[0]}.png or .jpg is missing, but {depth[0].parent} has its depth; "

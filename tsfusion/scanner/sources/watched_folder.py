@@ -3,16 +3,17 @@
 
 import logging
 import os
+import re
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 import cv2
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError, InvalidConfig, InvalidKeyframe, SourceError
-from tsfusion.datasets import file_names, stereo_pairs
+from tsfusion.datasets import depth_files, file_names, scan_files, stereo_pairs
 from tsfusion.datasets.cameras import (
     FILES,
     UnknownCamera,
@@ -21,14 +22,13 @@ from tsfusion.datasets.cameras import (
 )
 from tsfusion.datasets.dataset import UNREADABLE
 from tsfusion.datasets.depth_files import read_depth
-from tsfusion.datasets.formats.folder_table import NOT_MEASURED
-from tsfusion.datasets.formats.image_folders import DepthReader
+from tsfusion.datasets.formats.folder_table import NOT_MEASURED, Replica, SevenScenes
+from tsfusion.datasets.formats.image_folders import COLOR, SUFFIXES, DepthImages, DepthReader, ImagesAt
 from tsfusion.datasets.point_times import PointTimes, point_times
 from tsfusion.datasets.readers import read_image
 from tsfusion.datasets.scan_files import read_scan
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
-from tsfusion.scanner.sources import folder_layouts
 from tsfusion.scanner.sources.source import LiveSource, monotonic_of
 
 log = logging.getLogger(__name__)
@@ -44,10 +44,78 @@ _ENOUGH = 10  # names that tell what their fractions are
 _WAIT = object()  # the frame's files are not complete yet
 
 
+_PNG_END, _JPEG_END = b"\0\0\0\0IEND\xaeB`\x82", b"\xff\xd9"
+_ENDS = {".png": _PNG_END, ".jpg": _JPEG_END, ".jpeg": _JPEG_END}
+_POINT = 16  # bytes: x, y, z and intensity in float32
+
+
+class FolderLayout(NamedTuple):
+    """Files of a frame: the first, and of images the second, which shares a part of its name.
+
+    `files` are they in words, with {} for the folder of the second; `of` is the layout of a recording whose
+    usual unit of depth counts.
+    """
+
+    kind: Literal["depth", "pair", "points"]
+    files: str
+    first: ImagesAt
+    second: ImagesAt | None = None
+    suffixes: tuple[str, ...] = depth_files.SUFFIXES  # of the first
+    of: type[DepthImages] = DepthImages
+
+    def is_in(self, root: Path) -> bool:
+        """True if a folder has this layout: folders that are its own, else a first file."""
+        needed = [self.first, *([self.second] if self.second and self.kind == "pair" else ())]
+        if not all(at.folder(root).is_dir() for at in needed):
+            return False
+        if self.first.places != ("",) and self.first.name == "{}":
+            return True
+        where, pattern = self.first_files(root)
+        return any(pattern.fullmatch(name) for name in os.listdir(where))
+
+    def first_files(self, root: Path) -> tuple[Path, re.Pattern[str]]:
+        """Folder of the first files, and the pattern of their names, whose group the frame's files share."""
+        start, end = map(re.escape, self.first.name.split("{}"))
+        suffixes = "|".join(map(re.escape, self.suffixes))
+        return self.first.folder(root), re.compile(rf"{start}([^.].*){end}(?:{suffixes})")
+
+    def partner(self, root: Path, shared: str) -> Path | None:
+        """Second file of a frame; None = not there."""
+        if self.second is None:
+            return None
+        stem = self.second.folder(root) / self.second.name.format(shared)
+        return next((path for suffix in SUFFIXES if (path := Path(f"{stem}{suffix}")).exists()), None)
+
+    def words(self, root: Path) -> str:
+        """Files of a frame in words."""
+        return self.files.format("" if self.second is None else self.second.folder(root).name)
+
+
+LAYOUTS = (
+    FolderLayout("depth", "depth/NAME.png|tiff|exr|npy with {}/NAME.png|jpg",
+                 DepthImages.depth_at, ImagesAt(COLOR)),
+    FolderLayout("pair", "left/ and right/NAME.png|jpg",
+                 ImagesAt(("left",)), ImagesAt(("right",)), SUFFIXES),
+    FolderLayout("points", "velodyne/NAME.bin|pcd|ply|las|laz",
+                 ImagesAt(("velodyne",)), None, scan_files.SUFFIXES),
+    FolderLayout("depth", "frame-*.depth.png with frame-*.color.png|jpg",
+                 SevenScenes.depth_at, SevenScenes.color_at, (".png",), SevenScenes),
+    FolderLayout("depth", "results/depth*.png with results/frame*.jpg",
+                 Replica.depth_at, Replica.color_at, (".png",), Replica),
+    *(FolderLayout("points", f"NAME{suffix}", ImagesAt(("",)), None, (suffix,))
+      for suffix in scan_files.SUFFIXES),  # a file of another may be no scan, such as a mesh
+)  # fmt: skip
+EXPECTED = (
+    "depth/NAME.png|tiff|exr|npy with color/, colour/, rgb/, image/ or images/NAME.png|jpg; "
+    "frame-*.depth.png with frame-*.color.png|jpg; results/depth*.png with results/frame*.jpg; left/ and "
+    "right/NAME.png|jpg; NAME.bin|pcd|ply|las|laz, there or in velodyne/"
+)
+
+
 class WatchedFolder(LiveSource):
     """Frames in the order of their names, each as soon as its files are complete.
 
-    Layouts: `folder_layouts.EXPECTED`. Existing files come first. A frame waits for an incomplete one
+    Layouts: `LAYOUTS`. Existing files come first. A frame waits for an incomplete one
     before it, which is left out after `deadline` without a change. Colour must be registered to depth.
     Timestamps are those in the names (decimal seconds, or nanoseconds), or the times of the files.
 
@@ -94,7 +162,7 @@ class WatchedFolder(LiveSource):
             raise SourceError(f"{root} is not a folder; expected one that frames are written to")
         if calibration is not None and not Path(calibration).expanduser().exists():
             raise SourceError(f"calibration: {calibration} does not exist")
-        self._root, self._layout = root, folder_layouts.layout_of(root)
+        self._root, self._layout = root, _layout_of(root)
         self._places = (root, root.absolute().parent)  # where a file of the camera may lie
         super().__init__(f"folder {root.name}", "kinect")
         self._sensor = sensor
@@ -119,11 +187,11 @@ class WatchedFolder(LiveSource):
         """Contents of the folder, needs of the next frame, and the end of the source, for a person."""
         there = len(self._list())
         if self._layout is None:
-            wanted = f"no frames yet; waits for {folder_layouts.EXPECTED}"
+            wanted = f"no frames yet; waits for {EXPECTED}"
         elif there:
-            wanted = f"{there} frames are there; waits for more: {self._layout.files}"
+            wanted = f"{there} frames are there; waits for more: {self._layout.words(self._root)}"
         else:
-            wanted = f"no frames yet; waits for {self._layout.files}"
+            wanted = f"no frames yet; waits for {self._layout.words(self._root)}"
         if self._needs_camera():
             wanted += f", and for a camera: {FILES}, or --intrinsics or --calibration"
         ends = f"when a file {' or '.join(END_MARKERS)} appears there, or with Ctrl-C"
@@ -171,11 +239,11 @@ class WatchedFolder(LiveSource):
         """List (name, first file) of new frames, in order."""
         try:
             if self._layout is None or not self._handled:  # the folder of colour may still come
-                self._layout = folder_layouts.layout_of(self._root)
+                self._layout = _layout_of(self._root)
                 self._name_sensor()
             if self._layout is None:
                 return []
-            where, pattern = self._layout.first
+            where, pattern = self._layout.first_files(self._root)
             with os.scandir(where) as entries:
                 files = [entry.name for entry in entries if entry.name not in self._handled]
         except OSError as error:
@@ -209,22 +277,23 @@ class WatchedFolder(LiveSource):
     def _read(self, name: str, first: Path, *, final: bool) -> Any:
         """Read a frame; None if it is left out, or `_WAIT`."""
         assert self._layout is not None
-        kind, second = self._layout.kind, self._layout.partner(name)
+        kind, second = self._layout.kind, self._layout.partner(self._root, name)
         state = (name, *(_state(path) for path in (first, second)))
         if state != self._begun:
             self._begun, self._since = state, time.monotonic()
         waited = time.monotonic() - self._since
         final = final or waited > self._deadline
-        if second is None and self._layout.second is not None and self._colored is not False:
+        is_pair = kind == "pair"
+        if second is None and (is_pair or (self._layout.second is not None and self._colored is not False)):
             if not final:
                 return _WAIT
-            if kind == "pair" or self._colored:
+            if is_pair or self._colored:
                 return self._skip("without its other image")
             self._colored = False  # no frame has colour
         files = [first] if second is None else [first, second]
         try:
             settled = final or max(waited, time.time() - first.stat().st_mtime) > _SETTLED_S
-            if not all(folder_layouts.is_whole(file, settled=settled) for file in files):
+            if not all(is_whole(file, settled=settled) for file in files):
                 return self._unreadable(first, f"{first} is not complete") if final else _WAIT
             if kind != "points" and self._camera is None and not self._find_camera(kind, first, final=final):
                 return _WAIT
@@ -267,6 +336,7 @@ class WatchedFolder(LiveSource):
 
     def _find_camera(self, kind: str, first: Path, *, final: bool) -> bool:
         """Read the camera, for which the size of an image is needed; return whether it is there."""
+        assert self._layout is not None
         image = _image(first) if kind == "pair" else read_depth(first)
         size = image.shape[0], image.shape[1]
         given: Any = {"intrinsics": self._intrinsics, "calibration": self._calibration}
@@ -278,6 +348,7 @@ class WatchedFolder(LiveSource):
                 self.camera = str(found)
             else:
                 self._camera = found = find_camera(self._root, size, places=self._places, **given)
+                self._depth.usual_unit = self._layout.of.usual_unit
                 self._depth.use_camera(found, self._depth_scale)
                 self.camera = f"{found}; {self._depth.depth_unit}"
         except UnknownCamera as error:
@@ -311,3 +382,18 @@ def _state(path: Path | None) -> tuple[int, int] | None:
     except OSError:
         return None
     return None if found is None else (found.st_size, found.st_mtime_ns)
+
+
+def _layout_of(root: Path) -> FolderLayout | None:
+    """Layout of the files so far; None = unknown."""
+    return next((one for one in LAYOUTS if one.is_in(root)), None)
+
+
+def is_whole(path: Path, *, settled: bool) -> bool:
+    """True if a file is complete, by the mark at its end; by its `settled` state where it has none."""
+    if path.suffix.lower() in _ENDS:
+        with path.open("rb") as file:
+            file.seek(max(0, path.stat().st_size - len(_PNG_END)))
+            return file.read().endswith(_ENDS[path.suffix.lower()])
+    nbytes = path.stat().st_size
+    return settled and nbytes > 0 and not (path.suffix == ".bin" and nbytes % _POINT)

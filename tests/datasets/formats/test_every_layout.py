@@ -1,0 +1,212 @@
+# SPDX-License-Identifier: MIT
+"""What every layout keeps to: its frames at their own poses, whatever happened to a file of one of them."""
+
+import shutil
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import pytest
+from small_recordings import one_line
+
+from lab.reliability.fuzz_folders import WRITERS
+from tsfusion.datasets import find, open_dataset
+from tsfusion.datasets.dataset import frame_of, readable
+from tsfusion.geometry.frame import Frame
+from tsfusion.geometry.se3 import Transform
+from tsfusion.scanner.sources.watched_folder import WatchedFolder
+
+Found = dict[bytes, Transform | None]  # poses by what was measured
+
+
+class Row(NamedTuple):
+    """A layout, and the files of its frames in order."""
+
+    layout: str
+    writer: str
+    first: str
+    second: str = ""
+    poses: str = ""  # a file for each frame, or one for all
+    lines: tuple[int, int] = (1, 0)  # of a pose in such a file, and of these before its numbers
+    refused: dict[str, str] = {}  # changes that keep more than one frame from being told, and the error
+    is_watched: bool = False
+    options: dict[str, Any] = {}
+
+
+_ORDER = dict.fromkeys(("first missing", "first renamed"), "has 6 poses for 5")  # is all they go by
+_NUMBERS = {f"{side} renamed": "is not named by a frame number" for side in ("first", "second")}
+_KITTI, _RAW = "sequences/06/{}/*", "2011_09_26/2011_09_26_drive_0001_sync/{}/data/*"
+ROWS = (
+    Row("7-Scenes", "seven-scenes", "*.depth.png", "*.color.png", "*.pose.txt", is_watched=True),
+    Row("ScanNet", "scannet", "depth/*", "color/*", "pose/*"),
+    Row("Replica", "replica", "results/depth*", "results/frame*", "traj.txt", is_watched=True),
+    Row("HoloLens", "hololens", "depth/*", "images/*", "poses.txt", refused=_ORDER, is_watched=True),
+    Row("Redwood", "redwood", "depth/*", "color/*", "trajectory.log", (5, 1), is_watched=True),
+    Row("RGB-D folders", "plain", "depth/*", "rgb/*", is_watched=True),
+    Row("RGB-D folders", "flat", "depth_*", "color_*"),
+    Row("TUM RGB-D", "tum", "depth/*", "rgb/*", "groundtruth.txt"),
+    Row("nerfstudio", "nerfstudio", "depth/*", "images/*"),
+    Row("stereo folders", "stereo", "left/*", "right/*", is_watched=True),
+    Row("KITTI odometry", "kitti", _KITTI.format("image_0"), _KITTI.format("image_1"), "poses/06.txt",
+        refused=_NUMBERS),
+    Row("KITTI odometry", "kitti", _KITTI.format("velodyne"), "", "poses/06.txt", refused=_NUMBERS,
+        options={"modality": "lidar"}),
+    Row("KITTI raw", "kitti-raw", _RAW.format("image_00"), _RAW.format("image_01"), _RAW.format("oxts"),
+        refused=_NUMBERS),
+    Row("EuRoC", "euroc", "mav0/cam0/data/*", "mav0/cam1/data/*"),
+    Row("LiDAR scans", "scans", "*.bin", "", "poses_kitti.txt", refused=_ORDER, is_watched=True),
+    Row("LiDAR scans", "scans-pcd", "*.pcd", "", "poses_tum.txt", is_watched=True),
+    Row("LiDAR keyframes", "lidar-keyframes", "*/points.bin", "", "graph.txt"),
+)  # fmt: skip
+WITHOUT_POSES = ("plain", "flat", "stereo")
+# Colour that is not there is no loss where it lies beside its depth
+UNSEEN = {"flat": ("second missing", "second renamed")}
+
+
+def cut(file: Path) -> None:
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2 | 1])
+
+
+def of_another_type(file: Path) -> None:
+    """Another image in place of depth, else no image at all."""
+    stored = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+    if stored is not None and stored.dtype == np.uint16:
+        cv2.imwrite(str(file), np.zeros((*stored.shape, 3), np.uint8))
+    else:
+        file.write_bytes(b"\xff\xd8\xff\xe0" + bytes(51))
+
+
+def swap(one: Path, other: Path) -> None:
+    content = one.read_bytes()
+    one.write_bytes(other.read_bytes())
+    other.write_bytes(content)
+
+
+CHANGES: dict[str, Callable[[Path], object]] = {
+    "missing": Path.unlink,
+    "empty": lambda file: file.write_bytes(b""),
+    "cut": cut,
+    "renamed": lambda file: file.rename(file.with_name(f"x7-{file.name}")),
+    "of another type": of_another_type,
+}
+
+
+class Harmed(NamedTuple):
+    """One frame of a row, and what happens to a file of it."""
+
+    row: Row
+    change: str
+
+    def __str__(self) -> str:
+        return f"{self.row.writer} {self.row.first}: {self.change}"
+
+    def harm(self, root: Path) -> None:
+        """Change the frame in the middle."""
+        patterns = {"first": self.row.first, "second": self.row.second or self.row.first}
+        sides = {side: sorted(root.glob(pattern)) for side, pattern in patterns.items()}
+        middle = len(sides["first"]) // 2
+        side, change = self.change.split(" ", 1)
+        if side == "pose":
+            self._harm_pose(root, middle)
+        elif change == "swapped with the second":
+            swap(sides["first"][middle], sides["second"][middle])
+        else:
+            CHANGES[change](sides[side][middle])
+
+    def _harm_pose(self, root: Path, middle: int) -> None:
+        found = sorted(root.glob(self.row.poses))
+        file, frame = (found[middle], 0) if len(found) > 1 else (found[0], middle)
+        lines = file.read_text().splitlines()
+        each, before = self.row.lines
+        words = lines[frame * each + before].split()
+        lines[frame * each + before] = " ".join([*words[:-1], "nan"])
+        file.write_text("\n".join(lines) + "\n")
+
+
+def harms(row: Row) -> list[Harmed]:
+    changes = [f"{side} {change}" for side in ("first", "second") if getattr(row, side) for change in CHANGES]
+    is_depth = row.second and "image_0" not in row.first and row.first != "left/*" and "cam0" not in row.first
+    changes += ["first swapped with the second"] * bool(is_depth) + ["pose of nan"] * bool(row.poses)
+    return [Harmed(row, change) for change in changes]
+
+
+def measured(frame: Frame) -> bytes:
+    parts = (frame.depth, frame.left, frame.right, frame.points)
+    return b"".join(np.ascontiguousarray(part).tobytes() for part in parts if part is not None)
+
+
+def opened(root: Path, row: Row) -> tuple[Found, int]:
+    """Frames that can be read, and how many were left out."""
+    dataset = open_dataset(root, posed=row.writer not in WITHOUT_POSES, **row.options)
+    read = readable(lambda index: frame_of(dataset, index), range(len(dataset)))
+    return {measured(frame): frame.T_world_camera for _, frame in read}, sum(dataset.skipped.values())
+
+
+@pytest.fixture(scope="module")
+def unharmed(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Row], tuple[Path, Found]]:
+    """A recording in the layout of a row, and its frames."""
+
+    @cache
+    def made(writer: str) -> Path:
+        root = tmp_path_factory.mktemp(writer) / writer
+        root.mkdir()
+        WRITERS[writer](root)
+        return root
+
+    return lambda row: (made(row.writer), opened(made(row.writer), row)[0])
+
+
+@pytest.mark.parametrize("row", ROWS, ids=lambda row: f"{row.writer} {row.first}")
+def test_a_layout_is_recognised_and_has_all_frames_and_poses(
+    unharmed: Callable[[Row], tuple[Path, Found]], row: Row
+) -> None:
+    root, frames = unharmed(row)
+    count = len(list(root.glob(row.first)))
+    assert (find(root).layout.name, find(root).also) == (row.layout, ())
+    assert len(frames) == count >= 3
+    poses = [T for T in frames.values() if T is not None]
+    assert len(poses) == (0 if row.writer in WITHOUT_POSES else count)
+    assert len({T.tobytes() for T in poses}) == len(poses)
+
+
+@pytest.mark.parametrize("harmed", [one for row in ROWS for one in harms(row)], ids=str)
+def test_what_happens_to_one_frame_leaves_the_others_at_their_poses(
+    unharmed: Callable[[Row], tuple[Path, Found]], tmp_path: Path, harmed: Harmed
+) -> None:
+    whole, frames = unharmed(harmed.row)
+    root = Path(shutil.copytree(whole, tmp_path / whole.name))
+    harmed.harm(root)
+    if refused := harmed.row.refused.get(harmed.change):
+        one_line(lambda: opened(root, harmed.row), refused)
+        return
+    found, skipped = opened(root, harmed.row)
+    assert len(found) == len(frames) - (harmed.change not in UNSEEN.get(harmed.row.writer, ()))
+    for key, T in found.items():
+        expected = frames[key]
+        assert (T is None) == (expected is None)
+        assert T is None or np.abs(T - expected).max() < 1e-12
+    assert skipped <= 2
+
+
+@pytest.mark.parametrize(
+    "harmed",
+    [one for row in ROWS if row.is_watched for one in harms(row) if "pose" not in one.change],
+    ids=str,
+)
+def test_a_watched_folder_gives_the_same_frames(
+    unharmed: Callable[[Row], tuple[Path, Found]], tmp_path: Path, harmed: Harmed
+) -> None:
+    whole, frames = unharmed(harmed.row)
+    root = Path(shutil.copytree(whole, tmp_path / whole.name))
+    (root / "DONE").touch()
+    with WatchedFolder(root) as source:
+        assert [measured(frame) for frame in source] == list(frames)
+    harmed.harm(root)
+    with WatchedFolder(root) as source:
+        found = [measured(frame) for frame in source]
+    is_last = harmed.change == "first renamed" and not harmed.row.second  # any name will do
+    assert len(found) == len(frames) - (not is_last)
+    assert set(found) <= set(frames)
