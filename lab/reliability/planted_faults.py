@@ -25,49 +25,49 @@ class Fault(Struct, frozen=True):
 FAULTS = (
     # journal: what is acknowledged is on the disk, and found again
     Fault(
-        "journal/open_segment.py",
+        "journal/segments.py",
         "            os.fdatasync(self._descriptor)\n",
         "            pass\n",
         "journal/test_bad_disks.py::test_everything_is_on_the_disk_in_the_order_that_recovery_needs",
     ),
     Fault(
-        "journal/open_segment.py",
+        "journal/segments.py",
         "            durable_files.sync_folder(self.path.parent)\n",
         "            pass\n",
         "journal/test_bad_disks.py::test_everything_is_on_the_disk_in_the_order_that_recovery_needs",
     ),
     Fault(
-        "journal/open_segment.py",
+        "journal/segments.py",
         "os.ftruncate(self._descriptor, cut)",
         "pass",
         "journal/test_bad_disks.py::test_what_was_refused_is_cut_off_on_the_disk_as_well",
     ),
     Fault(
-        "journal/open_segment.py",
+        "journal/segments.py",
         "os.ftruncate(self._descriptor, at)",
         "pass",
         "journal/test_bad_disks.py::test_what_was_refused_is_cut_off_on_the_disk_as_well",
     ),
     Fault(
-        "journal/open_segment.py",
+        "journal/segments.py",
         "        self.is_over = True\n",
         "",
         "journal/test_files_taken_away.py::test_a_record_of_a_file_whose_place_is_not_known_is_taken_back",
     ),
     Fault(
-        "journal/open_segment.py",
+        "journal/segments.py",
         "os.O_RDWR | os.O_CREAT | os.O_EXCL",
         "os.O_RDWR | os.O_CREAT",
         "journal/test_files_taken_away.py::test_a_file_with_the_next_number_is_stepped_over",
     ),
     Fault(
-        "journal/open_segment.py",
+        "journal/segments.py",
         "copy.truncate(os.fstat(self._descriptor).st_size)",
         "pass",
         "journal/test_files_taken_away.py::test_a_record_that_was_taken_back_is_not_put_back",
     ),
     Fault(
-        "journal/open_segment.py",
+        "journal/segments.py",
         "return os.fstat(self._descriptor).st_nlink == 0",
         "return False",
         "journal/test_files_taken_away.py::test_an_open_segment_that_is_taken_away_is_put_back_with_every_record",

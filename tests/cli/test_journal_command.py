@@ -22,7 +22,7 @@ from tsfusion import journal
 from tsfusion.core.errors import JournalError
 from tsfusion.geometry import se3
 from tsfusion.journal import Journal, segment_path
-from tsfusion.journal.recording import JournalRecording
+from tsfusion.journal.journaled_keyframes import JournalRecording
 from tsfusion.journal.state_folder import find_journal
 from tsfusion.wire import codec, corrections
 

@@ -9,9 +9,8 @@ import pytest
 from keyframes_and_servers import wall
 
 from tsfusion.delivery import control_session
-from tsfusion.delivery.control_session import ControlSession
+from tsfusion.delivery.control_session import ControlSession, RefusedFolder
 from tsfusion.delivery.outbox import Outbox
-from tsfusion.delivery.refused_keyframes import RefusedFolder
 from tsfusion.delivery.spool import Spool
 from tsfusion.wire import codec, messages
 from tsfusion.wire.messages import Ack, Denied, Nack, Pong, ToClient, Welcome

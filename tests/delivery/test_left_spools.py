@@ -11,7 +11,7 @@ from keyframes_and_servers import pose
 
 from tsfusion import Client
 from tsfusion.core.errors import JournalError
-from tsfusion.delivery import left_spools, tombstones
+from tsfusion.delivery import left_spools, spool
 from tsfusion.delivery import spool as spool_module
 from tsfusion.delivery.spool import Spool
 from tsfusion.journal import Journal
@@ -82,7 +82,7 @@ def test_what_left_a_spool_stays_out_of_it_and_few_numbers_are_kept(
         spool.add(spool.write([bytes(1000)]))
         if len(spool.waiting) > 1:
             spool.remove(1)
-    assert (tmp_path / tombstones.NAME).stat().st_size < 16 + 8 * 50
+    assert (tmp_path / spool.TOMBSTONES).stat().st_size < 16 + 8 * 50
     spool.close()
     again = Spool(tmp_path, 5000)
     assert [entry.seq for entry in again.waiting] == [1]
@@ -119,6 +119,6 @@ def test_a_number_that_nobody_may_find_is_not_used_again(
 
 
 def test_numbers_that_another_session_left_mean_nothing(tmp_path: Path) -> None:
-    tombstones.Tombstones(tmp_path, bytes(16)).add(1)
+    spool.Tombstones(tmp_path, bytes(16)).add(1)
     for _ in range(2):
-        assert tombstones.Tombstones(tmp_path, bytes(range(16))).numbers == set()
+        assert spool.Tombstones(tmp_path, bytes(range(16))).numbers == set()

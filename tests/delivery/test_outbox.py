@@ -12,8 +12,8 @@ from keyframes_and_servers import wall
 
 from tsfusion.core.errors import InvalidKeyframe
 from tsfusion.delivery import outcomes
-from tsfusion.delivery.delivery_progress import NumberRuns
 from tsfusion.delivery.outbox import Outbox
+from tsfusion.delivery.outcomes import NumberRuns
 from tsfusion.delivery.spool import Spool, Waiting
 from tsfusion.journal import Position
 from tsfusion.wire import codec, corrections

@@ -15,7 +15,7 @@ from tsfusion import Client
 from tsfusion.core.config import ClientConfig
 from tsfusion.core.errors import FlushTimeout, InvalidConfig, JournalError, KeyframeRefused, ServerUnreachable
 from tsfusion.delivery.spool import Spool
-from tsfusion.journal.recording import JournalRecording
+from tsfusion.journal.journaled_keyframes import JournalRecording
 from tsfusion.wire import codec
 from tsfusion.wire.queries import fetch_health, fetch_status
 from tsfusion.wire.record_header import unpack
@@ -202,7 +202,7 @@ def test_what_a_full_map_rejects_is_said_at_once(tmp_path: Path, caplog: pytest.
 
 
 def test_what_is_kept_aside_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tsfusion.delivery.refused_keyframes.MAX_BYTES", 20_000)
+    monkeypatch.setattr("tsfusion.delivery.control_session.REFUSED_BYTES", 20_000)
     with (
         scripted(refuses=lambda header: True) as server,
         joined(server, spool=tmp_path, policy="spool_all") as client,

@@ -16,8 +16,7 @@ from tsfusion import Client, journal
 from tsfusion.core.config import ClientConfig
 from tsfusion.core.errors import JournalError, KeyframeRefused
 from tsfusion.delivery import backpressure, sender
-from tsfusion.delivery.spool import Spool
-from tsfusion.delivery.tombstones import NAME, Tombstones
+from tsfusion.delivery.spool import TOMBSTONES, Spool, Tombstones
 
 SMALL = ClientConfig(policy="spool_all", segment_bytes=1 << 16, stall_timeout=0.5)
 
@@ -122,7 +121,7 @@ def test_a_number_that_was_cut_off_shifts_no_other(tmp_path: Path, torn: int) ->
     session = bytes(range(1, 17))
     gone = Tombstones(tmp_path, session)
     gone.add(7)
-    path = tmp_path / NAME
+    path = tmp_path / TOMBSTONES
     os.truncate(path, 16 + 8)
     path.write_bytes((path.read_bytes() + b"\xff" * 8)[:torn])
     gone.add(8)

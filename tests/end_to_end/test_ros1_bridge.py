@@ -19,7 +19,7 @@ from tsfusion.core.errors import JournalError
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Keyframe
-from tsfusion.journal.recording import JournalRecording
+from tsfusion.journal.journaled_keyframes import JournalRecording
 from tsfusion.scanner.localization.localizer import Lost, Pose
 from tsfusion.scanner.localization.pose_feed.feed import PoseFeed
 

@@ -40,7 +40,7 @@ from tsfusion.core.errors import (
 )
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.journal import state_folder
-from tsfusion.journal.recording import JournalRecording
+from tsfusion.journal.journaled_keyframes import JournalRecording
 from tsfusion.wire import codec, messages, sockets
 from tsfusion.wire.mesh_updates import Meshed
 from tsfusion.wire.messages import Command

@@ -17,7 +17,7 @@ from quick_fusers import SUMS
 import tsfusion
 from tsfusion import Client
 from tsfusion.core.errors import FlushTimeout, NotAllowed, TransportError
-from tsfusion.journal.recording import JournalRecording
+from tsfusion.journal.journaled_keyframes import JournalRecording
 from tsfusion.wire import codec, key_folder, messages, sockets
 from tsfusion.wire.curve import ClientKeys, client_keys, server_keys
 from tsfusion.wire.queries import fetch_health, fetch_mesh, fetch_new_map, fetch_status

@@ -27,7 +27,7 @@ from tsfusion.gateway.map_registry import MapRegistry
 from tsfusion.gateway.metrics import Metrics
 from tsfusion.gateway.quotas import Quotas
 from tsfusion.journal import state_folder
-from tsfusion.journal.recording import JournalRecording
+from tsfusion.journal.journaled_keyframes import JournalRecording
 from tsfusion.wire import codec, messages, sockets
 from tsfusion.wire.queries import fetch_health, fetch_mesh, fetch_status
 from tsfusion.wire.record_header import Refused, unpack
@@ -90,7 +90,7 @@ def test_maps_that_cannot_be_opened_are_remembered_up_to_a_number(
     found._volumes = {"default": VolumeConfig()}
     for i in range(200):
         assert found.open_for_client(f"map{i}") is None
-    assert len(found.problems()) == 64
+    assert len(list(found.unopened())) == 64
     assert found.why_not("map199") == "no room"
 
 

@@ -14,7 +14,7 @@ from quick_fusers import SUMS
 from tsfusion import Client, journal
 from tsfusion.core.errors import InvalidConfig, TransportError, WorldRefused
 from tsfusion.journal import state_folder
-from tsfusion.journal.recording import JournalRecording
+from tsfusion.journal.journaled_keyframes import JournalRecording
 from tsfusion.journal.recovery import recover
 from tsfusion.wire import codec, messages, sockets
 from tsfusion.wire.queries import fetch_health, fetch_new_map

@@ -16,9 +16,7 @@ from keyframes_and_servers import CAMERA, SHAPE, VOLUME, wall
 from tsfusion import Volume
 from tsfusion.core.rates import Bucket
 from tsfusion.fuser import question_answers
-from tsfusion.fuser.inbox import Inbox
-from tsfusion.fuser.kept_slices import KeptSlices
-from tsfusion.fuser.kept_views import KeptViews
+from tsfusion.fuser.kept_answers import KeptSlices, KeptViews
 from tsfusion.fuser.live_mesh import TouchedBy
 from tsfusion.fuser.messages import (
     NOT_WORKING,
@@ -29,7 +27,7 @@ from tsfusion.fuser.messages import (
     Publish,
     encode,
 )
-from tsfusion.fuser.question_answers import QuestionAnswers
+from tsfusion.fuser.question_answers import Inbox, QuestionAnswers
 from tsfusion.fuser.watched_map import WatchedMap
 from tsfusion.journal.keyframe_poses import KeyframePoses
 from tsfusion.wire import questions

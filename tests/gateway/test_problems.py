@@ -15,7 +15,7 @@ from keyframes_and_servers import Server, pose, until, wall
 
 from tsfusion import Client
 from tsfusion.core import process
-from tsfusion.gateway import fuser_supervisor, gateway, recent_fates
+from tsfusion.gateway import fuser_supervisor, map_condition, recent_fates
 from tsfusion.gateway.client_routes import ClientRoute
 from tsfusion.gateway.fuser_supervisor import FuserSilence
 from tsfusion.gateway.problems import Problem, ProblemTimes, span
@@ -159,7 +159,7 @@ def test_a_client_of_which_everything_is_refused_is_a_problem_and_the_server_rea
 @pytest.mark.parametrize(("problems", "blocked"), [(["", "stuck"], False), (["stuck"], True), ([], False)])
 def test_a_server_with_a_good_map_is_ready(problems: list[str], blocked: bool) -> None:
     maps = {f"map{number}": map_health(problem=problem) for number, problem in enumerate(problems)}
-    assert gateway.all_blocked(maps) == blocked
+    assert map_condition.all_blocked(maps) == blocked
 
 
 # --- a fuser that does nothing ---

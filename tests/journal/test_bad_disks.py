@@ -18,7 +18,7 @@ from tsfusion import journal
 from tsfusion.core import durable_files
 from tsfusion.core.errors import JournalError
 from tsfusion.journal import Journal, Position, inspection, mcap_layout, segment_path, state_folder
-from tsfusion.journal.open_segment import OpenSegment
+from tsfusion.journal.segments import OpenSegment
 
 BIG = 1 << 30
 SESSION = bytes(range(16))

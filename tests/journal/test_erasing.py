@@ -16,8 +16,8 @@ from tsfusion.core.errors import JournalError
 from tsfusion.core.number_ranges import NumberRanges, parse
 from tsfusion.journal import Erased, Journal, Position, erasing, state_folder
 from tsfusion.journal.inspection import summarize, verify
+from tsfusion.journal.journaled_keyframes import JournalRecording
 from tsfusion.journal.quarantine import Quarantine
-from tsfusion.journal.recording import JournalRecording
 from tsfusion.journal.recovery import recover
 from tsfusion.wire import codec
 

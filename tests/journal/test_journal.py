@@ -20,8 +20,8 @@ from tsfusion import journal
 from tsfusion.core.errors import JournalError
 from tsfusion.delivery.spool import Spool
 from tsfusion.journal import Journal, Position, Unwritten, mcap_layout, quarantine, segment_path
+from tsfusion.journal.journaled_keyframes import JournalRecording
 from tsfusion.journal.quarantine import Quarantine
-from tsfusion.journal.recording import JournalRecording
 from tsfusion.wire import codec
 
 SESSION = bytes(16)

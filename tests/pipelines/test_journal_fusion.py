@@ -16,7 +16,7 @@ from keyframes_and_servers import VOLUME, map_hash, pose, wall
 
 from tsfusion import Keyframe, Volume, VolumeConfig
 from tsfusion.core.errors import InvalidConfig, JournalError
-from tsfusion.journal import Journal, selection
+from tsfusion.journal import Journal, journaled_keyframes
 from tsfusion.pipelines import journal_fusion
 from tsfusion.wire import codec, corrections
 
@@ -98,7 +98,7 @@ def test_wrong_values_list_what_there_is(state: Path) -> None:
     with pytest.raises(JournalError, match=r"is named 'right'; the journal has abababab \(left\), acababab"):
         hash_of(state, only=["right"])
     with pytest.raises(JournalError, match="several sessions begin with 'abab'"):
-        selection.sessions_named("abab", {LEFT: "", LEFT[:-1] + b"\0": ""})
+        journaled_keyframes.sessions_named("abab", {LEFT: "", LEFT[:-1] + b"\0": ""})
     with pytest.raises(JournalError, match=r"records from 2023-11-14 22:13:20Z to 2023-11-14 22:13:27Z"):
         hash_of(state, until="2001-01-01")
     for text in ("yesterday", "nan", ""):

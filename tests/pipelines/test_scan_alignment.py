@@ -22,7 +22,7 @@ from tsfusion.datasets import select
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
 from tsfusion.journal import state_folder
-from tsfusion.journal.recording import JournalRecording
+from tsfusion.journal.journaled_keyframes import JournalRecording
 from tsfusion.pipelines import scan as pipelines_scan
 from tsfusion.pipelines import scan_alignment
 from tsfusion.pipelines.scan_alignment import ExistingMap, PlacedLocalizer, PlacementTry, find_place

@@ -19,7 +19,7 @@ from tsfusion.core.errors import WorldRefused
 from tsfusion.datasets import select
 from tsfusion.datasets.trajectory_files import read_tum
 from tsfusion.geometry.frame import Frame
-from tsfusion.journal.recording import JournalRecording
+from tsfusion.journal.journaled_keyframes import JournalRecording
 from tsfusion.pipelines import engine
 from tsfusion.pipelines import scan as pipelines_scan
 from tsfusion.pipelines.scan_results import ScanSummary

@@ -55,7 +55,7 @@ MAY_REACH_TAICHI = (
 TAICHI_FREE = ("fuser.messages",)
 LIGHT = (
     *("client", "server", "scanner.scanner", "wire.codec"),
-    *("journal", "journal.recording", "datasets", "cli", "wire.map_client", "wire.map_watcher"),
+    *("journal", "journal.journaled_keyframes", "datasets", "cli", "wire.map_client", "wire.map_watcher"),
 )
 
 

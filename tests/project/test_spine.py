@@ -14,8 +14,8 @@ IDLE, KEYFRAME = 1, 2  # values of the byte that all processes see: which files 
 
 # A keyframe enters them only because they are asked whether they have work.
 ASKED = """
-core/number_ranges.py core/rates.py fuser/departures.py fuser/keep_window.py fuser/kept_slices.py
-fuser/kept_views.py fuser/pose_mover.py fuser/question_answers.py geometry/up_direction.py
+core/number_ranges.py core/rates.py fuser/departures.py fuser/kept_answers.py
+fuser/pose_mover.py fuser/question_answers.py geometry/up_direction.py
 journal/locations.py tsdf/carved_blocks.py tsdf/clear_blocks.py tsdf/map_slices.py
 """
 

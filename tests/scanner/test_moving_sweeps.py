@@ -15,7 +15,7 @@ from tsfusion.core.config import ScanConfig
 from tsfusion.datasets.trajectory_files import write_tum
 from tsfusion.geometry import se3, sweeps
 from tsfusion.geometry.frame import Frame
-from tsfusion.journal.recording import JournalRecording
+from tsfusion.journal.journaled_keyframes import JournalRecording
 from tsfusion.scanner.localization.given_poses import GivenPoses, TrajectoryFilePoses
 from tsfusion.scanner.localization.localizer import Localizer, Lost, Pose
 from tsfusion.scanner.scanner import Scanner

@@ -15,7 +15,7 @@ from tsfusion import Client
 from tsfusion.core.config import ScanConfig
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
-from tsfusion.journal.recording import JournalRecording
+from tsfusion.journal.journaled_keyframes import JournalRecording
 from tsfusion.scanner.localization.localizer import Localizer, Lost, Pose, PoseCorrections
 from tsfusion.scanner.scanner import Scanner
 from tsfusion.scanner.tracked_trajectory import TrackedTrajectory

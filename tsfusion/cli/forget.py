@@ -157,14 +157,14 @@ def _moment_ns(text: str) -> int:
     """A time of the wall clock; below zero, so long before the last record."""
     import time
 
-    from tsfusion.journal import selection
+    from tsfusion.journal import journaled_keyframes
 
     now = time.time_ns()
     try:
         float(text)
     except ValueError:
-        return selection.moment_ns(text, now)
-    return min(selection.moment_ns(text, now) - now, -1)
+        return journaled_keyframes.moment_ns(text, now)
+    return min(journaled_keyframes.moment_ns(text, now) - now, -1)
 
 
 @contextmanager

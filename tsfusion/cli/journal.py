@@ -232,7 +232,7 @@ def _describe_info(found: "JournalInfo") -> str:
 
 
 def _session(one: "SessionInfo") -> str:
-    from tsfusion.journal.selection import clock
+    from tsfusion.journal.journaled_keyframes import clock
 
     first, last = clock(one.first_logged_ns), clock(one.last_logged_ns)
     forgotten = f"  {one.forgotten} forgotten" if one.forgotten else ""

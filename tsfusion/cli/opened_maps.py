@@ -36,7 +36,7 @@ def opened(path: Path, map_name: str | None = None, *, quiet: bool) -> Iterator[
     Where damage in its journal has cost keyframes, the command ends with status 1, after its results.
     """
     from tsfusion.cli import progress
-    from tsfusion.journal.recording import LOST
+    from tsfusion.journal.journaled_keyframes import LOST
     from tsfusion.pipelines import saved_maps
 
     with progress.shown(quiet=quiet) as display:

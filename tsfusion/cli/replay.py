@@ -108,7 +108,7 @@ def open_recording(path: Path, /, *, unpack: bool = False, **given: Any) -> "Dat
     if is_journal(path):
         from tsfusion.cluster import keyframe_sources
         from tsfusion.core.errors import DatasetError
-        from tsfusion.journal.recording import JournalRecording
+        from tsfusion.journal.journaled_keyframes import JournalRecording
 
         for name, value in given.items():
             if value is not None and name != "posed":
@@ -130,7 +130,7 @@ def _refuse_own_journal(dataset: "Dataset", state: Path, map_name: str) -> None:
     """Raise InvalidConfig where a journal would be replayed into the map that it is of."""
     from tsfusion.core.errors import InvalidConfig
     from tsfusion.journal import state_folder
-    from tsfusion.journal.recording import JournalRecording
+    from tsfusion.journal.journaled_keyframes import JournalRecording
 
     folder = state_folder.map_folder(state, map_name).resolve()
     if isinstance(dataset, JournalRecording) and folder in Path(dataset.name).resolve().parents:

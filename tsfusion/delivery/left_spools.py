@@ -17,7 +17,7 @@ from msgspec import Struct
 from tsfusion import journal
 from tsfusion.core.errors import DecodeError, JournalError
 from tsfusion.core.folder_lock import lock_folder, owner_of
-from tsfusion.delivery import tombstones
+from tsfusion.delivery import spool
 from tsfusion.journal.mcap_layout import Record
 from tsfusion.journal.record_scan import Damage, scan_records
 from tsfusion.wire.record_header import unpack
@@ -90,7 +90,7 @@ def drop(left: LeftSpool) -> None:
     try:
         for number in journal.segments(left.folder):
             journal.segment_path(left.folder, number).unlink()
-        (left.folder / tombstones.NAME).unlink(missing_ok=True)
+        (left.folder / spool.TOMBSTONES).unlink(missing_ok=True)
     except OSError as error:
         raise JournalError(f"cannot delete {left.folder}: {error.strerror}", error.errno) from error
     finally:
@@ -116,6 +116,6 @@ def _waiting(folder: Path) -> Iterator[Record]:
             if isinstance(step, Damage):
                 continue
             if gone is None:
-                gone = tombstones.stored(folder, step.session) or set()
+                gone = spool.buried(folder, step.session) or set()
             if step.seq not in gone:
                 yield step

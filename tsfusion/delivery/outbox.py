@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 from tsfusion.core.errors import InvalidKeyframe
 from tsfusion.core.readable_numbers import count_of
-from tsfusion.delivery.delivery_progress import DeliveryProgress
 from tsfusion.delivery.link_state import LinkState
-from tsfusion.delivery.outcomes import ClientStats, Outcomes
+from tsfusion.delivery.outcomes import ClientStats, DeliveryProgress, Outcomes
 from tsfusion.delivery.spool import Spool, Waiting
 from tsfusion.delivery.timing import KeyframeTimesTable, Lag, TakingRate
 from tsfusion.geometry.keyframe import Keyframe

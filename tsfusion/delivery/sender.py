@@ -18,9 +18,8 @@ import zmq
 
 from tsfusion.core.config import ClientConfig
 from tsfusion.core.errors import MISSING, DecodeError, InvalidConfig, JournalError
-from tsfusion.delivery.control_session import ControlSession
+from tsfusion.delivery.control_session import ControlSession, RefusedFolder
 from tsfusion.delivery.outbox import Outbox
-from tsfusion.delivery.refused_keyframes import RefusedFolder
 from tsfusion.delivery.spool import Waiting
 from tsfusion.wire import sockets
 from tsfusion.wire.connection import Connection, Patience
@@ -196,15 +195,11 @@ class Sender:
     def _follow_if_allowed(self, place: tuple[str, str], now: float) -> None:
         """Go to the server that has the map. Without keys only one of this machine is believed."""
         try:
-            data = sockets.connect_address(place[0])
-            control = sockets.connect_address(sockets.control_address(data, place[1] or None))
-            if self._keys is None:
-                sockets.check_reachable(data, has_keys=False)
-                sockets.check_reachable(control, has_keys=False)
+            found = sockets.place_of(*place, has_keys=self._keys is not None)
         except InvalidConfig as error:
             self._control_session.refuse_move(str(error))
             return
-        self._follow((data, control), now)
+        self._follow(found, now)
 
     def _follow(self, place: tuple[str, str], now: float) -> None:
         self._data_address, self._control_address = place

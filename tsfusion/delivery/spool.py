@@ -6,6 +6,7 @@ server may already know, and a spool that was emptied starts a new session. Read
 cache costs less than holding the queue in memory, and bounds it.
 """
 
+import contextlib
 import logging
 import os
 import secrets
@@ -15,6 +16,7 @@ from collections import deque
 from collections.abc import Iterable
 from pathlib import Path
 
+import numpy as np
 from msgspec import Struct
 
 from tsfusion import journal
@@ -23,8 +25,78 @@ from tsfusion.core.durable_files import size_of
 from tsfusion.core.errors import MISSING, DecodeError, JournalError
 from tsfusion.core.folder_lock import lock_folder
 from tsfusion.core.readable_numbers import count_of
-from tsfusion.delivery.tombstones import Tombstones
 from tsfusion.wire.record_header import RecordHeader, is_correction, unpack
+
+TOMBSTONES = "gone"
+_NUMBER = np.dtype("<u8")
+_SESSION_BYTES = 16
+
+
+def buried(folder: Path, session: bytes) -> set[int] | None:
+    """The numbers in a spool's file; None = it is another session's."""
+    try:
+        content = (folder / TOMBSTONES).read_bytes()
+    except OSError:
+        return set()
+    if content[:_SESSION_BYTES] != session:
+        return None
+    whole = (len(content) - _SESSION_BYTES) // _NUMBER.itemsize
+    return set(np.frombuffer(content, _NUMBER, whole, _SESSION_BYTES).tolist())
+
+
+def _whole_bytes(size: int) -> int:
+    """Bytes of a file of this size up to its last whole number."""
+    numbers = (size - _SESSION_BYTES) // _NUMBER.itemsize
+    return _SESSION_BYTES + numbers * _NUMBER.itemsize if size >= _SESSION_BYTES else 0
+
+
+class Tombstones:
+    """Numbers of records that left a spool unsent or refused, while one of its files still holds them.
+
+    Without them a scanner that starts after a crash would find these records again and send them. The file is
+    not synced: a record whose number a power cut takes is found again, and sent. A disk that refuses is
+    passed over.
+    """
+
+    def __init__(self, folder: Path, session: bytes) -> None:
+        self._path = folder / TOMBSTONES
+        self._session = session
+        self.numbers = self._read()  # those in the file at the start
+        self.written = len(self.numbers)  # count of the numbers in the file
+
+    def _read(self) -> set[int]:
+        found = buried(self._path.parent, self._session)
+        if found is None:  # of a spool that was here before
+            self.clear()
+        return found or set()
+
+    def add(self, seq: int) -> None:
+        """Append a number."""
+        self._write([seq])
+
+    def keep(self, numbers: Iterable[int]) -> None:
+        """Write the file anew with these numbers; the records of all others are deleted."""
+        self.clear()
+        self._write(numbers)
+
+    def clear(self) -> None:
+        """Delete the file."""
+        self.written = 0
+        with contextlib.suppress(OSError):
+            self._path.unlink(missing_ok=True)
+
+    def _write(self, numbers: Iterable[int]) -> None:
+        added = np.fromiter(numbers, _NUMBER)
+        try:
+            with self._path.open("ab") as file:
+                whole = _whole_bytes(file.tell())
+                file.truncate(whole)  # what a full disk took of the last number would shift all that follow
+                head = b"" if whole else self._session
+                file.write(head + added.tobytes())
+        except OSError as error:
+            log.debug("%s cannot be written: %s", self._path, error.strerror)
+        self.written += len(added)
+
 
 log = logging.getLogger(__name__)
 
@@ -33,7 +105,6 @@ log = logging.getLogger(__name__)
 # answer to the other's keyframe for its own, and lose one in silence.
 _RESTART_GAP = 1024
 _RESTART_SPREAD = 1 << 24
-_SESSION_BYTES = 16
 _MANY_TOMBSTONES = 65536  # numbers before those of deleted files are forgotten
 _LOOK_SECONDS = 0.2  # for which somebody may hold the lock who only looks whether it is held
 _RECORD_OVERHEAD = 512  # what MCAP adds to a keyframe, its share of the index at the end included

@@ -18,8 +18,8 @@ from tsfusion.core.folder_lock import lock_folder
 from tsfusion.fuser import map_checkpoints
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.fuser.fuser import LOCK, Fuser
-from tsfusion.fuser.inbox import Inbox
 from tsfusion.fuser.map_checkpoints import OpenedMap
+from tsfusion.fuser.question_answers import Inbox
 from tsfusion.wire import sockets
 
 _LOCK_WAIT_S = 60.0  # for another fuser to end: it may be reading a large map

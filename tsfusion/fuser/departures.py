@@ -1,17 +1,273 @@
 # SPDX-License-Identifier: MIT
-"""Keyframes that are to leave a map: those that somebody names, and those beyond its window."""
+"""Keyframes that are to leave a map: those that somebody names, and those beyond its window.
 
+Both are looked for a part at a time, so that keyframes are fused between.
+"""
+
+import time
+from array import array
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion import journal
+from tsfusion.core.config import SERVER_SESSION
+from tsfusion.core.errors import DecodeError, InvalidConfig, InvalidKeyframe, JournalError
 from tsfusion.fuser import messages as fuser_messages
-from tsfusion.fuser.keep_window import KeepWindow
-from tsfusion.fuser.keyframe_search import KeyframeSearch
-from tsfusion.fuser.messages import Begin, Expire, Find, SessionProgress
-from tsfusion.journal import state_folder
-from tsfusion.journal.keyframe_poses import KeyframePoses
+from tsfusion.fuser.messages import EXPIRED, Begin, Expire, Find, Found, FoundKeyframes, SessionProgress
+from tsfusion.geometry.keyframe import points_world
+from tsfusion.journal import Position, Record, state_folder
+from tsfusion.journal.keyframe_poses import KeptKeyframes, KeyframePoses
+from tsfusion.wire import codec
+from tsfusion.wire.forgetting import Selection
+
+_SLICE_S = 0.05  # seconds at a time
+_REST_S = 0.15  # between two slices while keyframes come
+_INSIDE = 0.9  # share of a keyframe's points: noise, or a look out of a window, is not to keep it
+
+
+class KeyframeSearch:
+    """A search for selected keyframes in the journal. Call `go_on` when `wait` is over, until it gives them.
+
+    Args:
+        folder: the map's.
+        done: how far the map is with each session.
+    """
+
+    def __init__(
+        self, find: Find, folder: Path, poses: KeyframePoses, done: dict[bytes, SessionProgress]
+    ) -> None:
+        self._find, self._poses, self._done = find, poses, done
+        self._place = state_folder.JournalPlace(folder / state_folder.JOURNAL_FOLDER)
+        self._selected: dict[bytes, _Columns] = {}
+        self._steps = self._search(find.selection)
+        self._next = 0.0  # time.monotonic()
+        self._since_ns: int | None = None
+        self._first_ns: int | None = None  # of the first record in the journal
+
+    def wait(self, idle: bool) -> float:
+        """Seconds until it is time to go on."""
+        return 0.0 if idle else max(self._next - time.monotonic(), 0.0)
+
+    def go_on(self) -> Found | None:
+        """Search for a while; the answer when all was looked at."""
+        until = time.monotonic() + _SLICE_S
+        try:
+            for _ in self._steps:
+                if time.monotonic() >= until:
+                    self._next = time.monotonic() + _REST_S
+                    return None
+            return self._found()
+        except (JournalError, InvalidConfig) as error:
+            return Found(self._find.number, error=str(error))
+
+    def _search(self, selection: Selection) -> Iterator[None]:
+        if selection.counts_from_end:
+            selection = selection.at_end(self._last_logged_ns())
+        for _, step in self._place.steps():
+            if isinstance(step, Record) and self._first_ns is None:
+                self._first_ns = step.logged_ns
+                self._since_ns = selection.since_ns
+            if isinstance(step, Record) and not step.is_correction and self._is_selected(selection, step):
+                self._selected.setdefault(step.session, _Columns(step.client)).add(
+                    step, self._poses.is_forgotten(step.session, step.seq)
+                )
+            yield
+
+    def _last_logged_ns(self) -> int:
+        for path in reversed(self._place.files()):
+            found = [record for record in journal.records(path) if record.session != SERVER_SESSION]
+            if found:
+                return max(record.logged_ns for record in found)
+        return 0
+
+    def _is_selected(self, selection: Selection, record: Record) -> bool:
+        return selection.has(
+            session=record.session, client=record.client, seq=record.seq, logged_ns=record.logged_ns
+        ) and (selection.box is None or self._lies_in(np.array(selection.box).reshape(2, 3), record))
+
+    def _lies_in(self, corners: NDArray[np.float64], record: Record) -> bool:
+        """True if the sensor was in the box, and so is nearly all that it measured."""
+        low, high = corners.min(axis=0), corners.max(axis=0)
+        try:
+            keyframe = codec.decode_keyframe(record.frames)
+            pose = self._poses.pose_of(record.session, record.seq)
+            placed = self._poses.placed(record.session, keyframe)
+            placed = placed if pose is None else replace(placed, T_world_camera=pose)
+        except (DecodeError, InvalidKeyframe):  # the map has no such keyframe
+            return False
+        eye = placed.T_world_camera[:3, 3]
+        if not ((eye >= low) & (eye <= high)).all():
+            return False
+        points = points_world(placed)
+        points = points[np.isfinite(points).all(axis=1)]
+        inside = ((points >= low) & (points <= high)).all(axis=1)
+        return not len(inside) or bool(inside.mean() >= _INSIDE)
+
+    def _found(self) -> Found:
+        if self._find.selection.numbers is not None and len(self._selected) > 1:
+            names = ", ".join(key.hex()[:8] for key in self._selected)
+            raise InvalidConfig(
+                f"several sessions have keyframes of these numbers: {names}; name one of them"
+            )
+        if self._find.selection.session and len(self._selected) > 1:
+            names = ", ".join(key.hex() for key in self._selected)
+            raise InvalidConfig(f"several sessions begin with {self._find.selection.session}: {names}")
+        sessions = tuple(columns.found(key) for key, columns in self._selected.items())
+        return Found(self._find.number, sessions, tuple(self._unavailable()))
+
+    def _unavailable(self) -> Iterator[str]:
+        """The sessions that may have selected keyframes in the map which the journal has no more."""
+        if self._first_ns is not None and self._since_ns is not None and self._since_ns >= self._first_ns:
+            return  # those came before
+        for key, seq in self._poses.unknown():
+            if key == SERVER_SESSION:
+                continue
+            client = self._done[key].client if key in self._done else ""
+            own = self._find.selection
+            first = min((one for one, _ in own.numbers), default=1) if own.numbers is not None else 1
+            if key.hex().startswith(own.session) and own.client in (None, client) and first <= seq:
+                yield f"{key.hex()[:8]} up to number {seq}"
+
+
+class _Columns:
+    """The selected keyframes of one session."""
+
+    def __init__(self, client: str) -> None:
+        self._client = client
+        self._seqs, self._segments, self._offsets = array("q"), array("q"), array("q")
+        self._forgotten = array("b")
+
+    def add(self, record: Record, is_forgotten: bool) -> None:
+        self._seqs.append(record.seq)
+        self._segments.append(record.position.segment)
+        self._offsets.append(record.position.offset)
+        self._forgotten.append(is_forgotten)
+
+    def found(self, session: bytes) -> FoundKeyframes:
+        columns = (self._seqs, self._segments, self._offsets, self._forgotten)
+        return FoundKeyframes(session, self._client, *(column.tobytes() for column in columns))
+
+
+_INTERVAL_S = 0.5  # between two looks while keyframes come: each may write a record to the journal
+_PATIENCE_S = 5.0  # for that record to come back
+
+
+class KeepWindow:
+    """The bounds of a map in time, number and space, all of them against its newest keyframe.
+
+    Call `look` when `wait` is over: what is beyond a bound is told to the gateway, which writes a record that
+    removes it, as for `tsfusion map forget`. The cost of a look is bounded by what the window holds.
+
+    Args:
+        seconds: between a keyframe's coming to the server and the newest one's; None = no bound.
+        keyframes: how many, of all sessions together; None = no bound.
+        radius: metres from sensor to sensor; None = no bound.
+        send: takes the message.
+    """
+
+    def __init__(
+        self,
+        poses: KeyframePoses,
+        folder: Path,
+        *,
+        seconds: float | None,
+        keyframes: int | None,
+        radius: float | None,
+        send: Callable[[Found], None],
+    ) -> None:
+        self._poses, self._folder, self._send = poses, folder, send
+        self._seconds, self._keyframes, self._radius = seconds, keyframes, radius
+        self._before_segment = 0
+        self._is_behind = self.is_set
+        self._next = 0.0  # time.monotonic()
+        self._asked: float | None = None  # time.monotonic(), until the record comes
+
+    @property
+    def is_set(self) -> bool:
+        """True if a bound is set."""
+        return (self._seconds, self._keyframes, self._radius) != (None, None, None)
+
+    @property
+    def is_behind(self) -> bool:
+        """True if keyframes came since the last look."""
+        return self._is_behind
+
+    def note_keyframe(self) -> None:
+        """Note that one more keyframe is in the map, or is elsewhere."""
+        self._is_behind = self.is_set
+
+    def note_record(self) -> None:
+        """Note that a record came that removes keyframes."""
+        self._asked = None
+
+    def expire(self, before_segment: int) -> None:
+        """Let keyframes go whose segments are to be deleted, for the journal is at its limit."""
+        self._before_segment = max(before_segment, self._before_segment)
+        self._is_behind = self.is_set
+
+    def wait(self, idle: bool) -> float | None:
+        """Seconds until it is time for a `look`; None = nothing has come since the last one."""
+        if not self._is_behind:
+            return None
+        from_s = [0.0 if idle else self._next, 0.0 if self._asked is None else self._asked + _PATIENCE_S]
+        return max(max(from_s) - time.monotonic(), 0.0)
+
+    def look(self) -> None:
+        """Tell which keyframes are beyond a bound."""
+        self._is_behind = False
+        self._next = time.monotonic() + _INTERVAL_S
+        kept = self._poses.kept()
+        beyond = self._beyond(kept) if len(kept.seqs) else np.zeros(0, np.bool_)
+        if not beyond.any():
+            return
+        self._asked = time.monotonic()
+        found = []
+        for number, session in enumerate(kept.sessions):
+            seqs = kept.seqs[beyond & (kept.session == number)]
+            if len(seqs):
+                none = np.zeros(len(seqs), np.bool_).tobytes()
+                found.append(FoundKeyframes(session, "", seqs.tobytes(), b"", b"", none))
+        self._send(Found(EXPIRED, tuple(found)))
+
+    def _beyond(self, kept: KeptKeyframes) -> NDArray[np.bool_]:
+        """(n,) whether each is beyond a bound."""
+        order = np.lexsort((kept.offsets, kept.segments))  # as they came
+        beyond = kept.segments < self._before_segment
+        if self._keyframes is not None:
+            beyond[order[: -self._keyframes]] = True
+        if self._radius is not None:
+            beyond |= ~(np.linalg.norm(kept.centers - kept.centers[order[-1]], axis=1) <= self._radius)
+        if self._seconds is not None:
+            beyond[order[: self._count_older(kept, order, self._seconds)]] = True
+        return beyond
+
+    def _count_older(self, kept: KeptKeyframes, order: NDArray[np.int64], seconds: float) -> int:
+        """Number of keyframes older than so long before the last: by halving, so that few are looked at."""
+        newest = self._logged_ns(kept, int(order[-1]))
+        if newest is None:
+            return 0
+        low, high = 0, len(order) - 1
+        while low < high:
+            middle = (low + high) // 2
+            logged = self._logged_ns(kept, int(order[middle]))
+            if logged is None or newest - logged > seconds * 1e9:
+                low = middle + 1
+            else:
+                high = middle
+        return low
+
+    def _logged_ns(self, kept: KeptKeyframes, at: int) -> int | None:
+        """Wall clock at which a keyframe was journaled; None = its record cannot be read."""
+        try:
+            return journal.logged_ns(self._folder, Position(int(kept.segments[at]), int(kept.offsets[at])))
+        except JournalError:
+            return None
 
 
 class Departures:

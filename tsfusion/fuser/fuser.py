@@ -27,12 +27,11 @@ from tsfusion.core.errors import JournalError, TsfusionError
 from tsfusion.core.process import version_of
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.fuser.departures import Departures
-from tsfusion.fuser.inbox import Inbox
 from tsfusion.fuser.live_mesh import LiveMesh, TouchedBy, mesh_frames
 from tsfusion.fuser.map_checkpoints import OpenedMap
 from tsfusion.fuser.messages import CurrentKeyframe
 from tsfusion.fuser.pose_mover import REST_FACTOR, PoseMover
-from tsfusion.fuser.question_answers import QuestionAnswers
+from tsfusion.fuser.question_answers import Inbox, QuestionAnswers
 from tsfusion.fuser.watched_map import WatchedMap
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.geometry.sample_ranges import NO_SAMPLES

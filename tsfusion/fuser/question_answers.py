@@ -7,19 +7,20 @@ two keyframes. While keyframes wait, questions get a share of the time and no mo
 """
 
 import time
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import zmq
 
 from tsfusion.core.errors import InvalidConfig, TsfusionError
 from tsfusion.core.rates import Bucket
-from tsfusion.fuser.inbox import Inbox
-from tsfusion.fuser.kept_slices import KeptSlices
-from tsfusion.fuser.kept_views import KeptViews
-from tsfusion.fuser.messages import CurrentKeyframe, FuserAnswer, FuserQuestion
+from tsfusion.fuser import messages as fuser_messages
+from tsfusion.fuser.kept_answers import KeptSlices, KeptViews
+from tsfusion.fuser.messages import CurrentKeyframe, FuserAnswer, FuserQuestion, ToFuser
 from tsfusion.fuser.watched_map import WatchedMap
-from tsfusion.wire import questions
+from tsfusion.wire import questions, sockets
 from tsfusion.wire.questions import (
     MOST_VOXELS,
     Answer,
@@ -37,6 +38,30 @@ if TYPE_CHECKING:
     from tsfusion.geometry.map_grids import SliceGrid
     from tsfusion.tsdf.map_slices import CurrentSlice
     from tsfusion.tsdf.volume import Volume
+
+
+class Inbox:
+    """Messages of the gateway that were not handled yet; questions apart, for they go before all else.
+
+    Args:
+        link: the socket; None = nobody sends any.
+    """
+
+    def __init__(self, link: sockets.AnySocket | None = None) -> None:
+        self.orders: deque[ToFuser] = deque()  # in the order of their coming
+        self.questions: deque[tuple[FuserQuestion, Sequence[zmq.Frame]]] = deque()
+        self._link = link
+
+    def read(self) -> None:
+        """Take all that has come; never waits."""
+        while self._link is not None and int(self._link.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
+            head, *frames = self._link.recv_multipart(copy=False)
+            message = fuser_messages.to_fuser.decode(head.buffer)
+            if isinstance(message, FuserQuestion):
+                self.questions.append((message, frames))
+            else:
+                self.orders.append(message)
+
 
 _SHARE = 0.25  # of a busy fuser's time
 _BURST_S = 0.2  # seconds of time whose share may come at once

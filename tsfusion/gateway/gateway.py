@@ -14,14 +14,12 @@ from typing import Any
 import msgspec
 import zmq
 
-from tsfusion.core import logs, process
+from tsfusion.core import logs
 from tsfusion.core.config import ServerConfig
 from tsfusion.core.errors import DecodeError, JournalError
-from tsfusion.core.readable_numbers import count_of
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.gateway import fuser_queries
 from tsfusion.gateway.access_control import AccessControl
-from tsfusion.gateway.activity_log import ActivityLog
 from tsfusion.gateway.client_routes import Admission, ClientRoutes
 from tsfusion.gateway.connection_limits import ConnectionLimits
 from tsfusion.gateway.forgetting import Request
@@ -29,26 +27,24 @@ from tsfusion.gateway.fuser_queries import FuserQueries
 from tsfusion.gateway.greetings import Greetings
 from tsfusion.gateway.hosted_map import ForPeople, HostedMap
 from tsfusion.gateway.keyframe_intake import KeyframeIntake
+from tsfusion.gateway.map_condition import ServerCondition
 from tsfusion.gateway.map_moves import MapMoves
 from tsfusion.gateway.map_questions import MapQuestions
 from tsfusion.gateway.map_registry import MapRegistry
 from tsfusion.gateway.memory_guard import PendingReplies
 from tsfusion.gateway.metrics import Metrics
 from tsfusion.gateway.ports import Flood, Ports, Subscriptions, receive_some
-from tsfusion.gateway.problems import Problem, ProblemTimes
 from tsfusion.gateway.scan_updates import ScanUpdates
 from tsfusion.wire import messages, questions, sockets
 from tsfusion.wire.allow_list import ALL_MAPS, AllowedMaps
 from tsfusion.wire.forgetting import Forgotten
-from tsfusion.wire.health import Health, MapHealth
+from tsfusion.wire.health import Health
 from tsfusion.wire.sockets import mesh_topic
 
 log = logging.getLogger(__name__)
 
 _TICK_MS = 100  # within which a signal or a fuser's death is noticed
 _RENEW_TICK_MS = 10  # while the sockets are made anew
-_SNAPSHOT_INTERVAL = 1.0  # seconds
-_CLIENT_PROBLEMS = 10  # lines about single clients
 _REPLIES_SHARE = 4  # one fourth of the memory is for meshes and answers that wait to be read
 _PLACE_KEPT = 0.5  # seconds for which it is known at which server a map is
 _MOST_PLACES = 64
@@ -72,10 +68,8 @@ class Gateway:
         on_health: Callable[[Health], None] = lambda _: None,
     ) -> None:
         self.ports = ports
-        self._on_health = on_health
         self._server = server
         self._access = access
-        self._metrics = metrics
         self._routes = ClientRoutes(ports)
         self._admission = Admission(access, self._routes)
         self._refused = self._admission.refused
@@ -105,11 +99,10 @@ class Gateway:
         self._held: list[tuple[str, float, Callable[[], None]]] = []  # map, until when, what is done then
         self._publishing: dict[str, bool] = {}  # map → whether its fuser was told to send triangles
         self._limits = ConnectionLimits(ports, access, self._refused, server.memory_bytes)
-        self._activity = ActivityLog()
-        self._problems = ProblemTimes()
+        self._condition = ServerCondition(
+            ports, access, self.maps, self._routes, metrics, on_health=on_health
+        )
         self._accepting = self._stopped = False
-        self._started = time.monotonic()
-        self._next_snapshot = 0.0
         self._new_epoch()
 
     def _new_epoch(self) -> None:
@@ -120,7 +113,7 @@ class Gateway:
         self._accepting = True
         self.maps.end_start((addresses.data, addresses.control))
         self.moves.resume()
-        self._next_snapshot = 0.0  # health checks are to see it at once
+        self._condition.next_look = 0.0  # health checks are to see it at once
 
     def stop_accepting(self) -> None:
         """Take no more keyframes; clients keep those that are not acknowledged."""
@@ -154,7 +147,7 @@ class Gateway:
             one[2]()
         self._scans.step()
         self._update_fusers()
-        self._snapshot()
+        self._condition.step(self.health)
 
     def _handlers(self) -> Handlers:
         """The handler of each socket's messages; none of a socket that is made anew."""
@@ -182,18 +175,6 @@ class Gateway:
         self._subscriptions.clear()
         self._new_epoch()
         return True
-
-    def _snapshot(self) -> None:
-        """Give the metrics a new health snapshot, about once a second."""
-        now = time.monotonic()
-        if now < self._next_snapshot:
-            return
-        self._next_snapshot = now + _SNAPSHOT_INTERVAL
-        logs.log_left_out()
-        self._problems.note(self._find_problems())
-        self._metrics.health = health = self.health()
-        self._activity.note(health)
-        self._on_health(health)
 
     # --- maps ---
 
@@ -375,38 +356,10 @@ class Gateway:
         Args:
             shown: only these maps, their clients, and their problems; `ready` is the whole server's.
         """
-        now = time.monotonic()
-        maps = self.maps.health()
-        blocked = self.ports.problem or self._access.problem or all_blocked(maps)
-        return Health(
-            ready=self._accepting and not blocked,
-            problems=self._problems.lines(self._find_problems(shown)),
+        return self._condition.health(
+            shown,
+            is_accepting=self._accepting,
             epoch=self.epoch,
-            uptime_s=now - self._started,
-            rss_bytes=process.rss_bytes(),
             refused=dict(self._refused + self._access.refused),
             duplicates=self._intake.duplicates,
-            maps={name: one for name, one in maps.items() if name in shown},
-            clients=tuple(
-                route.health(now, self.maps.session(*route.place))
-                for route in self._routes
-                if route.map in shown
-            ),
         )
-
-    def _find_problems(self, shown: AllowedMaps = ALL_MAPS) -> list[Problem]:
-        """Present problems: of the whole server first, then of its maps, then of clients."""
-        found = [Problem(self.ports.problem, is_logged=True)] if self.ports.problem else []
-        if self._access.problem:
-            found.append(Problem(f"nobody may connect: {self._access.problem}", is_logged=True))
-        found += (one for one in self.maps.problems() if one.map in shown)
-        of_clients = [one for route in self._routes if route.map in shown and (one := route.problem)]
-        if len(of_clients) > _CLIENT_PROBLEMS:
-            rest = count_of(len(of_clients) - _CLIENT_PROBLEMS, "more client has", "more clients have")
-            of_clients[_CLIENT_PROBLEMS:] = [Problem(f"{rest} problems of this kind")]
-        return found + of_clients
-
-
-def all_blocked(maps: dict[str, MapHealth]) -> bool:
-    """True if no map takes and fuses keyframes: one that does is a reason to go on sending to this server."""
-    return bool(maps) and all(one.problem for one in maps.values())

@@ -1,13 +1,25 @@
 # SPDX-License-Identifier: MIT
-"""Condition of a map: in a word, in lines for a person, and in numbers."""
+"""Condition of a map and of a server: in a word, in lines for a person, and in numbers."""
 
 import time
+from collections.abc import Callable, Iterator
 
+from tsfusion.core import logs, process
 from tsfusion.core.readable_numbers import count_of
+from tsfusion.gateway.access_control import AccessControl
+from tsfusion.gateway.activity_log import ActivityLog
+from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.hosted_map import HostedMap
-from tsfusion.wire.health import MapHealth, MapState
+from tsfusion.gateway.map_registry import MapRegistry
+from tsfusion.gateway.metrics import Metrics
+from tsfusion.gateway.ports import Ports
+from tsfusion.gateway.problems import Problem, ProblemTimes
+from tsfusion.wire.allow_list import ALL_MAPS, AllowedMaps
+from tsfusion.wire.health import Health, MapHealth, MapState
 
 _FOR_GONE = "what no checkpoint holds of them is lost, unless they are put back"
+_INTERVAL = 1.0  # seconds between two looks
+_CLIENT_PROBLEMS = 10  # lines about single clients
 _STALLED_AFTER = 10.0  # seconds in which keyframes wait and none is fused
 
 
@@ -95,3 +107,93 @@ def health_of(hosted: HostedMap) -> MapHealth:
         mesh_epoch=outcomes.newest_mesh.epoch if outcomes.newest_mesh else "",
         mesh_number=outcomes.newest_mesh.number if outcomes.newest_mesh else 0,
     )
+
+
+def all_blocked(maps: dict[str, MapHealth]) -> bool:
+    """True if no map takes and fuses keyframes: one that does is a reason to go on sending to this server."""
+    return bool(maps) and all(one.problem for one in maps.values())
+
+
+class ServerCondition:
+    """The condition of a server, of which the log and the metrics hear about once a second.
+
+    Args:
+        on_health: told of it as often.
+    """
+
+    def __init__(
+        self,
+        ports: Ports,
+        access: AccessControl,
+        maps: MapRegistry,
+        routes: ClientRoutes,
+        metrics: Metrics,
+        *,
+        on_health: Callable[[Health], None],
+    ) -> None:
+        self._ports, self._access, self._maps, self._routes = ports, access, maps, routes
+        self._metrics, self._on_health = metrics, on_health
+        self._activity, self._problems = ActivityLog(), ProblemTimes()
+        self._started = time.monotonic()
+        self.next_look = 0.0
+
+    def step(self, health: Callable[[], Health]) -> None:
+        """Note the health, about once a second."""
+        now = time.monotonic()
+        if now < self.next_look:
+            return
+        self.next_look = now + _INTERVAL
+        logs.log_left_out()
+        self._problems.note(self._find_problems())
+        self._metrics.health = found = health()
+        self._activity.note(found)
+        self._on_health(found)
+
+    def health(
+        self,
+        shown: AllowedMaps,
+        *,
+        is_accepting: bool,
+        epoch: str,
+        refused: dict[str, int],
+        duplicates: int,
+    ) -> Health:
+        """Health of the server; see `Gateway.health`."""
+        now = time.monotonic()
+        maps = {hosted.name: health_of(hosted) for hosted in self._maps}
+        blocked = self._ports.problem or self._access.problem or all_blocked(maps)
+        return Health(
+            ready=is_accepting and not blocked,
+            problems=self._problems.lines(self._find_problems(shown)),
+            epoch=epoch,
+            uptime_s=now - self._started,
+            rss_bytes=process.rss_bytes(),
+            refused=refused,
+            duplicates=duplicates,
+            maps={name: one for name, one in maps.items() if name in shown},
+            clients=tuple(
+                route.health(now, self._maps.session(*route.place))
+                for route in self._routes
+                if route.map in shown
+            ),
+        )
+
+    def _find_problems(self, shown: AllowedMaps = ALL_MAPS) -> list[Problem]:
+        """Present problems: of the whole server first, then of its maps, then of clients."""
+        found = [Problem(self._ports.problem, is_logged=True)] if self._ports.problem else []
+        if self._access.problem:
+            found.append(Problem(f"nobody may connect: {self._access.problem}", is_logged=True))
+        found += (one for one in self._of_maps() if one.map in shown)
+        of_clients = [one for route in self._routes if route.map in shown and (one := route.problem)]
+        if len(of_clients) > _CLIENT_PROBLEMS:
+            rest = count_of(len(of_clients) - _CLIENT_PROBLEMS, "more client has", "more clients have")
+            of_clients[_CLIENT_PROBLEMS:] = [Problem(f"{rest} problems of this kind")]
+        return found + of_clients
+
+    def _of_maps(self) -> Iterator[Problem]:
+        """Problems of the maps; those that keep them from taking or fusing keyframes come first."""
+        for hosted in self._maps:
+            if problem := problem_of(hosted):
+                yield Problem(problem, hosted.name, is_logged=bool(hosted.records.disk.problem))
+        yield from (Problem(notice, hosted.name) for hosted in self._maps for notice in notices_of(hosted))
+        yield from (Problem(f"cannot be opened: {why}", name) for name, why in self._maps.unopened())

@@ -19,16 +19,13 @@ from tsfusion.gateway import map_arrivals, moved_maps
 from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.fuser_supervisor import FuserSupervisor
 from tsfusion.gateway.hosted_map import ForPeople, HostedMap
-from tsfusion.gateway.map_condition import health_of, notices_of, problem_of
 from tsfusion.gateway.map_directory import MapDirectory, Place
 from tsfusion.gateway.metrics import Metrics
-from tsfusion.gateway.problems import Problem
 from tsfusion.gateway.sessions import Session
 from tsfusion.gateway.spare_fusers import SpareFusers
 from tsfusion.journal import state_folder
 from tsfusion.journal.record_scan import journal_error
 from tsfusion.wire.allow_list import ALL_MAPS, AllowedMaps
-from tsfusion.wire.health import MapHealth
 from tsfusion.wire.messages import Denied, Hello
 from tsfusion.wire.record_header import RecordHeader
 
@@ -423,22 +420,11 @@ class MapRegistry:
         for hosted in self:
             hosted.close()
 
-    def health(self) -> dict[str, MapHealth]:
-        """Health of each map, by name."""
-        return {hosted.name: health_of(hosted) for hosted in self}
-
-    def problems(self) -> list[Problem]:
-        """Problems of the maps; those that keep them from taking or fusing keyframes come first."""
-        problems = [
-            Problem(problem, hosted.name, is_logged=bool(hosted.records.disk.problem))
-            for hosted in self
-            if (problem := problem_of(hosted))
-        ]
-        problems += [Problem(notice, hosted.name) for hosted in self for notice in notices_of(hosted)]
+    def unopened(self) -> Iterator[tuple[str, str]]:
+        """Names of maps that could not be opened lately, and why."""
         before = time.monotonic() - _UNOPENED_KEPT
         self._unopened = {name: one for name, one in self._unopened.items() if one[1] > before}
-        problems += [Problem(f"cannot be opened: {why}", name) for name, (why, _) in self._unopened.items()]
-        return problems
+        return ((name, why) for name, (why, _) in self._unopened.items())
 
 
 def _numbered(stem: str, number: int) -> str:

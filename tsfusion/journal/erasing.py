@@ -24,9 +24,8 @@ from typing import NamedTuple
 from mcap.opcode import Opcode
 
 from tsfusion.core.errors import JournalError
-from tsfusion.journal import mcap_layout, segment_file
-from tsfusion.journal.record_scan import journal_error
-from tsfusion.journal.segment_file import SegmentFile
+from tsfusion.journal import mcap_layout, record_scan
+from tsfusion.journal.record_scan import SegmentFile, journal_error
 
 _PIECE_BYTES = 4 << 20
 _PUNCH_HOLE = 0x01 | 0x02  # FALLOC_FL_KEEP_SIZE | FALLOC_FL_PUNCH_HOLE
@@ -46,7 +45,7 @@ def erase(path: Path, offsets: Collection[int]) -> Iterator[int]:
         with path.open("r+b", buffering=0) as file:
             with SegmentFile(path) as source:
                 places = [_place(source, offset) for offset in sorted(offsets)]
-                end = segment_file.read_segment_end(source)
+                end = record_scan.read_segment_end(source)
                 summary = _summary(source, end, {one.offset for one in places})
             if summary is not None:
                 file.truncate(summary[0])
@@ -124,7 +123,7 @@ _GROUP = struct.Struct("<BQQ")  # opcode, start, length
 _FOOTER = struct.Struct("<BQQQI")
 
 
-def _summary(source: SegmentFile, end: segment_file.SegmentEnd, erased: set[int]) -> tuple[int, bytes] | None:
+def _summary(source: SegmentFile, end: record_scan.SegmentEnd, erased: set[int]) -> tuple[int, bytes] | None:
     """Where the index begins, its end-of-data mark included, and the new one; None = there is none."""
     if end.data_end is None:
         return None

@@ -1,27 +1,109 @@
 # SPDX-License-Identifier: MIT
-"""The keyframes of a map's journal at their final poses, as the map has them when it is settled."""
+"""The keyframes of a journal: at their final poses, as the map has them, or as they came, as a dataset.
 
+Sessions and times can be chosen as a person writes them.
+"""
+
+import copy
+import datetime
 import logging
+import math
+import os
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from types import MappingProxyType
+from typing import Any, NamedTuple, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion import journal
-from tsfusion.core.config import SERVER_SESSION
-from tsfusion.core.errors import DecodeError, InvalidKeyframe
+from tsfusion.core.config import SERVER_SESSION, VolumeConfig
+from tsfusion.core.errors import DecodeError, InvalidConfig, InvalidKeyframe, JournalError
 from tsfusion.geometry.keyframe import Keyframe
+from tsfusion.geometry.object_cards import ShownRecording
+from tsfusion.geometry.origin import Origin
+from tsfusion.journal import state_folder
 from tsfusion.journal.keyframe_poses import KeyframePoses
 from tsfusion.journal.mcap_layout import Record
+from tsfusion.journal.record_scan import scan_records
 from tsfusion.journal.state_folder import JournalPlace, Watcher
 from tsfusion.wire import codec
 from tsfusion.wire.corrections import Correction
 from tsfusion.wire.record_header import KeyframeHeader, unpack_keyframe
+
+_LEAST_DIGITS = 4  # of a session's name
+
+
+def last_logged_ns(place: JournalPlace) -> int:
+    """Wall clock of the last record of a journal; raises JournalError when there is none."""
+    for file in reversed(place.files()):
+        stamps = [step.logged_ns for step in scan_records(file) if isinstance(step, Record)]
+        if stamps:
+            return max(stamps)
+    raise JournalError(
+        f"no keyframes in {place.path}; expected a state folder, a spool folder or an .mcap file"
+    )
+
+
+def moment_ns(text: str, last_ns: int) -> int:
+    """The wall clock that a person means.
+
+    Args:
+        text: seconds before the last record, such as `90`, or an ISO time such as `2026-05-01 14:30` (this
+            machine's zone) or `2026-05-01T12:30:00Z`.
+        last_ns: of the last record.
+
+    Raises:
+        InvalidConfig: for anything else.
+    """
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = math.nan
+    if 0 <= seconds < math.inf:
+        return last_ns - round(seconds * 1e9)
+    try:
+        moment = datetime.datetime.fromisoformat(text.strip().replace("Z", "+00:00"))
+        return round(moment.timestamp() * 1e9)
+    except (ValueError, OverflowError, OSError) as error:
+        raise InvalidConfig(
+            f"a time must be seconds before the last record, such as 90, or ISO such as "
+            f"{clock(last_ns)} (when that was), got {text!r}"
+        ) from error
+
+
+def clock(stamp_ns: int) -> str:
+    """A wall clock as `moment_ns` reads it, to the second."""
+    try:
+        moment = datetime.datetime.fromtimestamp(stamp_ns / 1e9, tz=datetime.timezone.utc)
+    except (OverflowError, OSError, ValueError):
+        return f"{stamp_ns} ns"
+    return moment.strftime("%Y-%m-%d %H:%M:%SZ")
+
+
+def sessions_named(name: str, clients: Mapping[bytes, str]) -> list[bytes]:
+    """The sessions of a client, or the one session that begins with these digits.
+
+    Args:
+        clients: session → name of its client; empty = no keys.
+
+    Raises:
+        JournalError: when there is none, or when several sessions begin so; it lists what there is.
+    """
+    if found := [key for key, client in clients.items() if name and client == name]:
+        return found
+    if len(name) >= _LEAST_DIGITS:
+        found = [key for key in clients if key.hex().startswith(name.lower())]
+    if len(found) == 1:
+        return found
+    there = ", ".join(f"{key.hex()[:8]} ({client or 'no key'})" for key, client in clients.items())
+    problem = "several sessions begin with" if found else "no session or client is named"
+    raise JournalError(f"{problem} {name!r}; the journal has {there or 'none'}")
+
 
 log = logging.getLogger(__name__)
 
@@ -195,3 +277,70 @@ def _without_measurement(header: KeyframeHeader) -> Keyframe:
     rows = np.array(header.pose).reshape(3, 4)
     T = np.vstack([rows, (0.0, 0.0, 0.0, 1.0)])
     return Keyframe(points=np.empty((0, 3), np.float32), T_world_camera=T)
+
+
+LOST = "lost to damage"  # reason of `JournalRecording.skipped`
+
+
+class JournalRecording(ShownRecording):
+    """The keyframes of a state folder (of one map, or of the one named), a map's folder or its `journal`, a
+    spool folder or one `.mcap` segment: each once, at its final pose, in journal order.
+
+    Keyframes the map had to reject are among them. Those that the server was told to forget, that
+    corrections removed, or that damage cost are left out and counted in `skipped`.
+
+    Raises:
+        JournalError: when there is no keyframe.
+    """
+
+    usual: Mapping[str, Any] = MappingProxyType({})  # settings of the map whose journal it is, if known
+    absent: int = 0  # keyframes of that map that it no longer has, if known
+
+    def __init__(self, path: str | os.PathLike[str], map_name: str | None = None) -> None:
+        place = state_folder.find_journal(Path(path), map_name)
+        self.name = str(place.path)
+        self.keyframes = found = JournaledKeyframes(place)
+        self._chosen = range(len(found))
+        removed = len(found.left_out) - found.forgotten
+        left_out = {"forgotten": found.forgotten, "removed by corrections": removed, LOST: found.lost}
+        self.skipped = {reason: count for reason, count in {**found.unreadable, **left_out}.items() if count}
+        if not len(found):
+            raise JournalError(
+                f"no keyframes in {place.path}; expected a state folder, a spool folder or an .mcap file"
+            )
+        self._poses = found.poses()
+        first = self[0]
+        self.sensor = first.sensor or VolumeConfig().sensor
+        self.timestamps_ns: NDArray[np.int64] | None = None
+        worlds = [*found.worlds]
+        self.origin = Origin.of_world(worlds[0]) if len(worlds) == 1 else None
+
+    def __len__(self) -> int:
+        return len(self._chosen)
+
+    @overload
+    def __getitem__(self, index: int) -> Keyframe: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> "JournalRecording": ...
+
+    def __getitem__(self, index: int | slice) -> "Keyframe | JournalRecording":
+        """A keyframe, or some; raises JournalError when it cannot be read any more."""
+        if isinstance(index, slice):
+            some = copy.copy(self)
+            some._chosen = self._chosen[index]
+            return some
+        try:
+            return self.keyframes[self._chosen[index]].keyframe
+        except (DecodeError, InvalidKeyframe) as error:
+            raise JournalError(f"{self.name}: keyframe {index} cannot be used: {error}") from error
+
+    def _first(self) -> Keyframe:
+        return self[0]
+
+    def pose(self, index: int) -> NDArray[np.float64]:
+        """(4, 4) final T_world_camera of a keyframe, which is not read for it."""
+        return np.asarray(self._poses[index])
+
+    def __iter__(self) -> Iterator[Keyframe]:
+        return (self[index] for index in range(len(self)))

@@ -16,9 +16,8 @@ from tsfusion.core import durable_files
 from tsfusion.core.errors import JournalError
 from tsfusion.journal import erasing, mcap_layout
 from tsfusion.journal.mcap_layout import Position, Record
-from tsfusion.journal.open_segment import OpenSegment
 from tsfusion.journal.record_scan import journal_error
-from tsfusion.journal.segments import RecordEntry, is_away, list_records, segment_path, segments
+from tsfusion.journal.segments import OpenSegment, RecordEntry, is_away, list_records, segment_path, segments
 
 log = logging.getLogger(__name__)
 

@@ -15,9 +15,8 @@ from tsfusion.core.config import VIEW_SETTINGS, VolumeConfig, override
 from tsfusion.core.errors import DecodeError, InvalidKeyframe, JournalError, MapError
 from tsfusion.geometry import color_scales
 from tsfusion.geometry.keyframe import Keyframe
-from tsfusion.journal import selection, state_folder
-from tsfusion.journal.journaled_keyframes import FinalKeyframe, JournaledKeyframes, JournaledSession
-from tsfusion.journal.recording import LOST
+from tsfusion.journal import journaled_keyframes, state_folder
+from tsfusion.journal.journaled_keyframes import LOST, FinalKeyframe, JournaledKeyframes, JournaledSession
 from tsfusion.journal.state_folder import Watcher
 from tsfusion.pipelines import saved_maps
 from tsfusion.tsdf import checkpoint
@@ -122,26 +121,28 @@ def choose(
 
     Args:
         source: what `state_folder.find_journal` takes.
-        until: a time, as `selection.moment_ns` reads it: also later corrections are left out.
-        only: sessions or clients, as `selection.sessions_named` reads them; empty = all.
+        until: a time, as `journaled_keyframes.moment_ns` reads it: also later corrections are left out.
+        only: sessions or clients, as `journaled_keyframes.sessions_named` reads them; empty = all.
 
     Raises:
         InvalidConfig, JournalError: for a time or a name that is none, or when it leaves nothing.
     """
     place = state_folder.find_journal(source)
-    last_ns = selection.last_logged_ns(place)
-    until_ns = None if until is None else selection.moment_ns(until, last_ns)
+    last_ns = journaled_keyframes.last_logged_ns(place)
+    until_ns = None if until is None else journaled_keyframes.moment_ns(until, last_ns)
     found = JournaledKeyframes(place, until_ns=until_ns, watch=watch)
     if only:
         clients = {key: one.client for key, one in found.sessions.items()}
         if clients:
-            found.keep_only({key for name in only for key in selection.sessions_named(name, clients)})
+            found.keep_only(
+                {key for name in only for key in journaled_keyframes.sessions_named(name, clients)}
+            )
     if not len(found) and (only or until is not None):
         begins = JournaledKeyframes(place).sessions.values()
-        first = selection.clock(min((one.first_ns for one in begins), default=last_ns))
+        first = journaled_keyframes.clock(min((one.first_ns for one in begins), default=last_ns))
         raise JournalError(
             f"the selection leaves no keyframe of {place.path}, which has records from {first} to "
-            f"{selection.clock(last_ns)}"
+            f"{journaled_keyframes.clock(last_ns)}"
         )
     return found
 

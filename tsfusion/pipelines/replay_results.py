@@ -15,7 +15,7 @@ from tsfusion.datasets import Dataset
 from tsfusion.datasets.cameras import camera_line
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.origin import Origin, world_of
-from tsfusion.journal.recording import LOST
+from tsfusion.journal.journaled_keyframes import LOST
 from tsfusion.pipelines import latency_ledger, run_files, shortfall
 from tsfusion.pipelines.run_files import Circumstances, WrittenMap
 from tsfusion.pipelines.shortfall import Verdict

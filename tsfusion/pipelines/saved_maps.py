@@ -19,7 +19,7 @@ from tsfusion.core.folder_lock import lock_folder
 from tsfusion.fuser import map_checkpoints
 from tsfusion.gateway import moved_maps
 from tsfusion.journal import state_folder
-from tsfusion.journal.recording import LOST
+from tsfusion.journal.journaled_keyframes import LOST
 from tsfusion.pipelines import settled_maps
 from tsfusion.tsdf import checkpoint, map_history, saved_map_addition
 from tsfusion.tsdf.block_store import unpack_keys

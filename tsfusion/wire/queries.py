@@ -230,18 +230,12 @@ def place_of(elsewhere: Elsewhere, keys: ClientKeys | None) -> tuple[str, str]:
     """Data and control address of a server that a map is said to be at.
 
     Raises:
-        TransportError: for addresses that are none, and without keys for those of other machines: anybody may
-            have said so.
+        TransportError: as `sockets.place_of` raises InvalidConfig.
     """
     try:
-        data = sockets.connect_address(elsewhere.address)
-        control = sockets.connect_address(control_address(data, elsewhere.control or None))
-        if keys is None:
-            sockets.check_reachable(data, has_keys=False)
-            sockets.check_reachable(control, has_keys=False)
+        return sockets.place_of(elsewhere.address, elsewhere.control, has_keys=keys is not None)
     except InvalidConfig as error:
         raise TransportError(f"the map is said to be at {elsewhere.address}: {error}") from error
-    return data, control
 
 
 def mesh_of(layout: MeshLayout, frames: list[memoryview]) -> Mesh:

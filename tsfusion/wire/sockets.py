@@ -292,6 +292,19 @@ def check_reachable(address: str, *, has_keys: bool) -> None:
     )
 
 
+def place_of(address: str, control: str, *, has_keys: bool) -> tuple[str, str]:
+    """Data and control address of a server that a map is said to be at; an empty one is the next port.
+
+    Raises:
+        InvalidConfig: for addresses that are none, and without keys for those of other machines: anybody may
+            have said so.
+    """
+    place = connect_address(address), connect_address(control_address(address, control or None))
+    for one in place:
+        check_reachable(one, has_keys=has_keys)
+    return place
+
+
 def check_own_machine(address: str) -> None:
     """Raise InvalidConfig when other machines can reach the address."""
     if not is_loopback(parse_address(address)[0]):

@@ -25,7 +25,7 @@ from tsfusion.datasets.rosbag.dataset import Bag, recognises
 from tsfusion.geometry import se3
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.journal import segment_path
-from tsfusion.journal.recording import JournalRecording
+from tsfusion.journal.journaled_keyframes import JournalRecording
 from tsfusion.journal.ros2_export import export
 from tsfusion.pipelines import shortfall
 

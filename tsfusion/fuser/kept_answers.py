@@ -1,16 +1,77 @@
 # SPDX-License-Identifier: MIT
-"""Views of a state hardly older than the newest, meshed ahead: a camera looks where it looked before."""
+"""Answers that are kept: a planner asks for the same slice again, and a camera looks where it looked before.
+
+A slice is brought up to date as blocks change; a view is of a state hardly older than the newest.
+"""
 
 import time
+from collections import OrderedDict
 from collections.abc import Callable
 from typing import TYPE_CHECKING, TypedDict
 
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
 from tsfusion.core.config import Surface
 from tsfusion.geometry.map_answers import View
-from tsfusion.wire.questions import MapState, Raycast
+from tsfusion.geometry.up_direction import Up
+from tsfusion.wire.questions import MOST_CELLS, MapState, Raycast, Slice
 
 if TYPE_CHECKING:
+    from tsfusion.tsdf.map_slices import CurrentSlice
     from tsfusion.tsdf.volume import Volume
+
+_MOST_KEPT = 2  # slices, of some 52 bytes a cell
+
+
+class KeptSlices:
+    """The slices of one map that were asked for last."""
+
+    def __init__(self, volume: "Volume") -> None:
+        self._volume = volume
+        self._kept: OrderedDict[Slice, CurrentSlice] = OrderedDict()
+        self._changed: dict[Slice, list[NDArray[np.int32]]] = {}
+
+    def note_taken(self, blocks: NDArray[np.int32]) -> None:
+        """Note changed blocks (n, 3) that `Volume.take_dirty` will not show again."""
+        for changed in self._changed.values():
+            changed.append(blocks)
+
+    def get(self, question: Slice) -> "CurrentSlice":
+        """The slice as the map is now.
+
+        Raises:
+            InvalidConfig: for too many cells.
+        """
+        from tsfusion.tsdf.block_store import distinct_blocks
+
+        if question.box is None:  # around the map, which grows
+            return self._made(question)
+        key = msgspec.structs.replace(question, kind="distance")
+        found, changed = self._kept.pop(key, None), self._changed.pop(key, [])
+        if found is None:
+            found = self._made(key)
+        else:
+            blocks = np.concatenate([*changed, self._volume.changed_blocks()])
+            found.update(distinct_blocks(blocks))
+        self._kept[key], self._changed[key] = found, []
+        if len(self._kept) > _MOST_KEPT:
+            del self._changed[self._kept.popitem(last=False)[0]]
+        return found
+
+    def _made(self, asked: Slice) -> "CurrentSlice":
+        return self._volume.current_slice(
+            asked.low,
+            asked.high,
+            box=asked.box,
+            up=Up(asked.up, "given"),
+            resolution=asked.resolution,
+            max_distance=asked.max_distance,
+            min_weight=asked.min_weight,
+            most_cells=MOST_CELLS,
+        )
+
 
 _WANTED_S = 2.0  # after a view that may be behind: for so long the next one is prepared
 _CUBES_AT_ONCE = 4
