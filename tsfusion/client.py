@@ -35,8 +35,7 @@ from tsfusion.core.errors import (
     WorldRefused,
 )
 from tsfusion.delivery.backpressure import Backpressure
-from tsfusion.delivery.link_state import LinkState
-from tsfusion.delivery.outbox import Outbox
+from tsfusion.delivery.outbox import LinkState, Outbox
 from tsfusion.delivery.outcomes import ClientStats
 from tsfusion.delivery.sender import Sender
 from tsfusion.delivery.spool import Spool
@@ -262,7 +261,7 @@ class Client:
     @property
     def spool_folder(self) -> Path:
         """Folder of the spool."""
-        return self._outbox.spool_folder
+        return self._outbox.spool.folder
 
     @property
     def link_state(self) -> LinkState:
@@ -272,7 +271,7 @@ class Client:
     @property
     def world(self) -> str:
         """Name of the coordinate frame of the poses; empty = that of poses given from elsewhere."""
-        return self._outbox.world
+        return self._outbox.spool.world
 
     @property
     def is_of_other_world(self) -> bool:
@@ -303,7 +302,7 @@ class Client:
             raise KeyframeRefused(refusals)
         if not done:
             waiting = self._outbox.describe_waiting()
-            kept = "" if self._outbox.is_temporary else f"; they stay in {self._outbox.spool_folder}"
+            kept = "" if self._outbox.spool.temporary else f"; they stay in {self._outbox.spool.folder}"
             raise FlushTimeout(f"{waiting} not acknowledged after {timeout:g} s: {self._why()}{kept}")
 
     def wait_fused(self, timeout: float = 60.0) -> None:

@@ -23,8 +23,7 @@ import numpy as np
 
 from tsfusion.core.config import ClientConfig, Policy
 from tsfusion.delivery.backpressure import Backpressure
-from tsfusion.delivery.link_state import LinkState
-from tsfusion.delivery.outbox import Outbox
+from tsfusion.delivery.outbox import LinkState, Outbox
 from tsfusion.delivery.spool import Spool
 from tsfusion.geometry.keyframe import Keyframe
 

@@ -26,8 +26,7 @@ from tsfusion import Client, Keyframe
 from tsfusion.core.config import ClientConfig
 from tsfusion.core.errors import TransportError
 from tsfusion.delivery.backpressure import Backpressure
-from tsfusion.delivery.link_state import LinkState
-from tsfusion.delivery.outbox import Outbox
+from tsfusion.delivery.outbox import LinkState, Outbox
 from tsfusion.delivery.spool import Spool
 from tsfusion.wire.queries import fetch_status
 
@@ -68,7 +67,7 @@ class Sensor:
             while fused and done + 1 / fused <= self.now and self.outbox.behind:
                 done += 1 / fused
                 stats = self.outbox.stats()
-                self.outbox.acknowledge(self.outbox.next_seq - 1, stats.fused + 1)
+                self.outbox.acknowledge(self.outbox.spool.next_seq - 1, stats.fused + 1)
         self.kept += kept
         return kept
 

@@ -16,8 +16,7 @@ from scripted_server import ScriptedServer, bind, scripted
 from tsfusion import Client
 from tsfusion.core.config import ClientConfig
 from tsfusion.core.errors import FlushTimeout, InvalidConfig, NotAllowed, ServerUnreachable
-from tsfusion.delivery.link_state import LinkKind, LinkState
-from tsfusion.delivery.outbox import Outbox
+from tsfusion.delivery.outbox import LinkKind, LinkState, Outbox
 from tsfusion.delivery.sender import Sender
 from tsfusion.delivery.spool import Spool
 from tsfusion.wire import codec, key_folder, sockets
@@ -94,8 +93,10 @@ def sender(tmp_path: Path) -> Iterator[tuple[Sender, Outbox, Carrier]]:
     """A sender with three keyframes, let in; its outbox; its connection for them."""
     outbox = Outbox(Spool(tmp_path, 1 << 20))
     for i in range(3):
-        frames = codec.encode(wall(i), session=outbox.session, seq=outbox.next_seq, jpeg_quality=90)
-        outbox.add(outbox.write(frames), wall(i))
+        frames = codec.encode(
+            wall(i), session=outbox.spool.session, seq=outbox.spool.next_seq, jpeg_quality=90
+        )
+        outbox.add(outbox.spool.write(frames), wall(i))
     sender, carrier = Sender("", "", outbox, PATIENT), Carrier()
     sender._control, sender._data = cast("Any", Carrier()), cast("Any", carrier)
     sender._control_session.welcome = Welcome("epoch", PROTOCOL_VERSION, 0, 0, 2, 1 << 20, 1 << 20)
@@ -126,7 +127,7 @@ def test_what_a_full_connection_does_not_take_may_be_dropped(sender: tuple[Sende
     its._pump(1.0)
     assert its._blocked
     assert outbox.drop_oldest()
-    assert [entry.seq for entry in outbox._spool.waiting] == [2, 3]
+    assert [entry.seq for entry in outbox.spool.waiting] == [2, 3]
 
 
 def test_the_connection_after_a_cut_is_news_as_well() -> None:

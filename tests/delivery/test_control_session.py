@@ -9,7 +9,7 @@ import pytest
 from keyframes_and_servers import wall
 
 from tsfusion.delivery import control_session
-from tsfusion.delivery.control_session import ControlSession, RefusedFolder
+from tsfusion.delivery.control_session import ControlSession, RefusedRecords
 from tsfusion.delivery.outbox import Outbox
 from tsfusion.delivery.spool import Spool
 from tsfusion.wire import codec, messages
@@ -22,13 +22,13 @@ class Side:
     def __init__(self, folder: Path) -> None:
         self.outbox = Outbox(Spool(folder, 1 << 20))
         self.said: list[bytes] = []
-        refused = RefusedFolder(self.outbox)
+        refused = RefusedRecords(self.outbox)
         self.control = ControlSession(
             self.outbox, refused, self.said.append, address="tcp://nobody", map_name="default"
         )
         for i in range(3):
-            frames = codec.encode(wall(i), session=self.key, seq=self.outbox.next_seq, jpeg_quality=90)
-            self.outbox.add(self.outbox.write(frames), wall(i))
+            frames = codec.encode(wall(i), session=self.key, seq=self.outbox.spool.next_seq, jpeg_quality=90)
+            self.outbox.add(self.outbox.spool.write(frames), wall(i))
         for _ in range(2):
             claimed = self.outbox.claim(8, 1 << 20)
             assert claimed is not None
@@ -36,11 +36,11 @@ class Side:
 
     @property
     def key(self) -> bytes:
-        return self.outbox.session
+        return self.outbox.spool.session
 
     @property
     def waiting(self) -> list[int]:
-        return [entry.seq for entry in self.outbox._spool.waiting]
+        return [entry.seq for entry in self.outbox.spool.waiting]
 
     def hear(self, message: ToClient) -> None:
         self.control.receive([messages.encode_sealed(message)])

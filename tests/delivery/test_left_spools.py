@@ -11,9 +11,9 @@ from keyframes_and_servers import pose
 
 from tsfusion import Client
 from tsfusion.core.errors import JournalError
-from tsfusion.delivery import left_spools, spool
+from tsfusion.delivery import left_spools
 from tsfusion.delivery import spool as spool_module
-from tsfusion.delivery.spool import Spool
+from tsfusion.delivery.spool import TOMBSTONES, Spool, Tombstones
 from tsfusion.journal import Journal
 
 
@@ -55,10 +55,10 @@ def test_a_spool_goes_on_in_its_own_world_only(tmp_path: Path) -> None:
     with pytest.raises(JournalError, match="holds 3 keyframes of another world, w1: send them first"):
         Client(NOBODY, spool=tmp_path, world="w2")
     with Client(NOBODY, spool=tmp_path) as client:
-        assert client._outbox.world == "w1"
+        assert client._outbox.spool.world == "w1"
     left(tmp_path / "older", 1)
     with Client(NOBODY, spool=tmp_path / "older", world="w2") as client:  # it names none: so it is told
-        assert client._outbox.world == "w2"
+        assert client._outbox.spool.world == "w2"
 
 
 def test_a_spool_in_use_is_neither_taken_nor_deleted(tmp_path: Path) -> None:
@@ -82,7 +82,7 @@ def test_what_left_a_spool_stays_out_of_it_and_few_numbers_are_kept(
         spool.add(spool.write([bytes(1000)]))
         if len(spool.waiting) > 1:
             spool.remove(1)
-    assert (tmp_path / spool.TOMBSTONES).stat().st_size < 16 + 8 * 50
+    assert (tmp_path / TOMBSTONES).stat().st_size < 16 + 8 * 50
     spool.close()
     again = Spool(tmp_path, 5000)
     assert [entry.seq for entry in again.waiting] == [1]
@@ -119,6 +119,6 @@ def test_a_number_that_nobody_may_find_is_not_used_again(
 
 
 def test_numbers_that_another_session_left_mean_nothing(tmp_path: Path) -> None:
-    spool.Tombstones(tmp_path, bytes(16)).add(1)
+    Tombstones(tmp_path, bytes(16)).add(1)
     for _ in range(2):
-        assert spool.Tombstones(tmp_path, bytes(range(16))).numbers == set()
+        assert Tombstones(tmp_path, bytes(range(16))).numbers == set()

@@ -21,8 +21,10 @@ from tsfusion.wire import codec, corrections
 
 def put(outbox: Outbox, count: int) -> None:
     for i in range(count):
-        frames = codec.encode(wall(i), session=outbox.session, seq=outbox.next_seq, jpeg_quality=90)
-        outbox.add(outbox.write(frames), wall(i))
+        frames = codec.encode(
+            wall(i), session=outbox.spool.session, seq=outbox.spool.next_seq, jpeg_quality=90
+        )
+        outbox.add(outbox.spool.write(frames), wall(i))
 
 
 @pytest.fixture
@@ -41,7 +43,7 @@ def send(outbox: Outbox) -> None:
 
 
 def waiting(outbox: Outbox) -> list[int]:
-    return [entry.seq for entry in outbox._spool.waiting]
+    return [entry.seq for entry in outbox.spool.waiting]
 
 
 def test_what_is_being_sent_is_not_dropped_unless_it_was_not(outbox: Outbox) -> None:
@@ -87,9 +89,9 @@ def test_what_the_server_has_no_more_is_lost(outbox: Outbox) -> None:
 
 def test_lost_corrections_and_rejected_keyframes_count_once(outbox: Outbox) -> None:
     correction = corrections.encode(
-        corrections.checked({1: np.eye(4)}), session=outbox.session, seq=outbox.next_seq
+        corrections.checked({1: np.eye(4)}), session=outbox.spool.session, seq=outbox.spool.next_seq
     )
-    outbox.add(outbox.write(correction), None)
+    outbox.add(outbox.spool.write(correction), None)
     for _ in range(4):
         send(outbox)
     outbox.acknowledge(4, 2)
@@ -110,7 +112,7 @@ def test_only_what_was_sent_can_be_corrected(outbox: Outbox, tmp_path: Path) -> 
     outbox.close()
     again = Outbox(Spool(tmp_path, 1 << 20))
     put(again, 1)
-    last = again.next_seq - 1
+    last = again.spool.next_seq - 1
     again.check_known(np.array([1, 3, last]))
     for never in (4, last - 1, last + 1):
         with pytest.raises(InvalidKeyframe, match=f"keyframe {never} was never sent from here"):

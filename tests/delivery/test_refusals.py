@@ -225,8 +225,8 @@ def test_what_is_kept_aside_is_bounded(tmp_path: Path, monkeypatch: pytest.Monke
 def test_keyframes_say_which_map_they_are_for(tmp_path: Path) -> None:
     with Client(NOBODY, spool=tmp_path, map="yard") as client:
         client.send(wall())
-        (entry,) = client._outbox._spool.waiting
-        assert unpack(client._outbox.read(entry)[0]).map == "yard"
+        (entry,) = client._outbox.spool.waiting
+        assert unpack(client._outbox.spool.read(entry)[0]).map == "yard"
 
 
 def test_leftovers_for_another_map_are_not_sent_there(tmp_path: Path) -> None:

@@ -51,7 +51,7 @@ def scan(client: Client, count: int = 3) -> list[int]:
 
 
 def session_of(client: Client) -> bytes:
-    return client._outbox.session
+    return client._outbox.spool.session
 
 
 def records(state: Path, session: bytes) -> list[tuple[int, bool]]:

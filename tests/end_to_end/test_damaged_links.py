@@ -32,7 +32,7 @@ def test_what_is_damaged_on_the_way_is_sent_again(tmp_path: Path) -> None:
             assert proxy.flipped > 10
             assert client.stats.durable == KEYFRAMES
             assert client.stats.refused == {}
-            session = client._outbox.session
+            session = client._outbox.spool.session
     records = [record for path in find_journal(state).files() for record in journal.records(path)]
     assert len(records) == KEYFRAMES
     for number, record in enumerate(records):

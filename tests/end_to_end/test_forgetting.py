@@ -46,7 +46,7 @@ def scan(server: Server, first: int, keys: Secured | None = None) -> str:
         for i in range(first, first + COUNT):
             client.send(wall(i))
         client.wait_settled(DEADLINE)
-        return client._outbox.session.hex()
+        return client._outbox.spool.session.hex()
 
 
 def hash_of(*firsts: int) -> str:

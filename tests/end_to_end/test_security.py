@@ -140,7 +140,7 @@ def test_anothers_session_is_not_to_be_had(site: Site, server: Server) -> None:
     with site.client(server, "robot") as client:
         client.send(wall(2))
         client.wait_fused(timeout=DEADLINE)
-        session = client._outbox.session
+        session = client._outbox.spool.session
         before = fetch_health(server.address, keys=site.of("robot"))
         with Raw(server, site.of("cart")) as cart:
             denied = cart.say(messages.Hello(session, messages.PROTOCOL_VERSION))

@@ -5,6 +5,7 @@ import errno
 import logging
 import os
 import shutil
+import sys
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -69,7 +70,7 @@ def test_an_open_segment_that_is_taken_away_is_put_back_with_every_record(
 
 def test_a_large_segment_is_put_back_piece_by_piece(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whoever waits for the same process waits for a piece at most; nothing is written meanwhile."""
-    monkeypatch.setattr("tsfusion.journal.segments._COPY_BYTES", 1 << 10)
+    monkeypatch.setattr(sys.modules["tsfusion.journal.segments"], "_COPY_BYTES", 1 << 10)
     log, path = Journal(tmp_path, BIG, longest_wait=-1.0), segment_path(tmp_path, 1)
     fill(log, 1, 2, 3, 4)
     path.unlink()
@@ -113,7 +114,7 @@ def test_a_record_that_was_taken_back_is_not_put_back(
 def test_a_segment_that_comes_back_by_itself_is_not_put_back_any_more(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("tsfusion.journal.segments._COPY_BYTES", 1 << 10)
+    monkeypatch.setattr(sys.modules["tsfusion.journal.segments"], "_COPY_BYTES", 1 << 10)
     log, path = Journal(tmp_path, BIG, longest_wait=-1.0), segment_path(tmp_path, 1)
     fill(log, 1, 2, 3, 4)
     path.rename(tmp_path / "aside")

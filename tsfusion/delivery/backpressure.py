@@ -15,6 +15,7 @@ import logging
 import math
 import time
 from collections import deque
+from typing import Any
 
 from tsfusion.core import durable_files, process
 from tsfusion.core.config import ClientConfig
@@ -52,12 +53,8 @@ class Backpressure:
             return None
         frames = codec.encode(
             keyframe,
-            session=self._outbox.session,
-            seq=self._outbox.next_seq,
-            map_name=self._config.map,
-            world=self._outbox.world,
-            same_frame=self._outbox.same_frame,
             jpeg_quality=self._config.jpeg_quality,
+            **self._addressed(),
         )
         return self._store(frames, keyframe)
 
@@ -69,15 +66,18 @@ class Backpressure:
         Raises:
             JournalError: as `put`.
         """
-        frames = corrections.encode(
-            correction,
-            session=self._outbox.session,
-            seq=self._outbox.next_seq,
-            map_name=self._config.map,
-            world=self._outbox.world,
-            same_frame=self._outbox.same_frame,
-        )
-        return self._store(frames, None)
+        return self._store(corrections.encode(correction, **self._addressed()), None)
+
+    def _addressed(self) -> dict[str, Any]:
+        """The fields of a header that say whose record is next, and what it is for."""
+        spool = self._outbox.spool
+        return {
+            "session": spool.session,
+            "seq": spool.next_seq,
+            "map_name": self._config.map,
+            "world": spool.world,
+            "same_frame": spool.same_frame,
+        }
 
     @process.uninterrupted()  # Ctrl-C would leave half a record, and hide what follows it
     def _store(self, frames: list[bytes], keyframe: Keyframe | None) -> int | None:
@@ -86,7 +86,7 @@ class Backpressure:
             outbox.skip(reason, is_correction=keyframe is None)
             return None
         try:
-            entry = outbox.write(frames)
+            entry = outbox.spool.write(frames)
         except JournalError as error:
             if error.errno is None:
                 raise
@@ -180,7 +180,7 @@ class Thinning:
 
     def _why(self, reason: str, room: int) -> str:
         if reason == "room":
-            return f"the spool {self._outbox.spool_folder} has room for {room / 1e6:.3g} MB more"
+            return f"the spool {self._outbox.spool.folder} has room for {room / 1e6:.3g} MB more"
         lag = self._outbox.lag
         return (
             f"the map is {lag.seconds:.3g} s behind ({lag.keyframes} keyframes wait, it takes "
@@ -271,17 +271,17 @@ class SpoolLimits:
         state, (used, *_) = self._outbox.state, self._outbox.usage()
         if state == "disk" or (state == "spool" and used < 0.9 * self._spool_bytes):
             self._outbox.state, self._outbox.spool_problem = "ok", ""
-            log.info("the spool %s takes every keyframe again", self._outbox.spool_folder)
+            log.info("the spool %s takes every keyframe again", self._outbox.spool.folder)
 
     def _measure_free_space(self, now: float) -> None:
         self._look_due, self._written = now + _LOOK_INTERVAL, 0
         try:
-            self._free = durable_files.free_bytes(self._outbox.spool_folder)
+            self._free = durable_files.free_bytes(self._outbox.spool.folder)
         except OSError:  # the write will say why
             self._free = 1 << 62
 
     def _enter(self, state: str, why: str) -> None:
-        problem = f"the spool {self._outbox.spool_folder} cannot keep them: {why}"
+        problem = f"the spool {self._outbox.spool.folder} cannot keep them: {why}"
         if self._outbox.state != state:
             log.error("keyframes are lost from here on: %s", problem)
         self._outbox.state, self._outbox.spool_problem = state, f"keyframes are lost: {problem}"

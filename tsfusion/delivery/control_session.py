@@ -10,8 +10,7 @@ from msgspec.structs import replace
 
 from tsfusion.core.errors import DecodeError, JournalError
 from tsfusion.core.readable_numbers import count_of
-from tsfusion.delivery.link_state import LinkState
-from tsfusion.delivery.outbox import Outbox
+from tsfusion.delivery.outbox import LinkState, Outbox
 from tsfusion.delivery.spool import Waiting
 from tsfusion.delivery.timing import SAMPLES, ClockOffset
 from tsfusion.geometry.sample_ranges import NO_SAMPLES
@@ -24,27 +23,27 @@ REFUSED_FOLDER = "refused"  # inside the spool; opens like any journal
 REFUSED_BYTES = 64 << 20
 
 
-class RefusedFolder:
+class RefusedRecords:
     """The refused records of a spool, in a folder inside it. A temporary spool keeps none."""
 
     def __init__(self, outbox: Outbox) -> None:
         self._outbox = outbox
-        self._kept = Quarantine(outbox.spool_folder / REFUSED_FOLDER, REFUSED_BYTES)
+        self._kept = Quarantine(outbox.spool.folder / REFUSED_FOLDER, REFUSED_BYTES)
 
     def give_up(self, entry: Waiting, reason: str, message: str, *, readable: bool = True) -> None:
         """Take a record out of the spool for good, and keep a copy when it can be read."""
         log.error("%s %d is lost (%s): %s", entry.kind, entry.seq, reason, message)
-        if readable and not self._outbox.is_temporary:
+        if readable and not self._outbox.spool.temporary:
             self._keep(entry, reason)
         self._outbox.refuse(entry, reason, message)
 
     def _keep(self, entry: Waiting, reason: str) -> None:
         try:
-            frames = self._outbox.read(entry)
+            frames = self._outbox.spool.read(entry)
         except (JournalError, OSError) as error:
             log.warning("%s %d could not be kept aside: %s", entry.kind, entry.seq, error)
             return
-        path = self._kept.keep(frames, session=self._outbox.session, seq=entry.seq, reason=reason)
+        path = self._kept.keep(frames, session=self._outbox.spool.session, seq=entry.seq, reason=reason)
         if path is not None:
             log.info("%s %d is in %s", entry.kind, entry.seq, path)
 
@@ -74,7 +73,7 @@ class ControlSession:
     def __init__(
         self,
         outbox: Outbox,
-        refused: RefusedFolder,
+        refused: RefusedRecords,
         send: Callable[[bytes], None],
         *,
         address: str,
@@ -90,7 +89,7 @@ class ControlSession:
         self._send = send
         self._address = address
         self._hello = messages.Hello(
-            outbox.session, PROTOCOL_VERSION, map_name, outbox.world, outbox.same_frame
+            outbox.spool.session, PROTOCOL_VERSION, map_name, outbox.spool.world, outbox.spool.same_frame
         )
         self._hello_due = self._ping_due = self._rewound = self._held_until = 0.0
         self._hello_interval = _HELLO_INTERVAL[0]
@@ -196,7 +195,7 @@ class ControlSession:
     def _note_loss(self, how: str) -> None:
         if not self._is_lost:
             self._is_lost = True
-            folder = self._outbox.spool_folder
+            folder = self._outbox.spool.folder
             log.warning(
                 "the server at %s %s; keyframes wait in %s until it answers", self._address, how, folder
             )
@@ -352,7 +351,7 @@ class ControlSession:
         if foreign:
             self._refuse(
                 f"the server has keyframe {durable} of this session, which was never sent from here: another "
-                f"scanner works with a copy of {self._outbox.spool_folder}; give each a folder of its own"
+                f"scanner works with a copy of {self._outbox.spool.folder}; give each a folder of its own"
             )
         return foreign
 

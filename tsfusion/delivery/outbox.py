@@ -2,24 +2,124 @@
 """The client's records and what became of each: shared by the thread that sends and those that call.
 
 Every method locks by itself and gives out copies, so callers cannot hold the lock too briefly or too long.
-`write`, `read` and `tidy` use the disk and are outside the lock.
+`Spool.write` and `Spool.read` use the disk and are outside the lock.
 """
 
 import threading
 import time
 from collections.abc import Callable
+from typing import Literal
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import InvalidKeyframe
 from tsfusion.core.readable_numbers import count_of
-from tsfusion.delivery.link_state import LinkState
 from tsfusion.delivery.outcomes import ClientStats, DeliveryProgress, Outcomes
 from tsfusion.delivery.spool import Spool, Waiting
 from tsfusion.delivery.timing import KeyframeTimesTable, Lag, TakingRate
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.wire.keyframe_times import KeyframeTimes, Stamps
+
+LinkKind = Literal[
+    "connecting", "connected", "held", "opening", "moved", "refused", "other_world", "locked_out", "silent"
+]
+
+
+class LinkState(Struct, frozen=True):
+    """State of the link between client and server; each method gives the next one after an event.
+
+        connecting   nobody has answered yet, or a server has let us in and its first answer is awaited
+        connected    the server answers, and takes what is sent
+        held         the server answers, but wants nothing for now: its disk is full, or the quota is used up
+        opening      the server answers, but the map is not open yet
+        refused      the server does not want this client: another version, another's session, no such map
+        moved        another server has the map, and the client goes there
+        other_world  the map has keyframes of another session, in another coordinate frame
+        locked_out   the server does not know the client's key, or asks for one
+        silent       the server answered once, and has not been heard for too long
+
+    A client begins as `connecting`. A Welcome leads back there from anywhere but `connected` and `held`: the
+    server has let us in, and the next Pong means `connected`. From there a Hold leads to `held`, and progress
+    back again. A Denied leads to `opening`, `moved`, `refused` or `other_world`, a refused handshake to
+    `locked_out`, and they stay until a Welcome, another Denied or, with `locked_out`, until the handshake
+    succeeds. Silence leads to `silent` from `connected`, `held`, `opening` and `moved`; the others say why
+    nothing moves already.
+
+    Nobody gives up in any state: the client asks again for ever, because a person may put it right at the
+    other end. `ControlSession` sees the events and replaces the present state by the next.
+    """
+
+    kind: LinkKind = "connecting"
+    why: str = ""  # for a person, why nothing is taken; empty = nothing is known against it
+
+    @property
+    def is_connected(self) -> bool:
+        """True if the server answers and has let this client in."""
+        return self.kind in ("connected", "held")
+
+    @property
+    def is_refused(self) -> bool:
+        return self.kind in ("refused", "other_world", "locked_out")
+
+    # --- the transport ---
+
+    def unreachable(self, why: str) -> "LinkState":
+        """The state when no connection can be made: no server ever answered, or no socket opens."""
+        return LinkState("connecting", why)
+
+    def reachable(self, problem: str) -> "LinkState":
+        """The state when a connection stands again that had this problem."""
+        return LinkState() if self.why == problem else self
+
+    def locked_out(self, why: str) -> "LinkState":
+        """The state after a refused handshake."""
+        return LinkState("locked_out", why)
+
+    def silent(self, why: str = "") -> "LinkState":
+        """The state when no message of the server came for too long; empty = the connection stands."""
+        is_so = self.is_connected or self.kind in ("opening", "moved", "silent")
+        return LinkState("silent", why) if is_so else self
+
+    # --- the server's messages ---
+
+    def misunderstood(self, why: str) -> "LinkState":
+        """The state when something answers that is no server of ours."""
+        return self if self.why else LinkState(self.kind, why)
+
+    def opening(self, why: str) -> "LinkState":
+        """The state after a Denied, because the map is not open yet."""
+        return LinkState("opening", why)
+
+    def away(self, why: str) -> "LinkState":
+        """The state after a Denied, because another server has the map."""
+        return LinkState("moved", why)
+
+    def refused(self, why: str) -> "LinkState":
+        """The state when server and client cannot work together, by a Denied or by what a Welcome says."""
+        return LinkState("refused", why)
+
+    def other_world(self, why: str) -> "LinkState":
+        """The state when the map's coordinate frame is not that of this client's poses."""
+        return LinkState("other_world", why)
+
+    def welcomed(self) -> "LinkState":
+        """The state after a Welcome."""
+        return LinkState("connected" if self.is_connected else "connecting")
+
+    def answered(self) -> "LinkState":
+        """The state after a Pong of the server that let this client in."""
+        return LinkState("connected") if self.kind in ("connecting", "silent") else self
+
+    def held(self, why: str) -> "LinkState":
+        """The state after a Hold."""
+        return self if self.is_refused else LinkState("held", why)
+
+    def moved(self) -> "LinkState":
+        """The state after the server has taken a record."""
+        return LinkState("connected") if self.kind == "held" else self
+
 
 _CHECK_INTERVAL = 0.5  # seconds between two calls of what `wait` was given to check
 
@@ -31,15 +131,11 @@ class Outbox:
         # The condition's own `with` may be left by Ctrl-C with the lock taken: it is written in Python.
         self._lock = threading.RLock()
         self._changed = threading.Condition(self._lock)
-        self._spool = spool
+        self.spool = spool  # its queue is for this class alone; all else uses the disk, outside the lock
         self.clock = clock  # seconds, of the rates
         self._rate = TakingRate()
         # How client and server stand with each other; replaced whole, by the sending thread alone
         self.link_state = LinkState()
-        self.session = spool.session  # 16 bytes
-        self.map_name, self.world, self.same_frame = spool.map_name, spool.world, spool.same_frame
-        self.spool_folder = spool.folder
-        self.is_temporary = spool.temporary  # goes away when it is closed
         self.state = "ok"  # of the spool, as in `ClientStats`; set by the one thread that writes to it
         self.spool_problem = ""  # why the spool cannot keep what comes; empty = it can
         self._outstanding = 0  # of the oldest in the spool, so many are on their way
@@ -113,27 +209,14 @@ class Outbox:
     def keyframes_waiting(self) -> int:
         """Number of keyframes in the spool."""
         with self._lock:
-            return len(self._spool.waiting) - self._spool.corrections
-
-    @property
-    def next_seq(self) -> int:
-        """The number of the next record. For the one thread that writes."""
-        return self._spool.next_seq
-
-    def write(self, frames: list[bytes]) -> Waiting:
-        """Write the record that was encoded as `next_seq`; `add` then makes it count. Outside the lock.
-
-        Raises:
-            JournalError: when the disk refuses.
-        """
-        return self._spool.write(frames)
+            return len(self.spool.waiting) - self.spool.corrections
 
     def add(self, entry: Waiting, keyframe: Keyframe | None) -> None:
         """Queue a keyframe, or a correction (None), that was written."""
         with self._lock:
             if not self.behind:
                 self._rate.rest()
-            self._spool.add(entry)
+            self.spool.add(entry)
             if keyframe is None:
                 self._outcomes.corrections_sent += 1
                 return
@@ -146,20 +229,15 @@ class Outbox:
             problem = self.spool_problem if reason in ("spool", "disk") else ""
             self._outcomes.skip(reason, problem, is_correction=is_correction)
 
-    @property
-    def spool_is_away(self) -> bool:
-        """True if the spool's folder is not to be found, or an empty one is in its place."""
-        return self._spool.is_away
-
     def usage(self) -> tuple[int, int, int]:
         """Bytes of the disk that the spool takes, records in it, and their bytes."""
         with self._lock:
-            return self._spool.used_bytes, len(self._spool.waiting), self._spool.waiting_bytes
+            return self.spool.used_bytes, len(self.spool.waiting), self.spool.waiting_bytes
 
     def tidy(self) -> None:
         """Delete files that hold nothing any more. For the one thread that writes."""
         with self._lock:
-            self._spool.tidy()
+            self.spool.tidy()
 
     def drop_oldest(self, newest: int | None = None) -> bool:
         """Take the oldest keyframe that was never sent out of the spool; False = there is none but `newest`.
@@ -169,11 +247,11 @@ class Outbox:
         """
         with self._lock:
             sent = max(self._perhaps_sent, self._claimed)
-            for place, entry in enumerate(self._spool.waiting):
+            for place, entry in enumerate(self.spool.waiting):
                 if entry.seq > sent and not entry.is_correction:
                     if entry.seq == newest:
                         return False
-                    self._spool.remove(place)
+                    self.spool.remove(place)
                     self._times.remove(entry.seq)
                     self._outcomes.skip("dropped", "")
                     self._changed.notify_all()
@@ -189,7 +267,7 @@ class Outbox:
     def check_known(self, seqs: NDArray[np.int64]) -> None:
         """Raise InvalidKeyframe unless each is the number of a record of this session, now or before."""
         with self._lock:
-            known = (seqs <= self._spool.left) | ((seqs > self._used_before) & (seqs < self._spool.next_seq))
+            known = (seqs <= self.spool.left) | ((seqs > self._used_before) & (seqs < self.spool.next_seq))
         if not known.all():
             raise InvalidKeyframe(f"keyframe {seqs[np.argmin(known)]} was never sent from here")
 
@@ -213,7 +291,7 @@ class Outbox:
             ahead: so many may be on their way or unfused; None = any number.
         """
         with self._lock:
-            waiting, count = self._spool.waiting, self._outstanding
+            waiting, count = self.spool.waiting, self._outstanding
             if count >= min(max(window_keyframes, 1), len(waiting)):
                 return None
             if ahead is not None and count + self._progress.unfused >= ahead:
@@ -229,14 +307,6 @@ class Outbox:
         """Note that the claimed record was not sent after all."""
         with self._lock:
             self._claimed = 0
-
-    def read(self, entry: Waiting) -> list[memoryview]:
-        """The frames of a record. Outside the lock.
-
-        Raises:
-            JournalError: when the disk has lost it.
-        """
-        return self._spool.read(entry)
 
     def sent(self, entry: Waiting, sent_ns: int) -> bool:
         """Note that the claimed record is on its way; whether it is the only one."""
@@ -263,8 +333,8 @@ class Outbox:
         """
         with self._lock:
             told = self._lose_beyond(durable)
-            if not self._welcomed and self._spool.waiting:
-                left = [entry.seq for entry in self._spool.waiting if entry.seq > durable]
+            if not self._welcomed and self.spool.waiting:
+                left = [entry.seq for entry in self.spool.waiting if entry.seq > durable]
                 window = left[: max(window_keyframes, 1)]
                 self._perhaps_sent = min(self._perhaps_sent, window[-1] if window else durable)
             self._welcomed = True
@@ -296,7 +366,7 @@ class Outbox:
             offset_ns, bound_ns: the server's clock minus ours, and how wrong that may be.
         """
         with self._lock:
-            dropped = self._spool.drop(durable)
+            dropped = self.spool.drop(durable)
             self._outstanding = max(self._outstanding - len(dropped), 0)
             corrections = sum(entry.is_correction for entry in dropped)
             self._outcomes.corrections_durable += corrections
@@ -357,7 +427,7 @@ class Outbox:
         """The record of this number, if it waits and was sent."""
         with self._lock:
             if seq <= self._perhaps_sent:
-                for entry in self._spool.waiting:
+                for entry in self.spool.waiting:
                     if entry.seq >= seq:
                         return entry if entry.seq == seq else None
             return None
@@ -365,9 +435,9 @@ class Outbox:
     def refuse(self, entry: Waiting, reason: str, message: str) -> None:
         """Give a record up. What was sent behind it has to be sent again: the server saw a gap there."""
         with self._lock:
-            place = self._spool.waiting.index(entry)
+            place = self.spool.waiting.index(entry)
             self._outstanding = min(self._outstanding, place)
-            self._spool.remove(place)
+            self.spool.remove(place)
             self._claimed = 0
             self._outcomes.refuse(entry, reason, message)
             self._changed.notify_all()
@@ -378,13 +448,13 @@ class Outbox:
     def is_durable(self) -> bool:
         """True if everything sent is on the server's disk, or was given up."""
         with self._lock:
-            return not self._spool.waiting
+            return not self.spool.waiting
 
     @property
     def is_fused(self) -> bool:
         """True if the map has answered for everything sent."""
         with self._lock:
-            return not self._spool.waiting and not self._progress.unfused
+            return not self.spool.waiting and not self._progress.unfused
 
     @property
     def is_settled(self) -> bool:
@@ -401,7 +471,7 @@ class Outbox:
     def describe_waiting(self) -> str:
         """The records in the spool, counted: `3 keyframes and 1 correction`."""
         with self._lock:
-            keyframes, corrections = self.keyframes_waiting, self._spool.corrections
+            keyframes, corrections = self.keyframes_waiting, self.spool.corrections
         counts = [count_of(keyframes, "keyframe")] if keyframes or not corrections else []
         return " and ".join([*counts, *([count_of(corrections, "correction")] if corrections else [])])
 
@@ -424,8 +494,8 @@ class Outbox:
         """A copy of the counts."""
         with self._lock:
             return self._outcomes.stats(
-                waiting=len(self._spool.waiting),
-                waiting_bytes=self._spool.waiting_bytes,
+                waiting=len(self.spool.waiting),
+                waiting_bytes=self.spool.waiting_bytes,
                 state=self.state,
                 corrections_waiting=self._corrections_waiting,
             )
@@ -433,6 +503,6 @@ class Outbox:
     def close(self) -> bool:
         """Release the spool; whether that loses what a temporary one still holds."""
         with self._lock:
-            loses = self.is_temporary and bool(self._spool.waiting)
-            self._spool.close()
+            loses = self.spool.temporary and bool(self.spool.waiting)
+            self.spool.close()
             return loses

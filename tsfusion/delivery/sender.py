@@ -18,7 +18,7 @@ import zmq
 
 from tsfusion.core.config import ClientConfig
 from tsfusion.core.errors import MISSING, DecodeError, InvalidConfig, JournalError
-from tsfusion.delivery.control_session import ControlSession, RefusedFolder
+from tsfusion.delivery.control_session import ControlSession, RefusedRecords
 from tsfusion.delivery.outbox import Outbox
 from tsfusion.delivery.spool import Waiting
 from tsfusion.wire import sockets
@@ -55,7 +55,7 @@ class Sender:
         self._keys = keys
         self._outbox = outbox
         self._config = config
-        self._refused = RefusedFolder(outbox)
+        self._refused = RefusedRecords(outbox)
         self._control_session = ControlSession(
             outbox, self._refused, self._send_control, address=control, map_name=config.map
         )
@@ -235,7 +235,7 @@ class Sender:
     def _read(self, entry: Waiting, now: float) -> list[memoryview] | None:
         """The frames of a record; None = they cannot be read now, or never."""
         try:
-            frames = self._outbox.read(entry)
+            frames = self._outbox.spool.read(entry)
         except JournalError as error:
             self._unread += 1
             if error.errno in _SCARCE or (error.errno is not None and self._unread < self._most_reads()):
@@ -252,7 +252,7 @@ class Sender:
         return frames
 
     def _most_reads(self) -> int:
-        return _MAX_READS_AWAY if self._outbox.spool_is_away else _MAX_READS
+        return _MAX_READS_AWAY if self._outbox.spool.is_away else _MAX_READS
 
     def _send(self, entry: Waiting, previous: int, frames: list[memoryview]) -> None:
         sent_ns = time.monotonic_ns()
@@ -261,9 +261,9 @@ class Sender:
                 frames[0],
                 previous=previous,
                 sent_ns=sent_ns,
-                map=self._outbox.map_name,
-                world=self._outbox.world,
-                same_frame=self._outbox.same_frame,
+                map=self._outbox.spool.map_name,
+                world=self._outbox.spool.world,
+                same_frame=self._outbox.spool.same_frame,
             )
         except (DecodeError, IndexError) as error:
             self._refused.give_up(entry, "spool", str(error))
