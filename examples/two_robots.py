@@ -9,7 +9,7 @@ import sys
 import threading
 
 import tsfusion
-from tsfusion.wire.queries import fetch_status
+from tsfusion.wire.asking.queries import fetch_status
 
 address = sys.argv[1] if sys.argv[1:] else "tcp://127.0.0.1:5555"
 room = list(tsfusion.open_dataset("synthetic:room", count=8))

@@ -26,7 +26,7 @@ from keyframes_and_servers import Server, serving
 from tsfusion.cli import main
 from tsfusion.core import logs
 from tsfusion.core.errors import MissingDependency
-from tsfusion.gateway import fuser_process
+from tsfusion.gateway.fusers import fuser_process
 
 os.environ["PYTHONPATH"] = os.pathsep.join(sys.path)  # programs that tests start find what tests find
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of workers, which start later; as commands do
@@ -170,7 +170,7 @@ def here(
 @pytest.fixture
 def quick_servers(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have servers of runs in this process start quick fusers (`quick_fusers.LAZY`)."""
-    from tsfusion.pipelines import target_server
+    from tsfusion.pipelines.runs import target_server
 
     names = {name: getattr(subprocess, name) for name in ("PIPE", "TimeoutExpired")}
     made = SimpleNamespace(Popen=quick_fusers.quick_server, **names)

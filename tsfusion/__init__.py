@@ -68,11 +68,11 @@ if TYPE_CHECKING:
     from tsfusion.geometry.map_grids import OccupancySlice as OccupancySlice
     from tsfusion.geometry.map_grids import SliceGrid as SliceGrid
     from tsfusion.geometry.mesh import Mesh as Mesh
-    from tsfusion.scanner.sources.registry import open_source as open_source
+    from tsfusion.scanner.sources.named_sources import open_source as open_source
     from tsfusion.scanner.sources.source import Source as Source
-    from tsfusion.tsdf.map_blocks import Blocks as Blocks
+    from tsfusion.tsdf.files.map_blocks import Blocks as Blocks
     from tsfusion.tsdf.volume import Volume as Volume
-    from tsfusion.wire.map_client import MapClient as MapClient
+    from tsfusion.wire.asking.map_client import MapClient as MapClient
 
 __version__ = "0.1.0"
 
@@ -85,7 +85,7 @@ _ERRORS = (
     "TransportError", "TsfusionError", "WeightOverflow", "WorkerLost", "WorldRefused",
 )  # fmt: skip
 _HOME = {
-    "Blocks": "tsdf.map_blocks",
+    "Blocks": "tsdf.files.map_blocks",
     "Client": "client",
     "Config": "core.config",
     "DistanceField": "geometry.map_grids",
@@ -93,7 +93,7 @@ _HOME = {
     "Intrinsics": "geometry.keyframe",
     "Keyframe": "geometry.keyframe",
     "Layout": "datasets",
-    "MapClient": "wire.map_client",
+    "MapClient": "wire.asking.map_client",
     "Mesh": "geometry.mesh",
     "PointCloud": "geometry.map_answers",
     "Samples": "geometry.map_answers",
@@ -104,7 +104,7 @@ _HOME = {
     "Volume": "tsdf.volume",
     "VolumeConfig": "core.config",
     "open_dataset": "datasets",
-    "open_source": "scanner.sources.registry",
+    "open_source": "scanner.sources.named_sources",
     **dict.fromkeys(_ERRORS, "core.errors"),
 }
 __all__ = ["__version__", *_HOME]  # noqa: PLE0604

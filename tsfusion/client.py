@@ -42,11 +42,12 @@ from tsfusion.delivery.spool import Spool
 from tsfusion.geometry.keyframe import Keyframe, keyframe_of
 from tsfusion.geometry.sample_ranges import wrong_unit
 from tsfusion.geometry.sweeps import skewed
-from tsfusion.wire import corrections, sockets
-from tsfusion.wire.curve import client_keys
-from tsfusion.wire.keyframe_times import KeyframeTimes
-from tsfusion.wire.record_header import WORLD_NAME
-from tsfusion.wire.sockets import control_address
+from tsfusion.wire.messages.keyframe_times import KeyframeTimes
+from tsfusion.wire.records import corrections
+from tsfusion.wire.records.record_header import WORLD_NAME
+from tsfusion.wire.sockets import sockets
+from tsfusion.wire.sockets.curve import client_keys
+from tsfusion.wire.sockets.sockets import control_address
 
 __all__ = ["Client", "ClientStats"]
 

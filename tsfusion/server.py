@@ -16,15 +16,15 @@ from tsfusion.core import process
 from tsfusion.core.config import DEFAULT_MAP, ServerConfig, VolumeConfig
 from tsfusion.core.folder_lock import lock_folder
 from tsfusion.core.service_manager import Watchdog
-from tsfusion.gateway import moved_maps
-from tsfusion.gateway.access_control import AccessControl
 from tsfusion.gateway.gateway import Gateway
-from tsfusion.gateway.metrics import Metrics
-from tsfusion.gateway.ports import Ports
+from tsfusion.gateway.health.metrics import Metrics
+from tsfusion.gateway.maps import moved_maps
+from tsfusion.gateway.ports.access_control import AccessControl
+from tsfusion.gateway.ports.ports import Ports
 from tsfusion.journal import state_folder
-from tsfusion.wire import sockets
-from tsfusion.wire.health import Health
-from tsfusion.wire.sockets import Addresses
+from tsfusion.wire.messages.health import Health
+from tsfusion.wire.sockets import sockets
+from tsfusion.wire.sockets.sockets import Addresses
 
 log = logging.getLogger(__name__)
 

@@ -158,8 +158,8 @@ class Stages:
 
     @contextmanager
     def watch(self) -> Iterator[None]:
-        from tsfusion.kernels import (
-            block_hash,
+        from tsfusion.kernels.base import block_hash
+        from tsfusion.kernels.integration import (
             integrate,
             ray_smoothing,
             rays_from_images,

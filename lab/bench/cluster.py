@@ -29,7 +29,7 @@ sys.path.append(str(Path(__file__).parents[2]))  # lab is not installed
 
 from lab.bench.memory import recording
 from tsfusion.journal import Journal
-from tsfusion.wire import codec
+from tsfusion.wire.records import codec
 
 SESSION = b"street".ljust(16, b"\0")
 _POLL_S = 0.02

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from tsfusion import Intrinsics, Keyframe, Volume
-from tsfusion.datasets.synthetic.dataset import Synthetic
+from tsfusion.datasets.worlds.synthetic import Synthetic
 from tsfusion.geometry.map_grids import FREE
 
 K, SHAPE = Intrinsics(160.0, 160.0, 159.5, 119.5), (240, 320)

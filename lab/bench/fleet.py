@@ -43,7 +43,7 @@ from lab.bench.peers import surroundings
 from tsfusion import VolumeConfig, journal
 from tsfusion.core import process
 from tsfusion.journal import state_folder
-from tsfusion.wire.queries import fetch_health
+from tsfusion.wire.asking.queries import fetch_health
 
 RAMP_S = 1.0  # in which the scanners begin one after the other
 _QUIET_S = 3.0  # in which a fuser that has nothing to do takes no processor time

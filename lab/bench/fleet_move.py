@@ -13,7 +13,7 @@ from keyframes_and_servers import Server
 
 from tsfusion import Client, Intrinsics, Keyframe, VolumeConfig, journal
 from tsfusion.journal import state_folder
-from tsfusion.wire import queries
+from tsfusion.wire.asking import queries
 
 _CAMERA = Intrinsics(525.0, 525.0, 319.5, 239.5)
 _PATIENCE = 120.0

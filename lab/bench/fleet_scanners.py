@@ -16,7 +16,9 @@ import numpy as np
 import zmq
 
 from tsfusion import Intrinsics, Keyframe
-from tsfusion.wire import codec, messages, record_header, sockets
+from tsfusion.wire.messages import messages
+from tsfusion.wire.records import codec, record_header
+from tsfusion.wire.sockets import sockets
 
 _CAMERA = Intrinsics(525.0, 525.0, 319.5, 239.5)
 _SHAPE = (480, 640)

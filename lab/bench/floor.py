@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from tsfusion.kernels.voxel_traversal import COUNT, RAY_FIELDS
+from tsfusion.kernels.base.voxel_traversal import COUNT, RAY_FIELDS
 
 LINE = 64  # bytes that move together
 

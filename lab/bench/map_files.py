@@ -23,8 +23,8 @@ import numpy as np
 
 from tsfusion import Volume, open_dataset
 from tsfusion.core import process
-from tsfusion.tsdf.block_store import pack_keys, unpack_keys
-from tsfusion.tsdf.checkpoint import CUBE
+from tsfusion.tsdf.files.checkpoint import CUBE
+from tsfusion.tsdf.store.block_store import pack_keys, unpack_keys
 
 Seconds = dict[str, float]  # of wall clock and of CPU
 

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion import Intrinsics, Keyframe, Volume, open_dataset
-from tsfusion.datasets.synthetic.dataset import Synthetic
+from tsfusion.datasets.worlds.synthetic import Synthetic
 
 SHAPE = 480, 640
 ROOM = "synthetic:room"

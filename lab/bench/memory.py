@@ -67,7 +67,7 @@ class Curve(msgspec.Struct):
 
 def recording(world: str, count: int, width: int) -> Iterator[Keyframe]:
     """Keyframes of a street of any length, or of laps in a room."""
-    from tsfusion.datasets.synthetic.dataset import Synthetic
+    from tsfusion.datasets.worlds.synthetic import Synthetic
 
     path = "tour" if world == "room" else None
     rendered = list(Synthetic(world, SENSORS[world], count=LAP, width=width, path=path))

@@ -40,9 +40,9 @@ from lab.bench.ask_live import FIRST, TURN, Scanner
 from lab.bench.peers import surroundings
 from lab.reliability.delivery import PATIENCE, _keyframes
 from tsfusion import VolumeConfig
-from tsfusion.wire.map_events import MapEvent, ScannerSeen, SurfaceUpdate
-from tsfusion.wire.map_watcher import MapWatcher
-from tsfusion.wire.queries import fetch_health, fetch_mesh
+from tsfusion.wire.asking.map_events import MapEvent, ScannerSeen, SurfaceUpdate
+from tsfusion.wire.asking.map_watcher import MapWatcher
+from tsfusion.wire.asking.queries import fetch_health, fetch_mesh
 
 TARGET = 1.10  # the keyframes' delay, p95, with watchers : without
 BROWSERS = ("reading", "real", "none")

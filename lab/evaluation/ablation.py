@@ -26,7 +26,7 @@ from lab.worlds import benchmark_worlds
 from tsfusion.core.config import SENSORS
 from tsfusion.datasets import Synthetic, open_dataset
 from tsfusion.geometry.keyframe import Intrinsics, Keyframe, points_world
-from tsfusion.kernels import runtime
+from tsfusion.kernels.base import runtime
 
 # metres, for every system; else the sensor preset's. 2.8: the things in the middle, not the walls behind
 MAX_RANGE = {"street": 30.0, "corners": 2.8, "thin": 2.8, "kitchen": 4.0, "hololens": 4.0}

@@ -28,7 +28,7 @@ from tsfusion import AlignmentRefused, Keyframe, Volume, open_dataset
 from tsfusion.core.config import SensorName, VolumeConfig
 from tsfusion.evaluation.surface_fit import nearest
 from tsfusion.geometry import se3
-from tsfusion.pipelines import map_alignment, mesh_preview
+from tsfusion.pipelines.maps import map_alignment, mesh_preview
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "support"))
 sys.path.append(str(Path(__file__).parents[2]))  # lab is not installed

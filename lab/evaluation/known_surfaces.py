@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from lab.evaluation import surface_error
 from lab.worlds.street_drive import StreetDrive, StreetWorld
 from tsfusion.core.errors import MissingDependency
-from tsfusion.datasets.synthetic.worlds import BOX, CYLINDER, GROUND, ROOM, Solids, World
+from tsfusion.datasets.worlds.worlds import BOX, CYLINDER, GROUND, ROOM, Solids, World
 from tsfusion.evaluation.surface_fit import nearest
 from tsfusion.geometry import se3
 from tsfusion.geometry.mesh import Mesh

@@ -44,7 +44,7 @@ from tsfusion.core.config import LocalizerName, ScanConfig
 from tsfusion.datasets import Dataset, select
 from tsfusion.evaluation.trajectory_error import TrajectoryError, absolute_error
 from tsfusion.geometry.frame import Frame
-from tsfusion.scanner.localization import registry
+from tsfusion.scanner.localization import localizers
 from tsfusion.scanner.localization.localizer import Localizer, Lost
 from tsfusion.scanner.localization.loop_closure.loop_closing import LoopClosing
 from tsfusion.scanner.sources.recorded import RecordedSource
@@ -204,7 +204,7 @@ def _localizer(scene: Scene, first: Frame) -> Localizer:
     if scene.peer:
         made: Localizer = getattr(odometry_peers, scene.peer)()
         return made
-    return registry.create_localizer(ScanConfig(localizer=scene.localizer, loop_closure=scene.loops), first)
+    return localizers.create_localizer(ScanConfig(localizer=scene.localizer, loop_closure=scene.loops), first)
 
 
 def _verdict(

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.geometry.frame import Frame
-from tsfusion.scanner.localization.localizer import Lost, Pose, PoseCorrections
+from tsfusion.scanner.localization.localizer import Lost, PoseCorrections, TrackedPose
 
 MAX_DEPTH = 5.0  # metres
 ITERATIONS = (20, 10, 5)  # coarse to fine; the default, twice to five times fewer, is too few at 7.5 Hz
@@ -27,7 +27,7 @@ class FrameToFrame(ABC):
         self._last: Any = None
         self._T = np.eye(4)
 
-    def track(self, frame: Frame) -> Pose | Lost:
+    def track(self, frame: Frame) -> TrackedPose | Lost:
         prepared = self.prepare(frame)
         step = np.eye(4) if self._last is None else self.motion(self._last, prepared, frame)
         self._last = prepared
@@ -35,7 +35,7 @@ class FrameToFrame(ABC):
             return Lost(reason="no motion was found", timestamp_ns=frame.timestamp_ns)
         self._T = self._T @ step
         self._number += 1
-        return Pose(
+        return TrackedPose(
             T_world_camera=self._T, timestamp_ns=frame.timestamp_ns, anchor=self._number,
             T_anchor_camera=np.eye(4), starts_anchor=True,
         )  # fmt: skip

@@ -35,8 +35,8 @@ from lab.bench.peers import Open3D, surroundings
 from lab.evaluation import view_colors
 from tsfusion import Keyframe, Volume, open_dataset
 from tsfusion.geometry.mesh import Mesh
-from tsfusion.tsdf import texturing
-from tsfusion.tsdf.texturing import TextureSettings
+from tsfusion.tsdf.texture import texturing
+from tsfusion.tsdf.texture.texturing import TextureSettings
 
 SHARPNESS = (1.0, 1.5, 3.0, 4.0)  # among which one is chosen, beside the default
 

@@ -11,7 +11,7 @@ from tsfusion.geometry import se3
 from tsfusion.geometry.keyframe import Intrinsics, Keyframe
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.textured_mesh import TexturedMesh, barycentric
-from tsfusion.tsdf.texture_images import TextureImage, image_of
+from tsfusion.tsdf.texture.texture_images import TextureImage, image_of
 
 MAX_OFF = 0.05  # metres between the mesh and the measured depth where a pixel is compared
 MIN_CLEARNESS = 0.5  # of its depth's edge: there the registration of colour to depth ends
@@ -35,11 +35,11 @@ def shown(
     mesh: Mesh, T_world_camera: NDArray[np.float64], intrinsics: Intrinsics, shape: tuple[int, int]
 ) -> ShownView:
     """A mesh with its texture, or else its colours at the vertices, as a camera without lamps sees it."""
-    from tsfusion.kernels import runtime
+    from tsfusion.kernels.base import runtime
 
     runtime.start()
-    from tsfusion.kernels import rasterizer
-    from tsfusion.tsdf import camera_views
+    from tsfusion.kernels.answers import rasterizer
+    from tsfusion.tsdf.answers import camera_views
 
     seen = camera_views.rasterised(mesh, intrinsics, T_world_camera, shape)[0]
     v, u = np.nonzero(seen != rasterizer.EMPTY)
@@ -107,7 +107,7 @@ def _followed(
     at: tuple[NDArray[np.intp], NDArray[np.intp]],
 ) -> NDArray[np.float64]:
     """T_camera_world of the colours, moved until they lie on the target at points shown at its pixels."""
-    from tsfusion.tsdf import texture_fitting  # Taichi, which `shown` has started
+    from tsfusion.tsdf.texture import texture_fitting  # Taichi, which `shown` has started
 
     gray = cv2.cvtColor(image.color, cv2.COLOR_RGB2GRAY)
     wanted = cv2.pyrDown(cv2.cvtColor(target, cv2.COLOR_RGB2GRAY))

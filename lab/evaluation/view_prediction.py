@@ -14,10 +14,10 @@ def predicted_depth(
     mesh: Mesh, T_world_camera: NDArray[np.float64], intrinsics: Intrinsics, shape: tuple[int, int]
 ) -> NDArray[np.float32]:
     """(H, W) float32 metres along the optical axis to the first front side; 0 = none."""
-    from tsfusion.kernels import runtime
+    from tsfusion.kernels.base import runtime
 
     runtime.start()
-    from tsfusion.tsdf import camera_views
+    from tsfusion.tsdf.answers import camera_views
 
     return camera_views.look_at(mesh, intrinsics, T_world_camera, shape).depth
 

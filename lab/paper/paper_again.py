@@ -30,9 +30,9 @@ from tsfusion.core.config import DEFAULT_MAP, ClientConfig, ServerConfig, Volume
 from tsfusion.core.errors import TransportError, TsfusionError
 from tsfusion.journal import state_folder
 from tsfusion.journal.journaled_keyframes import JournaledKeyframes
-from tsfusion.pipelines import target_server
-from tsfusion.pipelines.target_server import ServerChild
-from tsfusion.wire.queries import fetch_health, fetch_status
+from tsfusion.pipelines.runs import target_server
+from tsfusion.pipelines.runs.target_server import ServerChild
+from tsfusion.wire.asking.queries import fetch_health, fetch_status
 
 _PATIENCE_S = 300.0
 _POLL_S = 0.05
@@ -179,7 +179,7 @@ def fresh_hash(state: Path, volume: VolumeConfig) -> str:
 
 
 def _print_hash(state: Path, settings: Path) -> None:
-    from tsfusion.pipelines import journal_fusion
+    from tsfusion.pipelines.maps import journal_fusion
     from tsfusion.tsdf.volume import Volume
 
     config = msgspec.json.decode(settings.read_bytes(), type=VolumeConfig)

@@ -40,8 +40,9 @@ from tsfusion.core.config import DEFAULT_MAP, ServerConfig
 from tsfusion.core.errors import TsfusionError
 from tsfusion.datasets import Dataset
 from tsfusion.datasets.dataset import pose_of
-from tsfusion.pipelines import latency_ledger, map_growth, target_server
-from tsfusion.pipelines.map_growth import Row
+from tsfusion.pipelines.report import latency_ledger
+from tsfusion.pipelines.runs import map_growth, target_server
+from tsfusion.pipelines.runs.map_growth import GrowthRow
 
 FRONT_END = Path(__file__).with_name("paper_frontend.py")
 STATE = "state"
@@ -67,7 +68,7 @@ def conduct(run: Run, folder: Path, limits: Limits, tell: Tell) -> Outcome:
         plan = _plan(run, folder, limits, bounded=bounded)
         watch, death = _front_end(plan, run, limits, tell)
         status: dict[str, Any] = {}
-        grown: list[Row] = []
+        grown: list[GrowthRow] = []
     else:
         watch, death, grown, status = _decentralised(run, folder, limits, tell)
     story = paper_events.read(folder / "events.jsonl")
@@ -138,7 +139,7 @@ def _wait(child: "subprocess.Popen[bytes]", folder: Path, deadline: float, tell:
 
 def _decentralised(
     run: Run, folder: Path, limits: Limits, tell: Tell
-) -> tuple[MemoryWatch, Death | None, list[Row], dict[str, Any]]:
+) -> tuple[MemoryWatch, Death | None, list[GrowthRow], dict[str, Any]]:
     server = ServerConfig(listen="tcp://127.0.0.1:0", state=str(folder / STATE))
     with ExitStack() as stack:
         with _on_cores(run.machine.cores):  # the server's processes inherit it

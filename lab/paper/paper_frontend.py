@@ -32,8 +32,8 @@ from tsfusion.core.errors import FlushTimeout
 from tsfusion.datasets import Dataset
 from tsfusion.datasets.dataset import frame_of
 from tsfusion.geometry.frame import Frame
-from tsfusion.scanner.localization import registry
-from tsfusion.scanner.localization.localizer import Localizer, Lost, Pose, PoseCorrections
+from tsfusion.scanner.localization import localizers
+from tsfusion.scanner.localization.localizer import Localizer, Lost, PoseCorrections, TrackedPose
 from tsfusion.scanner.scanner import Scanner
 from tsfusion.scanner.sources.source import LiveSource
 
@@ -141,9 +141,9 @@ class Noted(Localizer):
 
     def __init__(self, localizer: Localizer) -> None:
         self._localizer, self.absolute = localizer, localizer.absolute
-        self.answer: Pose | Lost | None = None
+        self.answer: TrackedPose | Lost | None = None
 
-    def track(self, frame: Frame) -> Pose | Lost:
+    def track(self, frame: Frame) -> TrackedPose | Lost:
         self.answer = self._localizer.track(frame)
         return self.answer
 
@@ -180,7 +180,7 @@ def run(plan: FrontEndPlan) -> None:
 
     def note(_: Scanner) -> None:
         found, stats = localizer.answer, sink.stats
-        T = found.T_world_camera.tolist() if isinstance(found, Pose) else None
+        T = found.T_world_camera.tolist() if isinstance(found, TrackedPose) else None
         log.note(
             "frame", index=source.index, due_ns=source.due_ns, T_world_camera=T, late=source.late,
             cpu_s=time.process_time(), rss_bytes=process.rss_bytes(), queue=stats.sent - stats.fused,
@@ -216,7 +216,7 @@ def _scanner(plan: FrontEndPlan, dataset: Dataset, sink: Any) -> tuple[Noted, Sc
     world = plan.world
     config = ScanConfig(localizer=world.localizer, loop_closure=plan.loop_closure)
     _warm_up(config, dataset)
-    localizer = Noted(registry.create_localizer(config, frame_of(dataset, 0)))
+    localizer = Noted(localizers.create_localizer(config, frame_of(dataset, 0)))
     outdoors = world.sensor in OUTDOORS
     planned = planned_keyframes(dataset, world.keyframes, outdoors=outdoors)
     selector = PlannedKeyframes(stamps_ns(dataset)[planned])
@@ -235,7 +235,7 @@ def _scanner(plan: FrontEndPlan, dataset: Dataset, sink: Any) -> tuple[Noted, Sc
 def _warm_up(config: ScanConfig, dataset: Dataset) -> None:
     """Do all once that is slow the first time: this recording begins on the move."""
     frames = [frame_of(dataset, index) for index in range(min(2, len(dataset)))]
-    throwaway = registry.create_localizer(config, frames[0])
+    throwaway = localizers.create_localizer(config, frames[0])
     for frame in frames:
         throwaway.track(frame)
     frames[0].keyframe(np.eye(4))

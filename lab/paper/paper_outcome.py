@@ -15,9 +15,9 @@ from lab.paper.paper_events import SeenFrame, Story
 from lab.paper.paper_limits import Death, Sample
 from tsfusion.core.errors import DatasetError
 from tsfusion.evaluation.trajectory_error import TrajectoryError, absolute_error
-from tsfusion.pipelines import latency_ledger
-from tsfusion.pipelines.map_growth import Row
-from tsfusion.wire.keyframe_times import Spread
+from tsfusion.pipelines.report import latency_ledger
+from tsfusion.pipelines.runs.map_growth import GrowthRow
+from tsfusion.wire.messages.keyframe_times import Spread
 
 OUTCOME, POSES = "outcome.json", "poses.npz"
 DELAY, MEMORY = "delay.csv", "memory.csv"
@@ -161,7 +161,7 @@ def _seconds(story: Story) -> float:
     return (story.frames[-1].done_ns - story.started_ns) / 1e9
 
 
-def memory_rows(story: Story, samples: Sequence[Sample], grown: Sequence[Row]) -> list[MemoryRow]:
+def memory_rows(story: Story, samples: Sequence[Sample], grown: Sequence[GrowthRow]) -> list[MemoryRow]:
     """Memory of both machines over a run's time, whose second 0 is the first frame's.
 
     Args:

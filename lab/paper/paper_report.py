@@ -18,8 +18,7 @@ from lab.paper.paper_runs import MODES, Limits
 from lab.paper.paper_verdicts import Findings, Verdict
 from tsfusion.core import durable_files
 from tsfusion.evaluation.trajectory_error import TrajectoryError
-from tsfusion.pipelines import run_files
-from tsfusion.pipelines.report import page
+from tsfusion.pipelines.report import findings, page
 from tsfusion.pipelines.report.page import Page
 
 RECORD, REPORT = "run.json", "report.html"
@@ -178,8 +177,8 @@ def write_record(
     record = {
         "verdicts": made, "limits": limits, **told, "paper": PAPER,
         "worlds": [msgspec.structs.replace(world, cache="") for world in found.worlds],
-        "runs": found.outcomes, "sweep": found.sweep, "versions": run_files.versions(),
-        "made": run_files.circumstances(),
+        "runs": found.outcomes, "sweep": found.sweep, "versions": findings.versions(),
+        "made": findings.circumstances(),
     }  # fmt: skip
     with durable_files.replacing(folder / RECORD) as file:
         file.write(msgspec.json.format(msgspec.json.encode(record), indent=2) + b"\n")

@@ -102,9 +102,9 @@ def measure_map(job: MapJob) -> dict[str, Any]:
 
 def _draw(mesh: Mesh, poses: NDArray[np.float64], path: str, *, is_indoors: bool) -> None:
     """Draw the whole map from above, and a part of it over the camera's shoulder."""
-    from tsfusion.kernels import runtime
-    from tsfusion.pipelines import mesh_preview
-    from tsfusion.pipelines.mesh_preview import PreviewCamera
+    from tsfusion.kernels.base import runtime
+    from tsfusion.pipelines.maps import mesh_preview
+    from tsfusion.pipelines.maps.mesh_preview import PreviewCamera
 
     runtime.start()
     up = -poses[:, :3, 1].mean(axis=0)

@@ -27,11 +27,11 @@ from tsfusion.core.errors import TransportError, TsfusionError
 from tsfusion.core.number_ranges import NumberRanges
 from tsfusion.journal.inspection import ForgottenNumbers
 from tsfusion.journal.state_folder import JournalPlace
-from tsfusion.wire import codec
-from tsfusion.wire.forgetting import Forgotten, Selection
-from tsfusion.wire.health import Status
-from tsfusion.wire.queries import fetch_health, fetch_status, forget
-from tsfusion.wire.record_header import unpack_keyframe
+from tsfusion.wire.asking.queries import fetch_health, fetch_status, forget
+from tsfusion.wire.messages.forget_messages import Forgotten, Selection
+from tsfusion.wire.messages.health import Status
+from tsfusion.wire.records import codec
+from tsfusion.wire.records.record_header import unpack_keyframe
 
 _RECORD_OVERHEAD = 300  # bytes of MCAP a keyframe
 

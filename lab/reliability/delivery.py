@@ -34,7 +34,7 @@ from lab.bench.peers import DATA, surroundings
 from tsfusion import Client, Keyframe, VolumeConfig
 from tsfusion.core.config import ClientConfig, override
 from tsfusion.datasets import open_dataset
-from tsfusion.wire.queries import fetch_health
+from tsfusion.wire.asking.queries import fetch_health
 
 BLOCK = 30  # keyframes to one server before it is the other's turn
 DISTINCT = 60  # keyframes; then they come again
@@ -86,7 +86,7 @@ def _keyframes() -> tuple[list[Keyframe], str]:
     if recorded.exists():
         dataset = open_dataset(recorded)
         return [dataset[i] for i in range(min(DISTINCT, len(dataset)))], "7scenes"
-    from tsfusion.datasets.synthetic.dataset import Synthetic
+    from tsfusion.datasets.worlds.synthetic import Synthetic
 
     return list(Synthetic("room", count=DISTINCT, width=640)), "room"
 

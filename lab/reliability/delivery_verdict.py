@@ -10,8 +10,8 @@ from sum_map import SumMap, hash_of
 
 from tsfusion import journal
 from tsfusion.core.config import SERVER_SESSION
-from tsfusion.wire.health import Status
-from tsfusion.wire.record_header import unpack_keyframe
+from tsfusion.wire.messages.health import Status
+from tsfusion.wire.records.record_header import unpack_keyframe
 
 VOXEL_SIZE = 0.04  # as `wire.Server`'s map
 

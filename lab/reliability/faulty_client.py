@@ -20,7 +20,7 @@ from sum_map import TOO_MUCH
 from tsfusion import Client, Keyframe
 from tsfusion.core.config import ClientConfig
 from tsfusion.core.errors import TsfusionError
-from tsfusion.wire.queries import fetch_health
+from tsfusion.wire.asking.queries import fetch_health
 
 CONFIG = ClientConfig(policy="spool_all", stall_timeout=0.5, segment_bytes=1 << 16)
 REFUSED, REJECTED = 6, 8  # walls too far away for the server, and too much for the map

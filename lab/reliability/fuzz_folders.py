@@ -25,7 +25,7 @@ from rosbag_writing import OPTICAL, writing
 
 from lab.reliability.fuzz_targets import Broken, Target, scratch
 from tsfusion.core.errors import TsfusionError
-from tsfusion.datasets import Dataset, open_dataset, registry
+from tsfusion.datasets import Dataset, layouts, open_dataset
 from tsfusion.datasets.dataset import UnreadableRecording
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
@@ -413,7 +413,7 @@ def run(layout: str, content: bytes) -> str:
     trajectory = whole.with_name("slam.txt")
     _put(trajectory, "".join(map(_tum_line, range(COUNT))))
     options: tuple[dict[str, object], ...] = ({}, {"posed": False}, {"trajectory": trajectory})
-    with mock.patch.object(registry, "_plugins", list):  # looking for them takes longer than the rest
+    with mock.patch.object(layouts, "_plugins", list):  # looking for them takes longer than the rest
         return "; ".join(_opened(work, wanted, **each) for each in options)
 
 

@@ -19,13 +19,15 @@ from lab.reliability import fuzz_mutate
 from tsfusion import Keyframe, journal
 from tsfusion.core.config import ServerConfig, VolumeConfig
 from tsfusion.core.errors import CheckpointError, DecodeError, InvalidKeyframe, JournalError
-from tsfusion.gateway.quotas import Quotas
+from tsfusion.gateway.intake.quotas import Quotas
 from tsfusion.geometry import se3
-from tsfusion.tsdf import checkpoint
-from tsfusion.wire import codec, corrections, keyframe_times, messages, questions
-from tsfusion.wire.codec import measurement
-from tsfusion.wire.health import ClientHealth, Health, MapHealth, MeshLayout
-from tsfusion.wire.record_header import CorrectionHeader, Refused, stamp, unpack
+from tsfusion.tsdf.files import checkpoint
+from tsfusion.tsdf.store.growing_array import LAYER_DTYPES
+from tsfusion.wire.messages import keyframe_times, messages, questions
+from tsfusion.wire.messages.health import ClientHealth, Health, MapHealth, MeshLayout
+from tsfusion.wire.records import codec, corrections
+from tsfusion.wire.records.codec import measurement
+from tsfusion.wire.records.record_header import CorrectionHeader, Refused, stamp, unpack
 
 MAX_BYTES = 1 << 16  # of a case
 
@@ -158,7 +160,7 @@ def _control_seeds() -> list[bytes]:
                 arrays=(questions.ArrayLayout("distance", "float32", (3,), True),),
                 crc=5,
                 waited_s=0.1,
-                state=questions.MapState(keyframes=3, changes=4, epoch="e", segment=1, offset=9),
+                state=questions.MapVersion(keyframes=3, changes=4, epoch="e", segment=1, offset=9),
             ),
         ),
     ]
@@ -300,7 +302,7 @@ def run_checkpoint(content: bytes) -> str:
 def _read_chunk(chunk: checkpoint.Chunk, layers: list[str]) -> int:
     chunk.fill(np.empty(chunk.blocks, np.int64))
     for name in layers:
-        chunk.fill(np.empty((chunk.blocks, 512), checkpoint.LAYER_DTYPES[name]))
+        chunk.fill(np.empty((chunk.blocks, 512), LAYER_DTYPES[name]))
     return chunk.blocks
 
 

@@ -33,12 +33,13 @@ from supervisors import PATIENCE, SCANNER
 from lab.reliability.hostile_watch import Seen, Watch
 from tsfusion import journal
 from tsfusion.core.config import ClientConfig, ServerConfig, override
-from tsfusion.pipelines import latency_ledger
-from tsfusion.wire import key_folder, keyframe_times
-from tsfusion.wire.curve import client_keys
-from tsfusion.wire.keyframe_times import KeyframeTimes, Spread
-from tsfusion.wire.queries import fetch_status
-from tsfusion.wire.record_header import unpack_keyframe
+from tsfusion.pipelines.report import latency_ledger
+from tsfusion.wire.asking.queries import fetch_status
+from tsfusion.wire.keys import key_folder
+from tsfusion.wire.messages import keyframe_times
+from tsfusion.wire.messages.keyframe_times import KeyframeTimes, Spread
+from tsfusion.wire.records.record_header import unpack_keyframe
+from tsfusion.wire.sockets.curve import client_keys
 
 RATE = 8.0  # keyframes a second of the well-behaved one
 MEMORY_BYTES = ServerConfig().memory_bytes  # the bound on the gateway

@@ -10,8 +10,9 @@ import zmq
 from keyframes_and_servers import Secured, Server, connected
 from msgspec import Struct
 
-from tsfusion.wire import messages, sockets
-from tsfusion.wire.health import Health
+from tsfusion.wire.messages import messages
+from tsfusion.wire.messages.health import Health
+from tsfusion.wire.sockets import sockets
 
 _LOOK_S, _ASK_S, _HEALTH_S = 0.02, 0.05, 0.25  # between two looks, questions, questions for the health
 _AGAIN_MS = 250  # without an answer for so long: the connection may be another one now

@@ -20,9 +20,9 @@ from lab.reliability.hostile_watch import rss_bytes
 from tsfusion import VolumeConfig
 from tsfusion.core.config import ClientConfig
 from tsfusion.core.errors import TsfusionError
-from tsfusion.wire import sockets
-from tsfusion.wire.health import Status
-from tsfusion.wire.queries import fetch_health, fetch_status
+from tsfusion.wire.asking.queries import fetch_health, fetch_status
+from tsfusion.wire.messages.health import Status
+from tsfusion.wire.sockets import sockets
 
 SCANNERS = 3
 VIEWS = 60  # of the room; after them the map has every block it will ever have

@@ -4,8 +4,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.datasets.synthetic import worlds
-from tsfusion.datasets.synthetic.worlds import (
+from tsfusion.datasets.worlds import worlds
+from tsfusion.datasets.worlds.worlds import (
     BOX,
     CYLINDER,
     INTERIOR,

@@ -5,8 +5,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets.synthetic.dataset import Synthetic
-from tsfusion.datasets.synthetic.worlds import (
+from tsfusion.datasets.worlds.synthetic import Synthetic
+from tsfusion.datasets.worlds.worlds import (
     AXLE,
     BOX,
     CYLINDER,

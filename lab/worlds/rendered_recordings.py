@@ -20,8 +20,8 @@ from lab.worlds.street_drive import StreetDrive
 from tsfusion.core.durable_files import make_folder, replacing, sync_folder
 from tsfusion.core.errors import DatasetError
 from tsfusion.core.folder_lock import hold
-from tsfusion.datasets.synthetic.dataset import DEPTH_SCALE, Synthetic
 from tsfusion.datasets.trajectory_files import write_tum
+from tsfusion.datasets.worlds.synthetic import DEPTH_SCALE, Synthetic
 
 ABOUT = "world.json"
 CORBS = "D1_pre_registereddata"  # as CoRBS names the folder of a scene: its camera is known by that

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lab.worlds.road_ground import KERB, STEP, Floats, RoadGround
-from tsfusion.datasets.synthetic.worlds import AXLE, BOX, CYLINDER, PRISM, SPHERE, Solids, solid
+from tsfusion.datasets.worlds.worlds import AXLE, BOX, CYLINDER, PRISM, SPHERE, Solids, solid
 
 # As in worlds/kernels/street_things.py
 HOUSE, TILES, BODY, CABIN, TYRE, POLE, TRUNK, CROWN, HEDGE, SIGN, FENCE, BIN = range(20, 32)

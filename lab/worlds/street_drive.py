@@ -20,8 +20,8 @@ from lab.worlds.roadside import roadside
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.cameras import RecordedCamera
 from tsfusion.datasets.dataset import STREET, Frames
-from tsfusion.datasets.synthetic.worlds import World
 from tsfusion.datasets.trajectory_files import read_kitti
+from tsfusion.datasets.worlds.worlds import World
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lab.worlds.road_ground import RoadGround
-from tsfusion.datasets.synthetic.worlds import Solids
+from tsfusion.datasets.worlds.worlds import Solids
 from tsfusion.geometry.keyframe import Intrinsics
 
 TILE = 16  # pixels
@@ -29,7 +29,7 @@ class StreetRenderer:
     """
 
     def __init__(self, solids: Solids, ground: RoadGround, size: tuple[int, int], K: Intrinsics) -> None:
-        from tsfusion.kernels import runtime
+        from tsfusion.kernels.base import runtime
 
         runtime.start()
         self._solids, self._ground, self._size, self._K = solids, ground, size, K

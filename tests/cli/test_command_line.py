@@ -238,7 +238,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(
     (tmp_path / "empty").mkdir()
     (tmp_path / "file").write_text("here first")
     (tmp_path / "garbage.tsf").write_bytes(bytes(range(200)))
-    monkeypatch.setattr("tsfusion.wire.queries._PING_TIMEOUT", 0.2)
+    monkeypatch.setattr("tsfusion.wire.asking.queries._PING_TIMEOUT", 0.2)
     done = here(*arguments)
     assert words in one_line(done)
     left = {path.name for path in tmp_path.rglob("*")}.difference(
@@ -305,7 +305,7 @@ def replayed(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         asked.update(settings, dataset=dataset)
         raise OutputError("recorded")
 
-    monkeypatch.setattr("tsfusion.pipelines.replay.replay", record)
+    monkeypatch.setattr("tsfusion.pipelines.runs.replay.replay", record)
     return asked
 
 
@@ -340,7 +340,7 @@ def test_a_sensor_chosen_in_the_environment_counts(
 def test_flags_of_the_environment_are_not_refused(here: Here, monkeypatch: pytest.MonkeyPatch) -> None:
     """Variables may be meant for other commands."""
     monkeypatch.setenv("TSFUSION_VOXEL_SIZE", "0.5")
-    monkeypatch.setattr("tsfusion.wire.queries._PING_TIMEOUT", 0.2)
+    monkeypatch.setattr("tsfusion.wire.asking.queries._PING_TIMEOUT", 0.2)
     assert "no server" in one_line(here("mesh", NOBODY, "a.ply"))
 
 

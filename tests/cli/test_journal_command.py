@@ -24,7 +24,7 @@ from tsfusion.geometry import se3
 from tsfusion.journal import Journal, segment_path
 from tsfusion.journal.journaled_keyframes import JournalRecording
 from tsfusion.journal.state_folder import find_journal
-from tsfusion.wire import codec, corrections
+from tsfusion.wire.records import codec, corrections
 
 Run = Callable[..., tuple[int, str, str]]
 ANNA, BOB = b"a" * 16, b"b" * 16

@@ -19,10 +19,10 @@ from saved_maps import ANNA, BOB, correct, decoded, forget, make_map
 from small_recordings import first_views
 
 from tsfusion import Client, Intrinsics, Keyframe, Volume, journal
-from tsfusion.gateway import moved_maps
+from tsfusion.gateway.maps import moved_maps
 from tsfusion.journal import segment_path, state_folder
-from tsfusion.tsdf import checkpoint
-from tsfusion.tsdf.checkpoint import CheckpointHeader
+from tsfusion.tsdf.files import checkpoint
+from tsfusion.tsdf.files.checkpoint import CheckpointHeader
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ from tsfusion.cli import progress, progress_rows
 from tsfusion.client import ClientStats
 from tsfusion.core import rates
 from tsfusion.scanner.scanner import ScanState
-from tsfusion.wire.messages import explained
+from tsfusion.wire.messages.messages import explained
 
 STATS = ClientStats(
     sent=9, durable=8, fused=7, refused={}, rejected={"quota": 1}, skipped={}, waiting=1, waiting_bytes=5000,

@@ -17,11 +17,11 @@ from small_recordings import first_views
 
 from tsfusion import Client, FlushTimeout, Volume, VolumeConfig, journal
 from tsfusion.core import durable_files
+from tsfusion.fuser.fuser_messages import SessionProgress
 from tsfusion.fuser.map_checkpoints import MapCheckpoints
-from tsfusion.fuser.messages import SessionProgress
 from tsfusion.geometry.up_direction import HeldSensor
-from tsfusion.tsdf import field_regularizer
-from tsfusion.wire.codec import decode_keyframe
+from tsfusion.tsdf.surface import field_regularizer
+from tsfusion.wire.records.codec import decode_keyframe
 
 VOXEL = 0.08
 

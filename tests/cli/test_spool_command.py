@@ -13,7 +13,7 @@ from idle_fuser import keeping
 from keyframes_and_servers import Server, wall
 
 from tsfusion import Client
-from tsfusion.wire.queries import fetch_health
+from tsfusion.wire.asking.queries import fetch_health
 
 
 @pytest.fixture(scope="module")

@@ -116,7 +116,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         found.update(settings, dataset=dataset, out=out)
         raise OutputError("recorded")
 
-    monkeypatch.setattr("tsfusion.pipelines.replay.replay", record)
+    monkeypatch.setattr("tsfusion.pipelines.runs.replay.replay", record)
     return found
 
 

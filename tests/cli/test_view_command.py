@@ -22,17 +22,17 @@ from live_pages import DEADLINE, address_of, ended, running, viewing
 from tsfusion.cli import verbs
 from tsfusion.cli import view as view_command
 from tsfusion.core.errors import InvalidConfig
-from tsfusion.pipelines import viewer_child
-from tsfusion.pipelines.viewer_child import ViewerChild
+from tsfusion.pipelines.runs import viewer_child
+from tsfusion.pipelines.runs.viewer_child import ViewerChild
 from tsfusion.viewer.live_page import LivePage
-from tsfusion.viewer.page_place import listen
-from tsfusion.wire import key_folder
-from tsfusion.wire.queries import fetch_health
+from tsfusion.viewer.page.page_place import listen
+from tsfusion.wire.asking.queries import fetch_health
+from tsfusion.wire.keys import key_folder
 
 NOBODY = "tcp://127.0.0.1:9"
 _SERVE = f"""
 import sys
-from tsfusion.gateway import fuser_process
+from tsfusion.gateway.fusers import fuser_process
 fuser_process.COMMAND = {IDLE_FUSER!r}
 from tsfusion.__main__ import main
 main()

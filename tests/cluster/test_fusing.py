@@ -27,11 +27,11 @@ from tsfusion import Volume
 from tsfusion.cluster import fusion, job_runner, jobs, keyframe_sources, ray_scheduler
 from tsfusion.cluster.carrying_out import ATTEMPTS
 from tsfusion.cluster.fusion import FusedRun, Wishes
-from tsfusion.cluster.jobs import AnyJob, Lost, Message
+from tsfusion.cluster.jobs import AnyJob, JobLost, JobMessage
 from tsfusion.core.config import VolumeConfig
 from tsfusion.core.errors import InvalidConfig, JournalError, MapError, OutputError, WorkerLost
 from tsfusion.journal import Journal, segment_path
-from tsfusion.wire import codec, corrections
+from tsfusion.wire.records import codec, corrections
 
 SESSION, COUNT = b"\xab" * 16, 12
 
@@ -49,14 +49,14 @@ class InThisProcess:
     def start(self, job: AnyJob) -> None:
         self._started.append(job)
 
-    def wait(self) -> Sequence[Message]:
+    def wait(self) -> Sequence[JobMessage]:
         job = self._started.pop()  # the last first: any order will do
         found = list(job_runner.run(job))
         kind = job.name.partition("-")[0]
         if self._lose.get(kind, 0):
             self._lose[kind] -= 1
             jobs.done_file(Path(job.folder), job.name).unlink(missing_ok=True)
-            return [Lost(job.name, "it was killed")]
+            return [JobLost(job.name, "it was killed")]
         self.done.append(job.name)
         return found
 
@@ -137,7 +137,7 @@ def test_a_job_that_ends_every_worker_is_told(state: Path, tmp_path: Path) -> No
 
 def test_an_interrupted_run_goes_on(state: Path, tmp_path: Path, expected: Volume) -> None:
     class Interrupted(InThisProcess):
-        def wait(self) -> Sequence[Message]:
+        def wait(self) -> Sequence[JobMessage]:
             if len(self.done) == 3:
                 raise KeyboardInterrupt
             return super().wait()

@@ -14,7 +14,7 @@ from keyframes_and_servers import VOLUME, map_hash, wall
 from tsfusion.cluster import keyframe_sources
 from tsfusion.core.errors import JournalError, MissingDependency
 from tsfusion.journal import Journal, locations
-from tsfusion.wire import codec
+from tsfusion.wire.records import codec
 
 upath = pytest.importorskip("upath", reason="universal-pathlib is not installed: pip install '.[s3]'")
 

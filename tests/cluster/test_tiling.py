@@ -14,7 +14,7 @@ from tsfusion import Volume, VolumeConfig
 from tsfusion.cluster import mesh_runs, tiling
 from tsfusion.core.errors import InvalidConfig
 from tsfusion.geometry.mesh_parts import joined
-from tsfusion.tsdf import field_regularizer, mesh_tiles
+from tsfusion.tsdf.surface import field_regularizer, mesh_tiles
 
 CONFIG = VolumeConfig(voxel_size=0.02, threads=1)
 

@@ -22,7 +22,7 @@ from tsfusion.core import read_limits
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.depth_files import read_depth
 from tsfusion.datasets.readers import read_image, read_lines
-from tsfusion.datasets.rosbag.dataset import Bag
+from tsfusion.datasets.rosbag.bag import Bag
 from tsfusion.datasets.scan_files import read_scan
 
 HOLE = 1 << 30

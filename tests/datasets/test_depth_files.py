@@ -16,10 +16,10 @@ from tsfusion.core.errors import DatasetError, MissingDependency
 from tsfusion.datasets import open_dataset
 from tsfusion.datasets.depth_files import check_metres, read_depth
 from tsfusion.datasets.readers import read_color, read_image
-from tsfusion.datasets.rosbag import messages
+from tsfusion.datasets.rosbag import bag_messages
 from tsfusion.geometry.keyframe import depth_metres
-from tsfusion.viewer.scanner_marks import small_picture
-from tsfusion.wire.array_encoding import unpack_image
+from tsfusion.viewer.map.scanner_marks import small_picture
+from tsfusion.wire.records.array_encoding import unpack_image
 
 
 def save(path: Path, depth: np.ndarray) -> None:
@@ -187,11 +187,11 @@ def test_colour_is_read_as_stored_whatever_its_exif_orientation(tmp_path, orient
     for found in (
         read_color(tmp_path / "a.jpg", (24, 32)),
         read_image(tmp_path / "a.jpg", "an image", cv2.IMREAD_ANYCOLOR),
-        messages.color(bag),
+        bag_messages.color(bag),
         unpack_image(raw.tobytes(), np.dtype(np.uint8), (24, 32, 3)),
         small_picture(raw.tobytes()),
     ):
         assert np.abs(found.astype(int) - image).mean() < 3
-    assert np.abs(messages.gray(bag).astype(int) - image[..., 0]).mean() < 3
+    assert np.abs(bag_messages.gray(bag).astype(int) - image[..., 0]).mean() < 3
     if orientation > 4:
         one_line(lambda: read_color(tmp_path / "a.jpg", (32, 24)), "EXIF orientation turns these")

@@ -16,7 +16,7 @@ from small_recordings import claim_size, hololens, kitti, one_line, redwood, sev
 from written_recordings import replica, scannet, transforms, write
 
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets import Dataset, Selection, describe, find, layouts, open_dataset, select
+from tsfusion.datasets import Dataset, PartOfDataset, describe, find, layouts, open_dataset, select
 from tsfusion.datasets.dataset import pose_of
 from tsfusion.geometry.keyframe import Intrinsics
 
@@ -79,7 +79,7 @@ def test_some_poses_are_given_where_they_are_known(tmp_path):
     assert describe(dataset) == f"{said}; {unit}; camera fx 5 fy 5 cx 4 cy 3, 8×6, from camera-intrinsics.txt"
     every_second = select(dataset, stride=2)
     assert [pose_of(every_second, index) is None for index in range(2)] == [False, True]
-    assert isinstance(every_second, Selection)
+    assert isinstance(every_second, PartOfDataset)
     with pytest.raises(IndexError):
         dataset.pose(4)
 

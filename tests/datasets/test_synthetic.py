@@ -16,10 +16,10 @@ from scipy.spatial import cKDTree
 from lab.worlds.desk_world import desk
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets import Synthetic
-from tsfusion.datasets.synthetic import worlds
-from tsfusion.datasets.synthetic.dataset import DEPTH_SCALE, RayTiles, kinect, stereo
+from tsfusion.datasets.worlds import worlds
+from tsfusion.datasets.worlds.synthetic import DEPTH_SCALE, RayTiles, kinect, stereo
 from tsfusion.geometry.keyframe import Keyframe, depth_metres, points_world
-from tsfusion.scanner.localization.rgbd.tracker import RGBDLocalizer
+from tsfusion.scanner.localization.rgbd.rgbd_tracker import RGBDLocalizer
 
 
 def digest(keyframe: Keyframe) -> str:
@@ -192,7 +192,7 @@ def test_equal_seeds_give_equal_bytes_in_any_order():
 
 def test_the_thread_count_changes_nothing():
     code = (
-        "import sys; sys.path[:0] = sys.argv[2:]; from tsfusion.kernels import runtime;"
+        "import sys; sys.path[:0] = sys.argv[2:]; from tsfusion.kernels.base import runtime;"
         "runtime.start(int(sys.argv[1]));"
         "from tsfusion.datasets import Synthetic; from test_synthetic import digest;"
         "print(digest(Synthetic('street', 'stereo', width=96)[1]), digest(Synthetic('room', 'lidar')[1]))"
@@ -229,7 +229,7 @@ def test_colour_is_the_surfaces_own():
 
 def test_the_tables_of_solids_and_materials_agree_with_the_kernel():
     Synthetic(width=16, count=1)[0]  # starts Taichi
-    from tsfusion.kernels import synthetic_raycast, synthetic_textures
+    from tsfusion.kernels.worlds import synthetic_raycast, synthetic_textures
 
     solids = "ROOM BOX SPHERE CYLINDER GROUND"
     materials = "INTERIOR WOOD MARBLE STRIPES ROAD PAVEMENT FACADE PAINT METAL BARK LEAVES GLASS PLAIN"

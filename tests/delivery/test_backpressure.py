@@ -28,7 +28,7 @@ from tsfusion.core.errors import TransportError
 from tsfusion.delivery.backpressure import Backpressure
 from tsfusion.delivery.outbox import LinkState, Outbox
 from tsfusion.delivery.spool import Spool
-from tsfusion.wire.queries import fetch_status
+from tsfusion.wire.asking.queries import fetch_status
 
 # --- policies ---
 

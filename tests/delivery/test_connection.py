@@ -19,10 +19,12 @@ from tsfusion.core.errors import FlushTimeout, InvalidConfig, NotAllowed, Server
 from tsfusion.delivery.outbox import LinkKind, LinkState, Outbox
 from tsfusion.delivery.sender import Sender
 from tsfusion.delivery.spool import Spool
-from tsfusion.wire import codec, key_folder, sockets
-from tsfusion.wire.connection import Connection
-from tsfusion.wire.curve import server_keys
-from tsfusion.wire.messages import PROTOCOL_VERSION, Welcome
+from tsfusion.wire.keys import key_folder
+from tsfusion.wire.messages.messages import PROTOCOL_VERSION, Welcome
+from tsfusion.wire.records import codec
+from tsfusion.wire.sockets import sockets
+from tsfusion.wire.sockets.connection import ServerLink
+from tsfusion.wire.sockets.curve import server_keys
 
 PATIENT = ClientConfig(stall_timeout=1000.0, policy="spool_all")
 
@@ -136,7 +138,7 @@ def test_the_connection_after_a_cut_is_news_as_well() -> None:
         server = sockets.pull(context, 1 << 20)
         server.bind("tcp://127.0.0.1:*")
         address = server.getsockopt_string(zmq.LAST_ENDPOINT)
-        with closing(Connection(context, sockets.push, address, None)) as connection:
+        with closing(ServerLink(context, sockets.push, address, None)) as connection:
             cuts: list[bool] = []
 
             def news() -> int:

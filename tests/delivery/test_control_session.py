@@ -12,8 +12,9 @@ from tsfusion.delivery import control_session
 from tsfusion.delivery.control_session import ControlSession, RefusedRecords
 from tsfusion.delivery.outbox import Outbox
 from tsfusion.delivery.spool import Spool
-from tsfusion.wire import codec, messages
-from tsfusion.wire.messages import Ack, Denied, Nack, Pong, ToClient, Welcome
+from tsfusion.wire.messages import messages
+from tsfusion.wire.messages.messages import Ack, Denied, Nack, Pong, ToClient, Welcome
+from tsfusion.wire.records import codec
 
 
 class Side:

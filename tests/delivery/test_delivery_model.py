@@ -25,8 +25,9 @@ from tsfusion.delivery.backpressure import Backpressure
 from tsfusion.delivery.outbox import Outbox
 from tsfusion.delivery.sender import Sender
 from tsfusion.delivery.spool import Spool
-from tsfusion.wire import codec, corrections, messages
-from tsfusion.wire.record_header import KeyframeHeader, unpack
+from tsfusion.wire.messages import messages
+from tsfusion.wire.records import codec, corrections
+from tsfusion.wire.records.record_header import KeyframeHeader, unpack
 
 POLICIES = ("thin", "drop_oldest", "spool_all", "block")
 SEEDS = 40

@@ -16,7 +16,7 @@ from tsfusion.delivery.outbox import Outbox
 from tsfusion.delivery.outcomes import NumberRuns
 from tsfusion.delivery.spool import Spool, Waiting
 from tsfusion.journal import Position
-from tsfusion.wire import codec, corrections
+from tsfusion.wire.records import codec, corrections
 
 
 def put(outbox: Outbox, count: int) -> None:

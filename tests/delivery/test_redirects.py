@@ -13,8 +13,8 @@ from served_gateway import Served, serving_here
 from tsfusion import Client
 from tsfusion.core.config import ClientConfig
 from tsfusion.delivery import control_session, sender
-from tsfusion.gateway import moved_maps
-from tsfusion.gateway.moved_maps import Departed
+from tsfusion.gateway.maps import moved_maps
+from tsfusion.gateway.maps.moved_maps import Departed
 
 
 @pytest.fixture

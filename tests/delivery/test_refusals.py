@@ -16,9 +16,9 @@ from tsfusion.core.config import ClientConfig
 from tsfusion.core.errors import FlushTimeout, InvalidConfig, JournalError, KeyframeRefused, ServerUnreachable
 from tsfusion.delivery.spool import Spool
 from tsfusion.journal.journaled_keyframes import JournalRecording
-from tsfusion.wire import codec
-from tsfusion.wire.queries import fetch_health, fetch_status
-from tsfusion.wire.record_header import unpack
+from tsfusion.wire.asking.queries import fetch_health, fetch_status
+from tsfusion.wire.records import codec
+from tsfusion.wire.records.record_header import unpack
 
 # --- for a while ---
 

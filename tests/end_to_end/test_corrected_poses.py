@@ -35,9 +35,11 @@ from tsfusion.core.errors import FlushTimeout, InvalidKeyframe, KeyframeRefused
 from tsfusion.geometry import se3
 from tsfusion.journal import state_folder
 from tsfusion.journal.inspection import summarize
-from tsfusion.wire import codec, corrections, key_folder, sockets
-from tsfusion.wire.health import MapHealth
-from tsfusion.wire.queries import fetch_health, fetch_status
+from tsfusion.wire.asking.queries import fetch_health, fetch_status
+from tsfusion.wire.keys import key_folder
+from tsfusion.wire.messages.health import MapHealth
+from tsfusion.wire.records import codec, corrections
+from tsfusion.wire.sockets import sockets
 
 SESSION = bytes(range(16))
 FUSER = SUMS  # but where keyframes are moved in a real map

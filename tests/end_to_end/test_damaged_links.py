@@ -10,10 +10,12 @@ from idle_fuser import keeping
 from keyframes_and_servers import DEADLINE, connected, wall
 
 from tsfusion import Client, journal
-from tsfusion.gateway import keyframe_intake
+from tsfusion.gateway.intake import keyframe_intake
 from tsfusion.journal.state_folder import find_journal
-from tsfusion.wire import codec, messages, sockets
-from tsfusion.wire.queries import fetch_health
+from tsfusion.wire.asking.queries import fetch_health
+from tsfusion.wire.messages import messages
+from tsfusion.wire.records import codec
+from tsfusion.wire.sockets import sockets
 
 SESSION = bytes(range(16))
 KEYFRAMES = 60

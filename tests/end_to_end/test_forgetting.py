@@ -29,12 +29,14 @@ from tsfusion.core.config import SERVER_SESSION
 from tsfusion.core.errors import JournalError
 from tsfusion.journal import state_folder
 from tsfusion.journal.inspection import verify
-from tsfusion.pipelines.stored_map import open_map
-from tsfusion.wire import corrections, key_folder, sockets
-from tsfusion.wire.forgetting import Selection
-from tsfusion.wire.health import MapHealth
-from tsfusion.wire.messages import PROTOCOL_VERSION, Denied, Hello
-from tsfusion.wire.queries import CommandRefused, fetch_health, fetch_status, forget
+from tsfusion.pipelines.maps.stored_map import open_map
+from tsfusion.wire.asking.queries import CommandRefused, fetch_health, fetch_status, forget
+from tsfusion.wire.keys import key_folder
+from tsfusion.wire.messages.forget_messages import Selection
+from tsfusion.wire.messages.health import MapHealth
+from tsfusion.wire.messages.messages import PROTOCOL_VERSION, Denied, Hello
+from tsfusion.wire.records import corrections
+from tsfusion.wire.sockets import sockets
 
 COUNT = 4
 FUSER = SUMS  # of the server that some tests share
@@ -125,7 +127,7 @@ def test_nothing_but_the_server_writes_what_is_forgotten(shared: Server) -> None
         link.send_multipart(corrections.encode(plain, session=SERVER_SESSION, seq=1, previous=0))
         until(lambda: fetch_health(shared.address).refused.get("forgetting", 0) == before + 2)
     assert health_of(shared).keyframes_forgotten == 0
-    from tsfusion.wire import messages
+    from tsfusion.wire.messages import messages
 
     with connected(sockets.dealer, shared.control) as link:
         link.send(messages.encode_sealed(Hello(SERVER_SESSION, PROTOCOL_VERSION)))

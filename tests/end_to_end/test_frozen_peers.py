@@ -29,9 +29,11 @@ from tsfusion.core.config import ClientConfig
 from tsfusion.core.errors import FlushTimeout, ServerUnreachable, TransportError
 from tsfusion.delivery import control_session, spool
 from tsfusion.journal.state_folder import find_journal
-from tsfusion.wire import codec, messages, sockets
-from tsfusion.wire.queries import fetch_health, fetch_status
-from tsfusion.wire.record_header import VERSION
+from tsfusion.wire.asking.queries import fetch_health, fetch_status
+from tsfusion.wire.messages import messages
+from tsfusion.wire.records import codec
+from tsfusion.wire.records.record_header import VERSION
+from tsfusion.wire.sockets import sockets
 
 FREEZE = 6.0  # seconds: longer than any timeout of client and server
 SHORT_FREEZE = 3.0  # where the gateway lives, and would have noticed by then

@@ -13,8 +13,8 @@ from command_processes import alive
 from keyframes_and_servers import DEADLINE, VOLUME, Server, map_hash, serving, until
 
 from tsfusion import Client, Keyframe
-from tsfusion.wire.health import MapHealth
-from tsfusion.wire.queries import CommandRefused, fetch_health, fetch_mesh, fetch_status
+from tsfusion.wire.asking.queries import CommandRefused, fetch_health, fetch_mesh, fetch_status
+from tsfusion.wire.messages.health import MapHealth
 
 LEAST = 1 << 28  # bytes, the smallest `fuser_memory_bytes`
 PATIENCE = 10 * DEADLINE  # seconds to read or write gigabytes on a busy machine

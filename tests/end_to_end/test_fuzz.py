@@ -11,8 +11,8 @@ from lab.reliability import fuzz_mutate
 from lab.reliability.fuzz_engine import fuzz
 from lab.reliability.fuzz_folders import FOLDERS
 from lab.reliability.fuzz_targets import TARGETS
-from tsfusion.wire import codec
-from tsfusion.wire.record_header import Refused
+from tsfusion.wire.records import codec
+from tsfusion.wire.records.record_header import Refused
 
 CASES = {"message": 3000, "control": 10_000, "corrections": 1500, "journal": 1000, "checkpoint": 500}
 NIGHTLY = 20  # times as many

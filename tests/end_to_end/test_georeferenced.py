@@ -94,7 +94,7 @@ def test_every_way_of_giving_poses_has_one_origin(tmp_path: Path) -> None:
 
 def test_a_scan_by_a_trajectory_in_utm(tmp_path: Path) -> None:
     from tsfusion.core.config import ScanConfig
-    from tsfusion.scanner.localization import registry
+    from tsfusion.scanner.localization import localizers
 
     poses = [view.T_world_camera.copy() for view in Synthetic("room", sensor="lidar", count=COUNT)]
     for T in poses:
@@ -104,6 +104,6 @@ def test_a_scan_by_a_trajectory_in_utm(tmp_path: Path) -> None:
     for given, height in ((None, 0.0), ("447000,5411000,-300", 300.0)):
         config = ScanConfig(localizer="trajectory", trajectory=str(tmp_path / "poses.txt"), origin=given)
         first = Frame.of(Synthetic("room", sensor="lidar", count=1)[0], "lidar")
-        localizer = registry.create_localizer(config, first)
+        localizer = localizers.create_localizer(config, first)
         assert localizer.origin.position == (447_000, 5_411_000, -300 if given else 0)
         assert localizer._trajectory.translations[0][2] == pytest.approx(poses[0][2, 3] + height)

@@ -23,12 +23,14 @@ from tsfusion import AnswerLate, Client, InvalidConfig, MapClient, ServerUnreach
 from tsfusion.core.errors import TransportError
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.geometry.map_answers import View
-from tsfusion.wire import key_folder, messages, questions, sockets
-from tsfusion.wire.curve import client_keys
-from tsfusion.wire.forgetting import Selection
-from tsfusion.wire.messages import Command, Reply
-from tsfusion.wire.queries import CommandRefused, fetch_health, forget
-from tsfusion.wire.questions import MOST_POINTS, Cells, Field, Keyframes, Raycast, Sample, Slice
+from tsfusion.wire.asking.queries import CommandRefused, fetch_health, forget
+from tsfusion.wire.keys import key_folder
+from tsfusion.wire.messages import messages, questions
+from tsfusion.wire.messages.forget_messages import Selection
+from tsfusion.wire.messages.messages import Command, Reply
+from tsfusion.wire.messages.questions import MOST_POINTS, Cells, Field, Keyframes, Raycast, Sample, Slice
+from tsfusion.wire.sockets import sockets
+from tsfusion.wire.sockets.curve import client_keys
 
 COUNT = 4
 EASY = 30.0  # seconds for an answer that is there in milliseconds

@@ -20,9 +20,10 @@ from tsfusion import Client, MapClient, journal
 from tsfusion.core.config import ClientConfig
 from tsfusion.core.errors import TransportError
 from tsfusion.journal import state_folder
-from tsfusion.wire import queries, questions
-from tsfusion.wire.map_events import MapEvent, SurfaceUpdate
-from tsfusion.wire.map_watcher import MapWatcher
+from tsfusion.wire.asking import queries
+from tsfusion.wire.asking.map_events import MapEvent, SurfaceUpdate
+from tsfusion.wire.asking.map_watcher import MapWatcher
+from tsfusion.wire.messages import questions
 
 QUICK = ClientConfig(stall_timeout=0.5)
 FEW = 12
@@ -164,7 +165,7 @@ def test_a_map_that_cannot_go_stays_and_goes_on(tmp_path: Path) -> None:
 
 _DIES_AT = """
 import os, signal
-from tsfusion.gateway import map_arrivals, map_departures
+from tsfusion.gateway.migration import map_arrivals; from tsfusion.gateway.migration import map_departures
 def die(*_arguments, **_more):
     os.kill(os.getpid(), signal.SIGKILL)
 {patch}
@@ -175,7 +176,7 @@ _DEATHS = {
     # The taker: it has all, and died before it asked for the last word.
     "taker": "map_arrivals.MapArrival._commit = die",
     # The taker again: the map is its own by the last word, and it has not opened it.
-    "taker, late": "map_arrivals.install = die",
+    "taker, late": "moved_maps.install = die",
 }
 
 

@@ -108,7 +108,7 @@ def test_poses_that_cannot_be_paired_are_an_error_that_says_so(
 def test_a_scan_of_images_without_times_takes_one_pose_a_frame(
     kitchen: list[Keyframe], tmp_path: Path, poses: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from tsfusion.cli.scan import _open
+    from tsfusion.cli.scan_verb import _open
 
     root = own_recordings.images(tmp_path / "mine", kitchen, poses=False)
     slam = str(poses_file(tmp_path / "slam.txt", poses, kitchen))

@@ -20,7 +20,7 @@ from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.journal.journaled_keyframes import JournalRecording
-from tsfusion.scanner.localization.localizer import Lost, Pose
+from tsfusion.scanner.localization.localizer import Lost, TrackedPose
 from tsfusion.scanner.localization.pose_feed.feed import PoseFeed
 
 BRIDGE = ROOT / "contrib" / "ros1_bridge.py"
@@ -102,10 +102,10 @@ def test_poses_reach_the_feed(ros: dict[str, str], source: list[str]) -> None:
             process(PYTHON, BRIDGE, "--feed", feed.address, "--connect", *source, environment=ros)
         )
         stack.enter_context(process(PYTHON, TALKER, "poses", "tf", environment=ros))
-        lap = next(n for n in (20, 60, 120) if isinstance(feed.track(at(20 * n + 10)), Pose))
+        lap = next(n for n in (20, 60, 120) if isinstance(feed.track(at(20 * n + 10)), TrackedPose))
         for tenths, within in ((10, 1e-6), (3, 1e-6), (3.5, 1e-3)):
             found = feed.track(at(20 * lap + tenths))
-            assert isinstance(found, Pose), found.reason
+            assert isinstance(found, TrackedPose), found.reason
             np.testing.assert_allclose(found.T_world_camera, place(tenths), atol=within)
         assert not feed.dropped
 

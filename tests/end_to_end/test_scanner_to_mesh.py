@@ -38,13 +38,15 @@ from tsfusion.core.errors import (
     TransportError,
     WorldRefused,
 )
-from tsfusion.fuser import messages as fuser_messages
+from tsfusion.fuser import fuser_messages
 from tsfusion.journal import state_folder
 from tsfusion.journal.journaled_keyframes import JournalRecording
-from tsfusion.wire import codec, messages, sockets
-from tsfusion.wire.mesh_updates import Meshed
-from tsfusion.wire.messages import Command
-from tsfusion.wire.queries import fetch_health, fetch_mesh, fetch_status, request
+from tsfusion.wire.asking.queries import fetch_health, fetch_mesh, fetch_status, request
+from tsfusion.wire.messages import messages
+from tsfusion.wire.messages.mesh_updates import Meshed
+from tsfusion.wire.messages.messages import Command
+from tsfusion.wire.records import codec
+from tsfusion.wire.sockets import sockets
 
 COUNT = 8
 

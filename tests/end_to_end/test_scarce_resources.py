@@ -24,9 +24,10 @@ from tsfusion.core.errors import InvalidKeyframe, KeyframeRefused
 from tsfusion.datasets import Synthetic
 from tsfusion.delivery import sender
 from tsfusion.delivery.spool import Spool
-from tsfusion.wire import messages, sockets
-from tsfusion.wire.messages import Command
-from tsfusion.wire.queries import fetch_health
+from tsfusion.wire.asking.queries import fetch_health
+from tsfusion.wire.messages import messages
+from tsfusion.wire.messages.messages import Command
+from tsfusion.wire.sockets import sockets
 
 FUSER = SUMS  # but where a map outgrows its memory
 
@@ -91,9 +92,9 @@ _FEW_FILES = """
 import os, resource, signal, sys, zmq
 from tsfusion import Client
 from tsfusion.core.errors import JournalError, ServerUnreachable, TransportError
-from tsfusion.wire import sockets
-from tsfusion.wire.connection import Connection
-from tsfusion.wire.queries import fetch_health
+from tsfusion.wire.sockets import sockets
+from tsfusion.wire.sockets.connection import Connection
+from tsfusion.wire.asking.queries import fetch_health
 
 def leave(free):
     resource.setrlimit(resource.RLIMIT_NOFILE, (64, 64))

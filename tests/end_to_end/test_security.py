@@ -18,9 +18,12 @@ import tsfusion
 from tsfusion import Client
 from tsfusion.core.errors import FlushTimeout, NotAllowed, TransportError
 from tsfusion.journal.journaled_keyframes import JournalRecording
-from tsfusion.wire import codec, key_folder, messages, sockets
-from tsfusion.wire.curve import ClientKeys, client_keys, server_keys
-from tsfusion.wire.queries import fetch_health, fetch_mesh, fetch_new_map, fetch_status
+from tsfusion.wire.asking.queries import fetch_health, fetch_mesh, fetch_new_map, fetch_status
+from tsfusion.wire.keys import key_folder
+from tsfusion.wire.messages import messages
+from tsfusion.wire.records import codec
+from tsfusion.wire.sockets import sockets
+from tsfusion.wire.sockets.curve import ClientKeys, client_keys, server_keys
 
 
 class Site:

@@ -21,16 +21,18 @@ from tsfusion import Client
 from tsfusion.core import config
 from tsfusion.core.config import ServerConfig, VolumeConfig
 from tsfusion.core.errors import JournalError, ServerUnreachable, TransportError
-from tsfusion.gateway import map_registry
-from tsfusion.gateway.client_routes import ClientRoutes
-from tsfusion.gateway.map_registry import MapRegistry
-from tsfusion.gateway.metrics import Metrics
-from tsfusion.gateway.quotas import Quotas
+from tsfusion.gateway.clients.client_routes import ClientRoutes
+from tsfusion.gateway.health.metrics import Metrics
+from tsfusion.gateway.intake.quotas import Quotas
+from tsfusion.gateway.maps import map_registry
+from tsfusion.gateway.maps.map_registry import MapRegistry
 from tsfusion.journal import state_folder
 from tsfusion.journal.journaled_keyframes import JournalRecording
-from tsfusion.wire import codec, messages, sockets
-from tsfusion.wire.queries import fetch_health, fetch_mesh, fetch_status
-from tsfusion.wire.record_header import Refused, unpack
+from tsfusion.wire.asking.queries import fetch_health, fetch_mesh, fetch_status
+from tsfusion.wire.messages import messages
+from tsfusion.wire.records import codec
+from tsfusion.wire.records.record_header import Refused, unpack
+from tsfusion.wire.sockets import sockets
 
 
 def scan(address: str, map_name: str, numbers: range) -> None:
@@ -95,7 +97,7 @@ def test_maps_that_cannot_be_opened_are_remembered_up_to_a_number(
 
 
 def test_a_map_takes_only_so_many_sessions(tmp_path: Path) -> None:
-    code = "import tsfusion.gateway.sessions; tsfusion.gateway.sessions._MAX_SESSIONS = 2\n"
+    code = "import tsfusion.gateway.clients.sessions; tsfusion.gateway.clients.sessions._MAX_SESSIONS = 2\n"
     with contextlib.closing(Server(tmp_path, code=code, fuser=SUMS)) as server:
         for i in range(2):
             scan(server.address, "default", range(i, i + 1))

@@ -8,7 +8,7 @@ from keyframes_and_servers import DEADLINE, map_hash, serving, until, wall
 from tsfusion import Client
 from tsfusion.journal import state_folder
 from tsfusion.journal.journaled_keyframes import JournalRecording
-from tsfusion.wire.queries import fetch_health, fetch_status
+from tsfusion.wire.asking.queries import fetch_health, fetch_status
 
 
 def problems(address: str) -> str:

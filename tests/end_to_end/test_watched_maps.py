@@ -28,12 +28,13 @@ from watched_surfaces import Held, Surfaces, fresh
 from tsfusion import Client, Volume
 from tsfusion.core.config import ClientConfig, override
 from tsfusion.geometry.keyframe import Keyframe
-from tsfusion.wire import key_folder, sockets
-from tsfusion.wire.curve import client_keys
-from tsfusion.wire.forgetting import Selection
-from tsfusion.wire.map_events import HealthSeen, LinkSeen
-from tsfusion.wire.map_watcher import MapWatcher
-from tsfusion.wire.queries import fetch_health, forget
+from tsfusion.wire.asking.map_events import HealthSeen, LinkSeen
+from tsfusion.wire.asking.map_watcher import MapWatcher
+from tsfusion.wire.asking.queries import fetch_health, forget
+from tsfusion.wire.keys import key_folder
+from tsfusion.wire.messages.forget_messages import Selection
+from tsfusion.wire.sockets import sockets
+from tsfusion.wire.sockets.curve import client_keys
 
 NORMAL = override(VOLUME, surface="normal")  # whose cells depend on the map alone, to the last bit
 SOON = 0.05

@@ -16,9 +16,11 @@ from tsfusion.core.errors import InvalidConfig, TransportError, WorldRefused
 from tsfusion.journal import state_folder
 from tsfusion.journal.journaled_keyframes import JournalRecording
 from tsfusion.journal.recovery import recover
-from tsfusion.wire import codec, messages, sockets
-from tsfusion.wire.queries import fetch_health, fetch_new_map
-from tsfusion.wire.record_header import unpack
+from tsfusion.wire.asking.queries import fetch_health, fetch_new_map
+from tsfusion.wire.messages import messages
+from tsfusion.wire.records import codec
+from tsfusion.wire.records.record_header import unpack
+from tsfusion.wire.sockets import sockets
 
 REFUSED = r"map {} has [0-9]+ keyframes? of another session, .*: use --map \S+ or --map auto, or --same-frame"
 

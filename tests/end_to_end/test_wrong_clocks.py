@@ -14,7 +14,7 @@ from tsfusion import Client, journal
 from tsfusion.delivery import left_spools
 from tsfusion.journal.quarantine import Quarantine
 from tsfusion.journal.state_folder import find_journal
-from tsfusion.wire import codec
+from tsfusion.wire.records import codec
 
 YEAR = 365 * 86_400 * 10**9  # nanoseconds
 CLOCKS = {"1970": 0, "before 1970": -5 * YEAR, "long ago": 10 * YEAR, "far ahead": 200 * YEAR}

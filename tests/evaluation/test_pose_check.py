@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from support.corrupted_recordings import FOLDERS, Corrupted, genuine, opened
 
 from tsfusion import cli
-from tsfusion.datasets import Dataset, Selection, Synthetic, open_dataset, select
+from tsfusion.datasets import Dataset, PartOfDataset, Synthetic, open_dataset, select
 from tsfusion.evaluation import pose_check
 from tsfusion.evaluation.pose_check import check
 from tsfusion.geometry import se3
@@ -225,7 +225,7 @@ def blind(frame: Frame) -> dict[str, object]:
 
 
 def still(views: Dataset) -> Dataset:
-    return Corrupted(Selection(views, [0] * 20), lambda _: np.eye(4))
+    return Corrupted(PartOfDataset(views, [0] * 20), lambda _: np.eye(4))
 
 
 @pytest.mark.parametrize(
@@ -290,13 +290,13 @@ def inverted(place: Path, folder: Path) -> Path:
 def test_replay_stops_before_it_fuses_what_is_wrong(
     data: Data, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from tsfusion.cli import replay
+    from tsfusion.cli import replay_verb
     from tsfusion.core.errors import IncompleteRun
 
     wrong = inverted(data(FOLDERS["open3d"]), tmp_path)
     with pytest.raises(IncompleteRun, match=r"nothing is fused, .* the poses are world-to-camera"):
-        replay._checked(open_dataset(wrong))
-    assert replay._checked(open_dataset(data(FOLDERS["open3d"]))) == ("", [])
+        replay_verb._checked(open_dataset(wrong))
+    assert replay_verb._checked(open_dataset(data(FOLDERS["open3d"]))) == ("", [])
     assert capsys.readouterr().err == ""
 
 

@@ -22,11 +22,11 @@ from test_fuser import Link, is_due, opened
 
 from tsfusion import Keyframe, Volume, journal
 from tsfusion.core.config import SERVER_SESSION
-from tsfusion.fuser import messages
+from tsfusion.fuser import fuser_messages
 from tsfusion.fuser.fuser import Fuser
 from tsfusion.journal import Journal, Position
-from tsfusion.wire import codec, corrections
-from tsfusion.wire.forgetting import Selection
+from tsfusion.wire.messages.forget_messages import Selection
+from tsfusion.wire.records import codec, corrections
 
 SESSIONS = (b"a" * 16, b"b" * 16)
 
@@ -37,7 +37,7 @@ class Recorded:
     def __init__(self, state: Path, segment_bytes: int = 1 << 20) -> None:
         self.state = state
         self.journal = Journal(state / "journal", segment_bytes)
-        self.orders: list[messages.Fuse] = []
+        self.orders: list[fuser_messages.Fuse] = []
         self.keyframes: dict[bytes, list[int]] = {session: [] for session in SESSIONS}
         self._seqs = dict.fromkeys(SESSIONS, 0)
 
@@ -64,24 +64,24 @@ class Recorded:
     def _append(self, session: bytes, encode: Any) -> int:
         self._seqs[session] = seq = self._seqs.get(session, 0) + 1
         position = self.journal.append(encode(session=session, seq=seq), session=session, seq=seq)
-        self.orders.append(messages.Fuse(len(self.orders), position, session, seq, ""))
+        self.orders.append(fuser_messages.Fuse(len(self.orders), position, session, seq, ""))
         return seq
 
     def fresh(self) -> Volume:
         return fresh_map(self.state / "journal", VOLUME.voxel_size)
 
 
-def find(fuser: Fuser, link: Link, **selection: Any) -> messages.Found:
+def find(fuser: Fuser, link: Link, **selection: Any) -> fuser_messages.Found:
     """The keyframes of a selection."""
-    fuser.handle(messages.Find(7, Selection(**selection)))
+    fuser.handle(fuser_messages.Find(7, Selection(**selection)))
     while is_due(fuser, "search"):
         fuser.chores["search"].do()
     found = link.last()
-    assert isinstance(found, messages.Found)
+    assert isinstance(found, fuser_messages.Found)
     return found
 
 
-def found_numbers(found: messages.Found) -> dict[bytes, list[int]]:
+def found_numbers(found: fuser_messages.Found) -> dict[bytes, list[int]]:
     """The numbers that were found and are not forgotten, by session."""
     return {
         one.session: np.frombuffer(one.seqs, np.int64)[~np.frombuffer(one.forgotten, np.bool_)].tolist()
@@ -89,7 +89,7 @@ def found_numbers(found: messages.Found) -> dict[bytes, list[int]]:
     }
 
 
-def positions(found: messages.Found) -> list[Position]:
+def positions(found: fuser_messages.Found) -> list[Position]:
     """Where the records are that were found."""
     return [
         Position(*place)
@@ -111,8 +111,8 @@ def settle(fuser: Fuser) -> int:
     return moves
 
 
-def progress(link: Link) -> messages.CorrectionProgress:
-    return [message for message, _ in link.sent if isinstance(message, messages.CorrectionProgress)][-1]
+def progress(link: Link) -> fuser_messages.CorrectionProgress:
+    return [message for message, _ in link.sent if isinstance(message, fuser_messages.CorrectionProgress)][-1]
 
 
 @pytest.fixture
@@ -170,7 +170,7 @@ def test_a_checkpoint_knows_where_each_keyframe_was_fused(recorded: Recorded) ->
     recorded.correct({1: pose(0.5), 2: pose(0.7), 4: pose(-0.4)}, removed=(3,), T=pose(0, 1.0))
     fuser, _ = fused(recorded)
     fuser.chores["move"].do()
-    fuser.handle(messages.Save())
+    fuser.handle(fuser_messages.Save())
     fuser.chores["move"].do()  # this one is lost
     recorded.add()
     again, _ = fused(recorded, first=5)
@@ -237,7 +237,7 @@ def test_what_the_journal_deleted_takes_no_room(tmp_path: Path) -> None:
     recorded.journal.close()
     for number in range(1, 5):
         (tmp_path / "journal" / f"{number:06d}.mcap").unlink()
-    fuser.handle(messages.Save())
+    fuser.handle(fuser_messages.Save())
     poses = fuser._map.poses
     assert poses._sessions[SESSIONS[0]].seqs.tolist() == [5, 6]
     assert (poses.waiting, poses.unavailable, poses.removed, poses.next()) == (0, 2, 1, None)
@@ -293,7 +293,7 @@ def test_a_full_map_keeps_the_keyframe_where_it_is(
 def test_an_earlier_version_did_not_write_down_where_keyframes_were_fused(recorded: Recorded) -> None:
     fuser, _ = fused(recorded)
     fuser._map.poses.saved = lambda: None  # type: ignore[method-assign, assignment, return-value]
-    fuser.handle(messages.Save())
+    fuser.handle(fuser_messages.Save())
     recorded.correct({1: pose(0.5), 2: pose(0.5)})
     recorded.add()
     recorded.correct({6: pose(0.5)})
@@ -301,7 +301,7 @@ def test_an_earlier_version_did_not_write_down_where_keyframes_were_fused(record
     settle(again)
     last = progress(link)
     assert (last.waiting, last.unavailable, last.moved) == (0, 2, 1)
-    again.handle(messages.Save())
+    again.handle(fuser_messages.Save())
     assert opened(recorded.state)[0].ready().moves.unavailable == 2  # type: ignore[union-attr]
 
 
@@ -375,7 +375,7 @@ def test_keyframes_that_the_journal_lost_cannot_be_forgotten_and_that_is_said(tm
     recorded.journal.close()
     for number in (1, 2):
         (tmp_path / "journal" / f"{number:06d}.mcap").unlink()
-    fuser.handle(messages.Save())
+    fuser.handle(fuser_messages.Save())
     found = find(fuser, link, session=SESSIONS[0].hex())
     assert found_numbers(found) == {SESSIONS[0]: [3, 4]}
     assert found.unavailable == ("61616161 up to number 2",)
@@ -383,26 +383,26 @@ def test_keyframes_that_the_journal_lost_cannot_be_forgotten_and_that_is_said(tm
 
 def test_a_checkpoint_that_is_to_be_alone_replaces_the_one_before(recorded: Recorded) -> None:
     fuser, link = fused(recorded, keep_previous=True)
-    fuser.handle(messages.Save())
+    fuser.handle(fuser_messages.Save())
     recorded.forget(SESSIONS[0], [1])
     fuser.handle(recorded.orders[-1])
     settle(fuser)
     previous = recorded.state / "map.previous.tsf"
-    fuser.handle(messages.Save(alone=True))
-    assert link.last() == messages.Saved(written=True, alone=True)
+    fuser.handle(fuser_messages.Save(alone=True))
+    assert link.last() == fuser_messages.Saved(written=True, alone=True)
     assert previous.read_bytes() == (recorded.state / "map.tsf").read_bytes()
     recorded.add()
     fuser.handle(recorded.orders[-1])
-    fuser.handle(messages.Save())
+    fuser.handle(fuser_messages.Save())
     assert opened(recorded.state)[0].ready().keyframes == 4
     previous.replace(recorded.state / "map.tsf")
     assert opened(recorded.state)[0].ready().keyframes == 3
 
 
-def expired(link: Link) -> messages.Found | None:
+def expired(link: Link) -> fuser_messages.Found | None:
     """The last message of keyframes that are too old or too far away."""
-    found = [one for one, _ in link.sent if isinstance(one, messages.Found)]
-    return next((one for one in reversed(found) if one.number == messages.EXPIRED), None)
+    found = [one for one, _ in link.sent if isinstance(one, fuser_messages.Found)]
+    return next((one for one in reversed(found) if one.number == fuser_messages.EXPIRED), None)
 
 
 def journal_expired(recorded: Recorded, fuser: Fuser, link: Link) -> None:
@@ -410,7 +410,7 @@ def journal_expired(recorded: Recorded, fuser: Fuser, link: Link) -> None:
     while is_due(fuser, "search"):
         before = len(link.sent)
         fuser.chores["search"].do()
-        for found in (one for one, _ in link.sent[before:] if isinstance(one, messages.Found)):
+        for found in (one for one, _ in link.sent[before:] if isinstance(one, fuser_messages.Found)):
             for session, seqs in found_numbers(found).items():
                 recorded.forget(session, seqs)
                 fuser.handle(recorded.orders[-1])
@@ -440,7 +440,7 @@ def test_a_map_of_what_is_now_keeps_a_window(
     assert fuser._map.poses._sessions[SESSIONS[0]].seqs.tolist() == stay
     assert progress(link).waiting == 0
     assert fuser._volume.map_hash() == recorded.fresh().map_hash()
-    fuser.handle(messages.Save())
+    fuser.handle(fuser_messages.Save())
     again, link = opened(tmp_path, **bound)
     journal_expired(recorded, again, link)
     assert expired(link) is None
@@ -454,7 +454,7 @@ def test_a_window_counts_all_sessions_and_goes_by_corrected_poses(recorded: Reco
     recorded.correct({1: pose(3.0)})
     fuser.handle(recorded.orders[-1])
     journal_expired(recorded, fuser, link)
-    assert found_numbers(expired(link) or messages.Found(0)) == {SESSIONS[0]: [1]}
+    assert found_numbers(expired(link) or fuser_messages.Found(0)) == {SESSIONS[0]: [1]}
     assert fuser._volume.map_hash() == recorded.fresh().map_hash()
 
 
@@ -465,7 +465,7 @@ def test_a_journal_at_its_limit_takes_the_oldest_from_the_window(tmp_path: Path)
     fuser, link = fused(recorded, keep_keyframes=100)
     journal_expired(recorded, fuser, link)
     assert (expired(link), progress(link).first_segment) == (None, 1)
-    fuser.handle(messages.Expire(3))
+    fuser.handle(fuser_messages.Expire(3))
     journal_expired(recorded, fuser, link)
     assert (progress(link).keyframes, progress(link).first_segment) == (2, 3)
     assert fuser._volume.map_hash() == recorded.fresh().map_hash()
@@ -525,12 +525,12 @@ class Life(RuleBasedStateMachine):
             self.recorded.forget(session, seqs)
             self._fuse()
         settle(self.fuser)
-        self.fuser.handle(messages.Save(alone=True))
+        self.fuser.handle(fuser_messages.Save(alone=True))
         if found.sessions:
             for _ in self.recorded.journal.erase(positions(found)):
                 pass
 
-    def _find(self, draw: st.DataObject) -> messages.Found:
+    def _find(self, draw: st.DataObject) -> fuser_messages.Found:
         """Keyframes by one of the ways to select them, or by two."""
         logged = sorted(
             record.logged_ns
@@ -562,12 +562,12 @@ class Life(RuleBasedStateMachine):
 
     @rule()
     def save(self) -> None:
-        self.fuser.handle(messages.Save())
+        self.fuser.handle(fuser_messages.Save())
 
     @rule(saved=st.booleans())
     def restart(self, saved: bool) -> None:
         if saved:
-            self.fuser.handle(messages.Finish())
+            self.fuser.handle(fuser_messages.Finish())
         self.fuser, self.link = opened(self.recorded.state)
         done = self.fuser.ready().done
         # Not in the journal's order: each session in its own.
@@ -584,7 +584,7 @@ class Life(RuleBasedStateMachine):
         assert free_space(self.fuser._volume) == free_space(self.recorded.fresh())
         final = final_keyframes(self.recorded.state / "journal")
         assert self.fuser._volume.keyframes == len(final)
-        self.fuser.handle(messages.Finish())
+        self.fuser.handle(fuser_messages.Finish())
         if (self.recorded.state / "map.tsf").exists():
             merged = Volume.load(self.recorded.state / "map.tsf")
             merged.merge(volume_of(OTHERS, voxel_size=VOLUME.voxel_size, threads=1))

@@ -23,9 +23,9 @@ from tsfusion.fuser import live_mesh
 from tsfusion.fuser.live_mesh import LiveMesh, TouchedBy
 from tsfusion.fuser.watched_map import WatchedMap
 from tsfusion.journal.keyframe_poses import KeyframePoses
-from tsfusion.wire import mesh_updates, questions
-from tsfusion.wire.followed_map import FollowedMap
-from tsfusion.wire.questions import Answer, MapState
+from tsfusion.wire.asking.followed_map import FollowedMap
+from tsfusion.wire.messages import mesh_updates, questions
+from tsfusion.wire.messages.questions import Answer, MapVersion
 
 SESSIONS = bytes(16), bytes([1] * 16)
 STEPS = ("integrate", "retract", "mesh", "refine", "lose", *2 * ["read"], *3 * ["ask"], "health")
@@ -70,7 +70,7 @@ class Process:
         assert question.problem([]) == ""
         layouts, frames = questions.pack(self.answers.answer(question), compress=True)
         answer = Answer(
-            arrays=layouts, state=MapState(keyframes=0, epoch=self.epoch), crc=questions.crc_of(frames)
+            arrays=layouts, state=MapVersion(keyframes=0, epoch=self.epoch), crc=questions.crc_of(frames)
         )
         decoded = msgspec.msgpack.decode(msgspec.msgpack.encode(answer), type=Answer)
         return self.epoch, questions.unpack(decoded, frames)

@@ -16,11 +16,11 @@ from tsfusion.fuser.watched_map import WatchedMap
 from tsfusion.geometry.up_direction import HeldSensor
 from tsfusion.journal import Position
 from tsfusion.journal.keyframe_poses import KeyframePoses
-from tsfusion.wire import corrections
-from tsfusion.wire.corrections import Correction
-from tsfusion.wire.followed_paths import FollowedPaths
-from tsfusion.wire.map_events import PathsFound
-from tsfusion.wire.mesh_updates import Scanned
+from tsfusion.wire.asking.followed_paths import FollowedPaths
+from tsfusion.wire.asking.map_events import PathsFound
+from tsfusion.wire.messages.mesh_updates import Scanned
+from tsfusion.wire.records import corrections
+from tsfusion.wire.records.corrections import Correction
 
 ONE, TWO, THREE = (bytes([i] * 16) for i in (1, 2, 3))
 HELD = HeldSensor(range(12))

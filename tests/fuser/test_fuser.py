@@ -32,40 +32,40 @@ from tsfusion import VolumeConfig
 from tsfusion.core import durable_files, errors, folder_lock, process
 from tsfusion.core.config import CacheConfig, override
 from tsfusion.fuser import __main__ as fuser_main
-from tsfusion.fuser import map_checkpoints, messages
+from tsfusion.fuser import fuser_messages, map_checkpoints
 from tsfusion.fuser.fuser import Chore, Fuser
+from tsfusion.fuser.fuser_messages import CurrentKeyframe
 from tsfusion.fuser.map_checkpoints import MapCheckpoints
-from tsfusion.fuser.messages import CurrentKeyframe
 from tsfusion.journal import Journal, Position, segment_path
 from tsfusion.journal.state_folder import MAP_FILE, PREVIOUS_FILE
-from tsfusion.wire import codec, corrections, record_header
-from tsfusion.wire.mesh_updates import Meshed
-from tsfusion.wire.messages import Command
-from tsfusion.wire.queries import fetch_health
+from tsfusion.wire.asking.queries import fetch_health
+from tsfusion.wire.messages.mesh_updates import Meshed
+from tsfusion.wire.messages.messages import Command
+from tsfusion.wire.records import codec, corrections, record_header
 
 
 class Link:
     """Takes what the fuser sends."""
 
     def __init__(self) -> None:
-        self.sent: list[tuple[messages.ToGateway, list[Any]]] = []
+        self.sent: list[tuple[fuser_messages.ToGateway, list[Any]]] = []
 
     def send_multipart(self, frames: list[Any], copy: bool) -> None:
         assert not copy
-        self.sent.append((messages.to_gateway.decode(frames[0]), frames[1:]))
+        self.sent.append((fuser_messages.to_gateway.decode(frames[0]), frames[1:]))
 
     def last(self) -> Any:
         return self.sent[-1][0]
 
-    def done(self) -> messages.Done:
-        return [message for message, _ in self.sent if isinstance(message, messages.Done)][-1]
+    def done(self) -> fuser_messages.Done:
+        return [message for message, _ in self.sent if isinstance(message, fuser_messages.Done)][-1]
 
 
 SESSION = bytes(16)
 
 
-def order(index: int, position: Position, skip: str | None = None) -> messages.Fuse:
-    return messages.Fuse(index, position, SESSION, index + 1, "robot", skip=skip)
+def order(index: int, position: Position, skip: str | None = None) -> fuser_messages.Fuse:
+    return fuser_messages.Fuse(index, position, SESSION, index + 1, "robot", skip=skip)
 
 
 def fill(state: Path, count: int) -> list[Position]:
@@ -92,7 +92,7 @@ def opened(state: Path, volume: VolumeConfig = VOLUME, **settings: Any) -> tuple
         "quota_cost": 10**8,
         "quota_map": 0.75,
     }
-    begin = messages.Begin(str(state), volume, working=str(working), **{**usual, **settings})
+    begin = fuser_messages.Begin(str(state), volume, working=str(working), **{**usual, **settings})
     return Fuser(link, begin), link  # type: ignore[arg-type]
 
 
@@ -154,8 +154,8 @@ def opened_with_one(state: Path) -> tuple[Position, Fuser, Link]:
     return position, *opened(state)
 
 
-def status(fuser: Fuser, link: Link) -> messages.FuserStatus:
-    fuser.handle(messages.FuserQuery(1, Command(name="status")))
+def status(fuser: Fuser, link: Link) -> fuser_messages.FuserStatus:
+    fuser.handle(fuser_messages.FuserQuery(1, Command(name="status")))
     answer = link.last()
     assert answer.status is not None
     return msgspec.structs.replace(answer.status, peak_rss_bytes=0)  # of this whole process
@@ -173,10 +173,10 @@ def test_keyframes_are_fused_meshed_and_checkpointed(tmp_path: Path) -> None:
     assert is_due(fuser, "mesh")
     fuser.chores["mesh"].do()
     assert (link.last().count, link.sent[-1][1]) == (3, [])
-    fuser.handle(messages.Finish())
+    fuser.handle(fuser_messages.Finish())
     assert fuser.exit_status == 0
     again, link_again = opened(tmp_path)
-    assert again.ready().done == {SESSION: messages.SessionProgress(3, "robot")}
+    assert again.ready().done == {SESSION: fuser_messages.SessionProgress(3, "robot")}
     assert status(again, link_again) == status(fuser, link)
 
 
@@ -198,7 +198,7 @@ def test_a_map_whose_blocks_wait_on_the_disk_is_the_same_and_goes_on(
     for index, position in enumerate(positions[:2]):
         fuser.handle(order(index, position))
     fuser.chores["mesh"].do()
-    fuser.handle(messages.Finish())
+    fuser.handle(fuser_messages.Finish())
     again, link = opened(tmp_path, fine, **limits)
     for index, position in enumerate(positions):
         again.handle(order(index, position))
@@ -223,7 +223,7 @@ def test_a_sensor_that_no_map_knows_is_rejected_where_an_older_server_journaled_
 
 def test_watchers_get_the_triangles(tmp_path: Path) -> None:
     position, fuser, link = opened_with_one(tmp_path)
-    fuser.handle(messages.Publish(True))
+    fuser.handle(fuser_messages.Publish(True))
     fuser.handle(order(0, position))
     fuser.chores["mesh"].do()
     meshed, frames = link.sent[-1]
@@ -241,7 +241,7 @@ def test_nothing_is_meshed_while_nobody_watches(tmp_path: Path, monkeypatch: pyt
     meshed, frames = link.sent[-1]
     assert isinstance(meshed, Meshed)
     assert (meshed.layout, frames) == (None, [])
-    fuser.handle(messages.FuserQuery(1, Command(name="mesh")))
+    fuser.handle(fuser_messages.FuserQuery(1, Command(name="mesh")))
     assert link.last().layout.faces > 0
 
 
@@ -251,7 +251,7 @@ def test_what_was_meshed_as_fused_is_refined_bit_by_bit(
     monkeypatch.setattr("tsfusion.fuser.live_mesh._REFINED_AT_ONCE", 10)
     monkeypatch.setattr("tsfusion.fuser.live_mesh._QUIET_S", 0.0)
     position, fuser, link = opened_with_one(tmp_path)
-    fuser.handle(messages.Publish(True))
+    fuser.handle(fuser_messages.Publish(True))
     fuser.handle(order(0, position))
     fuser.chores["mesh"].do()
     before = len(link.sent)
@@ -264,7 +264,7 @@ def test_what_was_meshed_as_fused_is_refined_bit_by_bit(
     cells = np.concatenate([np.frombuffer(frames[0], np.int32).reshape(-1, 3) for _, frames in refined])
     assert len(np.unique(cells, axis=0)) == len(cells)
     fuser.chores["mesh"].do()
-    fuser.handle(messages.Publish(False))
+    fuser.handle(fuser_messages.Publish(False))
     assert not is_due(fuser, "refine")
 
 
@@ -398,13 +398,13 @@ def test_a_checkpoint_that_cannot_be_read_now_stays(
         patched.setattr(Path, "open", refused)
         with pytest.raises(errors.CheckpointError, match=os.strerror(code)):
             opened(tmp_path)
-    assert opened(tmp_path)[0].ready().done == {SESSION: messages.SessionProgress(1, "")}
+    assert opened(tmp_path)[0].ready().done == {SESSION: fuser_messages.SessionProgress(1, "")}
 
 
 def test_a_checkpoint_without_memory_for_it_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = saved(tmp_path)
 
-    monkeypatch.setattr("tsfusion.tsdf.block_store.BlockStore.reserve", raising(MemoryError()))
+    monkeypatch.setattr("tsfusion.tsdf.store.block_store.BlockStore.reserve", raising(MemoryError()))
     with pytest.raises(errors.CheckpointError, match="does not fit"):
         opened(tmp_path)
     assert path.exists()
@@ -423,16 +423,16 @@ def test_a_checkpoint_on_request_keeps_the_one_before(tmp_path: Path) -> None:
     """The journal forgets what both hold, so a damaged one is made good by the other."""
     positions = fill(tmp_path, 3)
     fuser, link = opened(tmp_path, keep_previous=True)
-    fuser.handle(messages.Save())
-    assert link.last() == messages.Saved(written=False)
+    fuser.handle(fuser_messages.Save())
+    assert link.last() == fuser_messages.Saved(written=False)
     for index in (0, 1):
         fuser.handle(order(index, positions[index]))
-        fuser.handle(messages.Save())
-        assert link.last() == messages.Saved(written=True)
+        fuser.handle(fuser_messages.Save())
+        assert link.last() == fuser_messages.Saved(written=True)
     assert (tmp_path / PREVIOUS_FILE).exists()
     (tmp_path / MAP_FILE).write_bytes(b"")
     again, _ = opened(tmp_path, keep_previous=True)
-    assert again.ready().done == {SESSION: messages.SessionProgress(1, "robot")}
+    assert again.ready().done == {SESSION: fuser_messages.SessionProgress(1, "robot")}
 
 
 @pytest.mark.parametrize("keep_previous", [False, True])
@@ -444,7 +444,7 @@ def test_a_checkpoint_that_fails_leaves_the_old_ones(
     folder.mkdir()
     written = MapCheckpoints(folder, VOLUME, keep_previous=keep_previous)
     for seq in (1, 2):
-        written.done = {SESSION: messages.SessionProgress(seq, "robot")}
+        written.done = {SESSION: fuser_messages.SessionProgress(seq, "robot")}
         assert written.save()
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     assert sorted(before) == ([PREVIOUS_FILE] if keep_previous else []) + [MAP_FILE]
@@ -461,7 +461,7 @@ def test_a_checkpoint_that_fails_leaves_the_old_ones(
 def test_a_map_of_many_sessions_comes_back(tmp_path: Path) -> None:
     written = MapCheckpoints(tmp_path, VOLUME, keep_previous=False)
     written.done = {
-        number.to_bytes(16): messages.SessionProgress(number, "robot") for number in range(1, 40_001)
+        number.to_bytes(16): fuser_messages.SessionProgress(number, "robot") for number in range(1, 40_001)
     }
     assert written.save()
     assert opened(tmp_path)[0].ready().done == written.done
@@ -596,7 +596,7 @@ def test_a_png_that_unfolds_to_more_than_its_pixels_is_rejected(tmp_path: Path) 
     fuser, link = opened(tmp_path)
     for index, position in enumerate(positions):
         fuser.handle(order(index, position))
-    reasons = [one.reason for one, _ in link.sent if isinstance(one, messages.Done)]
+    reasons = [one.reason for one, _ in link.sent if isinstance(one, fuser_messages.Done)]
     assert (reasons, status(fuser, link).keyframes_rejected) == ([None, "limits"], {"limits": 1})
 
 
@@ -612,7 +612,7 @@ def test_no_mesh_is_made_while_another_keyframe_waits_at_the_gateway(tmp_path: P
 def test_no_question_ends_the_fuser(tmp_path: Path, min_weight: float) -> None:
     position, fuser, link = opened_with_one(tmp_path)
     fuser.handle(order(0, position))
-    fuser.handle(messages.FuserQuery(1, Command(name="mesh", min_weight=min_weight)))
+    fuser.handle(fuser_messages.FuserQuery(1, Command(name="mesh", min_weight=min_weight)))
     assert "min_weight must be" in link.last().error
 
 
@@ -622,7 +622,7 @@ def test_a_question_that_fails_in_the_arithmetic_is_answered(
 ) -> None:
     fuser, link = opened(tmp_path)
     monkeypatch.setattr(tsfusion.Volume, "extract_mesh", raising(error))
-    fuser.handle(messages.FuserQuery(1, Command(name="mesh")))
+    fuser.handle(fuser_messages.FuserQuery(1, Command(name="mesh")))
     assert link.last().error == str(error)
 
 
@@ -633,9 +633,9 @@ def test_a_mesh_that_there_is_no_memory_for_is_an_answer(
     fuser.handle(order(0, position))
     with monkeypatch.context() as patched:
         patched.setattr(tsfusion.Volume, "extract_mesh", raising(MemoryError("no room for 9 GB")))
-        fuser.handle(messages.FuserQuery(1, Command(name="mesh")))
+        fuser.handle(fuser_messages.FuserQuery(1, Command(name="mesh")))
     assert link.last().error == "not enough memory for that: no room for 9 GB; raise fuser_memory_bytes"
-    fuser.handle(messages.FuserQuery(2, Command(name="mesh")))
+    fuser.handle(fuser_messages.FuserQuery(2, Command(name="mesh")))
     assert link.last().layout.faces > 0
 
 
@@ -704,11 +704,13 @@ def test_a_map_has_one_fuser_at_a_time(tmp_path: Path, monkeypatch: pytest.Monke
     """A killed fuser that waits for a disk may still be there when the next one begins."""
     sent: list[bytes] = []
     monkeypatch.setattr(fuser_main, "_LOCK_WAIT_S", 0.0)
-    begin = messages.Begin(str(tmp_path), VOLUME, 1.0, 0, "", False, 1 << 30, quota_cost=1, quota_map=1.0)
+    begin = fuser_messages.Begin(
+        str(tmp_path), VOLUME, 1.0, 0, "", False, 1 << 30, quota_cost=1, quota_map=1.0
+    )
     with folder_lock.hold(tmp_path, fuser_main.LOCK):
         assert fuser_main._open_map(cast("Any", SimpleNamespace(send=sent.append)), begin) is None
-    failed = messages.to_gateway.decode(sent[0])
-    assert isinstance(failed, messages.Failed)
+    failed = fuser_messages.to_gateway.decode(sent[0])
+    assert isinstance(failed, fuser_messages.Failed)
     assert "fuser" in str(failed.error())
 
 
@@ -717,10 +719,12 @@ def test_a_system_that_refuses_while_a_map_is_opened_is_one_clear_error(
 ) -> None:
     sent: list[bytes] = []
     monkeypatch.setattr(fuser_main, "Fuser", refuse(errno.EIO))
-    begin = messages.Begin(str(tmp_path), VOLUME, 1.0, 0, "", False, 1 << 30, quota_cost=1, quota_map=1.0)
+    begin = fuser_messages.Begin(
+        str(tmp_path), VOLUME, 1.0, 0, "", False, 1 << 30, quota_cost=1, quota_map=1.0
+    )
     assert fuser_main._open_map(cast("Any", SimpleNamespace(send=sent.append)), begin) is None
-    failed = messages.to_gateway.decode(sent[0])
-    assert isinstance(failed, messages.Failed)
+    failed = fuser_messages.to_gateway.decode(sent[0])
+    assert isinstance(failed, fuser_messages.Failed)
     assert str(failed.error()) == "the map cannot be opened: [Errno 5] Input/output error"
 
 
@@ -736,8 +740,8 @@ def test_a_system_that_refuses_while_a_map_is_opened_is_one_clear_error(
 def test_the_kind_of_a_failure_reaches_the_gateway(
     error: errors.TsfusionError, kind: str, raised: type[errors.TsfusionError]
 ) -> None:
-    sent = messages.to_gateway.decode(messages.encode(messages.Failed.of(error)))
-    assert isinstance(sent, messages.Failed)
+    sent = fuser_messages.to_gateway.decode(fuser_messages.encode(fuser_messages.Failed.of(error)))
+    assert isinstance(sent, fuser_messages.Failed)
     again = sent.error()
     assert (sent.kind, type(again), str(again)) == (kind, raised, str(error))
 
@@ -776,7 +780,7 @@ def test_a_fusers_own_lines_obey_log_level(level: str, shown: list[str]) -> None
 
 
 def held(fuser: Fuser, link: Link) -> bool:
-    return isinstance(link.last(), messages.Held) and fuser.is_held
+    return isinstance(link.last(), fuser_messages.Held) and fuser.is_held
 
 
 def test_a_journal_that_is_away_is_waited_for_and_the_order_kept(
@@ -795,7 +799,7 @@ def test_a_journal_that_is_away_is_waited_for_and_the_order_kept(
     assert status(fuser, link).keyframes_fused == 0  # questions are answered meanwhile
     (tmp_path / "aside").rename(tmp_path / "journal")
     fuser.go_on()
-    done = [message for message, _ in link.sent if isinstance(message, messages.Done)]
+    done = [message for message, _ in link.sent if isinstance(message, fuser_messages.Done)]
     assert [(one.index, one.reason) for one in done] == [(0, None), (1, None)]
     assert (fuser.is_held, fuser.exit_status) == (False, None)
 
@@ -820,19 +824,19 @@ def test_a_checkpoint_that_cannot_be_written_is_said_until_it_can(tmp_path: Path
     position, fuser, link = opened_with_one(folder)
     fuser.handle(order(0, position))
     folder.rename(aside)
-    fuser.handle(messages.Save())
+    fuser.handle(fuser_messages.Save())
     assert not link.last().written
     assert "is not there" in link.last().problem
     folder.mkdir()  # a checkpoint in there would be hidden again
-    fuser.handle(messages.Save())
+    fuser.handle(fuser_messages.Save())
     assert not link.last().written
     assert list(folder.iterdir()) == []
     folder.rmdir()
     aside.rename(folder)
-    fuser.handle(messages.Save())
+    fuser.handle(fuser_messages.Save())
     assert (link.last().written, link.last().problem) == (True, "")
     again, _ = opened(folder)
-    assert again.ready().done == {SESSION: messages.SessionProgress(1, "robot")}
+    assert again.ready().done == {SESSION: fuser_messages.SessionProgress(1, "robot")}
 
 
 def test_a_disk_that_refuses_a_checkpoint_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -840,11 +844,11 @@ def test_a_disk_that_refuses_a_checkpoint_is_said(tmp_path: Path, monkeypatch: p
     fuser.handle(order(0, position))
     with monkeypatch.context() as patched:
         patched.setattr(os, "fsync", refuse(errno.ENOSPC))
-        fuser.handle(messages.Save())
+        fuser.handle(fuser_messages.Save())
         assert "No space left" in link.last().problem
-        fuser.handle(messages.Finish())
+        fuser.handle(fuser_messages.Finish())
         assert fuser.exit_status == 1
-    fuser.handle(messages.Finish())
+    fuser.handle(fuser_messages.Finish())
     assert (link.last().written, link.last().problem) == (True, "")
     assert fuser.exit_status == 0
 

@@ -10,16 +10,16 @@ from keyframes_and_servers import VOLUME, map_hash, wall
 
 from tsfusion import Volume, journal
 from tsfusion.fuser import __main__ as fuser_main
-from tsfusion.fuser import messages
-from tsfusion.wire import codec
+from tsfusion.fuser import fuser_messages
+from tsfusion.wire.records import codec
 
 SESSION = b"s" * 16
 
 
-def begin(folder: Path) -> messages.Begin:
+def begin(folder: Path) -> fuser_messages.Begin:
     working = folder.parent / "working"
     working.write_bytes(b"\xff" * 8)
-    return messages.Begin(str(folder), VOLUME, 0.2, 0, str(working), False, 1 << 30, 10**8, 0.75)
+    return fuser_messages.Begin(str(folder), VOLUME, 0.2, 0, str(working), False, 1 << 30, 10**8, 0.75)
 
 
 def test_a_map_goes_on_in_the_folder_that_it_was_moved_to(tmp_path: Path) -> None:
@@ -38,18 +38,18 @@ def test_a_map_goes_on_in_the_folder_that_it_was_moved_to(tmp_path: Path) -> Non
     ]
     with_more.close()
     sent: list[Any] = []
-    link = cast("Any", SimpleNamespace(send=lambda one: sent.append(messages.to_gateway.decode(one))))
+    link = cast("Any", SimpleNamespace(send=lambda one: sent.append(fuser_messages.to_gateway.decode(one))))
     link.send_multipart = lambda frames, **_: link.send(frames[0])
     ahead = fuser_main._Ahead(link)
-    assert ahead.do(messages.Open(begin(waits)))
-    assert [type(one) for one in sent] == [messages.Prepared]
+    assert ahead.do(fuser_messages.ReadAhead(begin(waits)))
+    assert [type(one) for one in sent] == [fuser_messages.Prepared]
     waits.rename(home)
     fuser = fuser_main._open_map(link, begin(home), opened=ahead.opened)
     assert fuser is not None
-    assert isinstance(sent[-1], messages.Ready)
+    assert isinstance(sent[-1], fuser_messages.Ready)
     assert sent[-1].done[SESSION].seq == 1
-    fuser.handle(messages.Fuse(0, places[1], SESSION, 2))
-    fuser.handle(messages.Finish())
+    fuser.handle(fuser_messages.Fuse(0, places[1], SESSION, 2))
+    fuser.handle(fuser_messages.Finish())
     assert fuser.exit_status == 0
     assert Volume.load(home / "map.tsf").map_hash() == map_hash(map(wall, range(2)))
     assert not os.path.exists(waits)
@@ -57,6 +57,6 @@ def test_a_map_goes_on_in_the_folder_that_it_was_moved_to(tmp_path: Path) -> Non
 
 def test_a_map_that_cannot_be_read_ahead_is_told(tmp_path: Path) -> None:
     sent: list[Any] = []
-    link = cast("Any", SimpleNamespace(send=lambda one: sent.append(messages.to_gateway.decode(one))))
-    assert not fuser_main._Ahead(link).do(messages.Open(begin(tmp_path / "nowhere")))
-    assert isinstance(sent[0], messages.Failed)
+    link = cast("Any", SimpleNamespace(send=lambda one: sent.append(fuser_messages.to_gateway.decode(one))))
+    assert not fuser_main._Ahead(link).do(fuser_messages.ReadAhead(begin(tmp_path / "nowhere")))
+    assert isinstance(sent[0], fuser_messages.Failed)

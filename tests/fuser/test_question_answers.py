@@ -16,9 +16,7 @@ from keyframes_and_servers import CAMERA, SHAPE, VOLUME, wall
 from tsfusion import Volume
 from tsfusion.core.rates import Bucket
 from tsfusion.fuser import question_answers
-from tsfusion.fuser.kept_answers import KeptSlices, KeptViews
-from tsfusion.fuser.live_mesh import TouchedBy
-from tsfusion.fuser.messages import (
+from tsfusion.fuser.fuser_messages import (
     NOT_WORKING,
     CurrentKeyframe,
     Finish,
@@ -27,11 +25,13 @@ from tsfusion.fuser.messages import (
     Publish,
     encode,
 )
+from tsfusion.fuser.kept_answers import KeptSlices, KeptViews
+from tsfusion.fuser.live_mesh import TouchedBy
 from tsfusion.fuser.question_answers import Inbox, QuestionAnswers
 from tsfusion.fuser.watched_map import WatchedMap
 from tsfusion.journal.keyframe_poses import KeyframePoses
-from tsfusion.wire import questions
-from tsfusion.wire.questions import MapState, Raycast, Sample, Slice
+from tsfusion.wire.messages import questions
+from tsfusion.wire.messages.questions import MapVersion, Raycast, Sample, Slice
 
 POINTS = np.array([[0, 0, 1.2], [0.1, 0.1, 1.25]], np.float32)
 FRAMES = questions.point_frames(POINTS)
@@ -69,7 +69,7 @@ class Desk:
             volume,
             self.inbox,
             WatchedMap(volume, KeyframePoses(None, {}), TouchedBy(), cast("Any", None)),
-            state=lambda: MapState(keyframes=volume.keyframes),
+            state=lambda: MapVersion(keyframes=volume.keyframes),
             at_work=self.at_work,
             send=lambda message, _frames: self.sent.append(message),
         )
@@ -294,7 +294,7 @@ class Growing:
 
     def __init__(self) -> None:
         self.volume = Volume(VOLUME)
-        self.views = KeptViews(self.volume, lambda: MapState(keyframes=self.volume.keyframes))
+        self.views = KeptViews(self.volume, lambda: MapVersion(keyframes=self.volume.keyframes))
 
     def add(self, number: int) -> None:
         self.views.note_change()

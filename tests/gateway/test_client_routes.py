@@ -5,12 +5,12 @@ from typing import cast
 
 import pytest
 
-from tsfusion.gateway.access_control import AccessControl
-from tsfusion.gateway.client_routes import Admission, ClientRoutes
-from tsfusion.gateway.ports import Ports, Subscriptions
-from tsfusion.gateway.sessions import Sessions
-from tsfusion.wire import sockets
-from tsfusion.wire.messages import Ping
+from tsfusion.gateway.clients.client_routes import Admission, ClientRoutes
+from tsfusion.gateway.clients.sessions import Sessions
+from tsfusion.gateway.ports.access_control import AccessControl
+from tsfusion.gateway.ports.ports import Ports, Subscriptions
+from tsfusion.wire.messages.messages import Ping
+from tsfusion.wire.sockets import sockets
 
 SESSION = bytes(range(16))
 

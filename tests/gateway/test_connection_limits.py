@@ -7,8 +7,8 @@ from typing import Any, cast
 
 import pytest
 
-from tsfusion.gateway import connection_limits
-from tsfusion.gateway.connection_limits import ConnectionLimits
+from tsfusion.gateway.ports import connection_limits
+from tsfusion.gateway.ports.connection_limits import ConnectionLimits
 
 
 def limits_of(connections: SimpleNamespace, refused: Counter[str]) -> ConnectionLimits:

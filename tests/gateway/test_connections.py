@@ -10,8 +10,8 @@ from unittest import mock
 import pytest
 from keyframes_and_servers import until
 
-from tsfusion.gateway import connections
-from tsfusion.gateway.connections import Connections
+from tsfusion.gateway.ports import connections
+from tsfusion.gateway.ports.connections import Connections
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only Linux shows them")
 _PLENTY = 1 << 40  # bytes of memory

@@ -7,8 +7,8 @@ from typing import cast
 import pytest
 
 from tsfusion.core.errors import JournalError
-from tsfusion.gateway import map_records
-from tsfusion.gateway.map_records import DiskPause
+from tsfusion.gateway.maps import map_records
+from tsfusion.gateway.maps.map_records import DiskPause
 from tsfusion.journal import Journal
 
 

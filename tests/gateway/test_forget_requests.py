@@ -11,12 +11,12 @@ from keyframes_and_servers import wall
 
 from tsfusion import journal
 from tsfusion.core.errors import JournalError
-from tsfusion.fuser.messages import EXPIRED, Find, Found, FoundKeyframes, Save, Saved
-from tsfusion.gateway.forgetting import MOST_REQUESTS, Forgetting, Request
+from tsfusion.fuser.fuser_messages import EXPIRED, Find, Found, FoundKeyframes, Save, Saved
+from tsfusion.gateway.maps.forgetting import MOST_REQUESTS, ForgetRequest, Forgetting
 from tsfusion.journal import Journal, Position
 from tsfusion.journal.quarantine import Quarantine
-from tsfusion.wire import codec
-from tsfusion.wire.forgetting import Forgotten, Selection
+from tsfusion.wire.messages.forget_messages import Forgotten, Selection
+from tsfusion.wire.records import codec
 
 SESSION = b"s" * 16
 ALL = Selection(session=SESSION.hex())
@@ -53,7 +53,7 @@ class Asked:
         return True
 
     def ask(self, **how: bool) -> None:
-        self.map.add(Request(ALL, self.answers.append, **how))
+        self.map.add(ForgetRequest(ALL, self.answers.append, **how))
         self.step()
 
     def step(self, *, settled: bool = False, unavailable: int = 0) -> None:

@@ -25,22 +25,22 @@ from tsfusion.core import process
 from tsfusion.core.config import ServerConfig
 from tsfusion.core.errors import InvalidConfig, JournalError, MapError
 from tsfusion.datasets import open_dataset
-from tsfusion.fuser import messages as fuser_messages
-from tsfusion.gateway import fuser_process, fuser_supervisor
-from tsfusion.gateway.access_control import AccessControl
-from tsfusion.gateway.fuser_process import FuserProcess
+from tsfusion.fuser import fuser_messages
+from tsfusion.gateway.fusers import fuser_process, fuser_supervisor
+from tsfusion.gateway.fusers.fuser_process import FuserProcess
 from tsfusion.gateway.gateway import Gateway
-from tsfusion.gateway.metrics import Metrics
-from tsfusion.gateway.ports import Ports
+from tsfusion.gateway.health.metrics import Metrics
+from tsfusion.gateway.ports.access_control import AccessControl
+from tsfusion.gateway.ports.ports import Ports
 from tsfusion.journal import Journal, Position, state_folder
-from tsfusion.wire.health import MapHealth
-from tsfusion.wire.queries import fetch_status
-from tsfusion.wire.sockets import Addresses
+from tsfusion.wire.asking.queries import fetch_status
+from tsfusion.wire.messages.health import MapHealth
+from tsfusion.wire.sockets.sockets import Addresses
 
 _FAKE = """
 import os, struct, sys, time, zmq
-from tsfusion.fuser import messages as fuser_messages
-from tsfusion.wire import sockets
+from tsfusion.fuser import fuser_messages
+from tsfusion.wire.sockets import sockets
 
 link = sockets.pair(zmq.Context())
 link.connect(sys.argv[1])
@@ -412,7 +412,7 @@ def test_nothing_is_deleted_from_a_journal_that_is_away(
     start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With an empty folder in its place its segments would count as deleted, and nobody would miss them."""
-    monkeypatch.setattr("tsfusion.gateway.map_records._DISK_PAUSE", 0.01)
+    monkeypatch.setattr("tsfusion.gateway.maps.map_records._DISK_PAUSE", 0.01)
     gateway = drained(start(fusing("pass")))
     (hosted,) = gateway.maps
     journal_folder(tmp_path).rename(tmp_path / "aside")
@@ -459,7 +459,7 @@ def test_a_disk_that_fails_while_a_map_is_opened_for_a_client_is_said(
         assert "error" in gateway.maps.why_not("yard")
         with suppress(JournalError):  # no name is guessed
             assert gateway.maps.free_name("yard") != "yard"
-    monkeypatch.setattr("tsfusion.gateway.map_registry._RETRY_INTERVAL", 0.0)
+    monkeypatch.setattr("tsfusion.gateway.maps.map_registry._RETRY_INTERVAL", 0.0)
     assert gateway.maps.open_for_client("yard") is not None
 
 
@@ -476,7 +476,7 @@ def test_a_gap_in_the_journal_is_said_from_the_start(start: Start, tmp_path: Pat
 def test_a_checkpoint_that_cannot_be_written_is_a_problem_and_tried_again(
     start: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("tsfusion.gateway.journal_retention._SAVE_PAUSE", 0.0)
+    monkeypatch.setattr("tsfusion.gateway.maps.journal_retention._SAVE_PAUSE", 0.0)
     gateway = start(f"""{fusing("pass")}
         say(fuser_messages.Saved(False, "No space left on device"))
     if isinstance(message, fuser_messages.Save):

@@ -9,9 +9,11 @@ import pytest
 import zmq
 from served_gateway import Served, record, serving_here
 
-from tsfusion.wire import key_folder, messages, sockets
-from tsfusion.wire.curve import ClientKeys, server_keys
-from tsfusion.wire.forgetting import Selection
+from tsfusion.wire.keys import key_folder
+from tsfusion.wire.messages import messages
+from tsfusion.wire.messages.forget_messages import Selection
+from tsfusion.wire.sockets import sockets
+from tsfusion.wire.sockets.curve import ClientKeys, server_keys
 
 
 @pytest.mark.parametrize("limited", [False, True], ids=["", "with clients of few maps"])

@@ -17,14 +17,17 @@ from keyframes_and_servers import DEADLINE, Server, connected, until, wall
 from tsfusion import Client
 from tsfusion.core import config
 from tsfusion.core.errors import InvalidConfig, ServerUnreachable, TransportError
-from tsfusion.fuser import messages as fuser_messages
-from tsfusion.gateway.fuser_queries import FuserQueries
-from tsfusion.gateway.memory_guard import PendingReplies
-from tsfusion.gateway.ports import Ports
-from tsfusion.wire import codec, health, messages, queries, sockets
-from tsfusion.wire.messages import Command
-from tsfusion.wire.queries import fetch_mesh, fetch_status, request
-from tsfusion.wire.record_header import Refused, pack, unpack
+from tsfusion.fuser import fuser_messages
+from tsfusion.gateway.people.fuser_queries import FuserQueries
+from tsfusion.gateway.ports.memory_guard import PendingReplies
+from tsfusion.gateway.ports.ports import Ports
+from tsfusion.wire.asking import queries
+from tsfusion.wire.asking.queries import fetch_mesh, fetch_status, request
+from tsfusion.wire.messages import health, messages
+from tsfusion.wire.messages.messages import Command
+from tsfusion.wire.records import codec
+from tsfusion.wire.records.record_header import Refused, pack, unpack
+from tsfusion.wire.sockets import sockets
 
 # --- strangers ---
 

@@ -12,7 +12,8 @@ from failures import refuse
 from keyframes_and_servers import connected
 from served_gateway import Served, record, serving_here
 
-from tsfusion.wire import messages, sockets
+from tsfusion.wire.messages import messages
+from tsfusion.wire.sockets import sockets
 
 SESSIONS = [bytes([i]) * 16 for i in (1, 2, 3)]
 

@@ -7,21 +7,21 @@ from typing import Any, cast
 
 import pytest
 
-from tsfusion.fuser.messages import Done, Fuse
-from tsfusion.gateway.client_routes import ClientRoutes
-from tsfusion.gateway.fuser_backlog import FuserBacklog
-from tsfusion.gateway.fuser_supervisor import FuserSupervisor
-from tsfusion.gateway.fuser_time import FuserTime
-from tsfusion.gateway.keyframe_index import KeyframeIndex
-from tsfusion.gateway.keyframe_outcomes import DelayStatistics, KeyframeOutcomes
-from tsfusion.gateway.map_records import MapRecords
-from tsfusion.gateway.metrics import Metrics
-from tsfusion.gateway.recent_fates import RecentFates
-from tsfusion.gateway.sessions import Session, Sessions
+from tsfusion.fuser.fuser_messages import Done, Fuse
+from tsfusion.gateway.clients.client_routes import ClientRoutes
+from tsfusion.gateway.clients.recent_fates import RecentFates
+from tsfusion.gateway.clients.sessions import Session, Sessions
+from tsfusion.gateway.fusers.fuser_supervisor import FuserSupervisor
+from tsfusion.gateway.health.metrics import Metrics
+from tsfusion.gateway.maps.keyframe_outcomes import DelayStatistics, KeyframeOutcomes
+from tsfusion.gateway.maps.map_records import MapRecords
+from tsfusion.gateway.records.fuser_backlog import FuserBacklog
+from tsfusion.gateway.records.fuser_time import FuserTime
+from tsfusion.gateway.records.keyframe_index import KeyframeIndex
 from tsfusion.geometry.sample_ranges import NO_SAMPLES
 from tsfusion.journal import Position, RecordEntry
 from tsfusion.journal.quarantine import Quarantine
-from tsfusion.wire.keyframe_times import Stamps
+from tsfusion.wire.messages.keyframe_times import Stamps
 
 SESSION = bytes(range(16))
 
@@ -108,7 +108,7 @@ def test_each_keyframe_is_admitted_once_and_in_order() -> None:
 
 
 def test_sessions_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tsfusion.gateway.sessions._MAX_SESSIONS", 2)
+    monkeypatch.setattr("tsfusion.gateway.clients.sessions._MAX_SESSIONS", 2)
     sessions = Sessions()
     for key in (SESSION, bytes(16)):
         assert sessions.room_for(key)
@@ -219,7 +219,7 @@ def test_a_fuser_that_ended_owes_no_answers() -> None:
 
 
 def test_accounts_of_clients_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tsfusion.gateway.fuser_time._MAX_CLIENTS", 8)
+    monkeypatch.setattr("tsfusion.gateway.records.fuser_time._MAX_CLIENTS", 8)
     time = FuserTime()
     for index in range(100):
         time.charge(f"client {index}", index)

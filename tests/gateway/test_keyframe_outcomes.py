@@ -7,17 +7,17 @@ from typing import cast
 
 import pytest
 
-from tsfusion.fuser.messages import Done, Ready
-from tsfusion.gateway.client_routes import ClientRoutes
-from tsfusion.gateway.keyframe_index import KeyframeIndex
-from tsfusion.gateway.keyframe_outcomes import KeyframeOutcomes
-from tsfusion.gateway.map_records import MapRecords
-from tsfusion.gateway.metrics import Metrics
-from tsfusion.gateway.ports import Ports
-from tsfusion.gateway.sessions import Sessions
+from tsfusion.fuser.fuser_messages import Done, Ready
+from tsfusion.gateway.clients.client_routes import ClientRoutes
+from tsfusion.gateway.clients.sessions import Sessions
+from tsfusion.gateway.health.metrics import Metrics
+from tsfusion.gateway.maps.keyframe_outcomes import KeyframeOutcomes
+from tsfusion.gateway.maps.map_records import MapRecords
+from tsfusion.gateway.ports.ports import Ports
+from tsfusion.gateway.records.keyframe_index import KeyframeIndex
 from tsfusion.journal import Position
 from tsfusion.journal.quarantine import Quarantine
-from tsfusion.wire.messages import Ack, Nack, ToClient
+from tsfusion.wire.messages.messages import Ack, Nack, ToClient
 
 SESSION = bytes(range(16))
 

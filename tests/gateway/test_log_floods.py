@@ -11,8 +11,8 @@ from keyframes_and_servers import connected
 from served_gateway import Served, record, serving_here
 
 from tsfusion.core import logs
-from tsfusion.gateway.metrics_http import HttpResponse, MetricsPage
-from tsfusion.wire import sockets
+from tsfusion.gateway.health.metrics_http import HttpResponse, MetricsPage
+from tsfusion.wire.sockets import sockets
 
 MANY = 3 * logs.MOST
 

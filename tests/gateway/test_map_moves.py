@@ -14,10 +14,11 @@ from keyframes_and_servers import connected, until
 from served_gateway import Served, record, serving_here
 
 from tsfusion.core.errors import DecodeError, JournalError
-from tsfusion.gateway import map_arrivals, map_departures
-from tsfusion.wire import messages, sockets
-from tsfusion.wire.map_moves import HandOver, MapFile, Parcel
-from tsfusion.wire.messages import Command, Reply
+from tsfusion.gateway.migration import map_arrivals, map_departures
+from tsfusion.wire.messages import messages
+from tsfusion.wire.messages.messages import Command, Reply
+from tsfusion.wire.messages.migration_messages import HandOver, MapFile, Parcel
+from tsfusion.wire.sockets import sockets
 
 MOVE, SESSION = bytes(range(16)), bytes(16)
 
@@ -230,7 +231,7 @@ def test_a_map_is_not_fetched_from_anywhere(asking: Asking, source: str, error: 
 def test_a_source_that_does_not_answer_is_an_error_and_blocks_nothing(
     asking: Asking, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("tsfusion.gateway.map_arrivals._ANSWER_S", 0.1)
+    monkeypatch.setattr("tsfusion.gateway.migration.map_arrivals._ANSWER_S", 0.1)
     context: zmq.Context[Any] = zmq.Context()
     silent = context.socket(zmq.ROUTER)
     port = silent.bind_to_random_port("tcp://127.0.0.1")

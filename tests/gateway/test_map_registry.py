@@ -18,18 +18,19 @@ from served_gateway import Served, record, serving_here
 
 from tsfusion.core.config import ServerConfig
 from tsfusion.core.errors import JournalError
-from tsfusion.gateway import map_registry
-from tsfusion.gateway.client_routes import ClientRoutes
-from tsfusion.gateway.fuser_process import FuserProcess
-from tsfusion.gateway.hosted_map import HostedMap
-from tsfusion.gateway.map_records import IncomingRecord
-from tsfusion.gateway.map_registry import MapRegistry
-from tsfusion.gateway.metrics import Metrics
+from tsfusion.gateway.clients.client_routes import ClientRoutes
+from tsfusion.gateway.fusers.fuser_process import FuserProcess
+from tsfusion.gateway.health.metrics import Metrics
+from tsfusion.gateway.maps import map_registry
+from tsfusion.gateway.maps.hosted_map import HostedMap
+from tsfusion.gateway.maps.map_records import IncomingRecord
+from tsfusion.gateway.maps.map_registry import MapRegistry
 from tsfusion.journal import Journal, quarantine, state_folder
-from tsfusion.wire import messages, sockets
-from tsfusion.wire.allow_list import AllowedMaps
-from tsfusion.wire.messages import Command, Denied, Nack, Welcome
-from tsfusion.wire.record_header import unpack
+from tsfusion.wire.keys.allow_list import AllowedMaps
+from tsfusion.wire.messages import messages
+from tsfusion.wire.messages.messages import Command, Denied, Nack, Welcome
+from tsfusion.wire.records.record_header import unpack
+from tsfusion.wire.sockets import sockets
 
 
 @pytest.fixture

@@ -19,9 +19,9 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from tsfusion.core.config import ServerConfig
 from tsfusion.core.errors import InvalidConfig, TransportError
-from tsfusion.gateway import metrics_families, metrics_http
-from tsfusion.gateway.metrics import BUCKETS, FRESH, FRESH_START, STAGES, Metrics
-from tsfusion.wire.health import MapHealth
+from tsfusion.gateway.health import metrics_families, metrics_http
+from tsfusion.gateway.health.metrics import BUCKETS, FRESH, FRESH_START, STAGES, Metrics
+from tsfusion.wire.messages.health import MapHealth
 
 HOSTILE = 'x" } evil 1\n\\'
 Figures = dict[tuple[str, ...], float]

@@ -16,10 +16,12 @@ from keyframes_and_servers import connected, secured, wall
 from served_gateway import Served, record, serving_here
 
 from tsfusion import Client
-from tsfusion.gateway import access_control, connections, ports
-from tsfusion.gateway.connections import Connection, Connections
-from tsfusion.wire import key_folder, messages, sockets
-from tsfusion.wire.curve import ClientKeys, client_keys
+from tsfusion.gateway.ports import access_control, connections, ports
+from tsfusion.gateway.ports.connections import Connections, OpenConnection
+from tsfusion.wire.keys import key_folder
+from tsfusion.wire.messages import messages
+from tsfusion.wire.sockets import sockets
+from tsfusion.wire.sockets.curve import ClientKeys, client_keys
 
 FRAMES = 150_000  # of a hostile message, of which a third may be read
 
@@ -192,7 +194,7 @@ def test_the_number_of_a_connection_that_ended_may_be_another_files() -> None:
         assert not connections.cut(here.fileno())
         there.sendall(b"x")
         assert here.recv(1) == b"x"
-    new = Connection(7, 1, 0, 5 << 20, 0)
+    new = OpenConnection(7, 1, 0, 5 << 20, 0)
     connections._all = lambda: iter([new])  # type: ignore[method-assign]
     for before, kept in ((1 << 30, 5 << 20), (3 << 20, 3 << 20)):
         connections._read.clear()

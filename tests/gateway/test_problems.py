@@ -15,12 +15,14 @@ from keyframes_and_servers import Server, pose, until, wall
 
 from tsfusion import Client
 from tsfusion.core import process
-from tsfusion.gateway import fuser_supervisor, map_condition, recent_fates
-from tsfusion.gateway.client_routes import ClientRoute
-from tsfusion.gateway.fuser_supervisor import FuserSilence
-from tsfusion.gateway.problems import Problem, ProblemTimes, span
-from tsfusion.gateway.recent_fates import RecentFates
-from tsfusion.wire.queries import fetch_health
+from tsfusion.gateway.clients import recent_fates
+from tsfusion.gateway.clients.client_routes import ClientRoute
+from tsfusion.gateway.clients.recent_fates import RecentFates
+from tsfusion.gateway.fusers import fuser_supervisor
+from tsfusion.gateway.fusers.fuser_supervisor import FuserSilence
+from tsfusion.gateway.health.problems import Problem, ProblemTimes, span
+from tsfusion.gateway.maps import map_condition
+from tsfusion.wire.asking.queries import fetch_health
 
 
 class Clock:

@@ -8,15 +8,15 @@ from typing import Any, cast
 import pytest
 import zmq
 
-from tsfusion.fuser.messages import FuserAnswer, FuserQuestion
-from tsfusion.gateway import map_questions
-from tsfusion.gateway.keyframe_outcomes import QuestionCounts
-from tsfusion.gateway.map_questions import MOST_OF_A_CLIENT, MOST_UNREAD, MOST_WAITING, MapQuestions
-from tsfusion.gateway.memory_guard import PendingReplies
-from tsfusion.gateway.metrics import Metrics
-from tsfusion.wire import messages
-from tsfusion.wire.messages import Command
-from tsfusion.wire.questions import Answer, Field, MapState, Raycast
+from tsfusion.fuser.fuser_messages import FuserAnswer, FuserQuestion
+from tsfusion.gateway.health.metrics import Metrics
+from tsfusion.gateway.maps.keyframe_outcomes import QuestionCounts
+from tsfusion.gateway.people import map_questions
+from tsfusion.gateway.people.map_questions import MOST_OF_A_CLIENT, MOST_UNREAD, MOST_WAITING, MapQuestions
+from tsfusion.gateway.ports.memory_guard import PendingReplies
+from tsfusion.wire.messages import messages
+from tsfusion.wire.messages.messages import Command
+from tsfusion.wire.messages.questions import Answer, Field, MapVersion, Raycast
 
 LOOK = Raycast(intrinsics=(1, 1, 0, 0), pose=(1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1), shape=(1, 1))
 
@@ -55,7 +55,7 @@ class Desk:
 
     def answer(self, nbytes: int = 0) -> None:
         """The one that was passed on last."""
-        answer = Answer(arrays=(), state=MapState(keyframes=1), crc=0)
+        answer = Answer(arrays=(), state=MapVersion(keyframes=1), crc=0)
         frames = [zmq.Frame(bytes(nbytes))] if nbytes else []
         self.asked.on_answer(FuserAnswer(self.passed_on[-1].number, answer), frames)
 

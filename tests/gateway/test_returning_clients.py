@@ -8,7 +8,8 @@ import pytest
 from keyframes_and_servers import connected
 from served_gateway import Served, record, serving_here
 
-from tsfusion.wire import messages, sockets
+from tsfusion.wire.messages import messages
+from tsfusion.wire.sockets import sockets
 
 SESSION = bytes(16)
 PING = messages.encode(messages.Ping(SESSION, 1, None, 0, 0, {}))

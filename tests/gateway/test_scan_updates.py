@@ -14,10 +14,12 @@ import zmq
 from keyframes_and_servers import CAMERA, SHAPE, connected, secured, wall
 from served_gateway import Served, record, serving_here
 
-from tsfusion.gateway import scan_updates
-from tsfusion.wire import key_folder, mesh_updates, sockets
-from tsfusion.wire.curve import ClientKeys, client_keys
-from tsfusion.wire.mesh_updates import Scanned
+from tsfusion.gateway.people import scan_updates
+from tsfusion.wire.keys import key_folder
+from tsfusion.wire.messages import mesh_updates
+from tsfusion.wire.messages.mesh_updates import Scanned
+from tsfusion.wire.sockets import sockets
+from tsfusion.wire.sockets.curve import ClientKeys, client_keys
 
 TOPIC = sockets.scan_topic("default")
 

@@ -15,9 +15,9 @@ from keyframes_and_servers import connected, until
 from served_gateway import Served, record, serving_here
 
 from tsfusion.core.config import ServerConfig, VolumeConfig
-from tsfusion.gateway import fuser_process
-from tsfusion.gateway.spare_fusers import SpareFusers
-from tsfusion.wire import sockets
+from tsfusion.gateway.fusers import fuser_process
+from tsfusion.gateway.fusers.spare_fusers import SpareFusers
+from tsfusion.wire.sockets import sockets
 
 
 @pytest.fixture

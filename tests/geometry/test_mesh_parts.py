@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from tsfusion import Volume
 from tsfusion.core.errors import OutputError
 from tsfusion.geometry import up_direction
-from tsfusion.tsdf import field_regularizer
+from tsfusion.tsdf.surface import field_regularizer
 
 
 @pytest.fixture

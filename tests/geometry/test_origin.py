@@ -8,7 +8,7 @@ from tsfusion import Keyframe
 from tsfusion.core.errors import InvalidConfig, InvalidKeyframe
 from tsfusion.geometry import origin
 from tsfusion.geometry.origin import Origin
-from tsfusion.wire.record_header import WORLD_NAME
+from tsfusion.wire.records.record_header import WORLD_NAME
 
 UTM = np.array([447_812.3, 5_411_377.9, 312.0])
 

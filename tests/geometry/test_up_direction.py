@@ -79,7 +79,7 @@ def test_a_kitchen_whose_cameras_look_down(data: Callable[[str], Path]) -> None:
     sensors = held(poses, sensor)
     height = up_direction.floor_height(mesh, up, sensors)
     assert sensors.position @ up.direction - height == pytest.approx(1.40, abs=0.1), "not the worktop's"
-    wall = up_direction._Surface(mesh)._plane(np.array((0.0, 0.46, -0.89)), np.True_)[0]
+    wall = up_direction._FacingSurface(mesh)._plane(np.array((0.0, 0.46, -0.89)), np.True_)[0]
     assert degrees(up.direction, wall) == pytest.approx(90, abs=1.5)
 
 

@@ -19,7 +19,7 @@ from tsfusion.journal.inspection import summarize, verify
 from tsfusion.journal.journaled_keyframes import JournalRecording
 from tsfusion.journal.quarantine import Quarantine
 from tsfusion.journal.recovery import recover
-from tsfusion.wire import codec
+from tsfusion.wire.records import codec
 
 SESSION = b"s" * 16
 

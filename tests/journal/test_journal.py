@@ -22,7 +22,7 @@ from tsfusion.delivery.spool import Spool
 from tsfusion.journal import Journal, Position, Unwritten, mcap_layout, quarantine, segment_path
 from tsfusion.journal.journaled_keyframes import JournalRecording
 from tsfusion.journal.quarantine import Quarantine
-from tsfusion.wire import codec
+from tsfusion.wire.records import codec
 
 SESSION = bytes(16)
 BIG = 1 << 30

@@ -24,8 +24,8 @@ from tsfusion.journal import Journal, read, records, segment_path
 from tsfusion.journal.ros2_export import Export, export
 from tsfusion.journal.ros2_messages import depth_image
 from tsfusion.journal.state_folder import JournalPlace
-from tsfusion.wire import codec
-from tsfusion.wire.record_header import unpack
+from tsfusion.wire.records import codec
+from tsfusion.wire.records.record_header import unpack
 
 rosbags_highlevel = pytest.importorskip("rosbags.highlevel")
 NOW = 1_700_000_000_123_456_789

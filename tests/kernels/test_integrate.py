@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from ray_maps import CASES, QUANTA, SEGMENTS, RayMap, random_segments, rays_along
 
-from tsfusion.kernels.voxel_traversal import SHARED
-from tsfusion.tsdf.block_store import unpack_keys
+from tsfusion.kernels.base.voxel_traversal import SHARED
+from tsfusion.tsdf.store.block_store import unpack_keys
 
 
 @pytest.mark.parametrize("case", ["one", "many", "crowded", "borders"])

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 import taichi as ti
 
-from tsfusion.kernels import runtime
-from tsfusion.kernels.quick_launch import QuickLaunch
+from tsfusion.kernels.base import runtime
+from tsfusion.kernels.base.quick_launch import QuickLaunch
 
 
 @ti.kernel

@@ -4,7 +4,8 @@
 import kernel_twins
 import numpy as np
 
-from tsfusion.kernels import rasterizer, runtime
+from tsfusion.kernels.answers import rasterizer
+from tsfusion.kernels.base import runtime
 
 
 def test_shading_equals_the_twin() -> None:

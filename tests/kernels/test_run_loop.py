@@ -8,8 +8,8 @@ import pytest
 import taichi as ti
 from command_processes import python
 
-from tsfusion.kernels import runtime
-from tsfusion.kernels.run_loop import runs, unit_of
+from tsfusion.kernels.base import runtime
+from tsfusion.kernels.base.run_loop import runs, unit_of
 
 
 @ti.kernel

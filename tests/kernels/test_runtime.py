@@ -18,7 +18,7 @@ except MissingDependency as error:
     raise SystemExit(str(error))
 from taichi import _version_check
 _version_check.try_check_version = lambda: os.write(1, b"would tell its makers\\n")
-from tsfusion.kernels import runtime
+from tsfusion.kernels.base import runtime
 runtime.start(1)
 for thread in threading.enumerate():
     if thread is not threading.main_thread():
@@ -87,7 +87,8 @@ def test_a_home_that_cannot_be_written_is_done_without(tmp_path: Path) -> None:
         assert not (tmp_path / ".cache").exists() or name != "HOME"
     other.chmod(0o777)  # others might have put kernels there
     done = python(
-        "from tsfusion.kernels.runtime import kept_in; print(kept_in()[0])", env={**usual, "HOME": os.devnull}
+        "from tsfusion.kernels.base.runtime import kept_in; print(kept_in()[0])",
+        env={**usual, "HOME": os.devnull},
     )
     assert done.stdout.startswith(f"{tmp_path}/tsfusion-kernels-")
     assert done.stdout.strip() != str(other)

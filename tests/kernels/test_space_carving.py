@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 
 from tsfusion import Intrinsics, Keyframe
 from tsfusion.core.config import SensorModel
-from tsfusion.kernels import runtime, space_carving
-from tsfusion.tsdf.block_store import unpack_keys
-from tsfusion.tsdf.carved_blocks import CarvedBlocks
-from tsfusion.tsdf.ray_buffers import _depth_scale, _optional, model_parameters
+from tsfusion.kernels.base import runtime
+from tsfusion.kernels.integration import space_carving
+from tsfusion.tsdf.integration.carved_blocks import CarvedBlocks
+from tsfusion.tsdf.integration.ray_buffers import _depth_scale, _optional, model_parameters
+from tsfusion.tsdf.store.block_store import unpack_keys
 
 VOXEL = 0.05
 MODEL = SensorModel(sigma_floor=0.01, sigma_slope=0.004, sigma_z0=0.3, max_range=6.0)

@@ -7,10 +7,11 @@ import pytest
 from block_stores import store_of
 from numpy.typing import NDArray
 
-from tsfusion.kernels import block_hash, marching_tables, runtime, surface_cells
-from tsfusion.tsdf.block_store import cells_of, pack_keys, unpack_keys
-from tsfusion.tsdf.mesh_extraction import MeshBuffers
-from tsfusion.tsdf.surface_values import values_of
+from tsfusion.kernels.base import block_hash, runtime
+from tsfusion.kernels.surface import marching_tables, surface_cells
+from tsfusion.tsdf.store.block_store import cells_of, pack_keys, unpack_keys
+from tsfusion.tsdf.surface.mesh_extraction import MeshBuffers
+from tsfusion.tsdf.surface.surface_values import values_of
 
 PATCH = np.array([(x, y, z) for x in (-2, -1, 0) for y in (-1, 0) for z in (-1, 0, 1) if x + y + z], np.int32)
 
@@ -83,7 +84,7 @@ def test_no_blocks_have_no_cells() -> None:
 
 
 def test_the_buffers_give_the_memory_of_a_large_mesh_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tsfusion.tsdf.mesh_extraction.KEPT_BLOCKS", 100)
+    monkeypatch.setattr("tsfusion.tsdf.surface.mesh_extraction.KEPT_BLOCKS", 100)
     buffers = MeshBuffers()
     buffers.reserve(50)
     small = buffers.nbytes

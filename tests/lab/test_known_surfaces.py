@@ -9,7 +9,7 @@ from lab.evaluation.known_surfaces import ReferenceSurface, WorldSurface, edges_
 from lab.worlds import benchmark_worlds
 from tsfusion import Mesh
 from tsfusion.datasets import Synthetic
-from tsfusion.datasets.synthetic import worlds
+from tsfusion.datasets.worlds import worlds
 from tsfusion.geometry.keyframe import points_world
 
 VOXEL = 0.02

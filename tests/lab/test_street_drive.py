@@ -13,7 +13,7 @@ from small_recordings import round_a_block
 from lab.evaluation.known_surfaces import WorldSurface, drive_surface
 from lab.worlds import roadside
 from lab.worlds.street_drive import StreetDrive
-from tsfusion.datasets.synthetic import worlds
+from tsfusion.datasets.worlds import worlds
 
 
 @pytest.fixture(scope="module")
@@ -147,7 +147,7 @@ def test_nothing_stands_in_the_way(data, name):
 def test_the_tables_agree_with_the_kernels(drive):
     drive._rendering()
     from lab.worlds.kernels import street_shading, street_things
-    from tsfusion.kernels import synthetic_raycast
+    from tsfusion.kernels.worlds import synthetic_raycast
 
     for name in (
         *(

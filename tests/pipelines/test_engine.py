@@ -10,10 +10,10 @@ import pytest
 
 from tsfusion.client import Client, ClientStats
 from tsfusion.core.errors import FlushTimeout, TransportError
-from tsfusion.pipelines import engine
-from tsfusion.pipelines.engine import Engine
-from tsfusion.pipelines.run_files import no_surface
-from tsfusion.pipelines.target_server import ServerChild, Target
+from tsfusion.pipelines.runs import engine
+from tsfusion.pipelines.runs.engine import Engine
+from tsfusion.pipelines.runs.run_files import no_surface
+from tsfusion.pipelines.runs.target_server import ServerChild, Target
 
 
 class Run:

@@ -17,8 +17,8 @@ from keyframes_and_servers import VOLUME, map_hash, pose, wall
 from tsfusion import Keyframe, Volume, VolumeConfig
 from tsfusion.core.errors import InvalidConfig, JournalError
 from tsfusion.journal import Journal, journaled_keyframes
-from tsfusion.pipelines import journal_fusion
-from tsfusion.wire import codec, corrections
+from tsfusion.pipelines.maps import journal_fusion
+from tsfusion.wire.records import codec, corrections
 
 LEFT, RIGHT = b"\xab" * 16, b"\xac" + b"\xab" * 15
 START_NS = 1_700_000_000 * 10**9

@@ -20,8 +20,8 @@ from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.textured_mesh import TexturedMesh
 from tsfusion.journal import Journal, state_folder
 from tsfusion.journal.journaled_keyframes import JournaledKeyframes
-from tsfusion.pipelines import journal_fusion, journal_textures
-from tsfusion.wire import codec, corrections
+from tsfusion.pipelines.maps import journal_fusion, journal_textures
+from tsfusion.wire.records import codec, corrections
 
 pytest.importorskip("xatlas")
 

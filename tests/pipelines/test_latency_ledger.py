@@ -9,9 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
-from tsfusion.pipelines import latency_ledger, run_files
-from tsfusion.wire import keyframe_times
-from tsfusion.wire.keyframe_times import KeyframeTimes
+from tsfusion.pipelines.report import latency_ledger
+from tsfusion.pipelines.runs import run_files
+from tsfusion.wire.messages import keyframe_times
+from tsfusion.wire.messages.keyframe_times import KeyframeTimes
 
 MS = 1_000_000
 

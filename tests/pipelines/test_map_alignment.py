@@ -23,11 +23,11 @@ from tsfusion import (
     open_dataset,
 )
 from tsfusion.evaluation import surface_registration
-from tsfusion.evaluation.surface_registration import Registration
+from tsfusion.evaluation.surface_registration import SurfaceRegistration
 from tsfusion.geometry import se3
 from tsfusion.journal import state_folder
-from tsfusion.pipelines import map_alignment
-from tsfusion.pipelines.map_alignment import AlignedMap, open_map
+from tsfusion.pipelines.maps import map_alignment
+from tsfusion.pipelines.maps.map_alignment import AlignedMap, open_map
 
 CONFIG = VolumeConfig(voxel_size=0.05, threads=1)
 START = unknown_start(1)  # T_b_a
@@ -57,7 +57,7 @@ def maps(halves: tuple[Path, Path]) -> tuple[AlignedMap, AlignedMap]:
     return open_map(a), open_map(b)
 
 
-class Given(Registration):
+class Given(SurfaceRegistration):
     """Finds what a test says, and refines nothing: what stands around the library runs without it."""
 
     found: ClassVar[list[Any]] = []
@@ -74,7 +74,7 @@ class Given(Registration):
 
 @pytest.fixture
 def given(monkeypatch: pytest.MonkeyPatch) -> type[Given]:
-    monkeypatch.setattr(map_alignment, "Registration", Given)
+    monkeypatch.setattr(map_alignment, "SurfaceRegistration", Given)
     monkeypatch.setattr(Given, "found", [se3.inverse(START)])
     monkeypatch.setattr(surface_registration, "check_installed", lambda: None)
     return Given

@@ -10,10 +10,10 @@ import pytest
 import trimesh
 
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets.synthetic.dataset import WORLDS
+from tsfusion.datasets.worlds.synthetic import WORLDS
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.up_direction import Up
-from tsfusion.pipelines.measured_errors import error_measure
+from tsfusion.pipelines.maps.measured_errors import error_measure
 
 POINTS = np.array([[0.2, 0.3, 0.01], [0.2, 0.3, -0.02]], np.float32)
 

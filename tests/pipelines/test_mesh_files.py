@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from tsfusion.geometry.mesh import Mesh
-from tsfusion.pipelines import mesh_finishing
+from tsfusion.pipelines.maps import mesh_finishing
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +30,7 @@ def test_which_files_have_islands(
     scattered: Mesh, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, keep: bool | None, without: list[str]
 ) -> None:
     drawn: list[Mesh] = []
-    monkeypatch.setattr("tsfusion.pipelines.mesh_preview.render", lambda mesh, _file: drawn.append(mesh))
+    monkeypatch.setattr("tsfusion.pipelines.maps.mesh_preview.render", lambda mesh, _file: drawn.append(mesh))
     files = [tmp_path / f"m{suffix}" for suffix in (".ply", ".obj", ".glb", ".png")]
     left_out = mesh_finishing.write(scattered, files, keep_islands=keep)
     assert left_out["files"] == without

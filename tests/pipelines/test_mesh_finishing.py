@@ -12,9 +12,9 @@ from formula_scenes import sphere_views, volume_of
 
 from tsfusion import Volume
 from tsfusion.core.errors import InvalidConfig, OutputError
-from tsfusion.pipelines import mesh_finishing
-from tsfusion.pipelines.mesh_finishing import simplification
-from tsfusion.wire import queries
+from tsfusion.pipelines.maps import mesh_finishing
+from tsfusion.pipelines.maps.mesh_finishing import simplification
+from tsfusion.wire.asking import queries
 
 
 @pytest.fixture(scope="module")
@@ -144,7 +144,7 @@ def test_a_box_of_a_map_larger_than_memory_has_the_same_mesh(
 def test_a_mesh_larger_than_memory_loses_its_small_pieces(
     here: Here, saved: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("tsfusion.tsdf.field_regularizer.BATCH", 40)
+    monkeypatch.setattr("tsfusion.tsdf.surface.field_regularizer.BATCH", 40)
     whole = Volume.load(saved, threads=2)
     memory = ("--memory", whole.stats().bytes - 1)
     mesh = whole.extract_mesh()

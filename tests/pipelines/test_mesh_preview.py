@@ -14,9 +14,9 @@ from tsfusion.core.errors import OutputError
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.textured_mesh import Texture, TexturedMesh
 from tsfusion.geometry.up_direction import Up, parse
-from tsfusion.kernels import rasterizer
-from tsfusion.pipelines import mesh_preview
-from tsfusion.pipelines.mesh_preview import PreviewCamera, choose_camera, draw
+from tsfusion.kernels.answers import rasterizer
+from tsfusion.pipelines.maps import mesh_preview
+from tsfusion.pipelines.maps.mesh_preview import PreviewCamera, choose_camera, draw
 
 
 def from_trimesh(shape: trimesh.Trimesh, colors: np.ndarray | None = None) -> Mesh:

@@ -14,10 +14,10 @@ from tsfusion import Volume, VolumeConfig
 from tsfusion.core.config import override
 from tsfusion.journal import state_folder
 from tsfusion.journal.journaled_keyframes import JournaledKeyframes
-from tsfusion.pipelines import piecewise_map
-from tsfusion.pipelines.map_rewinding import RewoundMap
-from tsfusion.pipelines.piecewise_map import PiecewiseMap
-from tsfusion.tsdf import field_regularizer
+from tsfusion.pipelines.shown import piecewise_map
+from tsfusion.pipelines.shown.map_rewinding import RewoundMap
+from tsfusion.pipelines.shown.piecewise_map import PiecewiseMap
+from tsfusion.tsdf.surface import field_regularizer
 
 RAW = override(VOLUME, surface="raw")
 

@@ -37,8 +37,9 @@ from tsfusion import Volume, VolumeConfig, journal
 from tsfusion.cli import options
 from tsfusion.core.config import Config, ServerConfig
 from tsfusion.core.output_folder import building
-from tsfusion.pipelines import replay, settled_maps
-from tsfusion.tsdf import checkpoint, map_history
+from tsfusion.pipelines.maps import settled_maps
+from tsfusion.pipelines.runs import replay
+from tsfusion.tsdf.files import checkpoint, map_history
 
 RESULTS = {
     "mesh.ply", "mesh.glb", "preview.png", "delay.csv", "delay.png", "growth.csv", "keyframes.txt",

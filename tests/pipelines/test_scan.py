@@ -37,11 +37,11 @@ from tsfusion.core.errors import InvalidConfig, InvalidKeyframe
 from tsfusion.datasets.trajectory_files import read_tum, write_tum
 from tsfusion.geometry.frame import Frame
 from tsfusion.journal.journaled_keyframes import JournalRecording
-from tsfusion.pipelines import engine
-from tsfusion.pipelines import scan as pipelines_scan
-from tsfusion.pipelines.scan_results import ScanSummary
+from tsfusion.pipelines.runs import engine
+from tsfusion.pipelines.runs import scan as pipelines_scan
+from tsfusion.pipelines.runs.scan_results import ScanSummary
 from tsfusion.scanner.sources.source import LiveSource
-from tsfusion.wire.queries import fetch_health
+from tsfusion.wire.asking.queries import fetch_health
 
 VOXEL = 0.05
 COARSE = ("--voxel-size", VOXEL)
@@ -49,7 +49,7 @@ SOURCE = "synthetic:room"
 # As on a robot without Taichi: importing it fails.
 BARE = "import sys; sys.modules['taichi'] = None; from tsfusion.__main__ import main; main(sys.argv[1:])"
 IMPATIENT = (
-    "import sys; from tsfusion.pipelines import engine; engine.LINGER = 0.5; "
+    "import sys; from tsfusion.pipelines.runs import engine; engine.LINGER = 0.5; "
     "from tsfusion.__main__ import main; main(sys.argv[1:])"
 )
 

@@ -23,12 +23,12 @@ from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
 from tsfusion.journal import state_folder
 from tsfusion.journal.journaled_keyframes import JournalRecording
-from tsfusion.pipelines import scan as pipelines_scan
-from tsfusion.pipelines import scan_alignment
-from tsfusion.pipelines.scan_alignment import ExistingMap, PlacedLocalizer, PlacementTry, find_place
-from tsfusion.pipelines.scan_results import ScanSummary
+from tsfusion.pipelines.maps import scan_alignment
+from tsfusion.pipelines.maps.scan_alignment import ExistingMap, PlacedLocalizer, PlacementTry, find_place
+from tsfusion.pipelines.runs import scan as pipelines_scan
+from tsfusion.pipelines.runs.scan_results import ScanSummary
 from tsfusion.scanner.keyframe_selection import KeyframeSelector
-from tsfusion.scanner.localization.localizer import Lost, Pose, PoseCorrections
+from tsfusion.scanner.localization.localizer import Lost, PoseCorrections, TrackedPose
 from tsfusion.scanner.sources.recorded import RecordedSource
 
 CONFIG = VolumeConfig(voxel_size=0.05, threads=1)
@@ -81,12 +81,14 @@ class Straight:
         self.frames = 0
         self._lost_at = lost_at
 
-    def track(self, frame: Frame) -> Pose | Lost:
+    def track(self, frame: Frame) -> TrackedPose | Lost:
         self.frames += 1
         if self.frames > self._lost_at:
             return Lost(reason="dark", timestamp_ns=frame.timestamp_ns)
         pose = se3.transform(np.eye(3), (0.2 * self.frames, 0, 0))
-        return Pose(T_world_camera=pose, timestamp_ns=frame.timestamp_ns, anchor=1, T_anchor_camera=np.eye(4))
+        return TrackedPose(
+            T_world_camera=pose, timestamp_ns=frame.timestamp_ns, anchor=1, T_anchor_camera=np.eye(4)
+        )
 
     def corrections(self) -> PoseCorrections | None:
         one = {1: se3.transform(np.eye(3), (0.0, 0.1, 0.0))}
@@ -122,8 +124,8 @@ def test_it_tries_again_with_more_keyframes(tries: list[int]) -> None:
     assert localizer.corrections() is None  # until the keyframes that they name were sent
     for frame, answer in zip(placing.frames, placing.answers, strict=True):
         moved = localizer.track(frame)
-        assert isinstance(moved, Pose)
-        assert isinstance(answer, Pose)
+        assert isinstance(moved, TrackedPose)
+        assert isinstance(answer, TrackedPose)
         assert np.allclose(moved.T_world_camera, T @ answer.T_world_camera)
     corrections = localizer.corrections()
     assert corrections is not None
@@ -132,7 +134,7 @@ def test_it_tries_again_with_more_keyframes(tries: list[int]) -> None:
     assert np.allclose(by @ T, anchor)  # what follows in the map's frame is corrected likewise
     localizer.reset()  # the sensor was lost: a new world, of which nothing is known
     again = localizer.track(placing.frames[0])
-    assert isinstance(again, Pose)
+    assert isinstance(again, TrackedPose)
     assert np.allclose(again.T_world_camera[:3, :3], np.eye(3))
 
 

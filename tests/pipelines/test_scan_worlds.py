@@ -20,11 +20,11 @@ from tsfusion.datasets import select
 from tsfusion.datasets.trajectory_files import read_tum
 from tsfusion.geometry.frame import Frame
 from tsfusion.journal.journaled_keyframes import JournalRecording
-from tsfusion.pipelines import engine
-from tsfusion.pipelines import scan as pipelines_scan
-from tsfusion.pipelines.scan_results import ScanSummary
+from tsfusion.pipelines.runs import engine
+from tsfusion.pipelines.runs import scan as pipelines_scan
+from tsfusion.pipelines.runs.scan_results import ScanSummary
 from tsfusion.scanner.sources.recorded import RecordedSource
-from tsfusion.wire.queries import fetch_health
+from tsfusion.wire.asking.queries import fetch_health
 
 FRAMES = 3
 OWN_WORLD = ("synthetic:room", "--localizer", "rgbd", "--max-frames", FRAMES)

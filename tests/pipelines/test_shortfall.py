@@ -10,7 +10,8 @@ import pytest
 from tsfusion import Intrinsics, InvalidConfig, Keyframe, VolumeConfig
 from tsfusion.client import ClientStats
 from tsfusion.datasets.dataset import UNREADABLE
-from tsfusion.pipelines import map_growth, shortfall
+from tsfusion.pipelines.report import shortfall
+from tsfusion.pipelines.runs import map_growth
 
 STATS = ClientStats(
     sent=10, durable=10, fused=10, refused={}, rejected={}, skipped={}, waiting=0, waiting_bytes=0, state="ok"

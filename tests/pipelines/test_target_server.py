@@ -12,8 +12,8 @@ from saved_maps import make_map
 
 from tsfusion.core.config import ClientConfig, ServerConfig, VolumeConfig
 from tsfusion.core.errors import InvalidConfig, TransportError
-from tsfusion.gateway import moved_maps
-from tsfusion.pipelines import target_server
+from tsfusion.gateway.maps import moved_maps
+from tsfusion.pipelines.runs import target_server
 
 
 @pytest.mark.skipif(sys.platform == "darwin", reason="Metal is there")

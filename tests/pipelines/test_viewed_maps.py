@@ -17,10 +17,10 @@ from tsfusion import Volume
 from tsfusion.core.errors import CheckpointError, JournalError, TsfusionError
 from tsfusion.core.folder_lock import lock_folder
 from tsfusion.journal import state_folder
-from tsfusion.pipelines import view_process, viewed_maps
-from tsfusion.pipelines.view_messages import Open, Opened, Took
-from tsfusion.pipelines.viewed_maps import SavedMapFeed, open_feed
-from tsfusion.wire.map_events import LinkSeen, SurfaceUpdate
+from tsfusion.pipelines.shown import view_process, viewed_maps
+from tsfusion.pipelines.shown.view_messages import Open, Opened, Took
+from tsfusion.pipelines.shown.viewed_maps import SavedMapFeed, open_feed
+from tsfusion.wire.asking.map_events import LinkSeen, SurfaceUpdate
 
 DEADLINE_S = 60.0
 
@@ -38,7 +38,7 @@ def state(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def feed(state: Path) -> Iterator[SavedMapFeed]:
     with pytest.MonkeyPatch.context() as patch, closing(open_feed(state, map_name="yard")) as feed:
-        patch.setattr("tsfusion.pipelines.viewed_maps._ANSWER_S", DEADLINE_S)
+        patch.setattr("tsfusion.pipelines.shown.viewed_maps._ANSWER_S", DEADLINE_S)
         yield feed
 
 
@@ -160,7 +160,7 @@ class Page:
 
 def test_triangles_wait_for_a_slow_page(state: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(view_process, "_MOST_BYTES", 100_000)
-    monkeypatch.setattr("tsfusion.pipelines.piecewise_map.CELLS", 20)
+    monkeypatch.setattr("tsfusion.pipelines.shown.piecewise_map.CELLS", 20)
     page = Page(state)
     view_process._Viewing(page).run()  # type: ignore[arg-type]
     assert isinstance(page.sent[0], Opened)

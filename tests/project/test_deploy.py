@@ -26,7 +26,7 @@ from repository import ROOT
 from tsfusion import Client, Intrinsics, Keyframe
 from tsfusion.cli import main
 from tsfusion.core.config import ServerConfig
-from tsfusion.gateway.metrics import STAGES, Metrics
+from tsfusion.gateway.health.metrics import STAGES, Metrics
 
 DEPLOY = ROOT / "docs" / "deploy"
 UNIT = (DEPLOY / "tsfusion.service").read_text(encoding="utf-8")

@@ -17,7 +17,7 @@ from thin_obstacles import POSTS, views
 
 from tsfusion import Client, Keyframe, Volume, open_dataset
 from tsfusion.geometry.trajectory import quaternion
-from tsfusion.wire.queries import fetch_status
+from tsfusion.wire.asking.queries import fetch_status
 
 COUNT = 3
 

@@ -17,8 +17,9 @@ from repository import ROOT
 
 from tsfusion import Client
 from tsfusion.core.config import ClientConfig, load
-from tsfusion.wire import key_folder, queries
-from tsfusion.wire.curve import client_keys
+from tsfusion.wire.asking import queries
+from tsfusion.wire.keys import key_folder
+from tsfusion.wire.sockets.curve import client_keys
 
 _FUSER = f"""
 import sys
@@ -30,7 +31,7 @@ sys.exit(main())
 """
 _QUICK = f"""
 import sys
-from tsfusion.gateway import fuser_process
+from tsfusion.gateway.fusers import fuser_process
 fuser_process.COMMAND = (sys.executable, "-c", {_FUSER!r})
 from tsfusion.__main__ import main
 main()

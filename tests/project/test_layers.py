@@ -29,10 +29,15 @@ ROWS = (
 
 # Folders of a wing, top to bottom. A room imports from those behind it, and from the folder that holds it.
 ROOMS = {
-    "datasets": ("formats", "rosbag", "synthetic", "download"),
-    "pipelines": ("report",),
+    "pipelines": ("shown", "runs", "report", "maps"),
     "scanner": ("sources", "localization"),
     "scanner.localization": ("rgbd", "stereo", "loop_closure", "pose_feed"),
+    "gateway": ("people", "migration", "intake", "maps", "records", "clients", "fusers", "ports", "health"),
+    "datasets": ("formats", "rosbag", "worlds", "download"),
+    "viewer": ("panels", "map", "page"),
+    "tsdf": ("device", "files", "texture", "answers", "sums", "surface", "integration", "store"),
+    "wire": ("asking", "messages", "keys", "records", "sockets"),
+    "kernels": ("device", "worlds", "answers", "surface", "integration", "base"),
 }
 
 # Files that import one another in a circle, types included.
@@ -44,7 +49,7 @@ MAY_REACH_TAICHI = (
         "kernels",
         "tsdf",
         "fuser",
-        "datasets.synthetic",
+        "datasets.worlds",
         "evaluation",
         "pipelines",
         "cluster",
@@ -52,10 +57,17 @@ MAY_REACH_TAICHI = (
         "__main__",
     ),
 )
-TAICHI_FREE = ("fuser.messages",)
+TAICHI_FREE = ("fuser.fuser_messages",)
 LIGHT = (
-    *("client", "server", "scanner.scanner", "wire.codec"),
-    *("journal", "journal.journaled_keyframes", "datasets", "cli", "wire.map_client", "wire.map_watcher"),
+    *("client", "server", "scanner.scanner", "wire.records.codec"),
+    *(
+        "journal",
+        "journal.journaled_keyframes",
+        "datasets",
+        "cli",
+        "wire.asking.map_client",
+        "wire.asking.map_watcher",
+    ),
 )
 
 

@@ -16,7 +16,8 @@ IDLE, KEYFRAME = 1, 2  # values of the byte that all processes see: which files 
 ASKED = """
 core/number_ranges.py core/rates.py fuser/departures.py fuser/kept_answers.py
 fuser/pose_mover.py fuser/question_answers.py geometry/up_direction.py
-journal/locations.py tsdf/carved_blocks.py tsdf/clear_blocks.py tsdf/map_slices.py
+journal/locations.py tsdf/answers/map_slices.py tsdf/integration/carved_blocks.py
+tsdf/store/clear_blocks.py
 """
 
 # Writes down each function that a process calls, once for each value of the byte; a file for each process.

@@ -17,7 +17,7 @@ from tsfusion.geometry import se3, sweeps
 from tsfusion.geometry.frame import Frame
 from tsfusion.journal.journaled_keyframes import JournalRecording
 from tsfusion.scanner.localization.given_poses import GivenPoses, TrajectoryFilePoses
-from tsfusion.scanner.localization.localizer import Localizer, Lost, Pose
+from tsfusion.scanner.localization.localizer import Localizer, Lost, TrackedPose
 from tsfusion.scanner.scanner import Scanner
 from tsfusion.scanner.sources.watched_folder import WatchedFolder
 
@@ -96,13 +96,13 @@ class Odometry(Localizer):
     def __init__(self, lost: tuple[int, ...] = ()) -> None:
         self._count, self._lost, self._first = 0, lost, True
 
-    def track(self, frame: Frame) -> Pose | Lost:
+    def track(self, frame: Frame) -> TrackedPose | Lost:
         self._count += 1
         if self._count in self._lost:
             return Lost(reason="the script says so", timestamp_ns=frame.timestamp_ns)
         motion = sweeps.motion_about(lidar.pose_at_ns, frame.timestamp_ns, frame.point_times_s)
         T, self._first, first = lidar.pose_at_ns(frame.timestamp_ns), False, self._first
-        return Pose(
+        return TrackedPose(
             T_world_camera=T, timestamp_ns=frame.timestamp_ns, anchor=self._count, T_anchor_camera=np.eye(4),
             motion=None if first else motion,
         )  # fmt: skip

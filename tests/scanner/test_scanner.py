@@ -16,7 +16,7 @@ from tsfusion.core.config import ScanConfig
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
 from tsfusion.journal.journaled_keyframes import JournalRecording
-from tsfusion.scanner.localization.localizer import Localizer, Lost, Pose, PoseCorrections
+from tsfusion.scanner.localization.localizer import Localizer, Lost, PoseCorrections, TrackedPose
 from tsfusion.scanner.scanner import Scanner
 from tsfusion.scanner.tracked_trajectory import TrackedTrajectory
 
@@ -34,7 +34,7 @@ class Scripted:
         self._news: PoseCorrections | None = None
         self._anchors: dict[int, np.ndarray] = {}
 
-    def track(self, frame: Frame) -> Pose | Lost:
+    def track(self, frame: Frame) -> TrackedPose | Lost:
         self._at += 1
         if self._script[self._at] == "L":
             return Lost(reason="the script says so", timestamp_ns=frame.timestamp_ns)
@@ -44,7 +44,7 @@ class Scripted:
         if self._script[self._at] == "C":
             moved = {number: pose(0, 0.05) @ anchor for number, anchor in self._anchors.items()}
             self._news = PoseCorrections(revision=1, anchors=moved, T_corrected_world=pose(0, 0.05), loops=1)
-        return Pose(
+        return TrackedPose(
             T_world_camera=T, timestamp_ns=frame.timestamp_ns, anchor=self._anchor,
             T_anchor_camera=np.eye(4), starts_anchor=True,
         )  # fmt: skip
@@ -224,8 +224,10 @@ def test_a_track_gives_back_what_it_took() -> None:
         T, T_anchor, reference = (se3.exp(rng.normal(0, 1, 6)) for _ in range(3))
         references.append(reference)
         poses.append(
-            Pose(T_world_camera=T, timestamp_ns=number << 40, anchor=number // 3, T_anchor_camera=T_anchor,
-                 starts_anchor=number % 3 == 0)
+            TrackedPose(
+                T_world_camera=T, timestamp_ns=number << 40, anchor=number // 3, T_anchor_camera=T_anchor,
+                starts_anchor=number % 3 == 0,
+            )
         )  # fmt: skip
         track.add(poses[-1], reference if number % 2 else None, number + 7 if number % 4 == 0 else None)
     np.testing.assert_array_equal(track.poses(), [given.T_world_camera for given in poses])
@@ -251,7 +253,7 @@ def test_a_track_of_an_hour_is_small() -> None:
     T = np.eye(4)
     tracemalloc.start()
     for number in range(20_000):
-        track.add(Pose(T_world_camera=T, timestamp_ns=number, anchor=0, T_anchor_camera=T), T, number)
+        track.add(TrackedPose(T_world_camera=T, timestamp_ns=number, anchor=0, T_anchor_camera=T), T, number)
     size, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert size / len(track) < 400

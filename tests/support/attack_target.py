@@ -8,8 +8,8 @@ from typing import Literal, get_args
 import msgspec
 from keyframes_and_servers import connected
 
-from tsfusion.wire import sockets
-from tsfusion.wire.curve import ClientKeys
+from tsfusion.wire.sockets import sockets
+from tsfusion.wire.sockets.curve import ClientKeys
 
 Access = Literal["open", "stranger", "allowed"]  # no keys; attackers without one; attackers with their own
 ACCESS: tuple[Access, ...] = get_args(Access)

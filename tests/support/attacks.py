@@ -29,10 +29,12 @@ from attack_target import Access, Target
 from hostile_messages import Frames, bad_values, bombs, hostile_corrections, lies
 from keyframes_and_servers import connected, wall
 
-from tsfusion.wire import codec, corrections, messages, sockets
-from tsfusion.wire.curve import ClientKeys
-from tsfusion.wire.messages import PROTOCOL_VERSION, Command
-from tsfusion.wire.sockets import parse_address
+from tsfusion.wire.messages import messages
+from tsfusion.wire.messages.messages import PROTOCOL_VERSION, Command
+from tsfusion.wire.records import codec, corrections
+from tsfusion.wire.sockets import sockets
+from tsfusion.wire.sockets.curve import ClientKeys
+from tsfusion.wire.sockets.sockets import parse_address
 
 _HALF_OPEN = 36_000
 _UNFINISHED = 400  # parts

@@ -4,8 +4,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.kernels import runtime
-from tsfusion.tsdf.block_store import BlockStore
+from tsfusion.kernels.base import runtime
+from tsfusion.tsdf.store.block_store import BlockStore
 
 
 def store_of(

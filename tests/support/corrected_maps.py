@@ -7,7 +7,7 @@ from pathlib import Path
 from formula_scenes import volume_of
 
 from tsfusion import Keyframe, Volume, journal
-from tsfusion.wire import codec
+from tsfusion.wire.records import codec
 
 
 def final_keyframes(folder: Path) -> list[Keyframe]:

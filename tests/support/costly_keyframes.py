@@ -12,7 +12,7 @@ from hostile_messages import Frames, with_depth, with_header
 from keyframes_and_servers import pose
 
 from tsfusion import Keyframe
-from tsfusion.wire import codec
+from tsfusion.wire.records import codec
 
 
 def rays(count: int, extent: float, *, seed: int = 0) -> Keyframe:

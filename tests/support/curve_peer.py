@@ -12,8 +12,8 @@ import pytest
 import zmq
 from zmq.utils import z85
 
-from tsfusion.wire.curve import ClientKeys
-from tsfusion.wire.sockets import parse_address
+from tsfusion.wire.sockets.curve import ClientKeys
+from tsfusion.wire.sockets.sockets import parse_address
 
 _TIMEOUT = 10.0
 _MAC, _KEY, _COOKIE = 16, 32, 96

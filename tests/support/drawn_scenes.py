@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.viewer import tile_glb
+from tsfusion.viewer.map import tile_glb
 
 # three.js, `ACESFilmicToneMapping`
 _IN = np.array(((0.59719, 0.35458, 0.04823), (0.07600, 0.90834, 0.01566), (0.02840, 0.13383, 0.83777)))

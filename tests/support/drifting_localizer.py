@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
-from tsfusion.scanner.localization.localizer import Lost, Pose, PoseCorrections
+from tsfusion.scanner.localization.localizer import Lost, PoseCorrections, TrackedPose
 
 
 class Drifting:
@@ -22,7 +22,7 @@ class Drifting:
         self._last: NDArray[np.float64] | None = None
         self._number = 0
 
-    def track(self, frame: Frame) -> Pose | Lost:
+    def track(self, frame: Frame) -> TrackedPose | Lost:
         truth = frame.T_world_camera
         if truth is None:
             return Lost(reason="the frame says nothing", timestamp_ns=frame.timestamp_ns)
@@ -35,7 +35,7 @@ class Drifting:
             drift = np.sqrt(way) * noise + way * np.array([0, 0, 4, 0, 1.5, 0]) / 1e3
             self._T = self._T @ step @ se3.exp(drift)
         self._last, self._number = truth, self._number + 1
-        return Pose(
+        return TrackedPose(
             T_world_camera=self._T,
             timestamp_ns=frame.timestamp_ns,
             anchor=self._number,

@@ -8,10 +8,11 @@ from typing import Any
 
 import zmq
 
-from tsfusion.wire import messages, sockets
-from tsfusion.wire.health import Health, Status
-from tsfusion.wire.keyframe_times import Spread
-from tsfusion.wire.messages import Command, Reply
+from tsfusion.wire.messages import messages
+from tsfusion.wire.messages.health import Health, Status
+from tsfusion.wire.messages.keyframe_times import Spread
+from tsfusion.wire.messages.messages import Command, Reply
+from tsfusion.wire.sockets import sockets
 
 Answer = Callable[[Command], Reply | bytes | None]
 

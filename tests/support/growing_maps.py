@@ -9,11 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion import Keyframe, Volume
-from tsfusion.tsdf.block_store import cells_of
+from tsfusion.tsdf.store.block_store import cells_of
 from tsfusion.viewer.map_feed import TimeLine
-from tsfusion.wire.health import ClientHealth, Health, MapHealth
-from tsfusion.wire.keyframe_times import Spread
-from tsfusion.wire.map_events import (
+from tsfusion.wire.asking.map_events import (
     Cleared,
     HealthSeen,
     LinkSeen,
@@ -22,6 +20,8 @@ from tsfusion.wire.map_events import (
     ScannerSeen,
     SurfaceUpdate,
 )
+from tsfusion.wire.messages.health import ClientHealth, Health, MapHealth
+from tsfusion.wire.messages.keyframe_times import Spread
 
 SESSION = bytes(range(16))
 

@@ -3,8 +3,8 @@
 
 from typing import Any
 
-from tsfusion.wire.health import ClientHealth, Health, MapHealth
-from tsfusion.wire.keyframe_times import Spread
+from tsfusion.wire.messages.health import ClientHealth, Health, MapHealth
+from tsfusion.wire.messages.keyframe_times import Spread
 
 MIB = 1 << 20
 

@@ -13,8 +13,8 @@ import numpy as np
 import zstandard
 from keyframes_and_servers import wall
 
-from tsfusion.wire import codec, corrections
-from tsfusion.wire.record_header import Buffer, pack, unpack
+from tsfusion.wire.records import codec, corrections
+from tsfusion.wire.records.record_header import Buffer, pack, unpack
 
 Frames = list[bytes]
 

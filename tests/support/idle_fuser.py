@@ -11,8 +11,8 @@ from keyframes_and_servers import Server
 _FUSER = """
 import select, signal, sys, zmq
 from tsfusion.core import process
-from tsfusion.fuser import messages as fuser_messages
-from tsfusion.wire import sockets
+from tsfusion.fuser import fuser_messages
+from tsfusion.wire.sockets import sockets
 
 process.on_parent_end(signal.SIGKILL)
 if select.select([sys.stdin], [], [], 0)[0]:
@@ -37,7 +37,7 @@ while True:
 """
 COMMAND = (sys.executable, "-c", _FUSER)
 _CODE = f"""
-from tsfusion.gateway import fuser_process
+from tsfusion.gateway.fusers import fuser_process
 fuser_process.COMMAND = {COMMAND!r}
 """
 

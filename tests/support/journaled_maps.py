@@ -10,7 +10,7 @@ import numpy as np
 from tsfusion import Keyframe, Volume, VolumeConfig
 from tsfusion.geometry import se3
 from tsfusion.journal import Journal, state_folder
-from tsfusion.wire import codec
+from tsfusion.wire.records import codec
 
 
 def recorded(folder: Path, keyframes: Iterable[Keyframe], config: VolumeConfig) -> Path:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import spsolve
 
-from tsfusion.kernels import marching_tables
+from tsfusion.kernels.surface import marching_tables
 
 Voxel = tuple[int, int, int]
 WEIGHT_ONE = 16
@@ -246,7 +246,7 @@ def crossed_cells(
     values: dict[Voxel, float], meshed: set[Voxel], behind: float, clear: float
 ) -> tuple[set[Voxel], set[tuple[Voxel, int]], dict[Voxel, int]]:
     """Cells of the `meshed` blocks that the surface crosses, the edges (voxel, axis) that carry their
-    vertices, and how many triangles each has: twin of `kernels.surface_cells.find_cells`. Where a corner is
+    vertices, and how many triangles each has: twin of `surface_cells.find_cells`. Where a corner is
     `clear` and another far `behind`, there are none."""
     edges, triangles = set(), {}
     for cell in values:
@@ -369,7 +369,7 @@ def neighbours(voxel: Voxel) -> set[Voxel]:
 
 
 def trace(distance: Any, origin: Any, directions: NDArray[np.float64], reach: float) -> NDArray[np.float64]:
-    """Twin of `kernels.synthetic_raycast.cast`: sphere tracing; 0 = nothing within reach."""
+    """Twin of `kernels.worlds.synthetic_raycast.cast`: sphere tracing; 0 = nothing within reach."""
     length = np.linalg.norm(directions, axis=1)
     t = np.zeros(len(directions))
     for _ in range(300):
@@ -381,7 +381,7 @@ def trace(distance: Any, origin: Any, directions: NDArray[np.float64], reach: fl
 def see(
     vertices: NDArray[np.float32], faces: NDArray[np.int32], focal: float, shape: tuple[int, int], near: float
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Twin of `kernels.rasterizer`: the front-facing triangle each pixel sees (−1 = none) and its depth."""
+    """Twin of `rasterizer`: the front-facing triangle each pixel sees (−1 = none) and its depth."""
     height, width = shape
     v, u = np.mgrid[:height, :width]
     rays = np.dstack([(u - (width - 1) / 2) / focal, (v - (height - 1) / 2) / focal, np.ones(shape)])
@@ -400,7 +400,7 @@ def see(
 
 
 def shade(corners: Any, normals: Any, colors: Any, ray: Any, up: Any) -> NDArray[np.float64]:
-    """Twin of `kernels.rasterizer.shade` for one pixel of one triangle: linear RGB."""
+    """Twin of `kernels.answers.rasterizer.shade` for one pixel of one triangle: linear RGB."""
     weights = np.linalg.solve(np.asarray(corners, float).T, ray)
     weights = np.clip(weights / weights.sum(), 0, 1)
     normal = weights @ np.asarray(normals, float)
@@ -412,8 +412,8 @@ def shade(corners: Any, normals: Any, colors: Any, ray: Any, up: Any) -> NDArray
 
 
 def occlusion(depth: Any, v: int, u: int, focal: float, radius: float, strength: float) -> float:
-    """Twin of `kernels.rasterizer.occlude` for one pixel: the share of its light that is left."""
-    from tsfusion.kernels import rasterizer
+    """Twin of `kernels.answers.rasterizer.occlude` for one pixel: the share of its light that is left."""
+    from tsfusion.kernels.answers import rasterizer
 
     height, width = depth.shape
 

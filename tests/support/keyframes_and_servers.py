@@ -22,9 +22,11 @@ import zmq
 from tsfusion import Intrinsics, Keyframe, journal
 from tsfusion.core.config import ServerConfig, VolumeConfig
 from tsfusion.journal import state_folder
-from tsfusion.wire import codec, key_folder, sockets
-from tsfusion.wire.corrections import Correction
-from tsfusion.wire.curve import ClientKeys, client_keys
+from tsfusion.wire.keys import key_folder
+from tsfusion.wire.records import codec
+from tsfusion.wire.records.corrections import Correction
+from tsfusion.wire.sockets import sockets
+from tsfusion.wire.sockets.curve import ClientKeys, client_keys
 
 DEADLINE = 120.0
 CAMERA = Intrinsics(40.0, 40.0, 31.5, 23.5)

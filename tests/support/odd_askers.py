@@ -20,10 +20,12 @@ from keyframes_and_servers import CAMERA, pose
 from odd_clients import drain, send, small_buffer
 
 from tsfusion import Keyframe
-from tsfusion.wire import codec, messages, questions, sockets
-from tsfusion.wire.forgetting import Selection
-from tsfusion.wire.messages import Command
-from tsfusion.wire.questions import MOST_POINTS, Cells, Field, Keyframes, Question, Raycast, Sample
+from tsfusion.wire.messages import messages, questions
+from tsfusion.wire.messages.forget_messages import Selection
+from tsfusion.wire.messages.messages import Command
+from tsfusion.wire.messages.questions import MOST_POINTS, Cells, Field, Keyframes, Question, Raycast, Sample
+from tsfusion.wire.records import codec
+from tsfusion.wire.sockets import sockets
 
 _LINKS = 24
 _FEW_RAYS = 3000

@@ -21,9 +21,11 @@ from hostile_messages import Frames, good, with_depth, with_header
 from keyframes_and_servers import CAMERA, connected, pose, wall
 
 from tsfusion import Intrinsics, Keyframe
-from tsfusion.wire import codec, messages, sockets
-from tsfusion.wire.curve import ClientKeys
-from tsfusion.wire.messages import PROTOCOL_VERSION, Command, Hello, Ping
+from tsfusion.wire.messages import messages
+from tsfusion.wire.messages.messages import PROTOCOL_VERSION, Command, Hello, Ping
+from tsfusion.wire.records import codec
+from tsfusion.wire.sockets import sockets
+from tsfusion.wire.sockets.curve import ClientKeys
 
 _PAUSE = 0.001
 _DEAF = 40

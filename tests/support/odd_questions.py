@@ -8,8 +8,8 @@ import numpy as np
 
 from tsfusion.core.config import Surface
 from tsfusion.geometry import se3
-from tsfusion.wire import questions
-from tsfusion.wire.questions import Cells, Field, Keyframes, Question, Raycast, Sample, Slice
+from tsfusion.wire.messages import questions
+from tsfusion.wire.messages.questions import Cells, Field, Keyframes, Question, Raycast, Sample, Slice
 
 EDGES = (0.0, -0.0, 1e-320, 1e-300, 1e-30, 1e-9, 0.04, 1.0, -1.0, 1e3, 1e6, 1e19, 1e39, 1e155, 1e300, -1e300)
 _LARGE = (0, 1, -1, 1 << 20, -(1 << 20), 1 << 31, -(1 << 31), (1 << 63) - 1, -(1 << 63))

@@ -6,11 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.config import VolumeConfig
-from tsfusion.kernels import integrate, ray_smoothing, runtime
-from tsfusion.kernels.voxel_traversal import COUNT, RAY_FIELDS, START, WEIGHT
-from tsfusion.tsdf.block_store import BlockStore, unpack_keys
-from tsfusion.tsdf.integrator import Integrator
-from tsfusion.tsdf.ray_buffers import BANDS, RayBuffers
+from tsfusion.kernels.base import runtime
+from tsfusion.kernels.base.voxel_traversal import COUNT, RAY_FIELDS, START, WEIGHT
+from tsfusion.kernels.integration import integrate, ray_smoothing
+from tsfusion.tsdf.integration.integrator import Integrator
+from tsfusion.tsdf.integration.ray_buffers import BANDS, RayBuffers
+from tsfusion.tsdf.store.block_store import BlockStore, unpack_keys
 
 QUANTA = integrate.QUANTA_PER_VOXEL
 Segment = tuple[NDArray[np.int64], NDArray[np.float64], int]  # end 2⁻¹⁰ voxel, direction, half 2⁻⁸ voxel

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from tsfusion.evaluation.trajectory_error import absolute_error
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
-from tsfusion.scanner.localization.localizer import Localizer, Lost, Pose
+from tsfusion.scanner.localization.localizer import Localizer, Lost, TrackedPose
 
 CAMERA = Intrinsics(292.5, 292.5, 159.5, 119.5)
 
@@ -20,7 +20,7 @@ CAMERA = Intrinsics(292.5, 292.5, 159.5, 119.5)
 class Track:
     """A localizer's answers, and the true poses of the frames."""
 
-    answers: list[Pose | Lost]
+    answers: list[TrackedPose | Lost]
     truth: list[NDArray[np.float64] | None]
 
     @property
@@ -29,12 +29,12 @@ class Track:
 
     @property
     def poses(self) -> NDArray[np.float64]:
-        return np.array([answer.T_world_camera for answer in self.answers if isinstance(answer, Pose)])
+        return np.array([answer.T_world_camera for answer in self.answers if isinstance(answer, TrackedPose)])
 
     def ate(self, count: int | None = None) -> float:
         """Millimetres, over the first `count` poses."""
         pairs = zip(self.answers, self.truth, strict=True)
-        truth = np.array([T for answer, T in pairs if isinstance(answer, Pose)])
+        truth = np.array([T for answer, T in pairs if isinstance(answer, TrackedPose)])
         return 1000 * absolute_error(self.poses[:count], truth[:count]).rmse
 
 

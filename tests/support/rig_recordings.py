@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from written_recordings import at, through_lens, views, write
 
 from tsfusion.datasets import Synthetic
-from tsfusion.datasets.synthetic import worlds
+from tsfusion.datasets.worlds import worlds
 from tsfusion.geometry.calibration import Camera
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.se3 import exp, inverse

@@ -9,12 +9,12 @@ import numpy as np
 from keyframes_and_servers import CAMERA, SHAPE, pose
 from rosbag_writing import BODY, OPTICAL, WORLD, BagWriter, writing
 
-from tsfusion.datasets.rosbag.dataset import Bag
+from tsfusion.datasets.rosbag.bag import Bag
 from tsfusion.geometry import se3
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.journal import Journal
 from tsfusion.journal.state_folder import JournalPlace
-from tsfusion.wire import codec
+from tsfusion.wire.records import codec
 
 T0, FRAME_NS = 1_700_000_000_123_456_789, 33_333_333
 T_BODY_OPTICAL = se3.exp(np.array([0.1, -0.05, 0.3, 1.2, -1.1, 1.3]))

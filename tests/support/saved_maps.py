@@ -10,11 +10,11 @@ from keyframes_and_servers import VOLUME, wall
 
 from tsfusion import Keyframe, VolumeConfig
 from tsfusion.core.config import SERVER_SESSION
+from tsfusion.fuser.fuser_messages import SessionProgress
 from tsfusion.fuser.map_checkpoints import MapCheckpoints
-from tsfusion.fuser.messages import SessionProgress
 from tsfusion.journal import Journal, state_folder
-from tsfusion.wire import codec, corrections
-from tsfusion.wire.codec import decode_keyframe
+from tsfusion.wire.records import codec, corrections
+from tsfusion.wire.records.codec import decode_keyframe
 
 ANNA, BOB = b"a" * 16, b"b" * 16
 

@@ -21,8 +21,8 @@ from msgspec import Struct
 
 from tsfusion import Client, Intrinsics, Keyframe, journal
 from tsfusion.core.config import SERVER_SESSION, ClientConfig
-from tsfusion.wire.keyframe_times import KeyframeTimes
-from tsfusion.wire.record_header import CorrectionHeader, unpack, unpack_keyframe
+from tsfusion.wire.messages.keyframe_times import KeyframeTimes
+from tsfusion.wire.records.record_header import CorrectionHeader, unpack, unpack_keyframe
 
 LOST = 3  # exit status
 
@@ -122,7 +122,7 @@ def journals(state: Path) -> list[Path]:
 
 def save_room(path: Path, count: int, width: int) -> None:
     """Views of the synthetic room, so that it is rendered once and not by each scanner."""
-    from tsfusion.datasets.synthetic.dataset import Synthetic
+    from tsfusion.datasets.worlds.synthetic import Synthetic
 
     views = list(Synthetic("room", count=count, width=width, path="tour"))
     np.savez(

@@ -12,10 +12,12 @@ from typing import Any
 import zmq
 
 from tsfusion.core.errors import TransportError
-from tsfusion.gateway.access_control import ZapHandler
-from tsfusion.wire import codec, messages, sockets
-from tsfusion.wire.curve import ServerKeys
-from tsfusion.wire.record_header import KeyframeHeader
+from tsfusion.gateway.ports.access_control import ZapHandler
+from tsfusion.wire.messages import messages
+from tsfusion.wire.records import codec
+from tsfusion.wire.records.record_header import KeyframeHeader
+from tsfusion.wire.sockets import sockets
+from tsfusion.wire.sockets.curve import ServerKeys
 
 
 def number(header: KeyframeHeader) -> int:

@@ -12,13 +12,15 @@ from idle_fuser import COMMAND
 from keyframes_and_servers import until, wall
 
 from tsfusion.core.config import ServerConfig, VolumeConfig
-from tsfusion.gateway import fuser_process, fuser_supervisor
-from tsfusion.gateway.access_control import AccessControl
+from tsfusion.gateway.fusers import fuser_process, fuser_supervisor
 from tsfusion.gateway.gateway import Gateway
-from tsfusion.gateway.metrics import Metrics
-from tsfusion.gateway.ports import Ports
-from tsfusion.wire import codec, messages, sockets
-from tsfusion.wire.record_header import stamp
+from tsfusion.gateway.health.metrics import Metrics
+from tsfusion.gateway.ports.access_control import AccessControl
+from tsfusion.gateway.ports.ports import Ports
+from tsfusion.wire.messages import messages
+from tsfusion.wire.records import codec
+from tsfusion.wire.records.record_header import stamp
+from tsfusion.wire.sockets import sockets
 
 
 class Served:

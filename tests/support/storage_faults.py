@@ -25,8 +25,8 @@ from syscall_faults import SHORT, Call, Watcher, install
 
 from tsfusion.core.errors import JournalError, TsfusionError
 from tsfusion.delivery.spool import Spool, Waiting
+from tsfusion.fuser.fuser_messages import SessionProgress
 from tsfusion.fuser.map_checkpoints import MapCheckpoints
-from tsfusion.fuser.messages import SessionProgress
 from tsfusion.journal import Journal, Unwritten
 
 SESSION = bytes(range(16))

@@ -140,8 +140,8 @@ def take_the_place_of_volume() -> None:
     """Have this process's fuser make such maps."""
     for name, its in (
         ("tsdf.volume", {"Volume": SumMap}),
-        ("tsdf.integrator", {"KeyframeQuota": lambda *limits: limits}),
-        ("kernels.runtime", {"start": lambda _: None}),
+        ("tsdf.integration.integrator", {"KeyframeQuota": lambda *limits: limits}),
+        ("kernels.base.runtime", {"start": lambda _: None}),
     ):
         module = ModuleType(name)
         vars(module).update(its)

@@ -8,7 +8,14 @@ from numpy.typing import NDArray
 
 from tsfusion import Mesh, Volume
 from tsfusion.core.config import Surface
-from tsfusion.wire.map_events import Cleared, LinkSeen, MapEvent, PathsFound, ScannerSeen, SurfaceUpdate
+from tsfusion.wire.asking.map_events import (
+    Cleared,
+    LinkSeen,
+    MapEvent,
+    PathsFound,
+    ScannerSeen,
+    SurfaceUpdate,
+)
 
 Cell = tuple[int, int, int]
 Surfaces = dict[Cell, frozenset[bytes]]  # the triangles of each cell that has some, as bytes of their corners

@@ -12,7 +12,7 @@ from geometry_checks import warp_residual
 from numpy.typing import NDArray
 
 from tsfusion.datasets import Dataset, Synthetic
-from tsfusion.datasets.synthetic import worlds
+from tsfusion.datasets.worlds import worlds
 from tsfusion.geometry.calibration import Camera
 from tsfusion.geometry.keyframe import Intrinsics, Keyframe, depth_metres
 from tsfusion.geometry.se3 import inverse

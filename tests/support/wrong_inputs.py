@@ -27,7 +27,7 @@ from idle_fuser import keeping
 from small_recordings import kitti, seven_scenes
 
 import tsfusion
-from tsfusion.wire import key_folder
+from tsfusion.wire.keys import key_folder
 
 SCAN = "scan"
 NOBODY = "tcp://127.0.0.1:9"  # the discard port: nobody listens there, and nobody may without being root
@@ -566,8 +566,8 @@ def run_command(line: str) -> tuple[int, str]:
     try:
         with (
             mock.patch.dict(os.environ, variables),
-            mock.patch("tsfusion.wire.queries._PING_TIMEOUT", 0.2),
-            mock.patch("tsfusion.pipelines.engine.LINGER", 0.2),
+            mock.patch("tsfusion.wire.asking.queries._PING_TIMEOUT", 0.2),
+            mock.patch("tsfusion.pipelines.runs.engine.LINGER", 0.2),
             contextlib.redirect_stdout(out),
             contextlib.redirect_stderr(err),
         ):

@@ -4,8 +4,8 @@
 import numpy as np
 from ray_maps import CASES, RayMap
 
-from tsfusion.kernels import block_hash, runtime
-from tsfusion.tsdf.growing_array import GrowingArray
+from tsfusion.kernels.base import block_hash, runtime
+from tsfusion.tsdf.store.growing_array import GrowingArray
 
 
 def test_the_map_hash_finds_what_was_inserted_and_nothing_else() -> None:

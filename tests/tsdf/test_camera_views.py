@@ -6,7 +6,7 @@ import pytest
 
 from tsfusion import Intrinsics, InvalidConfig, Keyframe, Volume
 from tsfusion.core.config import Surface
-from tsfusion.tsdf import camera_views
+from tsfusion.tsdf.answers import camera_views
 
 CAMERA = Intrinsics(100.0, 100.0, 79.5, 59.5)
 SHAPE = (120, 160)

@@ -10,7 +10,7 @@ from formula_scenes import plane_keyframe, sphere_views, volume_of
 
 from tsfusion import Keyframe, Volume
 from tsfusion.core.errors import KeyframeTooLarge, MapError, MapFull, MapQuota, WeightOverflow
-from tsfusion.tsdf.integrator import CARVED_COST, KeyframeQuota
+from tsfusion.tsdf.integration.integrator import CARVED_COST, KeyframeQuota
 
 VIEWS = sphere_views(0.4, 4)
 WALL = plane_keyframe(np.eye(4), np.array([0.0, 0.0, 1.0]), 2.0)

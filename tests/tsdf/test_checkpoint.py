@@ -20,9 +20,9 @@ from formula_scenes import sphere_views, volume_of
 
 from tsfusion import Volume, VolumeConfig
 from tsfusion.core.errors import CheckpointError, DamagedCheckpoint, InvalidConfig, MapFull, WeightOverflow
-from tsfusion.tsdf import checkpoint
-from tsfusion.tsdf.block_store import pack_keys
+from tsfusion.tsdf.files import checkpoint
 from tsfusion.tsdf.readable_map import begin_hash
+from tsfusion.tsdf.store.block_store import pack_keys
 
 VIEWS = sphere_views(0.4, 4)
 
@@ -322,7 +322,7 @@ import hashlib, os, signal, struct, sys
 from pathlib import Path
 import numpy as np
 from tsfusion import VolumeConfig
-from tsfusion.tsdf import checkpoint
+from tsfusion.tsdf.files import checkpoint
 
 path, numbers = Path(sys.argv[1]), np.arange(3000, dtype=np.int64)
 

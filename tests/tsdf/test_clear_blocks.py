@@ -16,11 +16,12 @@ from thin_obstacles import BAR_HEIGHT, POSTS, scans, views
 from tsfusion import Keyframe, MapFull, Volume
 from tsfusion.core.errors import DamagedCheckpoint
 from tsfusion.geometry.map_grids import FREE, OCCUPIED, UNSEEN
-from tsfusion.kernels import runtime
-from tsfusion.tsdf import checkpoint, clear_blocks
-from tsfusion.tsdf.block_store import unpack_keys
-from tsfusion.tsdf.clear_blocks import ClearBlocks
-from tsfusion.tsdf.saved_map_addition import add_files
+from tsfusion.kernels.base import runtime
+from tsfusion.tsdf.files import checkpoint
+from tsfusion.tsdf.files.saved_map_addition import add_files
+from tsfusion.tsdf.store import clear_blocks
+from tsfusion.tsdf.store.block_store import unpack_keys
+from tsfusion.tsdf.store.clear_blocks import ClearBlocks
 
 SIDE = 3.0  # of a room around the origin, metres
 VIEWS = sphere_views(0.4, 6)

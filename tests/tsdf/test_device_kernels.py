@@ -15,12 +15,13 @@ from formula_scenes import sphere_views
 
 from tsfusion import Keyframe, Volume
 from tsfusion.core.errors import KeyframeTooLarge, MapFull, MapQuota
-from tsfusion.kernels import device_copies, runtime
-from tsfusion.kernels.device_copies import Copies, CudaCopies
-from tsfusion.kernels.device_told import APART, NEW
-from tsfusion.tsdf import device_blocks, device_map, device_trial
-from tsfusion.tsdf.checkpoint import LAYER_DTYPES
-from tsfusion.tsdf.integrator import KeyframeQuota
+from tsfusion.kernels.base import runtime
+from tsfusion.kernels.device import device_copies
+from tsfusion.kernels.device.device_copies import Copies, CudaCopies
+from tsfusion.kernels.device.device_told import APART, NEW
+from tsfusion.tsdf.device import device_blocks, device_map, device_trial
+from tsfusion.tsdf.integration.integrator import KeyframeQuota
+from tsfusion.tsdf.store.growing_array import LAYER_DTYPES
 
 VIEWS = sphere_views(0.4, 4)
 COLOR = np.random.default_rng(1).integers(0, 256, (*VIEWS[0].shape, 3), np.uint8)

@@ -16,8 +16,8 @@ from formula_scenes import sphere_views
 from tsfusion import Keyframe, Volume
 from tsfusion.core.config import Arch, VolumeConfig, make_settings
 from tsfusion.core.errors import InvalidConfig, MapError, MapFull
-from tsfusion.tsdf import device_link
-from tsfusion.tsdf.device_link import DeviceLost
+from tsfusion.tsdf.device import device_link
+from tsfusion.tsdf.device.device_link import DeviceLost
 
 VIEWS = sphere_views(0.4, 4)
 COLOR = np.random.default_rng(1).integers(0, 256, (*VIEWS[0].shape, 3), np.uint8)

@@ -15,9 +15,9 @@ from scipy.ndimage import distance_transform_edt
 from tsfusion import DistanceField, Volume
 from tsfusion.core import durable_files
 from tsfusion.core.errors import InvalidConfig, MapError
-from tsfusion.kernels import distance_transform as kernels
-from tsfusion.kernels import runtime
-from tsfusion.tsdf import distance_fields
+from tsfusion.kernels.answers import distance_transform as kernels
+from tsfusion.kernels.base import runtime
+from tsfusion.tsdf.answers import distance_fields
 
 RADIUS, VOXEL = 0.4, 0.03
 BOX = (-0.8, -0.8, -0.8, 0.8, 0.8, 0.8)

@@ -16,11 +16,11 @@ from formula_scenes import sphere_views, tilted_plane, volume_of, with_noise
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from tsfusion.tsdf import field_regularizer
-from tsfusion.tsdf.block_store import pack_keys
-from tsfusion.tsdf.field_regularizer import FieldSettings, along_normals, solve
-from tsfusion.tsdf.mesh_extraction import extract
-from tsfusion.tsdf.surface_values import values_of
+from tsfusion.tsdf.store.block_store import pack_keys
+from tsfusion.tsdf.surface import field_regularizer
+from tsfusion.tsdf.surface.field_regularizer import FieldSettings, along_normals, solve
+from tsfusion.tsdf.surface.mesh_extraction import extract
+from tsfusion.tsdf.surface.surface_values import values_of
 
 QUANTA = 60
 SETTINGS = FieldSettings(smoothness=10.0, edge=0.03, reweightings=2)
@@ -136,7 +136,7 @@ def test_a_shift_by_whole_blocks_and_the_order_of_slots_change_no_bit(settings: 
 
 def test_threads_change_no_bit() -> None:
     program = (
-        "import test_field_regularizer as t; from tsfusion.kernels import runtime;"
+        "import test_field_regularizer as t; from tsfusion.kernels.base import runtime;"
         "runtime.start({}); d, w = t.noisy_roof(6); k, s = t.map_of(d, w, (0, 0, 0));"
         "print(t.digest(t.solve(k, t.store_of(k, s), 1.0, settings=t.STRONG)))"
     )

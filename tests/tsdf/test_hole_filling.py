@@ -14,11 +14,11 @@ from tsfusion import Mesh, Volume
 from tsfusion.core.errors import InvalidConfig
 from tsfusion.geometry import guessed_patches
 from tsfusion.geometry.mesh_simplification import border_edges
-from tsfusion.tsdf import hole_filling
-from tsfusion.tsdf.block_store import pack_keys
-from tsfusion.tsdf.hole_filling import extract_filled
-from tsfusion.tsdf.mesh_extraction import extract
-from tsfusion.tsdf.surface_values import values_of
+from tsfusion.tsdf.store.block_store import pack_keys
+from tsfusion.tsdf.surface import hole_filling
+from tsfusion.tsdf.surface.hole_filling import extract_filled
+from tsfusion.tsdf.surface.mesh_extraction import extract
+from tsfusion.tsdf.surface.surface_values import values_of
 
 SIDE = 64  # voxels
 QUANTA = 60

@@ -8,9 +8,9 @@ from formula_scenes import sphere_views, volume_of, with_noise
 from numpy.typing import NDArray
 
 from tsfusion import Keyframe, Volume
-from tsfusion.tsdf import kept_values
-from tsfusion.tsdf.block_store import BlockStore
-from tsfusion.tsdf.kept_values import KeptValues
+from tsfusion.tsdf.store.block_store import BlockStore
+from tsfusion.tsdf.surface import kept_values
+from tsfusion.tsdf.surface.kept_values import KeptValues
 
 HUNDREDTH = 0.6  # quanta: of a voxel
 

@@ -17,8 +17,8 @@ from tsfusion.core.config import SERVER_SESSION
 from tsfusion.core.errors import MapError, MapFull, WeightOverflow
 from tsfusion.journal import state_folder
 from tsfusion.journal.keyframe_poses import KeyframePoses
-from tsfusion.kernels.integrate import COLOR_LIMIT, WEIGHT_LIMIT, WEIGHT_MASK
-from tsfusion.tsdf.map_history import of_clients, sessions
+from tsfusion.kernels.integration.integrate import COLOR_LIMIT, WEIGHT_LIMIT, WEIGHT_MASK
+from tsfusion.tsdf.files.map_history import of_clients, sessions
 
 VIEWS = sphere_views(0.4, 6)
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tsfusion import MissingDependency, Volume
-from tsfusion.tsdf.block_store import unpack_keys
+from tsfusion.tsdf.store.block_store import unpack_keys
 
 VOXEL = 0.02
 

@@ -9,8 +9,8 @@ from formula_scenes import sphere_views, volume_of
 
 from tsfusion import Volume
 from tsfusion.core.config import Surface
-from tsfusion.tsdf.block_store import cells_of
-from tsfusion.tsdf.map_cells import CellMeshes
+from tsfusion.tsdf.store.block_store import cells_of
+from tsfusion.tsdf.surface.map_cells import CellMeshes
 
 VOXEL = 0.03
 SURFACES: tuple[Surface, ...] = ("raw", "normal", "field")

@@ -12,7 +12,7 @@ from saved_maps import make_map
 from tsfusion import Volume
 from tsfusion.core.errors import InvalidConfig, MapError
 from tsfusion.journal import state_folder
-from tsfusion.tsdf.block_store import unpack_keys
+from tsfusion.tsdf.store.block_store import unpack_keys
 
 VIEWS = sphere_views(0.4, 6)
 FAR = 100.0

@@ -7,7 +7,7 @@ from formula_scenes import look_at, plane_keyframe, sphere_views, volume_of
 
 from tsfusion import Keyframe
 from tsfusion.core.errors import InvalidConfig, MapError
-from tsfusion.tsdf.map_difference import COLORS
+from tsfusion.tsdf.sums.map_difference import COLORS
 
 VIEWS = sphere_views(0.4, 6)
 UP = np.array([0.0, 0.0, 1.0])

@@ -16,9 +16,9 @@ from tsfusion import Keyframe, Volume
 from tsfusion.core import durable_files, process
 from tsfusion.core.config import CacheConfig
 from tsfusion.core.errors import InvalidConfig, MapFull
-from tsfusion.tsdf import field_regularizer
-from tsfusion.tsdf.growing_array import FileArray
-from tsfusion.tsdf.residency import GROUP, Residency
+from tsfusion.tsdf.store.growing_array import FileArray
+from tsfusion.tsdf.store.residency import GROUP, Residency
+from tsfusion.tsdf.surface import field_regularizer
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="memory_bytes needs Linux")
 

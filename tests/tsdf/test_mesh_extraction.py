@@ -20,10 +20,10 @@ from scipy.spatial import cKDTree
 from lab.evaluation import stanford_bunny
 from tsfusion import Mesh, Volume
 from tsfusion.core.errors import InvalidConfig
-from tsfusion.kernels import surface_cells
-from tsfusion.tsdf import mesh_extraction
-from tsfusion.tsdf.block_store import BlockStore, cells_of, pack_keys, unpack_keys
-from tsfusion.tsdf.mesh_extraction import MeshBuffers, extract
+from tsfusion.kernels.surface import surface_cells
+from tsfusion.tsdf.store.block_store import BlockStore, cells_of, pack_keys, unpack_keys
+from tsfusion.tsdf.surface import mesh_extraction
+from tsfusion.tsdf.surface.mesh_extraction import MeshBuffers, extract
 
 
 def edge_uses(faces: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int64]]:

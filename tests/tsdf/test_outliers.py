@@ -13,9 +13,9 @@ from scipy.spatial import cKDTree
 
 from tsfusion import Intrinsics, Keyframe, Mesh, Volume
 from tsfusion.datasets import Synthetic
-from tsfusion.kernels.integrate import QUANTA_PER_VOXEL
-from tsfusion.kernels.surface_cells import NO_LIMITS
-from tsfusion.tsdf.block_store import unpack_keys
+from tsfusion.kernels.integration.integrate import QUANTA_PER_VOXEL
+from tsfusion.kernels.surface.surface_cells import NO_LIMITS
+from tsfusion.tsdf.store.block_store import unpack_keys
 
 WALL = plane_keyframe(np.eye(4), np.array([0.0, 0.0, 1.0]), 2.0)
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tsfusion import InvalidConfig, Keyframe, Volume
 from tsfusion.geometry.map_answers import Samples
-from tsfusion.tsdf.block_store import pack_keys
+from tsfusion.tsdf.store.block_store import pack_keys
 
 VOXEL = 0.05
 FINE = 1 << 16  # of a voxel
@@ -33,7 +33,7 @@ def volume() -> Volume:
 
 
 def expected(volume: Volume, points: NDArray[np.floating], min_weight: float = 0.25) -> Samples:
-    """The twin of `kernels.point_sampling`: of the sums, voxel by voxel."""
+    """The twin of `kernels.answers.point_sampling`: of the sums, voxel by voxel."""
     store = volume._store
     slots = {int(key): slot for slot, key in enumerate(store.keys)}
     found = np.full(len(points), np.nan), np.zeros(len(points)), np.full((len(points), 3), np.nan)

@@ -10,8 +10,8 @@ from ray_maps import QUANTA, RayMap, rays_of
 
 from tsfusion import Intrinsics, Keyframe
 from tsfusion.core.config import SENSORS, VolumeConfig
-from tsfusion.kernels import runtime
-from tsfusion.tsdf.ray_buffers import BANDS, RayBuffers, model_parameters
+from tsfusion.kernels.base import runtime
+from tsfusion.tsdf.integration.ray_buffers import BANDS, RayBuffers, model_parameters
 
 
 @pytest.fixture(scope="module", autouse=True)

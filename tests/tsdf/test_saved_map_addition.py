@@ -10,9 +10,9 @@ from keyframes_and_servers import wall
 
 from tsfusion import Keyframe, Volume
 from tsfusion.core.errors import DamagedCheckpoint, MapError, MapFull, WeightOverflow
-from tsfusion.kernels.integrate import WEIGHT_LIMIT
-from tsfusion.tsdf import checkpoint, saved_map_addition
-from tsfusion.tsdf.saved_map_addition import add_files
+from tsfusion.kernels.integration.integrate import WEIGHT_LIMIT
+from tsfusion.tsdf.files import checkpoint, saved_map_addition
+from tsfusion.tsdf.files.saved_map_addition import add_files
 
 
 def volume(*keyframes: Keyframe, **settings: object) -> Volume:
@@ -49,13 +49,13 @@ def test_the_sum_of_files_is_the_map_of_all(
         files = [volume(*KEYFRAMES[i::3]).save(tmp_path / f"{i}.tsf", meta={"part": i}) for i in range(3)]
     files.append(volume().save(tmp_path / "empty.tsf"))
     passed = []
-    pass_on = saved_map_addition._Stream.pass_on
+    pass_on = saved_map_addition._BlockStream.pass_on
 
     def counted(self: Any, digest: Any) -> Any:
         passed.append(self)
         return pass_on(self, digest)
 
-    monkeypatch.setattr(saved_map_addition._Stream, "pass_on", counted)
+    monkeypatch.setattr(saved_map_addition._BlockStream, "pass_on", counted)
     header = add_files(files, tmp_path / "sum.tsf")
     made, whole = Volume.load(tmp_path / "sum.tsf", threads=1), volume(*KEYFRAMES)
     assert whole.stats().blocks > 1024  # the hash is taken in more than one run

@@ -9,8 +9,9 @@ from formula_scenes import sphere_views, volume_of
 
 from tsfusion import Keyframe, Samples, View, Volume
 from tsfusion.core.config import Surface
-from tsfusion.tsdf import camera_views, point_samples, surface_tiles
-from tsfusion.tsdf.block_store import ASKED
+from tsfusion.tsdf.answers import camera_views, point_samples
+from tsfusion.tsdf.store.block_store import ASKED
+from tsfusion.tsdf.surface import surface_tiles
 
 VOXEL = 0.03
 SURFACES: tuple[Surface, ...] = ("raw", "normal", "field")

@@ -14,12 +14,12 @@ from gltf_validation import problems
 from lab.evaluation import view_colors
 from tsfusion import Keyframe, Volume
 from tsfusion.core.errors import InvalidConfig, MapError
-from tsfusion.datasets.synthetic.dataset import Synthetic
+from tsfusion.datasets.worlds.synthetic import Synthetic
 from tsfusion.geometry import se3
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.textured_mesh import TexturedMesh
-from tsfusion.tsdf import texture_fitting, texturing
-from tsfusion.tsdf.texturing import TextureSettings
+from tsfusion.tsdf.texture import texture_fitting, texturing
+from tsfusion.tsdf.texture.texturing import TextureSettings
 
 pytest.importorskip("xatlas")
 

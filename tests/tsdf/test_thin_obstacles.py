@@ -9,7 +9,7 @@ from thin_obstacles import BAR_HEIGHT, POSTS, VOXEL, scans, views
 
 from tsfusion import MapError, Volume, VolumeConfig
 from tsfusion.geometry.map_grids import FREE, OCCUPIED
-from tsfusion.tsdf.saved_map_addition import add_files
+from tsfusion.tsdf.files.saved_map_addition import add_files
 
 
 def check_not_free(volume: Volume, folder: Path, *, bar: bool) -> None:

@@ -37,11 +37,11 @@ from tsfusion.core.errors import (
 )
 from tsfusion.geometry.keyframe import KeyframeFields
 from tsfusion.geometry.map_grids import OwnSliceSettings
-from tsfusion.kernels import integrate, ray_smoothing
-from tsfusion.kernels.integrate import QUANTA_PER_VOXEL
-from tsfusion.kernels.voxel_traversal import ADDED, COST, COUNT
-from tsfusion.tsdf.block_store import cells_of, unpack_keys
-from tsfusion.tsdf.integrator import KeyframeQuota
+from tsfusion.kernels.base.voxel_traversal import ADDED, COST, COUNT
+from tsfusion.kernels.integration import integrate, ray_smoothing
+from tsfusion.kernels.integration.integrate import QUANTA_PER_VOXEL
+from tsfusion.tsdf.integration.integrator import KeyframeQuota
+from tsfusion.tsdf.store.block_store import cells_of, unpack_keys
 
 VIEWS = sphere_views(0.4, 8)
 
@@ -337,7 +337,7 @@ def test_whatever_fails_leaves_the_map_as_it_was(monkeypatch: pytest.MonkeyPatch
 
             patched.setattr(integrate, "add_rays", add)
         else:
-            patched.setattr("tsfusion.kernels.integrate.largest_weights", fail)
+            patched.setattr("tsfusion.kernels.integration.integrate.largest_weights", fail)
         with pytest.raises(MemoryError):
             volume.integrate(VIEWS[5])
     assert bytes_of(volume) == before
@@ -390,7 +390,7 @@ def test_a_still_camera_can_carve_for_long() -> None:
 
 def test_a_keyframe_too_heavy_for_one_go_gives_the_same_map(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = volume_of(VIEWS[:3])
-    monkeypatch.setattr("tsfusion.tsdf.integrator.PART_WEIGHT", 20_000)
+    monkeypatch.setattr("tsfusion.tsdf.integration.integrator.PART_WEIGHT", 20_000)
     parts = volume_of(VIEWS[:3])
     assert len(list(parts._integrator._parts())) > 3
     assert parts.map_hash() == whole.map_hash()
@@ -518,7 +518,7 @@ def test_kernels_stay_in_bounds() -> None:
     """Taichi's debug mode checks every array access; it needs a process of its own."""
     script = (
         "import numpy as np, formula_scenes\n"
-        "from tsfusion.kernels import runtime\n"
+        "from tsfusion.kernels.base import runtime\n"
         "from tsfusion import Volume, Keyframe\n"
         "import taichi as ti\n"
         "ti.init(arch=ti.cpu, debug=True, offline_cache=True, log_level=ti.ERROR)\n"

@@ -13,7 +13,7 @@ from formula_scenes import sphere_views, volume_of
 
 from tsfusion import Volume
 from tsfusion.core.errors import MapError
-from tsfusion.datasets.synthetic.dataset import Synthetic
+from tsfusion.datasets.worlds.synthetic import Synthetic
 
 VIEWS = sphere_views(0.4, 4)
 USES: list[Callable[[Volume], object]] = [

@@ -13,8 +13,8 @@ from formula_scenes import sphere_views, volume_of
 from tsfusion import Volume
 from tsfusion.core.errors import InvalidConfig, MissingDependency, OutputError
 from tsfusion.geometry import openvdb_files
-from tsfusion.tsdf import voxel_arrays
-from tsfusion.tsdf.voxel_arrays import FieldName
+from tsfusion.tsdf.files import voxel_arrays
+from tsfusion.tsdf.files.voxel_arrays import FieldName
 
 VIEWS = sphere_views(0.4, 5)
 READ_BY_OPENVDB = "b462b416a0a428f11a815ff535cacd6790376a4996c5b3835095aa23c5ff1a2f"

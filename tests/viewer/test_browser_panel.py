@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tsfusion.viewer import browser_panel
-from tsfusion.viewer.browser_panel import BY_HAND, WHOLE, BrowserPanel
-from tsfusion.viewer.map_views import View
+from tsfusion.viewer.map.map_views import PageCamera
+from tsfusion.viewer.panels import browser_panel
+from tsfusion.viewer.panels.browser_panel import BY_HAND, WHOLE, BrowserPanel
 
 UP = np.array((0.0, 0, 1))
 FIRST, SECOND = np.array((5.0, 0, 0)), np.array((9.0, 0, 0))
@@ -22,7 +22,7 @@ class Browser:
     """A browser that tells where its camera is when it is asked to, and the panel of it."""
 
     def __init__(self) -> None:
-        self.whole = View(FIRST, np.zeros(3), UP)
+        self.whole = PageCamera(FIRST, np.zeros(3), UP)
         self._camera = camera = SimpleNamespace(position=np.zeros(3), aspect=1.6)
         camera.on_update = lambda tell: setattr(self, "_tell", tell)
         client = MagicMock(camera=camera, gui=MagicMock(add_dropdown=self._dropdown))
@@ -30,7 +30,7 @@ class Browser:
         self.panel = BrowserPanel(client, shown, nullcontext(), nullcontext(), ["Picture"])
         self.panel.update()
 
-    def _whole_view(self, aspect: float, covered: float) -> View:
+    def _whole_view(self, aspect: float, covered: float) -> PageCamera:
         self.covered = covered
         return self.whole
 
@@ -43,7 +43,7 @@ class Browser:
         self._tell(None)
 
     def grows(self) -> None:
-        self.whole = View(SECOND, np.zeros(3), UP)
+        self.whole = PageCamera(SECOND, np.zeros(3), UP)
         self.panel.update()
 
 

@@ -4,7 +4,7 @@
 import numpy as np
 from formula_scenes import sphere_views, volume_of
 
-from tsfusion.viewer.clipping import Clipping
+from tsfusion.viewer.map.clipping import Clipping
 
 SLANTED = np.array((0.6, 0.0, 0.8))
 

@@ -17,14 +17,14 @@ from reading_browser import ReadingBrowser
 
 from tsfusion import Intrinsics, Keyframe, Volume
 from tsfusion.geometry.trajectory import quaternion
-from tsfusion.viewer.page_server import PageServer
-from tsfusion.wire.map_events import LinkSeen
+from tsfusion.viewer.page.page_server import PageServer
+from tsfusion.wire.asking.map_events import LinkSeen
 
 pytest.importorskip("viser", reason="the page is viser's (pip install 'tsfusion[viewer]')")
 
-from tsfusion.viewer import browser_panel
-from tsfusion.viewer.calm_callbacks import calm
 from tsfusion.viewer.live_page import LivePage
+from tsfusion.viewer.page.calm_callbacks import calm
+from tsfusion.viewer.panels import browser_panel
 
 DEADLINE = 60.0
 CAMERA = Intrinsics(160.0, 160.0, 119.5, 89.5)

@@ -8,9 +8,9 @@ from growing_maps import SESSION, GrowingMap, surface_update
 
 from tsfusion import Volume
 from tsfusion.geometry.mesh import Mesh
-from tsfusion.viewer import map_tiles
-from tsfusion.viewer.map_tiles import MapTiles
-from tsfusion.wire.map_events import SurfaceUpdate
+from tsfusion.viewer.map import map_tiles
+from tsfusion.viewer.map.map_tiles import MapTiles
+from tsfusion.wire.asking.map_events import SurfaceUpdate
 
 RADIUS = 0.3
 

@@ -7,9 +7,9 @@ import pytest
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.up_direction import HeldSensor
-from tsfusion.viewer.map_tiles import MapTiles
-from tsfusion.viewer.map_up import MapUp
-from tsfusion.wire.map_events import PathsFound, ScannerSeen, SurfaceUpdate
+from tsfusion.viewer.map.map_tiles import MapTiles
+from tsfusion.viewer.map.map_up import MapUp
+from tsfusion.wire.asking.map_events import PathsFound, ScannerSeen, SurfaceUpdate
 
 
 def floor(axis: int, height: float) -> SurfaceUpdate:

@@ -6,15 +6,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tsfusion.viewer import map_views
-from tsfusion.viewer.map_tiles import MapTiles
+from tsfusion.viewer.map import map_views
+from tsfusion.viewer.map.map_tiles import MapTiles
 
 
 @pytest.fixture
 def views(monkeypatch: pytest.MonkeyPatch) -> map_views.WholeViews:
     """Views of a map of some points."""
     points = np.random.default_rng(1).random((200, 3))
-    monkeypatch.setattr(map_views, "sample", lambda tiles: map_views.Sample(points, points - 0.5))
+    monkeypatch.setattr(map_views, "sample", lambda tiles: map_views.ShownPoint(points, points - 0.5))
     return map_views.WholeViews(MapTiles())
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from tsfusion.viewer.page_messages import checked
+from tsfusion.viewer.page.page_messages import checked
 
 SLIDER = SimpleNamespace(value=0.5, min=0.0, max=1.0)
 RANGE = SimpleNamespace(value=(0.0, 1.0), min=0.0, max=1.0)

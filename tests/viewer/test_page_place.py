@@ -4,8 +4,8 @@
 import pytest
 
 from tsfusion.core.errors import InvalidConfig, MissingDependency
-from tsfusion.viewer import page_place
-from tsfusion.viewer.page_server import PageServer
+from tsfusion.viewer.page import page_place
+from tsfusion.viewer.page.page_server import PageServer
 
 
 def test_places() -> None:

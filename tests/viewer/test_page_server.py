@@ -20,9 +20,9 @@ from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
 from tsfusion.core.errors import InvalidConfig, TransportError
-from tsfusion.viewer import page_server
-from tsfusion.viewer.page_guard import PageGuard
-from tsfusion.viewer.page_server import PageServer
+from tsfusion.viewer.page import page_server
+from tsfusion.viewer.page.page_guard import PageGuard
+from tsfusion.viewer.page.page_server import PageServer
 
 TOKEN = "open-sesame"
 DEADLINE = 30.0

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from test_map_tiles import RADIUS, grown
 
-from tsfusion.viewer.clipping import Clipping
-from tsfusion.viewer.map_tiles import MapTiles
-from tsfusion.viewer.map_views import first_hit
+from tsfusion.viewer.map.clipping import Clipping
+from tsfusion.viewer.map.map_tiles import MapTiles
+from tsfusion.viewer.map.map_views import first_hit
 
 
 @pytest.fixture(scope="module")

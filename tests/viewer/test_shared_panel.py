@@ -10,8 +10,8 @@ from growing_maps import GrowingMap
 
 from tsfusion import Volume
 from tsfusion.viewer.map_feed import TimeLine
-from tsfusion.viewer.page_server import PageServer
-from tsfusion.viewer.shared_panel import SharedPanel
+from tsfusion.viewer.page.page_server import PageServer
+from tsfusion.viewer.panels.shared_panel import SharedPanel
 
 pytest.importorskip("viser", reason="the page is viser's (pip install 'tsfusion[viewer]')")
 

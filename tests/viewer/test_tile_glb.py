@@ -8,7 +8,7 @@ import pytest
 from drawn_scenes import decoded
 from gltf_validation import problems
 
-from tsfusion.viewer import tile_glb
+from tsfusion.viewer.map import tile_glb
 
 VOXEL = 0.02
 

@@ -10,12 +10,12 @@ from drawn_scenes import DrawnScene, decoded
 
 from tsfusion.core.rates import Bucket
 from tsfusion.geometry.mesh import Mesh
-from tsfusion.viewer.clipping import Clipping
-from tsfusion.viewer.map_tiles import CELL, EDGE, MapTiles
-from tsfusion.viewer.tile_look import MOST_UNREAD, OwnLook
-from tsfusion.viewer.tile_nodes import PAUSE, ROOT, STEADY_PAUSE, TileNodes
-from tsfusion.viewer.vertex_colors import VertexColors
-from tsfusion.wire.map_events import SurfaceUpdate
+from tsfusion.viewer.map.clipping import Clipping
+from tsfusion.viewer.map.map_tiles import CELL, EDGE, MapTiles
+from tsfusion.viewer.map.tile_look import MOST_UNREAD, OwnLook
+from tsfusion.viewer.map.tile_nodes import PAUSE, ROOT, STEADY_PAUSE, TileNodes
+from tsfusion.viewer.map.vertex_colors import VertexColors
+from tsfusion.wire.asking.map_events import SurfaceUpdate
 
 VOXEL = 0.02
 LONG = EDGE * CELL * VOXEL  # metres along a tile's edge

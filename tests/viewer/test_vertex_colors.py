@@ -13,9 +13,18 @@ from numpy.typing import NDArray
 from test_map_tiles import grown
 
 from tsfusion.geometry.color_scales import of_number, ramp
-from tsfusion.viewer import vertex_colors
-from tsfusion.viewer.map_tiles import MapTiles
-from tsfusion.viewer.vertex_colors import AGE, CLIENT, HEIGHT, NORMAL, PICTURE, WEIGHT, Scale, VertexColors
+from tsfusion.viewer.map import vertex_colors
+from tsfusion.viewer.map.map_tiles import MapTiles
+from tsfusion.viewer.map.vertex_colors import (
+    AGE,
+    CLIENT,
+    HEIGHT,
+    NORMAL,
+    PICTURE,
+    WEIGHT,
+    Scale,
+    VertexColors,
+)
 
 ERROR = "Error [m]"
 DEADLINE = 30.0

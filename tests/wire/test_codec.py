@@ -19,8 +19,8 @@ from repository import GOLDEN
 from tsfusion import Keyframe
 from tsfusion.core.config import ServerConfig, override
 from tsfusion.core.errors import DecodeError, InvalidConfig, InvalidKeyframe
-from tsfusion.wire import array_encoding, codec
-from tsfusion.wire.record_header import VERSION, Refused, pack, stamp, unpack
+from tsfusion.wire.records import array_encoding, codec
+from tsfusion.wire.records.record_header import VERSION, Refused, pack, stamp, unpack
 
 SESSION = bytes(range(16))
 

@@ -12,11 +12,11 @@ from repository import GOLDEN
 
 from tsfusion.core.config import ServerConfig
 from tsfusion.core.errors import InvalidKeyframe
-from tsfusion.gateway.quotas import Quotas
+from tsfusion.gateway.intake.quotas import Quotas
 from tsfusion.geometry import se3
-from tsfusion.wire import codec, corrections
-from tsfusion.wire.corrections import Correction, checked
-from tsfusion.wire.record_header import CorrectionHeader, Refused, is_correction, stamp, unpack
+from tsfusion.wire.records import codec, corrections
+from tsfusion.wire.records.corrections import Correction, checked
+from tsfusion.wire.records.record_header import CorrectionHeader, Refused, is_correction, stamp, unpack
 
 SESSION = bytes(range(16))
 

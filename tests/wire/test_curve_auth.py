@@ -17,13 +17,14 @@ from keyframes_and_servers import until
 from zmq.utils import z85
 
 from tsfusion.core.errors import NotAllowed, ServerUnreachable, TransportError
-from tsfusion.gateway import access_control
-from tsfusion.gateway.access_control import ZapHandler, sender_of
-from tsfusion.wire import messages, sockets
-from tsfusion.wire.connection_monitor import ConnectionMonitor
-from tsfusion.wire.curve import ClientKeys, ServerKeys
-from tsfusion.wire.messages import Command
-from tsfusion.wire.queries import request
+from tsfusion.gateway.ports import access_control
+from tsfusion.gateway.ports.access_control import ZapHandler, sender_of
+from tsfusion.wire.asking.queries import request
+from tsfusion.wire.messages import messages
+from tsfusion.wire.messages.messages import Command
+from tsfusion.wire.sockets import sockets
+from tsfusion.wire.sockets.connection_monitor import ConnectionMonitor
+from tsfusion.wire.sockets.curve import ClientKeys, ServerKeys
 
 Message = tuple[list[bytes], list[str | None]]  # frames, and the sender of each
 

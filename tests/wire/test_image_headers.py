@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from tsfusion.wire import array_encoding, image_headers
-from tsfusion.wire.record_header import Refused
+from tsfusion.wire.records import array_encoding, image_headers
+from tsfusion.wire.records.record_header import Refused
 
 SHAPE = (48, 64)
 IMAGE = (np.arange(48 * 64) % 251).astype(np.uint8).reshape(SHAPE)

@@ -10,10 +10,11 @@ import pytest
 import zmq
 
 from tsfusion.core.errors import TransportError
-from tsfusion.wire import messages, sockets
-from tsfusion.wire.map_client import MapClient
-from tsfusion.wire.messages import Command, Elsewhere, Reply
-from tsfusion.wire.queries import CommandRefused, fetch_status
+from tsfusion.wire.asking.map_client import MapClient
+from tsfusion.wire.asking.queries import CommandRefused, fetch_status
+from tsfusion.wire.messages import messages
+from tsfusion.wire.messages.messages import Command, Elsewhere, Reply
+from tsfusion.wire.sockets import sockets
 
 
 class Redirecting:

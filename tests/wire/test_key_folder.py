@@ -19,9 +19,10 @@ from command_processes import Here, tsfusion
 from failures import refuse
 
 from tsfusion.core.errors import InvalidConfig, OutputError
-from tsfusion.wire import allow_list, curve, key_folder
-from tsfusion.wire.allow_list import AllowList
-from tsfusion.wire.curve import client_keys
+from tsfusion.wire.keys import allow_list, key_folder
+from tsfusion.wire.keys.allow_list import AllowList
+from tsfusion.wire.sockets import curve
+from tsfusion.wire.sockets.curve import client_keys
 
 Run = Callable[..., str]
 
@@ -338,7 +339,7 @@ def test_a_failed_write_changes_nothing(server: Path, monkeypatch: pytest.Monkey
 
 
 def test_many_at_once_lose_nothing(server: Path) -> None:
-    program = "import sys; from tsfusion.wire import key_folder as keys; keys.allow(*sys.argv[1:])"
+    program = "import sys; from tsfusion.wire.keys import key_folder as keys; keys.allow(*sys.argv[1:])"
     names = [f"robot{i}" for i in range(6)]
     children = [subprocess.Popen([sys.executable, "-c", program, str(server), name, key()]) for name in names]
     assert [child.wait(60) for child in children] == [0] * len(names)

@@ -5,9 +5,9 @@ import msgspec
 import pytest
 
 from tsfusion.core.errors import DecodeError
-from tsfusion.wire import messages
-from tsfusion.wire.keyframe_times import Stamps
-from tsfusion.wire.messages import Ack, Denied, Hello, Hold, Nack, Ping, Pong, Welcome
+from tsfusion.wire.messages import messages
+from tsfusion.wire.messages.keyframe_times import Stamps
+from tsfusion.wire.messages.messages import Ack, Denied, Hello, Hold, Nack, Ping, Pong, Welcome
 
 SESSION = bytes(range(16))
 

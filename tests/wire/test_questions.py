@@ -7,7 +7,7 @@ import msgspec
 import odd_questions
 import pytest
 
-from tsfusion.wire.questions import Question, Slice
+from tsfusion.wire.messages.questions import Question, Slice
 
 
 @pytest.mark.parametrize("edge", [1e155, 1e300])

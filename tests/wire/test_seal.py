@@ -9,10 +9,11 @@ import pytest
 from keyframes_and_servers import wall
 
 from tsfusion.core.errors import DecodeError
-from tsfusion.wire import codec, corrections, messages
-from tsfusion.wire.keyframe_times import Stamps
-from tsfusion.wire.record_header import stamp, unpack
-from tsfusion.wire.seal import is_damaged, seal
+from tsfusion.wire.messages import messages
+from tsfusion.wire.messages.keyframe_times import Stamps
+from tsfusion.wire.records import codec, corrections
+from tsfusion.wire.records.record_header import stamp, unpack
+from tsfusion.wire.records.seal import is_damaged, seal
 
 SESSION = bytes(range(16))
 

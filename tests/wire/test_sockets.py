@@ -13,11 +13,11 @@ from scripted_server import scripted
 
 from tsfusion import Client
 from tsfusion.core.errors import InvalidConfig, ServerUnreachable, TransportError
-from tsfusion.wire import sockets
-from tsfusion.wire.connection import Connection
-from tsfusion.wire.messages import Command
-from tsfusion.wire.queries import request
-from tsfusion.wire.sockets import control_address
+from tsfusion.wire.asking.queries import request
+from tsfusion.wire.messages.messages import Command
+from tsfusion.wire.sockets import sockets
+from tsfusion.wire.sockets.connection import ServerLink
+from tsfusion.wire.sockets.sockets import control_address
 
 needs_ipv6 = pytest.mark.skipif(not socket.has_dualstack_ipv6(), reason="this machine has no IPv6")
 
@@ -130,7 +130,7 @@ def test_a_name_is_looked_for_at_both_kinds_of_address() -> None:
     with socket.socket(socket.AF_INET6) as unused, zmq.Context() as context:
         unused.bind(("::1", 0))
         address = f"tcp://localhost:{unused.getsockname()[1]}"
-        with closing(Connection(context, sockets.dealer, address, None)) as connection:
+        with closing(ServerLink(context, sockets.dealer, address, None)) as connection:
             until(lambda: connection.check(time.monotonic()) is not None and connection.finds_nobody)
             made = connection.socket
             assert connection.check(time.monotonic()) == (None, False)

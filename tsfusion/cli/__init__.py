@@ -20,21 +20,21 @@ from tsfusion.cli import (
     ask,
     ate,
     check,
-    config,
+    config_verb,
     datasets,
     doctor,
-    download,
+    download_verb,
     fuse,
     journal,
     keys,
     map,
-    mesh,
+    mesh_verb,
     opened_maps,
-    replay,
+    replay_verb,
     report,
-    scan,
+    scan_verb,
     serve,
-    spool,
+    spool_verb,
     status,
     verbs,
     view,
@@ -56,15 +56,15 @@ app = typer.Typer(
     epilog="Flags are environment variables, too: TSFUSION_VOXEL_SIZE for --voxel-size.",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-verbs.verb(app, "tsfusion demo", "tsfusion demo --world street --rate 2", panel=START)(replay.demo)
+verbs.verb(app, "tsfusion demo", "tsfusion demo --world street --rate 2", panel=START)(replay_verb.demo)
 verbs.verb(
     app, "tsfusion scan my-recording --voxel-size 0.02",
     "tsfusion scan realsense --connect tcp://server:5555 --map yard", panel=START,
-)(scan.scan)  # fmt: skip
+)(scan_verb.scan)  # fmt: skip
 verbs.verb(
     app, "tsfusion replay my-recording --voxel-size 0.02",
     "tsfusion replay kitchen.bag --trajectory slam.txt", panel=START,
-)(replay.replay)  # fmt: skip
+)(replay_verb.replay)  # fmt: skip
 verbs.verb(
     app, "tsfusion check my-recording", "tsfusion check my-recording --trajectory slam.txt", panel=OWN
 )(check.check)
@@ -74,7 +74,7 @@ verbs.verb(
 verbs.verb(
     app, "tsfusion mesh out/latest/map.tsf room.glb", "tsfusion mesh tcp://server:5555 yard.ply --map yard",
     panel=OWN,
-)(mesh.mesh)  # fmt: skip
+)(mesh_verb.mesh)  # fmt: skip
 verbs.verb(
     app, "tsfusion fuse my-maps --voxel-size 0.02 --workers 4 --out fused",
     "tsfusion fuse s3://scans/monday --ray auto --out /shared/monday", panel=OWN,
@@ -94,7 +94,7 @@ verbs.verb(
 )(ate.ate)  # fmt: skip
 app.add_typer(datasets.app, name="datasets", rich_help_panel=OWN)
 verbs.verb(app, "tsfusion download", "tsfusion download tum-fr1-xyz --to datasets", panel=OWN)(
-    download.download
+    download_verb.download
 )
 verbs.verb(
     app, "tsfusion serve --state my-maps --voxel-size 0.02",
@@ -105,9 +105,9 @@ verbs.verb(
 )(status.status)
 app.add_typer(journal.app, name="journal", rich_help_panel=SERVER)
 app.add_typer(keys.app, name="keys", rich_help_panel=SERVER)
-app.add_typer(spool.app, name="spool", rich_help_panel=SERVER)
+app.add_typer(spool_verb.app, name="spool", rich_help_panel=SERVER)
 verbs.verb(app, "tsfusion doctor", "tsfusion doctor /mnt/maps", panel=SETUP)(doctor.doctor)
-app.add_typer(config.app, name="config", rich_help_panel=SETUP)
+app.add_typer(config_verb.app, name="config", rich_help_panel=SETUP)
 
 
 @app.callback(invoke_without_command=True)

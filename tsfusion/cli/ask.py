@@ -15,12 +15,12 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from tsfusion.geometry.map_answers import Samples
-    from tsfusion.wire.map_client import Answered
+    from tsfusion.wire.asking.map_client import Answered
 
 SurfaceName = Literal["raw", "normal", "field"]
 
 Point = tuple[float, float, float]
-Pose = tuple[float, float, float, float, float, float, float]
+PoseFlag = tuple[float, float, float, float, float, float, float]
 
 
 def ask(
@@ -37,7 +37,7 @@ def ask(
         str | None, typer.Option(metavar="FILE", help="From .csv, .npy, .ply; - = stdin.")
     ] = None,
     view: Annotated[
-        Pose | None,
+        PoseFlag | None,
         typer.Option(metavar="X…QW", help="View from the pose X Y Z QX QY QZ QW."),
     ] = None,
     slice_: Annotated[
@@ -77,7 +77,7 @@ def ask(
     timeout: Annotated[float, typer.Option(metavar="SECONDS", help="Longest wait for a live answer.")] = 5.0,
     map_: options.Map = None,
     control: options.Control = None,
-    key: options.Key = None,
+    key: options.KeyFlag = None,
     server_key: options.ServerKey = None,
     json: options.Json = False,
     help_all: verbs.HelpAll = None,
@@ -94,7 +94,7 @@ def ask(
     """
     from tsfusion.core.errors import InvalidConfig
     from tsfusion.geometry.map_grids import SLICE_FORMATS
-    from tsfusion.pipelines.answer_files import VIEWS
+    from tsfusion.pipelines.maps.answer_files import VIEWS
 
     if sum(one is not None for one in (at, points, view, slice_)) != 1:
         raise InvalidConfig(
@@ -158,7 +158,7 @@ def _ask_points(
 
     from tsfusion.core.errors import InvalidConfig
     from tsfusion.core.output_folder import check_writable
-    from tsfusion.pipelines import answer_files
+    from tsfusion.pipelines.maps import answer_files
 
     if out is not None:
         check_writable(out, answer_files.SAMPLES)
@@ -184,7 +184,7 @@ def _ask_points(
 
 def _in_parts(asked: Any, chosen: "NDArray[np.float64]", how: dict[str, Any]) -> "list[Answered[Samples]]":
     """The answers to as many questions as so many points take."""
-    from tsfusion.wire.questions import MOST_POINTS
+    from tsfusion.wire.messages.questions import MOST_POINTS
 
     return [asked.sample(chosen[i : i + MOST_POINTS], **how) for i in range(0, len(chosen), MOST_POINTS)]
 
@@ -204,8 +204,8 @@ def _map(where: str, map_: str | None, link: dict[str, Any], *, quiet: bool) -> 
     """A live map, or a saved one, to be asked by the same methods."""
     if "://" in where:
         from tsfusion.core.config import DEFAULT_MAP
-        from tsfusion.wire.curve import client_keys
-        from tsfusion.wire.map_client import MapClient
+        from tsfusion.wire.asking.map_client import MapClient
+        from tsfusion.wire.sockets.curve import client_keys
 
         keys = client_keys(link["key"], link["server_key"])
         with MapClient(
@@ -214,7 +214,7 @@ def _map(where: str, map_: str | None, link: dict[str, Any], *, quiet: bool) -> 
             yield client
         return
     from tsfusion.cli import opened_maps
-    from tsfusion.pipelines.saved_map_answers import SavedMapAnswers
+    from tsfusion.pipelines.maps.saved_map_answers import SavedMapAnswers
     from tsfusion.tsdf.volume import Volume
 
     with opened_maps.opened(Path(where), map_, quiet=quiet) as file:
@@ -262,7 +262,7 @@ def _write_slice(answer: "Answered[Any]", out: Path, *, json: bool) -> None:
     typer.echo(f"{' and '.join(map(str, files))}: {cells}, {said}; {_state([answer])}")
 
 
-def _camera(view: Pose, size: str, intrinsics: str | None) -> tuple[Any, Any, tuple[int, int]]:
+def _camera(view: PoseFlag, size: str, intrinsics: str | None) -> tuple[Any, Any, tuple[int, int]]:
     """Intrinsics, pose and (height, width)."""
     import re
 
@@ -291,7 +291,7 @@ def _camera(view: Pose, size: str, intrinsics: str | None) -> tuple[Any, Any, tu
 
 def _write_view(answer: "Answered[Any]", out: Path, *, json: bool) -> None:
     from tsfusion.cli import output
-    from tsfusion.pipelines import answer_files
+    from tsfusion.pipelines.maps import answer_files
 
     found = answer.result
     answer_files.write_view(out, found)

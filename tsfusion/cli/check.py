@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from tsfusion.cli import options, replay, verbs
+from tsfusion.cli import options, replay_verb, verbs
 
 
 def check(
@@ -15,12 +15,12 @@ def check(
         Path, typer.Argument(metavar="PATH", help="A dataset or a journal, as `tsfusion replay` takes it.")
     ],
     *,
-    trajectory: options.Trajectory = None,
-    origin: options.Origin = None,
+    trajectory: options.TrajectoryFlag = None,
+    origin: options.OriginFlag = None,
     sequence: options.Sequence = None,
-    modality: options.Modality = None,
+    modality: options.ModalityFlag = None,
     calibration: options.Calibration = None,
-    intrinsics: options.Intrinsics = None,
+    intrinsics: options.IntrinsicsFlag = None,
     option: options.DatasetOptions = None,
     unpack: options.Unpack = False,
     json: options.Json = False,
@@ -34,9 +34,9 @@ def check(
     from tsfusion.core.errors import IncompleteRun
     from tsfusion.datasets.cameras import camera_line
     from tsfusion.evaluation import pose_check
-    from tsfusion.pipelines import shortfall
+    from tsfusion.pipelines.report import shortfall
 
-    dataset = replay.open_recording(
+    dataset = replay_verb.open_recording(
         path,
         **options.dataset_options(
             option, unpack=unpack, sequence=sequence, modality=modality, trajectory=trajectory,

@@ -173,8 +173,8 @@ def _kernels() -> Finding:
     import numpy as np
 
     from tsfusion.geometry.mesh import Mesh
-    from tsfusion.kernels.runtime import kept_in
-    from tsfusion.pipelines.mesh_preview import PreviewCamera, draw
+    from tsfusion.kernels.base.runtime import kept_in
+    from tsfusion.pipelines.maps.mesh_preview import PreviewCamera, draw
 
     started = time.perf_counter()
     corners = np.array([(-9, -9, 2), (-9, 9, 2), (9, 9, 2)], np.float32)

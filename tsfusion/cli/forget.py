@@ -15,7 +15,7 @@ from tsfusion.cli import options, verbs
 from tsfusion.core.readable_numbers import count_of
 
 if TYPE_CHECKING:
-    from tsfusion.wire.forgetting import Forgotten, Selection
+    from tsfusion.wire.messages.forget_messages import Forgotten, Selection
 
 _MOST_SESSIONS = 20  # printed; --json has all
 _EXAMPLES = (
@@ -69,7 +69,7 @@ def forget(
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
     map_: Annotated[str | None, typer.Option("--map", metavar="NAME", help="Which map.")] = None,
     control: options.Control = None,
-    key: options.Key = None,
+    key: options.KeyFlag = None,
     server_key: options.ServerKey = None,
     json: options.Json = False,
     help_all: verbs.HelpAll = None,
@@ -129,7 +129,7 @@ def _selection(
     from tsfusion.core import number_ranges
     from tsfusion.core.config import make_settings
     from tsfusion.core.errors import InvalidConfig
-    from tsfusion.wire.forgetting import Selection
+    from tsfusion.wire.messages.forget_messages import Selection
 
     if box is not None and not all(map(math.isfinite, box)):
         raise InvalidConfig(f"--box must be six finite numbers, got {' '.join(map(str, box))}")
@@ -174,8 +174,8 @@ def _target(
     """Forget keyframes of a server's map, or of one that no server uses."""
     if "://" in where:
         from tsfusion.core.config import DEFAULT_MAP
-        from tsfusion.wire import queries
-        from tsfusion.wire.curve import client_keys
+        from tsfusion.wire.asking import queries
+        from tsfusion.wire.sockets.curve import client_keys
 
         keys = client_keys(link["key"], link["server_key"])
         at = {"control": link["control"], "map_name": map_ or DEFAULT_MAP, "keys": keys}
@@ -183,7 +183,7 @@ def _target(
         return
     from tsfusion.cli import progress
     from tsfusion.core.errors import InvalidConfig
-    from tsfusion.pipelines.stored_map import open_map
+    from tsfusion.pipelines.maps.stored_map import open_map
 
     if given := [name for name, value in link.items() if value is not None]:
         flag = "--" + given[0].replace("_", "-")

@@ -21,7 +21,7 @@ def fuse(
         typer.Argument(metavar="SOURCE…", help="Journals, state folders, datasets, URLs."),
     ],
     *,
-    out: options.Out = None,
+    out: options.OutFlag = None,
     overwrite: options.Overwrite = False,
     workers: Annotated[
         int | None,
@@ -38,7 +38,7 @@ def fuse(
     same_frame: Annotated[
         bool, options.option("--same-frame", None, "The sources' poses are in one frame.", rare=True)
     ] = False,
-    origin: options.Origin = None,
+    origin: options.OriginFlag = None,
     option: options.DatasetOptions = None,
     up: options.UpDirection = None,
     keep_islands: options.KeepIslands = None,
@@ -54,7 +54,7 @@ def fuse(
     from tsfusion.cli import output, progress
     from tsfusion.cluster import fusion, keyframe_sources
     from tsfusion.core.errors import IncompleteRun, InvalidConfig
-    from tsfusion.pipelines import shortfall
+    from tsfusion.pipelines.report import shortfall
 
     memory = options.byte_count(worker_memory)
     if tile_size is not None and not 0 < tile_size < float("inf"):

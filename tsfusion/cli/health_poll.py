@@ -10,8 +10,8 @@ from msgspec import Struct
 from tsfusion.core.errors import ServerUnreachable, TransportError
 from tsfusion.core.rates import Rates
 from tsfusion.core.readable_numbers import count_of
-from tsfusion.wire.health import Health, MapHealth, Status
-from tsfusion.wire.queries import CommandRefused, fetch_health, fetch_status
+from tsfusion.wire.asking.queries import CommandRefused, fetch_health, fetch_status
+from tsfusion.wire.messages.health import Health, MapHealth, Status
 
 READY, NOT_READY = 0, 3  # exit statuses; 1 is every error's, also that nobody answers
 _RECHECK_INTERVAL = 0.5  # seconds between the checks that tell a stall from a pause

@@ -10,12 +10,13 @@ import typer
 
 from tsfusion.cli import options, verbs
 from tsfusion.cli.output import size
+from tsfusion.core.readable_numbers import OnProgress
 
 if TYPE_CHECKING:
-    from tsfusion.journal.inspection import JournalInfo, JournalVerdict, Problem, SessionInfo
+    from tsfusion.journal.inspection import JournalFault, JournalInfo, JournalVerdict, SessionInfo
     from tsfusion.journal.recovery import Recovery
     from tsfusion.journal.ros2_export import Export
-    from tsfusion.journal.state_folder import JournalPlace, Watcher
+    from tsfusion.journal.state_folder import JournalPlace
 
 _Returned = TypeVar("_Returned")
 _MOST_LINES = 20  # printed of one kind; --json has all
@@ -97,7 +98,7 @@ def recover(
     from tsfusion.core.config import ServerConfig
     from tsfusion.journal.recovery import recover as save
 
-    def work(place: "JournalPlace", watch: "Watcher") -> "Recovery":
+    def work(place: "JournalPlace", watch: "OnProgress") -> "Recovery":
         return save(place, out, ServerConfig().segment_bytes, watch)
 
     if _run("saving", path, map_, work, partial(_describe_recovery, out), json=json).lost:
@@ -138,7 +139,7 @@ def export(
     """
     from tsfusion.journal.ros2_export import export as write
 
-    def work(place: "JournalPlace", watch: "Watcher") -> "Export":
+    def work(place: "JournalPlace", watch: "OnProgress") -> "Export":
         return write(place, out, watch, clouds=points)
 
     if _run("exporting", path, map_, work, partial(_describe_export, out), json=json).lost:
@@ -149,7 +150,7 @@ def _run(
     doing: str,
     path: Path,
     map_name: str | None,
-    work: Callable[["JournalPlace", "Watcher"], _Returned],
+    work: Callable[["JournalPlace", "OnProgress"], _Returned],
     describe: Callable[[_Returned], str],
     *,
     json: bool,
@@ -258,7 +259,7 @@ def _describe_verdict(verdict: "JournalVerdict") -> str:
     )
 
 
-def _problem_lines(problems: "list[Problem]") -> list[str]:
+def _problem_lines(problems: "list[JournalFault]") -> list[str]:
     return _shortened(
         [
             f"{one.kind:<7} {one.segment}, byte {one.offset}: {one.what}"

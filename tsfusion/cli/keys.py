@@ -48,7 +48,8 @@ def new(
 
     The name `server` is for the server's own pair.
     """
-    from tsfusion.wire import curve, key_folder
+    from tsfusion.wire.keys import key_folder
+    from tsfusion.wire.sockets import curve
 
     made = key_folder.create_pair(folder, name, force=force)
     typer.echo(f"public key of {name}: {made.public}")
@@ -102,7 +103,7 @@ def allow(
     characters that mean something to a shell: put it in single quotes, with -- before it if it begins with a
     dash.
     """
-    from tsfusion.wire import key_folder
+    from tsfusion.wire.keys import key_folder
 
     patterns = None if maps is None else [one.strip() for one in maps.split(",")]
     earlier = key_folder.allow(folder, name, key, maps=patterns, forget=forget)
@@ -120,7 +121,7 @@ def allow(
 @verbs.verb(app, "tsfusion keys revoke robot1", "tsfusion keys revoke robot1 --dir /etc/tsfusion/keys")
 def revoke(name: Name, *, folder: KeysFlag = _FOLDER) -> None:
     """Keep a scanner out; a running server closes its connections at once."""
-    from tsfusion.wire import key_folder
+    from tsfusion.wire.keys import key_folder
 
     key = key_folder.revoke(folder, name)
     typer.echo(f"{name} may no longer connect: {key}")
@@ -129,7 +130,7 @@ def revoke(name: Name, *, folder: KeysFlag = _FOLDER) -> None:
 @verbs.verb(app, "tsfusion keys list", "tsfusion keys list --json", name="list")
 def list_(*, folder: KeysFlag = _FOLDER, json: options.Json = False) -> None:
     """List the folder's own public keys, and on a server who is allowed and who was revoked."""
-    from tsfusion.wire import key_folder
+    from tsfusion.wire.keys import key_folder
 
     own = key_folder.list_pairs(folder)
     listed = key_folder.read_allow_list(folder) if key_folder.has_allow_list(folder) else None

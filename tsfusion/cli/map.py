@@ -47,7 +47,7 @@ def move(
     ],
     to: Annotated[str, typer.Option("--to", metavar="ADDRESS", help="The server that is to have it.")],
     timeout: Annotated[float, typer.Option(metavar="SECONDS", help="Longest wait for the end.")] = 3600.0,
-    key: options.Key = None,
+    key: options.KeyFlag = None,
     server_key: options.ServerKey = None,
     json: options.Json = False,
     help_all: verbs.HelpAll = None,
@@ -63,8 +63,8 @@ def move(
     import msgspec
 
     from tsfusion.cli import output
-    from tsfusion.wire import queries
-    from tsfusion.wire.curve import client_keys
+    from tsfusion.wire.asking import queries
+    from tsfusion.wire.sockets.curve import client_keys
 
     moved = queries.move_map(name, source, to, timeout=timeout, keys=client_keys(key, server_key))
     if json:
@@ -85,7 +85,7 @@ def info(path: MapArgument, map_: StateMapFlag = None, json: options.Json = Fals
     the journal has cost the map.
     """
     from tsfusion.cli import output, progress
-    from tsfusion.pipelines import saved_maps
+    from tsfusion.pipelines.maps import saved_maps
 
     with progress.reading(opened_maps.JOURNAL, quiet=json) as watch:
         found = saved_maps.summarise(saved_maps.find(path, map_), watch)
@@ -105,7 +105,7 @@ def hash_(path: MapArgument, map_: StateMapFlag = None, json: options.Json = Fal
     the journal holds: what its checkpoint lacks is fused first.
     """
     from tsfusion.cli import output
-    from tsfusion.pipelines import saved_maps
+    from tsfusion.pipelines.maps import saved_maps
 
     with opened_maps.opened(path, map_, quiet=json) as file:
         found = saved_maps.summarise(saved_maps.SavedMap(file))
@@ -147,8 +147,9 @@ def merge(
     from tsfusion.core.errors import InvalidConfig
     from tsfusion.core.output_folder import check_writable
     from tsfusion.journal.state_folder import check_no_map_of_a_server
-    from tsfusion.pipelines import map_alignment
-    from tsfusion.tsdf import map_crop, map_history
+    from tsfusion.pipelines.maps import map_alignment
+    from tsfusion.tsdf.files import map_history
+    from tsfusion.tsdf.sums import map_crop
 
     check_no_map_of_a_server(out)
     check_writable(out, (".tsf",), overwrite=overwrite)
@@ -246,7 +247,7 @@ def diff(
     from tsfusion.cli import output
     from tsfusion.core.output_folder import check_writable
     from tsfusion.geometry.mesh import FORMATS
-    from tsfusion.pipelines import mesh_finishing
+    from tsfusion.pipelines.maps import mesh_finishing
 
     if out is not None:
         check_writable(out, (*FORMATS, mesh_finishing.PICTURE))
@@ -268,10 +269,10 @@ def diff(
 @verbs.verb(app, *map_convert.EXAMPLES)
 def convert(
     path: MapArgument,
-    out: map_convert.Out,
+    out: map_convert.OutFile,
     *,
     dense: map_convert.Dense = False,
-    field: map_convert.Field = None,
+    field: map_convert.FieldFlag = None,
     max_distance: map_convert.MaxDistance = None,
     heights: map_convert.Heights = None,
     above_floor: map_convert.AboveFloor = False,
@@ -292,7 +293,7 @@ def convert(
     more choices.
     """
     from tsfusion.cli import output, progress
-    from tsfusion.pipelines import mesh_finishing
+    from tsfusion.pipelines.maps import mesh_finishing
 
     suffix, files = out.suffix.lower(), [out]
     given = {"heights": heights, "above_floor": above_floor, "box": box, "up": up, "resolution": resolution}
@@ -337,7 +338,7 @@ def resume(
     be neither corrected nor removed. End a server that runs there first.
     """
     from tsfusion.cli import output
-    from tsfusion.pipelines import saved_maps
+    from tsfusion.pipelines.maps import saved_maps
 
     with opened_maps.opened(path, quiet=json) as file:
         folder = saved_maps.resume(file, state, map_)
@@ -354,7 +355,7 @@ def resume(
 
 def _load(path: Path, map_name: str | None = None, *, quiet: bool) -> "Volume":
     """Read a map, with all that a journal holds beyond it."""
-    from tsfusion.tsdf import map_history
+    from tsfusion.tsdf.files import map_history
     from tsfusion.tsdf.volume import Volume
 
     with opened_maps.opened(path, map_name, quiet=quiet) as file:

@@ -9,7 +9,7 @@ import typer
 from tsfusion.cli import options, verbs
 
 if TYPE_CHECKING:
-    from tsfusion.pipelines.map_alignment import AlignedMap, Alignment
+    from tsfusion.pipelines.maps.map_alignment import AlignedMap, Alignment
 
 MAP_HELP = "A map (.tsf), a state folder, one map's folder in it, or a journal."
 _EXAMPLES = (
@@ -52,7 +52,8 @@ def align(
     from tsfusion.core.output_folder import check_writable
     from tsfusion.evaluation.surface_registration import check_installed
     from tsfusion.journal.state_folder import check_no_map_of_a_server
-    from tsfusion.pipelines import map_alignment, shortfall
+    from tsfusion.pipelines.maps import map_alignment
+    from tsfusion.pipelines.report import shortfall
 
     if out is not None:
         check_no_map_of_a_server(out)
@@ -80,7 +81,7 @@ def align(
 def _merge(a: "AlignedMap", b: "AlignedMap", found: "Alignment", out: Path, display: Any) -> dict[str, Any]:
     import numpy as np
 
-    from tsfusion.pipelines import map_alignment
+    from tsfusion.pipelines.maps import map_alignment
 
     volume = a.volume
     assert volume is not None  # it was opened here

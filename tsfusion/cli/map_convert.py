@@ -16,12 +16,12 @@ EXAMPLES = (
     "tsfusion map convert my-maps yard.yaml --heights 0.1 1.8 --above-floor",
 )
 _FORMATS = ".npz .zarr .vdb .tsf .ply .glb .obj .stl; slice: .yaml .pgm .png .npz"
-Out = Annotated[
+OutFile = Annotated[
     Path,
     typer.Argument(metavar="OUT", help=_FORMATS),
 ]
 Dense = Annotated[bool, typer.Option("--dense", help="One array, not blocks (.npz, .zarr).")]
-Field = Annotated[
+FieldFlag = Annotated[
     Literal["tsdf", "distance"] | None,
     typer.Option(help="As fused, or Euclidean distances."),
 ]
@@ -60,7 +60,7 @@ def check(
     from tsfusion.geometry.map_grids import SLICE_FORMATS
     from tsfusion.geometry.mesh import FORMATS
     from tsfusion.journal.state_folder import check_no_map_of_a_server
-    from tsfusion.tsdf.voxel_arrays import FORMATS as VOXELS
+    from tsfusion.tsdf.files.voxel_arrays import FORMATS as VOXELS
 
     suffix, is_slice = out.suffix.lower(), given["heights"] is not None
     if not (suffix == ".zarr" and any((out / one).exists() for one in ("zarr.json", ".zgroup"))):  # replaced

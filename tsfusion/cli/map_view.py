@@ -8,8 +8,8 @@ from tsfusion.cli import options
 from tsfusion.core.readable_numbers import count_of
 
 if TYPE_CHECKING:
-    from tsfusion.pipelines.saved_maps import MapSummary, SessionSummary
-    from tsfusion.tsdf.map_difference import MapDifference
+    from tsfusion.pipelines.maps.saved_maps import MapSummary, SessionSummary
+    from tsfusion.tsdf.sums.map_difference import MapDifference
     from tsfusion.tsdf.volume import Volume
 
 _MOST_LINES = 20  # printed of one kind; --json has all

@@ -24,7 +24,7 @@ def memory_for(file: Path, memory_bytes: int | None = None, *, maps: int = 1) ->
         memory_bytes: that a person gave for it.
         maps: that are open at the same time.
     """
-    from tsfusion.pipelines import saved_maps
+    from tsfusion.pipelines.maps import saved_maps
 
     return saved_maps.memory_for(file, maps=maps) if memory_bytes is None else memory_bytes
 
@@ -37,7 +37,7 @@ def opened(path: Path, map_name: str | None = None, *, quiet: bool) -> Iterator[
     """
     from tsfusion.cli import progress
     from tsfusion.journal.journaled_keyframes import LOST
-    from tsfusion.pipelines import saved_maps
+    from tsfusion.pipelines.maps import saved_maps
 
     with progress.shown(quiet=quiet) as display:
 
@@ -69,6 +69,6 @@ def begin() -> None:
 def end() -> None:
     """Raise IncompleteRun where damage has cost maps that the command has opened keyframes: its last line."""
     if any(_lost):
-        from tsfusion.pipelines import shortfall
+        from tsfusion.pipelines.report import shortfall
 
         raise IncompleteRun(shortfall.of_damage(sum(_lost)))

@@ -79,7 +79,7 @@ def takes_map_settings(verb: Callable[..., Any], also: dict[str, Any] | None = N
 
 
 ConfigFile = Annotated[Path | None, option("--config", "FILE", "TOML; `tsfusion config dump` writes one.")]
-Out = Annotated[
+OutFlag = Annotated[
     Path | None,
     option("--out", "DIR", "Folder of results; default: a dated one."),
 ]
@@ -87,7 +87,7 @@ Overwrite = Annotated[
     bool, option("--overwrite", None, "Replace the results that --out holds already.", rare=True)
 ]
 OverwriteMap = Annotated[bool, option("--overwrite", None, "Replace the map of that name.")]
-State = Annotated[Path | None, option("--state", "DIR", "Keep the journal and the map here.")]
+StateFlag = Annotated[Path | None, option("--state", "DIR", "Keep the journal and the map here.")]
 Connect = Annotated[str | None, option("--connect", "ADDRESS", "Send to this server, not to its own.")]
 Control = Annotated[
     str | None,
@@ -101,7 +101,7 @@ NewMap = Annotated[
 SameFrame = Annotated[
     bool, option("--same-frame", None, "The poses are in the frame of the existing map.", rare=True)
 ]
-Key = Annotated[
+KeyFlag = Annotated[
     str | None,
     option("--key", "FILE", "This client's secret key, for a server with keys (`tsfusion keys`).", rare=True),
 ]
@@ -110,7 +110,9 @@ ServerKey = Annotated[
     option("--server-key", "FILE|KEY", "That server's public key: a file, or the 40 characters.", rare=True),
 ]
 Json = Annotated[bool, option("--json", None, "Print JSON for a program to read.")]
-View = Annotated[str | None, option("--view", "[HOST:PORT]", "Show the map in a browser, while it grows.")]
+ViewFlag = Annotated[
+    str | None, option("--view", "[HOST:PORT]", "Show the map in a browser, while it grows.")
+]
 RunJson = Annotated[bool, option("--json", None, "Print run.json, for a program to read.", rare=True)]
 
 _rare_option = functools.partial(option, panel="Source", rare=True)
@@ -122,14 +124,14 @@ Rate = Annotated[
     float | None,
     _rare_option("--rate", "HZ", "Play so many a second; default: as fast as possible.", min=1e-3),
 ]
-Trajectory = Annotated[
+TrajectoryFlag = Annotated[
     Path | None, option("--trajectory", "FILE", "Poses of another SLAM: TUM's or KITTI's.")
 ]
-Origin = Annotated[
+OriginFlag = Annotated[
     str | None, _rare_option("--origin", "X,Y,Z|auto", "Whole metres to take off UTM or grid positions.")
 ]
 Sequence = Annotated[str | None, _rare_option("--sequence", "NN", "KITTI: which sequence.")]
-Modality = Annotated[str | None, _rare_option("--modality", "KIND", "KITTI: stereo or lidar.")]
+ModalityFlag = Annotated[str | None, _rare_option("--modality", "KIND", "KITTI: stereo or lidar.")]
 DatasetOptions = Annotated[
     list[str] | None,
     option("--option", "KEY=VALUE", "Setting of a layout: depth_topic=/depth."),
@@ -137,7 +139,7 @@ DatasetOptions = Annotated[
 Calibration = Annotated[
     Path | None, option("--calibration", "FILE", "Camera file, instead of the recording's.")
 ]
-Intrinsics = Annotated[
+IntrinsicsFlag = Annotated[
     str | None, option("--intrinsics", "FX,FY,CX,CY", "Camera in pixels, instead of its own.")
 ]
 Unpack = Annotated[bool, _rare_option("--unpack", None, "Unpack an archive beside itself.")]
@@ -347,7 +349,7 @@ def own_server(config: "Config", state: Path | None) -> "ServerConfig":
     from msgspec.structs import replace
 
     from tsfusion.core.config import ServerConfig
-    from tsfusion.pipelines.target_server import MAPS, THROWN_AWAY
+    from tsfusion.pipelines.runs.target_server import MAPS, THROWN_AWAY
 
     server = config.server
     if state is None:  # all of the recording is to be in a map that is made for it

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from rich.console import Console, RenderableType
 
     from tsfusion.client import ClientStats
-    from tsfusion.pipelines.viewer_child import ViewerChild
+    from tsfusion.pipelines.runs.viewer_child import ViewerChild
     from tsfusion.scanner.scanner import ScanState
 
 _LINE_INTERVAL = 2.0  # seconds between plain lines
@@ -199,7 +199,7 @@ def page_beside(view: str | None, display: "Quiet", *, truth: str | None = None)
     """
     if view is None:
         return None
-    from tsfusion.pipelines.viewer_child import ViewerChild
+    from tsfusion.pipelines.runs.viewer_child import ViewerChild
 
     return ViewerChild(view, lambda url: display.say(f"page {url}"), truth=truth)
 

@@ -9,7 +9,7 @@ from tsfusion.core.headline import Headline
 from tsfusion.core.logs import printable
 from tsfusion.core.rates import Rates
 from tsfusion.core.readable_numbers import count_of, span
-from tsfusion.wire.messages import explained
+from tsfusion.wire.messages.messages import explained
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -24,7 +24,7 @@ _BAR_WIDTHS = (8, 26)  # columns at least and at most
 _STYLES = {"good": "green", "notice": "yellow", "bad": "bold red"}
 
 
-class Row(NamedTuple):
+class ScreenRow(NamedTuple):
     """A name and figures; `share`: 0 to 1 of a bar, None = no bar."""
 
     name: str
@@ -51,7 +51,7 @@ class Note(NamedTuple):
 class Screen(NamedTuple):
     """Rows of one moment; `headline` None = there are no keyframes."""
 
-    rows: list[Row] = []
+    rows: list[ScreenRow] = []
     notes: list[Note] = []
     headline: Headline | None = None
 
@@ -104,16 +104,18 @@ class RunProgress:
         )
         to_send = f"{stats.waiting} to send, {size(stats.waiting_bytes)}" if stats.waiting else ""
         if scan is None:
-            rows = [Row("sent", f"{taken}{_of(total)}", _rate(taking), "", _share(taken, total)),
-                    Row("fused", f"{stats.fused}{_of(total)}", _rate(fusing),
+            rows = [ScreenRow("sent", f"{taken}{_of(total)}", _rate(taking), "", _share(taken, total)),
+                    ScreenRow("fused", f"{stats.fused}{_of(total)}", _rate(fusing),
                         _left(stats.fused, total, fusing), _share(stats.fused, total))]  # fmt: skip
         else:
-            rows = [Row("frames", f"{taken}{_of(total)}", _rate(taking), _left(taken, total, taking),
+            rows = [ScreenRow("frames", f"{taken}{_of(total)}", _rate(taking), _left(taken, total, taking),
                         _share(taken, total)),
-                    Row("keyframes", str(sum(scan.selected.values()))),
-                    Row("fused", str(stats.fused), _rate(fusing), _delay(scan))]  # fmt: skip
+                    ScreenRow("keyframes", str(sum(scan.selected.values()))),
+                    ScreenRow("fused", str(stats.fused), _rate(fusing), _delay(scan))]  # fmt: skip
         return Screen(
-            [*rows, Row("waiting", str(stats.under_way), "", to_send)], _notes(stats, link, scan), headline
+            [*rows, ScreenRow("waiting", str(stats.under_way), "", to_send)],
+            _notes(stats, link, scan),
+            headline,
         )
 
     def _standstill(self, stats: "ClientStats") -> str:
@@ -124,25 +126,27 @@ class RunProgress:
         return f"nothing fused for {span(now - self._moved)}" if now - self._moved > STILL else ""
 
 
-def fused_rows(read: int, fused: int, total: int, rates: Rates) -> list[Row]:
+def fused_rows(read: int, fused: int, total: int, rates: Rates) -> list[ScreenRow]:
     """Share of a journal that is read, and fused."""
     reading, fusing = rates(read, fused)
     return [
-        Row("read", f"{read}{_of(total)}", _rate(reading), _left(read, total, reading), _share(read, total)),
-        Row("fused", str(fused), _rate(fusing)),
+        ScreenRow(
+            "read", f"{read}{_of(total)}", _rate(reading), _left(read, total, reading), _share(read, total)
+        ),
+        ScreenRow("fused", str(fused), _rate(fusing)),
     ]
 
 
-def byte_row(text: str, done: int, total: int, rates: Rates) -> Row:
+def byte_row(text: str, done: int, total: int, rates: Rates) -> ScreenRow:
     """Bytes that are read, after `text`."""
     rate, _ = rates(done, 0)
     shown = "" if rate is None else f"{size(rate)}/s"
-    return Row(text, f"{size(done)} of {size(total)}", shown, "", _share(done, total))
+    return ScreenRow(text, f"{size(done)} of {size(total)}", shown, "", _share(done, total))
 
 
-def step_row(text: str, done: int, total: int) -> Row:
+def step_row(text: str, done: int, total: int) -> ScreenRow:
     """Number of steps done, after `text`."""
-    return Row(text, f"{done}{_of(total)}", share=_share(done, total))
+    return ScreenRow(text, f"{done}{_of(total)}", share=_share(done, total))
 
 
 def _trouble(link: str, scan: "ScanState | None") -> str:
@@ -191,7 +195,7 @@ def _delay(scan: "ScanState") -> str:
     return "" if scan.keyframe_delay_ms is None else f"delay {scan.keyframe_delay_ms:.0f} ms"
 
 
-def _grid(rows: list[Row], width: int) -> "RenderableType":
+def _grid(rows: list[ScreenRow], width: int) -> "RenderableType":
     """The rows in columns that do not move while the figures grow."""
     from rich.progress_bar import ProgressBar
     from rich.table import Table

@@ -33,7 +33,7 @@ def report(
     from tsfusion.core.output_folder import check_writable
     from tsfusion.pipelines.report import findings, run_report
     from tsfusion.pipelines.report.page import ENDINGS
-    from tsfusion.pipelines.run_files import REPORT
+    from tsfusion.pipelines.runs.run_files import REPORT
 
     is_run = findings.is_run(source)
     if is_run and map_ is not None:

@@ -8,12 +8,12 @@ from tsfusion.cli import output
 from tsfusion.cli.output import counted, grouped, size
 from tsfusion.core.headline import MARKS
 from tsfusion.core.readable_numbers import count_of
-from tsfusion.wire.messages import explained
+from tsfusion.wire.messages.messages import explained
 
 if TYPE_CHECKING:
     from tsfusion.evaluation.trajectory_error import TrajectoryError
-    from tsfusion.pipelines.replay_results import ReplaySummary
-    from tsfusion.pipelines.scan_results import MapResult, ScanSummary
+    from tsfusion.pipelines.runs.replay_results import ReplaySummary
+    from tsfusion.pipelines.runs.scan_results import MapResult, ScanSummary
 
 
 def print_replay(run: "ReplaySummary") -> None:

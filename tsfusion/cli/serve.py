@@ -19,10 +19,10 @@ from tsfusion.cli import options
 
 if TYPE_CHECKING:
     from tsfusion.core.config import Config
-    from tsfusion.pipelines.viewer_child import ViewerChild
-    from tsfusion.wire.curve import ClientKeys
-    from tsfusion.wire.health import Health
-    from tsfusion.wire.sockets import Addresses
+    from tsfusion.pipelines.runs.viewer_child import ViewerChild
+    from tsfusion.wire.messages.health import Health
+    from tsfusion.wire.sockets.curve import ClientKeys
+    from tsfusion.wire.sockets.sockets import Addresses
 
 log = logging.getLogger(__name__)
 
@@ -65,7 +65,7 @@ def serve(
     ] = None,
     *,
     config: options.ConfigFile = None,
-    view: options.View = None,
+    view: options.ViewFlag = None,
     json: options.Json = False,
     until_eof: Annotated[bool, typer.Option("--until-eof", hidden=True)] = False,
     **settings: Any,
@@ -164,8 +164,8 @@ def _announce(addresses: "Addresses", state: str, seconds: float, json: bool) ->
 
 def _page(place: str, folder: str | None, json: bool) -> "tuple[ViewerChild, ClientKeys | None]":
     """The live page of a server, and where that has a folder of keys, a pair that is the page's alone."""
-    from tsfusion.pipelines.viewer_child import ViewerChild
-    from tsfusion.wire.curve import ClientKeys, server_keys
+    from tsfusion.pipelines.runs.viewer_child import ViewerChild
+    from tsfusion.wire.sockets.curve import ClientKeys, server_keys
 
     def tell(url: str) -> None:
         if json:

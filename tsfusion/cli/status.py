@@ -22,7 +22,7 @@ def status(
     *,
     connect: options.Connect = None,
     control: options.Control = None,
-    key: options.Key = None,
+    key: options.KeyFlag = None,
     server_key: options.ServerKey = None,
     map_: Annotated[str | None, typer.Option("--map", metavar="NAME", help="Only this map.")] = None,
     watch: Annotated[
@@ -51,7 +51,7 @@ def status(
     """
     from tsfusion.cli.health_poll import ServerWatcher
     from tsfusion.core.config import ClientConfig
-    from tsfusion.wire.curve import client_keys
+    from tsfusion.wire.sockets.curve import client_keys
 
     address = server or connect or ClientConfig().address
     watcher = ServerWatcher(

@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from tsfusion.pipelines.measured_errors import Measure
+    from tsfusion.pipelines.maps.measured_errors import Measure
     from tsfusion.viewer.map_feed import MapFeed
-    from tsfusion.wire.curve import ClientKeys
+    from tsfusion.wire.sockets.curve import ClientKeys
 
 _ANSWER_SECONDS = 1.0  # for a server to say that it is there
 _SERVER = re.compile(r"[\w.-]+:\d{1,5}|\[[\da-fA-F:.]+\]:\d{1,5}", re.ASCII)
@@ -62,7 +62,7 @@ def view(
         bool, options.option("--no-browser", None, "Open no browser; only print the address.")
     ] = False,
     control: options.Control = None,
-    key: options.Key = None,
+    key: options.KeyFlag = None,
     server_key: options.ServerKey = None,
     json: options.Json = False,
     publish: Annotated[str | None, typer.Option("--publish", hidden=True)] = None,
@@ -79,9 +79,9 @@ def view(
     """
     from tsfusion.core import logs, process
     from tsfusion.viewer.live_page import LivePage
-    from tsfusion.viewer.page_place import check_installed, parse_place
-    from tsfusion.viewer.page_server import PageServer
-    from tsfusion.wire.curve import client_keys
+    from tsfusion.viewer.page.page_place import check_installed, parse_place
+    from tsfusion.viewer.page.page_server import PageServer
+    from tsfusion.wire.sockets.curve import client_keys
 
     logs.configure("text", "warning", "view")
     keys = _keys_from_parent() if from_parent else client_keys(key, server_key)
@@ -124,7 +124,7 @@ def _target(where: str | None, keys: "ClientKeys | None") -> str | Path:
     """The address of a server, or a path that exists."""
     from tsfusion.core.errors import InvalidConfig
     from tsfusion.core.output_folder import DEFAULT, LATEST
-    from tsfusion.wire.sockets import connect_address
+    from tsfusion.wire.sockets.sockets import connect_address
 
     if where is None:
         return _usual_target(keys, Path(DEFAULT, LATEST))
@@ -145,7 +145,7 @@ def _usual_target(keys: "ClientKeys | None", latest: Path) -> str | Path:
     """The server on this machine, or the newest run."""
     from tsfusion.core.config import ClientConfig
     from tsfusion.core.errors import InvalidConfig, ServerUnreachable
-    from tsfusion.wire.queries import fetch_health
+    from tsfusion.wire.asking.queries import fetch_health
 
     address = ClientConfig().address
     try:
@@ -162,11 +162,11 @@ def _usual_target(keys: "ClientKeys | None", latest: Path) -> str | Path:
 
 def _feed(target: str | Path, map_: str | None, link: dict[str, Any]) -> "MapFeed":
     if isinstance(target, Path):
-        from tsfusion.pipelines.viewed_maps import open_feed
+        from tsfusion.pipelines.shown.viewed_maps import open_feed
 
         return open_feed(target, map_name=map_)
     from tsfusion.core.config import DEFAULT_MAP
-    from tsfusion.wire.map_watcher import MapWatcher
+    from tsfusion.wire.asking.map_watcher import MapWatcher
 
     return MapWatcher(target, map_ or DEFAULT_MAP, **link)
 
@@ -174,7 +174,7 @@ def _feed(target: str | Path, map_: str | None, link: dict[str, Any]) -> "MapFee
 def _measures(target: str | Path, truth: str | None) -> "dict[str, Measure]":
     """Further colours of a map: its error, where the truth is given, or a run has measured it."""
     if truth is not None:
-        from tsfusion.pipelines.measured_errors import error_measure
+        from tsfusion.pipelines.maps.measured_errors import error_measure
 
         return {_ERROR: error_measure(truth)}
     if isinstance(target, Path) and (target / "error.npy").exists():
@@ -184,7 +184,7 @@ def _measures(target: str | Path, truth: str | None) -> "dict[str, Measure]":
 
 @cache
 def _measure_of_run(folder: Path) -> "Measure":
-    from tsfusion.pipelines.measured_errors import error_measure
+    from tsfusion.pipelines.maps.measured_errors import error_measure
 
     return error_measure(folder)
 
@@ -240,7 +240,7 @@ def _keys_from_parent() -> "ClientKeys | None":
     """The keys that our parent writes; when it ends, so do we. What it does comes before what we do."""
     import msgspec
 
-    from tsfusion.wire.curve import ClientKeys
+    from tsfusion.wire.sockets.curve import ClientKeys
 
     os.nice(_NICENESS)
     line = sys.stdin.readline()

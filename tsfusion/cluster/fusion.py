@@ -16,7 +16,7 @@ import msgspec
 
 from tsfusion.cluster import jobs, mesh_runs, tiling
 from tsfusion.cluster.carrying_out import CarryingOut
-from tsfusion.cluster.jobs import Done, Progress
+from tsfusion.cluster.jobs import JobDone, JobProgress
 from tsfusion.cluster.keyframe_sources import WORK, Listed
 from tsfusion.cluster.schedulers import Scheduler
 from tsfusion.core import folder_lock, output_folder
@@ -24,9 +24,10 @@ from tsfusion.core.config import VIEW_SETTINGS, VolumeConfig
 from tsfusion.core.durable_files import make_folder, replacing
 from tsfusion.core.errors import InvalidConfig, OutputError
 from tsfusion.geometry.up_direction import Up
-from tsfusion.pipelines import run_files
-from tsfusion.pipelines.run_files import Circumstances
-from tsfusion.tsdf import checkpoint
+from tsfusion.pipelines.report import findings
+from tsfusion.pipelines.report.findings import Circumstances
+from tsfusion.pipelines.runs import run_files
+from tsfusion.tsdf.files import checkpoint
 
 TILES = "tiles"  # folder of a mesh in tiles
 _MOST_KEYFRAMES = 512  # a job: what a lost worker costs
@@ -117,9 +118,9 @@ class _Clock:
     jobs: int = 0
 
     @contextmanager
-    def step(self, name: str) -> Iterator[list[Done]]:
+    def step(self, name: str) -> Iterator[list[JobDone]]:
         """Time a step; the block puts there what its jobs said in the end."""
-        begin, ended = time.monotonic(), list[Done]()
+        begin, ended = time.monotonic(), list[JobDone]()
         yield ended
         self.seconds[name] = round(time.monotonic() - begin, 3)
         self.worker_seconds[name] = round(sum(one.cpu_seconds for one in ended), 3)
@@ -224,7 +225,7 @@ class _Run:
             "worker_memory": wishes.worker_memory,
             "threads": config.threads or 1,
         }
-        self._progress: dict[str, Progress] = {}
+        self._progress: dict[str, JobProgress] = {}
 
     def carry_out(self, scheduler: Scheduler, results: Path, folder: Path) -> FusedRun:
         """Do all steps; the files of the results lie in `results` then."""
@@ -270,18 +271,18 @@ class _Run:
             mesh={name: value for name, value in mesh.figures.items() if name != "is_whole"},
             tiles=sum(bool(one.files) for one in tiles),
             config=msgspec.to_builtins(self._config),
-            versions=run_files.versions(),
-            made=run_files.circumstances(),
+            versions=findings.versions(),
+            made=findings.circumstances(),
         )
 
     # --- steps ---
 
-    def _fuse(self, doing: CarryingOut, workers: int) -> list[Done]:
+    def _fuse(self, doing: CarryingOut, workers: int) -> list[JobDone]:
         count = self._found.count
         shares = min(count, workers * -(-count // (workers * _MOST_KEYFRAMES)))
         self._display.stage(f"fusing {count} keyframes with {workers} workers")
         todo = [
-            jobs.Fuse(
+            jobs.FuseJob(
                 name=f"fuse-{number}-of-{shares}",
                 config=self._config,
                 keyframes=keyframes,
@@ -292,21 +293,21 @@ class _Run:
             for number, keyframes in enumerate(self._found.shares(shares))
         ]
 
-        def finished(one: Done) -> None:
-            self._watch(Progress(one.name, one.read, one.fused))
+        def finished(one: JobDone) -> None:
+            self._watch(JobProgress(one.name, one.read, one.fused))
 
         return doing.do(todo, finished)
 
-    def _watch(self, said: Progress) -> None:
+    def _watch(self, said: JobProgress) -> None:
         self._progress[said.name] = said
         read, fused = (
             sum(getattr(one, name) for one in self._progress.values()) for name in ("read", "fused")
         )
         self._display.show_fused(read, fused, self._found.count)
 
-    def _add(self, doing: CarryingOut, files: list[str]) -> tuple[str, list[Done]]:
+    def _add(self, doing: CarryingOut, files: list[str]) -> tuple[str, list[JobDone]]:
         """Add maps as a tree; the file of the whole map, and what the jobs said."""
-        ended: list[Done] = []
+        ended: list[JobDone] = []
         if len(files) > 1:
             self._display.stage(f"adding {len(files)} parts of the map")
         while len(files) > 1:
@@ -317,13 +318,13 @@ class _Run:
             files = [one.files[0] for one in done]
         return files[0], ended
 
-    def _mesh_runs(self, doing: CarryingOut, file: str, blocks: int, workers: int) -> list[Done]:
+    def _mesh_runs(self, doing: CarryingOut, file: str, blocks: int, workers: int) -> list[JobDone]:
         """Parts of the whole mesh by all workers, where the map fits into the memory of one."""
         self._display.stage("meshing")
         if self._wishes.worker_memory is not None:
             return []
         return doing.do(
-            jobs.MeshRun(
+            jobs.MeshRunJob(
                 name=f"run-{_digest([file, one.start, one.stop])}",
                 file=file,
                 view=self._view,
@@ -334,7 +335,7 @@ class _Run:
             for one in mesh_runs.shares(blocks, workers)
         )
 
-    def _mesh(self, doing: CarryingOut, file: str, runs: list[Done]) -> Done:
+    def _mesh(self, doing: CarryingOut, file: str, runs: list[JobDone]) -> JobDone:
         wishes = self._wishes
         (done,) = doing.do(
             [
@@ -353,7 +354,7 @@ class _Run:
             raise OutputError(f"{run_files.NO_SURFACE}: {run_files.MORE_SURFACE}")
         return done
 
-    def _tiles(self, doing: CarryingOut, file: str, mesh: Done) -> list[Done]:
+    def _tiles(self, doing: CarryingOut, file: str, mesh: JobDone) -> list[JobDone]:
         wishes = self._wishes
         if wishes.tile_size is None and mesh.figures["is_whole"]:
             return []
@@ -381,7 +382,7 @@ class _Run:
     def _view(self) -> dict[str, Any]:
         return {name: getattr(self._config, name) for name in VIEW_SETTINGS}
 
-    def _collect(self, results: Path, file: str, mesh: Done, tiles: list[Done]) -> None:
+    def _collect(self, results: Path, file: str, mesh: JobDone, tiles: list[JobDone]) -> None:
         """Move the files of the results out of the folder of what is half done."""
         try:
             os.replace(self._work / file, results / run_files.MAP)

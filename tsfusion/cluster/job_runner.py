@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 
 from tsfusion.cluster import jobs, keyframe_sources, mesh_runs
-from tsfusion.cluster.jobs import AnyJob, Done, Failed, Message, Progress
+from tsfusion.cluster.jobs import AnyJob, JobDone, JobFailed, JobMessage, JobProgress
 from tsfusion.core import process
 from tsfusion.core.config import VolumeConfig
 from tsfusion.core.durable_files import replacing
@@ -34,12 +34,13 @@ from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.mesh_arrays import Provenance
 from tsfusion.geometry.mesh_parts import joined
 from tsfusion.geometry.up_direction import HeldSensor
-from tsfusion.kernels import runtime
-from tsfusion.pipelines import mesh_finishing
-from tsfusion.tsdf import checkpoint, mesh_tiles
-from tsfusion.tsdf.map_history import HELD
+from tsfusion.kernels.base import runtime
+from tsfusion.pipelines.maps import mesh_finishing
+from tsfusion.tsdf.files import checkpoint
+from tsfusion.tsdf.files.map_history import HELD
+from tsfusion.tsdf.files.saved_map_addition import add_files
 from tsfusion.tsdf.readable_map import map_provenance
-from tsfusion.tsdf.saved_map_addition import add_files
+from tsfusion.tsdf.surface import mesh_tiles
 from tsfusion.tsdf.volume import Volume
 
 _PROGRESS_S = 0.2
@@ -47,11 +48,11 @@ _SPARE = 0.15  # share of a worker's memory for rays, chunks and what the alloca
 _LEAST_MAP_BYTES = 32 << 20
 _MESHING = 1.5  # memory of a map that is meshed in one piece, against that of its blocks
 _MESHING_BYTES = 160 << 20  # that meshing part by part takes beside them
-Doing = Generator[Progress, None, dict[str, Any]]  # what it gives in the end are fields of `Done`
+Doing = Generator[JobProgress, None, dict[str, Any]]  # what it gives in the end are fields of `Done`
 
 
-def run(job: AnyJob) -> Iterator[Message]:
-    """Do a job. The last message is its end: `Done`, or `Failed` for what nobody else could do either."""
+def run(job: AnyJob) -> Iterator[JobMessage]:
+    """Do a job. The last message is its end: `JobDone`, or `JobFailed` where nobody could do it."""
     folder = Path(job.folder)
     begin, cpu = time.monotonic(), time.process_time()
     base = process.rss_bytes()
@@ -59,10 +60,10 @@ def run(job: AnyJob) -> Iterator[Message]:
         runtime.start(job.threads)
         made = yield from _DOERS[type(job)](job, folder)
     except (TsfusionError, MemoryError) as error:
-        yield Failed(job.name, type(error).__name__, str(error))
+        yield JobFailed(job.name, type(error).__name__, str(error))
         return
     try:
-        done = Done(
+        done = JobDone(
             name=job.name,
             seconds=round(time.monotonic() - begin, 3),
             cpu_seconds=round(time.process_time() - cpu, 3),
@@ -74,7 +75,7 @@ def run(job: AnyJob) -> Iterator[Message]:
         with replacing(jobs.done_file(folder, job.name)) as file:
             file.write(msgspec.msgpack.encode(done))
     except OSError as error:
-        yield Failed(job.name, "OutputError", f"cannot write to {folder}: {error.strerror}")
+        yield JobFailed(job.name, "OutputError", f"cannot write to {folder}: {error.strerror}")
         return
     yield done
 
@@ -87,10 +88,10 @@ def _new(folder: Path, name: str, suffix: str) -> Path:
 # --- fusing ---
 
 
-class _Parts:
+class _JobParts:
     """The map of some keyframes, which goes to a file and begins anew when it is as large as it may be."""
 
-    def __init__(self, job: jobs.Fuse, folder: Path) -> None:
+    def __init__(self, job: jobs.FuseJob, folder: Path) -> None:
         self._job, self._folder = job, folder
         self._config: VolumeConfig = job.config
         self.files: list[str] = []
@@ -137,8 +138,8 @@ class _Parts:
             self._limit()
 
 
-def _fuse(job: jobs.Fuse, folder: Path) -> Doing:
-    parts, left_out = _Parts(job, folder), Counter[str]()
+def _fuse(job: jobs.FuseJob, folder: Path) -> Doing:
+    parts, left_out = _JobParts(job, folder), Counter[str]()
     told, read = time.monotonic(), 0
     for keyframe in keyframe_sources.reading(job.keyframes):
         try:
@@ -150,7 +151,7 @@ def _fuse(job: jobs.Fuse, folder: Path) -> Doing:
         read += 1
         if time.monotonic() - told > _PROGRESS_S:
             told = time.monotonic()
-            yield Progress(job.name, read, parts.fused)
+            yield JobProgress(job.name, read, parts.fused)
     parts.save(is_last=True)
     return {"files": parts.files, "read": read, "fused": parts.fused, "left_out": dict(left_out)}
 
@@ -187,7 +188,7 @@ def _add(job: jobs.Add, folder: Path) -> dict[str, Any]:
 # --- meshing ---
 
 
-def _run(job: jobs.MeshRun, folder: Path) -> dict[str, Any]:
+def _run(job: jobs.MeshRunJob, folder: Path) -> dict[str, Any]:
     path = _new(folder, job.name, ".npz")
     mesh_runs.write(path, mesh_runs.make(folder / job.file, range(job.first, job.stop), job.view))
     return {"files": [path.name]}
@@ -269,9 +270,9 @@ def _at_once(do: Callable[[Any, Path], dict[str, Any]]) -> Callable[[Any, Path],
 
 
 _DOERS: dict[type, Callable[[Any, Path], Doing]] = {
-    jobs.Fuse: _fuse,
+    jobs.FuseJob: _fuse,
     jobs.Add: _at_once(_add),
-    jobs.MeshRun: _at_once(_run),
+    jobs.MeshRunJob: _at_once(_run),
     jobs.MeshMap: _at_once(_mesh),
     jobs.MeshTile: _at_once(_tile),
 }

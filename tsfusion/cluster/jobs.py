@@ -68,7 +68,7 @@ class DatasetKeyframes(Struct, tag="dataset", frozen=True):
         return msgspec.structs.replace(self, first=self.first + first, stop=self.first + stop)
 
 
-Keyframes = JournalKeyframes | DatasetKeyframes
+KeyframeList = JournalKeyframes | DatasetKeyframes
 
 
 class Job(Struct, frozen=True, kw_only=True):
@@ -87,11 +87,11 @@ class Job(Struct, frozen=True, kw_only=True):
     threads: int = 1
 
 
-class Fuse(Job, tag="fuse", frozen=True, kw_only=True):
+class FuseJob(Job, tag="fuse", frozen=True, kw_only=True):
     """Make a map of keyframes; one that is larger than memory is left in several files."""
 
     config: VolumeConfig
-    keyframes: list[Keyframes]
+    keyframes: list[KeyframeList]
     sensor: str | None = None  # preset that all keyframes are taken to be of; None = each as it says
     world: str = ""  # name of the keyframes' coordinate frame
 
@@ -102,8 +102,8 @@ class Add(Job, tag="add", frozen=True, kw_only=True):
     files: list[str]
 
 
-class MeshRun(Job, tag="run", frozen=True, kw_only=True):
-    """Mesh some tiles of a map for `MeshMap` (`tsdf.mesh_tiles`): first ≤ number < stop."""
+class MeshRunJob(Job, tag="run", frozen=True, kw_only=True):
+    """Mesh some tiles of a map for `MeshMap` (`tsdf.surface.mesh_tiles`): first ≤ number < stop."""
 
     file: str
     view: dict[str, Any]
@@ -116,7 +116,7 @@ class MeshMap(Job, tag="mesh", frozen=True, kw_only=True):
 
     Attributes:
         file: the map.
-        runs: files of its `MeshRun` jobs, in their order; none = they are not made.
+        runs: files of its `MeshRunJob` jobs, in their order; none = they are not made.
         view: settings of the surface that differ from the map's.
         up: away from the ground; None = it is found.
         keep_islands: as of `mesh_files.write`.
@@ -139,10 +139,10 @@ class MeshTile(Job, tag="tile", frozen=True, kw_only=True):
     high: tuple[int, int, int]
 
 
-AnyJob = Fuse | Add | MeshRun | MeshMap | MeshTile
+AnyJob = FuseJob | Add | MeshRunJob | MeshMap | MeshTile
 
 
-class Progress(Struct, tag="progress", frozen=True):
+class JobProgress(Struct, tag="progress", frozen=True):
     """Progress of a job: keyframes read, and those of them in the map."""
 
     name: str
@@ -150,7 +150,7 @@ class Progress(Struct, tag="progress", frozen=True):
     fused: int
 
 
-class Done(Struct, tag="done", frozen=True, kw_only=True):
+class JobDone(Struct, tag="done", frozen=True, kw_only=True):
     """A job is done.
 
     Attributes:
@@ -174,7 +174,7 @@ class Done(Struct, tag="done", frozen=True, kw_only=True):
     figures: dict[str, Any] = {}
 
 
-class Failed(Struct, tag="failed", frozen=True):
+class JobFailed(Struct, tag="failed", frozen=True):
     """A job cannot be done, by whomever: `kind` of error, and why."""
 
     name: str
@@ -182,14 +182,14 @@ class Failed(Struct, tag="failed", frozen=True):
     why: str
 
 
-class Lost(Struct, tag="lost", frozen=True):
+class JobLost(Struct, tag="lost", frozen=True):
     """Whoever did a job has ended before it was done."""
 
     name: str
     why: str
 
 
-Message = Progress | Done | Failed | Lost
+JobMessage = JobProgress | JobDone | JobFailed | JobLost
 
 
 def digests(folder: Path, files: Iterable[str]) -> list[str]:

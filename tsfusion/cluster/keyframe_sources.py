@@ -17,23 +17,23 @@ import msgspec
 import numpy as np
 
 from tsfusion import journal
-from tsfusion.cluster.jobs import DatasetKeyframes, JournalKeyframes, Keyframes
+from tsfusion.cluster.jobs import DatasetKeyframes, JournalKeyframes, KeyframeList
 from tsfusion.core.config import VolumeConfig
 from tsfusion.core.durable_files import size_of
 from tsfusion.core.errors import CheckpointError, DatasetError, InvalidConfig, JournalError, MapError
 from tsfusion.core.output_folder import RECORD
-from tsfusion.core.readable_numbers import count_of
+from tsfusion.core.readable_numbers import OnProgress, count_of
 from tsfusion.datasets import open_dataset
 from tsfusion.datasets.cameras import camera_files
 from tsfusion.datasets.dataset import Dataset, first_frame, pose_of
-from tsfusion.datasets.registry import sweep_doubt
+from tsfusion.datasets.layouts import sweep_doubt
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.geometry.origin import world_of
 from tsfusion.journal import locations, state_folder
 from tsfusion.journal.journaled_keyframes import JournaledKeyframes
-from tsfusion.tsdf import checkpoint, map_history
-from tsfusion.tsdf.checkpoint import CheckpointHeader
-from tsfusion.wire import codec
+from tsfusion.tsdf.files import checkpoint, map_history
+from tsfusion.tsdf.files.checkpoint import CheckpointHeader
+from tsfusion.wire.records import codec
 
 SYNTHETIC = "synthetic:"
 WORK = ".fuse"  # folder of a run's unfinished work, in that of its results
@@ -59,7 +59,7 @@ class Listed(msgspec.Struct):
         absent: number of those of saved maps that the journals beside these no longer have.
     """
 
-    keyframes: list[Keyframes] = []
+    keyframes: list[KeyframeList] = []
     names: list[str] = []
     saved: dict[str, Any] = {}
     sensor: str | None = None
@@ -79,7 +79,7 @@ class Listed(msgspec.Struct):
         """Number of keyframes of all sources together."""
         return sum(map(len, self.keyframes))
 
-    def shares(self, count: int) -> list[list[Keyframes]]:
+    def shares(self, count: int) -> list[list[KeyframeList]]:
         """All of them in `count` runs of about the same length; neighbours see the same blocks."""
         ends = np.cumsum([len(one) for one in self.keyframes]).tolist()
         borders = np.linspace(0, self.count, count + 1).round().astype(int).tolist()
@@ -109,7 +109,7 @@ def listed(
     map_name: str | None = None,
     same_frame: bool = False,
     options: dict[str, Any] | None = None,
-    watch: state_folder.Watcher = lambda _done, _all: None,
+    watch: OnProgress = lambda _done, _all: None,
 ) -> Listed:
     """The keyframes of state folders, journals and datasets, which are in one coordinate frame.
 
@@ -161,9 +161,7 @@ def _is_journal(source: str) -> bool:
     return state_folder.is_journal(locations.location(source))
 
 
-def _journal(
-    found: Listed, source: str, map_name: str | None, watch: state_folder.Watcher
-) -> JournaledKeyframes:
+def _journal(found: Listed, source: str, map_name: str | None, watch: OnProgress) -> JournaledKeyframes:
     path = locations.location(source)
     saved = saved_beside(path, map_name)  # before the journal, which may grow meanwhile
     keyframes = JournaledKeyframes(state_folder.find_journal(path, map_name), watch=watch)
@@ -342,7 +340,7 @@ def _children(folder: Path) -> list[Path]:
 # --- reading ---
 
 
-def reading(keyframes: Sequence[Keyframes]) -> Iterator[Callable[[], Keyframe]]:
+def reading(keyframes: Sequence[KeyframeList]) -> Iterator[Callable[[], Keyframe]]:
     """Readers of the keyframes, in their order.
 
     A call raises JournalError or DatasetError when it cannot be read, DecodeError or InvalidKeyframe when it
@@ -368,7 +366,7 @@ class _LazyFrame:
 
 def _of_journal(one: JournalKeyframes) -> Iterator[Callable[[], Keyframe]]:
     rows = one.rows().reshape(-1, 3, 4)
-    with journal.Reading() as records:
+    with journal.SegmentReader() as records:
         for file, offset, pose in zip(one.file, one.offsets, rows, strict=True):
 
             def read(file: int = file, offset: int = offset, pose: Any = pose) -> Keyframe:

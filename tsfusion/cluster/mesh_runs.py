@@ -11,9 +11,10 @@ import numpy as np
 from tsfusion.core.durable_files import replacing
 from tsfusion.core.errors import OutputError
 from tsfusion.geometry.mesh_parts import MeshPart
-from tsfusion.tsdf import checkpoint, mesh_tiles
-from tsfusion.tsdf.block_store import unpack_keys
-from tsfusion.tsdf.mesh_tiles import MeshRun, Numbered
+from tsfusion.tsdf.files import checkpoint
+from tsfusion.tsdf.store.block_store import unpack_keys
+from tsfusion.tsdf.surface import mesh_tiles
+from tsfusion.tsdf.surface.mesh_tiles import MeshRun, Numbered
 from tsfusion.tsdf.volume import Volume
 
 LEAST_TILES = 3  # of a run: its neighbours' tiles are solved for it, too

@@ -13,7 +13,7 @@ from typing import Any
 
 import msgspec
 
-from tsfusion.cluster.jobs import AnyJob, Done, Failed, Lost, Message
+from tsfusion.cluster.jobs import AnyJob, JobDone, JobFailed, JobLost, JobMessage
 from tsfusion.core.errors import MissingDependency, TransportError
 
 _TICK_S = 1.0
@@ -71,23 +71,23 @@ class RayCluster:
     def start(self, job: AnyJob) -> None:
         self._under_way[self._do.options(num_cpus=job.threads).remote(msgspec.msgpack.encode(job))] = job.name
 
-    def wait(self) -> Sequence[Message]:
+    def wait(self) -> Sequence[JobMessage]:
         ready: list[Any] = []
         while not ready:
             ready, _ = self._ray.wait(list(self._under_way), num_returns=1, timeout=_TICK_S)
         return [self._next(one) for one in ready]
 
-    def _next(self, under_way: Any) -> Message:
+    def _next(self, under_way: Any) -> JobMessage:
         """The next message of a job."""
         try:
-            message: Message = msgspec.msgpack.decode(self._ray.get(next(under_way)), type=Message)
+            message: JobMessage = msgspec.msgpack.decode(self._ray.get(next(under_way)), type=JobMessage)
         except StopIteration:
-            message = Lost(self._under_way[under_way], "it ended without a result")
+            message = JobLost(self._under_way[under_way], "it ended without a result")
         except self._ray.exceptions.RayError as error:
-            message = Lost(
+            message = JobLost(
                 self._under_way[under_way], f"{type(error).__name__}: {str(error).splitlines()[0]}"
             )
-        if isinstance(message, Done | Failed | Lost):
+        if isinstance(message, JobDone | JobFailed | JobLost):
             del self._under_way[under_way]
         return message
 

@@ -12,7 +12,7 @@ from typing import Protocol
 import msgspec
 
 from tsfusion.cluster.__main__ import LENGTH
-from tsfusion.cluster.jobs import AnyJob, Done, Failed, Lost, Message
+from tsfusion.cluster.jobs import AnyJob, JobDone, JobFailed, JobLost, JobMessage
 from tsfusion.core import process
 from tsfusion.core.errors import OutputError
 
@@ -33,8 +33,8 @@ class Scheduler(Protocol):
     def start(self, job: AnyJob) -> None:
         """Begin a job; there are fewer than `workers` under way."""
 
-    def wait(self) -> Sequence[Message]:
-        """Next messages of the jobs under way, at least one. `Done`, `Failed` and `Lost` end a job."""
+    def wait(self) -> Sequence[JobMessage]:
+        """Next messages of the jobs under way, at least one. `JobDone`, `JobFailed` or `JobLost` end one."""
 
     def close(self) -> None:
         """End all, also what is under way."""
@@ -60,8 +60,8 @@ class LocalProcesses:
         self._busy.register(worker.output, selectors.EVENT_READ, worker)
         worker.begin(job)
 
-    def wait(self) -> Sequence[Message]:
-        found: list[Message] = []
+    def wait(self) -> Sequence[JobMessage]:
+        found: list[JobMessage] = []
         while not found:
             for key, _ in self._busy.select():
                 worker: _Worker = key.data
@@ -107,21 +107,21 @@ class _Worker:
             self.process.stdin.write(LENGTH.pack(len(encoded)) + encoded)
             self.process.stdin.flush()
 
-    def read(self) -> list[Message]:
+    def read(self) -> list[JobMessage]:
         """The messages that have come."""
         content = os.read(self.output, 1 << 16)
         if not content:
             name, self.job, self.is_over = self.job, None, True
-            return [Lost(name or "", f"its process ended with status {self.process.wait()}")]
+            return [JobLost(name or "", f"its process ended with status {self.process.wait()}")]
         self._unread += content
-        found: list[Message] = []
+        found: list[JobMessage] = []
         while len(self._unread) >= LENGTH.size:
             end = LENGTH.size + LENGTH.unpack_from(self._unread)[0]
             if len(self._unread) < end:
                 break
-            found.append(msgspec.msgpack.decode(self._unread[LENGTH.size : end], type=Message))
+            found.append(msgspec.msgpack.decode(self._unread[LENGTH.size : end], type=JobMessage))
             self._unread = self._unread[end:]
-        if any(isinstance(one, Done | Failed) for one in found):
+        if any(isinstance(one, JobDone | JobFailed) for one in found):
             self.job = None
         return found
 

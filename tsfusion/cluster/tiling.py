@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from tsfusion.core.durable_files import replacing
 from tsfusion.core.errors import InvalidConfig
-from tsfusion.tsdf import checkpoint
-from tsfusion.tsdf.block_store import distinct_blocks, unpack_keys
+from tsfusion.tsdf.files import checkpoint
+from tsfusion.tsdf.store.block_store import distinct_blocks, unpack_keys
 
 USUAL_BLOCKS = 16_384  # of a tile
 _BLOCK_BYTES = 24 << 10  # of a block that is meshed: its sums, values, the field's solution, triangles
@@ -23,7 +23,7 @@ _WORKING_BYTES = 64 << 20  # that meshing takes, however small a tile is
 _HALO = 4  # blocks around a tile, at most
 _LEAST_SIDE, _MOST_SIDE = 4, 1 << 14  # blocks
 
-Box = tuple[tuple[int, int, int], tuple[int, int, int]]
+BlockBox = tuple[tuple[int, int, int], tuple[int, int, int]]
 
 
 def most_blocks(worker_memory: int | None, base_rss: int) -> int:
@@ -37,7 +37,7 @@ def most_blocks(worker_memory: int | None, base_rss: int) -> int:
     return max(1, min(USUAL_BLOCKS, (worker_memory - base_rss - _WORKING_BYTES) // _BLOCK_BYTES))
 
 
-def boxes(file: Path, tile_size: float | None, most: int) -> list[Box]:
+def boxes(file: Path, tile_size: float | None, most: int) -> list[BlockBox]:
     """The cubes that hold a map's blocks: block coordinates, first and last + 1.
 
     Args:

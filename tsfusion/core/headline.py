@@ -7,8 +7,8 @@ from msgspec import Struct
 
 from tsfusion.core.readable_numbers import count_of, span
 
-Level = Literal["good", "notice", "bad"]
-MARKS: dict[Level, str] = {"good": "✓", "notice": "!", "bad": "✗"}
+Severity = Literal["good", "notice", "bad"]
+MARKS: dict[Severity, str] = {"good": "✓", "notice": "!", "bad": "✗"}
 _FEW = 3  # keyframes under way are no delay, however slow the map is: one travels, one waits, one is fused
 _SOON = 1.0  # seconds: what is fused within these is no delay either, however many keyframes it is
 
@@ -36,10 +36,10 @@ class Headline(Struct, frozen=True, kw_only=True):
         return self.waiting > _FEW and (not self.rate or self.waiting / self.rate > _SOON)
 
     @property
-    def parts(self) -> list[tuple[str, Level]]:
+    def parts(self) -> list[tuple[str, Severity]]:
         """The three answers, each with how bad it is."""
-        works: tuple[str, Level] = (self.trouble, "bad") if self.trouble else (self.doing, "good")
-        pace: tuple[str, Level] = (self.pace, "notice" if self.is_behind else "good")
+        works: tuple[str, Severity] = (self.trouble, "bad") if self.trouble else (self.doing, "good")
+        pace: tuple[str, Severity] = (self.pace, "notice" if self.is_behind else "good")
         return [works, pace, (f"lost {count_of(self.lost, 'keyframe')}", "bad" if self.lost else "good")]
 
     @property
@@ -51,7 +51,7 @@ class Headline(Struct, frozen=True, kw_only=True):
         return f"behind by {count_of(self.waiting, 'keyframe')}{seconds}"
 
     @property
-    def mark(self) -> tuple[str, Level]:
+    def mark(self) -> tuple[str, Severity]:
         """The sign of the worst of the three answers."""
         level = max((level for _, level in self.parts), key=list(MARKS).index)
         return MARKS[level], level

@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Numbers and counts as a person reads them."""
+"""Numbers and counts as a person reads them, and the progress of long work."""
 
+from collections.abc import Callable
 from decimal import Decimal
+
+OnProgress = Callable[[int, int], None]  # done, of how many (0 = unknown): bytes, records or steps
 
 
 def grouped(number: float) -> str:

@@ -21,7 +21,7 @@ MOST_SAID = 1 << 17  # bytes of a message
 _STEP = 1 << 20
 
 
-class Place(NamedTuple):
+class SharedSlot(NamedTuple):
     """Place of an array in shared memory."""
 
     offset: int
@@ -78,15 +78,15 @@ class SharedArrays:
         """Write over what was written before."""
         self._end = 0
 
-    def empty(self, shape: tuple[int, ...], dtype: DTypeLike) -> tuple[NDArray[Any], Place]:
+    def empty(self, shape: tuple[int, ...], dtype: DTypeLike) -> tuple[NDArray[Any], SharedSlot]:
         """An array to be filled, and where it is."""
-        place = Place(-(-self._end // _ALIGNMENT) * _ALIGNMENT, shape, np.dtype(dtype).str)
+        place = SharedSlot(-(-self._end // _ALIGNMENT) * _ALIGNMENT, shape, np.dtype(dtype).str)
         self._end = end = place.end
         if end > self._size:
             os.ftruncate(self._descriptor, -(-max(end, 2 * self._size) // _STEP) * _STEP)
         return self.read(place), place
 
-    def write(self, arrays: Iterable[NDArray[Any]]) -> list[Place]:
+    def write(self, arrays: Iterable[NDArray[Any]]) -> list[SharedSlot]:
         """Copy arrays into the memory."""
         places = []
         for array in arrays:
@@ -95,7 +95,7 @@ class SharedArrays:
             places.append(place)
         return places
 
-    def read(self, place: Place) -> NDArray[Any]:
+    def read(self, place: SharedSlot) -> NDArray[Any]:
         """The array at a place, not copied."""
         if self._map is None or place.end > self._size:
             # Arrays of the earlier mapping keep it.

@@ -6,7 +6,7 @@ Any object with `__len__` and `__getitem__` that follows the `Dataset` protocol 
 Rooms:
     formats: readers of recording layouts.
     rosbag: ROS 1 and ROS 2 bags and MCAP files as datasets, without ROS.
-    synthetic: worlds with a known surface, rendered as keyframes.
+    worlds: scenes with a known surface, rendered as keyframes.
     download: public recordings: downloaded, checked and unpacked.
 """
 
@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets.dataset import Dataset, Selection, select
+from tsfusion.datasets.dataset import Dataset, PartOfDataset, select
 from tsfusion.datasets.formats.euroc import EuRoC
 from tsfusion.datasets.formats.folder_table import HoloLens, Redwood, Replica, ScanNet, SevenScenes
 from tsfusion.datasets.formats.gtsam_points import LidarDump
@@ -24,9 +24,9 @@ from tsfusion.datasets.formats.nerfstudio import Nerfstudio
 from tsfusion.datasets.formats.scan_folders import ScanFolder
 from tsfusion.datasets.formats.stereo_folders import StereoFolder
 from tsfusion.datasets.formats.tum import TUM
-from tsfusion.datasets.registry import Found, Layout, describe, find, layouts, open_as, world_layout
-from tsfusion.datasets.rosbag.dataset import Bag
-from tsfusion.datasets.synthetic.dataset import WORLDS, Synthetic
+from tsfusion.datasets.layouts import FoundDataset, Layout, describe, find, layouts, open_as, world_layout
+from tsfusion.datasets.rosbag.bag import Bag
+from tsfusion.datasets.worlds.synthetic import WORLDS, Synthetic
 
 __all__ = [
     "KITTI",
@@ -34,17 +34,17 @@ __all__ = [
     "Bag",
     "Dataset",
     "EuRoC",
-    "Found",
+    "FoundDataset",
     "HoloLens",
     "KITTIRaw",
     "Layout",
     "LidarDump",
     "Nerfstudio",
+    "PartOfDataset",
     "Redwood",
     "Replica",
     "ScanFolder",
     "ScanNet",
-    "Selection",
     "SevenScenes",
     "StereoFolder",
     "Synthetic",

@@ -38,7 +38,7 @@ _FEWEST_TIMES, _MOST_PARTS = 10, 100  # of each part on average; more parts are 
 _FIRST_TRIES = 50  # frames that cannot be read and none before them that can: so it is with all
 _T = TypeVar("_T")
 Times = NDArray[np.int64] | None  # (n,) nanoseconds of a recording's frames; None where none were recorded
-Poses = Sequence[NDArray[np.float64] | None]  # (4, 4) T_world_camera of frames, None where there is none
+FramePoses = Sequence[NDArray[np.float64] | None]  # (4, 4) T_world_camera of frames, None where there is none
 
 log = logging.getLogger(__name__)
 _AROUND_NS = 50_000_000  # on each side of a frame's time
@@ -214,11 +214,11 @@ class Frames(ShownRecording):
     def __getitem__(self, index: int) -> Keyframe: ...
 
     @overload
-    def __getitem__(self, index: slice) -> "Selection": ...
+    def __getitem__(self, index: slice) -> "PartOfDataset": ...
 
-    def __getitem__(self, index: int | slice) -> "Keyframe | Selection":
+    def __getitem__(self, index: int | slice) -> "Keyframe | PartOfDataset":
         if isinstance(index, slice):
-            return Selection(self, range(len(self))[index])
+            return PartOfDataset(self, range(len(self))[index])
         return self._keyframe(self._checked(index))
 
     def _keyframe(self, index: int) -> Keyframe:
@@ -242,7 +242,7 @@ class Frames(ShownRecording):
     def _keep(
         self,
         files: Sequence[_T],
-        poses: Poses,
+        poses: FramePoses,
         where: tuple[Path, str],
         *,
         posed: bool,
@@ -325,7 +325,7 @@ class Wrapped(Frames):
         return frame_of(self._dataset, self._indices[index])
 
 
-class Selection(Wrapped):
+class PartOfDataset(Wrapped):
     """Selected keyframes of another dataset; `select` makes one."""
 
     def pose(self, index: int) -> NDArray[np.float64] | None:
@@ -372,7 +372,9 @@ def force_of(dataset: Dataset, index: int) -> NDArray[np.float64] | None:
     return own(index) if own is not None else None
 
 
-def poses_if_any(read: Callable[[], Poses], count: int, *, posed: bool, guessed: bool = False) -> Poses:
+def poses_if_any(
+    read: Callable[[], FramePoses], count: int, *, posed: bool, guessed: bool = False
+) -> FramePoses:
     """The poses of `count` frames; None for each where the recording has none.
 
     Args:
@@ -392,7 +394,7 @@ def poses_if_any(read: Callable[[], Poses], count: int, *, posed: bool, guessed:
 
 def select(
     dataset: Dataset, *, start: int = 0, stop: int | None = None, stride: int = 1, limit: int | None = None
-) -> Selection:
+) -> PartOfDataset:
     """Every `stride`-th keyframe of `dataset[start:stop]`, at most `limit` of them.
 
     Raises:
@@ -406,7 +408,7 @@ def select(
     if not indices:
         kept = f"after the first {start}" if stop is None else f"from {start} up to {stop}"
         raise DatasetError(f"{dataset.name} has {len(dataset)} keyframes, none {kept}")
-    return Selection(dataset, indices)
+    return PartOfDataset(dataset, indices)
 
 
 def nearest_in_time(sorted_ns: NDArray[np.int64], stamps_ns: NDArray[np.int64]) -> NDArray[np.intp]:

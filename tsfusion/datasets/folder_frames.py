@@ -10,8 +10,8 @@ from typing import Any
 from tsfusion.datasets.dataset import (
     NO_POSE_IN_TIME,
     WITHOUT_POSE,
+    FramePoses,
     Frames,
-    Poses,
     Times,
     poses_if_any,
     require_folder,
@@ -100,10 +100,10 @@ class FolderFrames(Frames):
         """Files of the frames in order, and their times, (n,) nanoseconds, where they are known."""
 
     @abstractmethod
-    def _recorded_poses(self, root: Path, files: list[Any]) -> Poses:
+    def _recorded_poses(self, root: Path, files: list[Any]) -> FramePoses:
         """The pose of each frame; raises NoPoses where the folder has none."""
 
-    def _poses_of(self, path: Path, files: list[Any]) -> Poses:
+    def _poses_of(self, path: Path, files: list[Any]) -> FramePoses:
         """Poses of a trajectory: by time where both have times, else one for each frame."""
         self._why = WITHOUT_POSE if self._times is None else NO_POSE_IN_TIME
         where = {"max_gap_s": self._gap_s, "time_offset_s": self._offset_s}

@@ -18,8 +18,8 @@ from tsfusion.core.errors import DatasetError, InvalidKeyframe
 from tsfusion.geometry.calibration import MAX_NO_SKEW
 from tsfusion.geometry.calibration_files import read_text
 from tsfusion.geometry.keyframe import MAX_IMAGE_SIDE, Intrinsics, check_intrinsics
-from tsfusion.wire import image_headers
-from tsfusion.wire.record_header import Refused
+from tsfusion.wire.records import image_headers
+from tsfusion.wire.records.record_header import Refused
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _PIXEL_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")

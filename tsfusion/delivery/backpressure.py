@@ -22,8 +22,8 @@ from tsfusion.core.config import ClientConfig
 from tsfusion.core.errors import JournalError
 from tsfusion.delivery.outbox import Outbox
 from tsfusion.geometry.keyframe import Keyframe
-from tsfusion.wire import codec, corrections
-from tsfusion.wire.corrections import Correction
+from tsfusion.wire.records import codec, corrections
+from tsfusion.wire.records.corrections import Correction
 
 log = logging.getLogger(__name__)
 

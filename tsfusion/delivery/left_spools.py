@@ -20,7 +20,7 @@ from tsfusion.core.folder_lock import lock_folder, owner_of
 from tsfusion.delivery import spool
 from tsfusion.journal.mcap_layout import Record
 from tsfusion.journal.record_scan import Damage, scan_records
-from tsfusion.wire.record_header import unpack
+from tsfusion.wire.records.record_header import unpack
 
 log = logging.getLogger(__name__)
 

@@ -20,7 +20,7 @@ from tsfusion.delivery.outcomes import ClientStats, DeliveryProgress, Outcomes
 from tsfusion.delivery.spool import Spool, Waiting
 from tsfusion.delivery.timing import KeyframeTimesTable, Lag, TakingRate
 from tsfusion.geometry.keyframe import Keyframe
-from tsfusion.wire.keyframe_times import KeyframeTimes, Stamps
+from tsfusion.wire.messages.keyframe_times import KeyframeTimes, Stamps
 
 LinkKind = Literal[
     "connecting", "connected", "held", "opening", "moved", "refused", "other_world", "locked_out", "silent"

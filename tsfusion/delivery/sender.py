@@ -21,10 +21,10 @@ from tsfusion.core.errors import MISSING, DecodeError, InvalidConfig, JournalErr
 from tsfusion.delivery.control_session import ControlSession, RefusedRecords
 from tsfusion.delivery.outbox import Outbox
 from tsfusion.delivery.spool import Waiting
-from tsfusion.wire import sockets
-from tsfusion.wire.connection import Connection, Patience
-from tsfusion.wire.curve import ClientKeys
-from tsfusion.wire.record_header import stamp
+from tsfusion.wire.records.record_header import stamp
+from tsfusion.wire.sockets import sockets
+from tsfusion.wire.sockets.connection import Patience, ServerLink
+from tsfusion.wire.sockets.curve import ClientKeys
 
 log = logging.getLogger(__name__)
 
@@ -106,8 +106,8 @@ class Sender:
         sockets.check_context()
         with (
             zmq.Context() as context,
-            closing(Connection(context, sockets.dealer, self._control_address, self._keys)) as control,
-            closing(Connection(context, sockets.push, self._data_address, self._keys)) as data,
+            closing(ServerLink(context, sockets.dealer, self._control_address, self._keys)) as control,
+            closing(ServerLink(context, sockets.push, self._data_address, self._keys)) as data,
         ):
             self._control, self._data = control, data
             self._outbox.change_link_state(self._outbox.link_state.reachable(self._no_socket))
@@ -208,7 +208,7 @@ class Sender:
         self._control.move_to(self._control_address)
         self._control_session.follow(self._control_address)
 
-    def _connect_again(self, *connections: Connection) -> None:
+    def _connect_again(self, *connections: ServerLink) -> None:
         """Make connections anew, and send again what is not acknowledged as soon as the server lets us in."""
         for connection in connections:
             connection.reopen()

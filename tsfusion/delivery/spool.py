@@ -25,7 +25,7 @@ from tsfusion.core.durable_files import size_of
 from tsfusion.core.errors import MISSING, DecodeError, JournalError
 from tsfusion.core.folder_lock import lock_folder
 from tsfusion.core.readable_numbers import count_of
-from tsfusion.wire.record_header import RecordHeader, is_correction, unpack
+from tsfusion.wire.records.record_header import RecordHeader, is_correction, unpack
 
 TOMBSTONES = "gone"
 _NUMBER = np.dtype("<u8")

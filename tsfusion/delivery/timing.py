@@ -6,7 +6,7 @@ from collections import deque
 import numpy as np
 from msgspec import Struct
 
-from tsfusion.wire.keyframe_times import KeyframeTimes, Stamps
+from tsfusion.wire.messages.keyframe_times import KeyframeTimes, Stamps
 
 CAPACITY = 65536
 _LARGEST = (1 << 63) - 1

@@ -13,8 +13,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from tsfusion.evaluation.fitted_factors import AS_GOOD, MIN_FOCAL_SIGMA, FittedFactor, sure_gain, zoomed
-from tsfusion.evaluation.frame_pairs import Fits, FramePair, Motion, best_fits_near, fits_of, share_of_best
+from tsfusion.evaluation.frame_pairs import (
+    Fits,
+    FramePair,
+    best_fits_near,
+    fits_of,
+    share_of_best,
+)
 from tsfusion.geometry.keyframe import Intrinsics
+from tsfusion.geometry.se3 import Transform
 
 MAX_OFF_CENTRE = 0.1  # of the image's side, from its centre: farther principal points are doubted
 MIN_RESIZED = 1.15  # factor between two sizes of an image below which they are the same
@@ -62,7 +69,7 @@ def is_outside(K: Intrinsics, shape: tuple[int, ...]) -> bool:
     return _off_centre(K, shape, OUTSIDE)
 
 
-def centre_fits(pairs: Sequence[FramePair], motions: Sequence[Motion], given: Fits) -> bool:
+def centre_fits(pairs: Sequence[FramePair], motions: Sequence[Transform], given: Fits) -> bool:
     """True if a principal point far from the centre is confirmed: frames fit worse with the likely ones."""
     view = pairs[0].first_view
     if view.camera is None:
@@ -123,7 +130,7 @@ def _centred(K: Intrinsics, shape: tuple[int, ...]) -> CameraMistake:
 
 
 def best_camera(
-    pairs: Sequence[FramePair], motions: Sequence[Motion], given: Fits, focal: FittedFactor | None
+    pairs: Sequence[FramePair], motions: Sequence[Transform], given: Fits, focal: FittedFactor | None
 ) -> tuple[float, CameraMistake | None, Fits]:
     """The camera with which frames surely fit better than as given: gain, camera, fits; or 0 and None.
 
@@ -154,7 +161,7 @@ def best_camera(
     return (gain, camera, fits) if explained else nothing
 
 
-def _fits_with(meant: CameraMistake, pairs: Sequence[FramePair], motions: Sequence[Motion]) -> Fits:
+def _fits_with(meant: CameraMistake, pairs: Sequence[FramePair], motions: Sequence[Transform]) -> Fits:
     return fits_of([pair.seen_by(meant.camera, along_ray=meant.along_ray) for pair in pairs], motions)
 
 

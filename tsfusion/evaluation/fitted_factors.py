@@ -11,12 +11,12 @@ from tsfusion.evaluation.frame_pairs import (
     MIN_FIT,
     Fits,
     FramePair,
-    Motion,
     fits_of,
     mean_gain,
     scaled_motion,
 )
 from tsfusion.geometry.keyframe import Intrinsics
+from tsfusion.geometry.se3 import Transform
 
 WIDEST_SCALE = np.log(12)  # logarithm of the largest factor tried beside the usual ones
 SCALE_STEPS = 61
@@ -55,7 +55,7 @@ class FittedFactor:
 
 
 def fitted_scale(
-    pairs: Sequence[FramePair], motions: Sequence[Motion], given: Fits, *, usual: Sequence[float]
+    pairs: Sequence[FramePair], motions: Sequence[Transform], given: Fits, *, usual: Sequence[float]
 ) -> FittedFactor:
     """The factor on translations that fits best: a usual one if it is as good.
 
@@ -75,7 +75,7 @@ def fitted_scale(
 
 
 def fitted_focal_length(
-    pairs: Sequence[FramePair], motions: Sequence[Motion], given: Fits
+    pairs: Sequence[FramePair], motions: Sequence[Transform], given: Fits
 ) -> FittedFactor | None:
     """The factor on `fx` and `fy` that fits best; None of a scan, or of stereo, whose depth it scales."""
     view = pairs[0].first_view

@@ -17,7 +17,6 @@ from tsfusion.geometry.frame import FrameKind
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.se3 import Transform
 
-Motion = NDArray[np.float64]  # (4, 4), from the first frame of a pair to the second
 Fits = NDArray[np.float64]  # (pairs,), each 0 to 1
 
 FIRST_FRAMES = 5  # spread over the recording, each the first of some pairs
@@ -61,12 +60,12 @@ class FramePair:
     first_view: DepthView
     second_view: DepthView
 
-    def motion(self, intended: Callable[[Transform], Motion] = np.asarray) -> Motion:
+    def motion(self, intended: Callable[[Transform], Transform] = np.asarray) -> Transform:
         """(4, 4) from the first frame's axes to the second's, by the intended poses."""
         first, second = (intended(T) for T in self.poses)
         return np.asarray(np.linalg.inv(second) @ first, np.float64)
 
-    def fit(self, motion: Motion, tolerance: float = 1.0) -> float:
+    def fit(self, motion: Transform, tolerance: float = 1.0) -> float:
         """Fit of the first frame's points to the second's surface, 0 to 1; 0 if too few can be compared.
 
         Args:
@@ -74,7 +73,7 @@ class FramePair:
         """
         return self.fit_of_shared(motion, tolerance) or 0.0
 
-    def fit_of_shared(self, motion: Motion, tolerance: float = 1.0) -> float | None:
+    def fit_of_shared(self, motion: Transform, tolerance: float = 1.0) -> float | None:
         """The fit of the first frame's points to the second's surface; None if too few can be compared."""
         points = motion[:3, :3] @ self.first_view.points
         points += motion[:3, 3:]
@@ -85,7 +84,7 @@ class FramePair:
         fits = 1 - (deviation / tolerance) ** 2
         return float(np.maximum(fits, 0, out=fits).sum()) / compared
 
-    def shift(self, motion: Motion, other: Motion) -> float:
+    def shift(self, motion: Transform, other: Transform) -> float:
         """Median distance between the first frame's points after one motion and after another, metres."""
         points = self.first_view.points
         difference = (motion - other)[:3]
@@ -136,7 +135,7 @@ def pairs_of(frames: dict[int, SeenFrame], wanted: Sequence[tuple[int, int]]) ->
     return pairs
 
 
-def fits_of(pairs: Sequence[FramePair], motions: Sequence[Motion]) -> Fits:
+def fits_of(pairs: Sequence[FramePair], motions: Sequence[Transform]) -> Fits:
     """The fit of each pair after its motion."""
     return np.array([pair.fit(motion) for pair, motion in zip(pairs, motions, strict=True)])
 
@@ -155,19 +154,19 @@ def mean_where(values: NDArray[np.float64], where: NDArray[np.bool_]) -> float:
     return round(float(values[where].mean()), 3) if where.any() else 0.0
 
 
-def scaled_motion(motion: Motion, factor: float) -> Motion:
+def scaled_motion(motion: Transform, factor: float) -> Transform:
     """A motion whose translation is multiplied by a factor."""
-    stretched: Motion = np.array(motion)
+    stretched: Transform = np.array(motion)
     stretched[:3, 3] *= factor
     return stretched
 
 
-def best_fits_near(pairs: Sequence[FramePair], motions: Sequence[Motion]) -> Fits:
+def best_fits_near(pairs: Sequence[FramePair], motions: Sequence[Transform]) -> Fits:
     """The best fit of each pair that small corrections of its motion reach."""
     return np.array([best_near(pair, motion)[0] for pair, motion in zip(pairs, motions, strict=True)])
 
 
-def best_near(pair: FramePair, motion: Motion, *, coarse: Sequence[float] = ()) -> tuple[float, Motion]:
+def best_near(pair: FramePair, motion: Transform, *, coarse: Sequence[float] = ()) -> tuple[float, Transform]:
     """The best fit that small corrections of a motion reach (hill climbing), and that motion.
 
     The fit is 0 where it starts from 0.
@@ -178,7 +177,7 @@ def best_near(pair: FramePair, motion: Motion, *, coarse: Sequence[float] = ()) 
     """
     given, price = motion, STRAY_PRICE if coarse else 0.0
 
-    def worth(motion: Motion, tolerance: float) -> float:
+    def worth(motion: Transform, tolerance: float) -> float:
         fit = pair.fit(motion, tolerance)
         if not price or not fit:
             return fit
@@ -191,7 +190,7 @@ def best_near(pair: FramePair, motion: Motion, *, coarse: Sequence[float] = ()) 
     return pair.fit(motion), motion
 
 
-def _climb(pair: FramePair, motion: Motion, worth: Callable[[Motion], float]) -> Motion:
+def _climb(pair: FramePair, motion: Transform, worth: Callable[[Transform], float]) -> Transform:
     best = worth(motion)
     if best == 0:
         return motion

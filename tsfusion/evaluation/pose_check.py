@@ -40,7 +40,6 @@ from tsfusion.evaluation.frame_pairs import (
     MIN_FIT,
     Fits,
     FramePair,
-    Motion,
     SeenFrame,
     best_fits_near,
     fits_of,
@@ -62,8 +61,9 @@ from tsfusion.evaluation.pose_mistakes import (
 )
 from tsfusion.evaluation.time_shift import time_shift, time_text
 from tsfusion.evaluation.trajectory_check import find_fault
+from tsfusion.geometry.se3 import Transform
 
-Verdict = Literal["agree", "disagree", "cannot tell"]
+PoseVerdict = Literal["agree", "disagree", "cannot tell"]
 
 MIN_LEAD = 0.05  # by which the poses must fit better than the median mistake, or nobody can tell
 MIN_EVIDENCE = 0.2  # share of the pairs that must fit, or nobody can tell
@@ -87,7 +87,7 @@ _UNEXPLAINED = (
 class PoseCheckReport:
     """Result of `check`."""
 
-    verdict: Verdict  # `disagree` only when it is sure
+    verdict: PoseVerdict  # `disagree` only when it is sure
     text: str  # one or two sentences: what is wrong and what to do
     # What is wrong: a name in `MISTAKES`, `scale`, `time`, `point times`, `depth unit`, of the camera
     # (`focal length`, `image size`, `exchanged centre`, `principal point`, `exchanged focal lengths`,
@@ -217,7 +217,7 @@ class _Comparison:
     dataset: Dataset
     content: Content
     pairs: list[FramePair]
-    motions: list[Motion]
+    motions: list[Transform]
     given: Fits
     best: Fits
     focal: FittedFactor | None
@@ -286,7 +286,7 @@ def _content(dataset: Dataset, frame: SeenFrame) -> Content:
 
 
 def _disagreement(
-    seen: _Comparison, tried: Mapping[str, Fits], corrected: Mapping[str, list[Motion]]
+    seen: _Comparison, tried: Mapping[str, Fits], corrected: Mapping[str, list[Transform]]
 ) -> PoseCheckReport | None:
     """Mistake in words; None where there is none, or nobody can tell."""
     pairs, given, report = seen.pairs, seen.given, partial(PoseCheckReport, "disagree")
@@ -343,7 +343,7 @@ def _as_likely(other: Fits, best: Fits, given: Fits) -> bool:
     return bool((other - given)[evidence].mean() > AS_LIKELY * (best - given)[evidence].mean())
 
 
-def _cannot_improve(pairs: Sequence[FramePair], motions: Sequence[Motion]) -> bool:
+def _cannot_improve(pairs: Sequence[FramePair], motions: Sequence[Transform]) -> bool:
     """True if small corrections hardly improve the fit of the motions."""
     return share_of_best(fits_of(pairs, motions), best_fits_near(pairs, motions)) >= MIN_SHARE_OF_BEST
 

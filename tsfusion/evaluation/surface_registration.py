@@ -52,7 +52,7 @@ def check_installed() -> None:
             raise MissingDependency(_INSTALL)
 
 
-class Registration:
+class SurfaceRegistration:
     """Two surfaces, of which the second is brought onto the first: two cells, points and features each."""
 
     def __init__(self, a: SampledSurface, b: SampledSurface) -> None:

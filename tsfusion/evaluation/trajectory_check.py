@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.datasets.dataset import NOMINAL_NS, Dataset, pose_of, readable
-from tsfusion.evaluation.frame_pairs import MIN_FIT, FramePair, Motion, best_near
+from tsfusion.evaluation.frame_pairs import MIN_FIT, FramePair, best_near
 from tsfusion.geometry import se3
 from tsfusion.geometry.se3 import Transform
 
@@ -124,7 +124,7 @@ def _jump(track: _Track, compare: Callable[[int, int], FramePair | None], range_
 
 
 def _jumped(
-    pair: FramePair | None, usual: Motion, range_m: float, *, moved: float, force: float, is_timed: bool
+    pair: FramePair | None, usual: Transform, range_m: float, *, moved: float, force: float, is_timed: bool
 ) -> float:
     """How far a step surely jumps, metres; 0 = nobody can tell, or it does not.
 
@@ -174,7 +174,7 @@ def _drift(
     return PoseFault("drift", (int(track.indices[first]), int(track.indices[second])), round(far, 3), text)
 
 
-def _shift(pair: FramePair, fitting: Motion, place: NDArray[np.float64]) -> NDArray[np.float64]:
+def _shift(pair: FramePair, fitting: Transform, place: NDArray[np.float64]) -> NDArray[np.float64]:
     """Shift (3,) of a place (3,) that makes the pair fit: both in the world's axes, metres."""
     T = pair.poses[1] @ fitting @ se3.inverse(pair.poses[0])
     return np.asarray(se3.apply(T, place[None])[0] - place)

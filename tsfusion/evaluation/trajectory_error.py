@@ -12,8 +12,7 @@ from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.dataset import NOMINAL_NS, Dataset, nearest_in_time, pose_of
 from tsfusion.datasets.trajectory_files import read_poses
 from tsfusion.geometry import se3
-
-Poses = NDArray[np.float64]  # (n, 4, 4) T_world_camera
+from tsfusion.geometry.se3 import Poses
 
 log = logging.getLogger(__name__)
 

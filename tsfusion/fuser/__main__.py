@@ -15,12 +15,11 @@ from tsfusion.core import logs, process
 from tsfusion.core.config import LogFormat, LogLevel
 from tsfusion.core.errors import MapError, TsfusionError
 from tsfusion.core.folder_lock import lock_folder
-from tsfusion.fuser import map_checkpoints
-from tsfusion.fuser import messages as fuser_messages
+from tsfusion.fuser import fuser_messages, map_checkpoints
 from tsfusion.fuser.fuser import LOCK, Fuser
 from tsfusion.fuser.map_checkpoints import OpenedMap
 from tsfusion.fuser.question_answers import Inbox
-from tsfusion.wire import sockets
+from tsfusion.wire.sockets import sockets
 
 _LOCK_WAIT_S = 60.0  # for another fuser to end: it may be reading a large map
 _held = ExitStack()  # the folder of the map
@@ -74,7 +73,7 @@ def _serve(link: sockets.AnySocket) -> int:
         if not inbox.orders:
             continue
         message = inbox.orders.popleft()
-        if isinstance(message, fuser_messages.Warm | fuser_messages.Open):
+        if isinstance(message, fuser_messages.Warm | fuser_messages.ReadAhead):
             fuser = None  # of an empty map that does without this process
             if not ahead.do(message):
                 return 1
@@ -96,7 +95,7 @@ class _Ahead:
         self._link = link
         self.opened: OpenedMap | None = None
 
-    def do(self, message: fuser_messages.Warm | fuser_messages.Open) -> bool:
+    def do(self, message: fuser_messages.Warm | fuser_messages.ReadAhead) -> bool:
         """Do it and say so; False where a map cannot be opened, and that is said."""
         try:
             if isinstance(message, fuser_messages.Warm):

@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 from tsfusion import journal
 from tsfusion.core.config import SERVER_SESSION
 from tsfusion.core.errors import DecodeError, InvalidConfig, InvalidKeyframe, JournalError
-from tsfusion.fuser import messages as fuser_messages
-from tsfusion.fuser.messages import EXPIRED, Begin, Expire, Find, Found, FoundKeyframes, SessionProgress
+from tsfusion.fuser import fuser_messages
+from tsfusion.fuser.fuser_messages import EXPIRED, Begin, Expire, Find, Found, FoundKeyframes, SessionProgress
 from tsfusion.geometry.keyframe import points_world
 from tsfusion.journal import Position, Record, state_folder
 from tsfusion.journal.keyframe_poses import KeptKeyframes, KeyframePoses
-from tsfusion.wire import codec
-from tsfusion.wire.forgetting import Selection
+from tsfusion.wire.messages.forget_messages import Selection
+from tsfusion.wire.records import codec
 
 _SLICE_S = 0.05  # seconds at a time
 _REST_S = 0.15  # between two slices while keyframes come

@@ -25,20 +25,21 @@ from tsfusion import journal
 from tsfusion.core import process
 from tsfusion.core.errors import JournalError, TsfusionError
 from tsfusion.core.process import version_of
-from tsfusion.fuser import messages as fuser_messages
+from tsfusion.fuser import fuser_messages
 from tsfusion.fuser.departures import Departures
+from tsfusion.fuser.fuser_messages import CurrentKeyframe
 from tsfusion.fuser.live_mesh import LiveMesh, TouchedBy, mesh_frames
 from tsfusion.fuser.map_checkpoints import OpenedMap
-from tsfusion.fuser.messages import CurrentKeyframe
 from tsfusion.fuser.pose_mover import REST_FACTOR, PoseMover
 from tsfusion.fuser.question_answers import Inbox, QuestionAnswers
 from tsfusion.fuser.watched_map import WatchedMap
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.geometry.sample_ranges import NO_SAMPLES
 from tsfusion.journal import Position, state_folder
-from tsfusion.wire import codec, sockets
-from tsfusion.wire.questions import MapState
-from tsfusion.wire.record_header import Refused
+from tsfusion.wire.messages.questions import MapVersion
+from tsfusion.wire.records import codec
+from tsfusion.wire.records.record_header import Refused
+from tsfusion.wire.sockets import sockets
 
 if TYPE_CHECKING:
     import numpy as np
@@ -365,7 +366,7 @@ class Fuser:
 
     def _integrate(self, keyframe: Keyframe, client: str) -> "IntegrateStats":
         """Add a client's keyframe to the map, within its quota. Without keys all clients are one."""
-        from tsfusion.tsdf.integrator import KeyframeQuota
+        from tsfusion.tsdf.integration.integrator import KeyframeQuota
 
         taken = self._map.blocks
         cost = self._begin.quota_cost * (_CARVING if self._volume.config.space_carving else 1)
@@ -436,9 +437,9 @@ class Fuser:
             config=msgspec.to_builtins(self._volume.config),
         )
 
-    def _state(self) -> MapState:
+    def _state(self) -> MapVersion:
         """The state of the map for whoever asked it something."""
-        return MapState(
+        return MapVersion(
             keyframes=self._volume.keyframes,
             changes=self._answered + self._mover.moved,
             epoch=self._epoch,

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from tsfusion.core.config import Surface
 from tsfusion.geometry.map_answers import View
 from tsfusion.geometry.up_direction import Up
-from tsfusion.wire.questions import MOST_CELLS, MapState, Raycast, Slice
+from tsfusion.wire.messages.questions import MOST_CELLS, MapVersion, Raycast, Slice
 
 if TYPE_CHECKING:
-    from tsfusion.tsdf.map_slices import CurrentSlice
+    from tsfusion.tsdf.answers.map_slices import CurrentSlice
     from tsfusion.tsdf.volume import Volume
 
 _MOST_KEPT = 2  # slices, of some 52 bytes a cell
@@ -44,7 +44,7 @@ class KeptSlices:
         Raises:
             InvalidConfig: for too many cells.
         """
-        from tsfusion.tsdf.block_store import distinct_blocks
+        from tsfusion.tsdf.store.block_store import distinct_blocks
 
         if question.box is None:  # around the map, which grows
             return self._made(question)
@@ -95,10 +95,10 @@ class KeptViews:
         state: of the map, now.
     """
 
-    def __init__(self, volume: "Volume", state: Callable[[], MapState]) -> None:
+    def __init__(self, volume: "Volume", state: Callable[[], MapVersion]) -> None:
         self._volume, self._state = volume, state
         self._how = _How(min_weight=None, surface=None)  # of what is kept
-        self._kept: tuple[int, MapState] | None = None  # stamp and state of what is kept
+        self._kept: tuple[int, MapVersion] | None = None  # stamp and state of what is kept
         self._newest_s = self._wanted_s = self._next_s = 0.0  # time.monotonic()
 
     def note_change(self) -> None:
@@ -106,7 +106,7 @@ class KeptViews:
         if self._is_newest:
             self._newest_s = time.monotonic()
 
-    def get(self, question: Raycast) -> tuple[View, MapState]:
+    def get(self, question: Raycast) -> tuple[View, MapVersion]:
         """The view, and the state that it is of."""
         how = _How(min_weight=question.min_weight, surface=question.surface)
         camera = question.intrinsics, question.matrix, question.shape

@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.geometry.mesh import Mesh
-from tsfusion.wire.health import MeshLayout
-from tsfusion.wire.mesh_updates import Meshed, MeshUpdate
+from tsfusion.wire.messages.health import MeshLayout
+from tsfusion.wire.messages.mesh_updates import Meshed, MeshUpdate
 
 if TYPE_CHECKING:
-    from tsfusion.tsdf.map_cells import CellMeshes
+    from tsfusion.tsdf.surface.map_cells import CellMeshes
     from tsfusion.tsdf.volume import Volume
 
 _REFINED_AT_ONCE = 512  # blocks: some 20 ms
@@ -142,7 +142,7 @@ class LiveMesh:
             self._next = started + self._interval
             self._send(self._message(time.monotonic_ns()))
             return
-        from tsfusion.tsdf.block_store import cells_of, distinct_blocks, unpack_keys
+        from tsfusion.tsdf.store.block_store import cells_of, distinct_blocks, unpack_keys
 
         found = self._volume.mesh_cells(cells_of(blocks), "raw")
         self._note_meshed()

@@ -14,10 +14,10 @@ from tsfusion import journal
 from tsfusion.core import durable_files, process
 from tsfusion.core.config import LIMIT_SETTINGS, RUN_SETTINGS, VIEW_SETTINGS, VolumeConfig
 from tsfusion.core.errors import CheckpointError, DamagedCheckpoint, InvalidConfig, TsfusionError
-from tsfusion.fuser.messages import Begin, SessionProgress
+from tsfusion.fuser.fuser_messages import Begin, SessionProgress
 from tsfusion.journal import state_folder
 from tsfusion.journal.keyframe_poses import KeyframePoses
-from tsfusion.tsdf import map_history
+from tsfusion.tsdf.files import map_history
 
 if TYPE_CHECKING:
     from tsfusion.tsdf.volume import Volume
@@ -198,7 +198,7 @@ class OpenedMap:
     """
 
     def __init__(self, begin: Begin) -> None:
-        from tsfusion.kernels import runtime
+        from tsfusion.kernels.base import runtime
 
         runtime.start(begin.volume.threads)  # it reserves a GB, and more for each thread, and hardly uses it
         self.memory_limit = process.data_bytes() + _WORKING_MEMORY + begin.memory_bytes
@@ -218,7 +218,7 @@ class OpenedMap:
 
 def warm(config: VolumeConfig) -> None:
     """Compile all kernels of maps with these settings: such a map opens at once then."""
-    from tsfusion.kernels import runtime
+    from tsfusion.kernels.base import runtime
     from tsfusion.tsdf.volume import Volume
 
     runtime.start(config.threads)

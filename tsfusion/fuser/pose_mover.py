@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any
 
 from tsfusion import journal
 from tsfusion.core.errors import JournalError, TsfusionError
-from tsfusion.fuser.messages import CorrectionProgress
+from tsfusion.fuser.fuser_messages import CorrectionProgress
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.journal.keyframe_poses import KeyframePoses, Move
-from tsfusion.wire import codec
+from tsfusion.wire.records import codec
 
 if TYPE_CHECKING:
     from tsfusion.tsdf.volume import Volume

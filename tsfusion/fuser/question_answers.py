@@ -16,27 +16,28 @@ import zmq
 
 from tsfusion.core.errors import InvalidConfig, TsfusionError
 from tsfusion.core.rates import Bucket
-from tsfusion.fuser import messages as fuser_messages
+from tsfusion.fuser import fuser_messages
+from tsfusion.fuser.fuser_messages import CurrentKeyframe, FuserAnswer, FuserQuestion, ToFuser
 from tsfusion.fuser.kept_answers import KeptSlices, KeptViews
-from tsfusion.fuser.messages import CurrentKeyframe, FuserAnswer, FuserQuestion, ToFuser
 from tsfusion.fuser.watched_map import WatchedMap
-from tsfusion.wire import questions, sockets
-from tsfusion.wire.questions import (
+from tsfusion.wire.asking.surface_parts import Arrays
+from tsfusion.wire.messages import questions
+from tsfusion.wire.messages.questions import (
     MOST_VOXELS,
     Answer,
     Cells,
     Field,
     Keyframes,
-    MapState,
+    MapVersion,
     Raycast,
     Sample,
     Slice,
 )
-from tsfusion.wire.surface_parts import Arrays
+from tsfusion.wire.sockets import sockets
 
 if TYPE_CHECKING:
     from tsfusion.geometry.map_grids import SliceGrid
-    from tsfusion.tsdf.map_slices import CurrentSlice
+    from tsfusion.tsdf.answers.map_slices import CurrentSlice
     from tsfusion.tsdf.volume import Volume
 
 
@@ -90,7 +91,7 @@ class QuestionAnswers:
         inbox: Inbox,
         watched: WatchedMap,
         *,
-        state: Callable[[], MapState],
+        state: Callable[[], MapVersion],
         at_work: CurrentKeyframe,
         send: Callable[[Any, list[Any]], None],
     ) -> None:
@@ -183,7 +184,7 @@ class QuestionAnswers:
             return
         self._began_s, self._until_s = time.process_time(), asked.deadline_ns / 1e9
         try:
-            state: MapState | None = None
+            state: MapVersion | None = None
             if isinstance(asked.question, Raycast):
                 view, state = self.views.get(asked.question)
                 arrays = {name: array for name, array in vars(view).items() if array is not None}

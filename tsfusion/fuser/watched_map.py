@@ -8,8 +8,14 @@ from numpy.typing import NDArray
 
 from tsfusion.fuser.live_mesh import LiveMesh, TouchedBy
 from tsfusion.journal.keyframe_poses import KeyframePoses
-from tsfusion.wire.questions import CELLS_AT_ONCE, KEYFRAMES_AT_ONCE, REFINED_AT_ONCE, Cells, Keyframes
-from tsfusion.wire.surface_parts import Arrays
+from tsfusion.wire.asking.surface_parts import Arrays
+from tsfusion.wire.messages.questions import (
+    CELLS_AT_ONCE,
+    KEYFRAMES_AT_ONCE,
+    REFINED_AT_ONCE,
+    Cells,
+    Keyframes,
+)
 
 if TYPE_CHECKING:
     from tsfusion.tsdf.volume import Volume
@@ -31,7 +37,7 @@ class WatchedMap:
         return self._cells(asked) if isinstance(asked, Cells) else self._keyframes(asked)
 
     def _cells(self, asked: Cells) -> Arrays:
-        """Arrays as `wire.mesh_updates.MeshUpdate` describes them, and `next`: where the others begin.
+        """Arrays as `mesh_updates.MeshUpdate` describes them, and `next`: where the others begin.
 
         `state`: stamp, drops, and the number of the newest mesh update: all later changes come in later ones.
         """

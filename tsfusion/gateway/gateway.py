@@ -17,29 +17,30 @@ import zmq
 from tsfusion.core import logs
 from tsfusion.core.config import ServerConfig
 from tsfusion.core.errors import DecodeError, JournalError
-from tsfusion.fuser import messages as fuser_messages
-from tsfusion.gateway import fuser_queries
-from tsfusion.gateway.access_control import AccessControl
-from tsfusion.gateway.client_routes import Admission, ClientRoutes
-from tsfusion.gateway.connection_limits import ConnectionLimits
-from tsfusion.gateway.forgetting import Request
-from tsfusion.gateway.fuser_queries import FuserQueries
-from tsfusion.gateway.greetings import Greetings
-from tsfusion.gateway.hosted_map import ForPeople, HostedMap
-from tsfusion.gateway.keyframe_intake import KeyframeIntake
-from tsfusion.gateway.map_condition import ServerCondition
-from tsfusion.gateway.map_moves import MapMoves
-from tsfusion.gateway.map_questions import MapQuestions
-from tsfusion.gateway.map_registry import MapRegistry
-from tsfusion.gateway.memory_guard import PendingReplies
-from tsfusion.gateway.metrics import Metrics
-from tsfusion.gateway.ports import Flood, Ports, Subscriptions, receive_some
-from tsfusion.gateway.scan_updates import ScanUpdates
-from tsfusion.wire import messages, questions, sockets
-from tsfusion.wire.allow_list import ALL_MAPS, AllowedMaps
-from tsfusion.wire.forgetting import Forgotten
-from tsfusion.wire.health import Health
-from tsfusion.wire.sockets import mesh_topic
+from tsfusion.fuser import fuser_messages
+from tsfusion.gateway.clients.client_routes import Admission, ClientRoutes
+from tsfusion.gateway.health.metrics import Metrics
+from tsfusion.gateway.intake.greetings import Greetings
+from tsfusion.gateway.intake.keyframe_intake import KeyframeIntake
+from tsfusion.gateway.maps.forgetting import ForgetRequest
+from tsfusion.gateway.maps.hosted_map import ForPeople, HostedMap
+from tsfusion.gateway.maps.map_condition import ServerCondition
+from tsfusion.gateway.maps.map_registry import MapRegistry
+from tsfusion.gateway.migration.map_moves import MapMoves
+from tsfusion.gateway.people import fuser_queries
+from tsfusion.gateway.people.fuser_queries import FuserQueries
+from tsfusion.gateway.people.map_questions import MapQuestions
+from tsfusion.gateway.people.scan_updates import ScanUpdates
+from tsfusion.gateway.ports.access_control import AccessControl
+from tsfusion.gateway.ports.connection_limits import ConnectionLimits
+from tsfusion.gateway.ports.memory_guard import PendingReplies
+from tsfusion.gateway.ports.ports import Flood, Ports, Subscriptions, receive_some
+from tsfusion.wire.keys.allow_list import ALL_MAPS, AllowedMaps
+from tsfusion.wire.messages import messages, questions
+from tsfusion.wire.messages.forget_messages import Forgotten
+from tsfusion.wire.messages.health import Health
+from tsfusion.wire.sockets import sockets
+from tsfusion.wire.sockets.sockets import mesh_topic
 
 log = logging.getLogger(__name__)
 
@@ -317,7 +318,9 @@ class Gateway:
         else:
             if not self._access.may_forget_all(client):
                 selection = msgspec.structs.replace(selection, client=client)
-            hosted.forgetting.add(Request(selection, answer, erase=command.erase, dry_run=command.dry_run))
+            hosted.forgetting.add(
+                ForgetRequest(selection, answer, erase=command.erase, dry_run=command.dry_run)
+            )
 
     def _on_subscription(self, frames: list[zmq.Frame]) -> None:
         """Let a viewer have the updates that it asks for, before the next message is read.

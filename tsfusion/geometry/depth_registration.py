@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import InvalidConfig
+from tsfusion.geometry.calibration import Size
 from tsfusion.geometry.keyframe import Intrinsics, check_pose
 
-Size = tuple[int, int]  # height, width
 _FAR = np.float32(65.535)  # metres: assumed depth of pixels without depth
 _STRIP = 32  # rows at once
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Transform = NDArray[np.float64]  # (…, 4, 4)
+Poses = NDArray[np.float64]  # (n, 4, 4), T_world_camera of frames or keyframes
 Twist = NDArray[np.float64]  # (…, 6)
 Matrix6 = NDArray[np.float64]  # (…, 6, 6): adjoints, covariances, information of twists
 

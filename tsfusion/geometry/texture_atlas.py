@@ -14,7 +14,7 @@ GUARD = 2  # texels around each chart that repeat its border
 _NOWHERE = 0xFFFFFFFF
 
 
-class Layout(NamedTuple):
+class ChartPlacement(NamedTuple):
     """Places of m faces on pages.
 
     Attributes:
@@ -36,7 +36,7 @@ def check_installed() -> None:
         )
 
 
-def pack(charts: Charts, faces: NDArray[np.int32], *, texel: float, side: int) -> Layout:
+def pack(charts: Charts, faces: NDArray[np.int32], *, texel: float, side: int) -> ChartPlacement:
     """Lay charts out.
 
     Args:
@@ -74,7 +74,7 @@ def pack(charts: Charts, faces: NDArray[np.int32], *, texel: float, side: int) -
     return _cropped(corners, np.where(placed.any(axis=1), page[rows, one], 0).astype(np.int32), side)
 
 
-def _cropped(corners: NDArray[np.float32], page: NDArray[np.int32], side: int) -> Layout:
+def _cropped(corners: NDArray[np.float32], page: NDArray[np.int32], side: int) -> ChartPlacement:
     """Pages as large as what is on them, up to a side."""
     sizes = []
     for number in range(int(page.max()) + 1):
@@ -82,4 +82,4 @@ def _cropped(corners: NDArray[np.float32], page: NDArray[np.int32], side: int) -
         most = np.ceil(of_page.max(axis=0)) + GUARD if len(of_page) else np.ones(2)
         width, height = np.minimum(most, side).astype(int).tolist()
         sizes.append((height, width))
-    return Layout(corners, page, sizes)
+    return ChartPlacement(corners, page, sizes)

@@ -176,7 +176,7 @@ def find(mesh: SurfaceArrays, held: HeldSensor, *, given: Up | None = None) -> U
     force = float(np.linalg.norm(held.force))
     if min(abs(force - GRAVITY) / GRAVITY, abs(force - 1)) < _SHORT:
         return _up(held.force, "imu")
-    surface = _Surface(mesh)
+    surface = _FacingSurface(mesh)
     length = float(np.linalg.norm(held.up))
     if length < _UPRIGHT:
         return surface.most_faced()
@@ -195,10 +195,10 @@ def floor_height(mesh: SurfaceArrays, up: Up, held: HeldSensor) -> float | None:
     """
     direction = np.array(up.direction)
     below = float(held.position @ direction) if held.is_known else np.inf
-    return _Surface(mesh).lowest_level(direction, below)
+    return _FacingSurface(mesh).lowest_level(direction, below)
 
 
-class _Surface:
+class _FacingSurface:
     """A sample of a mesh's triangles: centres (n, 3), unit normals (n, 3), areas (n,) of sum 1."""
 
     def __init__(self, mesh: SurfaceArrays) -> None:

@@ -8,8 +8,8 @@ new segment. One chunk a keyframe, uncompressed: the arrays are compressed alrea
 from tsfusion.journal.mcap_layout import Position, Record
 from tsfusion.journal.record_scan import Damage, Erased, scan_records, segment_number
 from tsfusion.journal.segments import (
-    Reading,
     RecordEntry,
+    SegmentReader,
     describe,
     has_another,
     is_away,
@@ -30,10 +30,10 @@ __all__ = [
     "Erased",
     "Journal",
     "Position",
-    "Reading",
     "ReadingWatcher",
     "Record",
     "RecordEntry",
+    "SegmentReader",
     "Unwritten",
     "describe",
     "has_another",

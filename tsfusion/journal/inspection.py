@@ -16,17 +16,18 @@ from tsfusion import journal
 from tsfusion.core.config import SERVER_SESSION
 from tsfusion.core.errors import DecodeError, InvalidKeyframe
 from tsfusion.core.number_ranges import NumberRanges
+from tsfusion.core.readable_numbers import OnProgress
 from tsfusion.geometry import se3
 from tsfusion.geometry.keyframe import check_pose
 from tsfusion.journal.mcap_layout import Record
 from tsfusion.journal.record_scan import Damage, Erased
-from tsfusion.journal.state_folder import JournalPlace, Watcher
-from tsfusion.wire import codec
-from tsfusion.wire.corrections import Correction
-from tsfusion.wire.record_header import unpack, unpack_keyframe
+from tsfusion.journal.state_folder import JournalPlace
+from tsfusion.wire.records import codec
+from tsfusion.wire.records.corrections import Correction
+from tsfusion.wire.records.record_header import unpack, unpack_keyframe
 
 
-class Problem(Struct, frozen=True):
+class JournalFault(Struct, frozen=True):
     """A place in a journal that is not as it should be.
 
     `torn`: the end of a write that was cut off before it was acknowledged. `note`: nothing is wrong with
@@ -89,7 +90,7 @@ class JournalInfo(Struct, kw_only=True):
     lost: int
     segments: list[SegmentInfo]
     sessions: list[SessionInfo]
-    problems: list[Problem]
+    problems: list[JournalFault]
     quarantined: list[dict[str, Any]]  # name, bytes
     erased: int = 0  # keyframes that were deleted on purpose
 
@@ -104,10 +105,10 @@ class JournalVerdict(Struct, kw_only=True):
     segments: int
     nbytes: int
     lost: int
-    problems: list[Problem]
+    problems: list[JournalFault]
 
 
-def summarize(place: JournalPlace, watch: Watcher) -> JournalInfo:
+def summarize(place: JournalPlace, watch: OnProgress) -> JournalInfo:
     """Read every record's CRC and header; of arrays only those of corrections.
 
     Raises:
@@ -115,7 +116,7 @@ def summarize(place: JournalPlace, watch: Watcher) -> JournalInfo:
     """
     segments = {path: _segment(path) for path in place.files()}
     sessions: dict[bytes, SessionInfo] = {}
-    problems: list[Problem] = []
+    problems: list[JournalFault] = []
     moves: dict[bytes, _Moves] = {}
     forgotten = ForgottenNumbers()
     for path, step in place.steps(watch):
@@ -219,15 +220,15 @@ def _count(sessions: dict[bytes, SessionInfo], record: Record) -> None:
     known.last_logged_ns = record.logged_ns
 
 
-def problem(path: Path, damage: Damage) -> Problem:
+def problem(path: Path, damage: Damage) -> JournalFault:
     """A damaged or erased place as a report names it."""
     kind: Literal["damage", "torn", "erased"] = "torn" if damage.torn else "damage"
     if isinstance(damage, Erased):
         kind = "erased"
-    return Problem(kind, path.name, damage.position.offset, damage.nbytes, damage.lost, damage.what)
+    return JournalFault(kind, path.name, damage.position.offset, damage.nbytes, damage.lost, damage.what)
 
 
-def verify(place: JournalPlace, watch: Watcher) -> JournalVerdict:
+def verify(place: JournalPlace, watch: OnProgress) -> JournalVerdict:
     """Read and decode every record.
 
     Raises:
@@ -256,12 +257,12 @@ def verify(place: JournalPlace, watch: Watcher) -> JournalVerdict:
     )
 
 
-def _missing(files: list[Path]) -> Iterator[Problem]:
+def _missing(files: list[Path]) -> Iterator[JournalFault]:
     numbers = [journal.segment_number(path) for path in files]
     for before, number, path in zip(numbers, numbers[1:], files[1:], strict=False):
         if number > before + 1:
             absent = number - before - 1
-            yield Problem("note", path.name, 0, 0, 0, f"{absent} numbers before this one have no file")
+            yield JournalFault("note", path.name, 0, 0, 0, f"{absent} numbers before this one have no file")
 
 
 class _Checks:
@@ -271,10 +272,10 @@ class _Checks:
         self._last: dict[bytes, int] = {}
         self._seen: set[tuple[bytes, int]] = set()
 
-    def of(self, path: Path, record: Record) -> list[Problem]:
+    def of(self, path: Path, record: Record) -> list[JournalFault]:
         found = [*self._order(record), *_content(record)]
         at, nbytes = record.position.offset, record.nbytes
-        return [Problem(kind, path.name, at, nbytes, lost, what) for kind, lost, what in found]
+        return [JournalFault(kind, path.name, at, nbytes, lost, what) for kind, lost, what in found]
 
     def _order(self, record: Record) -> Iterator[tuple[Literal["damage", "note"], int, str]]:
         key, name = (record.session, record.seq), _name(record)

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from tsfusion import journal
 from tsfusion.core.config import SERVER_SESSION, VolumeConfig
 from tsfusion.core.errors import DecodeError, InvalidConfig, InvalidKeyframe, JournalError
+from tsfusion.core.readable_numbers import OnProgress
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.geometry.object_cards import ShownRecording
 from tsfusion.geometry.origin import Origin
@@ -30,10 +31,10 @@ from tsfusion.journal import state_folder
 from tsfusion.journal.keyframe_poses import KeyframePoses
 from tsfusion.journal.mcap_layout import Record
 from tsfusion.journal.record_scan import scan_records
-from tsfusion.journal.state_folder import JournalPlace, Watcher
-from tsfusion.wire import codec
-from tsfusion.wire.corrections import Correction
-from tsfusion.wire.record_header import KeyframeHeader, unpack_keyframe
+from tsfusion.journal.state_folder import JournalPlace
+from tsfusion.wire.records import codec
+from tsfusion.wire.records.corrections import Correction
+from tsfusion.wire.records.record_header import KeyframeHeader, unpack_keyframe
 
 _LEAST_DIGITS = 4  # of a session's name
 
@@ -176,7 +177,7 @@ class JournaledKeyframes:
         place: JournalPlace,
         *,
         until_ns: int | None = None,
-        watch: Watcher = lambda _done, _all: None,
+        watch: OnProgress = lambda _done, _all: None,
         tells: bool = True,
     ) -> None:
         self.name = str(place.path)

@@ -22,14 +22,14 @@ from numpy.typing import NDArray
 from tsfusion.core.number_ranges import NumberRanges
 from tsfusion.geometry.keyframe import Keyframe, check_pose
 from tsfusion.journal import Position
-from tsfusion.wire.corrections import Correction
+from tsfusion.wire.records.corrections import Correction
 
 _POSE = 12  # numbers: the upper three rows
 _LEVER = 2.0  # metres from a sensor at which a turn of it counts
 _ABSENT = np.full(_POSE, np.nan)  # instead of the pose of a keyframe that is not in the map
 _SPARE = 1024
 
-Rows = NDArray[np.float64]  # (12,): the upper three rows of a pose; NaN = not in the map
+FlatPose = NDArray[np.float64]  # (12,): the upper three rows of a pose; NaN = not in the map
 
 
 class Move(NamedTuple):
@@ -97,7 +97,7 @@ class _SessionPoses:
         self.missed: set[int] = set()  # numbers of those that corrections name
         self.forgotten = NumberRanges()
 
-    def rows(self, at: int) -> Rows:
+    def rows(self, at: int) -> FlatPose:
         return np.array(self.fused[_POSE * at : _POSE * (at + 1)])
 
     def place_of(self, seq: int) -> int:
@@ -163,7 +163,7 @@ class KeyframePoses:
 
     def __init__(self, saved: Mapping[str, Any] | None, done: Mapping[bytes, int]) -> None:
         self._sessions: dict[bytes, _SessionPoses] = {}
-        self._waiting: dict[tuple[bytes, int], tuple[int, Rows]] = {}  # session, number → ticket, wanted
+        self._waiting: dict[tuple[bytes, int], tuple[int, FlatPose]] = {}  # session, number → ticket, wanted
         self._heap: list[tuple[float, int, bytes, int]] = []  # minus metres, ticket, session, number
         self._tickets = 0
         self._stuck: set[tuple[bytes, int]] = set()  # of those that wait, the ones that cannot be moved
@@ -396,7 +396,7 @@ class KeyframePoses:
     def _session(self, key: bytes) -> _SessionPoses:
         return self._sessions.setdefault(key, _SessionPoses())
 
-    def _want(self, session: bytes, seq: int, wanted: Rows) -> None:
+    def _want(self, session: bytes, seq: int, wanted: FlatPose) -> None:
         poses = self._sessions[session]
         fused = poses.rows(poses.place_of(seq))
         self._waiting.pop((session, seq), None)
@@ -413,12 +413,12 @@ class KeyframePoses:
         return waits is not None and waits[0] == ticket
 
 
-def _metres(fused: Rows, wanted: Rows) -> float:
+def _metres(fused: FlatPose, wanted: FlatPose) -> float:
     """Roughly how far a keyframe's surface moves; infinite where it comes or goes."""
     apart = (fused - wanted).reshape(3, 4)
     metres = float(np.linalg.norm(apart[:, 3]) + _LEVER * np.linalg.norm(apart[:, :3]) / np.sqrt(2))
     return metres if np.isfinite(metres) else np.inf
 
 
-def _pose(rows: Rows) -> NDArray[np.float64] | None:
+def _pose(rows: FlatPose) -> NDArray[np.float64] | None:
     return None if np.isnan(rows[0]) else np.vstack([rows.reshape(3, 4), (0.0, 0.0, 0.0, 1.0)])

@@ -21,7 +21,7 @@ from mcap.opcode import Opcode
 from msgspec import Struct
 
 from tsfusion.core.errors import JournalError
-from tsfusion.wire.record_header import is_correction, world_of
+from tsfusion.wire.records.record_header import is_correction, world_of
 
 TOPIC = "/keyframes"
 ENCODING = "x-tsfusion"

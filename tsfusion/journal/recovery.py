@@ -10,9 +10,10 @@ from msgspec import Struct
 from tsfusion.core import durable_files
 from tsfusion.core.errors import JournalError, OutputError
 from tsfusion.core.output_folder import building
-from tsfusion.journal.inspection import Problem, problem
+from tsfusion.core.readable_numbers import OnProgress
+from tsfusion.journal.inspection import JournalFault, problem
 from tsfusion.journal.record_scan import Damage, Erased
-from tsfusion.journal.state_folder import JournalPlace, Watcher
+from tsfusion.journal.state_folder import JournalPlace
 from tsfusion.journal.writer import Journal
 
 
@@ -26,10 +27,10 @@ class Recovery(Struct, kw_only=True):
     segments: int
     nbytes: int
     lost: int
-    problems: list[Problem]
+    problems: list[JournalFault]
 
 
-def recover(place: JournalPlace, out: Path, segment_bytes: int, watch: Watcher) -> Recovery:
+def recover(place: JournalPlace, out: Path, segment_bytes: int, watch: OnProgress) -> Recovery:
     """Write every whole record of a journal into the new folder `out`, in order, in closed segments.
 
     Of a record that was erased nothing is written.

@@ -13,15 +13,16 @@ from msgspec import Struct
 from tsfusion.core import durable_files
 from tsfusion.core.errors import DecodeError, InvalidKeyframe, JournalError, MissingDependency, OutputError
 from tsfusion.core.output_folder import check_writable
-from tsfusion.journal.inspection import Problem, problem
+from tsfusion.core.readable_numbers import OnProgress
+from tsfusion.journal.inspection import JournalFault, problem
 from tsfusion.journal.journaled_keyframes import JournaledKeyframes
 from tsfusion.journal.mcap_layout import Record
 from tsfusion.journal.record_scan import Damage, Erased
 from tsfusion.journal.ros2_messages import Converter, Outgoing
 from tsfusion.journal.segments import is_segment
-from tsfusion.journal.state_folder import JournalPlace, Watcher
-from tsfusion.wire import codec
-from tsfusion.wire.record_header import unpack_keyframe
+from tsfusion.journal.state_folder import JournalPlace
+from tsfusion.wire.records import codec
+from tsfusion.wire.records.record_header import unpack_keyframe
 
 _INSTALL = "export needs rosbags: pip install '.[ros]' in your clone of tsfusion"
 _LAST_SECOND = 2**31 - 1  # of a ROS 2 time stamp
@@ -35,10 +36,10 @@ class Export(Struct, kw_only=True):
     keyframes: int
     lost: int
     messages: dict[str, int]  # by topic
-    problems: list[Problem]
+    problems: list[JournalFault]
 
 
-def export(place: JournalPlace, out: Path, watch: Watcher, *, clouds: bool = False) -> Export:
+def export(place: JournalPlace, out: Path, watch: OnProgress, *, clouds: bool = False) -> Export:
     """Write every keyframe of a journal as ROS 2 messages; `out` appears when it is whole.
 
     Args:
@@ -121,10 +122,10 @@ class _Exporter:
         self._held: dict[bytes, tuple[Path, Record]] = {}
         self._seen: set[tuple[bytes, int]] = set()
         self._stamps: set[tuple[bytes, int]] = set()
-        self._problems: list[Problem] = []
+        self._problems: list[JournalFault] = []
         self._keyframes = 0
 
-    def run(self, place: JournalPlace, watch: Watcher) -> None:
+    def run(self, place: JournalPlace, watch: OnProgress) -> None:
         """Write everything that is whole, each keyframe once, at its final pose, and none that was forgotten
         or that corrections removed."""
         for path, step in place.steps(watch):
@@ -184,7 +185,9 @@ class _Exporter:
 
     def _refuse(self, path: Path, record: Record, error: Exception) -> None:
         at = record.position.offset
-        self._problems.append(Problem("damage", path.name, at, record.nbytes, 1, f"no keyframe: {error}"))
+        self._problems.append(
+            JournalFault("damage", path.name, at, record.nbytes, 1, f"no keyframe: {error}")
+        )
 
     def _name(self, record: Record) -> str:
         """A session's name that ROS accepts: its client's, numbered from the second session on."""

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tsfusion.geometry.keyframe import Intrinsics, Keyframe, depth_metres
 from tsfusion.geometry.trajectory import quaternion
 from tsfusion.journal.mcap_layout import Record
-from tsfusion.wire.record_header import KeyframeHeader
+from tsfusion.wire.records.record_header import KeyframeHeader
 
 WORLD = "world"
 _MILLIMETRE = 0.001

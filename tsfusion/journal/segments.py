@@ -136,14 +136,14 @@ def has_another(folder: Path, session: bytes, seq: int, position: Position, *, u
     return False
 
 
-class Reading:
+class SegmentReader:
     """Records of segments, one after the other: a segment stays open until one of another is read."""
 
     def __init__(self) -> None:
         self._path: Path | None = None
         self._open = ExitStack()
 
-    def __enter__(self) -> "Reading":
+    def __enter__(self) -> "SegmentReader":
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -3,7 +3,7 @@
 
 import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 from msgspec import Struct
@@ -11,7 +11,7 @@ from msgspec import Struct
 from tsfusion.core.config import MAP_NAME
 from tsfusion.core.durable_files import size_of
 from tsfusion.core.errors import JournalError, OutputError
-from tsfusion.core.readable_numbers import count_of
+from tsfusion.core.readable_numbers import OnProgress, count_of
 from tsfusion.journal.mcap_layout import Position, Record
 from tsfusion.journal.quarantine import quarantined_files
 from tsfusion.journal.record_scan import Damage, journal_error, scan_records, segment_number
@@ -123,9 +123,6 @@ def resolve_map(path: Path, name: str | None = None) -> Path:
     raise JournalError(f"{path} has {missing}; it has: {there}")
 
 
-Watcher = Callable[[int, int], None]  # bytes read, bytes of all
-
-
 class JournalPlace(Struct, frozen=True):
     """A journal on the disk."""
 
@@ -164,7 +161,7 @@ class JournalPlace(Struct, frozen=True):
         is_there = (beside / MAP_FILE).exists() or (beside / LOCK_FILE).exists()
         return self.quarantine is not None or (self.path.name == JOURNAL_FOLDER and is_there)
 
-    def steps(self, watch: Watcher = lambda _done, _all: None) -> Iterator[tuple[Path, Record | Damage]]:
+    def steps(self, watch: OnProgress = lambda _done, _all: None) -> Iterator[tuple[Path, Record | Damage]]:
         """Records and damaged places, each with its file; a file that cannot be read is a damaged place, and
         segments that a map's journal lacks between others are one."""
         files = [(path, size_of(path)) for path in self.files()]

@@ -1,5 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""Taichi kernels: free functions over NumPy arrays; the state they work on lives in their callers."""
+"""Taichi kernels: free functions over NumPy arrays; the state they work on lives in their callers.
+
+Rooms:
+    device: rays and additions on a GPU.
+    worlds: synthetic scenes, cast and painted.
+    answers: samples, slices, distances, views and textures.
+    surface: field smoothing, marching cubes, holes.
+    integration: rays of images and points, and their votes.
+    base: Taichi's start, fast launches, block keys, noise models.
+"""
 
 import inspect
 import os

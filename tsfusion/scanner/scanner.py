@@ -22,10 +22,10 @@ from tsfusion.delivery.outcomes import ClientStats
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.sweeps import Motion
 from tsfusion.scanner.keyframe_selection import KeyframeSelector, Selector
-from tsfusion.scanner.localization.localizer import Localizer, Lost, Pose, PoseCorrections
+from tsfusion.scanner.localization.localizer import Localizer, Lost, PoseCorrections, TrackedPose
 from tsfusion.scanner.tracked_trajectory import TrackedTrajectory
 
-State = Literal["starting", "tracking", "lost"]
+ScannerState = Literal["starting", "tracking", "lost"]
 
 log = logging.getLogger(__name__)
 
@@ -54,7 +54,7 @@ class Submap:
 class ScanState(msgspec.Struct, frozen=True, kw_only=True):
     """Progress of a scan."""
 
-    state: State
+    state: ScannerState
     why: str  # reason of the last loss; empty while tracking
     frames: int
     tracked: int
@@ -105,12 +105,12 @@ class Scanner:
         self._free_name = free_name
         self._selector = selector or KeyframeSelector(config, outdoors=outdoors)
         # The first frame of a world whose motion in its sweep only the next pose tells
-        self._waiting: tuple[Pose, Frame] | None = None
+        self._waiting: tuple[TrackedPose, Frame] | None = None
         self._next: str | None = None  # the map of the submap that begins with the next pose
         self._lost_since: int | None = None
         self._why = ""
         self.last_loss = ""  # reason; empty = the sensor was never lost
-        self._state: State = "starting"
+        self._state: ScannerState = "starting"
         self._frames = self._lost = 0
         self._tracking_cpu = 0.0
         self._selected: Counter[str] = Counter()
@@ -175,7 +175,7 @@ class Scanner:
             keyframe_delay_ms=_newest_delay(clients[-1]),
         )
 
-    def _handle_pose(self, pose: Pose, frame: Frame) -> None:
+    def _handle_pose(self, pose: TrackedPose, frame: Frame) -> None:
         if self._state == "lost":
             log.info("the sensor is found again")
         self._state, self._why, self._lost_since = "tracking", "", None
@@ -195,7 +195,7 @@ class Scanner:
             (pose, frame), self._waiting = self._waiting, None
             self._take(dataclasses.replace(pose, motion=motion), frame)
 
-    def _take(self, pose: Pose, frame: Frame) -> None:
+    def _take(self, pose: TrackedPose, frame: Frame) -> None:
         """Note where a frame is, and send it if it is a keyframe."""
         submap, T = self.submaps[-1], pose.T_world_camera
         reason = self._selector.reason(frame, T)

@@ -7,15 +7,13 @@ from array import array
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.geometry.se3 import Transform
-from tsfusion.scanner.localization.localizer import Pose, PoseCorrections
+from tsfusion.geometry.se3 import Poses, Transform
+from tsfusion.scanner.localization.localizer import PoseCorrections, TrackedPose
 
 _NONE = -1
 _BOTTOM = (0.0, 0.0, 0.0, 1.0)
 _ROWS = 12  # numbers of a pose: the upper three rows
 _COLUMNS = 4  # other numbers of a frame
-
-Poses = NDArray[np.float64]  # (n, 4, 4)
 
 
 class TrackedTrajectory:
@@ -32,7 +30,7 @@ class TrackedTrajectory:
 
     def add(
         self,
-        pose: Pose,
+        pose: TrackedPose,
         reference: Transform | None,
         seq: int | None,
         specific_force: NDArray[np.float64] | None = None,

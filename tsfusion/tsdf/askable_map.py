@@ -17,16 +17,18 @@ from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.map_answers import PointCloud, Samples, View, checked_camera, checked_points
 from tsfusion.geometry.map_grids import DistanceField, DistanceSlice, OccupancySlice, blocked
 from tsfusion.geometry.up_direction import Up
-from tsfusion.tsdf import camera_views, distance_fields, map_blocks, map_cells, map_slices, point_samples
-from tsfusion.tsdf.block_store import ASKED, BlockStore, pack_keys, unpack_keys
-from tsfusion.tsdf.distance_fields import FieldBlocks
-from tsfusion.tsdf.map_blocks import Blocks
-from tsfusion.tsdf.map_cells import CellMeshes
-from tsfusion.tsdf.map_slices import CurrentSlice
-from tsfusion.tsdf.mesh_extraction import extract_cells
+from tsfusion.tsdf.answers import camera_views, distance_fields, map_slices, point_samples
+from tsfusion.tsdf.answers.distance_fields import FieldBlocks
+from tsfusion.tsdf.answers.map_slices import CurrentSlice
+from tsfusion.tsdf.files import map_blocks
+from tsfusion.tsdf.files.map_blocks import Blocks
 from tsfusion.tsdf.readable_map import ReadableMap
-from tsfusion.tsdf.surface_tiles import SurfaceTiles
-from tsfusion.tsdf.surface_values import SurfaceView
+from tsfusion.tsdf.store.block_store import ASKED, BlockStore, pack_keys, unpack_keys
+from tsfusion.tsdf.surface import map_cells
+from tsfusion.tsdf.surface.map_cells import CellMeshes
+from tsfusion.tsdf.surface.mesh_extraction import extract_cells
+from tsfusion.tsdf.surface.surface_tiles import SurfaceTiles
+from tsfusion.tsdf.surface.surface_values import SurfaceView
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

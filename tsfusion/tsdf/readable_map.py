@@ -18,30 +18,26 @@ from numpy.typing import NDArray
 from tsfusion.core.config import Surface, VolumeConfig
 from tsfusion.core.distinct_integers import distinct
 from tsfusion.core.errors import InvalidConfig, MapError
-from tsfusion.core.readable_numbers import count_of
+from tsfusion.core.readable_numbers import OnProgress, count_of
 from tsfusion.geometry import object_cards
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.mesh_arrays import Provenance
 from tsfusion.geometry.mesh_parts import MeshParts, joined
 from tsfusion.geometry.up_direction import HeldSensor, Up
-from tsfusion.kernels import integrate, runtime
-from tsfusion.kernels.sensor_noise import WEIGHT_ONE
-from tsfusion.tsdf import (
-    field_regularizer,
-    hole_filling,
-    map_difference,
-    map_history,
-    mesh_tiles,
-    voxel_arrays,
-)
-from tsfusion.tsdf.block_store import BlockStore, cells_of, pack_keys, unpack_keys
-from tsfusion.tsdf.checkpoint import CheckpointHeader
-from tsfusion.tsdf.kept_values import KeptValues
-from tsfusion.tsdf.map_difference import MapDifference
-from tsfusion.tsdf.mesh_extraction import MeshBuffers, extract
-from tsfusion.tsdf.mesh_tiles import WholeMapValues, tiles
-from tsfusion.tsdf.surface_values import SurfaceView, values_of
-from tsfusion.tsdf.texture_images import Keyframes
+from tsfusion.kernels.base import runtime
+from tsfusion.kernels.base.sensor_noise import WEIGHT_ONE
+from tsfusion.kernels.integration import integrate
+from tsfusion.tsdf.files import map_history, voxel_arrays
+from tsfusion.tsdf.files.checkpoint import CheckpointHeader
+from tsfusion.tsdf.store.block_store import BlockStore, cells_of, pack_keys, unpack_keys
+from tsfusion.tsdf.sums import map_difference
+from tsfusion.tsdf.sums.map_difference import MapDifference
+from tsfusion.tsdf.surface import field_regularizer, hole_filling, mesh_tiles
+from tsfusion.tsdf.surface.kept_values import KeptValues
+from tsfusion.tsdf.surface.mesh_extraction import MeshBuffers, extract
+from tsfusion.tsdf.surface.mesh_tiles import WholeMapValues, tiles
+from tsfusion.tsdf.surface.surface_values import SurfaceView, values_of
+from tsfusion.tsdf.texture.texture_images import PosedImages
 
 _MOST_SHOWN = 50_000  # blocks of a map that has a picture: it is meshed for that
 
@@ -98,7 +94,7 @@ class ReadableMap(object_cards.Shown):
         surface: Surface | None = None,
         *,
         fill_holes: int | None = None,
-        texture: Keyframes | None = None,
+        texture: PosedImages | None = None,
     ) -> Mesh:
         """The surface, by marching cubes over the whole map or over the cells of some blocks.
 
@@ -108,8 +104,8 @@ class ReadableMap(object_cards.Shown):
                 changed.
             surface: what to mesh instead of what the settings say; for `raw`, `cells_of(take_dirty())` do.
             fill_holes: close holes and gaps up to so many voxels wide with a guess that continues the field
-                (`tsdf/hole_filling.py`); the mesh's `guessed` says which triangles these are. Of a whole map
-                only, and all of its field has to fit into memory.
+                (`surface/hole_filling.py`); the mesh's `guessed` says which triangles these are. Of a whole
+                map only, and all of its field has to fit into memory.
             texture: the map's keyframes at their poses, a list or anything that can be read again and again:
                 the mesh is a `TexturedMesh` with colours as sharp as their images (`texturing.textured`).
 
@@ -118,7 +114,7 @@ class ReadableMap(object_cards.Shown):
             MapError, MissingDependency: as `texturing.textured`.
         """
         if texture is not None:
-            from tsfusion.tsdf import texturing
+            from tsfusion.tsdf.texture import texturing
 
             plain = self.extract_mesh(min_weight, blocks, surface, fill_holes=fill_holes)
             return texturing.textured(plain, texture, self.config.voxel_size)
@@ -232,7 +228,7 @@ class ReadableMap(object_cards.Shown):
             raise InvalidConfig(f"tolerance must be 0 metres or more, got {tolerance}")
         blocks, voxels = map_difference.count(self._store, later._store)
         earlier, other = (
-            map_difference.Side(one.extract_mesh().without_islands(), one._store, one.model.min_weight)
+            map_difference.MapSide(one.extract_mesh().without_islands(), one._store, one.model.min_weight)
             for one in (self, later)
         )
         return MapDifference(blocks, voxels, *map_difference.surfaces(earlier, other, metres))
@@ -245,11 +241,11 @@ class ReadableMap(object_cards.Shown):
         field: voxel_arrays.FieldName = "tsdf",
         max_distance: float = 0.5,
         min_weight: float | None = None,
-        watch: voxel_arrays.Watch = lambda _done, _all: None,
+        watch: OnProgress = lambda _done, _all: None,
     ) -> Path:
         """Write voxels for NumPy (.npz), zarr (.zarr, a folder) or OpenVDB (.vdb): complete or not at all.
 
-        `tsdf/voxel_arrays.py` describes the arrays.
+        `tsdf/files/voxel_arrays.py` describes the arrays.
 
         Args:
             path: the file; `.npz`, `.zarr` or `.vdb`.

@@ -26,30 +26,24 @@ from tsfusion.geometry.keyframe import Keyframe, keyframe_of
 from tsfusion.geometry.mesh import FORMATS as MESHES
 from tsfusion.geometry.sample_ranges import why_no_samples
 from tsfusion.geometry.up_direction import HeldSensor
-from tsfusion.kernels import runtime
-from tsfusion.kernels.integrate import CUBE
-from tsfusion.kernels.voxel_traversal import COUNT, VOXEL_LIMIT
-from tsfusion.tsdf import (
-    checkpoint,
-    clear_blocks,
-    map_addition,
-    map_crop,
-    map_history,
-    mesh_extraction,
-    saved_map,
-    voxel_arrays,
-)
+from tsfusion.kernels.base import runtime
+from tsfusion.kernels.base.voxel_traversal import COUNT, VOXEL_LIMIT
+from tsfusion.kernels.integration.integrate import CUBE
 from tsfusion.tsdf.askable_map import AskableMap
-from tsfusion.tsdf.block_store import MESHED, BlockStore, unpack_keys
-from tsfusion.tsdf.device_blocks import DeviceBlocks
-from tsfusion.tsdf.device_integrator import DeviceIntegrator, DeviceRayBuffers
-from tsfusion.tsdf.device_trial import device_for
-from tsfusion.tsdf.integrator import Integrator, KeyframeQuota
-from tsfusion.tsdf.map_crop import Part
-from tsfusion.tsdf.map_history import HELD
-from tsfusion.tsdf.ray_buffers import RayBuffers, keyframes_of_every_kind
+from tsfusion.tsdf.device.device_blocks import DeviceBlocks
+from tsfusion.tsdf.device.device_integrator import DeviceIntegrator, DeviceRayBuffers
+from tsfusion.tsdf.device.device_trial import device_for
+from tsfusion.tsdf.files import checkpoint, map_history, saved_map, voxel_arrays
+from tsfusion.tsdf.files.map_history import HELD
+from tsfusion.tsdf.integration.integrator import Integrator, KeyframeQuota
+from tsfusion.tsdf.integration.ray_buffers import RayBuffers, keyframes_of_every_kind
 from tsfusion.tsdf.readable_map import begin_hash
-from tsfusion.tsdf.residency import checked_cache
+from tsfusion.tsdf.store import clear_blocks
+from tsfusion.tsdf.store.block_store import MESHED, BlockStore, unpack_keys
+from tsfusion.tsdf.store.residency import checked_cache
+from tsfusion.tsdf.sums import map_addition, map_crop
+from tsfusion.tsdf.sums.map_crop import Part
+from tsfusion.tsdf.surface import mesh_extraction
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

@@ -16,20 +16,19 @@ from tsfusion.core import process
 from tsfusion.core.rates import Bucket
 from tsfusion.core.readable_numbers import grouped
 from tsfusion.geometry.mesh import Mesh
-from tsfusion.viewer import map_views
-from tsfusion.viewer.browser_panel import BrowserPanel, set_theme
-from tsfusion.viewer.calm_callbacks import calm
+from tsfusion.viewer.map import map_views
+from tsfusion.viewer.map.map_tiles import MapTiles
+from tsfusion.viewer.map.map_up import MapUp
+from tsfusion.viewer.map.map_views import PageCamera
+from tsfusion.viewer.map.scanner_marks import ScannerMarks
+from tsfusion.viewer.map.tile_look import OwnLook, TileLook
+from tsfusion.viewer.map.tile_nodes import TileNodes
+from tsfusion.viewer.map.vertex_colors import VertexColors
 from tsfusion.viewer.map_feed import MapFeed
-from tsfusion.viewer.map_tiles import MapTiles
-from tsfusion.viewer.map_up import MapUp
-from tsfusion.viewer.map_views import View
-from tsfusion.viewer.scanner_marks import ScannerMarks
-from tsfusion.viewer.shared_panel import SharedPanel
-from tsfusion.viewer.tile_look import OwnLook, TileLook
-from tsfusion.viewer.tile_nodes import TileNodes
-from tsfusion.viewer.vertex_colors import VertexColors
-from tsfusion.wire.health import Health
-from tsfusion.wire.map_events import (
+from tsfusion.viewer.page.calm_callbacks import calm
+from tsfusion.viewer.panels.browser_panel import BrowserPanel, set_theme
+from tsfusion.viewer.panels.shared_panel import SharedPanel
+from tsfusion.wire.asking.map_events import (
     Cleared,
     HealthSeen,
     LinkSeen,
@@ -38,6 +37,7 @@ from tsfusion.wire.map_events import (
     ScannerSeen,
     SurfaceUpdate,
 )
+from tsfusion.wire.messages.health import Health
 
 if TYPE_CHECKING:
     import viser
@@ -265,11 +265,11 @@ class LivePage:
 
     # What the panels of browsers ask
 
-    def whole_view(self, aspect: float, covered: float) -> View | None:
+    def whole_view(self, aspect: float, covered: float) -> PageCamera | None:
         """All of the map; see `map_views.whole`."""
         return self._whole_views.of(aspect, covered)
 
-    def scanner_view(self, session: bytes) -> View | None:
+    def scanner_view(self, session: bytes) -> PageCamera | None:
         """From behind a scanner."""
         pose, up = self._marks.pose(session), self._up.direction
         return None if pose is None else map_views.behind(pose, up, distance=50 * self.voxel_size)

@@ -9,7 +9,7 @@ import taichi as ti
 import taichi.math as tm
 
 from tsfusion.kernels import F64, I32, F32x2, F64x2
-from tsfusion.kernels.synthetic_raycast import may_meet, solid_ray, vec3
+from tsfusion.kernels.worlds.synthetic_raycast import may_meet, solid_ray, vec3
 
 # What a ray meets, beside the number of a solid
 SKY, ROAD, PAVED, KERB = -1, -2, -3, -4

@@ -16,7 +16,7 @@ from lab.worlds.kernels.street_textures import (
     rgb3,
     tiles_color,
 )
-from tsfusion.kernels.synthetic_raycast import SPHERE
+from tsfusion.kernels.worlds.synthetic_raycast import SPHERE
 
 # Materials, column 9 of a solid, beside those of `synthetic_textures`
 HOUSE, TILES, BODY, CABIN, TYRE, POLE, TRUNK, CROWN, HEDGE, SIGN, FENCE, BIN = range(20, 32)

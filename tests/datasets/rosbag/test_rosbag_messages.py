@@ -11,7 +11,7 @@ from rosbag_scenes import BGR, COLOR, DEPTH, FRAME_NS, GRAY, T0, only_depth, rec
 from rosbag_writing import BagWriter, jpeg, writing
 
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets.rosbag.dataset import Bag
+from tsfusion.datasets.rosbag.bag import Bag
 
 pytest.importorskip("rosbags")
 WITH_ALPHA = np.dstack([BGR, np.full(SHAPE, 9, np.uint8)])

@@ -12,8 +12,8 @@ from rosbag_scenes import T0, T_BODY_OPTICAL
 from rosbag_writing import BODY, OPTICAL, WORLD, BagWriter, writing
 
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets.rosbag.cameras import RECTIFIED, REGISTERED
-from tsfusion.datasets.rosbag.dataset import Bag
+from tsfusion.datasets.rosbag.bag import Bag
+from tsfusion.datasets.rosbag.bag_cameras import RECTIFIED, REGISTERED
 from tsfusion.datasets.rosbag.transforms import PoseSamples
 from tsfusion.geometry import se3
 

@@ -12,7 +12,7 @@ from rosbag_scenes import BGR, FRAME_NS, GRAY, T0, records
 from rosbag_writing import BODY, OPTICAL, WORLD, writing
 
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets.rosbag.dataset import Bag
+from tsfusion.datasets.rosbag.bag import Bag
 from tsfusion.geometry import se3
 from tsfusion.geometry.calibration import Camera, Rectifier, StereoRig, Undistorter
 from tsfusion.geometry.depth_registration import Registration

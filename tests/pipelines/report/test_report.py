@@ -20,10 +20,9 @@ from tsfusion.core.errors import OutputError
 from tsfusion.datasets.trajectory_files import read_poses, write_tum
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.up_direction import parse
-from tsfusion.pipelines import latency_ledger
-from tsfusion.pipelines.report import map_report, run_report, run_sections, scene
+from tsfusion.pipelines.report import latency_ledger, map_report, run_report, run_sections, scene
 from tsfusion.pipelines.report.findings import RunFindings
-from tsfusion.wire.keyframe_times import KeyframeTimes
+from tsfusion.wire.messages.keyframe_times import KeyframeTimes
 
 _EMPTY = frozenset(("meta", "img", "br", "input", "image", "path"))  # elements without an end
 HOSTILE = '<script>alert("1")</script>&\'"'

@@ -24,16 +24,16 @@ from repository import ROOT
 from tsfusion.core.errors import DatasetError, DecodeError, InvalidConfig, TransportError
 from tsfusion.datasets import open_dataset
 from tsfusion.datasets.dataset import frame_of
-from tsfusion.datasets.synthetic.dataset import Synthetic
 from tsfusion.datasets.trajectory_files import write_tum
+from tsfusion.datasets.worlds.synthetic import Synthetic
 from tsfusion.geometry import se3, sweeps
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.trajectory import quaternion, rigid, slerp
 from tsfusion.scanner.localization.given_poses import GivenPoses, TrajectoryFilePoses
-from tsfusion.scanner.localization.localizer import Lost, Pose
+from tsfusion.scanner.localization.localizer import Lost, TrackedPose
 from tsfusion.scanner.localization.pose_feed.feed import PoseFeed
+from tsfusion.scanner.localization.pose_feed.feed_messages import MAX_BYTES, decode
 from tsfusion.scanner.localization.pose_feed.map_deformation import PoseHistory
-from tsfusion.scanner.localization.pose_feed.messages import MAX_BYTES, decode
 
 SENDER = ROOT / "contrib" / "pose_sender.py"
 DEADLINE = 20.0  # seconds
@@ -54,8 +54,8 @@ def seven(T: np.ndarray) -> list[float]:
     return [*T[:3, 3].tolist(), *quaternion(T[:3, :3]).tolist()]
 
 
-def same(pose: Pose | Lost, T: np.ndarray, within: float = 1e-9) -> None:
-    assert isinstance(pose, Pose), pose
+def same(pose: TrackedPose | Lost, T: np.ndarray, within: float = 1e-9) -> None:
+    assert isinstance(pose, TrackedPose), pose
     np.testing.assert_allclose(pose.T_world_camera, T, atol=within)
 
 
@@ -67,7 +67,7 @@ def test_given_poses_are_believed() -> None:
     found = [localizer.track(room.frame(index)) for index in range(12)]
     for index, pose in enumerate(found):
         same(pose, room.pose(index))
-    anchors = [pose for pose in found if isinstance(pose, Pose) and pose.starts_anchor]
+    anchors = [pose for pose in found if isinstance(pose, TrackedPose) and pose.starts_anchor]
     assert [pose.anchor for pose in anchors] == list(range(len(anchors)))
     assert len(anchors) > 2
     assert localizer.corrections() is None
@@ -76,12 +76,12 @@ def test_given_poses_are_believed() -> None:
 
 def test_no_pose_given_is_lost() -> None:
     localizer = GivenPoses()
-    assert isinstance(localizer.track(frame(1, way(0))), Pose)
+    assert isinstance(localizer.track(frame(1, way(0))), TrackedPose)
     assert localizer.track(frame(2)) == Lost(reason="the source gives no pose for this frame", timestamp_ns=2)
     localizer.reset()
     after = localizer.track(frame(3, way(1)))
     same(after, way(1))
-    assert isinstance(after, Pose)
+    assert isinstance(after, TrackedPose)
     assert (after.anchor, after.starts_anchor) == (1, True)
 
 
@@ -133,7 +133,7 @@ def test_kitti_file_with_its_times(data: Callable[[str], Path]) -> None:
 
 def test_a_source_without_times_gets_one_pose_at_most(data: Callable[[str], Path]) -> None:
     localizer = TrajectoryFilePoses(data("kitti_odometry") / "poses" / "06.txt", max_gap_s=0.2)
-    assert isinstance(localizer.track(frame(0)), Pose)  # KITTI's clock begins at 0
+    assert isinstance(localizer.track(frame(0)), TrackedPose)  # KITTI's clock begins at 0
     lost = localizer.track(frame(0))
     assert isinstance(lost, Lost)
     assert "no time" in lost.reason
@@ -266,7 +266,7 @@ def posed(seconds: float, T: np.ndarray | None = None) -> dict[str, Any]:
     return {"stamp_ns": START + round(seconds * SECOND), "pose": seven(T)}
 
 
-def follow(feed: PoseFeed, seconds: float) -> Pose:
+def follow(feed: PoseFeed, seconds: float) -> TrackedPose:
     """The feed's pose at a time, as soon as it is there."""
     until = time.monotonic() + DEADLINE
     while isinstance(found := feed.track(frame(START + round(seconds * SECOND))), Lost):
@@ -460,7 +460,7 @@ def test_corrections_move_the_tracking_keyframes(feed: PoseFeed) -> None:
             T[:3, 3] = (drift * seconds, 0, 2 * seconds)
             return T
 
-        found: dict[int, Pose] = {}
+        found: dict[int, TrackedPose] = {}
         for tenth in range(11):
             send(posed(tenth / 10, straight(tenth / 10, 0.1)))
             found[tenth] = follow(feed, tenth / 10)

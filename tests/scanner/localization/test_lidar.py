@@ -12,11 +12,11 @@ from command_processes import python
 from tsfusion.core.errors import InvalidKeyframe
 from tsfusion.datasets import open_dataset
 from tsfusion.datasets.dataset import frame_of
-from tsfusion.datasets.synthetic.dataset import Synthetic
+from tsfusion.datasets.worlds.synthetic import Synthetic
 from tsfusion.evaluation.trajectory_error import absolute_error
 from tsfusion.geometry import se3, sweeps
 from tsfusion.geometry.frame import Frame
-from tsfusion.scanner.localization.localizer import Lost, Pose
+from tsfusion.scanner.localization.localizer import Lost, TrackedPose
 
 pytest.importorskip("kiss_icp", exc_type=ImportError, reason="no kiss-icp: pip install '.[lidar]'")
 
@@ -46,9 +46,9 @@ def pose_of(frame: Frame) -> np.ndarray:
     return frame.T_world_camera
 
 
-def away(found: list[Pose | Lost], frames: list[Frame]) -> list[float]:
+def away(found: list[TrackedPose | Lost], frames: list[Frame]) -> list[float]:
     """Metres between each pose and the frame's own, first upon first."""
-    poses = [pose.T_world_camera for pose in found if isinstance(pose, Pose)]
+    poses = [pose.T_world_camera for pose in found if isinstance(pose, TrackedPose)]
     first = se3.inverse(pose_of(frames[0]))
     pairs = zip(poses, frames, strict=True)
     return [se3.distance(se3.inverse(first @ pose_of(frame)) @ T) for T, frame in pairs]
@@ -58,7 +58,7 @@ def test_kitti_agrees_with_orb(kitti: list[Frame]) -> None:
     lidar = LidarLocalizer()
     found = [lidar.track(frame) for frame in kitti]
     assert max(away(found, kitti)) < 0.10  # the bar is 0.15
-    assert all(pose.quality > 0.9 for pose in found if isinstance(pose, Pose))
+    assert all(pose.quality > 0.9 for pose in found if isinstance(pose, TrackedPose))
 
 
 def test_street_from_a_rolling_start(street: list[Frame]) -> None:
@@ -67,7 +67,7 @@ def test_street_from_a_rolling_start(street: list[Frame]) -> None:
     found = [lidar.track(frame) for frame in street]
     errors = away(found, street)
     assert max(errors[:4]) < 0.15
-    poses = np.array([pose.T_world_camera for pose in found if isinstance(pose, Pose)])
+    poses = np.array([pose.T_world_camera for pose in found if isinstance(pose, TrackedPose)])
     error = absolute_error(poses, np.array([frame.T_world_camera for frame in street]))
     assert error.rmse < 0.08
     assert error.drift_percent < 0.5
@@ -85,7 +85,7 @@ def test_equal_scans_give_equal_poses(street: list[Frame]) -> None:
     for _ in range(2):
         lidar = LidarLocalizer()
         found = [lidar.track(frame) for frame in street[:5]]
-        runs.append([pose.T_world_camera for pose in found if isinstance(pose, Pose)])
+        runs.append([pose.T_world_camera for pose in found if isinstance(pose, TrackedPose)])
     np.testing.assert_array_equal(runs[0], runs[1])
 
 
@@ -114,13 +114,13 @@ def test_a_bad_scan_is_lost_and_leaves_no_trace(
     assert [isinstance(pose, Lost) for pose in found] == [index in (6, 7) for index in range(12)]
     assert all(reason in pose.reason for pose in found[6:8])
     good = street[:6] + street[8:12]
-    assert max(away([pose for pose in found if isinstance(pose, Pose)], good)) < 0.2
+    assert max(away([pose for pose in found if isinstance(pose, TrackedPose)], good)) < 0.2
 
 
 def test_another_street_is_no_motion(kitti: list[Frame], data: Data) -> None:
     lidar = LidarLocalizer()
     for frame in kitti[:4]:
-        assert isinstance(lidar.track(frame), Pose)
+        assert isinstance(lidar.track(frame), TrackedPose)
     for index in range(3):
         path = data("kitti07_lidar_keyframes") / f"{index:06d}" / "points.bin"
         assert isinstance(lidar.track(scan(np.fromfile(path, np.float32).reshape(-1, 3))), Lost)
@@ -128,10 +128,10 @@ def test_another_street_is_no_motion(kitti: list[Frame], data: Data) -> None:
 
 def test_reset_begins_a_new_world(street: list[Frame]) -> None:
     lidar = LidarLocalizer()
-    before = [pose for pose in (lidar.track(frame) for frame in street[:3]) if isinstance(pose, Pose)]
+    before = [pose for pose in (lidar.track(frame) for frame in street[:3]) if isinstance(pose, TrackedPose)]
     lidar.reset()
     after = lidar.track(street[3])
-    assert isinstance(after, Pose)
+    assert isinstance(after, TrackedPose)
     np.testing.assert_array_equal(after.T_world_camera, np.eye(4))
     assert after.starts_anchor
     assert after.anchor == before[-1].anchor + 1
@@ -182,7 +182,7 @@ def test_the_motion_in_a_sweep_is_told(street: list[Frame], every: int, are_stam
     for number, frame in enumerate(slow):
         stamp = frame.timestamp_ns if are_stamped else (number + 1) * 33_333_333
         found = lidar.track(replace(frame, timestamp_ns=stamp))
-        assert isinstance(found, Pose)
+        assert isinstance(found, TrackedPose)
         if number == 0:
             assert found.motion is None
             continue

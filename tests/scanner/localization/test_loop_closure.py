@@ -13,17 +13,17 @@ from drifting_localizer import Drifting
 from tsfusion.core.errors import MissingDependency
 from tsfusion.datasets import Dataset, Synthetic, open_dataset
 from tsfusion.datasets.dataset import frame_of
-from tsfusion.datasets.synthetic import loop_worlds
+from tsfusion.datasets.worlds import loop_worlds
 from tsfusion.evaluation.trajectory_error import TrajectoryError, absolute_error
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
-from tsfusion.scanner.localization.localizer import Lost, Pose, PoseCorrections
+from tsfusion.scanner.localization.localizer import Lost, PoseCorrections, TrackedPose
 from tsfusion.scanner.localization.loop_closure.loop_closing import LoopClosing
 from tsfusion.scanner.localization.loop_closure.loop_consensus import Loop, LoopConsensus
 from tsfusion.scanner.localization.loop_closure.odometry_drift import OdometryChain, OdometryDrift
 from tsfusion.scanner.localization.loop_closure.place_index import PlaceIndex, PlaceView, place_view
 from tsfusion.scanner.localization.loop_closure.verification import check, matches
-from tsfusion.scanner.localization.rgbd.tracker import RGBDLocalizer
+from tsfusion.scanner.localization.rgbd.rgbd_tracker import RGBDLocalizer
 from tsfusion.scanner.tracked_trajectory import TrackedTrajectory
 
 FAR, TURNED = 0.05, 2.0  # metres and degrees: a loop that is farther off is wrong
@@ -39,7 +39,7 @@ class Run:
         self.corrections: list[PoseCorrections] = []
         for frame in frames:
             pose = self.closing.track(frame)
-            assert isinstance(pose, Pose)
+            assert isinstance(pose, TrackedPose)
             self.track.add(pose, None, None)
             if (news := self.closing.corrections()) is not None:
                 self.corrections.append(news)
@@ -273,12 +273,12 @@ def test_a_lost_tracker_goes_on_where_it_has_been_before():
     assert isinstance(alone.track(dataset.frame(8)), Lost)
     closing = LoopClosing(RGBDLocalizer())
     for index in range(46):
-        assert isinstance(closing.track(dataset.frame(index)), Pose)
+        assert isinstance(closing.track(dataset.frame(index)), TrackedPose)
     frame = dataset.frame(46)
     black = replace(frame, depth=np.zeros_like(frame.depth), color=np.zeros_like(frame.color))
     assert all(isinstance(closing.track(black), Lost) for _ in range(5))
     found = [(index, closing.track(dataset.frame(index))) for index in range(8, 16)]
-    poses = [(index, pose) for index, pose in found if isinstance(pose, Pose)]
+    poses = [(index, pose) for index, pose in found if isinstance(pose, TrackedPose)]
     assert len(poses) >= 6, found
     for index, pose in poses:
         truth = se3.inverse(dataset.pose(0)) @ dataset.pose(index)

@@ -15,9 +15,9 @@ from tsfusion.datasets import Synthetic, open_dataset, select
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
-from tsfusion.scanner.localization.localizer import Lost, Pose
+from tsfusion.scanner.localization.localizer import Lost, TrackedPose
 from tsfusion.scanner.localization.rgbd.rgbd_frame import RGBDFrame, TrackingKeyframe
-from tsfusion.scanner.localization.rgbd.tracker import RGBDLocalizer
+from tsfusion.scanner.localization.rgbd.rgbd_tracker import RGBDLocalizer
 
 
 @pytest.fixture(scope="module")
@@ -130,7 +130,7 @@ def test_uncovered_elsewhere_it_finds_a_place_it_has_been_to(kitchen):
     assert isinstance(localizer.track(garbage(seen[-1])["covered"]), Lost)
     again = track(localizer, seen[:8])
     assert len(again.lost) <= 3
-    found = [(a, T) for a, T in zip(again.answers, again.truth, strict=True) if isinstance(a, Pose)]
+    found = [(a, T) for a, T in zip(again.answers, again.truth, strict=True) if isinstance(a, TrackedPose)]
     assert found[0][0].starts_anchor
     for answer, T in found:
         error = se3.inverse(se3.inverse(seen[0].T_world_camera) @ T) @ answer.T_world_camera
@@ -232,7 +232,7 @@ def test_units_do_not_matter(room):
 def test_anchors_and_quality(room):
     localizer = RGBDLocalizer()
     poses, anchors = [localizer.track(frame) for frame in room], {}
-    assert all(isinstance(pose, Pose) for pose in poses)
+    assert all(isinstance(pose, TrackedPose) for pose in poses)
     assert poses[0].starts_anchor
     np.testing.assert_array_equal(poses[0].T_world_camera, np.eye(4))
     for pose, frame in zip(poses, room, strict=True):
@@ -255,7 +255,7 @@ def test_reset_begins_another_world(room):
     after = localizer.track(room[12])
     np.testing.assert_array_equal(after.T_world_camera, np.eye(4))
     assert after.anchor == before[-1].anchor + 1
-    assert isinstance(localizer.track(room[0]), (Pose, Lost))
+    assert isinstance(localizer.track(room[0]), (TrackedPose, Lost))
 
 
 def test_a_first_frame_without_depth_is_no_beginning(room):
@@ -308,7 +308,7 @@ import cv2
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.scanner.localization.localizer import Pose
-from tsfusion.scanner.localization.rgbd.tracker import RGBDLocalizer
+from tsfusion.scanner.localization.rgbd.rgbd_tracker import RGBDLocalizer
 
 def megabytes(name):
     return int(re.search(name + r":\\s+(\\d+)", Path("/proc/self/status").read_text())[1]) / 1024

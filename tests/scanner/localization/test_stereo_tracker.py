@@ -14,16 +14,16 @@ import pytest
 from tsfusion.core.errors import InvalidKeyframe
 from tsfusion.datasets import open_dataset
 from tsfusion.datasets.dataset import frame_of
-from tsfusion.datasets.synthetic.dataset import Synthetic
+from tsfusion.datasets.worlds.synthetic import Synthetic
 from tsfusion.evaluation.trajectory_error import absolute_error
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.stereo_matching import Matcher, quick_disparity
-from tsfusion.scanner.localization.localizer import Localizer, Lost, Pose
+from tsfusion.scanner.localization.localizer import Localizer, Lost, TrackedPose
 from tsfusion.scanner.localization.stereo.rectification_check import RectificationCheck
 from tsfusion.scanner.localization.stereo.reprojection import StereoCamera, refine
-from tsfusion.scanner.localization.stereo.tracker import StereoLocalizer
+from tsfusion.scanner.localization.stereo.stereo_tracker import StereoLocalizer
 
 Data = Callable[[str], Path]
 
@@ -38,14 +38,14 @@ def frames(data: Data, sequence: str, count: int) -> list[Frame]:
     return [frame_of(dataset, index) for index in range(count)]
 
 
-def poses(localizer: Localizer, followed: list[Frame]) -> list[Pose]:
+def poses(localizer: Localizer, followed: list[Frame]) -> list[TrackedPose]:
     found = [localizer.track(frame) for frame in followed]
     lost = [pose for pose in found if isinstance(pose, Lost)]
     assert not lost
-    return [pose for pose in found if isinstance(pose, Pose)]
+    return [pose for pose in found if isinstance(pose, TrackedPose)]
 
 
-def positions(found: list[Pose]) -> np.ndarray:
+def positions(found: list[TrackedPose]) -> np.ndarray:
     return np.array([pose.T_world_camera for pose in found])
 
 
@@ -66,7 +66,7 @@ def test_kitti_drift(data: Data) -> None:
     clip = frames(data, "06", 30)
     stereo = StereoLocalizer()
     found = [stereo.track(frame) for frame in clip]
-    assert all(isinstance(pose, Pose) and pose.quality > 0.5 for pose in found)
+    assert all(isinstance(pose, TrackedPose) and pose.quality > 0.5 for pose in found)
     error = absolute_error(positions(found), np.array([frame.T_world_camera for frame in clip]))
     assert error.drift_percent <= 1.0
     assert error.rmse < 0.08
@@ -118,7 +118,7 @@ def test_a_bad_frame_is_lost_and_the_next_one_is_not(data: Data, spoil: Callable
     assert found[3].timestamp_ns == clip[3].timestamp_ns
     assert re.search(r"^\d+ of \d+ (corners|points)", found[3].reason)
     last = found[4]
-    assert isinstance(last, Pose)
+    assert isinstance(last, TrackedPose)
     assert se3.distance(se3.inverse(whole[4].T_world_camera) @ last.T_world_camera) < 0.1
 
 
@@ -128,7 +128,7 @@ def test_half_a_second_without_frames_is_bridged(data: Data, last: int) -> None:
     stereo = StereoLocalizer()
     poses(stereo, clip[last - 2 : last + 1])
     found = stereo.track(clip[last + 5])
-    assert isinstance(found, Pose)
+    assert isinstance(found, TrackedPose)
     (whole,) = poses(StereoLocalizer(), clip[last - 2 :])[-1:]
     assert se3.distance(whole.T_world_camera) > 6
     assert se3.distance(se3.inverse(whole.T_world_camera) @ found.T_world_camera) < 0.3
@@ -150,8 +150,8 @@ def test_a_pose_does_not_wait_for_what_the_next_frame_needs(data: Data) -> None:
     prepared, alone = StereoLocalizer(), StereoLocalizer()
     for index, frame in enumerate(clip):
         found, expected = prepared.track(frame), alone.track(frame)
-        assert isinstance(found, Pose)
-        assert isinstance(expected, Pose)
+        assert isinstance(found, TrackedPose)
+        assert isinstance(expected, TrackedPose)
         np.testing.assert_array_equal(found.T_world_camera, expected.T_world_camera)
         assert ("tracking_disparity" in vars(frame)) == (index == 0)
         prepared.prepare()
@@ -177,7 +177,7 @@ def test_nothing_to_begin_with(data: Data) -> None:
     first = stereo.track(blank(frame))
     assert isinstance(first, Lost)
     assert "corners with depth" in first.reason
-    assert isinstance(stereo.track(frame), Pose)
+    assert isinstance(stereo.track(frame), TrackedPose)
 
 
 def test_disparity_with_an_image() -> None:

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from tsfusion.core.errors import DatasetError, MissingDependency, OutputError
+from tsfusion.core.readable_numbers import OnProgress
 from tsfusion.datasets.download import archives, http
 from tsfusion.datasets.download.catalogue import File, PublicRecording
-from tsfusion.datasets.download.http import Watcher
 
 _INSTALL = "downloads need pooch; install it with: pip install '.[download]' in your clone of tsfusion"
 ENDING = ".sha256"
@@ -37,7 +37,7 @@ class FetchedRecording(NamedTuple):
 
 
 def fetch(
-    recording: PublicRecording, to: Path, watch: Watcher, *, base: str | None = None
+    recording: PublicRecording, to: Path, watch: OnProgress, *, base: str | None = None
 ) -> FetchedRecording:
     """Bring a recording into `to`: its archives, and the folder `to/NAME` with what they hold.
 
@@ -72,7 +72,7 @@ def check(recording: PublicRecording, to: Path) -> list[CheckedFile]:
     return [_verified(file, path) for file, path in paths if path.exists()]
 
 
-def _fetched_or_there(file: File, path: Path, watch: Watcher, base: str | None) -> CheckedFile:
+def _fetched_or_there(file: File, path: Path, watch: OnProgress, base: str | None) -> CheckedFile:
     if path.exists():
         return _verified(file, path)
     url = f"{base.rstrip('/')}/{file.name}" if base else file.url
@@ -81,7 +81,7 @@ def _fetched_or_there(file: File, path: Path, watch: Watcher, base: str | None) 
     return _with_checksum_file(path, known=known is not None, fetched=True)
 
 
-def _download(url: str, path: Path, known: str | None, watch: Watcher) -> None:
+def _download(url: str, path: Path, known: str | None, watch: OnProgress) -> None:
     pooch = _pooch()
     part = path.with_name(f"{path.name}.part")
 

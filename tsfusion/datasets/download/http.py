@@ -10,7 +10,7 @@ import re
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
@@ -19,8 +19,7 @@ from tsfusion.core import durable_files, folder_lock
 from tsfusion.core.durable_files import size_of
 from tsfusion.core.errors import DatasetError, OutputError
 from tsfusion.core.process import version_of
-
-Watcher = Callable[[int, int], None]  # bytes there, bytes of all (0 = unknown)
+from tsfusion.core.readable_numbers import OnProgress
 
 _CHUNK_BYTES = 1 << 20
 _TIMEOUT_S = 30.0
@@ -28,7 +27,7 @@ _GIVE_UP_AFTER = 4  # requests in a row without a new byte
 _PAUSE_S = 1.0
 
 
-def download(url: str, part: Path, watch: Watcher) -> None:
+def download(url: str, part: Path, watch: OnProgress) -> None:
     """Complete `part`, from where an earlier call stopped; without ranges at the server, from the start.
 
     Raises:
@@ -62,7 +61,7 @@ def download(url: str, part: Path, watch: Watcher) -> None:
     )
 
 
-def _request(url: str, part: Path, watch: Watcher) -> bool:
+def _request(url: str, part: Path, watch: OnProgress) -> bool:
     """Send one request; True if the file is complete then."""
     start, validator = size_of(part), _validator(part)
     headers = {"User-Agent": f"tsfusion/{version_of('tsfusion')}", "Accept-Encoding": "identity"}
@@ -92,7 +91,7 @@ def _request(url: str, part: Path, watch: Watcher) -> bool:
     return not total or size_of(part) == total
 
 
-def _copy(response: Any, part: Path, at: int, total: int, watch: Watcher) -> None:
+def _copy(response: Any, part: Path, at: int, total: int, watch: OnProgress) -> None:
     with _locked(part) as file:
         if not at:
             _write_validator(part, _validator_of(response))

@@ -13,8 +13,8 @@ from tsfusion.datasets.dataset import (
     NO_POSE_IN_TIME,
     SCAN,
     Accelerometer,
+    FramePoses,
     NoPoses,
-    Poses,
     Times,
     read_table,
 )
@@ -68,7 +68,7 @@ class EuRoC(PairedImages, FolderFrames):
         self.camera = RecordedCamera(self.intrinsics, rectifier.size, "from sensor.yaml, rectified")
         return [pair[1:] for pair in pairs], np.array([stamp for stamp, _, _ in pairs], np.int64)
 
-    def _recorded_poses(self, root: Path, files: object) -> Poses:
+    def _recorded_poses(self, root: Path, files: object) -> FramePoses:
         path = self._place / _TRUTH
         if not path.exists():
             raise NoPoses(f"{path} is missing; expected `ns,px,py,pz,qw,qx,qy,qz,…` a line; {SCAN}")

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.cameras import DepthUnit, PublishedCamera
-from tsfusion.datasets.dataset import SCAN, WITHOUT_DEPTH, NoPoses, Poses, Times
+from tsfusion.datasets.dataset import SCAN, WITHOUT_DEPTH, FramePoses, NoPoses, Times
 from tsfusion.datasets.depth_files import SUFFIXES
 from tsfusion.datasets.file_names import in_order, in_time, numbers_in, series_of
 from tsfusion.datasets.formats.image_folders import (
@@ -248,7 +248,7 @@ class Redwood(DepthImages):
         files = [*self._beside] or depth_images(root, self.depth_at, self.expected)
         return in_time(files, _names(files))
 
-    def _recorded_poses(self, root: Path, files: list[Path]) -> Poses:
+    def _recorded_poses(self, root: Path, files: list[Path]) -> FramePoses:
         path = _log(root)
         if path is None:
             given = root / "groundtruth.txt"  # TUM's
@@ -256,8 +256,8 @@ class Redwood(DepthImages):
             raise NoPoses(f"{root} has no trajectory; expected {self.expected}; {hint}")
         return self._poses_of(path, files)
 
-    def _poses_of(self, path: Path, files: list[Path]) -> Poses:
-        """Poses of a `.log` by number; of another trajectory by time, or one for each image."""
+    def _poses_of(self, path: Path, files: list[Path]) -> FramePoses:
+        """FramePoses of a `.log` by number; of another trajectory by time, or one for each image."""
         if is_log(path):
             return poses_by_number(_names(files), read_log(path), path)
         return super()._poses_of(path, files)

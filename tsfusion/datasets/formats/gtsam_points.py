@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets.dataset import SCAN, NoPoses, Poses, Times
+from tsfusion.datasets.dataset import SCAN, FramePoses, NoPoses, Times
 from tsfusion.datasets.file_names import in_order
 from tsfusion.datasets.folder_frames import FolderFrames
 from tsfusion.datasets.readers import numbers, read_lines
@@ -34,7 +34,7 @@ class LidarDump(FolderFrames):
         files = in_order(root.glob("*/points.bin"))
         return [file for file in files if file.parent.name.isdecimal()], None
 
-    def _recorded_poses(self, root: Path, files: list[Path]) -> Poses:
+    def _recorded_poses(self, root: Path, files: list[Path]) -> FramePoses:
         path, content = root / "graph.txt", "`vK tx ty tz qx qy qz qw` a line"
         if not path.exists():
             raise NoPoses(f"{path} is missing; expected {EXPECTED}; {SCAN}")

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets import depth_files
 from tsfusion.datasets.cameras import MILLIMETRES, PublishedCamera, RecordedCamera, find_camera
-from tsfusion.datasets.dataset import SCAN, NoPoses, Poses, Times
+from tsfusion.datasets.dataset import SCAN, FramePoses, NoPoses, Times
 from tsfusion.datasets.depth_files import check_metres, read_depth
 from tsfusion.datasets.file_names import in_order, numbers_in, series_of
 from tsfusion.datasets.folder_frames import FolderFrames
@@ -69,7 +69,7 @@ class PoseRows(NamedTuple):
     file: str
     by_number: bool = False
 
-    def read(self, root: Path, files: list[Path], images: ImagesAt) -> Poses:
+    def read(self, root: Path, files: list[Path], images: ImagesAt) -> FramePoses:
         """The pose of each image; raises NoPoses where the file is missing."""
         path = root / self.file
         if not path.exists():
@@ -90,7 +90,7 @@ class PoseFiles(NamedTuple):
 
     file: str  # {} as of `ImagesAt`
 
-    def read(self, root: Path, files: list[Path], images: ImagesAt) -> Poses:
+    def read(self, root: Path, files: list[Path], images: ImagesAt) -> FramePoses:
         """The pose of each image; None where its file is missing, or a tracker wrote that it was lost."""
         is_apart = "/" in self.file
 
@@ -201,7 +201,7 @@ class DepthImages(DepthReader, FolderFrames):
     def _list(self, root: Path) -> tuple[list[Any], Times]:
         return depth_images(root, self.depth_at, self.expected), None
 
-    def _recorded_poses(self, root: Path, files: list[Any]) -> Poses:
+    def _recorded_poses(self, root: Path, files: list[Any]) -> FramePoses:
         return self.poses_at.read(root, files, self.depth_at)
 
     def _colors(self, root: Path) -> Sequence[Path | None]:

@@ -21,8 +21,8 @@ from tsfusion.datasets.cameras import RecordedCamera
 from tsfusion.datasets.dataset import (
     SCAN,
     STREET,
+    FramePoses,
     NoPoses,
-    Poses,
     SeveralRecordings,
     poses_if_any,
     require_folder,
@@ -179,7 +179,7 @@ def frames_of(place: Path, folders: Sequence[str], skipped: dict[str, int]) -> d
     return {**paired(left, right, skipped)}
 
 
-def _trajectory(root: Path, sequence: str, poses: str | Path | None, frames: list[int]) -> Poses:
+def _trajectory(root: Path, sequence: str, poses: str | Path | None, frames: list[int]) -> FramePoses:
     """The pose of each frame; the benchmark has none from sequence 11 on."""
     path = root / "poses" / f"{sequence}.txt"
     if poses is not None:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets.dataset import NoPoses, Poses, SeveralRecordings, poses_if_any, require_folder
+from tsfusion.datasets.dataset import FramePoses, NoPoses, SeveralRecordings, poses_if_any, require_folder
 from tsfusion.datasets.formats.kitti import (
     KITTIFrames,
     files_by_frame,
@@ -147,7 +147,7 @@ def _cameras(drive: Path, cameras: str | None) -> tuple[str, str]:
     return _CAMERAS[cameras]
 
 
-def _imu_poses(place: Path, frames: list[int]) -> Poses:
+def _imu_poses(place: Path, frames: list[int]) -> FramePoses:
     """T_world_imu of frames, by pykitti's Mercator projection; the first packet is the origin."""
     files = files_by_frame(place, ".txt")
     if not files:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError, InvalidConfig, InvalidKeyframe
 from tsfusion.datasets.cameras import MILLIMETRES, DepthUnit, RecordedCamera, given_camera
-from tsfusion.datasets.dataset import WITHOUT_DEPTH, Poses, Times, first_frame
+from tsfusion.datasets.dataset import WITHOUT_DEPTH, FramePoses, Times, first_frame
 from tsfusion.datasets.depth_files import check_metres, read_depth
 from tsfusion.datasets.formats.image_folders import DepthImages, resample_for_camera
 from tsfusion.datasets.readers import listed_file, read_color, turned_by_exif
@@ -100,7 +100,7 @@ class Nerfstudio(DepthImages):
             self.skipped[WITHOUT_DEPTH] = len(frames) - len(self._listed)
         return [entry.depth for entry in self._listed], None
 
-    def _recorded_poses(self, root: Path, files: list[Path]) -> Poses:
+    def _recorded_poses(self, root: Path, files: list[Path]) -> FramePoses:
         capture, file = self._capture, self._file
         applied = _scale(capture, "applied_scale", file) if "applied_scale" in capture else 1.0
         return usable(file, self._with_depth, lambda one: _pose(one[0], applied, one[1]))

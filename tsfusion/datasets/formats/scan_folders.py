@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets.dataset import SCAN, NoPoses, Poses, Times
+from tsfusion.datasets.dataset import SCAN, FramePoses, NoPoses, Times
 from tsfusion.datasets.file_names import in_time, series_of
 from tsfusion.datasets.folder_frames import FolderFrames
 from tsfusion.datasets.given_trajectory import poses_between
@@ -96,10 +96,10 @@ class ScanFolder(FolderFrames):
             self._posed, self.system, self.expected = True, first.system or System(), _IN_GRID
         return files, times
 
-    def _recorded_poses(self, root: Path, files: list[Path]) -> Poses:
+    def _recorded_poses(self, root: Path, files: list[Path]) -> FramePoses:
         return self._poses_of(_poses(root, self.expected), files)
 
-    def _poses_of(self, path: Path, files: list[Path]) -> Poses:
+    def _poses_of(self, path: Path, files: list[Path]) -> FramePoses:
         if self.in_world and self._times is None and has_times(path):
             self._times = self._follow(path, files)
         found = super()._poses_of(path, files)

@@ -4,7 +4,7 @@
 from pathlib import Path
 from typing import Any
 
-from tsfusion.datasets.dataset import SCAN, NoPoses, Poses, Times
+from tsfusion.datasets.dataset import SCAN, FramePoses, NoPoses, Times
 from tsfusion.datasets.file_names import in_time
 from tsfusion.datasets.folder_frames import FolderFrames
 from tsfusion.datasets.formats.image_folders import first_size, images
@@ -66,5 +66,5 @@ class StereoFolder(PairedImages, FolderFrames):
         files, times = in_time([left[name] for name in pairs], [*pairs])
         return [pairs[file.stem] for file in files], times
 
-    def _recorded_poses(self, root: Path, files: object) -> Poses:
+    def _recorded_poses(self, root: Path, files: object) -> FramePoses:
         raise NoPoses(f"{root} has no poses; expected --trajectory FILE; {SCAN}")

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tsfusion.datasets.cameras import DepthUnit, PublishedCamera
-from tsfusion.datasets.dataset import SCAN, NoPoses, Poses, Times, read_table
+from tsfusion.datasets.dataset import SCAN, FramePoses, NoPoses, Times, read_table
 from tsfusion.datasets.formats.image_folders import DepthImages
 from tsfusion.datasets.formats.tum_lists import ASSOCIATIONS, read_recording
 from tsfusion.geometry.keyframe import Intrinsics
@@ -90,7 +90,7 @@ class TUM(DepthImages):
         )  # fmt: skip
         return self._listed.depth, np.array(self._listed.timestamps_ns, np.int64)
 
-    def _recorded_poses(self, root: Path, files: list[Path]) -> Poses:
+    def _recorded_poses(self, root: Path, files: list[Path]) -> FramePoses:
         return self._poses_of(_trajectory(root), files)
 
     def _colors(self, root: Path) -> list[Path | None]:

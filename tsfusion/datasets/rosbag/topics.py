@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets.rosbag import messages
-from tsfusion.datasets.rosbag.cameras import (
+from tsfusion.datasets.rosbag import bag_messages
+from tsfusion.datasets.rosbag.bag_cameras import (
     RECTIFIED,
     REGISTERED,
     CameraRig,
@@ -18,7 +18,7 @@ from tsfusion.datasets.rosbag.cameras import (
     ImageTopic,
     image_topic,
 )
-from tsfusion.datasets.rosbag.messages import CAMERA, CLOUD, COMPRESSED, IMAGE
+from tsfusion.datasets.rosbag.bag_messages import CAMERA, CLOUD, COMPRESSED, IMAGE
 from tsfusion.datasets.rosbag.reader import BagRecording, Stream, frame_id
 from tsfusion.geometry.keyframe import Intrinsics
 
@@ -209,7 +209,7 @@ class TopicChooser:
 
     def _pair(self, right: ImageTopic) -> tuple[ImageTopic, ImageTopic] | None:
         """The left and the right images, if these are some of a right camera."""
-        if messages.is_depth(right.first):
+        if bag_messages.is_depth(right.first):
             return None
         camera = self._cameras.find(right)
         if camera is None or not camera.P[0, 3] < 0:

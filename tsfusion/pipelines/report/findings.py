@@ -3,22 +3,31 @@
 
 import csv
 import json
+import os
+import platform
 import re
+import shlex
+import sys
+import time
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from tsfusion.core import process
 from tsfusion.core.errors import DatasetError, OutputError
 from tsfusion.core.output_folder import RECORD
+from tsfusion.core.process import version_of
 from tsfusion.datasets.trajectory_files import read_poses
 from tsfusion.geometry.mesh import Mesh
+from tsfusion.geometry.se3 import Poses
 from tsfusion.geometry.up_direction import Up
-from tsfusion.wire.keyframe_times import KeyframeTimes
+from tsfusion.wire.messages.keyframe_times import KeyframeTimes
 
-Poses = NDArray[np.float64]  # (n, 4, 4) T_world_camera
 Paths = dict[str, tuple[NDArray[np.int64] | None, Poses]]  # of a file's name, timestamps and poses
 PATHS = ("trajectory", "trajectory-corrected", "reference", "keyframes")
 
@@ -171,6 +180,48 @@ def date_of(record: dict[str, Any], path: Path) -> str:
     named = re.search(r"(\d{4}-\d{2}-\d{2})_(\d{2})-(\d{2})-\d{2}", path.absolute().name)
     if named:
         return f"{named[1]} {named[2]}:{named[3]}"
-    import time
 
     return time.strftime("%Y-%m-%d %H:%M", time.localtime((path / RECORD).stat().st_mtime))
+
+
+class Circumstances(msgspec.Struct, frozen=True, kw_only=True):
+    """Time and place of a run's end, and its command. `finished` is local time."""
+
+    finished: str
+    command: str  # empty = it was not started by the `tsfusion` command
+    host: str
+    cpu: str
+    cores: int
+    memory_bytes: int
+
+
+def circumstances() -> Circumstances:
+    """Circumstances of this process: when, where and by which command."""
+    started = Path(sys.argv[0])
+    is_command = started.stem == "tsfusion" or (
+        started.name == "__main__.py" and started.parent.name == "tsfusion"
+    )
+    return Circumstances(
+        finished=time.strftime("%Y-%m-%d %H:%M"),
+        command=shlex.join(["tsfusion", *sys.argv[1:]]) if is_command else "",
+        host=platform.node(),
+        cpu=_cpu(),
+        cores=os.cpu_count() or 0,
+        memory_bytes=process.physical_memory_bytes(),
+    )
+
+
+def _cpu() -> str:
+    """Name of the processor; where the system does not tell, its architecture."""
+    with suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.machine()
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python, the platform, tsfusion and the packages it stands on."""
+    packages = "tsfusion taichi numpy opencv-python-headless pyzmq trimesh mcap msgspec zstandard"
+    found = {"python": platform.python_version(), "platform": platform.platform()}
+    return found | {name: version_of(name) for name in packages.split()}

@@ -5,16 +5,17 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
-from tsfusion.core.readable_numbers import count_of, counted, grouped, size
+from tsfusion.core.readable_numbers import OnProgress, count_of, counted, grouped, size
+from tsfusion.geometry.se3 import Poses
 from tsfusion.journal import inspection, state_folder
 from tsfusion.journal.inspection import JournalInfo
 from tsfusion.journal.journaled_keyframes import JournaledKeyframes
-from tsfusion.pipelines import run_files, saved_maps
-from tsfusion.pipelines.report import page, run_sections
-from tsfusion.pipelines.report.findings import MapFindings, Poses
+from tsfusion.pipelines.maps import saved_maps
+from tsfusion.pipelines.maps.saved_maps import MapSummary
+from tsfusion.pipelines.report import findings, page, run_sections
+from tsfusion.pipelines.report.findings import MapFindings
 from tsfusion.pipelines.report.map_sections import ShownMap
 from tsfusion.pipelines.report.page import Page
-from tsfusion.pipelines.saved_maps import MapSummary
 from tsfusion.tsdf.volume import Volume
 
 _NO_DELAY = "A saved map does not hold when its keyframes were fused: a run's report has that."
@@ -28,7 +29,7 @@ class AboutMap(NamedTuple):
     poses: Poses | None
 
 
-def read(source: Path, name: str | None, watch: state_folder.Watcher = lambda _done, _all: None) -> AboutMap:
+def read(source: Path, name: str | None, watch: OnProgress = lambda _done, _all: None) -> AboutMap:
     """Read about a saved map; see `saved_maps.find`.
 
     Raises:
@@ -144,7 +145,7 @@ def _journal(journal: JournalInfo | None) -> str:
 
 def _setting(about: AboutMap) -> dict[str, object]:
     summary = about.summary
-    return {"folder": summary.path, "config": summary.settings, "versions": run_files.versions()}
+    return {"folder": summary.path, "config": summary.settings, "versions": findings.versions()}
 
 
 def _builtins(figures: dict[str, object]) -> dict[str, object]:

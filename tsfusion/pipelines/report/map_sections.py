@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from tsfusion.core.readable_numbers import grouped
 from tsfusion.geometry.mesh import Mesh
-from tsfusion.pipelines import mesh_preview
+from tsfusion.pipelines.maps import mesh_preview
 from tsfusion.pipelines.report import charts, page, pictures, scene
 from tsfusion.pipelines.report.charts import Axis, Chart
 from tsfusion.pipelines.report.findings import MapFindings, Paths

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from tsfusion.core import durable_files
 from tsfusion.core.errors import OutputError
-from tsfusion.core.headline import Level
+from tsfusion.core.headline import Severity
 from tsfusion.geometry.color_scales import ramp
-from tsfusion.pipelines import mesh_preview
+from tsfusion.pipelines.maps import mesh_preview
 
 # No request leaves the page, whatever text it holds.
 _POLICY = (
@@ -40,7 +40,7 @@ class Page:
     title: str
     subtitle: str
     verdict: str
-    level: Level = "good"
+    level: Severity = "good"
     warnings: list[str] = field(default_factory=list)
     tiles: list[tuple[str, str, str]] = field(default_factory=list)
     sections: list[tuple[str, str]] = field(default_factory=list)

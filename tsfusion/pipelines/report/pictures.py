@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tsfusion.core.errors import OutputError
 from tsfusion.geometry.color_scales import ramp, rounded_up
 from tsfusion.geometry.mesh import Mesh
-from tsfusion.pipelines import mesh_preview
+from tsfusion.pipelines.maps import mesh_preview
 
 SIZE = (840, 560)  # pixels
 SIDES = 4

@@ -6,8 +6,7 @@ from typing import Any
 
 from tsfusion.core.readable_numbers import count_of, counted, figure, grouped, size
 from tsfusion.geometry.mesh import Mesh
-from tsfusion.pipelines import shortfall
-from tsfusion.pipelines.report import findings, map_sections, page, run_sections
+from tsfusion.pipelines.report import findings, map_sections, page, run_sections, shortfall
 from tsfusion.pipelines.report.findings import MapFindings, RunFindings
 from tsfusion.pipelines.report.map_sections import ShownMap
 from tsfusion.pipelines.report.page import Page, Pictures

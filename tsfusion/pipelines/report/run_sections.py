@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 from tsfusion.core.errors import DatasetError
 from tsfusion.core.readable_numbers import counted, figure, grouped, size
 from tsfusion.evaluation import trajectory_error
-from tsfusion.pipelines import latency_ledger
-from tsfusion.pipelines.report import charts, page
+from tsfusion.pipelines.report import charts, latency_ledger, page
 from tsfusion.pipelines.report.charts import Axis, Chart
 from tsfusion.pipelines.report.findings import MapFindings, RunFindings
-from tsfusion.wire.keyframe_times import DELAY, STAGES, KeyframeTimes, spread
-from tsfusion.wire.messages import SKIP_REASONS
+from tsfusion.wire.messages.keyframe_times import DELAY, STAGES, KeyframeTimes, spread
+from tsfusion.wire.messages.messages import SKIP_REASONS
 
 _COLUMNS = 200  # of a chart by keyframe: more keyframes are drawn together
 _BINS = 50

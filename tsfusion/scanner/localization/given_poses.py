@@ -14,7 +14,7 @@ from tsfusion.geometry import origin as origins
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.sweeps import motion_about
 from tsfusion.geometry.trajectory import Trajectory
-from tsfusion.scanner.localization.localizer import Localizer, Lost, Pose, TrackingKeyframes
+from tsfusion.scanner.localization.localizer import Localizer, Lost, TrackedPose, TrackingKeyframes
 
 
 class TrajectoryFilePoses(Localizer):
@@ -56,7 +56,7 @@ class TrajectoryFilePoses(Localizer):
         self._anchors = TrackingKeyframes()
         self._begun = False
 
-    def track(self, frame: Frame) -> Pose | Lost:
+    def track(self, frame: Frame) -> TrackedPose | Lost:
         """Look up the pose at the frame's timestamp; Lost in gaps and beyond the ends."""
         stamp = frame.timestamp_ns + self._offset_ns
         # A recording's first frame may be its time 0; 0 again is a source without times.
@@ -127,7 +127,7 @@ class GivenPoses(Localizer):
     def __init__(self) -> None:
         self._anchors = TrackingKeyframes()
 
-    def track(self, frame: Frame) -> Pose | Lost:
+    def track(self, frame: Frame) -> TrackedPose | Lost:
         """Return the frame's own pose; Lost where it has none."""
         if frame.T_world_camera is None:
             return Lost(reason="the source gives no pose for this frame", timestamp_ns=frame.timestamp_ns)

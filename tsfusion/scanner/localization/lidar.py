@@ -13,7 +13,7 @@ from tsfusion.core.distinct_integers import distinct
 from tsfusion.core.errors import InvalidKeyframe, MissingDependency
 from tsfusion.geometry import se3, sweeps
 from tsfusion.geometry.frame import Frame
-from tsfusion.scanner.localization.localizer import Localizer, Lost, Pose, TrackingKeyframes
+from tsfusion.scanner.localization.localizer import Localizer, Lost, TrackedPose, TrackingKeyframes
 
 Points = NDArray[np.float64]  # (n, 3) metres
 
@@ -65,7 +65,7 @@ class LidarLocalizer(Localizer):
         self._anchors = TrackingKeyframes()
         self.reset()
 
-    def track(self, frame: Frame) -> Pose | Lost:
+    def track(self, frame: Frame) -> TrackedPose | Lost:
         """Find the sensor's pose at the frame's timestamp, in the axes of the first frame."""
         if frame.points is None:
             raise InvalidKeyframe(f"the localizer lidar follows points, got {frame.kind}")

@@ -14,7 +14,7 @@ from tsfusion.geometry.sweeps import Motion
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Pose:
+class TrackedPose:
     """Pose of the sensor at one frame.
 
     Attributes:
@@ -78,7 +78,7 @@ class Localizer(Protocol):
 
     absolute: bool
 
-    def track(self, frame: Frame) -> Pose | Lost:
+    def track(self, frame: Frame) -> TrackedPose | Lost:
         """Find the sensor's pose; Lost when it is not known (then try the next frame, or `reset`).
 
         Raises:
@@ -117,11 +117,11 @@ class TrackingKeyframes:
         self._number = -1
         self._T_world_anchor: se3.Transform | None = None
 
-    def pose(self, T_world_camera: se3.Transform, timestamp_ns: int, **known: Any) -> Pose:
+    def pose(self, T_world_camera: se3.Transform, timestamp_ns: int, **known: Any) -> TrackedPose:
         """Make a localizer's answer of (4, 4) `T_world_camera`, relative to the tracking keyframe.
 
         Args:
-            known: quality and motion, as of a `Pose`.
+            known: quality and motion, as of a `TrackedPose`.
         """
         T = np.eye(4) if self._T_world_anchor is None else se3.inverse(self._T_world_anchor) @ T_world_camera
         moved = se3.distance(T) > self.distance or se3.angle(T) > self._angle
@@ -129,7 +129,7 @@ class TrackingKeyframes:
         if starts:
             self._number += 1
             self._T_world_anchor, T = T_world_camera, np.eye(4)
-        return Pose(
+        return TrackedPose(
             T_world_camera=T_world_camera,
             timestamp_ns=timestamp_ns,
             anchor=self._number,

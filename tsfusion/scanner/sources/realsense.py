@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from tsfusion.core.errors import InvalidConfig, MissingDependency, SourceError
-from tsfusion.geometry.calibration import Camera, Undistorter
+from tsfusion.geometry.calibration import Camera, Size, Undistorter
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.scanner.sources import realsense_frames
@@ -63,7 +63,7 @@ class RealSense(LiveSource):
         device: Any = None,
         images: realsense_frames.Images = "depth",
         color: bool = True,
-        size: realsense_frames.Size = (480, 640),
+        size: Size = (480, 640),
         fps: int = 30,
         real_time: bool = False,
         deadline: float = 5.0,

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import SourceError
+from tsfusion.geometry.calibration import Size
 
 Images = Literal["depth", "infrared"]
-Size = tuple[int, int]  # height, width
 
 _QUEUE = 4  # framesets a syncer keeps; the oldest goes first
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
-from tsfusion.scanner.localization.localizer import Localizer, Lost, Pose, PoseCorrections
+from tsfusion.scanner.localization.localizer import Localizer, Lost, PoseCorrections, TrackedPose
 from tsfusion.scanner.localization.loop_closure import pose_graph, verification
 from tsfusion.scanner.localization.loop_closure.loop_consensus import Loop, LoopConsensus
 from tsfusion.scanner.localization.loop_closure.odometry_drift import OdometryChain, OdometryDrift
@@ -97,7 +97,7 @@ class LoopClosing:
         self._lost = 0  # frames, since the last that was not
         self._T_world_tracker: se3.Transform = np.eye(4)  # another where the tracker was restarted
 
-    def track(self, frame: Frame) -> Pose | Lost:
+    def track(self, frame: Frame) -> TrackedPose | Lost:
         """Track with the wrapped localizer; when it is lost, search for a known place to go on from."""
         found = self._localizer.track(frame)
         if isinstance(found, Lost):
@@ -123,14 +123,14 @@ class LoopClosing:
         if self._search is not None:
             self._search.wait()
 
-    def _relocalised(self, frame: Frame, lost: Lost) -> Pose | Lost:
+    def _relocalised(self, frame: Frame, lost: Lost) -> TrackedPose | Lost:
         """Restart the tracker at a place that was seen before."""
         place = self.relocalise(frame)
         if place is None:
             return lost
         self._localizer.reset()
         begun = self._localizer.track(frame)
-        if isinstance(begun, Pose):
+        if isinstance(begun, TrackedPose):
             self._T_world_tracker = place.T_world_camera @ se3.inverse(begun.T_world_camera)
         return begun
 
@@ -146,7 +146,7 @@ class LoopClosing:
         self._localizer.reset()
         self._forget()
 
-    def relocalise(self, frame: Frame) -> Pose | None:
+    def relocalise(self, frame: Frame) -> TrackedPose | None:
         """Find a frame's pose by the remembered places alone; None unless the place is certain."""
         self.settle()
         seen = _described(frame)
@@ -167,7 +167,7 @@ class LoopClosing:
         if any(se3.distance(se3.inverse(poses[0]) @ other) > MAX_PLACE_SPREAD for other in poses[1:]):
             return None
         place, T = found[0]
-        return Pose(
+        return TrackedPose(
             T_world_camera=self._chain.poses[place] @ T,
             timestamp_ns=frame.timestamp_ns,
             anchor=place,
@@ -179,7 +179,7 @@ class LoopClosing:
         last = next(reversed(self._corrected))
         return self._corrected[last] @ se3.inverse(self._chain.poses[last])
 
-    def _keyframe(self, pose: Pose, frame: Frame) -> None:
+    def _keyframe(self, pose: TrackedPose, frame: Frame) -> None:
         T = self._correction() if self._corrected else np.eye(4)
         self._chain.add(pose.anchor, pose.T_world_camera)
         self._corrected[pose.anchor] = T @ pose.T_world_camera

@@ -14,10 +14,10 @@ from functools import partial
 from tsfusion.core.errors import DecodeError, InvalidConfig, TransportError
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.sweeps import motion_about
-from tsfusion.scanner.localization.localizer import Lost, Pose, PoseCorrections, TrackingKeyframes
+from tsfusion.scanner.localization.localizer import Lost, PoseCorrections, TrackedPose, TrackingKeyframes
+from tsfusion.scanner.localization.pose_feed.feed_messages import MAX_BYTES, decode
 from tsfusion.scanner.localization.pose_feed.map_deformation import MapDeformation, PoseHistory
-from tsfusion.scanner.localization.pose_feed.messages import MAX_BYTES, decode
-from tsfusion.wire import sockets
+from tsfusion.wire.sockets import sockets
 
 log = logging.getLogger(__name__)
 
@@ -77,7 +77,7 @@ class PoseFeed:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def track(self, frame: Frame) -> Pose | Lost:
+    def track(self, frame: Frame) -> TrackedPose | Lost:
         """Interpolate the feed's poses at the frame's timestamp; wait up to `wait_s` for the next one.
 
         Of a frame with point times the one after its last point is waited for.

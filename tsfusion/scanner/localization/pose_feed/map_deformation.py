@@ -10,7 +10,7 @@ from tsfusion.geometry import se3
 from tsfusion.geometry.se3 import Transform
 from tsfusion.geometry.trajectory import Trajectory, quaternion
 from tsfusion.scanner.localization.localizer import PoseCorrections
-from tsfusion.scanner.localization.pose_feed.messages import FeedCorrections
+from tsfusion.scanner.localization.pose_feed.feed_messages import FeedCorrections
 
 _NUMBERS = 7  # translation and quaternion; all NaN where the sender was lost
 

@@ -1,0 +1,322 @@
+# SPDX-License-Identifier: MIT
+"""The known layouts of recordings, and the one that a path is in.
+
+Another package adds a layout by an entry point in the group `tsfusion.datasets` that names a `Layout`; it is
+tried before the built-in ones.
+"""
+
+import logging
+from collections.abc import Callable, Iterable
+from functools import partial
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tsfusion.core import plugins
+from tsfusion.core.errors import DatasetError
+from tsfusion.datasets.dataset import Dataset, Frames
+from tsfusion.datasets.download import archives
+from tsfusion.datasets.folder_frames import FolderFrames
+from tsfusion.datasets.formats import kitti, kitti_raw
+from tsfusion.datasets.formats.euroc import EuRoC
+from tsfusion.datasets.formats.folder_table import (
+    PLAIN_EXPECTED,
+    HoloLens,
+    Redwood,
+    Replica,
+    ScanNet,
+    SevenScenes,
+)
+from tsfusion.datasets.formats.gtsam_points import LidarDump
+from tsfusion.datasets.formats.nerfstudio import Nerfstudio
+from tsfusion.datasets.formats.scan_folders import ScanFolder
+from tsfusion.datasets.formats.stereo_folders import StereoFolder
+from tsfusion.datasets.formats.tum import TUM
+from tsfusion.datasets.given_trajectory import WithTrajectory
+from tsfusion.datasets.rosbag import bag as rosbag_dataset
+from tsfusion.datasets.rosbag.reader import ENDINGS
+from tsfusion.geometry.frame import Frame
+from tsfusion.geometry.origin import System
+
+GROUP = "tsfusion.datasets"
+
+_log = logging.getLogger(__name__)
+_MAC = "__MACOSX"  # what macOS puts into archives beside the recording
+_INDEX = (".txt", ".json", ".yaml", ".csv", ".freiburg")  # a file of these is taken for its folder
+
+
+class Layout(NamedTuple):
+    """A way in which recordings are stored on the disk.
+
+    Attributes:
+        name: for reports.
+        description: the expected files, in one line.
+        recognises: True if a folder or file is in this layout; quick, reads no images, raises nothing. Of a
+            layout that is a world's, True of `Path("synthetic:WORLD")`.
+        open: `open(path, **options)` → a dataset; takes `posed` where frames may lack a pose. A world's takes
+            `world` and `sensor` by name.
+
+    Examples:
+        >>> from tsfusion.datasets import layouts
+        >>> "7-Scenes" in [layout.name for layout in layouts()]
+        True
+    """
+
+    name: str
+    description: str
+    recognises: Callable[[Path], bool]
+    open: Callable[..., Dataset]
+
+
+class FoundDataset(NamedTuple):
+    """Result of `find`."""
+
+    path: Path  # the folder or file to open: the given one, or the only dataset in it
+    layout: Layout
+    also: tuple[str, ...]  # names of less specific layouts that fit too
+
+    def open(self, /, **options: Any) -> Dataset:
+        """Open the dataset; options that are None are left out.
+
+        Raises:
+            DatasetError: the files are wrong, or an option that the layout does not have.
+        """
+        return open_as(self.layout.name, partial(self.layout.open, self.path), options)
+
+
+def _row(layout: type[FolderFrames], name: str = "", also: str = "") -> Layout:
+    return Layout(name or layout.layout, layout.expected + also, layout.recognises, layout)
+
+
+# In the order in which they are tried: specific layouts first.
+BUILT_IN = (
+    _row(EuRoC),
+    Layout("KITTI odometry", kitti.EXPECTED, kitti.recognises, kitti.open_kitti),
+    Layout("KITTI raw", kitti_raw.EXPECTED, kitti_raw.recognises, kitti_raw.KITTIRaw),
+    _row(SevenScenes),
+    _row(ScanNet),
+    _row(Replica),
+    _row(Nerfstudio),
+    _row(LidarDump),
+    _row(TUM, "TUM RGB-D", " (also CoRBS, ICL-NUIM)"),
+    _row(HoloLens),
+    _row(Redwood),
+    Layout("ROS bag", rosbag_dataset.EXPECTED, rosbag_dataset.recognises, rosbag_dataset.Bag),
+)
+# Tried where no other layout fits.
+PLAIN = (Layout("RGB-D folders", PLAIN_EXPECTED, Redwood.recognises_plain, Redwood), _row(StereoFolder))
+# Tried where nothing there is in any other: points beside a recording are often made of it.
+SCANS = (_row(ScanFolder),)
+SYNTHETIC = (
+    "synthetic",
+    "no files: synthetic:WORLD, or synthetic:WORLD:SENSOR; worlds: room (also -untextured, -plain, -bare), "
+    "street, corridor, rooms; sensors: kinect, tof, stereo, lidar",
+)
+
+
+def layouts() -> list[Layout]:
+    """Every layout, in the order in which they are tried."""
+    return [*_plugins(), *BUILT_IN, *PLAIN, *SCANS]
+
+
+def world_layout(name: str) -> Layout | None:
+    """Layout of another package that stands for `synthetic:NAME`."""
+    return next((one for one in _plugins() if _recognises(one, Path(f"synthetic:{name}"))), None)
+
+
+def find(path: str | Path, *, unpack: bool = False) -> FoundDataset:
+    """Find the dataset at a path: its folder, a folder that holds exactly one, or a file that stands for it.
+
+    Args:
+        unpack: unpack an archive beside itself; otherwise the error names the command that does.
+
+    Raises:
+        DatasetError: nothing or more than one dataset found; the message says what was expected.
+    """
+    root = Path(path).expanduser()
+    if not root.exists():
+        raise DatasetError(f"{root} does not exist; expected a dataset or synthetic:room, synthetic:street")
+    if root.name in ("", ".."):  # such as the present folder: a benchmark is known by its folder's name
+        root = root.resolve()
+    if root.is_file() and archives.is_archive(root):
+        root = _unpacked(root, unpack=unpack)
+    found = _match([root])
+    if not found and root.is_file():
+        found = _match([root.absolute().parent]) if root.suffix.lower() in _INDEX else _match([root], SCANS)
+    elif not found:
+        places = _folders_in(root)
+        found = _match(places) or _match([root], SCANS) or _match(places, SCANS)
+    if len(found) != 1:
+        raise DatasetError(_unrecognised(root, [place.path for place in found]))
+    if found[0].also:
+        _log.warning(
+            "%s is taken for %s; it fits %s too",
+            found[0].path, found[0].layout.name, ", ".join(found[0].also),
+        )  # fmt: skip
+    return found[0]
+
+
+def open_as(name: str, opener: Callable[..., Dataset], options: dict[str, Any]) -> Dataset:
+    """Call a layout's opener; it may lack the options `posed` and `trajectory`; `poses` is the latter.
+
+    Options of any layout: `origin` and `crs`, see `Frames.take_off_origin`; `depth_along_ray`: depth images
+    hold distances along rays, which become depth.
+
+    Raises:
+        DatasetError: an option that it does not take, or of the wrong type.
+    """
+    options = dict(options)
+    origin, crs, along_ray = (options.pop(each, None) for each in ("origin", "crs", "depth_along_ray"))
+    dataset = _open_as(name, opener, options)
+    if along_ray is not None:
+        if not isinstance(along_ray, bool) or not isinstance(dataset, Frames):
+            raise DatasetError(
+                f"depth_along_ray is true or false, of depth images in files; got {along_ray!r} for {name}"
+            )
+        dataset.along_ray = along_ray
+    if isinstance(dataset, Frames):
+        dataset.take_off_origin(origin, crs)
+    elif origin is not None or crs is not None:
+        raise DatasetError(f"a {name} dataset has poses of its own: leave out the options origin and crs")
+    return dataset
+
+
+def _open_as(name: str, opener: Callable[..., Dataset], options: dict[str, Any]) -> Dataset:
+    if not plugins.takes(opener, "posed"):
+        options.pop("posed", None)
+    for camera in ("intrinsics", "calibration"):
+        if options.get(camera) is not None and not plugins.takes(opener, camera):
+            raise DatasetError(f"a {name} dataset comes with what it needs of a camera: leave out --{camera}")
+    for given, known in (("poses", "trajectory"), ("trajectory", "poses")):
+        if given in options and not plugins.takes(opener, given) and plugins.takes(opener, known):
+            options[known] = options.pop(given)
+    trajectory = options.get("trajectory")
+    if trajectory is None or plugins.takes(opener, "trajectory"):
+        return plugins.call(opener, options, name=f"a {name} dataset", error=DatasetError)
+    del options["trajectory"]
+    posed = options.get("posed", True)
+    if plugins.takes(opener, "posed"):
+        options["posed"] = False
+    where = {key: options[key] for key in ("max_gap_s", "time_offset_s") if options.get(key) is not None}
+    options = {key: value for key, value in options.items() if key not in where or plugins.takes(opener, key)}
+    dataset = plugins.call(opener, options, name=f"a {name} dataset", error=DatasetError)
+    return WithTrajectory(dataset, Path(trajectory).expanduser(), posed=posed, **where)
+
+
+def describe(dataset: Dataset) -> str:
+    """One line: number and kind of frames, size, rate, how many have a pose, the camera. Reads one frame."""
+    from tsfusion.datasets.cameras import camera_line, depth_line
+    from tsfusion.datasets.dataset import first_frame, pose_of
+
+    first = first_frame(dataset)
+    words = {"pair": "stereo pairs", "points": "scans", "disparity": "disparity images"}
+    kind = words.get(first.kind) or ("depth images" if first.color is None else "RGB-D frames")
+    size = "" if first.kind == "points" else f" {first.shape[1]}×{first.shape[0]}"
+    stamps = dataset.timestamps_ns
+    rate = ""
+    if stamps is not None and len(stamps) > 1 and stamps[-1] > stamps[0]:
+        rate = f" at {(len(stamps) - 1) / (stamps[-1] - stamps[0]) * 1e9:.3g} Hz"
+    posed = sum(pose_of(dataset, index) is not None for index in range(len(dataset)))
+    poses = "no poses" if not posed else "all with poses" if posed == len(dataset) else f"poses for {posed}"
+    uncolored = getattr(dataset, "uncolored", 0)
+    color = f", {uncolored} without colour in time" if uncolored else ""
+    unit = depth_line(dataset, first)
+    camera = camera_line(dataset, first)
+    seen = f"; {unit}" * bool(unit) + f"; camera {camera}" * bool(camera)
+    system = getattr(dataset, "system", System())
+    if getattr(dataset, "in_world", False):
+        seen += "; points in the frame of the poses" + ", taken for metres" * (system == System())
+    if system.metres != System().metres:
+        seen += f"; units of {system.metres[0]:.9g} m become metres"
+    if origin := getattr(dataset, "origin", None):
+        seen += f"; positions count from the origin {origin}"
+    if doubt := sweep_doubt(first):
+        seen += f"; {doubt}"
+    elif first.point_times_s is not None:
+        seconds = np.ptp(first.point_times_s)
+        seen += f"; motion is taken out of sweeps of {seconds:.2g} s (--option deskew=false leaves it)"
+    return f"{dataset.name}, {len(dataset)} {kind}{size}{rate}, {poses}{color}{seen}"
+
+
+def sweep_doubt(first: Frame) -> str:
+    """Reason why no motion is known within sweeps; empty = it is, or points have no times."""
+    if first.untimed:
+        return first.untimed
+    lacks = first.motion is None and first.T_world_camera is not None and first.point_times_s is not None
+    return "its poses tell no motion within sweeps" if lacks else ""
+
+
+def _unpacked(path: Path, *, unpack: bool) -> Path:
+    into = archives.destination(path)
+    if into.is_dir():
+        return into
+    if unpack:
+        return archives.unpack(path)
+    raise DatasetError(
+        f"{path} is an archive; unpack it with: {archives.command(path)}, then open {into} "
+        "(or let --unpack do so; in Python unpack=True)"
+    )
+
+
+def _match(places: Iterable[Path], only: tuple[Layout, ...] = ()) -> list[FoundDataset]:
+    """The datasets at these places, in any layout but the last, or in `only` these."""
+    ranked = [] if only else [*_plugins(), *BUILT_IN]
+    found = []
+    for place in places:
+        fitting = [layout for layout in ranked if _recognises(layout, place)]
+        fitting = fitting or [layout for layout in only or PLAIN if layout.recognises(place)]
+        if fitting:
+            found.append(FoundDataset(place, fitting[0], tuple(layout.name for layout in fitting[1:])))
+    return found
+
+
+def _recognises(layout: Layout, place: Path) -> bool:
+    if layout in BUILT_IN:
+        return layout.recognises(place)
+    try:
+        return layout.recognises(place)
+    except Exception as error:  # noqa: BLE001 - another package's code
+        _log.warning("the layout %s failed on %s: %r", layout.name, place, error)
+        return False
+
+
+def _plugins() -> list[Layout]:
+    found = []
+    for point in entry_points(group=GROUP):
+        try:
+            found.append(Layout(*plugins.load(point, DatasetError)))
+        except (DatasetError, TypeError) as error:
+            _log.warning("the dataset layout %s is left out: %s", point.name, error)
+    return found
+
+
+def _folders_in(root: Path) -> list[Path]:
+    try:
+        return sorted(
+            child
+            for child in root.iterdir()
+            if child.is_dir() and not child.name.startswith(".") and child.name != _MAC
+        )
+    except OSError as error:
+        raise DatasetError(f"cannot read {root}: {error.strerror}") from error
+
+
+def _unrecognised(root: Path, several: list[Path]) -> str:
+    if several:
+        return f"{root} holds {len(several)} datasets; open one of them: {', '.join(map(str, several))}"
+    if root.suffix == ".sens":
+        return f"{root} is a ScanNet recording; export it to folders first with ScanNet's SensReader"
+    if root.is_file() and root.suffix.lower() in ENDINGS:
+        realsense = f"; a RealSense recording: `tsfusion scan realsense:{root}`" * (root.suffix == ".db3")
+        return (
+            f"{root} is no ROS bag, by its first bytes; expected a whole {', '.join(ENDINGS)} file{realsense}"
+        )
+    if root.is_file():
+        return (
+            f"{root} is not a folder, nor a file that stands for a dataset (an archive, a transforms.json, "
+            "a trajectory.log, a file of a recognised folder)"
+        )
+    known = ", ".join(layout.name for layout in layouts())
+    return f"{root} is in no layout known here: {known}; `tsfusion datasets` says what each expects"

@@ -1,0 +1,376 @@
+# SPDX-License-Identifier: MIT
+"""ROS 1 bags, ROS 2 bags (SQLite or MCAP) and MCAP files as datasets, without ROS.
+
+`Bag` finds topics and poses by type and name, or takes those that the user names.
+"""
+
+import logging
+from collections import Counter
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tsfusion.core.errors import DatasetError
+from tsfusion.datasets.cameras import DepthUnit, RecordedCamera
+from tsfusion.datasets.dataset import CLOCK, NO_POSE_IN_TIME, Frames, clock_parts, nearest_in_time
+from tsfusion.datasets.depth_files import check_metres
+from tsfusion.datasets.rosbag import bag_messages
+from tsfusion.datasets.rosbag.bag_cameras import CameraWatch
+from tsfusion.datasets.rosbag.poses import ImuTopics, PoseFinder, pose_streams
+from tsfusion.datasets.rosbag.reader import ENDINGS, BagRecording, Message, MessageLocation, recording
+from tsfusion.datasets.rosbag.topics import Modality, TopicChooser, recorded_scale
+from tsfusion.geometry import se3
+from tsfusion.geometry.calibration_files import read_depth_unit
+from tsfusion.geometry.depth_registration import Registration
+from tsfusion.geometry.frame import Frame
+from tsfusion.geometry.keyframe import Intrinsics
+from tsfusion.geometry.se3 import Transform
+from tsfusion.journal import is_segment
+
+log = logging.getLogger(__name__)
+
+EXPECTED = "a .bag, .mcap or .db3 file, or a folder with metadata.yaml: depth, stereo or points, and poses"
+_MODALITIES = ("depth", "stereo", "lidar")
+_DIFFERENCE_S = {"depth": 0.02, "stereo": 0.005, "lidar": 0.0}
+
+
+def recognises(path: Path) -> bool:
+    """True for a ROS recording or a folder with one; False for a tsfusion journal, MCAP too."""
+    return recording(path) is not None
+
+
+class Bag(Frames):
+    """Depth images, stereo pairs or point clouds of a ROS recording, in the order of their header stamps.
+
+    Colour goes with the depth image nearest in time; where it is not registered to it (in the same frame, or
+    `aligned`/`registered` in the depth topic's name), /tf_static and its CameraInfo register it here. Depth
+    without colour is kept and counted in `uncolored`. Poses come from
+    /tf where a transform between the sensor's frame and the root of its tree changes, else from odometry,
+    transform, pose or path messages, carried to the sensor by /tf_static. A time without poses around it
+    gives none. Broken messages, pairs that miss an image, and (`posed`) frames without a pose are counted in
+    `skipped`.
+
+    Opening reads the recording once; a frame is read from the disk at each access.
+
+    Args:
+        path: a file, or a folder with exactly one recording.
+        modality: `depth`, `stereo` or `lidar`; default the first of them that is there.
+        info_topic: CameraInfo of the images; default the one beside or above their topic.
+        pose_topic: default by type, as above.
+        world_frame: default the root of the sensor's tree, or the frame of the pose topic.
+        body_frame: the frame whose poses the pose topic holds; default its `child_frame_id`, or the sensor's.
+        intrinsics, calibration: of the depth camera instead of a CameraInfo's; of a stereo pair the
+            calibration of both cameras.
+        depth_scale: metres per unit; default of 16-bit depth 0.001 (REP 118), or as a RealSense recorded it,
+            and of floats 1.
+        rectified: whether the images are rectified, so that `P` is theirs; default where the topic's name
+            has `rect`. Others are undistorted or rectified here (colour by its depth's camera).
+        part: where the clock stepped back, the part to read, from 1; default the first, and the others are
+            counted in `skipped`.
+        max_difference_s: between a depth image and its colour (default 20 ms), or left and right (5 ms).
+        max_gap_s: between the two poses interpolated, seconds.
+        time_offset_s: added to a frame's stamp before its pose is looked up, seconds.
+        deskew: put points that have times where they were then; False for those that are put right already.
+        posed: leave out frames without a pose; otherwise they have `T_world_camera` None.
+
+    Raises:
+        MissingDependency: without rosbags.
+        DatasetError: it cannot be read, or the topics cannot be chosen (the message lists them).
+    """
+
+    quaternions = True
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        modality: Modality | None = None,
+        depth_topic: str | None = None,
+        color_topic: str | None = None,
+        info_topic: str | None = None,
+        points_topic: str | None = None,
+        left_topic: str | None = None,
+        right_topic: str | None = None,
+        pose_topic: str | None = None,
+        world_frame: str | None = None,
+        body_frame: str | None = None,
+        intrinsics: Intrinsics | None = None,
+        calibration: str | Path | None = None,
+        depth_scale: float | None = None,
+        rectified: bool | None = None,
+        part: int | None = None,
+        max_difference_s: float | None = None,
+        max_gap_s: float = 0.25,
+        time_offset_s: float = 0.0,
+        sensor: str | None = None,
+        color: bool = True,
+        deskew: bool = True,
+        posed: bool = True,
+    ) -> None:
+        path = _recording_path(Path(path).expanduser())
+        if modality not in (None, *_MODALITIES):
+            raise DatasetError(
+                f"modality of a ROS recording must be {', '.join(_MODALITIES)}; got {modality!r}"
+            )
+        self._recording = BagRecording(path)
+        topics = {
+            "depth_topic": depth_topic,
+            "color_topic": color_topic,
+            "info_topic": info_topic,
+            "points_topic": points_topic,
+            "left_topic": left_topic,
+            "right_topic": right_topic,
+        }
+        chosen = TopicChooser(
+            self._recording, topics, intrinsics=intrinsics, calibration=calibration, rectified=rectified
+        ).choose(modality)
+        self._chosen = chosen
+        if chosen.view is not None:
+            self.camera = RecordedCamera(
+                chosen.view.intrinsics, chosen.size, chosen.view.source, chosen.view.undistorter
+            )
+        elif chosen.rig is not None:
+            self.camera = RecordedCamera(chosen.rig.intrinsics, chosen.size, chosen.rig.source)
+        self._float_scale = depth_scale or 1.0
+        self.name, self.sensor, self.skipped = f"ROS {path.name}", sensor or chosen.sensor, {}
+        self._with_color, self._deskew = color, deskew
+        self.depth_unit = self._unit(depth_scale, calibration)
+        self.depth_scale = self.depth_unit.metres
+        self.uncolored = 0
+        poses = PoseFinder(
+            path,
+            chosen.frame,
+            pose_streams(self._recording, pose_topic),
+            topic_named=pose_topic is not None,
+            world_frame=world_frame,
+            body_frame=body_frame,
+            max_gap_s=max_gap_s,
+        )
+        imu = ImuTopics(self._recording)
+        mains, others, cut = self._index(poses, imu, part)
+        difference_s = _DIFFERENCE_S[chosen.modality] if max_difference_s is None else max_difference_s
+        self._pair(mains, others, round(difference_s * 1e9))
+        self._pose(poses.finish(required=posed, part=cut), round(time_offset_s * 1e9), posed)
+        self._registration = self._register(poses)
+        self._accelerometer = imu.accelerometer(partial(self._from_frame, poses))
+
+    def __len__(self) -> int:
+        return len(self._mains)
+
+    def _unit(self, given: float | None, calibration: str | Path | None) -> DepthUnit:
+        if given is not None:
+            return DepthUnit(given, "as given")
+        stated = None if calibration is None else read_depth_unit(calibration)
+        if stated is not None:
+            return DepthUnit(stated, f"from {Path(str(calibration)).name}")
+        recorded = recorded_scale(self._recording, self._chosen.main)
+        return DepthUnit(recorded or 0.001, "as ROS has it" if recorded is None else "as recorded")
+
+    def _index(
+        self, poses: PoseFinder, imu: ImuTopics, part: int | None
+    ) -> tuple[dict[int, MessageLocation], dict[int, MessageLocation], int | None]:
+        """Locations by time of the main and the other messages, from one pass over the recording.
+
+        The last is the number of the part that they are of, None where the clock never stepped back.
+        """
+        chosen = self._chosen
+        used = [chosen.main]
+        if chosen.other and (self._with_color or chosen.modality == "stereo"):
+            used.append(chosen.other)
+        check = _CHECKS.get(chosen.main.kind)
+        locations: dict[str, list[MessageLocation]] = {one.topic: [] for one in used}
+        broken: Counter[str] = Counter()
+        sources = [chosen.view, chosen.rig, chosen.color_camera and chosen.color_camera.view]
+        watch = CameraWatch([one.info for one in sources if one is not None and one.info is not None])
+        for message in self._recording.messages([*used, *poses.streams, *imu.streams, *watch.streams]):
+            if not isinstance(message, Message):
+                broken[message.topic] += message in used
+            elif message.stream in watch.streams:
+                watch.add(message)
+            elif message.stream in used:
+                try:
+                    if check is not None and message.stream.kind == chosen.main.kind:
+                        check(message.content)
+                        chosen.check_size(message.stream, (message.content.height, message.content.width))
+                    locations[message.stream.topic].append(message.location)
+                except DatasetError as error:
+                    broken[message.stream.topic] += 1
+                    log.debug("%s: %s %s", self._recording.path, message.stream.topic, error)
+            elif message.stream in imu.streams:
+                imu.add(message)
+            else:
+                poses.add(message)
+        for topic, count in broken.items():
+            if count:
+                self.skipped[f"of {topic} that are broken"] = count
+        cut = self._cut(locations, part)
+        # Messages by their header's stamp, or by the recorder's clock where a header says nothing
+        found = [{each.stamp_ns or each.log_ns: each for each in locations[one.topic]} for one in used]
+        if repeated := len(locations[chosen.main.topic]) - len(found[0]):
+            self.skipped[f"of {chosen.main.topic} with another's time"] = repeated
+        return found[0], found[1] if len(found) > 1 else {}, cut
+
+    def _cut(self, locations: dict[str, list[MessageLocation]], part: int | None) -> int | None:
+        """Keep one part of messages whose clock stepped back; returns its number, None = it never did."""
+        main = self._chosen.main.topic
+        stamps = {topic: [one.stamp_ns or one.log_ns for one in own] for topic, own in locations.items()}
+        parts = {topic: clock_parts(own) for topic, own in stamps.items()}
+        if not 1 <= (part or 1) <= len(parts[main]):
+            raise DatasetError(f"{self._recording.path} has {len(parts[main])} parts, got part={part}")
+        if len(parts[main]) == 1:
+            return None
+        begin, count = parts[main][1].start, len(locations[main])
+        back_s = (max(stamps[main][:begin]) - stamps[main][begin]) / 1e9
+        for topic, own in parts.items():
+            same: Counter[MessageLocation] = Counter()
+            for number, one in enumerate(locations[topic]):
+                locations[topic][number] = one._replace(earlier=same[one])
+                same[one] += 1
+            locations[topic] = locations[topic][own[: part or 1][-1]]
+        reason = f"{CLOCK} of {main} stepped back by {back_s:.2f} s (--option part=2 reads them instead)"
+        reason = reason if part is None else "of other parts"
+        self.skipped[reason] = count - len(locations[main])
+        return part or 1
+
+    def _pair(
+        self, mains: dict[int, MessageLocation], others: dict[int, MessageLocation], max_difference_ns: int
+    ) -> None:
+        """Give each main message the nearest other one."""
+        stamps = np.array(sorted(mains), dtype=np.int64)
+        there = np.array(sorted(others), dtype=np.int64)
+        nearest = nearest_in_time(there, stamps) if len(there) else np.zeros_like(stamps)
+        near = np.abs(there[nearest] - stamps) <= max_difference_ns if len(there) else stamps < 0
+        if self._chosen.modality == "stereo":
+            if not near.all():
+                self.skipped["without a right image in time"] = int((~near).sum())
+            stamps, nearest, near = stamps[near], nearest[near], near[near]
+        elif self._chosen.other is not None and self._with_color:
+            self.uncolored = int((~near).sum())
+        self.timestamps_ns = stamps
+        self._mains = [mains[stamp] for stamp in stamps.tolist()]
+        self._others = [others[int(there[i])] if ok else None for i, ok in zip(nearest, near, strict=True)]
+
+    def _pose(self, at: Callable[[int], Transform | None], offset_ns: int, posed: bool) -> None:
+        """Find the frames' poses; leave out those without."""
+        assert self.timestamps_ns is not None
+        self._poses = [at(stamp + offset_ns) for stamp in self.timestamps_ns.tolist()]
+        rig = self._chosen.rig
+        if rig is not None and rig.rectifier is not None:
+            turned = rig.rectifier.T_left_rectified
+            self._poses = [None if pose is None else pose @ turned for pose in self._poses]
+        where = self._recording.path, EXPECTED
+        chosen = self._keep(range(len(self._poses)), self._poses, where, posed=posed, reason=NO_POSE_IN_TIME)
+        self._between = lambda: lambda stamp: at(stamp + offset_ns)
+        self.timestamps_ns = self.timestamps_ns[chosen]
+        self._mains = [self._mains[i] for i in chosen]
+        self._others = [self._others[i] for i in chosen]
+
+    def _register(self, poses: PoseFinder) -> Registration | None:
+        """Registration that brings the colour of a separate camera onto the depth; None = it is left out."""
+        chosen = self._chosen
+        if chosen.color_camera is None or chosen.view is None or not len(self):
+            return None
+        T_color_depth = poses.between(chosen.color_camera.frame, chosen.frame, self._stamp(0))
+        if T_color_depth is None:
+            log.warning(
+                "%s: no transforms lead from %r to %r, so that colour cannot be registered and is left out",
+                self._recording.path,
+                chosen.frame,
+                chosen.color_camera.frame,
+            )
+            self._others = [None] * len(self)
+            return None
+        return Registration(
+            chosen.view.intrinsics,
+            chosen.color_camera.view.intrinsics,
+            T_color_depth,
+            chosen.size,
+            color_size=chosen.color_camera.size,
+        )
+
+    def _from_frame(self, poses: PoseFinder, frame: str) -> Transform | None:
+        """The transform from another frame to that of the images or points; None = not known."""
+        T_sensor_frame = poses.between(self._chosen.frame, frame, self._stamp(0))
+        rig = self._chosen.rig
+        if T_sensor_frame is None or rig is None or rig.rectifier is None:
+            return T_sensor_frame
+        return se3.inverse(rig.rectifier.T_left_rectified) @ T_sensor_frame
+
+    def _frame(self, index: int) -> Frame:
+        chosen, location = self._chosen, self._mains[index]
+        content = self._recording.read(location)
+        try:
+            if chosen.modality == "lidar":
+                found = bag_messages.cloud(content)
+                return self._sweep(index, found if self._with_color else found._replace(color=None))
+            other = self._others[index]
+            beside = None if other is None else self._recording.read(other)
+            if chosen.modality == "stereo":
+                return self._pair_frame(index, content, beside)
+            return self._depth_frame(index, content, beside)
+        except DatasetError as error:
+            raise DatasetError(
+                f"{self._recording.path}: message {index} of {chosen.main.topic} {error}"
+            ) from error
+
+    def _depth_frame(self, index: int, content: Any, beside: Any) -> Frame:
+        view = self._chosen.view
+        assert view is not None
+        depth = bag_messages.depth(content)
+        self._chosen.check_size(self._chosen.main, depth.shape)
+        if depth.dtype == np.float32:
+            depth = depth * np.float32(self._float_scale)
+            check_metres(depth, "has floats")
+        color = None if beside is None else bag_messages.color(beside)
+        color_view = view if self._chosen.color_camera is None else self._chosen.color_camera.view
+        if view.undistorter is not None:
+            depth = view.undistorter.depth(depth)
+        if color is not None and color_view.undistorter is not None:
+            color = color_view.undistorter.image(color)
+        if color is not None and self._registration is not None:
+            metres = np.nan_to_num(depth * (1.0 if depth.dtype == np.float32 else self.depth_scale))
+            color = self._registration.color_of_depth(color, metres.astype(np.float32))
+        return self._posed_frame(
+            index, depth=depth, depth_scale=self.depth_scale, color=color, intrinsics=view.intrinsics
+        )
+
+    def _pair_frame(self, index: int, left: Any, right: Any) -> Frame:
+        rig = self._chosen.rig
+        assert rig is not None
+        pair = bag_messages.gray(left), bag_messages.gray(right)
+        color = bag_messages.color(left) if self._with_color else None
+        if rig.rectifier is not None:
+            if color is not None:
+                color = rig.rectifier.pair(color, color)[0]
+            pair = rig.rectifier.pair(*pair)
+        return self._posed_frame(
+            index,
+            left=pair[0],
+            right=pair[1],
+            color=color,
+            intrinsics=rig.intrinsics,
+            baseline_fx=rig.baseline_fx,
+        )
+
+
+_CHECKS: dict[str, Callable[[Any], None]] = {
+    bag_messages.IMAGE: bag_messages.check_image,
+    bag_messages.CLOUD: bag_messages.check_cloud,
+}
+
+
+def _recording_path(path: Path) -> Path:
+    found = recording(path)
+    if found is not None:
+        return found
+    if not path.exists():
+        raise DatasetError(f"{path} does not exist; expected {EXPECTED}")
+    if path.is_file():
+        hint = " (`tsfusion replay` reads a journal of tsfusion)" if is_segment(path) else ""
+        raise DatasetError(f"{path} does not begin as a ROS recording{hint}; expected {EXPECTED}")
+    several = sorted(str(child) for child in path.glob("*.*") if child.suffix in ENDINGS)
+    holds = f"holds {len(several)} files ({', '.join(several[:8])})" if several else "holds no ROS recording"
+    raise DatasetError(f"{path} {holds}; expected {EXPECTED}")

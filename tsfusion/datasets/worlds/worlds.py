@@ -1,0 +1,263 @@
+# SPDX-License-Identifier: MIT
+"""The synthetic worlds: tables of solids with a known signed distance, and a path through each.
+
+A world is the union of its solids; the renderer casts rays at the same table.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.geometry import se3
+from tsfusion.geometry.keyframe import Intrinsics
+
+# (m, 12): kind, centre xyz, half sizes xyz, cos yaw, sin yaw, material, variant, top
+Solids = NDArray[np.float64]
+
+# As in kernels/worlds/synthetic_raycast.py, which cannot be imported without Taichi; a test compares them.
+# AXLE: a cylinder along y. PRISM: a box whose ends x shrink upwards, to `top` of their length.
+ROOM, BOX, SPHERE, CYLINDER, GROUND, AXLE, PRISM = range(7)
+INTERIOR, WOOD, MARBLE, STRIPES, ROAD, PAVEMENT, FACADE, PAINT, METAL, BARK, LEAVES, GLASS, PLAIN = range(13)
+
+_CHUNK = 1 << 16  # points measured at once
+
+
+@dataclass(frozen=True)
+class SyntheticCamera:
+    """A pinhole camera of a synthetic recording; `baseline` in metres, for stereo."""
+
+    size: tuple[int, int]  # height, width
+    intrinsics: Intrinsics
+    baseline: float
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """Solids, the sensor's path, and the sensor that usually takes it."""
+
+    name: str
+    solids: Solids  # (m, 12) float64, metres
+    # `paths[name](index, count)` → (4, 4) T_world_camera, OpenCV axes; the first is the usual one
+    paths: dict[str, Callable[[int, int], NDArray[np.float64]]]
+    # Frames of the whole usual path when a person walks it, near enough for a scanner to follow
+    steps: int = 40
+    sensor: str = "kinect"
+    camera: SyntheticCamera = SyntheticCamera((240, 320), Intrinsics(292.5, 292.5, 159.5, 119.5), 0.12)
+
+    def distance(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Signed distance to the nearest surface: (n, 3) metres → (n,) float64, negative inside solids.
+
+        Exact outside every solid; inside it is exact where solids do not overlap.
+        """
+        points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+        result = np.full(len(points), np.inf)
+        for start in range(0, len(points), _CHUNK):
+            part = slice(start, start + _CHUNK)
+            for solid in self.solids:
+                np.minimum(result[part], _distance(solid, points[part]), out=result[part])
+        return result
+
+    def near(self, position: NDArray[np.float64], reach: float) -> Solids:
+        """The solids that begin within `reach` metres of `position`."""
+        half = np.linalg.norm(self.solids[:, 4:7], axis=1)
+        away = np.linalg.norm(self.solids[:, 1:4] - position, axis=1) - half
+        endless = np.isin(self.solids[:, 0], (ROOM, GROUND))
+        return np.ascontiguousarray(self.solids[endless | (away < reach)])
+
+
+def room(name: str = "room") -> World:
+    """A 4×4×2.8 m room with a sphere, a box and a column; the usual path is a closed circle.
+
+    Others, hard for one who has to find the path: `room-untextured` (everything of one colour), `room-plain`
+    (the walls of one colour), `room-bare` (the walls alone, coloured: one to three planes in view).
+    """
+    walls = solid(ROOM, (0, 0, 1.4), (2, 2, 1.4), INTERIOR)
+    things = [
+        solid(SPHERE, (0.6, 0.3, 0.5), (0.5, 0.5, 0.5), MARBLE),
+        solid(BOX, (-0.7, 0.6, 0.4), (0.4, 0.3, 0.4), WOOD),
+        solid(CYLINDER, (0, -0.8, 0.6), (0.15, 0.15, 0.6), STRIPES),
+    ]
+    solids = np.array([walls] if name == "room-bare" else [walls, *things])
+    if name == "room-untextured":
+        solids[:, 9] = PLAIN
+    elif name == "room-plain":
+        solids[0, 9] = PLAIN
+    return World(name, solids, {"circle": _circle, "tour": _tour, "handheld": _handheld})
+
+
+def street(length: float = 80.0) -> World:
+    """A street along x: road, pavements, facades, parked cars, lamp posts, trees and bins.
+
+    Built piece by piece from x = -16 m on, so that a longer street begins like a shorter one.
+    """
+    rng = {side: np.random.default_rng(20 + side) for side in (-1, 1)}
+    solids = [
+        solid(GROUND, (0, 0, 0), (0, 0, 0), ROAD),
+        solid(BOX, (length / 2, 7.5, 0.0), (length / 2 + 200, 3.0, 0.14), PAVEMENT),
+        solid(BOX, (length / 2, -7.5, 0.0), (length / 2 + 200, 3.0, 0.14), PAVEMENT),
+    ]
+    for side in (-1, 1):
+        solids += _houses(rng[side], side, length)
+        solids += _kerbside(rng[side], side, length)
+    camera = SyntheticCamera((188, 620), Intrinsics(353.5, 353.5, 309.5, 91.5), 0.54)
+    return World("street", np.array(solids), {"drive": _drive}, camera=camera)
+
+
+def solid(
+    kind: int,
+    center: tuple[float, ...],
+    half: tuple[float, ...],
+    material: int,
+    *,
+    yaw: float = 0.0,
+    variant: int = 0,
+    top: float = 1.0,
+) -> list[float]:
+    """One row of the table."""
+    return [kind, *center, *half, np.cos(yaw), np.sin(yaw), material, variant, top]
+
+
+def look_at(position: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(4, 4) T_world_camera at `position` with its optical axis through `target`; z is up in the world."""
+    forward = target - position
+    forward = forward / np.linalg.norm(forward)
+    right = np.cross(forward, (0.0, 0.0, 1.0))
+    right /= np.linalg.norm(right)
+    return se3.transform(np.stack([right, np.cross(forward, right), forward], axis=1), position)
+
+
+def _circle(index: int, count: int) -> NDArray[np.float64]:
+    angle = 2.5 + 2 * np.pi * index / count
+    position = np.array([0.9 * np.cos(angle), 0.9 * np.sin(angle), 1.5])
+    return look_at(position, np.array([1.2 * np.cos(angle - 2.5), 1.2 * np.sin(angle - 2.5), 0.6]))
+
+
+def _tour(index: int, count: int) -> NDArray[np.float64]:
+    """Path through the whole room in three rounds: the things, the foot of the walls, their upper part."""
+    first, second = 2 * count // 5, 7 * count // 10
+    start, end = next(part for part in ((0, first), (first, second), (second, count)) if index < part[1])
+    angle = 2.5 + 2 * np.pi * (index - start) / (end - start)
+    toward = np.array([np.cos(angle), np.sin(angle), 0.0])
+    wall = 2 * toward / np.abs(toward).max()
+    if index < first:
+        height, ahead = ((1.1, 0.0), (2.1, 0.7))[index % 2]  # the things, and the floor behind them
+        return look_at(1.66 * toward + (0, 0, height), ahead * toward + (0, 0, 0.4))
+    if index < second:
+        return look_at(0.8 * toward + (0, 0, 2.1), wall + (0, 0, 0.4))
+    return look_at(0.03 * toward + (0, 0, 1.31), wall + (0, 0, 1.7))
+
+
+def _handheld(index: int, _count: int) -> NDArray[np.float64]:
+    """Path of a person who walks round with a camera, ten frames a second: 0.4 m/s, 20 to 40 degrees/s."""
+    t = index * 0.1
+    angle = 2.5 + 0.4 * t + 0.12 * np.sin(0.9 * t)
+    radius = 0.9 + 0.15 * np.sin(0.7 * t + 1)
+    position = np.array([radius * np.cos(angle), radius * np.sin(angle), 1.5 + 0.12 * np.sin(1.1 * t)])
+    sway = 0.12 * np.sin([1.7 * t, 1.3 * t + 0.5, 1.9 * t + 2])
+    target = np.array([1.2 * np.cos(angle - 2.5), 1.2 * np.sin(angle - 2.5), 0.6]) + sway
+    T, roll = look_at(position, target), 0.07 * np.sin(0.8 * t)
+    turned = np.array([[np.cos(roll), -np.sin(roll), 0], [np.sin(roll), np.cos(roll), 0], [0, 0, 1]])
+    T[:3, :3] = T[:3, :3] @ turned
+    return T
+
+
+def _drive(index: int, count: int) -> NDArray[np.float64]:
+    """One metre a keyframe in the right lane, swaying a little."""
+    x = float(index)
+    position = np.array([x, -1.15 + 0.25 * np.sin(0.11 * x), 1.65 + 0.02 * np.sin(0.7 * x)])
+    ahead = np.array([x + 10, -1.15 + 0.25 * np.sin(0.11 * (x + 10)), 1.6 + 0.03 * np.sin(0.9 * x)])
+    return look_at(position, ahead)
+
+
+# `np.random` is quoted wherever worlds name it: the name alone loads it, 2 MB that few need.
+def _houses(rng: "np.random.Generator", side: int, length: float) -> list[list[float]]:
+    """Houses side by side with an alley now and then, each with a door step and balconies."""
+    solids, x, number = [], -16.0, 0
+    while x < length + 60:
+        width, height, front = rng.uniform(7, 13), rng.uniform(6.5, 12.0), rng.uniform(8.6, 9.4)
+        number += 1
+        middle = x + width / 2
+        solids.append(
+            solid(
+                BOX,
+                (middle, side * (front + 4), height / 2),
+                (width / 2, 4, height / 2),
+                FACADE,
+                variant=number,
+            )
+        )
+        solids.append(solid(BOX, (middle, side * (front - 0.25), 0.1), (0.8, 0.25, 0.25), PAVEMENT))
+        if rng.uniform() < 0.6:
+            solids.append(solid(BOX, (middle, side * (front - 0.4), 3.35), (1.3, 0.4, 0.5), METAL))
+        x += width + (rng.uniform(2.0, 3.5) if rng.uniform() < 0.3 else 0.0)
+    return solids
+
+
+def _kerbside(rng: "np.random.Generator", side: int, length: float) -> list[list[float]]:
+    """Parked cars, and on the pavement posts, trees and bins in turn."""
+    solids, x, number = [], -13.0, 0
+    while x < length + 50:
+        number += 1
+        if rng.uniform() < 0.7:
+            solids += _car(rng, x, side * 3.45, number)
+        along = x + rng.uniform(2.6, 3.4)
+        if number % 3 == 0:
+            solids.append(solid(CYLINDER, (along, side * 4.9, 2.6), (0.08, 0.08, 2.6), METAL))
+            solids.append(solid(BOX, (along, side * 4.4, 5.15), (0.12, 0.55, 0.06), METAL))
+        elif number % 3 == 1:
+            crown = rng.uniform(0.9, 1.35)
+            solids.append(solid(CYLINDER, (along, side * 5.4, 1.3), (0.15, 0.15, 1.3), BARK))
+            solids.append(solid(SPHERE, (along, side * 5.4, 2.2 + crown), (crown,) * 3, LEAVES))
+        else:
+            solids.append(
+                solid(BOX, (along, side * 6.6, 0.65), (0.5, 0.35, 0.55), PAINT, variant=90 + number)
+            )
+        x += rng.uniform(5.6, 7.5)
+    return solids
+
+
+def _car(rng: "np.random.Generator", x: float, y: float, number: int) -> list[list[float]]:
+    yaw = rng.normal(0, 0.025)
+    long, wide = rng.uniform(1.95, 2.3), rng.uniform(0.82, 0.9)
+    body = solid(BOX, (x, y, 0.53), (long, wide, 0.33), PAINT, yaw=yaw, variant=number)
+    cabin = solid(BOX, (x - 0.25, y, 1.12), (0.52 * long, 0.88 * wide, 0.27), GLASS, yaw=yaw)
+    roof = solid(BOX, (x - 0.25, y, 1.42), (0.5 * long, 0.86 * wide, 0.03), PAINT, yaw=yaw, variant=number)
+    return [body, cabin, roof]
+
+
+def _distance(row: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
+    kind, half, (cosine, sine) = int(row[0]), row[4:7], row[7:9]
+    p = points - row[1:4]
+    p = np.stack([cosine * p[:, 0] + sine * p[:, 1], cosine * p[:, 1] - sine * p[:, 0], p[:, 2]], axis=1)
+    q = np.abs(p) - half
+    if kind == CYLINDER:
+        q = np.stack([np.hypot(p[:, 0], p[:, 1]) - half[0], q[:, 2]], axis=1)
+    elif kind == AXLE:
+        q = np.stack([np.hypot(p[:, 0], p[:, 2]) - half[0], q[:, 1]], axis=1)
+    elif kind == PRISM:
+        q = np.stack([_trapezoid(np.abs(p[:, 0]), p[:, 2], half, row[11]), q[:, 1]], axis=1)
+    result: NDArray[np.float64] = np.linalg.norm(np.maximum(q, 0), axis=1) + np.minimum(q.max(axis=1), 0)
+    if kind == GROUND:
+        result = p[:, 2]
+    elif kind == SPHERE:
+        result = np.linalg.norm(p, axis=1) - half[0]
+    elif kind == ROOM:
+        result = -q.max(axis=1)
+    return result
+
+
+def _trapezoid(
+    x: NDArray[np.float64], z: NDArray[np.float64], half: NDArray[np.float64], top: float
+) -> NDArray[np.float64]:
+    """Signed distance to a symmetric trapezoid, at x >= 0: half[0] long below, `top` of it above."""
+    length = half[0] * np.where(z < 0, 1.0, top)
+    ends = np.stack([x - np.minimum(x, length), np.abs(z) - half[2]])
+    corner = np.array([half[0] * top, half[2]])
+    side = np.array([half[0] * (top - 1), 2 * half[2]])
+    share = np.clip((corner[0] - x) * side[0] + (corner[1] - z) * side[1], 0, side @ side) / (side @ side)
+    slope = np.stack([x - corner[0] + side[0] * share, z - corner[1] + side[1] * share])
+    away = np.sqrt(np.minimum((ends**2).sum(axis=0), (slope**2).sum(axis=0)))
+    result: NDArray[np.float64] = np.where((slope[0] < 0) & (ends[1] < 0), -away, away)
+    return result

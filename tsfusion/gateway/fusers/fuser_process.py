@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: MIT
+"""One fuser process: its socket, and the file that says which keyframe it is at."""
+
+import os
+import shutil
+import struct
+import subprocess
+import sys
+import tempfile
+import threading
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import zmq
+
+from tsfusion.core import process
+from tsfusion.core.config import LogFormat, LogLevel
+from tsfusion.fuser import fuser_messages
+from tsfusion.wire.sockets import sockets
+
+_KILL_DEADLINE = 5.0  # seconds
+_SOCKET = "0"  # name of the file
+COMMAND = (sys.executable, "-m", "tsfusion.fuser")
+
+
+class FuserProcess:
+    """A process that is started at once, or by `start`. Call `close` when it has ended, or to end it.
+
+    Args:
+        name: of the map, for the log lines; empty = that of a `Begin` that comes later.
+        waits: for `start`.
+
+    Attributes:
+        has_started: whether it has said so, and takes messages.
+
+    Raises:
+        OSError, zmq.ZMQError: when the system cannot start it.
+    """
+
+    def __init__(
+        self,
+        context: "zmq.Context[Any]",
+        name: str,
+        log_format: LogFormat,
+        log_level: LogLevel,
+        *,
+        waits: bool = False,
+    ) -> None:
+        self.has_started = False
+        self._working = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115  nameless, held as long as this
+        self._scratch = _socket_folder()
+        self.socket = sockets.pair(context)  # the gateway's end
+        try:
+            self.clear_current_keyframe()
+            endpoint = f"ipc://{self._scratch}/{_SOCKET}"
+            self.socket.bind(endpoint)
+            self._command = [*COMMAND, endpoint, log_format, log_level, name]
+            self._process: subprocess.Popen[bytes] | None = None
+            if not waits:
+                self.start()
+        except BaseException:
+            self._clear_up()
+            raise
+
+    def start(self) -> None:
+        """Start it; raises OSError."""
+        self._process = subprocess.Popen(
+            self._command,
+            stdin=subprocess.PIPE,  # closes when the gateway dies, however it dies
+            stdout=subprocess.DEVNULL,
+            pass_fds=[self._working.fileno()],
+            **process.OWN_GROUP,  # a Ctrl-C is for the gateway
+        )
+
+    @property
+    def working_file(self) -> str:
+        """The path by which the process opens it; see `fuser.fuser_messages.Begin`."""
+        return f"/dev/fd/{self._working.fileno()}"
+
+    @property
+    def pid(self) -> int:
+        """The number of the process; 0 = it was not started."""
+        return self._process.pid if self._process else 0
+
+    @property
+    def status(self) -> int | None:
+        """The exit status; None = it runs, or was not started."""
+        return self._process.poll() if self._process else None
+
+    @property
+    def current_keyframe(self) -> int:
+        """The index of the keyframe that it is at, or `fuser.fuser_messages.NOT_WORKING`."""
+        try:
+            (index,) = struct.unpack("<q", os.pread(self._working.fileno(), 8, 0))
+        except (OSError, struct.error):
+            return fuser_messages.NOT_WORKING
+        return int(index)
+
+    def clear_current_keyframe(self) -> None:
+        """Write that it is at no keyframe."""
+        os.pwrite(self._working.fileno(), struct.pack("<q", fuser_messages.NOT_WORKING), 0)
+
+    def note_start(self) -> None:
+        """Note that it has connected: the file by which it did must not stay behind a killed gateway."""
+        self.has_started = True
+        self.remove_socket_file()
+
+    def remove_socket_file(self) -> None:
+        """Remove the file by which the process has connected."""
+        shutil.rmtree(self._scratch, ignore_errors=True)
+
+    def kill(self) -> None:
+        """Kill the process: it ends at once, or, where it waits for a disk, when that answers."""
+        if self._process:
+            self._process.kill()
+
+    def close(self, timeout: float = 0.0, *, wait: bool = True) -> None:
+        """End the process and clear up. It may end by itself within so many seconds; then it is killed.
+
+        Args:
+            wait: some seconds until a killed one has ended. It is reaped in any case.
+        """
+        if self._process is None:
+            self._clear_up()
+            return
+        assert self._process.stdin is not None
+        with suppress(OSError):
+            self._process.stdin.close()  # it ends when it sees that
+        try:
+            self._process.wait(timeout)
+        except subprocess.TimeoutExpired:
+            self.kill()
+            reaper = threading.Thread(target=self._process.wait, daemon=True)
+            reaper.start()
+            reaper.join(_KILL_DEADLINE if wait else 0.0)
+        self._clear_up()
+
+    def _clear_up(self) -> None:
+        self.socket.close()
+        self._working.close()
+        self.remove_socket_file()
+
+
+def _socket_folder() -> Path:
+    """A new folder of this user's alone, whose path is short enough for a socket's."""
+    folder = tempfile.mkdtemp(prefix="tsfusion-")
+    if len(os.fsencode(f"{folder}/{_SOCKET}")) > zmq.IPC_PATH_MAX_LEN:
+        os.rmdir(folder)
+        folder = tempfile.mkdtemp(prefix="tsfusion-", dir="/tmp")
+    return Path(folder)

@@ -1,0 +1,423 @@
+# SPDX-License-Identifier: MIT
+"""The fuser process of a map, seen from the gateway: started, given work, replaced when it dies or hangs."""
+
+import logging
+import signal
+import time
+from collections import deque
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import zmq
+
+from tsfusion.core import logs, process
+from tsfusion.core.config import CacheConfig, ServerConfig, VolumeConfig
+from tsfusion.core.errors import MapError
+from tsfusion.fuser import fuser_messages
+from tsfusion.gateway.fusers.fuser_process import FuserProcess
+from tsfusion.gateway.fusers.spare_fusers import SpareFusers
+from tsfusion.wire.sockets import sockets
+
+log = logging.getLogger(__name__)
+
+_MAX_IN_FLIGHT = 4  # keyframes handed out before their answers: hides the gateway's disk waits
+_MAX_EARLY_DEATHS = 3  # in a row, before the map counts as failed
+_LONGEST_PAUSE = 60.0  # seconds between one start and the next
+_END_DEADLINE = 5.0  # seconds
+# A keyframe is given up after two crashes of the process that works at it, or six kills from outside: so many
+# kills do not hit the same keyframe by chance.
+GIVE_UP_AT = 6
+CRASH_WEIGHT = 3
+KILL_WEIGHT = 1
+_STEADY_AFTER = 60.0  # seconds of fusing, after which earlier deaths no longer count
+_BETWEEN_KEYFRAMES = 10  # times `fuser_timeout` for a mesh or a checkpoint, which may take longer
+STANDS_STILL_AFTER = 5.0  # seconds at one keyframe, stopped, or waiting for a disk, before that is a problem
+_INTERVAL = 0.25  # seconds between two looks
+_LONGEST_STEP = 1.0  # seconds that one look counts: what is beyond them, the gateway itself stood still
+
+
+class FuserSilence:
+    """Seconds since a process answered, by what it could do in them. Call `look` again and again.
+
+    A process that is stopped (SIGSTOP, a debugger) or that waits for a disk does nothing, so that no keyframe
+    is to blame. Nor is one while the gateway stands still, too: the machine or the container was suspended.
+
+    Args:
+        pid: of the process.
+    """
+
+    def __init__(self, pid: int) -> None:
+        self._pid = pid
+        self._looked = time.monotonic()
+        self.answered()
+
+    def answered(self) -> None:
+        """Begin anew: the process has said something, or owes nothing."""
+        self.working = self.stopped = self.disk = 0.0
+
+    def look(self, *, owes: bool) -> None:
+        """Count the seconds since the last look.
+
+        Args:
+            owes: whether the process has to answer something. One that is stopped is noticed anyway.
+        """
+        now = time.monotonic()
+        if now - self._looked < _INTERVAL:
+            return
+        step, self._looked = min(now - self._looked, _LONGEST_STEP), now
+        state = process.state(self._pid)
+        if state in ("T", "t"):
+            self.stopped += step
+            return
+        self.stopped = 0.0
+        if not owes:
+            self.answered()
+        elif state == "D":
+            self.disk += step
+        else:
+            self.working += step
+
+
+class FuserSupervisor:
+    """One fuser process after another, all at work on the same map.
+
+    Args:
+        ahead: another folder, in which the map is read until `begin_work` says that it lies in its own.
+        spares: processes that have all but the map.
+        waits: for `begin`.
+
+    Attributes:
+        is_prepared: whether the map was read ahead.
+        waits: whether no process was started yet.
+    """
+
+    def __init__(
+        self,
+        context: "zmq.Context[Any]",
+        folder: Path,
+        server: ServerConfig,
+        volume: VolumeConfig,
+        *,
+        ahead: Path | None = None,
+        spares: SpareFusers | None = None,
+        waits: bool = False,
+    ) -> None:
+        self._map, self.waits = folder.name, waits
+        self._server, self._ahead = server, ahead
+        self._spares = spares or SpareFusers(context, server)
+        self._begin = fuser_messages.Begin(
+            str(folder),
+            volume,
+            server.mesh_interval,
+            server.checkpoint_every,
+            "",  # each process has its own
+            server.journal_bytes is not None,
+            server.fuser_memory_bytes or process.physical_memory_bytes() * 3 // 4,
+            server.quota_cost,
+            server.quota_map,
+            keep_seconds=server.keep_seconds,
+            keep_keyframes=server.keep_keyframes,
+            keep_radius=server.keep_radius,
+            cache=_cache(server, folder if ahead is None else folder.parent),  # on the same disk
+        )
+        self.is_prepared = False
+        self._early_deaths = 0  # in a row, of processes that were not at work on a keyframe
+        self._blame: dict[int, int] = {}  # index of a keyframe → weight of the deaths at it
+        self.finishing = self._finish_sent = False
+        self.restarts = 0
+        self.failed = ""  # why no process stays alive; empty = one does; tried again, ever more rarely
+        self.held = ""  # why its next record cannot be read for now; empty = it can
+        self._was_ready = False
+        try:
+            self._start()
+        except (OSError, zmq.ZMQError) as error:
+            raise MapError(f"the fuser process of map {self._map} cannot be started: {error}") from error
+
+    def _start(self) -> None:
+        self._process = self._spares.take(self._map, self._begin.volume, waits=self.waits)
+        self.is_prepared = False
+        self.ready = False  # it has opened the map and compiled the kernels
+        self.held = ""
+        self._restart_at = 0.0
+        self._silence = FuserSilence(self._process.pid)
+        self._last_message = self._ready_since = time.monotonic()
+        self._oom_kills = process.oom_kills()
+        self.in_flight: deque[int] = deque()  # indices that it has not answered, oldest first
+        if self._process.has_started:
+            self._send_begin()
+
+    def begin(self) -> None:
+        """Start the process that waits, if it does; it is tried again a second after it could not be."""
+        if not self.waits or time.monotonic() < self._restart_at:
+            return
+        try:
+            self._process.start()
+        except OSError as error:
+            self._note_no_start(error)
+            return
+        self.waits, self.failed, self._restart_at = False, "", 0.0
+        self._silence = FuserSilence(self._process.pid)
+
+    def give_process(self) -> FuserProcess:
+        """The process, which another map is to have; the next one waits for `begin`."""
+        given, self.waits = self._process, True
+        self._start()
+        return given
+
+    def _note_no_start(self, error: OSError | zmq.ZMQError) -> None:
+        self.failed = f"its fuser process cannot be started: {error}"
+        self._restart_at = time.monotonic() + 1.0
+
+    def _send_begin(self) -> None:
+        """Give the process its map. It takes messages, and none was sent: there is room for this one."""
+        if self._ahead is None:
+            self.send(msgspec.structs.replace(self._begin, working=self._process.working_file))
+        else:
+            self.send(fuser_messages.ReadAhead(msgspec.structs.replace(self._begin, folder=str(self._ahead))))
+
+    def begin_work(self) -> None:
+        """Have the map, which lies in its own folder now, worked at."""
+        self._ahead = None
+        if self._process.has_started:
+            self._send_begin()
+
+    @property
+    def socket(self) -> sockets.AnySocket:
+        """The socket to poll before `receive`."""
+        return self._process.socket
+
+    @property
+    def pid(self) -> int:
+        """The number of the process."""
+        return self._process.pid
+
+    @property
+    def volume(self) -> VolumeConfig:
+        """The settings of the map."""
+        return self._begin.volume
+
+    @property
+    def keeps_window(self) -> bool:
+        """True if the map forgets keyframes that are old, far away, or too many."""
+        begin = self._begin
+        return (begin.keep_seconds, begin.keep_keyframes, begin.keep_radius) != (None,) * 3
+
+    @property
+    def problem(self) -> str:
+        """Reason why no keyframe is fused now, and what to do; empty = they are."""
+        if self.failed or self._restart_at:
+            return self.failed
+        if self.held:
+            return self.held
+        silence, timeout = self._silence, self._server.fuser_timeout
+        process_ = f"its fuser (process {self.pid})"
+        if silence.stopped >= min(STANDS_STILL_AFTER, timeout / 2):
+            return (
+                f"{process_} is stopped from outside, as by SIGSTOP or a debugger: let it go on (kill -CONT "
+                f"{self.pid}); another takes over after {timeout:g} s"
+            )
+        if silence.disk >= STANDS_STILL_AFTER:
+            return f"{process_} waits for a disk that does not answer: look at the disk of its map's folder"
+        if self._at_keyframe and silence.working >= STANDS_STILL_AFTER:
+            return f"{process_} is still at the same keyframe; another takes over after {timeout:g} s"
+        return ""
+
+    @property
+    def _at_keyframe(self) -> bool:
+        return self._process.current_keyframe != fuser_messages.NOT_WORKING
+
+    @property
+    def idle(self) -> bool:
+        """True if the process is ready and has answered every keyframe that was handed out."""
+        return self.ready and not self.in_flight
+
+    @property
+    def seconds_at_work(self) -> float:
+        """Seconds since its last answer, while it has a keyframe to answer; 0 = it has none."""
+        return time.monotonic() - self._last_message if self.ready and self.in_flight else 0.0
+
+    @property
+    def wants_work(self) -> bool:
+        """True if another keyframe may be handed out."""
+        return self.ready and not self.finishing and len(self.in_flight) < _MAX_IN_FLIGHT
+
+    def send(self, message: fuser_messages.ToFuser, frames: Sequence[zmq.Frame] = ()) -> bool:
+        """Send a message; False when its queue is full now. What a dead fuser has not read is lost."""
+        try:
+            self.socket.send_multipart([fuser_messages.encode(message), *frames], zmq.NOBLOCK)
+        except zmq.Again:
+            return False
+        return True
+
+    def fuse(self, order: fuser_messages.Fuse) -> bool:
+        """Hand out a keyframe; False when it has to be tried again."""
+        if self._blame.get(order.index, 0) >= GIVE_UP_AT:
+            order = msgspec.structs.replace(order, skip="crash")
+        if not self.send(order):
+            return False
+        if not self.in_flight:
+            self._silence.answered()
+        self.in_flight.append(order.index)
+        return True
+
+    def receive(self) -> tuple[fuser_messages.ToGateway, Sequence[zmq.Frame]] | None:
+        """The next message and its frames, or None.
+
+        Raises:
+            TsfusionError: when the fuser cannot open the map.
+        """
+        if self._restart_at:  # the process is dead: the keyframes it answered late are fused once more
+            return None
+        try:
+            head, *frames = self.socket.recv_multipart(zmq.NOBLOCK, copy=False)
+        except zmq.Again:
+            return None
+        self._last_message = time.monotonic()
+        self._silence.answered()
+        message = fuser_messages.to_gateway.decode(head.buffer)
+        if isinstance(message, fuser_messages.Failed) and self._was_ready:
+            log.error("the fuser cannot open the map: %s", message.message)
+        elif isinstance(message, fuser_messages.Failed):
+            raise message.error()
+        if isinstance(message, fuser_messages.Started):
+            self._process.note_start()
+            self._send_begin()
+        elif isinstance(message, fuser_messages.Prepared):
+            self.is_prepared = True
+        elif isinstance(message, fuser_messages.Ready):
+            self.ready = self._was_ready = True
+            self._ready_since = self._last_message
+        elif isinstance(message, fuser_messages.Done):
+            self.in_flight.popleft()
+            if self._blame.get(message.index, 0) < GIVE_UP_AT:  # one that is given up stays so
+                self._blame.pop(message.index, None)
+            self.failed = self.held = ""
+            if self._last_message - self._ready_since > _STEADY_AFTER:
+                self._early_deaths = 0
+        elif isinstance(message, fuser_messages.Held):
+            self.held = message.message
+        elif isinstance(message, fuser_messages.Saved) and message.written:
+            self._early_deaths = 0
+            self._blame.pop(fuser_messages.MOVING, None)
+        return message, frames
+
+    def ended(self) -> bool:
+        """Kill a process that hangs. Returns True once the process has ended."""
+        if self._process.status is not None:
+            return True
+        busy = bool(self.in_flight) or self._finish_sent
+        self._silence.look(owes=busy and self.ready)
+        timeout = self._server.fuser_timeout
+        if (busy or not self.ready) and self._silence.stopped > timeout:
+            return self._replace(f"the fuser process has been stopped for {timeout:.0f} s", blame=0)
+        if not self._at_keyframe:
+            timeout *= _BETWEEN_KEYFRAMES
+        if self._silence.working > timeout:
+            return self._replace(f"the fuser process has been silent for {timeout:.0f} s", blame=CRASH_WEIGHT)
+        return False
+
+    def _replace(self, why: str, *, blame: int) -> bool:
+        """Kill a process that stands still; whether it has ended yet: no other one begins before that."""
+        log.error("%s: it is killed", why, extra=logs.about(map=self._map))
+        self._blame_current_keyframe(blame)
+        self._silence.answered()
+        self._process.kill()
+        return self._process.status is not None
+
+    def restart(self) -> None:
+        """Start a new process in the place of a dead one, after a pause when that happens again and again.
+
+        It begins at the last checkpoint. Call it until `ended` is no longer true.
+
+        Raises:
+            MapError: when the first process of all died before it was ready.
+        """
+        if not self._restart_at:
+            self._on_death()
+        if time.monotonic() < self._restart_at:
+            return
+        dead = self._process
+        try:
+            self._start()
+        except (OSError, zmq.ZMQError) as error:
+            self._note_no_start(error)
+            return
+        dead.close()
+        self.restarts += 1
+
+    def _on_death(self) -> None:
+        """Find out what the process died of, and set the time of the next start."""
+        status = self._process.status
+        killed = status == -signal.SIGKILL and process.oom_kills() == self._oom_kills
+        if not self.ready and self.restarts == 0 and not killed:
+            raise MapError(f"the fuser process ended with status {status} before it was ready")
+        blamed = self._blame_current_keyframe(KILL_WEIGHT if killed else CRASH_WEIGHT)
+        pause = 0.0
+        if not blamed and not killed:
+            if self._early_deaths >= _MAX_EARLY_DEATHS:
+                self.failed = (
+                    f"its fuser process ended {self._early_deaths} times, last with status {status}: the log "
+                    "says why; keyframes are journaled, and it is tried again every minute"
+                )
+            pause = min(2.0**self._early_deaths - 1, _LONGEST_PAUSE)
+            self._early_deaths += 1
+        self.in_flight.clear()
+        self.ready = False
+        self._restart_at = time.monotonic() + pause
+        log.error(
+            "the fuser process ended with status %s; another takes over from the checkpoint%s",
+            status,
+            f" in {pause:.0f} s" if pause else "",
+            extra=logs.about(map=self._map),
+        )
+
+    def _blame_current_keyframe(self, weight: int) -> bool:
+        """Put a death down to the keyframe that the process was at; False when it was at none."""
+        index = self._process.current_keyframe
+        if index == fuser_messages.NOT_WORKING:
+            return False
+        self._blame[index] = self._blame.get(index, 0) + weight
+        if index == fuser_messages.MOVING and self._blame[index] >= GIVE_UP_AT and self._begin.moves:
+            self._begin = msgspec.structs.replace(self._begin, moves=False)
+            log.error(
+                "the fuser process died again and again while it moved corrected keyframes: they stay where "
+                "they were fused until the server starts anew",
+                extra=logs.about(map=self._map),
+            )
+        with suppress(OSError):
+            self._process.clear_current_keyframe()
+        return True
+
+    def finish(self) -> None:
+        """Ask for a checkpoint and the end of the process. Call it until `ended`: the queue may be full."""
+        if not self._finish_sent:
+            self._finish_sent = self.send(fuser_messages.Finish())
+            self._silence.answered()
+        self.finishing = True
+
+    @property
+    def finished_well(self) -> bool:
+        """True if the process has ended with its checkpoint on the disk."""
+        return self.finishing and self._process.status == 0
+
+    def close(self, *, wait: bool = True) -> None:
+        """End the process. The next one fuses what it had not saved from the journal.
+
+        Args:
+            wait: some seconds until it has ended; else the next one waits for the lock of the map's folder.
+        """
+        self._process.close(_END_DEADLINE if self.ready and wait else 0.0, wait=wait)
+
+
+def _cache(server: ServerConfig, folder: Path) -> CacheConfig | None:
+    """Where a map's blocks wait that are not in memory."""
+    if server.fuser_disk_bytes is None:
+        return None
+    return CacheConfig(
+        folder=str(server.cache or folder),
+        disk_bytes=server.fuser_disk_bytes,
+        min_free_bytes=server.min_free_bytes,
+    )

@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: MIT
+"""Fuser processes that wait for a map: started, with their kernels compiled, so that it opens at once."""
+
+import logging
+import time
+from contextlib import suppress
+from typing import Any
+
+import zmq
+
+from tsfusion.core.config import ServerConfig, VolumeConfig
+from tsfusion.core.readable_numbers import count_of
+from tsfusion.fuser import fuser_messages
+from tsfusion.gateway.fusers.fuser_process import FuserProcess
+
+log = logging.getLogger(__name__)
+
+_LONGEST_PAUSE = 60.0  # seconds between one start and the next, where they fail
+
+
+class _Spare:
+    """A process, and the settings that it is for."""
+
+    def __init__(self, process: FuserProcess, volume: VolumeConfig) -> None:
+        self.process, self.volume = process, volume
+        self.is_warm = False
+        self.problem = ""  # why it cannot be of use; empty = it can
+
+    def fits(self, volume: VolumeConfig) -> bool:
+        """True if a map with these settings can have the process now."""
+        return self.is_warm and self.volume == volume and self.process.status is None
+
+    def receive(self) -> None:
+        """Take its messages."""
+        with suppress(zmq.Again):
+            while True:
+                message = fuser_messages.to_gateway.decode(self.process.socket.recv(zmq.NOBLOCK))
+                if isinstance(message, fuser_messages.Started):
+                    self.process.note_start()
+                    self.process.socket.send(fuser_messages.encode(fuser_messages.Warm(self.volume)))
+                elif isinstance(message, fuser_messages.Failed):
+                    self.problem = message.message
+                self.is_warm |= isinstance(message, fuser_messages.Prepared)
+
+
+class SpareFusers:
+    """Up to `spare_fusers` processes for maps with the same settings. Call `step` again and again."""
+
+    def __init__(self, context: "zmq.Context[Any]", server: ServerConfig) -> None:
+        self._context, self._server = context, server
+        self._spares: list[_Spare] = []
+        self._was_full = self._is_closed = False
+        self._failures = 0  # in a row, of those that never became ready
+        self._start_at = 0.0  # time.monotonic()
+
+    def take(self, name: str, volume: VolumeConfig, *, waits: bool = False) -> FuserProcess:
+        """A process for a map: a spare one, or another that begins now, or that `waits`.
+
+        Raises:
+            OSError, zmq.ZMQError: when the system cannot start it.
+        """
+        for one in self._spares:
+            if one.fits(volume):
+                self._spares.remove(one)
+                return one.process
+        return self._start(name, waits=waits)
+
+    def add(self, process: FuserProcess, volume: VolumeConfig) -> None:
+        """Take a process that has its kernels, from a map that has nothing."""
+        self._spares.append(_Spare(process, volume))
+        self._spares[-1].is_warm = True
+
+    def has_for(self, volume: VolumeConfig) -> bool:
+        return any(one.fits(volume) for one in self._spares)
+
+    def step(self, volume: VolumeConfig, *, may_start: bool) -> None:
+        """Have as many as there are to be, for these settings, one after the other; after `close` none.
+
+        Args:
+            may_start: nobody waits for the processor time that it takes.
+        """
+        if self._is_closed:
+            return
+        for one in self._spares:
+            one.receive()
+            if one.is_warm:
+                self._failures = 0
+        for one in [one for one in self._spares if one.process.status is not None or one.volume != volume]:
+            self._spares.remove(one)
+            if not one.is_warm and one.volume == volume:
+                self._on_failure(one.problem or f"it ended with status {one.process.status}")
+            one.process.close(wait=False)
+        count, are_warm = len(self._spares), all(one.is_warm for one in self._spares)
+        is_time = may_start and time.monotonic() >= self._start_at
+        if are_warm and is_time and count < self._server.spare_fusers:
+            try:
+                self._spares.append(_Spare(self._start(""), volume))
+            except (OSError, zmq.ZMQError) as error:
+                self._on_failure(str(error))
+        is_full = bool(count) and are_warm and count >= self._server.spare_fusers
+        if is_full and not self._was_full:
+            log.info("%s ready", count_of(count, "spare fuser is", "spare fusers are"))
+        self._was_full = is_full
+
+    def _on_failure(self, why: str) -> None:
+        """Log it, and wait with the next one: its start takes a second of processor time."""
+        pause = min(2.0**self._failures, _LONGEST_PAUSE)
+        self._failures += 1
+        self._start_at = time.monotonic() + pause
+        log.warning("a spare fuser cannot be started: %s; it is tried again in %.0f s", why, pause)
+
+    def _start(self, name: str, *, waits: bool = False) -> FuserProcess:
+        log_format, log_level = self._server.log_format, self._server.log_level
+        return FuserProcess(self._context, name, log_format, log_level, waits=waits)
+
+    def close(self) -> None:
+        """End them; no other begins: the server ends, and steps on until its maps are saved."""
+        self._is_closed = True
+        for one in self._spares:
+            one.process.close()
+        self._spares.clear()

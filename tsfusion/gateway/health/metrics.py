@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: MIT
+"""A server's figures for Prometheus, and its health checks.
+
+The gateway's thread writes (`observe`, `health`), another thread answers HTTP; neither waits for the other.
+"""
+
+import platform
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from prometheus_client import CollectorRegistry, Histogram, generate_latest
+from prometheus_client.core import GaugeMetricFamily, Metric
+from prometheus_client.registry import Collector
+
+from tsfusion.core.config import ServerConfig
+from tsfusion.core.logs import printable
+from tsfusion.core.process import version_of
+from tsfusion.gateway.health import metrics_families
+from tsfusion.gateway.health.metrics_http import HttpResponse, MetricsPage
+from tsfusion.wire.messages.health import Health
+from tsfusion.wire.messages.keyframe_times import STAGES as LEDGER_STAGES
+
+STAGES = (*LEDGER_STAGES, "total")
+BUCKETS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)  # seconds
+FRESH = 10.0  # seconds; a gateway renews its snapshot every second
+FRESH_START = 60.0  # seconds; while it reads a journal a slow disk may keep it from reporting for a while
+_TEXT_FORMAT = "text/plain; version=0.0.4; charset=utf-8"
+_MAX_MAPS = 256  # with a label of their own; the others share `metrics_families.OTHERS`
+
+
+class Metrics(Collector):
+    """The figures of one server.
+
+    Args:
+        server: None = without the limits of the disk and what is free on it.
+        clock: seconds, monotonic.
+    """
+
+    def __init__(
+        self, server: ServerConfig | None = None, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._server = server
+        self._clock = clock
+        self._seen: tuple[Health, float] | None = None
+        self._starting = ("the gateway is starting", clock())  # what it does instead of its rounds, and when
+        self._maps: set[str] = set()
+        self._page: MetricsPage | None = None
+        self._registry = CollectorRegistry()
+        self._delay = Histogram(
+            "tsfusion_keyframe_delay_seconds",
+            "How long a keyframe took from one stamp to the next; total = captured to fused.",
+            ("map", "stage"),
+            buckets=BUCKETS,
+            registry=self._registry,
+        )
+        self._question_delay = Histogram(
+            "tsfusion_question_delay_seconds",
+            "How long an answer to a question about the map took, in the server.",
+            ("map",),
+            buckets=BUCKETS,
+            registry=self._registry,
+        )
+        self._registry.register(self)
+
+    def observe(self, map_name: str, stage: str, seconds: float) -> None:
+        """Count the seconds that a keyframe took for a stage of `STAGES`."""
+        self._delay.labels(self._label(map_name), stage).observe(max(seconds, 0.0))
+
+    def observe_question(self, map_name: str, seconds: float) -> None:
+        """Count the seconds that the answer to a question took."""
+        self._question_delay.labels(self._label(map_name)).observe(max(seconds, 0.0))
+
+    def _label(self, map_name: str) -> str:
+        if map_name not in self._maps:
+            if len(self._maps) >= _MAX_MAPS:
+                return metrics_families.OTHERS
+            self._maps.add(map_name)
+        return map_name
+
+    @property
+    def health(self) -> Health | None:
+        """The gateway's last snapshot."""
+        return self._seen[0] if self._seen else None
+
+    @health.setter
+    def health(self, snapshot: Health) -> None:
+        self._seen = (snapshot, self._clock())
+
+    def report_start(self, progress: str) -> None:
+        """Note that the gateway is alive, though it does something long instead of its rounds."""
+        self._starting = (progress, self._clock())
+
+    def serve(self, address: str) -> str:
+        """Answer HTTP at HOST:PORT (port 0 = a random one) until `close`; the real address.
+
+        Raises:
+            InvalidConfig: when others than this machine could reach it.
+            TransportError: when the port is taken.
+        """
+        self._page = MetricsPage(
+            address, {"/metrics": self._figures, "/livez": self._alive, "/readyz": self._ready}
+        )
+        return self._page.address
+
+    def close(self) -> None:
+        """Stop answering HTTP."""
+        if self._page is not None:
+            self._page.close()
+            self._page = None
+
+    # --- pages ---
+
+    def _figures(self) -> HttpResponse:
+        return HttpResponse(200, generate_latest(self._registry), _TEXT_FORMAT)
+
+    def _alive(self) -> HttpResponse:
+        _, progress, silence = self._look()
+        if silence:
+            return HttpResponse(503, silence)
+        return HttpResponse(200, f"alive: {progress}" if progress else "alive")
+
+    def _ready(self) -> HttpResponse:
+        health, progress, silence = self._look()
+        if health is None:
+            return HttpResponse(503, progress or silence)
+        if health.ready:
+            return HttpResponse(200, "ready")
+        opening = [name for name, one in health.maps.items() if one.state == "opening"]
+        lines = [*health.problems, *(f"map {name} is being opened" for name in opening)]
+        return HttpResponse(503, "\n".join(map(printable, lines)) or "not ready")
+
+    def _look(self) -> tuple[Health | None, str, str]:
+        """The snapshot; or what the gateway does at its start; or for how long it has done nothing."""
+        now, (progress, told) = self._clock(), self._starting
+        if self._seen is None or self._seen[1] < told:
+            age, most = now - told, FRESH_START
+        else:
+            age, most, progress = now - self._seen[1], FRESH, ""
+        if age > most:
+            return None, "", f"the gateway has done nothing for {age:.0f} s"
+        return (None if progress else self._seen and self._seen[0]), progress, ""
+
+    # --- figures ---
+
+    def describe(self) -> list[Metric]:
+        """An empty list: the figures depend on the snapshot."""
+        return []
+
+    def collect(self) -> Iterator[Metric]:
+        """The figures of the last snapshot: all but the delays."""
+        build = GaugeMetricFamily("tsfusion_build_info", "Versions.", labels=("version", "python"))
+        build.add_metric((version_of("tsfusion"), platform.python_version()), 1)
+        yield build
+        seen = self._seen
+        age = self._clock() - seen[1] if seen else None
+        up = age is not None and age <= FRESH
+        yield GaugeMetricFamily("tsfusion_up", "Whether the gateway does its rounds.", value=up)
+        ready = up and seen is not None and seen[0].ready
+        yield GaugeMetricFamily("tsfusion_ready", "Whether keyframes are taken and fused.", value=ready)
+        if self._server is not None:
+            yield from metrics_families.of_disk(Path(self._server.state), self._server)
+        if seen is not None and age is not None:
+            yield from metrics_families.of_health(seen[0], age)

@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: MIT
+"""Sessions of clients: how they begin, and the signs of life between records."""
+
+import logging
+import time
+
+import zmq
+
+from tsfusion.core import logs
+from tsfusion.core.config import SERVER_SESSION, ServerConfig
+from tsfusion.core.errors import JournalError
+from tsfusion.gateway.clients.client_routes import Admission, ClientRoutes
+from tsfusion.gateway.clients.sessions import Sessions
+from tsfusion.gateway.maps.map_registry import MapRegistry
+from tsfusion.gateway.ports.ports import Ports
+from tsfusion.wire.messages import messages
+from tsfusion.wire.sockets import sockets
+
+log = logging.getLogger(__name__)
+
+
+class Greetings:
+    """Answer greetings and pings, each with the server's epoch: it tells clients that messages were lost."""
+
+    def __init__(
+        self,
+        server: ServerConfig,
+        maps: MapRegistry,
+        admission: Admission,
+        routes: ClientRoutes,
+        ports: Ports,
+    ) -> None:
+        self._server, self._maps, self._ports = server, maps, ports
+        self._admission, self._routes = admission, routes
+
+    def on_hello(self, frame: zmq.Frame, hello: messages.Hello, client: str, epoch: str) -> None:
+        """Open a session, or say why not."""
+        identity = frame.bytes
+        if denied := self._denial(identity, hello, client):
+            self._ports.reply(identity, messages.Denied(hello.session, *denied))
+            return
+        if (route := self._routes.get(hello.session)) is not None:
+            route.address = sockets.peer_address(frame)
+        durable, fused = self._maps.progress(hello.map, hello.session)
+        welcome = messages.Welcome(
+            epoch=epoch,
+            version=messages.PROTOCOL_VERSION,
+            durable=durable,
+            fused=fused,
+            window_keyframes=self._server.window_keyframes,
+            window_bytes=self._server.window_bytes,
+            max_frame_bytes=self._server.max_frame_bytes,
+        )
+        if (hosted := self._maps.get(hello.map)) is not None:
+            hosted.outcomes.tell_untold(hello.session)  # before it is told that these are answered
+        self._ports.reply(identity, welcome)
+
+    def _denial(self, identity: bytes, hello: messages.Hello, client: str) -> tuple[str, ...] | None:
+        """The fields of the answer to a session that is not opened; None = it is, and its route is made."""
+        if version := messages.other_version(server=messages.PROTOCOL_VERSION, client=hello.version):
+            return "version", version
+        if forbidden := self._admission.denial_of_map(client, hello.map, sends=True):
+            return "map", forbidden
+        try:
+            elsewhere = self._maps.elsewhere(hello.map)
+        except JournalError as error:
+            return "map", f"map {hello.map} cannot be opened: {error}"
+        if elsewhere is not None:
+            return "moved", f"map {hello.map} is at {elsewhere[0]} now", "", *elsewhere
+        hosted = self._maps.greet(hello.map)
+        if hosted is None and (why := self._maps.why_not(hello.map)):
+            return "map", f"map {hello.map} cannot be opened: {why}"
+        if hosted is not None and not hosted.takes_records:
+            what = "moves to another server" if hosted.is_frozen else "is being opened"
+            return "opening", f"map {hello.map} {what}"
+        if hello.session == SERVER_SESSION:
+            return "session", "the session of this spool is the server's own: use another spool folder"
+        sessions = Sessions() if hosted is None else hosted.records.sessions
+        if not self._admission.owns(sessions, hello.session, client):
+            return "session", "the session of this spool is another client's: use another spool folder"
+        if not sessions.room_for(hello.session):
+            return "session", f"map {hello.map} has {len(sessions)} sessions and takes no new one"
+        may_use = self._admission.maps_of(client)
+        if hosted is not None and (other := self._maps.denial_of_world(hosted, hello, may_use)):
+            self._admission.refused["world"] += 1
+            log.warning("%s", other.message, extra=logs.about(session=hello.session, client=client))
+            return other.reason, other.message, other.free_map
+        scans = sessions.get(hello.session) is not None
+        self._routes.connect(hello.session, hello.map, identity, client, scans=scans)
+        return None
+
+    def on_ping(self, identity: bytes, ping: messages.Ping, client: str, epoch: str) -> None:
+        """Answer a sign of life, which says how a client is doing."""
+        received_ns = time.monotonic_ns()
+        progress: tuple[int, int] = (0, 0)
+        waiting = None
+        route = self._routes.mark_alive(ping.session, client)
+        if route is not None:
+            route.identity = identity  # of several connections the one that is heard is the one that stands
+            route.update(ping)
+            progress = self._maps.progress(route.map, ping.session)
+            if (hosted := self._maps.get(route.map)) is not None:
+                hosted.outcomes.tell_untold(ping.session)
+                waiting = hosted.corrections_waiting
+        pong = messages.Pong(epoch, ping.sent_ns, received_ns, time.monotonic_ns(), *progress, waiting)
+        self._ports.reply(identity, pong)

@@ -1,0 +1,247 @@
+# SPDX-License-Identifier: MIT
+"""Keyframes and corrections from the data socket: checked, then journaled, held off, or refused.
+
+Records that came together are journaled together: a disk takes many by one wait about as fast as one.
+The cheapest checks come first, and nothing is answered before the message is known to be from the session's
+own client: a forged message must not make a client give up a good keyframe.
+"""
+
+import logging
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import zmq
+
+from tsfusion.core import logs
+from tsfusion.core.config import ServerConfig
+from tsfusion.core.errors import JournalError
+from tsfusion.gateway.clients.client_routes import Admission, ClientRoutes
+from tsfusion.gateway.intake.quotas import Quotas
+from tsfusion.gateway.maps.hosted_map import HostedMap
+from tsfusion.gateway.maps.map_records import IncomingRecord
+from tsfusion.gateway.maps.map_registry import MapRegistry
+from tsfusion.wire.messages import messages
+from tsfusion.wire.records import codec, corrections
+from tsfusion.wire.records.record_header import Damaged, KeyframeHeader, RecordHeader, Refused, unpack
+from tsfusion.wire.sockets import sockets
+
+log = logging.getLogger(__name__)
+
+# Seconds for which a client is held off: the keyframes that were under way have to be sent again.
+_SHORTEST_HOLD = 0.25
+_LONGEST_HOLD = 10.0
+_MOST_DAMAGED = 8  # times that a record may come damaged before it is refused for good
+_BATCH_BYTES = 4 << 20  # of records that are journaled together; one that is larger goes alone
+
+
+class KeyframeIntake:
+    """The way from the data socket into the journals. Call `finish` when some messages were handled.
+
+    Args:
+        on_keyframe: told of each keyframe that was journaled: its map, header, frames, and client.
+    """
+
+    def __init__(
+        self,
+        server: ServerConfig,
+        maps: MapRegistry,
+        admission: Admission,
+        routes: ClientRoutes,
+        *,
+        on_keyframe: Callable[[str, KeyframeHeader, Sequence[Any], str], None],
+    ) -> None:
+        self.duplicates = 0  # messages with records that were journaled before
+        self._server = server
+        self._maps = maps
+        self._admission = admission
+        self._refused = admission.refused
+        self._routes = routes
+        self._quotas = Quotas(server)
+        self._on_keyframe = on_keyframe
+        self._batch: dict[HostedMap, list[IncomingRecord]] = {}  # not yet journaled
+        self._batch_bytes = 0
+        self._taken: dict[tuple[str, bytes], int] = {}  # map, session → the highest number among them
+
+    def handle(self, frames: list[zmq.Frame]) -> None:
+        """Check one message, and take its record to be journaled or answer why not."""
+        received_ns = time.monotonic_ns()
+        client = self._admission.client_of(frames[0])
+        if client is None:
+            return
+        buffers = [frame.buffer for frame in frames]
+        try:
+            header = unpack(buffers[0])
+            if corrections.is_servers_own(header):
+                raise Refused("forgetting", "only the server itself writes such a record")
+        except Refused as error:
+            self._refused[error.reason] += 1
+            subject = logs.about(client=client, reason=error.reason)
+            log.warning("a message is refused: %s", error, extra=subject)
+            return
+        record = IncomingRecord(header, buffers, client, received_ns, self._routes.get(header.session))
+        if forbidden := self._admission.denial_of_map(client, header.map, sends=True):
+            self._turn_away(record, "map", forbidden)
+            return
+        hosted = self._maps.get(header.map) or self._make_map(record)
+        if hosted is None or not hosted.takes_records:  # its client will say hello, and send it again
+            self._turn_away(record, "map")
+        elif not hosted.records.sessions.room_for(header.session):  # its client is told when it says hello
+            self._turn_away(record, "session")
+        elif not self._admission.owns(hosted.records.sessions, header.session, client):
+            self._turn_away(record, "session", "its session is another client's")
+        elif denied := self._maps.denial_of_world(hosted, header, self._admission.maps_of(client)):
+            self._turn_away(record, "world", denied.message, denied)
+        elif hosted.is_empty and (elsewhere := self._claimed_elsewhere(header)) is not None:
+            self._turn_away(record, "map", answer=elsewhere)
+        elif not self._has_to_wait(hosted, record, sockets.file_of(frames[0])):
+            self._on_admitted(hosted, record)
+
+    def _turn_away(
+        self, record: IncomingRecord, reason: str, why: str = "", answer: messages.Denied | None = None
+    ) -> None:
+        """Count a record that its client keeps; log why (empty = nothing is wrong with it), and answer."""
+        self._refused[reason] += 1
+        if why:
+            log.warning("a %s is refused: %s", record.header.kind, why, extra=record.about(reason))
+        if answer is not None:
+            self._routes.send(record.header.session, answer)
+
+    def _claimed_elsewhere(self, header: RecordHeader) -> messages.Denied | None:
+        """The answer to the first record of a map that another server has; None = it begins here."""
+        try:
+            place = self._maps.claim(header.map)
+        except JournalError as error:
+            return messages.Denied(header.session, "map", f"map {header.map} cannot begin: {error}")
+        if place is None:
+            return None
+        why = f"map {header.map} is at {place[0]} now"
+        return messages.Denied(header.session, "moved", why, address=place[0], control=place[1])
+
+    def _make_map(self, record: IncomingRecord) -> HostedMap | None:
+        """The map that a client was let into, made for its first record; None = it is not, or cannot be."""
+        header, route = record.header, record.route
+        if route is None or (route.client, route.map) != (record.client, header.map):
+            return None
+        try:
+            self._check(record)
+        except Refused as error:
+            self._refuse(error, record)
+            return None
+        if (elsewhere := self._claimed_elsewhere(header)) is not None:
+            self._routes.send(header.session, elsewhere)
+            return None
+        hosted = self._maps.open_for_client(header.map)
+        if hosted is None:
+            why = f"map {header.map} cannot be opened: {self._maps.why_not(header.map)}"
+            self._routes.send(header.session, messages.Denied(header.session, "map", why))
+        return hosted
+
+    def _check(self, record: IncomingRecord) -> None:
+        """Raise Refused for a record that is wrong, or that asks too much."""
+        codec.check(record.frames, self._server.max_frame_bytes)
+        self._quotas.check(record.header, record.frames)
+
+    def _has_to_wait(self, hosted: HostedMap, record: IncomingRecord, connection: int | None) -> bool:
+        route, now = record.route, time.monotonic()
+        if route is not None:
+            route.received_bytes += record.nbytes
+            if now < route.held_until:
+                self._refused["held"] += 1
+                return True
+        if seconds := hosted.records.disk.seconds_left(now):
+            self._hold(record, seconds, "disk", hosted.records.disk.problem)
+            return True
+        if seconds := self._quotas.wait(record.client, record.nbytes, now, connection):
+            rates = f"{self._server.quota_keyframes:g} keyframes and {self._server.quota_bytes >> 20} MB"
+            whose = "each client" if record.client else "all clients together"
+            self._hold(record, seconds, "quota", f"the server takes {rates} a second of {whose}")
+            return True
+        return False
+
+    def _hold(self, record: IncomingRecord, seconds: float, reason: str, message: str) -> None:
+        self._refused["held"] += 1
+        seconds = min(max(seconds, _SHORTEST_HOLD), _LONGEST_HOLD)
+        if (route := record.route) is not None:
+            route.hold_reason, route.hold_message = reason, message
+            route.held_until = time.monotonic() + seconds
+            route.fates.held()
+        session = record.header.session
+        self._routes.send(session, messages.Hold(session, seconds, reason, message))
+
+    def _on_admitted(self, hosted: HostedMap, record: IncomingRecord) -> None:
+        # Duplicates come first: a keyframe that is journaled must not be refused when it is sent again.
+        header = record.header
+        taken = self._taken.get((header.map, header.session), 0)
+        verdict = hosted.records.sessions.admit(header.session, header.seq, header.previous, taken)
+        if verdict != "next":
+            self.finish()  # so that the answer says how far the session is
+            self.duplicates += verdict == "duplicate"
+            self._refused["gap"] += verdict == "gap"
+            self._routes.mark_alive(header.session, record.client, scans=verdict == "duplicate")
+            hosted.outcomes.acknowledge(header.session, resend=verdict == "gap")
+            return
+        try:
+            self._check(record)
+        except Refused as error:
+            self.finish()
+            if isinstance(error, Damaged) and _comes_again(record):
+                self._refused[error.reason] += 1
+                log.warning(
+                    "a %s is asked for again: %s", header.kind, error, extra=record.about(error.reason)
+                )
+                hosted.outcomes.acknowledge(header.session, resend=True)
+            else:
+                self._refuse(error, record)
+            return
+        self._routes.mark_alive(header.session, record.client, scans=True)
+        self._take(hosted, record)
+
+    def _take(self, hosted: HostedMap, record: IncomingRecord) -> None:
+        """Put a record into the batch. What a new session may do is known when its first one is journaled."""
+        header = record.header
+        if self._batch_bytes + record.nbytes > min(_BATCH_BYTES, self._server.segment_bytes):
+            self.finish()
+        self._batch.setdefault(hosted, []).append(record)
+        self._batch_bytes += record.nbytes
+        self._taken[header.map, header.session] = header.seq
+        if hosted.records.sessions.get(header.session) is None:
+            self.finish()
+
+    def finish(self) -> None:
+        """Journal the records of the batch, each map's by one wait for the disk, and answer their clients."""
+        if not self._batch:
+            return
+        batch, self._batch, self._batch_bytes = self._batch, {}, 0
+        self._taken.clear()
+        for hosted, records in batch.items():
+            try:
+                hosted.accept(records)
+            except JournalError:
+                seconds, why = hosted.records.disk.seconds_left(time.monotonic()), hosted.records.disk.problem
+                for record in {one.header.session: one for one in records}.values():
+                    self._hold(record, seconds, "disk", why)
+                continue
+            for record in records:
+                if record.route is not None:
+                    record.route.fates.taken()
+                if isinstance(record.header, KeyframeHeader):
+                    self._on_keyframe(hosted.name, record.header, record.frames, record.client)
+
+    def _refuse(self, error: Refused, record: IncomingRecord) -> None:
+        """Count a bad record, and tell its client not to send it again."""
+        self._turn_away(record, error.reason, str(error))
+        if record.route is not None:
+            record.route.refused += 1
+            record.route.fates.turned_away(str(error))
+        session, seq = record.header.session, record.header.seq
+        self._routes.send(session, messages.Nack(session, seq, "door", error.reason, str(error)))
+
+
+def _comes_again(record: IncomingRecord) -> bool:
+    """Count a damaged record. Returns True if its client, whose copy may be well, sends it again."""
+    if (route := record.route) is None:
+        return False
+    seq, times = route.damaged
+    route.damaged = (record.header.seq, times + 1 if seq == record.header.seq else 1)
+    return route.damaged[1] < _MOST_DAMAGED

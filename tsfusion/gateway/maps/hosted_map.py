@@ -1,0 +1,285 @@
+# SPDX-License-Identifier: MIT
+"""One map of a server: its journal, its sessions, and the fuser that works through the journal."""
+
+import logging
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import zmq
+from numpy.typing import NDArray
+
+from tsfusion.core import logs
+from tsfusion.core.config import SERVER_SESSION, ServerConfig, VolumeConfig
+from tsfusion.core.errors import JournalError
+from tsfusion.fuser import fuser_messages
+from tsfusion.gateway.clients.client_routes import ClientRoutes
+from tsfusion.gateway.fusers.fuser_supervisor import FuserSupervisor
+from tsfusion.gateway.fusers.spare_fusers import SpareFusers
+from tsfusion.gateway.health.metrics import Metrics
+from tsfusion.gateway.maps import map_opening
+from tsfusion.gateway.maps.forgetting import Forgetting
+from tsfusion.gateway.maps.journal_retention import CheckpointOrders
+from tsfusion.gateway.maps.keyframe_outcomes import KeyframeOutcomes, QuestionCounts
+from tsfusion.gateway.maps.map_records import IncomingRecord, MapRecords
+from tsfusion.gateway.records.fuser_backlog import FuserBacklog
+from tsfusion.journal import ReadingWatcher
+from tsfusion.wire.messages.mesh_updates import Meshed
+from tsfusion.wire.records import corrections
+from tsfusion.wire.records.record_header import unpack
+
+log = logging.getLogger(__name__)
+
+ForPeople = Meshed | fuser_messages.FuserReply | fuser_messages.FuserAnswer
+PassOn = Callable[[ForPeople, Sequence[zmq.Frame]], None]
+
+
+class HostedMap:
+    """An open map. Call `step` again and again, and `accept` with the records that came.
+
+    Args:
+        watch: told how far the journal is read: that may take minutes, in which nothing else is done.
+        fuser: that read the map ahead; None = one begins now.
+        spares: processes that it may take.
+        waits: for `fuser.begin`, until when nothing is fused.
+
+    Attributes:
+        records: what came, on the disk.
+        backlog: the records that the fuser has yet to answer.
+        outcomes: what became of the others, and how clients are told.
+        warm: the fuser has been ready once: from then on it is known what the map has.
+    """
+
+    def __init__(
+        self,
+        context: "zmq.Context[Any]",
+        name: str,
+        server: ServerConfig,
+        volume: VolumeConfig,
+        *,
+        routes: ClientRoutes,
+        metrics: Metrics,
+        watch: ReadingWatcher = lambda _done, _all, _records: None,
+        fuser: FuserSupervisor | None = None,
+        spares: SpareFusers | None = None,
+        waits: bool = False,
+    ) -> None:
+        self.name = name
+        self.records = records = MapRecords(name, server, watch)
+        self.questions = QuestionCounts()
+        self.is_leaving = self.is_frozen = False  # to another server; it takes no records any more
+        self.warm = False
+        self.backlog = FuserBacklog(records.index, records.sessions)
+        self.outcomes = KeyframeOutcomes(name, records, routes, metrics)
+        self.fuser = fuser or FuserSupervisor(
+            context, records.folder, server, volume, spares=spares, waits=waits
+        )
+        if fuser is not None:
+            fuser.begin_work()
+        self.checkpoints = CheckpointOrders(self.fuser, records.journal)
+        self.forgetting = Forgetting(
+            name,
+            records.folder,
+            records.journal,
+            records.quarantine,
+            append=self._append_forgotten,
+            send=self.fuser.send,
+        )
+
+    @property
+    def is_saved(self) -> bool:
+        """True if the checkpoint for the map's departure is written, or cannot be."""
+        return self.checkpoints.is_answered
+
+    @property
+    def takes_records(self) -> bool:
+        """True if the content of the map is known, and the map stays here.
+
+        Its fuser has read that, or there was nothing, or the server from which it came said it.
+        """
+        return (self.warm or self.records.is_new or self.records.has_arrived) and not self.is_frozen
+
+    @property
+    def is_empty(self) -> bool:
+        """True if the map is known to have nothing, and never to have had any."""
+        is_known = self.warm or self.records.is_new
+        return is_known and not (len(self.records.sessions) or self.outcomes.blocks or self.outcomes.taken)
+
+    @property
+    def keyframes_durable(self) -> int:
+        """Number of keyframes that were journaled."""
+        return self.outcomes.taken + self.outcomes.rejected.total() + self.backlog.keyframes
+
+    @property
+    def drained(self) -> bool:
+        """True if the map has every keyframe of the journal, each at its newest corrected pose."""
+        return self.fuser.idle and self.backlog.is_empty and not self.outcomes.moves.waiting
+
+    @property
+    def corrections_waiting(self) -> int:
+        """Number of keyframes whose newest pose is not fused, or that are to be forgotten and are not yet."""
+        return self.outcomes.moves.waiting + sum(self.backlog.leaving.values())
+
+    @property
+    def settled(self) -> bool:
+        """True if the map is drained, or will not be soon: its fuser cannot be kept alive, or read."""
+        return self.drained or bool(self.fuser.failed or self.fuser.held) or self.records.disk.is_away
+
+    def idle_since(self, since: float) -> bool:
+        """True if no keyframe waits, nor came after `since` (`time.monotonic()`)."""
+        last = self.records.last_keyframe
+        return self.drained and (last is None or last < since)
+
+    def close(self, *, wait: bool = True) -> None:
+        """End the fuser and finish the journal. A journal that cannot be finished is logged.
+
+        Args:
+            wait: until the fuser has ended, for some seconds.
+        """
+        self.fuser.close(wait=wait)
+        try:
+            self.records.journal.close()
+        except JournalError as error:  # its index only: every keyframe is on the disk
+            log.error("%s", error, extra=logs.about(map=self.name))
+
+    # --- keyframes ---
+
+    def _append_forgotten(self, target: bytes, seqs: NDArray[np.int64]) -> None:
+        """Write the record to the journal that removes these keyframes of a session."""
+        if self.is_frozen:
+            raise JournalError(f"map {self.name} moves to another server")
+        durable, _ = self.records.sessions.progress(SERVER_SESSION)
+        frames = corrections.encode(
+            corrections.forgetting(target, seqs),
+            session=SERVER_SESSION,
+            seq=durable + 1,
+            map_name=self.name,
+        )
+        (index,) = self.accept([IncomingRecord(unpack(frames[0]), frames, "", time.monotonic_ns())])
+        self.backlog.leaving[index] = len(seqs)
+
+    def accept(self, records: Sequence[IncomingRecord]) -> list[int]:
+        """Write keyframes and corrections to the journal, all or none, and acknowledge them; their indices.
+
+        Raises:
+            JournalError: when the disk refuses.
+        """
+        indices, durable_ns = self.records.append(records)
+        for record, index in zip(records, indices, strict=True):
+            session = self.records.sessions.numbered(self.records.index[index].session)
+            self.backlog.add(session, is_correction=record.is_correction)
+            self.outcomes.on_durable(record, durable_ns)
+        return indices
+
+    # --- another server ---
+
+    def begin_to_leave(self) -> None:
+        """Delete no file of the journal any more, close the open one, and have a checkpoint written.
+
+        Raises:
+            JournalError: when the disk refuses.
+        """
+        self.records.close_segment()
+        self.is_leaving = True  # not where that fails: nobody would have it stay
+        self.checkpoints.ask()
+
+    def freeze(self) -> None:
+        """Take no records any more, and close the journal's last file; raises JournalError."""
+        self.is_frozen = True
+        self.records.close_segment()
+
+    def stay(self) -> None:
+        """Go on as before."""
+        self.is_leaving = self.is_frozen = False
+
+    # --- fuser ---
+
+    def step(self, pass_on: PassOn) -> None:
+        """Read the fuser's messages, replace it if it died, give it work, keep the journal to its limit.
+
+        In this order: whether it has ended is asked before its last messages are read, and what it answered
+        is out of the way before the next one begins, or work is handed out.
+
+        Args:
+            pass_on: takes the messages for viewers and for those who asked, with their frames.
+
+        Raises:
+            TsfusionError: when the map cannot be opened.
+        """
+        ended = self.fuser.ended()
+        while (received := self.fuser.receive()) is not None:
+            self._dispatch(*received, pass_on)
+        if ended and not self.fuser.finishing:
+            self.records.disk.look()
+            if not self.records.disk.is_away:  # another one would find an empty map
+                self.fuser.restart()
+        self.backlog.hand_out(self.fuser)
+        self.records.disk.step()
+        if not self.records.disk.is_away and not self.is_leaving:
+            needed = self.outcomes.moves.first_segment if self.fuser.keeps_window else None
+            self.records.retention.step(self.fuser, self.outcomes.unmeshed, window_from=needed)
+        self.checkpoints.step()
+        self._forget()
+
+    def _dispatch(
+        self, message: fuser_messages.ToGateway, frames: Sequence[zmq.Frame], pass_on: PassOn
+    ) -> None:
+        """Give a fuser's message to all whom it concerns, after `FuserSupervisor.receive` had it.
+
+        An answer is passed on here, before what was fused after it is counted.
+        """
+        match message:
+            case fuser_messages.Done():
+                self.backlog.on_done(message.index, (message.fused_ns - message.fuse_start_ns) / 1e9)
+                self.outcomes.on_done(message)
+            case fuser_messages.CorrectionProgress():
+                self.outcomes.on_moves(message)
+            case fuser_messages.Ready():
+                self._on_ready(message)
+            case fuser_messages.Saved():
+                if message.written:
+                    self.outcomes.on_checkpoint()
+                self.checkpoints.on_saved(message)
+                self.records.retention.on_saved(message)
+                self.forgetting.on_saved(message)
+            case fuser_messages.Found():
+                self.forgetting.on_found(message)
+            case Meshed():
+                self.outcomes.on_meshed(message)
+                pass_on(message, frames)
+            case fuser_messages.FuserAnswer() | fuser_messages.FuserReply():
+                pass_on(message, frames)
+
+    def _forget(self) -> None:
+        if self.fuser.failed and not self.fuser.ready:
+            self.forgetting.give_up(self.fuser.failed)
+        elif self.fuser.ready:
+            moves, sessions = self.outcomes.moves, self.records.sessions
+            own = sessions.get(SERVER_SESSION)
+            is_answered = own is None or own.in_map >= own.durable
+            self.forgetting.step(
+                settled=is_answered and not moves.waiting,
+                in_map=lambda key: session.in_map if (session := sessions.get(key)) else 0,
+                unavailable=moves.unavailable,
+            )
+
+    def _on_ready(self, ready: fuser_messages.Ready) -> None:
+        records = self.records
+        if not self.warm:
+            map_opening.compare(self.name, records.journal, records.sessions, ready)
+        for key, progress in ready.done.items():
+            session = records.sessions.open(key, progress.client, progress.world)
+            session.durable = max(session.durable, progress.seq)
+            if progress.seq > session.fused:
+                session.fused = progress.seq
+                session.answered = records.index.keyframes_up_to(session, progress.seq)
+        self.backlog.restart(ready.done)
+        self.outcomes.on_ready(ready)
+        self.records.retention.on_ready()
+        self.forgetting.on_ready()
+        if not self.warm:
+            self.warm, self.backlog.last_progress = True, time.monotonic()
+            found = map_opening.contents(ready, self.backlog.keyframes)
+            log.info("%s", found, extra=logs.about(map=self.name))
+        records.loss = map_opening.loss(self.name, records.journal, ready)

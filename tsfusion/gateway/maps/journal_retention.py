@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: MIT
+"""The limit of a map's journal, and checkpoints that the gateway asks for.
+
+Segments that two checkpoints hold are deleted, oldest first. A fuser writes most checkpoints by itself.
+"""
+
+import logging
+import time
+from collections.abc import Iterable
+
+from tsfusion.core.errors import JournalError
+from tsfusion.fuser import fuser_messages
+from tsfusion.gateway.clients.sessions import Sessions
+from tsfusion.gateway.fusers.fuser_supervisor import FuserSupervisor
+from tsfusion.gateway.records.keyframe_index import KeyframeIndex
+from tsfusion.journal import Journal
+
+log = logging.getLogger(__name__)
+
+_SAVE_PAUSE = 10.0  # seconds until a checkpoint is tried again that could not be written
+_SAVE_INTERVAL = 10.0  # seconds between checkpoints that are made only for the journal's sake
+
+
+class JournalRetention:
+    """Keep a journal to its limit. It holds more only while two checkpoints do not have its keyframes.
+
+    Args:
+        max_bytes: None = no limit.
+    """
+
+    def __init__(
+        self, journal: Journal, index: KeyframeIndex, sessions: Sessions, max_bytes: int | None
+    ) -> None:
+        self._journal = journal
+        self._index = index
+        self._sessions = sessions
+        self._max_bytes = max_bytes
+        # All segments below these numbers are in the last checkpoint, and in the one before it.
+        self._in_last = self._in_previous = 0
+        self._saving = False
+        self._saved_at = float("-inf")  # time.monotonic()
+        self._expired = 0  # keyframes of lower segments were let go
+        self._window_from: int | None = None
+        # Segments below these have no keyframe that the last two checkpoints hold and that is to leave
+        self._window = (0, 0)
+
+    def on_ready(self) -> None:
+        """Note that a fuser began with the last checkpoint."""
+        self._expired = 0
+        self._saving = False
+        self._in_last = self._first_needed()
+
+    def on_saved(self, saved: fuser_messages.Saved) -> None:
+        """Note the end of a checkpoint, which was written only if there was something new."""
+        self._saving = False
+        self._saved_at = time.monotonic()
+        if saved.written:
+            self._in_previous, self._in_last = self._in_last, self._first_needed()
+            self._window = (self._window[1], self._window_from or 0)
+
+    def _first_needed(self) -> int:
+        """The number of the oldest segment with a keyframe that the map does not have."""
+        unfused = (
+            self._index.segment(session.entries[done])
+            for session in self._sessions
+            if (done := self._index.after(session, session.in_map)) < len(session.entries)
+        )
+        return min(unfused, default=self._journal.segment)
+
+    def step(self, fuser: FuserSupervisor, needed: Iterable[int], *, window_from: int | None = None) -> None:
+        """Delete segments if the journal is too large, and ask for a checkpoint if that is not enough.
+
+        Args:
+            needed: indices of keyframes that must stay in the index.
+            window_from: the oldest segment with a keyframe of a map that is to forget old ones, which takes
+                their records: it lets them go before their segment does. None = none is forgotten.
+        """
+        self._window_from = None if window_from is None else window_from or self._journal.segment
+        if self._max_bytes is None or self._journal.nbytes <= self._max_bytes:
+            return
+        try:
+            below = self._in_previous
+            if self._window_from is not None:
+                below = min(below, *self._window)
+                self._expire(fuser, self._window_from)
+            self._journal.retire(below, self._max_bytes)
+            self._index.forget(self._journal.first, self._sessions, [*needed, *fuser.in_flight])
+        except JournalError as error:
+            log.warning("%s", error)
+        due = not self._saving and time.monotonic() - self._saved_at > _SAVE_INTERVAL
+        if due and fuser.ready and self._journal.nbytes > self._max_bytes:
+            self._saving = fuser.send(fuser_messages.Save())
+
+    def _expire(self, fuser: FuserSupervisor, window_from: int) -> None:
+        """Have the keyframes of the oldest segment forgotten, so that it can be deleted."""
+        before = window_from + 1
+        is_due = window_from < self._journal.segment and before > self._expired
+        if is_due and fuser.ready and fuser.send(fuser_messages.Expire(before)):
+            self._expired = before
+
+
+class CheckpointOrders:
+    """Ask again where a checkpoint failed, where segments of the journal have gone, and before a map leaves.
+
+    Attributes:
+        written: number of checkpoints since the map was opened.
+        problem: why none can be written; empty = one can.
+        is_answered: nothing that `ask` asked for is to come any more.
+    """
+
+    def __init__(self, fuser: FuserSupervisor, journal: Journal) -> None:
+        self._fuser, self._journal = fuser, journal
+        self.written = 0
+        self.problem = ""
+        self.is_answered = True
+        self._ask_at = 0.0  # time.monotonic()
+        self._missing = 0  # segments of the journal that were missing when one was asked for
+
+    def ask(self) -> None:
+        """Have one written now, if there is a fuser."""
+        self.is_answered = not (self._fuser.ready and self._fuser.send(fuser_messages.Save()))
+
+    def on_saved(self, saved: fuser_messages.Saved) -> None:
+        """Take what the fuser says of one."""
+        self.is_answered = True
+        self.written += saved.written
+        self.problem = saved.problem
+        self._ask_at = time.monotonic() + _SAVE_PAUSE
+
+    def step(self) -> None:
+        """Ask for one where that is due."""
+        now, missing = time.monotonic(), len(self._journal.missing)
+        is_due = self.problem and now >= self._ask_at
+        if (
+            self._fuser.ready
+            and (is_due or missing > self._missing)
+            and self._fuser.send(fuser_messages.Save())
+        ):
+            self._ask_at = now + _SAVE_PAUSE
+            self._missing = missing
+        self._missing = min(self._missing, missing)

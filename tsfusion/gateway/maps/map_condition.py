@@ -1,0 +1,199 @@
+# SPDX-License-Identifier: MIT
+"""Condition of a map and of a server: in a word, in lines for a person, and in numbers."""
+
+import time
+from collections.abc import Callable, Iterator
+
+from tsfusion.core import logs, process
+from tsfusion.core.readable_numbers import count_of
+from tsfusion.gateway.clients.activity_log import ActivityLog
+from tsfusion.gateway.clients.client_routes import ClientRoutes
+from tsfusion.gateway.health.metrics import Metrics
+from tsfusion.gateway.health.problems import Problem, ProblemTimes
+from tsfusion.gateway.maps.hosted_map import HostedMap
+from tsfusion.gateway.maps.map_registry import MapRegistry
+from tsfusion.gateway.ports.access_control import AccessControl
+from tsfusion.gateway.ports.ports import Ports
+from tsfusion.wire.keys.allow_list import ALL_MAPS, AllowedMaps
+from tsfusion.wire.messages.health import Health, MapHealth, MapState
+
+_FOR_GONE = "what no checkpoint holds of them is lost, unless they are put back"
+_INTERVAL = 1.0  # seconds between two looks
+_CLIENT_PROBLEMS = 10  # lines about single clients
+_STALLED_AFTER = 10.0  # seconds in which keyframes wait and none is fused
+
+
+def state_of(hosted: HostedMap) -> MapState:
+    """The state in a word."""
+    if hosted.fuser.failed:
+        return "failed"
+    if not hosted.warm or hosted.fuser.waits:
+        return "opening"
+    if not hosted.fuser.ready:
+        return "restarting"
+    return "idle" if hosted.drained else "busy"
+
+
+def problem_of(hosted: HostedMap) -> str:
+    """Reason why keyframes are not accepted or not fused, and what to do; empty = they are."""
+    if problem := hosted.records.disk.problem or hosted.fuser.problem:
+        return problem
+    backlog = hosted.backlog
+    since = 0.0 if backlog.is_empty else time.monotonic() - backlog.last_progress
+    stalled = hosted.warm and since > _STALLED_AFTER
+    if stalled and hosted.fuser.ready:
+        return "keyframes wait and none is fused: its fuser makes a mesh or a checkpoint, or it hangs"
+    return "keyframes wait, and its fuser is still starting again: read the log" if stalled else ""
+
+
+def notices_of(hosted: HostedMap) -> list[str]:
+    """Problems that a person should know of, though keyframes are taken and will be fused."""
+    journal = hosted.records.journal
+    damaged, put_back = journal.damaged, journal.put_back
+    lost = count_of(damaged, "keyframe of its journal is", "keyframes of its journal are")
+    notices = [f"{lost} damaged and lost"] if damaged else []
+    if absent := journal.absent:
+        gone = count_of(absent, "segment of its journal was", "segments of its journal were")
+        notices.append(f"{gone} not there at the start: {_FOR_GONE}")
+    if missing := journal.missing:
+        first = f"{missing[0]:06d}.mcap"
+        gone = count_of(len(missing), "segment of its journal is", "segments of its journal are")
+        notices.append(f"{gone} gone, first {first}: {_FOR_GONE}")
+    if put_back:
+        notices.append(
+            f"its journal was taken away while it was written to, {count_of(put_back, 'time')}, and was "
+            "put back with every keyframe: find out who deletes or moves files there"
+        )
+    if hosted.checkpoints.problem:
+        notices.append(f"no checkpoint can be written: {hosted.checkpoints.problem}")
+    if state_of(hosted) == "restarting" and not problem_of(hosted):
+        notices.append("its fuser ended, and another one takes over: the log says why")
+    notices += filter(None, (hosted.records.quarantine.problem, hosted.records.loss))
+    return [*notices, *hosted.outcomes.notices.values()]
+
+
+def health_of(hosted: HostedMap) -> MapHealth:
+    """Health of a map, as far as it is known without asking the fuser."""
+    now, outcomes, records = time.monotonic(), hosted.outcomes, hosted.records
+    return MapHealth(
+        state=state_of(hosted),
+        problem=problem_of(hosted),
+        keyframes_durable=hosted.keyframes_durable,
+        keyframes_fused=outcomes.fused,
+        waiting=hosted.backlog.keyframes,
+        rejected=dict(outcomes.rejected),
+        quarantined=len(records.quarantine),
+        sessions=records.sessions.of_clients,
+        journal_bytes=records.journal.nbytes,
+        journal_damaged=records.journal.damaged,
+        fuser_restarts=hosted.fuser.restarts,
+        blocks=outcomes.blocks,
+        map_bytes=outcomes.map_bytes,
+        last_keyframe_s=None if records.last_keyframe is None else max(now - records.last_keyframe, 0.0),
+        delay_ms=outcomes.delays.summary(),
+        delay_bound_ms=outcomes.delays.bound_ms,
+        corrections=records.corrections,
+        corrections_waiting=hosted.corrections_waiting,
+        corrections_unavailable=outcomes.moves.unavailable,
+        keyframes_moved=outcomes.moves.moved,
+        moving_s=outcomes.moves.seconds,
+        keyframes_forgotten=outcomes.moves.forgotten,
+        checkpoints=hosted.checkpoints.written,
+        journal_missing=records.journal.absent + len(records.journal.missing),
+        journal_put_back=records.journal.put_back,
+        fusing_s=hosted.fuser.seconds_at_work,
+        questions=dict(hosted.questions.by_outcome),
+        question_ms=hosted.questions.delay_ms,
+        mesh_epoch=outcomes.newest_mesh.epoch if outcomes.newest_mesh else "",
+        mesh_number=outcomes.newest_mesh.number if outcomes.newest_mesh else 0,
+    )
+
+
+def all_blocked(maps: dict[str, MapHealth]) -> bool:
+    """True if no map takes and fuses keyframes: one that does is a reason to go on sending to this server."""
+    return bool(maps) and all(one.problem for one in maps.values())
+
+
+class ServerCondition:
+    """The condition of a server, of which the log and the metrics hear about once a second.
+
+    Args:
+        on_health: told of it as often.
+    """
+
+    def __init__(
+        self,
+        ports: Ports,
+        access: AccessControl,
+        maps: MapRegistry,
+        routes: ClientRoutes,
+        metrics: Metrics,
+        *,
+        on_health: Callable[[Health], None],
+    ) -> None:
+        self._ports, self._access, self._maps, self._routes = ports, access, maps, routes
+        self._metrics, self._on_health = metrics, on_health
+        self._activity, self._problems = ActivityLog(), ProblemTimes()
+        self._started = time.monotonic()
+        self.next_look = 0.0
+
+    def step(self, health: Callable[[], Health]) -> None:
+        """Note the health, about once a second."""
+        now = time.monotonic()
+        if now < self.next_look:
+            return
+        self.next_look = now + _INTERVAL
+        logs.log_left_out()
+        self._problems.note(self._find_problems())
+        self._metrics.health = found = health()
+        self._activity.note(found)
+        self._on_health(found)
+
+    def health(
+        self,
+        shown: AllowedMaps,
+        *,
+        is_accepting: bool,
+        epoch: str,
+        refused: dict[str, int],
+        duplicates: int,
+    ) -> Health:
+        """Health of the server; see `Gateway.health`."""
+        now = time.monotonic()
+        maps = {hosted.name: health_of(hosted) for hosted in self._maps}
+        blocked = self._ports.problem or self._access.problem or all_blocked(maps)
+        return Health(
+            ready=is_accepting and not blocked,
+            problems=self._problems.lines(self._find_problems(shown)),
+            epoch=epoch,
+            uptime_s=now - self._started,
+            rss_bytes=process.rss_bytes(),
+            refused=refused,
+            duplicates=duplicates,
+            maps={name: one for name, one in maps.items() if name in shown},
+            clients=tuple(
+                route.health(now, self._maps.session(*route.place))
+                for route in self._routes
+                if route.map in shown
+            ),
+        )
+
+    def _find_problems(self, shown: AllowedMaps = ALL_MAPS) -> list[Problem]:
+        """Present problems: of the whole server first, then of its maps, then of clients."""
+        found = [Problem(self._ports.problem, is_logged=True)] if self._ports.problem else []
+        if self._access.problem:
+            found.append(Problem(f"nobody may connect: {self._access.problem}", is_logged=True))
+        found += (one for one in self._of_maps() if one.map in shown)
+        of_clients = [one for route in self._routes if route.map in shown and (one := route.problem)]
+        if len(of_clients) > _CLIENT_PROBLEMS:
+            rest = count_of(len(of_clients) - _CLIENT_PROBLEMS, "more client has", "more clients have")
+            of_clients[_CLIENT_PROBLEMS:] = [Problem(f"{rest} problems of this kind")]
+        return found + of_clients
+
+    def _of_maps(self) -> Iterator[Problem]:
+        """Problems of the maps; those that keep them from taking or fusing keyframes come first."""
+        for hosted in self._maps:
+            if problem := problem_of(hosted):
+                yield Problem(problem, hosted.name, is_logged=bool(hosted.records.disk.problem))
+        yield from (Problem(notice, hosted.name) for hosted in self._maps for notice in notices_of(hosted))
+        yield from (Problem(f"cannot be opened: {why}", name) for name, why in self._maps.unopened())

@@ -1,0 +1,433 @@
+# SPDX-License-Identifier: MIT
+"""The maps of a server: the open ones, and why others could not be opened."""
+
+import logging
+import re
+import time
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import zmq
+
+from tsfusion.core import logs
+from tsfusion.core.config import DEFAULT_MAP, MAP_NAME_LENGTH, ServerConfig, VolumeConfig
+from tsfusion.core.errors import JournalError, TsfusionError
+from tsfusion.core.readable_numbers import count_of
+from tsfusion.gateway.clients.client_routes import ClientRoutes
+from tsfusion.gateway.clients.sessions import Session
+from tsfusion.gateway.fusers.fuser_supervisor import FuserSupervisor
+from tsfusion.gateway.fusers.spare_fusers import SpareFusers
+from tsfusion.gateway.health.metrics import Metrics
+from tsfusion.gateway.maps import moved_maps
+from tsfusion.gateway.maps.hosted_map import ForPeople, HostedMap
+from tsfusion.gateway.maps.map_directory import AddressPair, MapDirectory
+from tsfusion.journal import state_folder
+from tsfusion.journal.record_scan import journal_error
+from tsfusion.wire.keys.allow_list import ALL_MAPS, AllowedMaps
+from tsfusion.wire.messages.messages import Denied, Hello
+from tsfusion.wire.records.record_header import RecordHeader
+
+log = logging.getLogger(__name__)
+
+# A map whose journal is read: bytes that were read, bytes of all, and records so far
+MapWatcher = Callable[[str, int, int, int], None]
+_MAX_UNOPENED = 64
+_RETRY_INTERVAL = 10.0  # seconds before a map that could not be opened is tried again
+_UNOPENED_KEPT = 600.0  # seconds after which nobody misses a map that could not be opened
+_KEPT_NAMES = 64  # free names that were given out
+_KEPT_SECONDS = 300.0  # until then nobody else is given them: a map takes a while to be opened
+
+
+class MapRegistry:
+    """The open maps of a server. Call `step` again and again."""
+
+    def __init__(
+        self, context: "zmq.Context[Any]", server: ServerConfig, routes: ClientRoutes, metrics: Metrics
+    ) -> None:
+        self._context = context
+        self._server = server
+        self._routes = routes
+        self._metrics = metrics
+        self._volumes: Mapping[str, VolumeConfig] = {}
+        self._watch: MapWatcher = lambda *_progress: None
+        self._open: dict[str, HostedMap] = {}
+        self._unopened: dict[str, tuple[str, float]] = {}  # name → why, when
+        self._kept: dict[str, float] = {}  # free name that was given out → when
+        self.place = ("", "")  # data and control address by which clients reach this server
+        self.arriving: set[str] = set()  # maps that are being copied from another server
+        self._spares = SpareFusers(context, server)
+        self._directory = MapDirectory(server.directory) if server.directory else None
+        if self._directory is not None:
+            self._directory.check()
+        self._started = self.is_ending = False  # when it ends, no map begins that waits
+
+    def __iter__(self) -> Iterator[HostedMap]:
+        return iter(self._open.values())
+
+    def get(self, name: str) -> HostedMap | None:
+        """An open map, by name; its fuser begins."""
+        hosted = self._open.get(name)
+        if hosted is not None:
+            hosted.fuser.begin()
+        return hosted
+
+    def progress(self, name: str, session: bytes) -> tuple[int, int]:
+        """The highest seq of a session that is durable, and that is fused."""
+        hosted = self.get(name)
+        return hosted.records.sessions.progress(session) if hosted else (0, 0)
+
+    def session(self, name: str, key: bytes) -> Session | None:
+        """A session of a map; None = it has nothing in the journal."""
+        hosted = self.get(name)
+        return hosted.records.sessions.get(key) if hosted else None
+
+    def open_at_start(
+        self,
+        volumes: Mapping[str, VolumeConfig],
+        watch: MapWatcher = lambda *_progress: None,
+        *,
+        later: Collection[str] = (),
+    ) -> None:
+        """Open maps by name with their settings; those that clients ask for get those of the default map.
+
+        Args:
+            later: maps whose fusers begin when somebody asks for them, or else one after the other.
+            watch: told how far the journal of a map is read, also of a map that is opened later. What it
+                raises ends the start.
+
+        Raises:
+            TsfusionError: when a journal cannot be opened.
+        """
+        self._volumes, self._watch = volumes, watch
+        for name in volumes:
+            self._open_map(name, waits=name in later)
+
+    def end_start(self, place: AddressPair) -> None:
+        """Go on when a map cannot be opened, from here on; before, that is an error of the server.
+
+        Args:
+            place: where clients reach this server.
+        """
+        self._started, self.place = True, place
+        for hosted in self:
+            if not hosted.is_empty:
+                self._enter(hosted.name)
+
+    # --- other servers ---
+
+    def has(self, name: str) -> bool:
+        """True if a map is open here and not empty."""
+        hosted = self.get(name)
+        return hosted is not None and not hosted.is_empty
+
+    def elsewhere(self, name: str) -> AddressPair | None:
+        """The server that has a map of which this one has nothing; None = no other has it.
+
+        Raises:
+            JournalError: when that cannot be read.
+        """
+        if self.has(name) or name in self.arriving:
+            return None
+        entered = self._directory.place_of(name) if self._directory else None
+        if entered is not None and entered != self.place:
+            return entered
+        left = moved_maps.departed(self._server.state, name)
+        return None if left is None else (left.address, left.control)
+
+    def claim(self, name: str) -> AddressPair | None:
+        """Enter a map that is about to begin here; the other server that has it, None = it may begin.
+
+        Raises:
+            JournalError: when the directory cannot be written.
+        """
+        if (found := self.elsewhere(name)) is not None or self._directory is None:
+            return found
+        found = self._directory.claim(name, self.place)
+        return None if found == self.place else found
+
+    def _enter(self, name: str) -> None:
+        """Enter a map that is here, whatever the directory says."""
+        if self._directory is None:
+            return
+        try:
+            self._directory.move(name, self.place)
+        except JournalError as error:
+            log.error("%s", error, extra=logs.about(map=name))
+
+    def why_not_take(self, name: str) -> str:
+        """Reason why a map of this name cannot come from another server; empty = it can."""
+        if name in self.arriving:
+            return f"map {name} is coming already"
+        if self._has_own(name):
+            return f"this server has a map {name} of its own"
+        return "" if self.get(name) is not None else self.why_not(name)
+
+    def _has_own(self, name: str) -> bool:
+        hosted = self._open.get(name)
+        return state_folder.holds_records(self._folder(name)) if hosted is None else not hosted.is_empty
+
+    def begin_to_take(self, name: str) -> None:
+        """Let nothing begin under the name of a map that is coming."""
+        self.arriving.add(name)
+        if (hosted := self.get(name)) is not None:
+            hosted.freeze()
+
+    def end_to_take(self, name: str) -> None:
+        """Note that a map has come, or will not come."""
+        self.arriving.discard(name)
+        if (hosted := self._open.get(name)) is not None:
+            hosted.stay()
+
+    def open_ahead(self, name: str, folder: Path, volume: VolumeConfig) -> FuserSupervisor:
+        """A fuser that reads a map in a folder where it waits, for `take_in` to go on with.
+
+        Where no spare process has these settings, that of an empty map is taken: a start takes seconds.
+
+        Raises:
+            MapError: when the system cannot start it.
+        """
+        in_use = {route.map for route in self._routes}
+        idle = (one for one in self if one.is_empty and one.fuser.idle and one.fuser.volume == volume)
+        if not self._spares.has_for(volume):
+            unused = sorted((one for one in idle if one.name not in in_use), key=lambda one: one.name != name)
+            for hosted in unused[:1]:
+                self._spares.add(hosted.fuser.give_process(), volume)
+        place = self._folder(name)
+        return FuserSupervisor(self._context, place, self._server, volume, ahead=folder, spares=self._spares)
+
+    def give_away(self, name: str) -> None:
+        """Close a map that another server has from now on, or that makes room for one that came."""
+        hosted = self._open.pop(name, None)
+        if hosted is not None:
+            hosted.close(wait=False)
+
+    def take_in(self, name: str, fuser: FuserSupervisor | None = None) -> None:
+        """Open a map that has come from another server.
+
+        Args:
+            fuser: that has read it ahead.
+
+        Raises:
+            TsfusionError: when it cannot be opened; its files are here then, and the next start tries again.
+        """
+        if self._has_own(name):
+            raise JournalError(f"this server has a map {name} of its own")
+        self.give_away(name)
+        moved_maps.install(self._server.state, name)
+        self._enter(name)
+        self._open_map(name, fuser)
+
+    def greet(self, name: str) -> HostedMap | None:
+        """A map by name, opened when it is on the disk; None = there is none, or `why_not` says why.
+
+        A greeting alone makes no map: the first record does.
+        """
+        try:
+            is_there = name in self._open or state_folder.holds_a_map(self._folder(name))
+        except JournalError as error:
+            self._give_up(name, error)
+            return None
+        return self.open_for_client(name) if is_there else None
+
+    def open_for_client(self, name: str) -> HostedMap | None:
+        """A map by name, opened or made when need be; None when it cannot be, and `why_not` says why."""
+        if self.why_not(name) and name not in self._open:
+            return None
+        try:
+            return self.get(name) or self._open_map(name)
+        except TsfusionError as error:
+            self._give_up(name, error)
+            return None
+
+    def why_not(self, name: str) -> str:
+        """Reason why a map that is not open cannot be opened now; empty = it can be."""
+        if name in self.arriving:
+            return "it is coming from another server"
+        why, failed = self._unopened.get(name, ("", -_RETRY_INTERVAL))
+        if time.monotonic() - failed < _RETRY_INTERVAL:
+            return why
+        return self.why_full if len(self._open) >= self._server.max_maps else ""
+
+    @property
+    def why_full(self) -> str:
+        """Reason why there is no room for another map, and what makes some."""
+        most = self._server.max_maps
+        return (
+            f"{most} are open; use one of them (`tsfusion status` lists them), or restart the server with a "
+            f"larger max_maps than {most} (--config)"
+        )
+
+    def why_none_free(self, like: str, maps: AllowedMaps) -> str:
+        """Reason why `keep_free_name` has no name for a client."""
+        if self.free_name(like, maps) is None:
+            return f"no name is free of the maps that this key may use: {maps}"
+        return f"no room for another map: {self.why_full}"
+
+    def denial_of_world(
+        self, hosted: HostedMap, record: Hello | RecordHeader, maps: AllowedMaps = ALL_MAPS
+    ) -> Denied | None:
+        """The answer to a session that does not share a map's coordinate frame; None = it may go on.
+
+        `maps`: that its client may use, of which a free one is named.
+
+        Every record is asked this, not its session's greeting alone: of two that greet a map nobody has yet,
+        the one whose record comes first has it.
+        """
+        if hosted.records.sessions.shares_frame(record.session, record):
+            return None
+        keyframes = count_of(hosted.keyframes_durable, "keyframe")
+        why = f"map {hosted.name} has {keyframes} of another session, in another coordinate frame"
+        try:
+            free = self.free_name(hosted.name, maps)
+        except JournalError:
+            free = None
+        return Denied(record.session, "world", why, free or "")
+
+    def free_name(self, like: str, maps: AllowedMaps = ALL_MAPS) -> str | None:
+        """The first of NAME, NAME-2, NAME-3, … that is no map's yet and was given to nobody just now.
+
+        Where a client may not use that name: the first such name that is like one that it may use.
+
+        Args:
+            maps: that the client may use; None of their names may be free.
+
+        Raises:
+            JournalError: when the state folder cannot be listed.
+        """
+        now = time.monotonic()
+        in_use = {one.name for one in self if len(one.records.sessions)} | {
+            route.map for route in self._routes
+        }
+        on_disk = set(state_folder.map_names(self._server.state)) - self._open.keys()
+        kept = {name for name, since in self._kept.items() if now - since < _KEPT_SECONDS}
+        taken = in_use | on_disk | kept | set(self._unopened)
+        stem = re.sub(r"-[0-9]+$", "", like)
+        stems = [stem if stem in taken else like]
+        stems += [one.rstrip("*").rstrip("-_") for one in maps.patterns or ()]
+        # Of so many names one is not taken.
+        numbered = (_numbered(one, number) for one in stems if one for number in range(1, len(taken) + 3))
+        return next((name for name in numbered if name not in taken and name in maps), None)
+
+    def keep_free_name(self, like: str, maps: AllowedMaps = ALL_MAPS) -> str | None:
+        """A free name that nobody else is given; None = there is none, or no room for another map.
+
+        Raises:
+            JournalError: as `free_name`.
+        """
+        name = self.free_name(like, maps)
+        if name is None:
+            return None
+        if name not in self._open and len(self._open) >= self._server.max_maps:
+            return None
+        self._kept[name] = time.monotonic()
+        if len(self._kept) > _KEPT_NAMES:
+            self._kept.pop(next(iter(self._kept)))
+        return name
+
+    def _open_map(self, name: str, fuser: FuserSupervisor | None = None, *, waits: bool = False) -> HostedMap:
+        own = moved_maps.volume_of(self._folder(name))
+        volume = own or self._volumes.get(name) or self._volumes[DEFAULT_MAP]
+        try:
+            hosted = HostedMap(
+                self._context,
+                name,
+                self._server,
+                volume,
+                routes=self._routes,
+                metrics=self._metrics,
+                watch=partial(self._watch, name),
+                fuser=fuser,
+                spares=self._spares,
+                waits=waits,
+            )
+        except OSError as error:
+            raise journal_error("open", self._folder(name), error) from error
+        self._open[name] = hosted
+        self._unopened.pop(name, None)
+        return hosted
+
+    def _folder(self, name: str) -> Path:
+        return state_folder.map_folder(self._server.state, name)
+
+    def _give_up(self, name: str, error: Exception) -> None:
+        log.error("the map cannot be opened: %s", error, extra=logs.about(map=name))
+        self._unopened[name] = (str(error), time.monotonic())
+        if len(self._unopened) > _MAX_UNOPENED:
+            self._unopened.pop(next(iter(self._unopened)))
+        hosted = self._open.pop(name, None)
+        if hosted is not None:
+            hosted.close(wait=False)
+
+    def step(self, pass_on: Callable[[HostedMap, ForPeople, Sequence[zmq.Frame]], None]) -> None:
+        """Step every map.
+
+        Args:
+            pass_on: takes the fusers' messages for viewers and for those who asked.
+
+        Raises:
+            TsfusionError: when a map that was to be opened at the start cannot be.
+        """
+        for hosted in list(self):
+            try:
+                hosted.step(partial(pass_on, hosted))
+            except TsfusionError as error:
+                if not self._started or hosted.warm:
+                    raise
+                self._give_up(hosted.name, error)
+        if self._started:
+            waiting = next((one for one in self if one.fuser.waits and one.name not in self.arriving), None)
+            self._spares.step(self._volumes[DEFAULT_MAP], may_start=self.warm and waiting is None)
+            if waiting is not None and self.warm and not self.is_ending:
+                self.open_for_client(waiting.name)
+
+    @property
+    def warm(self) -> bool:
+        """True if every open map can take keyframes, but for those whose fusers wait."""
+        return all(hosted.warm for hosted in self._begun)
+
+    @property
+    def _begun(self) -> list[HostedMap]:
+        """The maps whose fusers do not wait: nobody has asked for the others, and the next start has them."""
+        return [hosted for hosted in self if not hosted.fuser.waits]
+
+    @property
+    def drained(self) -> bool:
+        """True if every map that has begun has every keyframe of its journal."""
+        return all(hosted.drained for hosted in self._begun)
+
+    @property
+    def settled(self) -> bool:
+        """True if every map that has begun is drained, or never will be."""
+        return all(hosted.settled for hosted in self._begun)
+
+    def finish(self) -> bool:
+        """Have every fuser write its checkpoint and end; whether all have ended. Call it until they have."""
+        self._spares.close()
+        for hosted in self._begun:
+            hosted.fuser.finish()
+        return all(hosted.fuser.ended() for hosted in self._begun)
+
+    @property
+    def finished_well(self) -> bool:
+        """True if every checkpoint is on the disk."""
+        return all(hosted.fuser.finished_well for hosted in self._begun)
+
+    def close(self) -> None:
+        """End the fusers and finish the journals."""
+        self._spares.close()
+        for hosted in self:
+            hosted.close()
+
+    def unopened(self) -> Iterator[tuple[str, str]]:
+        """Names of maps that could not be opened lately, and why."""
+        before = time.monotonic() - _UNOPENED_KEPT
+        self._unopened = {name: one for name, one in self._unopened.items() if one[1] > before}
+        return ((name, why) for name, (why, _) in self._unopened.items())
+
+
+def _numbered(stem: str, number: int) -> str:
+    """NAME, NAME-2, NAME-3, …"""
+    suffix = f"-{number}" if number > 1 else ""
+    return stem[: MAP_NAME_LENGTH - len(suffix)] + suffix

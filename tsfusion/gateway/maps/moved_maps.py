@@ -1,0 +1,185 @@
+# SPDX-License-Identifier: MIT
+"""The files that say which maps came from another server, and which ones another server has.
+
+`STATE/maps/NAME/arrived.json` belongs to the map. `STATE/moved/NAME.json` says where it is now; the files
+that it had here when it left are beside it, in `STATE/moved/NAME/` (when it left again in `NAME.2/`, …), and
+nothing reads them any more.
+"""
+
+import logging
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import suppress
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from msgspec import Struct
+
+from tsfusion.core import durable_files, logs
+from tsfusion.core.config import AnyStruct, VolumeConfig, make_settings
+from tsfusion.core.errors import JournalError
+from tsfusion.journal import state_folder
+from tsfusion.journal.record_scan import journal_error
+from tsfusion.wire.messages.migration_messages import MovedSession
+
+log = logging.getLogger(__name__)
+
+_SUFFIX = ".json"
+ARRIVING = ".", ".arriving"  # before and after the name of a map whose copy is not whole
+
+
+class Arrival(Struct, frozen=True):
+    """Origin of a map, and what was acknowledged there.
+
+    Attributes:
+        move: of this move, in hexadecimal.
+        source, source_control: addresses of the server that had it.
+        volume: the map's settings.
+    """
+
+    move: str
+    source: str
+    source_control: str
+    volume: dict[str, Any]
+    sessions: tuple[MovedSession, ...]
+
+
+class Departed(Struct, frozen=True):
+    """Place of a map that left.
+
+    Attributes:
+        move: of this move, in hexadecimal.
+        before: of the move by which it had come here; empty = it began here.
+    """
+
+    move: str
+    before: str
+    address: str
+    control: str
+
+
+def arrival_of(folder: Path) -> Arrival | None:
+    """How the map in a folder came here; None = it began here."""
+    return _read(folder / state_folder.ARRIVED_FILE, Arrival)
+
+
+def volume_of(folder: Path) -> VolumeConfig | None:
+    """The settings of a map that came from another server; None = it began here.
+
+    Raises:
+        JournalError: when the file cannot be read.
+        InvalidConfig: when they are another version's.
+    """
+    arrival = arrival_of(folder)
+    return None if arrival is None else make_settings(VolumeConfig, arrival.volume)
+
+
+def departed(state: str | Path, name: str) -> Departed | None:
+    """Where a map is that left this server; None = it did not, or it came back."""
+    found = _read(path_of(state, name), Departed)
+    if found is None:
+        return None
+    here = arrival_of(state_folder.map_folder(state, name))
+    return found if here is None or here.move == found.before else None
+
+
+def write_departed(state: str | Path, name: str, where: Departed) -> None:
+    """Write down that another server has a map; raises JournalError when the disk refuses."""
+    path = path_of(state, name)
+    try:
+        durable_files.make_folder(path.parent)
+        with durable_files.replacing(path) as file:
+            file.write(msgspec.json.encode(where))
+    except OSError as error:
+        with suppress(OSError):  # nobody may find what was not promised
+            path.unlink(missing_ok=True)
+        raise journal_error("write", path, error) from error
+
+
+def put_aside(state: str | Path, name: str) -> None:
+    """Move the files of a map that left out of the way. What fails is logged, and tried at a start."""
+    folder = state_folder.map_folder(state, name)
+    if departed(state, name) is None or not folder.is_dir() or not state_folder.holds_a_map(folder):
+        return
+    aside = next(path for path in _asides(state, name) if not path.exists())
+    try:
+        os.replace(folder, aside)
+        durable_files.sync_folder(folder.parent)
+        log.info("the map has moved; its files are kept in %s", aside, extra=logs.about(map=name))
+    except OSError as error:
+        log.error("%s", journal_error("move away", folder, error), extra=logs.about(map=name))
+
+
+def left_behind(folder: Path) -> list[Path]:
+    """Folders with the files that a map has left here, one for each time that it moved away.
+
+    Args:
+        folder: of the map in a state folder.
+    """
+    where = folder.parent.parent / state_folder.MOVED_FOLDER
+    return sorted(path for path in where.glob(f"{folder.name}*") if _is_aside(path, folder.name))
+
+
+def _is_aside(path: Path, name: str) -> bool:
+    return path.name.partition(".")[0] == name and path.is_dir()
+
+
+def _asides(state: str | Path, name: str) -> Iterator[Path]:
+    """Folders for the files that a map leaves here: NAME, NAME.2, NAME.3, …"""
+    first = path_of(state, name).with_suffix("")
+    yield first
+    yield from (first.with_name(f"{name}.{number}") for number in count(2))
+
+
+def forget_departed(state: str | Path, name: str) -> None:
+    """Note that a map is back."""
+    with suppress(OSError):
+        path_of(state, name).unlink(missing_ok=True)
+
+
+def departed_names(state: str | Path) -> list[str]:
+    """The maps that left this server at some time."""
+    with suppress(OSError):
+        return sorted(
+            path.stem
+            for path in (Path(state) / state_folder.MOVED_FOLDER).iterdir()
+            if path.suffix == _SUFFIX
+        )
+    return []
+
+
+def path_of(state: str | Path, name: str) -> Path:
+    """The file that says where a map is."""
+    return Path(state) / state_folder.MOVED_FOLDER / f"{name}{_SUFFIX}"
+
+
+def _read(path: Path, kind: type[AnyStruct]) -> AnyStruct | None:
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=kind)
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise journal_error("read", path, error) from error
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise JournalError(f"{path} is damaged: {error}") from error
+
+
+def arriving_folder(state: str | Path, name: str) -> Path:
+    """The folder in which a map's copy is made."""
+    return Path(state) / state_folder.MAPS_FOLDER / f"{ARRIVING[0]}{name}{ARRIVING[1]}"
+
+
+def install(state: str | Path, name: str) -> None:
+    """Make a map that has come one of this server's; raises JournalError when the disk refuses."""
+    folder, arriving = state_folder.map_folder(state, name), arriving_folder(state, name)
+    try:
+        if folder.is_dir():  # with a lock, and nothing else that anybody needs
+            shutil.rmtree(folder)
+        os.replace(arriving, folder)
+        durable_files.sync_folder(folder.parent)
+    except OSError as error:
+        raise JournalError(f"cannot install map {name}: {error}", error.errno) from error
+    forget_departed(state, name)

@@ -1,0 +1,197 @@
+# SPDX-License-Identifier: MIT
+"""Maps that leave this server: what the server that is to have one asks, and what it is answered.
+
+See `migration_messages`. One that falls silent before `commit` loses its claim, and the map goes on here;
+to another server that asks it loses it sooner.
+"""
+
+import errno
+import logging
+import os
+import time
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import msgspec
+import zmq
+from msgspec import Struct, field
+
+from tsfusion.core import logs
+from tsfusion.core.config import ServerConfig
+from tsfusion.core.errors import JournalError
+from tsfusion.gateway.maps import moved_maps
+from tsfusion.gateway.maps.hosted_map import HostedMap
+from tsfusion.gateway.maps.map_registry import MapRegistry
+from tsfusion.gateway.maps.moved_maps import Departed
+from tsfusion.journal.record_scan import journal_error
+from tsfusion.journal.state_folder import JOURNAL_FOLDER, MAP_FILE, QUARANTINE_FOLDER
+from tsfusion.wire.messages.migration_messages import READ_BYTES, HandOver, MapFile, MovedSession, Parcel
+
+log = logging.getLogger(__name__)
+
+_FROZEN_S = 15.0  # without a question, while the map takes no records
+_LEAVING_S = 120.0  # without a question, before that
+_REPLACED_S = 3.0  # without a question, after which a third server may have the map instead
+_DOUBTED_S = 0.5  # after which that server asks again: one that lives asks ten times a second
+
+
+class _Departure(Struct, eq=False):
+    """A map that is being copied."""
+
+    move: bytes
+    hosted: HostedMap
+    asked: float  # time.monotonic()
+    files: dict[str, int] = field(default_factory=dict)  # descriptors, by name
+
+    def close(self) -> None:
+        """Close the files."""
+        for descriptor in self.files.values():
+            os.close(descriptor)
+        self.files.clear()
+
+
+class MapDepartures:
+    """All maps that are being copied. Call `step` again and again.
+
+    Args:
+        on_left: told the name of a map that is another server's now, and where it is.
+        on_stay: told the name of a map that was frozen and goes on here.
+    """
+
+    def __init__(
+        self,
+        server: ServerConfig,
+        maps: MapRegistry,
+        *,
+        on_left: Callable[[str, Departed], None],
+        on_stay: Callable[[str], None],
+    ) -> None:
+        self._state = server.state
+        self._maps = maps
+        self._on_left, self._on_stay = on_left, on_stay
+        self._leaving: dict[str, _Departure] = {}  # by map
+
+    def step(self) -> None:
+        """Give up the moves whose other server has fallen silent."""
+        now = time.monotonic()
+        for name, one in list(self._leaving.items()):
+            if now - one.asked > (_FROZEN_S if one.hosted.is_frozen else _LEAVING_S):
+                log.warning(
+                    "the map stays: the server that asked for it is silent", extra=logs.about(map=name)
+                )
+                self._give_up(name)
+
+    def close(self) -> None:
+        """Close the files that are being copied."""
+        for one in self._leaving.values():
+            one.close()
+
+    def answer(self, name: str, question: HandOver) -> tuple[Parcel, list[zmq.Frame]]:
+        """The answer to a question about a map, and its frames.
+
+        Raises:
+            JournalError: when there is no such map here, it cannot leave now, or the disk refuses.
+        """
+        if question.step == "commit":
+            return self._commit(name, question), []
+        one = self._departure(name, question)
+        one.asked = time.monotonic()
+        if question.step == "read":
+            return self._read(one, question)
+        if question.step == "cancel":
+            self._give_up(name)
+            return Parcel(), []
+        if question.step == "freeze" and not one.hosted.is_frozen:
+            one.hosted.freeze()
+            log.info("the map takes no records: it moves to another server", extra=logs.about(map=name))
+        return self._listed(one), []
+
+    def _departure(self, name: str, question: HandOver) -> _Departure:
+        one = self._leaving.get(name)
+        if one is not None and one.move == question.move:
+            return one
+        if one is not None and (silent := time.monotonic() - one.asked) < _REPLACED_S:
+            again = errno.EAGAIN if silent > _DOUBTED_S else None
+            raise JournalError(f"map {name} is moving to another server already", again)
+        if one is not None and question.step == "list":
+            log.warning("another server takes the map: the one before is silent", extra=logs.about(map=name))
+            self._give_up(name)
+        hosted = self._maps.get(name)
+        if hosted is None or question.step != "list":
+            raise JournalError(f"no map {name} is open here, or its move was given up")
+        if not hosted.warm or not hosted.forgetting.is_idle:
+            raise JournalError(f"map {name} is being opened, or forgets keyframes: ask again", errno.EAGAIN)
+        hosted.begin_to_leave()
+        one = self._leaving[name] = _Departure(question.move, hosted, time.monotonic())
+        return one
+
+    def _give_up(self, name: str) -> None:
+        one = self._leaving.pop(name)
+        one.close()
+        was_frozen = one.hosted.is_frozen
+        one.hosted.stay()
+        if was_frozen:
+            self._on_stay(name)
+
+    def _listed(self, one: _Departure) -> Parcel:
+        folder = one.hosted.records.folder
+        sessions: tuple[MovedSession, ...] = ()
+        try:
+            files = tuple(sorted(_files(folder), key=lambda file: file.name))
+        except OSError as error:
+            raise journal_error("list", folder, error) from error
+        if one.hosted.is_frozen:
+            sessions = tuple(
+                MovedSession(each.key, each.client, each.world, each.durable)
+                for each in one.hosted.records.sessions
+            )
+        volume = msgspec.to_builtins(one.hosted.fuser.volume)
+        return Parcel(files=files, volume=volume, is_saved=one.hosted.is_saved, sessions=sessions)
+
+    def _read(self, one: _Departure, question: HandOver) -> tuple[Parcel, list[zmq.Frame]]:
+        path = one.hosted.records.folder / question.file
+        try:
+            if question.offset == 0 and (before := one.files.pop(question.file, None)) is not None:
+                os.close(before)
+            if (descriptor := one.files.get(question.file)) is None:
+                descriptor = one.files[question.file] = os.open(path, os.O_RDONLY)
+            piece = os.pread(descriptor, READ_BYTES, question.offset)
+            if len(piece) < READ_BYTES:
+                os.close(one.files.pop(question.file))
+        except OSError as error:
+            raise journal_error("read", path, error) from error
+        return Parcel(crc32=zlib.crc32(piece)), [zmq.Frame(piece)]
+
+    def _commit(self, name: str, question: HandOver) -> Parcel:
+        """Write down that the map is the other server's. The answer to a second question is the same."""
+        before = moved_maps.departed(self._state, name)
+        if before is not None and before.move == question.move.hex():
+            return Parcel()
+        one = self._leaving.get(name)
+        if one is None or one.move != question.move or not one.hosted.is_frozen:
+            raise JournalError(f"map {name} stays: its move was given up")
+        arrival = moved_maps.arrival_of(one.hosted.records.folder)
+        where = Departed(
+            question.move.hex(), arrival.move if arrival else "", question.address, question.control
+        )
+        moved_maps.write_departed(self._state, name, where)
+        self._leaving.pop(name).close()
+        self._maps.give_away(name)
+        moved_maps.put_aside(self._state, name)
+        log.info("the map is at %s now", question.address, extra=logs.about(map=name))
+        self._on_left(name, where)
+        return Parcel()
+
+
+def _files(folder: Path) -> Iterator[MapFile]:
+    """The files that make a map, as they are now."""
+    paths = [folder / MAP_FILE]
+    for kind in (JOURNAL_FOLDER, QUARANTINE_FOLDER):
+        paths += (folder / kind).glob("[0-9A-Za-z]*.mcap")
+    for path in paths:
+        with suppress(FileNotFoundError):  # no checkpoint yet, or a quarantined record that made room
+            stat = path.stat()
+            version = f"{stat.st_ino:x}-{stat.st_mtime_ns:x}" if path.parent == folder else ""
+            yield MapFile(str(path.relative_to(folder)), stat.st_size, version)

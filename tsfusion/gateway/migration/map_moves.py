@@ -1,0 +1,193 @@
+# SPDX-License-Identifier: MIT
+"""Moves of maps between servers: those that leave, those that come, and where clients are sent."""
+
+import errno
+import logging
+import time
+from collections.abc import Callable, Sequence
+
+import zmq
+
+from tsfusion.core import logs
+from tsfusion.core.config import ServerConfig, VolumeConfig, make_settings
+from tsfusion.core.errors import InvalidConfig, JournalError, MapError, TsfusionError
+from tsfusion.gateway.clients.client_routes import ClientRoutes
+from tsfusion.gateway.fusers.fuser_supervisor import FuserSupervisor
+from tsfusion.gateway.maps.map_registry import MapRegistry
+from tsfusion.gateway.maps.moved_maps import Arrival, Departed
+from tsfusion.gateway.migration import map_arrivals
+from tsfusion.gateway.migration.map_arrivals import MapArrival, MoveRequest
+from tsfusion.gateway.migration.map_departures import MapDepartures
+from tsfusion.gateway.ports.access_control import AccessControl
+from tsfusion.gateway.ports.memory_guard import PendingReplies
+from tsfusion.gateway.ports.ports import Ports
+from tsfusion.wire.messages import messages
+from tsfusion.wire.messages.messages import Command, Reply
+from tsfusion.wire.messages.migration_messages import Moved
+from tsfusion.wire.sockets import sockets
+
+log = logging.getLogger(__name__)
+
+_MOST_ARRIVALS = 4  # at once
+_MOST_UNREAD = 32  # answers to one server that have not left: of one that was read it is known later
+
+
+class MapMoves:
+    """Answer the commands about moves, and call `step` again and again.
+
+    Args:
+        unread: large replies that wait to be read.
+        max_bytes: of these; no piece of a map is added beyond.
+        on_left: told the name of a map that is closed here: nobody answers questions about it any more.
+    """
+
+    def __init__(
+        self,
+        server: ServerConfig,
+        maps: MapRegistry,
+        routes: ClientRoutes,
+        ports: Ports,
+        access: AccessControl,
+        *,
+        unread: PendingReplies,
+        max_bytes: int,
+        on_left: Callable[[str], None],
+    ) -> None:
+        self._unread, self._max_bytes = unread, max_bytes
+        self._on_left = on_left
+        self._server = server
+        self._maps, self._routes, self._ports, self._access = maps, routes, ports, access
+        self._departures = MapDepartures(server, maps, on_left=self._send_away, on_stay=self._call_back)
+        self._arrivals: list[MapArrival] = []
+        self._fusers: dict[str, FuserSupervisor] = {}  # of maps that come
+
+    def resume(self) -> None:
+        """Go on with what an earlier process had copied whole; the server listens now."""
+        for name, arrival in map_arrivals.unfinished(self._server.state):
+            log.info("going on with the move of the map from %s", arrival.source, extra=logs.about(map=name))
+            request = MoveRequest(name, arrival.source, arrival.source_control)
+            self._begin(request, lambda _: None, arrival)
+
+    def step(self) -> None:
+        """Take over the maps that have come, and give up those that will not."""
+        self._departures.step()
+        for one in self._arrivals:
+            self._prepare(one)
+        for one in [one for one in self._arrivals if one.outcome is not None]:
+            self._arrivals.remove(one)
+            fuser = self._fusers.pop(one.name, None)
+            if fuser is not None and (not fuser.is_prepared or fuser.ended()):
+                fuser.close(wait=False)
+                fuser = None
+            self._maps.end_to_take(one.name)
+            outcome = one.outcome
+            assert outcome is not None
+            if isinstance(outcome, Moved):
+                try:
+                    self._maps.take_in(one.name, fuser)
+                    fuser = None
+                except TsfusionError as error:
+                    outcome = f"map {one.name} has come and cannot be opened: {error}"
+            if isinstance(outcome, str):
+                log.error("%s", outcome, extra=logs.about(map=one.name))
+            if fuser is not None:
+                fuser.close(wait=False)
+            for answer in one.on_end:
+                answer(outcome)
+
+    def _prepare(self, one: MapArrival) -> None:
+        """Have a map read where it is being copied to; where that fails it is read later."""
+        if one.prepared.is_set() or not one.wants_fuser.is_set():
+            return
+        fuser = self._fusers.get(one.name)
+        try:
+            if fuser is None:
+                volume = make_settings(VolumeConfig, one.volume)
+                fuser = self._fusers[one.name] = self._maps.open_ahead(one.name, one.folder, volume)
+            while fuser.receive() is not None:
+                pass
+            if fuser.is_prepared:
+                one.prepared.set()
+            elif fuser.ended():
+                raise MapError("its process ended")
+        except TsfusionError as error:
+            log.warning("the map cannot be read ahead: %s", error, extra=logs.about(map=one.name))
+            if (fuser := self._fusers.pop(one.name, None)) is not None:
+                fuser.close(wait=False)
+            one.prepared.set()
+
+    def close(self) -> None:
+        """End the threads, and close the files."""
+        for one in self._arrivals:
+            one.stop()
+        for fuser in self._fusers.values():
+            fuser.close()
+        self._departures.close()
+
+    def on_command(self, identity: bytes, command: Command, client: str) -> None:
+        """Answer a command `move` or `hand_over`, at once or when the map has come."""
+        parcel, error, retry = None, None, False
+        frames: list[zmq.Frame] = []
+        try:
+            if not self._access.may_forget_all(client):
+                raise JournalError("this key may not move maps (`tsfusion keys allow --forget`)")
+            if command.name == "move":
+                self._ask_for(identity, command)
+                return
+            if command.hand_over is None:
+                raise JournalError("the request names no part of the map")
+            if self._unread.of(identity)[0] >= _MOST_UNREAD or self._unread.nbytes > self._max_bytes:
+                raise JournalError("earlier answers were not read yet")
+            parcel, frames = self._departures.answer(command.map, command.hand_over)
+        except TsfusionError as refusal:
+            error = str(refusal)
+            retry = isinstance(refusal, JournalError) and refusal.errno == errno.EAGAIN
+        reply = Reply(name=command.name, number=command.number, parcel=parcel, error=error, retry=retry)
+        reader = identity + command.number.to_bytes(8, "big")
+        self._ports.reply(identity, reply, self._unread.wrap(reader, frames) if frames else ())
+
+    def _ask_for(self, identity: bytes, command: Command) -> None:
+        def answer(outcome: Moved | str) -> None:
+            moved, error = (outcome, None) if isinstance(outcome, Moved) else (None, outcome)
+            self._ports.reply(identity, Reply(name="move", number=command.number, moved=moved, error=error))
+
+        source = sockets.connect_address(command.source)
+        control = sockets.connect_address(sockets.control_address(source, command.source_control or None))
+        sockets.check_reachable(source, has_keys=self._server.keys is not None)
+        if (source, control) == self._maps.place:
+            raise InvalidConfig(f"map {command.map} is to come from this server itself")
+        request = MoveRequest(command.map, source, control)
+        under_way = next((one for one in self._arrivals if one.request == request), None)
+        if under_way is not None and len(under_way.on_end) < _MOST_UNREAD:
+            under_way.on_end.append(answer)  # its asker gave up waiting, and asks again
+            return
+        if why := self._maps.why_not_take(command.map):
+            raise JournalError(why)
+        if len(self._arrivals) >= _MOST_ARRIVALS:
+            raise JournalError("too many maps are coming: ask again")
+        self._begin(request, answer, None)
+
+    def _begin(self, request: MoveRequest, answer: map_arrivals.OnEnd, resumed: Arrival | None) -> None:
+        self._maps.begin_to_take(request.name)
+        keys = self._access.keys.as_client() if self._access.keys else None
+        self._arrivals.append(
+            MapArrival(self._server.state, request, self._maps.place, keys, on_end=answer, resumed=resumed)
+        )
+
+    # --- clients ---
+
+    def _send_away(self, name: str, where: Departed) -> None:
+        self._on_left(name)
+        for session in self._sessions(name):
+            why = f"map {name} is at {where.address} now"
+            denied = messages.Denied(session, "moved", why, address=where.address, control=where.control)
+            self._routes.send(session, denied)
+
+    def _call_back(self, name: str) -> None:
+        """Ask for what came while the map was frozen."""
+        for session in self._sessions(name):
+            self._routes.send(session, messages.Ack(session, *self._maps.progress(name, session), (), True))
+
+    def _sessions(self, name: str) -> Sequence[bytes]:
+        now = time.monotonic()
+        return [one.session for one in self._routes if one.map == name and one.state(now) != "gone"]

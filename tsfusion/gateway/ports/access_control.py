@@ -1,0 +1,217 @@
+# SPDX-License-Identifier: MIT
+"""Keys and allow-list: checked when a connection is made, and again at every message."""
+
+import logging
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import zmq
+from zmq.utils import z85
+
+from tsfusion.core.errors import InvalidConfig
+from tsfusion.wire.keys.allow_list import ALL_MAPS, AllowedMaps, AllowList
+from tsfusion.wire.sockets.curve import DOMAIN, ServerKeys, server_keys
+
+log = logging.getLogger(__name__)
+
+
+KEPT_OUT = 60.0  # seconds; then a client that was kept out may try again
+GUEST = "(guest)"  # no client in a list can have this name
+SERVER = "(server)"  # nor this one: another server of the fleet, which has the same pair of keys
+
+
+class AccessControl:
+    """The allow-list of one server; without a folder of keys everybody who can reach the server may connect.
+
+    Args:
+        folder: the folder that `tsfusion keys` made; None = no keys.
+        guest: public key that may watch every map, and send nothing, as long as this server runs.
+
+    Raises:
+        InvalidConfig: when the folder has no usable keys or allow-list.
+    """
+
+    def __init__(self, context: "zmq.Context[Any]", folder: str | None, *, guest: str | None = None) -> None:
+        self._guest = guest
+        self.keys: ServerKeys | None = None  # the server's own pair, for its sockets; None without a folder
+        self._allowed: AllowList | None = None
+        self._zap: ZapHandler | None = None
+        self._revoked = False
+        self._kept_out: dict[str, float] = {}  # client → until when (`time.monotonic()`)
+        if folder is not None:
+            self.keys = server_keys(folder)
+            self._allowed = AllowList(Path(folder))
+            if self._allowed.problem:  # an error at the start; later, nobody is let in
+                raise InvalidConfig(self._allowed.problem)
+            self._zap = ZapHandler(context, self._name_of, self._why_not)
+        self.poll = [] if self._zap is None else [self._zap.socket]  # the sockets to poll before `step`
+
+    @property
+    def problem(self) -> str:
+        """Reason why nobody may connect; empty = the allow-list can be read."""
+        return "" if self._allowed is None else self._allowed.problem
+
+    @property
+    def refused(self) -> Counter[str]:
+        """Connections that were turned away, by reason."""
+        return Counter() if self._zap is None else self._zap.refused
+
+    def step(self) -> bool:
+        """Answer new connections. True when a key was revoked or has other maps: all have to connect anew."""
+        if self._allowed is None or self._zap is None:
+            return False
+        self._revoked |= self._allowed.refresh()
+        self._zap.answer_all()
+        revoked, self._revoked = self._revoked, False
+        return revoked
+
+    def client_of(self, frame: zmq.Frame) -> str | None:
+        """The name that the sender's key is allowed under: empty without keys, None when it is not."""
+        if self._allowed is None:
+            return ""
+        self._revoked |= self._allowed.refresh()  # the file may have changed since the last step
+        key = sender_of(frame)
+        return None if key is None else self._name_of(key)
+
+    def keep_out(self, frame: zmq.Frame) -> str:
+        """Let the client that sent a frame make no connection for a while; its name, empty without keys."""
+        client = self.client_of(frame) or ""
+        if client:
+            self._kept_out[client] = time.monotonic() + KEPT_OUT
+        return client
+
+    def _name_of(self, key: str) -> str | None:
+        if key == self._guest:
+            return GUEST
+        if self.keys is not None and key == self.keys.public:
+            return SERVER
+        name = None if self._allowed is None else self._allowed.name_of(key)
+        return None if name is not None and self._is_kept_out(name) else name
+
+    def _is_kept_out(self, name: str) -> bool:
+        return time.monotonic() < self._kept_out.get(name, 0.0)
+
+    def _why_not(self, key: str) -> str:
+        assert self._allowed is not None
+        return _KEPT_OUT_WORD if self._allowed.name_of(key) else self._allowed.rejection_reason(key)
+
+    @property
+    def limits_maps(self) -> bool:
+        """True if some client may not use every map."""
+        return self._allowed is not None and self._allowed.limits_maps
+
+    def maps_of(self, client: str) -> AllowedMaps:
+        """The maps that the client of a name may use: without keys every map."""
+        return (
+            ALL_MAPS if self._allowed is None or client in (GUEST, SERVER) else self._allowed.maps_of(client)
+        )
+
+    def may_forget_all(self, client: str) -> bool:
+        """True if a client may forget keyframes of others, too: without keys everybody may."""
+        return self._allowed is None or client == SERVER or self._allowed.may_forget_all(client)
+
+    def close(self) -> None:
+        """Stop answering: nobody can connect any more."""
+        if self._zap is not None:
+            self._zap.close()
+
+
+_ENDPOINT = "inproc://zeromq.zap.01"
+_REQUESTS_A_STEP = 100
+_LOG_EVERY = 60.0  # seconds, in which a refusal is logged once, and few are: keys cost nothing to make
+_LOGGED_AT_MOST = 20
+_KEY_BYTES = 32
+_KEPT_OUT_WORD = "kept out"
+Allow = Callable[[str], str | None]
+
+
+class ZapHandler:
+    """The authenticator of one ZeroMQ context (RFC 27, ZAP).
+
+    Make it before the sockets with keys bind, and close it after them.
+
+    Args:
+        allow: the client's name by its public key (40 characters); None = it may not connect.
+        why_not: a word for the reason, for the log and for `refused`.
+    """
+
+    def __init__(
+        self, context: "zmq.Context[Any]", allow: Allow, why_not: Callable[[str], str] = lambda _: "unknown"
+    ) -> None:
+        self.refused: Counter[str] = Counter()  # connections that were turned away, by reason
+        self._allow = allow
+        self._why_not = why_not
+        self._logged: set[tuple[str, str]] = set()
+        self._logged_since = 0.0
+        self.socket: zmq.Socket[Any] = context.socket(zmq.ROUTER)
+        self.socket.setsockopt(zmq.LINGER, 0)
+        self.socket.bind(_ENDPOINT)
+
+    def answer_all(self) -> None:
+        """Answer the requests that came, up to a limit: other sockets get their turn. Never waits."""
+        for _ in range(_REQUESTS_A_STEP):
+            try:
+                frames = self.socket.recv_multipart(zmq.NOBLOCK)
+            except zmq.Again:
+                return
+            self._answer(frames)
+
+    def close(self) -> None:
+        """Stop answering: nobody can connect any more."""
+        self.socket.close()
+
+    def _answer(self, frames: Sequence[bytes]) -> None:
+        """Answer one: peer, nothing, version, request, domain, address, identity, mechanism, credentials."""
+        if len(frames) < 4:  # nothing that an answer could refer to
+            self.refused["malformed"] += 1
+            return
+        peer, delimiter, version, number, *request = frames
+        if delimiter or version != b"1.0" or len(request) < 4:
+            key, reason = "", "malformed"
+        else:
+            key, reason = self._judge(request)
+        if reason:
+            self._note(key, reason, request[1] if len(request) > 1 else b"")
+        status = b"300" if reason == _KEPT_OUT_WORD else b"400"  # 300: it may try again, without a word
+        verdict = [status, reason.encode(), b"", b""] if reason else [b"200", b"OK", key.encode(), b""]
+        try:
+            self.socket.send_multipart([peer, b"", b"1.0", number, *verdict], zmq.NOBLOCK)
+        except zmq.ZMQError as error:  # the connection has ended meanwhile
+            log.debug("an answer about a connection was not sent: %s", error)
+
+    def _judge(self, request: Sequence[bytes]) -> tuple[str, str]:
+        """The key, and the reason why it may not connect; an empty reason = it may."""
+        domain, _address, _identity, mechanism, *credentials = request
+        if domain != DOMAIN:
+            return "", "domain"
+        if mechanism != b"CURVE":
+            return "", "mechanism"
+        if len(credentials) != 1 or len(credentials[0]) != _KEY_BYTES:
+            return "", "malformed"
+        key = z85.encode(credentials[0]).decode("ascii")
+        return key, "" if self._allow(key) is not None else self._why_not(key)
+
+    def _note(self, key: str, reason: str, address: bytes) -> None:
+        self.refused[reason] += 1
+        now = time.monotonic()
+        if now - self._logged_since > _LOG_EVERY:
+            self._logged.clear()
+            self._logged_since = now
+        if (key, reason) not in self._logged and len(self._logged) < _LOGGED_AT_MOST:
+            self._logged.add((key, reason))
+            place = address[:64].decode("ascii", "replace")
+            log.warning("a connection from %s is refused (%s): key %s", place, reason, key or "none")
+
+
+def sender_of(frame: zmq.Frame) -> str | None:
+    """The public key (40 characters) of the client that sent a frame, received with `copy=False`.
+
+    Only for a socket with keys: one without takes whatever the other side claims.
+    """
+    try:
+        return str(frame.get("User-Id"))
+    except (zmq.ZMQError, UnicodeDecodeError):
+        return None

@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: MIT
+"""The connections that are cut off: who floods, who fills the memory, and whoever is too many."""
+
+import logging
+import time
+from collections import Counter
+
+import zmq
+
+from tsfusion.core import logs
+from tsfusion.core.readable_numbers import count_of
+from tsfusion.gateway.ports.access_control import AccessControl
+from tsfusion.gateway.ports.memory_guard import MemoryGuard
+from tsfusion.gateway.ports.ports import Flood, Ports
+from tsfusion.wire.sockets import sockets
+
+log = logging.getLogger(__name__)
+
+_CUT_HELPS_WITHIN = 1.0  # seconds: more memory after that is a new attack
+_UNNOTICED = 4  # one part in so many of the memory is for what comes in until it is noticed
+
+
+class ConnectionLimits:
+    """Limits of what connections may do to a gateway. Call `step` and `all_must_go` again and again.
+
+    Args:
+        refused: counts what is cut off, by reason.
+        memory_bytes: that the process may have.
+    """
+
+    def __init__(self, ports: Ports, access: AccessControl, refused: Counter[str], memory_bytes: int) -> None:
+        self._ports = ports
+        self._access = access
+        self._refused = refused
+        self._memory = MemoryGuard(memory_bytes - memory_bytes // _UNNOTICED)
+        self._hoarders_cut = -_CUT_HELPS_WITHIN  # time.monotonic()
+
+    def step(self) -> None:
+        """Cut off some connections where there are too many, and what only says it is a viewer."""
+        if surplus := self._ports.connections.step():
+            self._refused["connection"] += surplus
+            cut = count_of(surplus, "connection is", "connections are")
+            log.warning("%s cut off: there are too many, or viewers send messages", cut)
+
+    def on_flood(self, socket: sockets.AnySocket, flood: Flood) -> bool:
+        """Cut off who sent a message of frames without end, and with it, where that takes long, its port.
+
+        The others of the port are back at once; the client, where it has a name, after a while.
+
+        Returns:
+            Whether the port is made anew.
+        """
+        self._refused["frames"] += 1
+        client = self._access.keep_out(flood.first)
+        log.warning(
+            "a message from %s has more than %d frames: its connection is cut off%s",
+            sockets.peer_address(flood.first) or "somewhere",
+            flood.discarded,
+            ", and the others of that port are made anew" if flood.goes_on else "",
+            extra=logs.about(client=client, reason="frames"),
+        )
+        self._ports.cut_off(flood.first)
+        if flood.goes_on:
+            self._ports.renew(socket)
+        return flood.goes_on
+
+    def on_rubbish(self, first: zmq.Frame) -> None:
+        """Cut off a viewer that sent what is no subscription; it may connect again after a while."""
+        client = self._access.keep_out(first)
+        if client:  # else it is kept out already
+            log.warning(
+                "a viewer sends what is no subscription: it is cut off",
+                extra=logs.about(client=client, reason="subscription"),
+            )
+        self._ports.cut_off(first)
+
+    def all_must_go(self, uncounted: int) -> bool:
+        """True if every connection must be made anew: a key was revoked, or they hold too much memory.
+
+        ZeroMQ limits a frame and a queue of whole messages, not a message that never ends.
+
+        Args:
+            uncounted: bytes of this process that are no connection's fault.
+        """
+        if self._access.step():
+            log.warning("a key was revoked, or may use other maps: every connection is made anew")
+            self._refused["revoked"] += 1
+            return True
+        held = self._memory.excess(uncounted)
+        if not held or self._cut_hoarders(held):
+            return False
+        log.error(
+            "the gateway holds %d MB, too near to memory_bytes: every connection is made anew", held >> 20
+        )
+        self._refused["memory"] += 1
+        return True
+
+    def _cut_hoarders(self, held: int) -> bool:
+        """Cut off the connections that fill the memory, if they can be told; all go if that does not help."""
+        now = time.monotonic()
+        if now - self._hoarders_cut < _CUT_HELPS_WITHIN:
+            return False
+        hoarders = self._ports.connections.cut_hoarders()
+        for peer, nbytes in hoarders:
+            self._hoarders_cut = now
+            self._refused["memory"] += 1
+            log.warning(
+                "the gateway holds %d MB, too near to memory_bytes: the connection from %s, with %.1f MB of "
+                "messages that are not whole, is cut off",
+                held >> 20,
+                peer,
+                nbytes / 1e6,
+            )
+        if hoarders:
+            return True
+        if deaf := self._ports.connections.cut_deaf_viewers():
+            self._hoarders_cut = now
+            self._refused["memory"] += deaf
+            log.warning(
+                "the gateway holds %d MB, too near to memory_bytes: %s cut off",
+                held >> 20,
+                count_of(deaf, "viewer that does not read is", "viewers that do not read are"),
+            )
+        return deaf > 0

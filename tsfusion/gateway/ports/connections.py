@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: MIT
+"""The TCP connections of a server's ports, as the system sees them: counted, and single ones cut off (Linux).
+
+ZeroMQ accepts as many as come, and says of none what it holds. The system knows of each how many bytes came
+and how long it is silent. Elsewhere than on Linux nothing is found, and the memory guard alone is left.
+"""
+
+import os
+import resource
+import socket
+import stat
+import struct
+import time
+from collections import Counter
+from collections.abc import Collection, Iterator
+from contextlib import suppress
+
+from msgspec import Struct
+
+from tsfusion.wire.sockets import sockets
+
+_MOST = 4096  # connections at once
+_BYTES_EACH = 48 << 10  # of memory, roughly
+_GREETING_BYTES = 64  # of ZMTP; who has sent no more has made no connection yet
+_INTERVAL = 0.1  # seconds between two looks
+_VIEWER_BYTES = 64 << 10  # that a viewer may send in all: its subscriptions are some hundred
+_LONGEST_INTERVAL = 1.0
+_SHARE = 20  # of the time at most one part in so many goes into looking
+_UNREAD_BYTES = 1 << 20  # that a connection may have under way whatever happens
+# linux/tcp.h: tcpi_state, tcpi_last_data_recv, tcpi_bytes_received, tcpi_notsent_bytes
+_TCP_INFO = struct.Struct("=B51xI72xQ8xI")
+_TCP_LISTEN = 10
+_FILES = "/proc/self/fd"
+
+
+class OpenConnection(Struct, frozen=True):
+    """A connection that stands."""
+
+    fd: int
+    port: int  # of this process
+    silent_ms: int
+    received_bytes: int
+    unsent_bytes: int  # that the other end does not read
+
+
+class Connections:
+    """The connections to some ports of this process. Call `step` again and again.
+
+    Args:
+        memory_bytes: that the process may have.
+    """
+
+    def __init__(self, memory_bytes: int) -> None:
+        files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+        self.most = min(_MOST, files // 2, max(memory_bytes // 4 // _BYTES_EACH, 1))
+        self._ports: Collection[int] = ()
+        self._viewers_port = 0
+        self._next_look = self._next_full_look = 0.0  # time.monotonic()
+        self._others = 0  # files of this process that are no connections, at the last full look
+        self._read: Counter[int] = Counter()  # fd → bytes of the messages that the gateway got
+
+    def listen_at(self, data: int, control: int, viewers: int) -> None:
+        """Say which ports are meant."""
+        self._ports = {data, control, viewers}
+        self._viewers_port = viewers
+
+    def note_read(self, fd: int, nbytes: int) -> None:
+        """Note a message that came over a connection."""
+        self._read[fd] += nbytes
+
+    def step(self) -> int:
+        """Cut off connections where there are too many, and viewers that talk; the number of those.
+
+        Where there are too many, those go first that have not even sent a greeting, then the ones that are
+        silent for longest. What viewers send is read by ZeroMQ at once, however much it is.
+        """
+        now = time.monotonic()
+        if now < self._next_look:
+            return 0
+        self._next_look = now + _INTERVAL
+        files = len(_files())
+        if files - self._others <= self.most and now < self._next_full_look:
+            return 0
+        began = time.thread_time()
+        found = self._look()
+        self._others = files - len(found)
+        self._next_full_look = now + min(_SHARE * (time.thread_time() - began), _LONGEST_INTERVAL)
+        talk = [one for one in found if one.port == self._viewers_port and one.received_bytes > _VIEWER_BYTES]
+        if len(found) > self.most:
+            found.sort(key=lambda one: (one.received_bytes > _GREETING_BYTES, -one.silent_ms))
+            talk += found[: len(found) - self.most * 3 // 4]
+        return sum(self.cut(one.fd) for one in talk)
+
+    def cut_hoarders(self) -> list[tuple[str, int]]:
+        """Cut off the connections over which most came that is no whole message yet.
+
+        Returns:
+            For each the address of its other end, and these bytes.
+        """
+        unread = [(one.fd, one.received_bytes - self._read[one.fd]) for one in self._look()]
+        least = max(max((nbytes for _, nbytes in unread), default=0) // 2, _UNREAD_BYTES)
+        hoarders = [(fd, _peer_of(fd), nbytes) for fd, nbytes in unread if nbytes > least]
+        return [(peer, nbytes) for fd, peer, nbytes in hoarders if self.cut(fd)]
+
+    def cut_deaf_viewers(self) -> int:
+        """Cut off the viewers that do not read what waits for them; how many that were.
+
+        ZeroMQ keeps some messages for each, and others for one that came later.
+        """
+        deaf = [one.fd for one in self._look() if one.port == self._viewers_port and one.unsent_bytes]
+        return sum(map(self.cut, deaf))
+
+    def _look(self) -> list[OpenConnection]:
+        """The connections that stand. More than came over one was read over another of its number, before."""
+        found = list(self._all())
+        self._read = Counter({one.fd: min(self._read[one.fd], one.received_bytes) for one in found})
+        return found
+
+    def _all(self) -> Iterator[OpenConnection]:
+        for fd in map(int, _files()):
+            with suppress(OSError):
+                if not stat.S_ISSOCK(os.fstat(fd).st_mode):
+                    continue
+                with _shared(fd) as link:
+                    state, silent_ms, received, unsent = _TCP_INFO.unpack(
+                        link.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _TCP_INFO.size)
+                    )
+                    if state != _TCP_LISTEN and self._is_ours(link):
+                        yield OpenConnection(fd, link.getsockname()[1], silent_ms, received, unsent)
+
+    def cut(self, fd: int) -> bool:
+        """Cut a connection off; False when it is none (any more)."""
+        with suppress(OSError), _shared(fd) as link:
+            if self._is_ours(link):  # one that has ended may have left its number to another file
+                link.shutdown(socket.SHUT_RDWR)
+                return True
+        return False
+
+    def _is_ours(self, link: socket.socket) -> bool:
+        name = link.getsockname()
+        return isinstance(name, tuple) and name[1] in self._ports
+
+
+def _files() -> list[str]:
+    """Numbers of the open files of this process; none where the system does not tell."""
+    try:
+        return os.listdir(_FILES)
+    except OSError:
+        return []
+
+
+def _peer_of(fd: int) -> str:
+    """Address of a connection's other end; empty where it has none any more."""
+    with suppress(OSError), socket.socket(fileno=os.dup(fd)) as link:
+        return str(link.getpeername()[0]).removeprefix(sockets.MAPPED)
+    return ""
+
+
+def _shared(fd: int) -> socket.socket:
+    """The socket of an open file, held open meanwhile; raises OSError where it is none.
+
+    It is taken for one of IPv4, which is faster than to ask: of others, its ports alone are right.
+    """
+    copy = os.dup(fd)
+    try:
+        return socket.socket(socket.AF_INET, socket.SOCK_STREAM, fileno=copy)
+    except OSError:
+        os.close(copy)
+        raise

@@ -1,0 +1,286 @@
+# SPDX-License-Identifier: MIT
+"""The server's three sockets, read and written without ever waiting, and what viewers subscribed to."""
+
+import logging
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple, TypeAlias
+
+import zmq
+
+from tsfusion.core.config import ServerConfig
+from tsfusion.core.errors import TransportError
+from tsfusion.gateway.ports.connections import Connections
+from tsfusion.wire.messages import messages
+from tsfusion.wire.records.codec import MAX_FRAMES
+from tsfusion.wire.sockets import sockets
+from tsfusion.wire.sockets.curve import ServerKeys
+from tsfusion.wire.sockets.sockets import Addresses
+
+log = logging.getLogger(__name__)
+
+_MESSAGES_A_STEP = 16
+_SECONDS_A_STEP = 0.05
+_MANY_FRAMES = 1000  # surplus ones, which no mistake explains
+_MOST_DISCARDED = 50_000  # frames of one message that are read and forgotten: some 50 ms
+_REBIND_INTERVAL = 0.01  # seconds
+Handler: TypeAlias = Callable[[list[zmq.Frame]], None]
+
+
+class Flood(NamedTuple):
+    """A message with many more frames than any may have.
+
+    ZeroMQ has all of them in memory, and gives what others sent to the socket only behind the last one.
+    """
+
+    first: zmq.Frame
+    discarded: int  # number of frames that were read and forgotten
+    goes_on: bool  # whether there are more: only a new socket gets rid of them soon
+
+
+class Ports:
+    """The sockets: keyframes in, control both ways, mesh updates and what scanners see out.
+
+    Args:
+        grants_topics: asked when sockets are made: whether viewers get only what `grant_topics` says.
+    """
+
+    def __init__(
+        self,
+        context: "zmq.Context[Any]",
+        server: ServerConfig,
+        keys: ServerKeys | None = None,
+        *,
+        grants_topics: Callable[[], bool] = lambda: False,
+    ) -> None:
+        self._context = context
+        self._server = server
+        self._keys = keys
+        self._grants_topics = grants_topics
+        self._is_manual = self._is_mixed_up = False
+        self._addresses: dict[str, str] = {}  # of the sockets, once they are bound
+        self._unbound: set[str] = set()  # sockets that are being made anew
+        self._next_bind = 0.0
+        self.problem = ""  # why nobody can connect; empty = clients can
+        self.connections = Connections(server.memory_bytes)
+        self._sockets = {name: self._make(name) for name in ("keyframes", "control", "viewers")}
+
+    def _make(self, name: str) -> sockets.AnySocket:
+        if name == "keyframes":
+            return sockets.pull(self._context, self._server.max_frame_bytes, keys=self._keys)
+        if name == "control":
+            return sockets.router(self._context, keys=self._keys)
+        self._is_manual, self._is_mixed_up = self._grants_topics(), False
+        return sockets.publisher(self._context, keys=self._keys, manual=self._is_manual)
+
+    @property
+    def keyframes(self) -> sockets.AnySocket:
+        """Records come in here."""
+        return self._sockets["keyframes"]
+
+    @property
+    def control(self) -> sockets.AnySocket:
+        """Greetings, pings and commands come in here, and their answers leave."""
+        return self._sockets["control"]
+
+    @property
+    def viewers(self) -> sockets.AnySocket:
+        """Mesh updates leave here, and subscriptions come in."""
+        return self._sockets["viewers"]
+
+    def is_served(self, socket: sockets.AnySocket) -> bool:
+        """True unless the socket is being made anew."""
+        return all(self._sockets[name] is not socket for name in self._unbound)
+
+    def bind(self) -> Addresses:
+        """Bind the sockets, so that clients can connect.
+
+        Raises:
+            TransportError: when a port is taken.
+        """
+        listen, control = self._server.listen, self._server.control
+        found = sockets.bind(self.keyframes, self.control, self.viewers, listen, control)
+        self._addresses = {"keyframes": found.data, "control": found.control, "viewers": found.publish}
+        listening = (sockets.parse_address(one)[1] for one in self._addresses.values())
+        self.connections.listen_at(*listening)
+        return found
+
+    def reply(self, identity: bytes, message: messages.ToClient, frames: Sequence[zmq.Frame] = ()) -> None:
+        """Send a message to a connection of the control socket, or drop it."""
+        send_now(self.control, [identity, messages.encode_sealed(message), *frames])
+
+    def publish(self, topic: bytes, message: bytes, frames: Sequence[zmq.Frame]) -> None:
+        """Send a message to the viewers that subscribed to its topic, or drop it."""
+        if not self.viewers.closed:
+            send_now(self.viewers, [topic, message, *frames])
+
+    @property
+    def grants_topics(self) -> bool:
+        """True if viewers get only what `grant_topics` says."""
+        return self._is_manual
+
+    def grant_topics(self, topics: Iterable[bytes]) -> None:
+        """Send these topics' updates to the viewer whose message was received last."""
+        for topic in topics if self._is_manual else ():
+            self.viewers.setsockopt(zmq.SUBSCRIBE, topic)
+
+    def revoke_topics(self, topics: Iterable[bytes]) -> None:
+        """Send these topics' updates to that viewer no more."""
+        for topic in topics if self._is_manual else ():
+            self.viewers.setsockopt(zmq.UNSUBSCRIBE, topic)
+
+    def knows_viewer(self, *, after_rubbish: bool = False) -> bool:
+        """True if topics would be granted to the viewer whose message was received last.
+
+        ZeroMQ takes subscriptions that wait behind rubbish for others' than those that sent them, until none
+        waits.
+
+        Args:
+            after_rubbish: the message is no subscription.
+        """
+        self._is_mixed_up |= after_rubbish and self._is_manual
+        if self._is_mixed_up and not int(self.viewers.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
+            self._is_mixed_up = False
+        return not self._is_mixed_up
+
+    def renew(self, only: sockets.AnySocket | None = None) -> None:
+        """Drop every connection, with all that it holds in memory; `step` listens at the same ports again.
+
+        Args:
+            only: the socket whose connections are meant; None = those of all.
+        """
+        for name, socket in self._sockets.items():
+            if only in (None, socket):
+                socket.close()
+                self._unbound.add(name)
+        self.problem = "connections are made anew"
+        self.step()
+
+    def step(self) -> None:
+        """Listen again, as soon as ZeroMQ's threads have given the ports back. Never waits."""
+        now = time.monotonic()
+        if not self._unbound or now < self._next_bind:
+            return
+        self._next_bind = now + _REBIND_INTERVAL
+        self.problem = ""
+        for name in [one for one in self._sockets if one in self._unbound]:
+            try:
+                if self._sockets[name].closed:
+                    self._sockets[name] = self._make(name)
+                if self._addresses:
+                    sockets.bind_socket(self._sockets[name], self._addresses[name])
+                self._unbound.remove(name)
+            except (TransportError, zmq.ZMQError) as error:
+                self.problem = f"cannot listen any more, and will try again: {error}"
+
+    def cut_off(self, frame: zmq.Frame) -> None:
+        """End the connection over which a frame came, if it still stands. Others of the same port stay."""
+        if (fd := sockets.file_of(frame)) is not None:
+            self.connections.cut(fd)
+
+    def close(self) -> None:
+        """Close the sockets at once, with whatever they have not sent."""
+        for socket in self._sockets.values():
+            socket.close()
+
+
+def receive_some(
+    socket: sockets.AnySocket,
+    handle: Handler,
+    on_flood: Callable[[Flood], None],
+    note_read: Callable[[int, int], None],
+) -> None:
+    """Handle the messages that a socket holds, up to a limit: then the other sockets get their turn.
+
+    Args:
+        note_read: told the file number of the connection, and the bytes of a message that is handled.
+        on_flood: told of a message with many more frames than any may have, which is not handled.
+    """
+    until = time.monotonic() + _SECONDS_A_STEP
+    for _ in range(_MESSAGES_A_STEP):
+        if socket.closed or time.monotonic() > until:  # the handler closed it, or the disk is slow
+            return
+        try:
+            frames = [socket.recv(zmq.NOBLOCK, copy=False)]
+        except zmq.Again:
+            return
+        while frames[-1].more and len(frames) <= MAX_FRAMES:  # one too many shows that the message is none
+            frames.append(socket.recv(zmq.NOBLOCK, copy=False))
+        discarded = _discard(socket) if frames[-1].more else 0
+        if discarded > _MANY_FRAMES:
+            on_flood(Flood(frames[0], discarded, socket.getsockopt(zmq.RCVMORE) == 1))
+            return
+        if (fd := sockets.file_of(frames[-1])) is not None:
+            note_read(fd, sum(map(len, frames)))
+        handle(frames)
+
+
+def _discard(socket: sockets.AnySocket) -> int:
+    """Read and forget the rest of a message, up to a limit; the number of frames."""
+    discarded, more = 0, True
+    while more and discarded < _MOST_DISCARDED:
+        socket.recv(zmq.NOBLOCK)
+        more = socket.getsockopt(zmq.RCVMORE) == 1
+        discarded += 1
+    return discarded
+
+
+def send_now(socket: sockets.AnySocket, frames: list[Any]) -> None:
+    """Send a message, or drop it when it cannot leave at once: whoever needs it will ask again."""
+    try:
+        socket.send_multipart(frames, zmq.NOBLOCK, copy=False)
+    except zmq.ZMQError as error:  # zmq.Again: it is full; or it is being made anew
+        log.warning("an answer was dropped: %s", error)
+
+
+_MAX_TOPICS = 256  # of maps that are not open
+
+
+class Subscriptions:
+    """The topics that viewers subscribed to, as far as they can be a map's.
+
+    A connection that ends takes its subscriptions back, but nobody says then whose they were. So those that
+    were not granted are counted, too: a map may be taken for watched that is not, never the other way round.
+    """
+
+    def __init__(self) -> None:
+        self._granted: Counter[bytes] = Counter()
+        self._denied: Counter[bytes] = Counter()
+
+    def __len__(self) -> int:
+        return len(self._granted.keys() | self._denied.keys())
+
+    def add(self, topic: bytes, maps: Iterable[str], *, granted: bool = True) -> bool:
+        """Note a subscription; False when it is not to be granted. Topics of open maps are never too many.
+
+        Args:
+            maps: the names of the open maps.
+            granted: whether its viewer may have any of it.
+        """
+        wanted = any(own.startswith(topic) for name in maps for own in sockets.topics_of(name))
+        new = topic not in self._granted and topic not in self._denied
+        if not wanted and ((new and len(self) >= _MAX_TOPICS) or not sockets.is_topic(topic)):
+            return False
+        (self._granted if granted else self._denied)[topic] += 1
+        return granted
+
+    def discard(self, topic: bytes, *, granted: bool | None = None) -> None:
+        """Note that a subscription to a topic ended.
+
+        Args:
+            granted: as in `add`; None = not known.
+        """
+        denied_first = granted is None and self._denied[topic] > 0
+        counts = self._denied if denied_first or granted is False else self._granted
+        counts[topic] -= 1
+        self._granted, self._denied = +self._granted, +self._denied
+
+    def clear(self) -> None:
+        """Forget all subscriptions: every connection was dropped."""
+        self._granted.clear()
+        self._denied.clear()
+
+    def watched(self, topic: bytes) -> bool:
+        """True if any viewer gets what is published under a map's topic."""
+        return any(topic.startswith(wanted) for wanted in self._granted)

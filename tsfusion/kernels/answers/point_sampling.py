@@ -1,0 +1,307 @@
+# SPDX-License-Identifier: MIT
+"""The map's signed distance between voxel centres: trilinear interpolation, and its gradient.
+
+A point is rounded to 2⁻¹⁶ voxel. It lies between eight voxel centres, of which those count that have a share
+in it: at a voxel's centre that voxel alone.
+
+The map holds distances along rays. Where these were oblique, the gradient is steeper than 1: divided by it,
+the distance is, to first order, that to the surface.
+"""
+
+import taichi as ti
+
+from tsfusion.kernels import F32, I32, I64, U8, ANYx2, F32x2, I64x2
+from tsfusion.kernels.base.block_hash import map_find
+from tsfusion.kernels.base.quick_launch import QuickLaunch
+from tsfusion.kernels.base.run_loop import runs, unit_of
+from tsfusion.kernels.base.sensor_noise import WEIGHT_ONE
+from tsfusion.kernels.base.voxel_traversal import VOXEL_LIMIT, offset_in_block, pack, vec3i
+from tsfusion.kernels.integration.integrate import CUBE, QUANTA_PER_VOXEL, lane_distance, lane_weight
+
+ONE = 65536.0  # of a voxel
+UNKNOWN = -2  # slot of a block that was not looked up
+BANDS = 64  # of blocks: units of parallel work
+BAND = 512  # points that one thread takes at a time
+BATCH = 64  # points of a band that wait for memory together
+
+# What values are: Σ w·m / Σ w; that, with what `correction` adds to Σ w·m; or what `pair` put beside Σ w
+FUSED, CORRECTED, SOLVED = 0, 1, 2
+
+vec3f = ti.types.vector(3, ti.f32)
+vec4f = ti.types.vector(4, ti.f32)
+vec3l = ti.types.vector(3, ti.i64)
+corners_i = ti.types.vector(8, ti.i32)
+corners_l = ti.types.vector(8, ti.i64)
+corners_f = ti.types.vector(8, ti.f32)
+
+
+@ti.func
+def place_of(points: ti.template(), n, per_metre):
+    """Point n in 2⁻¹⁶ voxel from the centre of voxel (0, 0, 0), and whether a map can reach so far."""
+    place = vec3l(0)
+    inside = True
+    for a in ti.static(range(3)):
+        scaled = ti.cast(points[n, a], ti.f64) * per_metre
+        inside = inside and ti.abs(scaled) < VOXEL_LIMIT - 64
+        place[a] = ti.cast(ti.floor(ti.select(inside, scaled, 0.0) * ONE + 0.5), ti.i64) - 32768
+    return place, inside
+
+
+@ti.func
+def find_near(near: ti.template(), voxel, k, map_keys: ti.template(), map_slots: ti.template()):
+    """Slot of the block k away (bits: one on along x, y, z) from that of a voxel; kept in `near`."""
+    if near[k] == UNKNOWN:
+        key = pack((voxel[0] >> 3) + (k & 1), (voxel[1] >> 3) + (k >> 1 & 1), (voxel[2] >> 3) + (k >> 2))
+        near[k] = map_find(map_keys, map_slots, map_keys.shape[0] - 1, key)
+    return near[k]
+
+
+@ti.func
+def crossing(voxel):
+    """Along which axes (bits) the voxels one on lie in the next block."""
+    return (
+        ti.cast((voxel[0] & 7) == 7, ti.i32)
+        | ti.cast((voxel[1] & 7) == 7, ti.i32) << 1
+        | ti.cast((voxel[2] & 7) == 7, ti.i32) << 2
+    )
+
+
+@ti.func
+def corner_offset(voxel, c: ti.template()):
+    """Number, in its block, of corner c (bits: one on along x, y, z) of the cell that begins at a voxel."""
+    return (
+        (((voxel[0] + (c & 1)) & 7) << 6)
+        | (((voxel[1] + (c >> 1 & 1)) & 7) << 3)
+        | ((voxel[2] + (c >> 2)) & 7)
+    )
+
+
+@ti.func
+def read_voxel(row, o, sums: ti.template(), kind, correction: ti.template()):
+    """The sums of a voxel, and what `correction` holds of it."""
+    held = ti.f32(0.0)
+    if kind == CORRECTED:
+        held = correction[row, o]
+    return sums[row, o], held
+
+
+@ti.func
+def value_of(packed, held, kind, min_weight):
+    """Value of a voxel in quanta, NaN where it is unseen, and its weight."""
+    w = lane_weight(packed)
+    solved = ti.bit_cast(ti.cast(packed >> 32, ti.i32), ti.f32)
+    if kind == SOLVED:
+        w = ti.cast(packed, ti.i32)
+    weight = ti.cast(w, ti.f32)
+    value = (ti.cast(lane_distance(packed), ti.f32) + held) / weight
+    value = ti.select(kind == SOLVED, solved, value)
+    return ti.select(w >= min_weight, value, ti.math.nan), weight
+
+
+@ti.func
+def blend(v, f):
+    """Trilinear mean of eight corners at the place f in their cell, and its gradient."""
+    x = vec4f(v[1] - v[0], v[3] - v[2], v[5] - v[4], v[7] - v[6])
+    along_x = vec4f(v[0], v[2], v[4], v[6]) + f[0] * x
+    y0, y1 = along_x[1] - along_x[0], along_x[3] - along_x[2]
+    low, high = along_x[0] + f[1] * y0, along_x[2] + f[1] * y1
+    x0, x1 = x[0] + f[1] * (x[1] - x[0]), x[2] + f[1] * (x[3] - x[2])
+    z = high - low
+    return low + f[2] * z, vec3f(x0 + f[2] * (x1 - x0), y0 + f[2] * (y1 - y0), z)
+
+
+@ti.func
+def blend_shares(v, f):
+    """Trilinear mean of those of eight corners that have a share in it."""
+    total = ti.f32(0.0)
+    for c in ti.static(range(8)):
+        share = ti.f32(1.0)
+        for a in ti.static(range(3)):
+            share *= f[a] if ti.static(c >> a & 1) else 1.0 - f[a]
+        if share > 0.0:
+            total += share * v[c]
+    return total
+
+
+@ti.func
+def write_sample(
+    n, packed, held, f, kind, min_weight, metres, distance: ti.template(), weight: ti.template(),
+    gradient: ti.template(),
+):  # fmt: skip
+    """Sample n: of the sums of its eight corners, at the place f in their cell."""
+    v = corners_f(0.0)
+    w = corners_f(0.0)
+    for c in ti.static(range(8)):
+        v[c], w[c] = value_of(packed[c], held[c], kind, min_weight)
+    total, slope = blend(v, f)
+    if not (total == total):  # Taichi's != is false of NaN
+        total = blend_shares(v, f)
+    slope *= ti.static(1.0 / QUANTA_PER_VOXEL)
+    # along oblique rays the distance grows faster than that to the surface
+    steep = slope.norm()
+    shorter = 1.0 / ti.select(steep > 1.0, steep, 1.0)
+    distance[n] = total * metres * shorter
+    weight[n] = blend(w, f)[0] * ti.static(1.0 / WEIGHT_ONE)
+    for a in ti.static(range(3)):
+        gradient[n, a] = slope[a] * shorter
+
+
+@QuickLaunch
+@ti.kernel
+def list_blocks(points: ANYx2, per_metre: ti.f64, map_keys: I64, map_slots: I32, is_needed: U8):
+    """Mark the slots of the blocks whose voxels `interpolate` reads."""
+    count = points.shape[0]
+    for run in range(runs((count + BAND - 1) // BAND)):  # run loop: kernels/base/run_loop.py
+        first = unit_of(run, (count + BAND - 1) // BAND) * BAND
+        if first < count:
+            last = vec3i(2147483647)
+            near = corners_i(UNKNOWN)
+            for n in range(first, ti.min(first + BAND, count)):
+                place, inside = place_of(points, n, per_metre)
+                if inside:
+                    voxel = ti.cast(place >> 16, ti.i32)
+                    block = voxel >> 3
+                    if block[0] != last[0] or block[1] != last[1] or block[2] != last[2]:
+                        last = block
+                        near = corners_i(UNKNOWN)
+                    across = crossing(voxel)
+                    for k in range(8):
+                        if (k & ~across) == 0:
+                            slot = find_near(near, voxel, k, map_keys, map_slots)
+                            if slot >= 0:
+                                is_needed[slot] = ti.u8(1)
+
+
+@QuickLaunch
+@ti.kernel
+def pair(slots: I32, sums: I64x2, values: F32x2, pairs: I64x2):
+    """Row n of `pairs`: row n of `values`, bits, in the upper halves; in the lower ones Σ w of `slots[n]`.
+
+    What `interpolate` reads of a point lies together then: at points in random order it waits for memory.
+    """
+    for run in range(runs(BANDS)):  # run loop: kernels/base/run_loop.py
+        band = unit_of(run, BANDS)
+        if band < BANDS:
+            count = slots.shape[0]
+            for n in range(count * band // BANDS, count * (band + 1) // BANDS):
+                slot = slots[n]
+                for o in range(CUBE):
+                    bits = ti.cast(ti.bit_cast(values[n, o], ti.i32), ti.i64)
+                    pairs[n, o] = bits << 32 | ti.cast(lane_weight(sums[slot, o]), ti.i64)
+
+
+@QuickLaunch
+@ti.kernel
+def interpolate(
+    points: ANYx2, per_metre: ti.f64, map_keys: I64, map_slots: I32,
+    sums: I64x2,  # SOLVED: pairs
+    min_weight: ti.i32, kind: ti.i32, correction: F32x2,
+    row_of: I32,  # SOLVED: row of a slot
+    distance: F32, weight: F32, gradient: F32x2,
+):  # fmt: skip
+    """Distance in metres, weight in full samples, and gradient at every point."""
+    count = points.shape[0]
+    metres = ti.cast(1.0 / (per_metre * QUANTA_PER_VOXEL), ti.f32)
+    for run in range(runs((count + BAND - 1) // BAND)):  # run loop: kernels/base/run_loop.py
+        first = unit_of(run, (count + BAND - 1) // BAND) * BAND
+        if first < count:
+            last = vec3i(2147483647)
+            near = corners_i(UNKNOWN)
+            for n in range(first, ti.min(first + BAND, count)):
+                place, inside = place_of(points, n, per_metre)
+                voxel = ti.cast(place >> 16, ti.i32)
+                block = voxel >> 3
+                if block[0] != last[0] or block[1] != last[1] or block[2] != last[2]:
+                    last = block
+                    near = corners_i(UNKNOWN)
+                across = crossing(voxel)
+                packed = corners_l(0)
+                held = corners_f(0.0)
+                if inside and across == 0:  # two of three: eight corners in one block
+                    slot = find_near(near, voxel, 0, map_keys, map_slots)
+                    if slot >= 0:
+                        o, row = offset_in_block(voxel), slot
+                        if kind == SOLVED:
+                            row = row_of[slot]
+                        for c in ti.static(range(8)):
+                            step = ti.static(64 * (c & 1) + 8 * (c >> 1 & 1) + (c >> 2))
+                            packed[c], held[c] = read_voxel(row, o + step, sums, kind, correction)
+                elif inside:
+                    for c in ti.static(range(8)):
+                        slot = find_near(near, voxel, c & across, map_keys, map_slots)
+                        if slot >= 0:
+                            o, row = corner_offset(voxel, c), slot
+                            if kind == SOLVED:
+                                row = row_of[slot]
+                            packed[c], held[c] = read_voxel(row, o, sums, kind, correction)
+                f = ti.cast(place & 65535, ti.f32) * ti.static(1.0 / ONE)
+                write_sample(n, packed, held, f, kind, min_weight, metres, distance, weight, gradient)
+
+
+@ti.kernel
+def interpolate_within(
+    points: ANYx2, per_metre: ti.f64, rows: I32, begin: vec3i, size: vec3i,
+    sums: I64x2,  # SOLVED: pairs
+    min_weight: ti.i32, kind: ti.i32, correction: F32x2, distance: F32, weight: F32, gradient: F32x2,
+):  # fmt: skip
+    """As `interpolate`, to the bit, at many points: by a table instead of the hash, and many at once.
+
+    `rows` has the rows in `sums` of the blocks in a box, which begins at block `begin` and has `size` of them
+    along x, y and z: -1 where there is none, as in the first two layers along each axis and in the last.
+
+    Points in random order wait for memory; here, those of a batch together: all are placed, then all sums are
+    touched that they need, then these are blended. Meanwhile a point's row of the answer has its block
+    (`weight`, bits), its voxel (`distance`, bits) and its place in the cell (`gradient`).
+    """
+    count = points.shape[0]
+    metres = ti.cast(1.0 / (per_metre * QUANTA_PER_VOXEL), ti.f32)
+    along = vec3i(size[1] * size[2], size[2], 1)
+    for run in range(runs((count + BAND - 1) // BAND)):  # run loop: kernels/base/run_loop.py
+        band = unit_of(run, (count + BAND - 1) // BAND)
+        if band * BAND < count:
+            for part in range(BAND // BATCH):
+                first = band * BAND + part * BATCH
+                end = ti.min(first + BATCH, count)
+                for n in range(first, end):
+                    place, inside = place_of(points, n, per_metre)
+                    voxel = ti.cast(place >> 16, ti.i32)
+                    block = (voxel >> 3) - begin
+                    for a in ti.static(range(3)):
+                        inside = inside and block[a] >= 0 and block[a] < size[a] - 1
+                        gradient[n, a] = ti.cast(place[a] & 65535, ti.f32) * ti.static(1.0 / ONE)
+                    weight[n] = ti.bit_cast(ti.select(inside, block.dot(along), 0), ti.f32)
+                    distance[n] = ti.bit_cast(offset_in_block(voxel), ti.f32)
+                for n in range(first, end):
+                    block, o = ti.bit_cast(weight[n], ti.i32), ti.bit_cast(distance[n], ti.i32)
+                    voxel = vec3i(o >> 6, o >> 3 & 7, o & 7)
+                    touched = ti.i64(0)
+                    for c in ti.static(range(4)):  # eight voxels along z are a line of the cache
+                        k = c & crossing(voxel)
+                        row = rows[block + (k & 1) * along[0] + (k >> 1) * along[1]]
+                        if row >= 0:
+                            touched ^= sums[row, corner_offset(voxel, c)]
+                    distance[n] = ti.bit_cast(
+                        o | ti.cast(touched, ti.i32) << 9, ti.f32
+                    )  # else it is not read
+                for n in range(first, end):
+                    block, o = ti.bit_cast(weight[n], ti.i32), ti.bit_cast(distance[n], ti.i32) & 511
+                    voxel = vec3i(o >> 6, o >> 3 & 7, o & 7)
+                    across = crossing(voxel)
+                    packed = corners_l(0)
+                    held = corners_f(0.0)
+                    if across == 0:
+                        row = rows[block]
+                        if row >= 0:
+                            for c in ti.static(range(8)):
+                                step = ti.static(64 * (c & 1) + 8 * (c >> 1 & 1) + (c >> 2))
+                                packed[c], held[c] = read_voxel(row, o + step, sums, kind, correction)
+                    else:
+                        for c in ti.static(range(8)):
+                            k = c & across
+                            row = rows[block + vec3i(k & 1, k >> 1 & 1, k >> 2).dot(along)]
+                            if row >= 0:
+                                packed[c], held[c] = read_voxel(
+                                    row, corner_offset(voxel, c), sums, kind, correction
+                                )
+                    f = vec3f(gradient[n, 0], gradient[n, 1], gradient[n, 2])
+                    write_sample(n, packed, held, f, kind, min_weight, metres, distance, weight, gradient)

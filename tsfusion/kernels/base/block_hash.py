@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: MIT
+"""The hash from block key to slot of the whole map, and the set of blocks that a keyframe finds missing.
+
+The set is the phase-concurrent, history-independent table of Shun and Blelloch (SPAA 2014): a larger key
+displaces a smaller one onward with `atomic_max`, so the table's content, and with it every slot given out
+from it, does not depend on which thread came first. No locks, no compare-and-swap.
+"""
+
+import taichi as ti
+
+from tsfusion.kernels import I32, I64
+from tsfusion.kernels.base.quick_launch import QuickLaunch
+from tsfusion.kernels.base.voxel_traversal import hash_key
+
+MAX_PROBES = 256
+
+
+@ti.func
+def set_insert(table: ti.template(), mask, key):
+    """Insert `key` (> 0) into the set; returns how much larger it is now, and whether it is too full.
+
+    Of threads that insert one key at the same time, one counts it.
+    """
+    full, grown = 0, 0
+    carried = key
+    i = hash_key(key) & mask
+    probes = 0
+    while carried != 0:
+        if table[i] == carried:
+            carried = ti.i64(0)
+        else:
+            before = ti.atomic_max(table[i], carried)
+            if before == carried:
+                carried = ti.i64(0)
+            elif before < carried:
+                grown = ti.cast(before == 0, ti.i32)
+                carried = before
+        i = (i + 1) & mask
+        probes += 1
+        if probes > MAX_PROBES:
+            full = 1
+            carried = ti.i64(0)
+    return grown, full
+
+
+@ti.func
+def map_find(keys: ti.template(), slots: ti.template(), mask, key):
+    """Slot of block `key` in the map, -1 if absent. The table is never more than half full."""
+    i = hash_key(key) & mask
+    slot = -1
+    probes = 0
+    while probes <= mask:
+        k = keys[i]
+        if k == key:
+            slot = slots[i]
+            probes = mask
+        elif k == 0:
+            probes = mask
+        i = (i + 1) & mask
+        probes += 1
+    return slot
+
+
+@QuickLaunch
+@ti.kernel
+def insert_blocks(keys: I64, first: ti.i32, count: ti.i32, first_slot: ti.i32, map_keys: I64, map_slots: I32):
+    """Give `keys[first + i]` the slot `first_slot + i`. Serial; the caller keeps the table half empty and
+    the keys distinct and new."""
+    mask = map_keys.shape[0] - 1
+    ti.loop_config(serialize=True)
+    for n in range(count):
+        i = hash_key(keys[first + n]) & mask
+        probes = 0
+        while map_keys[i] != 0 and probes <= mask:
+            i = (i + 1) & mask
+            probes += 1
+        map_keys[i] = keys[first + n]
+        map_slots[i] = first_slot + n
+
+
+@QuickLaunch
+@ti.kernel
+def find_blocks(keys: I64, map_keys: I64, map_slots: I32, slots: I32):
+    """Slots of block keys, -1 where absent."""
+    mask = map_keys.shape[0] - 1
+    for i in range(keys.shape[0]):
+        slots[i] = map_find(map_keys, map_slots, mask, keys[i])
+
+
+@QuickLaunch
+@ti.kernel
+def find_places(keys: I64, map_keys: I64, places: I32):
+    """Places of blocks in the hash, where they are in it. Serial, as `insert_blocks`."""
+    mask = map_keys.shape[0] - 1
+    ti.loop_config(serialize=True)
+    for n in range(keys.shape[0]):
+        i = hash_key(keys[n]) & mask
+        probes = 0
+        while map_keys[i] != keys[n] and probes <= mask:
+            i = (i + 1) & mask
+            probes += 1
+        places[n] = i

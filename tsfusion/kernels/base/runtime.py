@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: MIT
+"""Taichi is started once, here, on the thread that will launch kernels."""
+
+import ctypes
+import os
+import stat
+import tempfile
+import textwrap
+from contextlib import redirect_stdout, suppress
+from functools import cache
+from io import StringIO
+from threading import get_ident
+from types import SimpleNamespace
+
+from tsfusion.core import process
+from tsfusion.core.errors import MapError, MissingDependency
+
+_GRID = 2048  # blocks of 128 threads of a device's task: of four times as many, most only end: 5 µs each task
+
+_started_threads: int | None = None
+_FORKED = -1  # the thread stayed in the parent
+_thread: int | None = None  # the one that kernels run in; None = no one yet
+
+
+def check_thread() -> None:
+    """Raise MapError in another thread than the one that started Taichi, and in a process forked from it.
+
+    Taichi asks at a kernel's first launch at most. Two threads would write to one map at the same time; in a
+    forked process the threads of kernels are missing, and a launch waits for them for ever.
+    """
+    if get_ident() == _thread or _thread is None:
+        return
+    if _thread == _FORKED:
+        raise MapError(
+            "maps cannot be used in a process forked from one that has used some: begin it anew "
+            '(multiprocessing.get_context("spawn")), or fork before the first Volume'
+        )
+    raise MapError(
+        "maps and synthetic recordings belong to the first thread of a process that used some, and this is "
+        "another thread: call them there alone (keyframes can come through a queue.Queue), or have a process "
+        "for them (tsfusion serve, tsfusion.Client)"
+    )
+
+
+def _leave_thread() -> None:
+    """Note in a forked process that it lacks the threads of kernels, for which Taichi waits at its end."""
+    global _thread  # noqa: PLW0603  as below
+    if _thread is not None:
+        from taichi.lang import impl
+
+        _thread = _FORKED
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(impl.get_runtime().prog))  # so that it has no end
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_leave_thread)
+
+
+def start(threads: int | None = None) -> None:
+    """Start Taichi's CPU backend, once a process.
+
+    The thread count of the first call stands: a second `ti.init` would tear kernels down. Results never
+    depend on it.
+
+    Raises:
+        MissingDependency: where taichi has no wheel (Linux aarch64, Intel Macs).
+        MapError: in another thread than before, or in a forked process (`check_thread`).
+    """
+    global _started_threads, _thread  # noqa: PLW0603  the process-wide state: Taichi itself is global
+    from tsfusion.kernels import taichi as ti  # says what to do where there is none
+
+    check_thread()
+    if _started_threads is None:
+        _thread = get_ident()
+        _leave_out_source_lines()
+        _started_threads = threads or len(process.cores())
+        kept_in()
+        # `ti.init` starts the threads of kernels last, and prints; a program may be reading our stdout
+        with process.cores_of_their_own(_started_threads), redirect_stdout(StringIO()):
+            ti.init(
+                arch=ti.cpu,
+                cpu_max_num_threads=_started_threads,
+                fast_math=False,  # a reassociated float would make two kernels disagree
+                cfg_optimization=False,  # LLVM does the same, and Taichi's took three quarters of compiling
+                offline_cache=True,
+                log_level=ti.ERROR,
+            )
+
+
+def start_device(arch: str) -> None:
+    """Start Taichi on a device instead, once a process: `cuda`, `vulkan` or `metal`.
+
+    Raises:
+        MissingDependency: where this machine, or Taichi's build for it, has no such device, or the device
+            lacks what the map is made of.
+    """
+    from tsfusion.kernels import taichi as ti
+
+    _leave_out_source_lines()
+    kept_in()
+    with redirect_stdout(StringIO()):
+        ti.init(
+            arch=getattr(ti, arch), fast_math=False, cfg_optimization=arch == "cuda", offline_cache=True,
+            log_level=ti.ERROR, saturating_grid_dim=_GRID,
+        )  # fmt: skip
+    if ti.cfg.arch != getattr(ti, arch):
+        raise MissingDependency("Taichi finds no such device, or no driver of one")
+    from tsfusion.kernels.base import device_check
+
+    try:
+        is_exact = device_check.is_exact()
+    except RuntimeError as error:
+        raise MissingDependency(f"the device cannot run the kernels ({first_line(error)})") from error
+    if not is_exact:
+        raise MissingDependency("the device does not add 64-bit integers and round 64-bit floats exactly")
+
+
+@cache
+def kept_in() -> tuple[str, str]:
+    """The folder of compiled kernels, and why it is not the usual one; empty = it is.
+
+    Taichi makes the folder when a process ends, and where it cannot, that end is a segmentation fault.
+    """
+    from taichi.lang import impl
+
+    usual = os.environ.get("TI_OFFLINE_CACHE_FILE_PATH") or impl.default_cfg().offline_cache_file_path
+    try:
+        os.makedirs(usual, exist_ok=True)
+    except OSError as error:
+        other = f"{tempfile.gettempdir()}/tsfusion-kernels-{os.getuid()}"
+        with suppress(OSError):
+            os.mkdir(other, 0o700)
+        found = os.lstat(other)
+        if found.st_uid != os.getuid() or found.st_mode != stat.S_IFDIR | 0o700:  # what runs is read there
+            other = tempfile.mkdtemp(prefix="tsfusion-kernels-")
+        os.environ["TI_OFFLINE_CACHE_FILE_PATH"] = other  # an argument of `ti.init` would be warned of
+        return other, f"{usual} cannot be made: {error.strerror}"
+    return usual, ""
+
+
+def first_line(error: BaseException) -> str:
+    """First line of an error of Taichi; the rest is where in Taichi it arose."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return lines[0] if lines else type(error).__name__
+
+
+def _leave_out_source_lines() -> None:
+    """Keep Taichi from formatting the source position of every statement of every kernel.
+
+    Only compile errors show these positions. Formatting them took a third of the time in which kernels load
+    from the cache. Nor are a function's lines looked up and wrapped anew wherever it is called: a twelfth.
+    """
+    with suppress(
+        ImportError, AttributeError
+    ):  # another version of Taichi: it loads kernels as slowly as before
+        from taichi.lang import kernel_impl
+        from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
+
+        ASTTransformerContext.get_pos_info = lambda _context, _node: ""
+        kernel_impl.getsourcelines = cache(kernel_impl.getsourcelines)
+        kernel_impl.textwrap = SimpleNamespace(fill=lambda line, **_: line.rstrip(), dedent=textwrap.dedent)
+
+
+def threads() -> int:
+    """Number of threads that kernels run on; 1 before `start`."""
+    return _started_threads or 1

@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: MIT
+"""Copies between a process's memory and a device's.
+
+Taichi 1.7 copies an array of NumPy that a kernel is handed into new memory of the device, and back, whoever
+writes to it: 0.15 ms for four numbers on a GPU of 2024. On CUDA the driver is asked instead.
+"""
+
+import ctypes
+import math
+import sys
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.kernels import ANY, I32x2
+from tsfusion.kernels import taichi as ti
+from tsfusion.kernels.base.quick_launch import Copied
+
+_ALIGNMENT = 256  # bytes
+_FIRST_BYTES = 1 << 20
+_SMALL_BYTES = 1 << 12
+_DTYPES = {ti.i32: np.dtype(np.int32), ti.i64: np.dtype(np.int64)}
+
+
+@ti.kernel
+def _read(source: ANY, out: ANY):
+    for i in range(out.shape[0]):
+        out[i] = source[i]
+
+
+@ti.kernel
+def _read_rows(source: I32x2, out: I32x2):
+    for i, j in ti.ndrange(out.shape[0], out.shape[1]):
+        out[i, j] = source[i, j]
+
+
+class Copies:
+    """By kernels of Taichi, on any device."""
+
+    def given(self, *arrays: NDArray[Any]) -> Sequence[Any]:
+        """Arguments for a kernel (`QuickLaunch`) that reads these arrays; valid until the next call."""
+        return arrays
+
+    def read(self, *wanted: tuple[Any, int]) -> list[NDArray[Any]]:
+        """The first items of Taichi's arrays of int32 or int64, valid until the next call.
+
+        Args:
+            wanted: arrays of one dimension or two, and how many numbers or rows of each.
+        """
+        found = []
+        for source, count in wanted:
+            out = np.empty((count, *source.shape[1:]), _DTYPES[source.dtype])
+            if count:
+                (_read_rows if out.ndim == 2 else _read)(source, out)
+            found.append(out)
+        return found
+
+    def finish(self) -> None:
+        """Wait until what was given is copied: from then on it may change. `read` waits, too."""
+
+    def pin(self, memory: NDArray[np.uint8]) -> None:
+        """Let this memory, instead of any before, be copied from faster, where the device can."""
+
+
+class CudaCopies(Copies):
+    """By CUDA's driver, in the order of Taichi's launches: both use the default stream.
+
+    Raises:
+        OSError: where there is no driver.
+    """
+
+    def __init__(self) -> None:
+        self._cuda = ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
+        self._program = ti.lang.impl.get_runtime().prog
+        self._there = self._room(_FIRST_BYTES)
+        self._here = self._pinned(_FIRST_BYTES)
+        self._registered: NDArray[np.uint8] | None = None
+
+    def given(self, *arrays: NDArray[Any]) -> Sequence[Any]:
+        begins = [0] * len(arrays)
+        end = small_end = 0
+        for i in sorted(range(len(arrays)), key=lambda i: arrays[i].nbytes):
+            begins[i] = _aligned(end)
+            end = begins[i] + arrays[i].nbytes
+            small_end = end if arrays[i].nbytes <= _SMALL_BYTES else small_end
+        if end > self._there.shape[0]:
+            self._there = self._room(2 * end)
+        first = self._address(self._there)
+        small = np.empty(small_end, np.uint8)  # which go together
+        for array, begin in zip(arrays, begins, strict=True):
+            if array.nbytes <= _SMALL_BYTES:
+                small[begin : begin + array.nbytes] = array.reshape(-1).view(np.uint8)
+            else:
+                self._call("cuMemcpyHtoDAsync_v2", _U64(first + begin), *_memory(array), None)
+        if small_end:
+            self._call("cuMemcpyHtoDAsync_v2", _U64(first), *_memory(small), None)
+        return [Copied(array, first + begin) for array, begin in zip(arrays, begins, strict=True)]
+
+    def read(self, *wanted: tuple[Any, int]) -> list[NDArray[Any]]:
+        found: list[NDArray[Any]] = []
+        end = 0
+        for source, count in wanted:
+            shape, dtype = (count, *source.shape[1:]), _DTYPES[source.dtype]
+            begin, nbytes = _aligned(end), math.prod(shape) * dtype.itemsize
+            end = begin + nbytes
+            if end > len(self._here):
+                self._here = self._pinned(2 * end)  # what was read into the other stays there
+            out = self._here[begin:end].view(dtype).reshape(shape)
+            if count:
+                address, size = _memory(out)
+                self._call("cuMemcpyDtoHAsync_v2", address, _U64(self._address(source)), size, None)
+            found.append(out)
+        self.finish()
+        return found
+
+    def finish(self) -> None:
+        self._call("cuStreamSynchronize", None)
+
+    def pin(self, memory: NDArray[np.uint8]) -> None:
+        if self._registered is not None:
+            self._cuda.cuMemHostUnregister(_memory(self._registered)[0])
+        failed = self._cuda.cuMemHostRegister_v2(*_memory(memory), 0)
+        self._registered = None if failed else memory  # it stays mapped until then
+
+    def _address(self, array: Any) -> int:
+        found: int = self._program.get_ndarray_data_ptr_as_int(array.arr)
+        return found
+
+    def _room(self, nbytes: int) -> Any:
+        return ti.ndarray(ti.u8, (nbytes,))
+
+    def _pinned(self, nbytes: int) -> NDArray[np.uint8]:
+        """Memory that is copied to faster; it is kept until the process ends."""
+        address = ctypes.c_void_p()
+        self._call("cuMemAllocHost_v2", ctypes.byref(address), _U64(nbytes))
+        return np.ctypeslib.as_array((ctypes.c_uint8 * nbytes).from_address(address.value or 0))
+
+    def _call(self, name: str, *arguments: Any) -> None:
+        """Call the driver.
+
+        Raises:
+            RuntimeError: it failed.
+        """
+        error = getattr(self._cuda, name)(*arguments)
+        if error:
+            raise RuntimeError(f"{name} of CUDA's driver failed with error {error}")
+
+
+_U64 = ctypes.c_uint64
+
+
+def _aligned(nbytes: int) -> int:
+    return -(-nbytes // _ALIGNMENT) * _ALIGNMENT
+
+
+def _memory(array: NDArray[Any]) -> tuple[Any, Any]:
+    """Address and size of an array."""
+    return ctypes.c_void_p(array.ctypes.data), _U64(array.nbytes)
+
+
+def copies() -> Copies:
+    """Copies to and from the device that Taichi was started on."""
+    if ti.lang.impl.current_cfg().arch == ti.cuda:
+        with suppress(OSError):
+            return CudaCopies()
+    return Copies()

@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: MIT
+"""The list of numbers that a launch on a device tells its host, `told`: (n,) int32."""
+
+import taichi as ti
+
+from tsfusion.kernels.base.voxel_traversal import BAND_FIELDS, DEFERRED
+from tsfusion.kernels.integration.integrate import TOUCHED_HEADER, TOUCHED_MISSING
+
+# `told` begins with the header of the touched blocks (`integrate`). It goes on with: how many new
+# blocks are blocks of the map now; how many missing ones have a place in the hash that no other one wants;
+# whether two of them are the same; the bands, of which the k-th also counts updates of every 64th ray; keys
+# of new blocks, in the order of their slots, two numbers each; slots of touched blocks.
+NEW, APART, ARE_SAME = (TOUCHED_HEADER + i for i in range(3))
+HEADER = 16
+BANDS = 64  # those of a map on the CPU: at their ends bundles of points end
+FEW_NEW = 4096  # blocks that a launch makes blocks of the map itself
+BANDS_AT = HEADER
+FRESH_AT = BANDS_AT + BANDS * BAND_FIELDS
+TOUCHED_AT = FRESH_AT + 2 * FEW_NEW
+FIRST_BLOCKS = 8192  # that a map has room for at first
+FIRST_HASH = 4 * FIRST_BLOCKS
+LACKING = DEFERRED  # of a band: updates of missing blocks
+
+CLAIMS = 1 << 14  # places of a table beside it: how many missing blocks want a place in the hash
+BEGINNERS = max(TOUCHED_AT, CLAIMS)
+
+
+@ti.func
+def band_field(band, field: ti.template()):
+    """Place of a band's field in `told`."""
+    return BANDS_AT + band * BAND_FIELDS + field
+
+
+@ti.func
+def begin_keyframe(i, told: ti.template(), claims: ti.template()):
+    """The i-th of `BEGINNERS` threads empties what is told of the keyframe before."""
+    if i < TOUCHED_AT:
+        told[i] = 0
+    if i < CLAIMS:
+        claims[i] = 0
+
+
+@ti.func
+def joined(low, high):
+    """A key of its two numbers."""
+    return (ti.cast(high, ti.i64) << 32) | (ti.cast(low, ti.i64) & ti.i64(4294967295))
+
+
+@ti.func
+def fresh_key(told: ti.template(), rank):
+    """Key of a new block."""
+    return joined(told[FRESH_AT + 2 * rank], told[FRESH_AT + 2 * rank + 1])
+
+
+@ti.func
+def rank_of(told: ti.template(), key):
+    """The rank of a new block: those that share no place in the hash come first, each lot by its keys."""
+    rank = rank_within(told, key, 0, told[APART])
+    if rank < 0:
+        rank = rank_within(told, key, told[APART], told[TOUCHED_MISSING])
+    return rank
+
+
+@ti.func
+def rank_within(told: ti.template(), key, first, end):
+    """The rank of a new block that is among those of a run of ranks; else −1."""
+    low, high = first, end
+    while high - low > 1:
+        middle = (low + high) >> 1
+        if fresh_key(told, middle) <= key:
+            low = middle
+        else:
+            high = middle
+    found = -1
+    if first < end:
+        found = ti.select(fresh_key(told, low) == key, low, -1)
+    return found

@@ -1,0 +1,447 @@
+# SPDX-License-Identifier: MIT
+"""Additive integer integration: rays → the map's sums.
+
+A voxel's sum is one int64, (Σ w·m) · 2²⁷ + Σ w: m = signed distance along the ray in sixtieths of a voxel,
+|m| ≤ 1023, which is beyond the widest band there can be. Voxels before the band, where the sensor looks
+through, get half the weight, and at most the support for m.
+Colour is (Σ R) · 2⁴⁰ + (Σ G) · 2¹⁶ + n in an int64 and Σ B in an int32, one vote a ray, in the voxel where
+it ends. In maps that count hits a ray without a colour is counted there instead, in an int32.
+Addition modulo 2⁶⁴ is a group: any order gives the same bytes, and subtracting restores them.
+"""
+
+import taichi as ti
+
+from tsfusion.kernels import I32, I64, U8, I32x2, I64x2
+from tsfusion.kernels.base.block_hash import map_find, set_insert
+from tsfusion.kernels.base.quick_launch import QuickLaunch
+from tsfusion.kernels.base.run_loop import runs, unit_of
+from tsfusion.kernels.base.voxel_traversal import (
+    ADDED,
+    COUNT,
+    DEFERRED,
+    NEVER,
+    SHARED,
+    START,
+    UNIT,
+    UPDATES,
+    WEIGHT_COLOR,
+    pack,
+    parts_of,
+    ray_weight,
+    voxel_of,
+)
+from tsfusion.kernels.integration.block_windows import (
+    UNKNOWN,
+    WINDOW_BITS,
+    WINDOW_BLOCKS,
+    WINDOW_SCRATCH,
+    WINDOWS,
+    open_window,
+)
+from tsfusion.kernels.integration.rays_abreast import (
+    ABREAST,
+    BAND,
+    BLOCK_AT,
+    COLORED,
+    DISTANCE_AT,
+    FREE,
+    LIST,
+    MET,
+    NOBODY,
+    ODD,
+    RAY,
+    RAY_LENGTH,
+    STRETCH,
+    UNCOLORED,
+    VOXELS,
+    WALKS,
+    WINDOW_AT,
+    begin,
+    measure,
+    walk,
+    window_of,
+)
+
+WEIGHT_BITS = 27
+WEIGHT_MASK = (1 << WEIGHT_BITS) - 1
+WEIGHT_LIMIT = 1 << 26  # half of what the lane holds: going over, or below none, shows before it can carry
+QUANTA_PER_VOXEL = 60
+MAX_DISTANCE = 1023  # quanta: the widest half-width, 16 voxels, and one to spare
+FREE_SHIFT = 1  # a vote for free space before the band is half of one for a surface
+COLOR_LIMIT = 1 << 15  # votes after which a voxel's colour is settled and takes no more
+CUBE = 512
+CHANGED = 255  # a block is dirty for all that follow its changes: a bit each
+
+# `touched`: how many blocks, whether more are missing than may be, whether a colour was taken away that was
+# not there, how many blocks are missing, and then the slots of the touched ones
+TOUCHED_COUNT, TOUCHED_OVERFLOW, TOUCHED_MISMATCH, TOUCHED_MISSING, TOUCHED_HEADER = 0, 1, 2, 3, 4
+
+# Which rays of a band are added: all of them, those that cross blocks which were missing, or those that were
+# added before it showed that too many blocks are missing (to take them away again).
+ALL, ONLY_DEFERRED, ONLY_ADDED = 0, 1, 2
+LATER, OTHERS = 0, 1  # rays that are added `again`: to blocks that are missing, to blocks of other units
+
+# Why nothing is added to a block: the map lacks it, another unit adds to it, its turn is in another call; or
+# it is not known yet. All are negative, and have a bit each among those that are zero in places of blocks.
+ABSENT, OF_ANOTHER, LEFT_OUT = (bit - (1 << 31) for bit in (1, 2, 4))
+BITS = 15
+
+COLORS_AT = WINDOW_SCRATCH
+LISTED_COLORS = 512  # votes, one int64: the voxel's place above the colour
+LISTED_UPDATES = 2 * STRETCH  # in an array of the function: one of 512 numbers takes 0.2 s to compile
+UNIT_SCRATCH = COLORS_AT + LISTED_COLORS  # int64 of a unit: its windows, votes for colours
+
+# What a launch does, `job`: which rays of which bands, on how many units, sign, slots from which on, how many
+# blocks may be missing, number of the keyframe, what a ray leaves in the voxel where it ends (`NO_VOTE` …)
+WHICH, FIRST_BAND, LAST_BAND, UNITS, SIGN, OLDEST, MOST_MISSING, STAMP, VOTE = range(9)
+NO_VOTE, COLOR_VOTE, HIT_VOTE = 0, 1, 2  # a hit is counted in the layer that is handed in place of Σ B
+
+
+@ti.func
+def lane_weight(packed):
+    """Σ w of a voxel's sum."""
+    return ti.cast(packed & WEIGHT_MASK, ti.i32)
+
+
+@ti.func
+def lane_distance(packed):
+    """Σ w·m of a voxel's sum."""
+    return packed >> WEIGHT_BITS
+
+
+@ti.func
+def quantize(distance):
+    """Distance in 2⁻¹⁶ voxel → quanta."""
+    return ti.min((distance * QUANTA_PER_VOXEL + 32768) >> 16, MAX_DISTANCE)
+
+
+@ti.func
+def free_bounds(half, support):
+    """Least and greatest distance that is told to a voxel before the band of this half-width, quanta: its
+    own, up to the support; where the band is as wide as that, no other."""
+    most = quantize(support)
+    return ti.select(half < support, 0, most), most
+
+
+@ti.func
+def claim(
+    slot, mark, stamp, owners: ti.template(), stamps: ti.template(), places: ti.template(),
+    dirty: ti.template(), touched: ti.template(),
+):  # fmt: skip
+    """Whether a block is the unit's whose `mark` this is: the one that comes to it first, and lists it.
+
+    A unit asks for its own mark alone, which nobody else writes.
+    """
+    is_own = ti.cast(owners[slot] == mark, ti.i32)
+    if is_own == 0 and stamps[slot] != stamp:
+        if ti.atomic_max(stamps[slot], stamp) != stamp:
+            is_own = 1
+            owners[slot] = mark
+            place = ti.atomic_add(touched[TOUCHED_COUNT], 1)
+            touched[TOUCHED_HEADER + place] = slot
+            places[slot] = place
+            dirty[slot] = ti.u8(CHANGED)
+    return is_own
+
+
+@ti.func
+def note_missing(key, missing: ti.template(), most_missing, touched: ti.template()):
+    """Put the key of a block that the map does not have into the set, while there are not too many."""
+    if touched[TOUCHED_OVERFLOW] == 0:
+        grown, full = set_insert(missing, missing.shape[0] - 1, key)
+        if grown == 1:
+            full |= ti.cast(ti.atomic_add(touched[TOUCHED_MISSING], 1) >= most_missing, ti.i32)
+        if full == 1:
+            touched[TOUCHED_OVERFLOW] = 1
+
+
+@ti.func
+def enter_block(
+    key, oldest, mark, stamp, most_missing, hash_keys: ti.template(), hash_slots: ti.template(),
+    missing: ti.template(), owners: ti.template(), stamps: ti.template(), places: ti.template(),
+    dirty: ti.template(), touched: ti.template(), of_others: ti.template(),
+):  # fmt: skip
+    """Place of a block's first voxel in the layers; or why nothing is added to it."""
+    slot = map_find(hash_keys, hash_slots, hash_keys.shape[0] - 1, key)
+    first = ABSENT
+    if slot < 0:
+        if ti.static(not of_others):
+            note_missing(key, missing, most_missing, touched)
+    elif slot < oldest:
+        first = LEFT_OUT
+    elif ti.static(of_others):
+        first = ti.select(owners[slot] == mark, LEFT_OUT, slot * CUBE)
+    elif claim(slot, mark, stamp, owners, stamps, places, dirty, touched) == 1:
+        first = slot * CUBE
+    else:
+        first = OF_ANOTHER
+    return first
+
+
+@ti.func
+def add(lanes: ti.template(), at, amount, atomically: ti.template()):
+    """Add to a lane; returns what it was."""
+    before = lanes[at]
+    if ti.static(atomically):
+        before = ti.atomic_add(lanes[at], amount)
+    else:
+        lanes[at] = before + amount
+    return before
+
+
+@ti.func
+def vote_color(
+    listed, kind, sign_, color_rgn: ti.template(), color_b: ti.template(), touched: ti.template(),
+    atomically: ti.template(),
+):  # fmt: skip
+    """Add a listed vote for a colour, or a hit.
+
+    A count just below 2¹⁶ has gone below none. A settled colour stays, whatever is added or taken away: it is
+    no longer a sum. Hits may go below none: a map of an earlier version has not counted those that it took.
+    """
+    at, packed = ti.cast(listed >> 32, ti.i32), ti.cast(listed, ti.i32)
+    votes = COLOR_LIMIT
+    if kind == HIT_VOTE:
+        add(color_b, at, sign_, atomically)
+    else:
+        votes = ti.cast(color_rgn[at] & 65535, ti.i32)
+    if votes < COLOR_LIMIT or votes >= COLOR_LIMIT + (COLOR_LIMIT >> 1):
+        red = ti.cast((packed >> 16) & 255, ti.i64)
+        green = ti.cast((packed >> 8) & 255, ti.i64)
+        before = add(color_rgn, at, sign_ * ((red << 40) + (green << 16) + 1), atomically)
+        add(color_b, at, sign_ * (packed & 255), atomically)
+        if sign_ < 0 and (before & 65535) == 0:
+            touched[TOUCHED_MISMATCH] = 1
+
+
+@ti.func
+def add_votes(
+    scratch: ti.template(), base, colors: ti.template(), kind, sign_, color_rgn: ti.template(),
+    color_b: ti.template(), touched: ti.template(), atomically: ti.template(),
+):  # fmt: skip
+    """Add the listed votes for colours, and empty their list, which ends at `colors`."""
+    for i in range(base + COLORS_AT, colors):
+        vote_color(scratch[i], kind, sign_, color_rgn, color_b, touched, atomically)
+    colors = base + COLORS_AT
+
+
+@ti.func
+def list_updates(
+    walks: ti.template(), k, listed: ti.template(), weight_color, support, sign_, scratch: ti.template(),
+    base, colors: ti.template(), voxels: ti.template(), amounts: ti.template(), count: ti.template(), oldest,
+    mark, stamp, most_missing, hash_keys: ti.template(), hash_slots: ti.template(), missing: ti.template(),
+    owners: ti.template(), stamps: ti.template(), places: ti.template(), dirty: ti.template(),
+    touched: ti.template(), of_others: ti.template(),
+):  # fmt: skip
+    """List the voxels of the ray at place `k` in its stretch, after `count` others, and what each is given.
+
+    The ray's vote for a colour is listed, too. Returns the bits of what the ray crosses (`ABSENT` …).
+    """
+    weight = (weight_color >> 24) & 255
+    vote, free_vote = sign_ * weight, sign_ * ti.max(weight >> FREE_SHIFT, 1)
+    half = walks[RAY_LENGTH + k] - ((walks[RAY_LENGTH + k] + walks[BAND + k]) >> 1)
+    least, most = free_bounds(half, support)
+    before, uncolored = walks[FREE + k], walks[UNCOLORED + k]
+    number = walks[ODD + k]
+    window = window_of(walks, k, number)
+    blocks = open_window(window, scratch, base)
+    met = 0
+    n = ti.min(walks[VOXELS + k], STRETCH)
+    i = 0
+    while i < n:
+        place = listed[i * ABREAST + k]
+        if ((place >> WINDOW_AT) & 7) != number:
+            number = (place >> WINDOW_AT) & 7
+            window = window_of(walks, k, number)
+            blocks = open_window(window, scratch, base)
+        b = (place >> BLOCK_AT) & (WINDOW_BLOCKS - 1)
+        first = ti.cast(scratch[blocks + b], ti.i32)
+        if first < 0:
+            if first == UNKNOWN:
+                block = (window << (WINDOW_BITS - 3)) + voxel_of(b)
+                first = enter_block(
+                    pack(block[0], block[1], block[2]), oldest, mark, stamp, most_missing, hash_keys,
+                    hash_slots, missing, owners, stamps, places, dirty, touched, of_others,
+                )  # fmt: skip
+                scratch[blocks + b] = first
+            met |= ti.select(first < 0, first, 0)
+        if first >= 0:
+            at = first + (place & (CUBE - 1))
+            m, w = place >> DISTANCE_AT, vote
+            if i < before:
+                m, w = ti.min(ti.max(m, least), most), free_vote
+            # both sums in one addition; their quotient minimises Σ w (x − m)²: paper eq. 2
+            voxels[count], amounts[count] = at, (ti.cast(m * w, ti.i64) << WEIGHT_BITS) + w
+            count += 1
+            if i == uncolored:
+                scratch[colors] = (ti.cast(at, ti.i64) << 32) | (weight_color & 0xFFFFFF)
+                colors += 1
+        i += 1
+    return met
+
+
+@ti.func
+def add_updates(
+    voxels: ti.template(), amounts: ti.template(), count: ti.template(), sums: ti.template(),
+    atomically: ti.template(),
+):  # fmt: skip
+    """Add what is listed, and empty the list.
+
+    A loop so short that a processor waits for dozens of voxels' memory at once, not for ten: of a LiDAR's
+    rays, whose voxels are in no cache, it takes a third of the time.
+    """
+    for i in range(count):
+        add(sums, voxels[i], amounts[i], atomically)
+    count = 0
+
+
+@ti.func
+def add_bands(
+    unit, rays: ti.template(), bands: ti.template(), again: ti.template(), job: ti.template(),
+    hash_keys: ti.template(), hash_slots: ti.template(), missing: ti.template(), scratch: ti.template(),
+    owners: ti.template(), stamps: ti.template(), places: ti.template(), dirty: ti.template(),
+    touched: ti.template(), sums: ti.template(), color_rgn: ti.template(), color_b: ti.template(),
+    of_others: ti.template(),
+):  # fmt: skip
+    """Add the rays of a unit's bands to its own blocks; or a share of those that cross blocks `of_others` to
+    these: whoever came first to a block that two units share has it, so that one unit may have them all."""
+    which, stamp = job[WHICH], job[STAMP]
+    sign_, oldest, most_missing, kind = job[SIGN], job[OLDEST], job[MOST_MISSING], job[VOTE]
+    has_color = ti.min(kind, COLOR_VOTE)
+    base, owner = unit * UNIT_SCRATCH, -1
+    mark = (ti.cast(stamp, ti.i64) << 32) | unit
+    walks, listed = ti.Vector([0] * WALKS), ti.Vector([0] * LIST)
+    voxels, amounts = ti.Vector([0] * LISTED_UPDATES), ti.Vector([0] * LISTED_UPDATES, dt=ti.i64)
+    for k in range(ABREAST):
+        walks[RAY + k], walks[FREE + k], walks[UNCOLORED + k] = NOBODY, 0, NEVER
+    colors, updates, carves = base + COLORS_AT, 0, 0
+    for band in range(job[FIRST_BAND], job[LAST_BAND]):
+        if ti.static(of_others) or bands[band, UNIT] == unit:
+            start, count, added = bands[band, START], bands[band, COUNT], 0
+            n = 0
+            if which == ONLY_DEFERRED:
+                count, added = bands[band, DEFERRED], bands[band, UPDATES]
+            if which == ONLY_ADDED:
+                count = bands[band, ADDED]
+            if ti.static(of_others):
+                n = unit * bands[band, SHARED] // job[UNITS]
+                count, added = (unit + 1) * bands[band, SHARED] // job[UNITS], 0
+            if bands[band, UNIT] != owner:
+                owner = bands[band, UNIT]
+                mark = (ti.cast(stamp, ti.i64) << 32) | owner
+                for i in range(WINDOWS):
+                    scratch[base + i] = 0
+            deferred, shared, walking = 0, 0, 0
+            while n < count or walking > 0:
+                for k in range(ABREAST):
+                    while walks[RAY + k] == NOBODY and n < count:
+                        r = start + n
+                        n += 1
+                        if ti.static(of_others):
+                            r = again[OTHERS, r]
+                        elif which == ONLY_DEFERRED:
+                            r = again[LATER, r]
+                        if ray_weight(rays, r) > 0:
+                            begin(rays, r, QUANTA_PER_VOXEL, has_color, walks, k)
+                            walking += 1
+                            carves |= ti.cast(walks[BAND + k] > 0, ti.i32)
+                longest = measure(walks, carves, has_color)
+                walk(walks, ti.min(longest, STRETCH), listed, listed, False)
+                if colors > base + UNIT_SCRATCH - ABREAST:
+                    add_votes(scratch, base, colors, kind, sign_, color_rgn, color_b, touched, of_others)
+                for k in range(ABREAST):
+                    r = walks[RAY + k]
+                    if r != NOBODY:
+                        added -= updates
+                        walks[MET + k] |= list_updates(
+                            walks, k, listed, rays[r, WEIGHT_COLOR], parts_of(rays, r)[2], sign_,
+                            scratch, base, colors, voxels, amounts, updates, oldest, mark, stamp,
+                            most_missing, hash_keys, hash_slots, missing, owners, stamps, places,
+                            dirty, touched, of_others,
+                        )  # fmt: skip
+                        added += updates
+                        if updates > LISTED_UPDATES - STRETCH:
+                            add_updates(voxels, amounts, updates, sums, of_others)
+                        if walks[UNCOLORED + k] < STRETCH:
+                            walks[COLORED + k] = NEVER
+                        if walks[VOXELS + k] <= STRETCH:
+                            walks[RAY + k] = NOBODY
+                            walking -= 1
+                            if ti.static(not of_others):
+                                if (walks[MET + k] & BITS & OF_ANOTHER) != 0:
+                                    again[OTHERS, start + shared] = r
+                                    shared += 1
+                                if (walks[MET + k] & BITS & ABSENT) != 0:
+                                    again[LATER, start + deferred] = r
+                                    deferred += 1
+                                    if which == ALL and touched[TOUCHED_OVERFLOW] == 1:
+                                        count = n
+            if ti.static(of_others):
+                ti.atomic_add(bands[band, UPDATES], added)
+            else:
+                bands[band, UPDATES], bands[band, SHARED] = added, shared
+                if which == ALL:
+                    bands[band, DEFERRED], bands[band, ADDED] = deferred, n
+    add_updates(voxels, amounts, updates, sums, of_others)
+    add_votes(scratch, base, colors, kind, sign_, color_rgn, color_b, touched, of_others)
+
+
+@QuickLaunch
+@ti.kernel
+def add_rays(
+    rays: I32x2, bands: I32x2, again: I32x2, job: I32, hash_keys: I64, hash_slots: I32, missing: I64,
+    scratch: I64, owners: I64, stamps: I32, places: I32, dirty: U8, touched: I32, sums: I64, color_rgn: I64,
+    color_b: I32,
+):  # fmt: skip
+    """Add to every voxel that each ray crosses in its band, in blocks of slot ≥ `OLDEST`.
+
+    Rays that cross blocks the map does not have are listed in `again`, the keys in `missing`; when those
+    blocks exist, a second call with `ONLY_DEFERRED` and `OLDEST` = the first new slot adds the rest. With
+    more than `MOST_MISSING` of them every band ends after the ray that it is at: `ONLY_ADDED` are those.
+
+    Units run at the same time, each through its own bands. A block is of the unit that comes to it first and
+    adds to it alone, without atomics. Rays that cross blocks of other units are listed, too, for
+    `add_shared_rays`. The layers are flat: slot · 512 + offset.
+    """
+    for run in range(runs(job[UNITS])):  # run loop: kernels/base/run_loop.py
+        unit = unit_of(run, job[UNITS])
+        if unit < job[UNITS]:
+            add_bands(
+                unit, rays, bands, again, job, hash_keys, hash_slots, missing, scratch, owners, stamps,
+                places, dirty, touched, sums, color_rgn, color_b, False,
+            )  # fmt: skip
+
+
+@QuickLaunch
+@ti.kernel
+def add_shared_rays(
+    rays: I32x2, bands: I32x2, again: I32x2, job: I32, hash_keys: I64, hash_slots: I32, missing: I64,
+    scratch: I64, owners: I64, stamps: I32, places: I32, dirty: U8, touched: I32, sums: I64, color_rgn: I64,
+    color_b: I32,
+):  # fmt: skip
+    """Add the rays that cross blocks of other units to these, with atomics: after `add_rays`, same arguments.
+
+    A kernel of its own, because one thread need not wait until it is compiled.
+    """
+    for run in range(runs(job[UNITS])):  # run loop: kernels/base/run_loop.py
+        unit = unit_of(run, job[UNITS])
+        if unit < job[UNITS]:
+            add_bands(
+                unit, rays, bands, again, job, hash_keys, hash_slots, missing, scratch, owners, stamps,
+                places, dirty, touched, sums, color_rgn, color_b, True,
+            )  # fmt: skip
+
+
+@QuickLaunch
+@ti.kernel
+def largest_weights(sums: I64x2, touched: I32, bounds: I32):
+    """`bounds[slot]` = the largest weight lane in each touched block."""
+    count = touched[TOUCHED_COUNT]
+    for run in range(runs(count)):  # run loop: kernels/base/run_loop.py
+        n = unit_of(run, count)
+        if n < count:
+            slot = touched[TOUCHED_HEADER + n]
+            most = 0
+            for v in range(CUBE):
+                most = ti.max(most, lane_weight(sums[slot, v]))
+            bounds[slot] = most

@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: MIT
+"""Eight rays that walk side by side, so that a step of all of them is a few vector instructions.
+
+A stretch is up to 64 voxels of each. Its first pass walks and lists voxels: arithmetic without a branch, on
+arrays of the function, which no store to an argument may change: so the rays become lanes of vectors. Whoever
+uses the stretch goes through the list, ray by ray.
+"""
+
+import taichi as ti
+
+from tsfusion.kernels.base.voxel_traversal import (
+    CROSSING,
+    DISTANCE,
+    END,
+    INTERVAL,
+    LOSS,
+    NEVER,
+    VOXEL,
+    parts_of,
+    ray_vector,
+    steps,
+    vec3i,
+)
+from tsfusion.kernels.integration.block_windows import WINDOW_BITS
+
+ABREAST = 8
+STRETCH = 1 << WINDOW_BITS  # voxels: a ray leaves its window at most once an axis
+LIST = ABREAST * STRETCH
+
+# Where a ray is in its window, 21 bits: number of the voxel in the block, 64 x + 8 y + z, that of the block
+# in the window, likewise, and of each axis whether the window's number is odd: seven bits an axis, in three
+# places. A listed voxel has above it, 11 bits, the distance to the surface, quanta.
+BLOCK_AT, WINDOW_AT, DISTANCE_AT = 9, 18, 21
+ONE = (1 << 6, 1 << 3, 1)  # a step towards +x, +y, +z adds that
+ALL_BITS = tuple(
+    (7 * ONE[a] << BLOCK_AT) + 7 * ONE[a] + (4 >> a << WINDOW_AT) for a in range(3)
+)  # of an axis
+MOST_LISTED = 1023  # quanta
+
+# Numbers of the rays that walk, `walks`: field + place. Three fields an axis: where along the band the ray
+# crosses it next, the interval, what a step adds to `AT` and to `OFF`, number of the window. `AT`: where in
+# the window; `OFF`: distance to the surface, 2⁻¹⁶ quantum; `ODD`: bits of the window in `WINDOW`.
+NEXT, EVERY, STEP, TURN, WINDOW = (axis * ABREAST for axis in (0, 3, 6, 9, 12))
+AT, OFF, ODD, RAY_LENGTH, BAND, COLORED, RAY, MET, VOXELS, FREE, UNCOLORED = (
+    field * ABREAST for field in range(15, 26)
+)
+WALKS = 26 * ABREAST
+NOBODY = -1  # instead of a ray
+HALF_A_QUANTUM = 1 << 15  # of `OFF`, whose upper bits are rounded so
+
+
+@ti.func
+def begin(rays: ti.template(), r, per_voxel: ti.template(), colors, walks: ti.template(), k):
+    """Let ray `r` begin at place `k`; `per_voxel`: units of `OFF` for one of the ray's distance."""
+    length, end, _ = parts_of(rays, r)
+    voxel, towards = ray_vector(rays, r, VOXEL), steps(rays[r, END])
+    at = 0
+    for a in ti.static(range(3)):
+        walks[NEXT + a * ABREAST + k] = rays[r, CROSSING + a]
+        walks[EVERY + a * ABREAST + k] = rays[r, INTERVAL + a]
+        walks[STEP + a * ABREAST + k] = ti.select(towards[a] > 0, ONE[a], ALL_BITS[a])
+        walks[TURN + a * ABREAST + k] = -rays[r, LOSS + a] * per_voxel
+        walks[WINDOW + a * ABREAST + k] = voxel[a] >> WINDOW_BITS
+        at += ONE[a] * ((voxel[a] & 7) + ((voxel[a] & 56) << (BLOCK_AT - 3)))
+    walks[AT + k] = at
+    walks[ODD + k] = 0
+    walks[OFF + k] = rays[r, DISTANCE] * per_voxel + HALF_A_QUANTUM
+    walks[RAY_LENGTH + k] = length
+    walks[BAND + k] = end - (length - end)
+    walks[COLORED + k] = ti.select(colors == 1 and end + 1 != length, end + 1, NEVER)
+    walks[RAY + k] = r
+    walks[MET + k] = 0
+
+
+@ti.func
+def crossed_before(walks: ti.template(), k, until):
+    """How many voxels the ray at place `k` leaves before it is `until` along its band."""
+    n = 0
+    for a in ti.static(range(3)):
+        gap = until - 1 - walks[NEXT + a * ABREAST + k]
+        # exact: a quotient of such integers is an integer, or further from one than float64 rounds
+        times = ti.cast(ti.cast(gap, ti.f64) / ti.cast(walks[EVERY + a * ABREAST + k], ti.f64), ti.i32) + 1
+        n += ti.select(gap >= 0, times, 0)
+    return n
+
+
+@ti.func
+def measure(walks: ti.template(), carves, colors):
+    """Count the voxels that each ray has before it: all, those in free space, those before the one
+    that takes the colour. Returns the largest number of all."""
+    for k in range(ABREAST):
+        n = crossed_before(walks, k, walks[RAY_LENGTH + k]) + 1
+        walks[VOXELS + k] = ti.select(walks[RAY + k] != NOBODY, n, 0)
+        here = walks[AT + k] >> WINDOW_AT
+        for a in ti.static(range(3)):
+            walks[WINDOW + a * ABREAST + k] += beyond(walks, k, here, a)
+        walks[ODD + k] = here
+    if carves == 1:
+        for k in range(ABREAST):
+            walks[FREE + k] = crossed_before(walks, k, walks[BAND + k])
+    if colors == 1:
+        for k in range(ABREAST):
+            walks[UNCOLORED + k] = crossed_before(walks, k, walks[COLORED + k])
+    longest = 0
+    for k in range(ABREAST):
+        longest = ti.max(longest, walks[VOXELS + k])
+    return longest
+
+
+@ti.func
+def beyond(walks: ti.template(), k, here, a: ti.template()):
+    """By how much the number of the window `here` (its odd bits) differs on an axis from that in `walks`."""
+    changed = ((here ^ walks[ODD + k]) >> (2 - a)) & 1
+    return ti.select(walks[STEP + a * ABREAST + k] == ALL_BITS[a], -changed, changed)
+
+
+@ti.func
+def window_of(walks: ti.template(), k, here):
+    """The window whose odd bits are `here`, of those that the ray at place `k` comes to in the stretch."""
+    window = vec3i(walks[WINDOW + k], walks[WINDOW + ABREAST + k], walks[WINDOW + 2 * ABREAST + k])
+    for a in ti.static(range(3)):
+        window[a] += beyond(walks, k, here, a)
+    return window
+
+
+@ti.func
+def walk(
+    walks: ti.template(), count, listed: ti.template(), distances: ti.template(), exactly: ti.template()
+):
+    """List `count` voxels of each ray, the first of all rays, then the second. Behind a ray's end stands
+    anything. `exactly`: put the distances as `OFF` has them into `distances`, too."""
+    for i in range(count):
+        for k in range(ABREAST):
+            at, off = walks[AT + k], walks[OFF + k]
+            x, y, z = walks[NEXT + k], walks[NEXT + ABREAST + k], walks[NEXT + 2 * ABREAST + k]
+            # the axis that is crossed next, the first of equals
+            is_x, is_y = (x <= y) & (x <= z), y <= z
+            walks[NEXT + k] = x + ti.select(is_x, walks[EVERY + k], 0)
+            walks[NEXT + ABREAST + k] = y + ti.select(is_x, 0, ti.select(is_y, walks[EVERY + ABREAST + k], 0))
+            walks[NEXT + 2 * ABREAST + k] = z + ti.select(is_x | is_y, 0, walks[EVERY + 2 * ABREAST + k])
+            step = ti.select(is_y, walks[STEP + ABREAST + k], walks[STEP + 2 * ABREAST + k])
+            turn = ti.select(is_y, walks[TURN + ABREAST + k], walks[TURN + 2 * ABREAST + k])
+            bits = ti.select(is_x, ALL_BITS[0], ti.select(is_y, ALL_BITS[1], ALL_BITS[2]))
+            # ones between the axis' bits carry from one to the next
+            stepped = (at | ~bits) + ti.select(is_x, walks[STEP + k], step)
+            walks[AT + k] = (stepped & bits) | (at & ~bits)
+            walks[OFF + k] = off + ti.select(is_x, walks[TURN + k], turn)
+            if ti.static(exactly):
+                distances[i * ABREAST + k] = off
+            m = ti.min(ti.max(off >> 16, -MOST_LISTED), MOST_LISTED)
+            listed[i * ABREAST + k] = (m << DISTANCE_AT) | at

@@ -1,0 +1,237 @@
+# SPDX-License-Identifier: MIT
+"""Marching cubes: vertices and triangles of the cells that `surface_cells.py` found. Every vertex belongs to
+one voxel edge and exists once, whichever block's cells use it: no cracks, no duplicates.
+
+Vertices are numbered by block, x, axis of their edge, y, z. A vertex's number is then its plane's start and
+the number of bits before its own.
+"""
+
+import taichi as ti
+
+from tsfusion.kernels import I32, I64, F32x2, I32x2, I64x2, U8x2, U64x2
+from tsfusion.kernels.base.quick_launch import QuickLaunch
+from tsfusion.kernels.base.run_loop import runs, unit_of
+from tsfusion.kernels.base.voxel_traversal import unpack, vec3i
+from tsfusion.kernels.surface.surface_cells import case_of, corner_planes, lowest
+from tsfusion.kernels.surface.voxel_values import BANDS
+
+PAD = 11  # a block with one voxel before and two behind
+PADDED = PAD * PAD * PAD
+GREY = 160
+
+vec3f = ti.types.vector(3, ti.f32)
+
+
+@ti.func
+def neighbour_of(p):
+    """Number of the block, of the 27 around (13 = itself), that holds the voxel at block-relative p."""
+    return ((p[0] >> 3) + 1) * 9 + ((p[1] >> 3) + 1) * 3 + (p[2] >> 3) + 1
+
+
+@ti.func
+def gather(r, count, first, last, around: ti.template(), values: ti.template(), padded: ti.template(), band):
+    """Copy a block's values with their border to `padded[band]`, for first ≤ x < last; NaN where unseen."""
+    for x in range(first, last):
+        for y in range(-1, 10):
+            to = ((x + 1) * PAD + y + 1) * PAD + 1
+            o = ((x & 7) << 6) | ((y & 7) << 3)
+            k = ((x >> 3) + 1) * 9 + ((y >> 3) + 1) * 3 + 1
+            below = around[r, k - 1]
+            middle = around[r, k]
+            above = around[r, k + 1]
+            padded[band, to - 1] = ti.math.nan
+            if below < count:
+                padded[band, to - 1] = values[below, o + 7]
+            run = ti.Vector([ti.math.nan] * 8)
+            if middle < count:
+                for z in ti.static(range(8)):
+                    run[z] = values[middle, o + z]
+            for z in ti.static(range(8)):
+                padded[band, to + z] = run[z]
+            padded[band, to + 8] = ti.math.nan
+            padded[band, to + 9] = ti.math.nan
+            if above < count:
+                padded[band, to + 8] = values[above, o]
+                padded[band, to + 9] = values[above, o + 1]
+
+
+@ti.func
+def slope(padded: ti.template(), band, i, step):
+    """Central difference, one-sided at the edge of what was seen."""
+    before = padded[band, i - step]
+    here = padded[band, i]
+    after = padded[band, i + step]
+    result = ti.f32(0.0)
+    if before == before and after == after:
+        result = 0.5 * (after - before)
+    elif after == after:
+        result = after - here
+    elif before == before:
+        result = here - before
+    return result
+
+
+@ti.func
+def normal_at(padded: ti.template(), band, i, axis, t):
+    """Unit gradient at the share t of the edge that starts at i."""
+    step = axis_step(axis)
+    normal = vec3f(0.0)
+    for a in ti.static(range(3)):
+        s = axis_step(a)
+        one = padded[band, i + s] - padded[band, i - s]
+        other = padded[band, i + step + s] - padded[band, i + step - s]
+        normal[a] = (1.0 - t) * one + t * other
+    length = normal.norm()
+    if not (length == length):  # something around is unseen
+        for a in ti.static(range(3)):
+            s = axis_step(a)
+            normal[a] = (1.0 - t) * slope(padded, band, i, s) + t * slope(padded, band, i + step, s)
+        length = normal.norm()
+    if not (length > 0.0):
+        length = 1.0
+        rising = padded[band, i + step] > padded[band, i]
+        for a in ti.static(range(3)):
+            normal[a] = ti.select(a == axis, ti.select(rising, 1.0, -1.0), 0.0)
+    return normal * (1.0 / length)
+
+
+@ti.func
+def axis_step(axis):
+    """How far apart neighbours along an axis are in `padded`."""
+    return ti.select(axis == 0, PAD * PAD, ti.select(axis == 1, PAD, 1))
+
+
+@ti.func
+def add_color(
+    slots: ti.template(), around: ti.template(), r, p, share, rgn: ti.template(), b: ti.template(), total
+):
+    """Add the mean colour at voxel p, weighted; the fourth element counts the weight."""
+    row = r
+    if ((p[0] | p[1] | p[2]) & ~7) != 0:
+        row = around[r, neighbour_of(p)]
+    slot = slots[row]
+    result = total
+    if slot >= 0:
+        o = ((p[0] & 7) << 6) | ((p[1] & 7) << 3) | (p[2] & 7)
+        packed = rgn[slot, o]
+        n = ti.cast(packed & 65535, ti.f32)
+        if n > 0.0:
+            red = ti.cast((packed >> 40) & 16777215, ti.f32)
+            green = ti.cast((packed >> 16) & 16777215, ti.f32)
+            blue = ti.cast(b[slot, o], ti.f32)
+            result += share * ti.Vector([red / n, green / n, blue / n, 1.0])
+    return result
+
+
+@ti.func
+def color_at(
+    slots: ti.template(), around: ti.template(), r, p, axis, t, rgn: ti.template(), b: ti.template()
+):
+    """Colour at the share t of voxel p's edge along `axis`, rounded."""
+    q = p
+    for a in ti.static(range(3)):
+        q[a] += ti.cast(a == axis, ti.i32)
+    total = ti.Vector([0.0, 0.0, 0.0, 0.0])
+    total = add_color(slots, around, r, p, 1.0 - t, rgn, b, total)
+    total = add_color(slots, around, r, q, t, rgn, b, total)
+    if total[3] == 0.0:  # the surface moved off the voxels that rays ended in
+        for n in range(27):
+            near = p + vec3i(n // 9 - 1, n // 3 % 3 - 1, n % 3 - 1)
+            total = add_color(slots, around, r, near, 1.0, rgn, b, total)
+    shade = vec3f(GREY)
+    if total[3] > 0.0:
+        for a in ti.static(range(3)):
+            shade[a] = total[a] / total[3]
+    return shade + 0.5
+
+
+@QuickLaunch
+@ti.kernel
+def emit_vertices(
+    count: ti.i32, keys: I64, around: I32x2, values: F32x2, edges: U64x2, first: I32x2, padded: F32x2,
+    voxel_size: ti.f64, slots: I32, color_rgn: I64x2, color_b: I32x2, has_color: ti.i32, positions: F32x2,
+    normals: F32x2, colors: U8x2,
+):  # fmt: skip
+    """Position, unit normal and colour of every vertex: where the value crosses zero along its edge."""
+    for run in range(runs(BANDS)):  # run loop: kernels/base/run_loop.py
+        band = unit_of(run, BANDS)
+        if band < BANDS:
+            for r in range(count * band // BANDS, count * (band + 1) // BANDS):
+                if first[r, 0] < first[r + 1, 0]:
+                    low = 8
+                    high = 0
+                    for x in range(8):
+                        if (edges[r, 3 * x] | edges[r, 3 * x + 1] | edges[r, 3 * x + 2]) != 0:
+                            low = ti.min(low, x)
+                            high = x
+                    gather(r, count, low - 1, high + 3, around, values, padded, band)
+                    corner = unpack(keys[r]) * 8
+                    vertex = first[r, 0]
+                    for plane in range(3 * low, 3 * high + 3):
+                        left = edges[r, plane]
+                        axis = plane % 3
+                        while left != 0:
+                            j = lowest(left)
+                            left &= left - ti.u64(1)
+                            p = vec3i(plane // 3, j >> 3, j & 7)
+                            i = ((p[0] + 1) * PAD + p[1] + 1) * PAD + p[2] + 1
+                            here = padded[band, i]
+                            there = padded[band, i + axis_step(axis)]
+                            # kept off the voxel centres, where several edges' vertices would fall together
+                            t = ti.min(ti.max(here / (here - there), 0.001), 0.999)
+                            normal = normal_at(padded, band, i, axis, t)
+                            for a in ti.static(range(3)):
+                                along = ti.select(a == axis, ti.cast(t, ti.f64), ti.f64(0.0))
+                                position = ti.cast(corner[a] + p[a], ti.f64) + 0.5 + along
+                                positions[vertex, a] = ti.cast(position * voxel_size, ti.f32)
+                                normals[vertex, a] = normal[a]
+                            if has_color == 1:
+                                color = color_at(slots, around, r, p, axis, t, color_rgn, color_b)
+                                for a in ti.static(range(3)):
+                                    colors[vertex, a] = ti.cast(color[a], ti.u8)
+                            vertex += 1
+
+
+@ti.func
+def vertex_on(edges: ti.template(), starts: ti.template(), first: ti.template(), row, plane, j):
+    """Number of the vertex on the edge of voxel j of a plane."""
+    before = edges[row, plane] & ((ti.u64(1) << ti.cast(j, ti.u64)) - ti.u64(1))
+    return first[row, 0] + starts[row, plane] + ti.cast(ti.math.popcnt(before), ti.i32)
+
+
+@QuickLaunch
+@ti.kernel
+def emit_faces(
+    count: ti.i32, around: I32x2, inside: U64x2, active: U64x2, edges: U64x2, starts: I32x2, first: I32x2,
+    triangle_count: I32, triangle_starts: I32x2, faces: I32x2,
+):  # fmt: skip
+    """Triangles of each cell, as the numbers of the vertices on its edges."""
+    for run in range(runs(BANDS)):  # run loop: kernels/base/run_loop.py
+        band = unit_of(run, BANDS)
+        if band < BANDS:
+            for r in range(count * band // BANDS, count * (band + 1) // BANDS):
+                face = first[r, 1]
+                if face < first[r + 1, 1]:
+                    low = corner_planes(inside, around, r, 0)
+                    for x in range(8):
+                        high = corner_planes(inside, around, r, x + 1)
+                        left = active[r, x]
+                        while left != 0:
+                            j = lowest(left)
+                            left &= left - ti.u64(1)
+                            case = case_of(low, high, j)
+                            for n in range(triangle_count[case]):
+                                corners = vec3i(0)
+                                for k in ti.static(range(3)):
+                                    e = triangle_starts[case, 3 * n + k]
+                                    q = vec3i(x + (e & 1), (j >> 3) + (e >> 1 & 1), (j & 7) + (e >> 2 & 1))
+                                    owner = r
+                                    if ((q[0] | q[1] | q[2]) & 8) != 0:
+                                        owner = around[r, neighbour_of(q)]
+                                    plane = 3 * (q[0] & 7) + (e >> 3)
+                                    voxel = ((q[1] & 7) << 3) | (q[2] & 7)
+                                    corners[k] = vertex_on(edges, starts, first, owner, plane, voxel)
+                                for k in ti.static(range(3)):
+                                    faces[face, k] = corners[k]
+                                face += 1
+                        low = high

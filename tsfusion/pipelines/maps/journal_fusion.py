@@ -1,0 +1,205 @@
+# SPDX-License-Identifier: MIT
+"""Maps made of a journal: all of it, up to a time, as one scanner saw it, elsewhere, or painted by origin."""
+
+from collections import Counter
+from collections.abc import Callable, Collection
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core.config import VIEW_SETTINGS, VolumeConfig, override
+from tsfusion.core.errors import DecodeError, InvalidKeyframe, JournalError, MapError
+from tsfusion.core.readable_numbers import OnProgress
+from tsfusion.geometry import color_scales
+from tsfusion.geometry.keyframe import Keyframe
+from tsfusion.journal import journaled_keyframes, state_folder
+from tsfusion.journal.journaled_keyframes import LOST, FinalKeyframe, JournaledKeyframes, JournaledSession
+from tsfusion.pipelines.maps import saved_maps
+from tsfusion.tsdf.files import checkpoint
+from tsfusion.tsdf.volume import Volume
+
+ColorBy = Literal["client", "session"]
+FusionProgress = Callable[[int, int, int], None]  # keyframes read, in the map, of how many
+
+
+class Painter:
+    """Colours of keyframes by their origin, instead of what the cameras saw.
+
+    Where several saw a surface their colours are mixed by their votes.
+
+    Args:
+        by: client = by the name of its key, or by session where there are no keys.
+    """
+
+    def __init__(self, by: ColorBy) -> None:
+        self._by = by
+        self._counts: Counter[str] = Counter()
+
+    def __call__(self, found: FinalKeyframe) -> Keyframe:
+        """The keyframe with the colour of its origin."""
+        name = self._name(found.session)
+        self._counts[name] += 1
+        keyframe = found.keyframe
+        bgr = color_scales.of_number(list(self._counts).index(name))[::-1]
+        return replace(keyframe, color=np.full((*keyframe.shape, 3), bgr, np.uint8))
+
+    @property
+    def legend(self) -> list[dict[str, Any]]:
+        """`name`, `color` as #rrggbb and `keyframes` of each origin, in the order in which they came."""
+        return [
+            {"name": name, "color": color_scales.as_hex(color_scales.of_number(index)), "keyframes": count}
+            for index, (name, count) in enumerate(self._counts.items())
+        ]
+
+    def _name(self, session: JournaledSession) -> str:
+        return session.name if self._by == "client" else session.key.hex()[:8]
+
+
+class JournalMap(msgspec.Struct):
+    """A map that was made of a journal.
+
+    Attributes:
+        volume: the map.
+        left_out: reason → number of keyframes that it could not take.
+        legend: of its colours, as `Painter` gives it; empty = the cameras'.
+        missing: number of keyframes of the saved map that the journal does not have.
+        lost: number of keyframes that damage in the journal has cost this map, at least.
+    """
+
+    volume: Volume
+    left_out: dict[str, int]
+    legend: list[dict[str, Any]] = []
+    missing: int = 0
+    lost: int = 0
+
+
+def fuse(
+    keyframes: JournaledKeyframes,
+    volume: Volume,
+    *,
+    T_map_journal: NDArray[np.float64] | None = None,
+    sensor: str | None = None,
+    paint: Painter | None = None,
+    watch: FusionProgress = lambda _read, _fused, _all: None,
+) -> JournalMap:
+    """Add the keyframes of a journal, each at its final pose, to a map.
+
+    One that the map cannot take is counted and left out, as in the server.
+
+    Args:
+        T_map_journal: (4, 4) where the journal's frame lies in the map's; None = they are the same.
+        sensor: of keyframes that name none; None = the map's own.
+        paint: gives each its colour.
+
+    Raises:
+        JournalError: when a keyframe cannot be read any more.
+    """
+    left_out = Counter(keyframes.unreadable)
+    for index in range(len(keyframes)):
+        try:
+            found = keyframes[index]
+            keyframe = found.keyframe if paint is None else paint(found)
+            if T_map_journal is not None:
+                keyframe = replace(keyframe, T_world_camera=T_map_journal @ keyframe.T_world_camera)
+            if sensor is not None and keyframe.sensor is None:
+                keyframe = replace(keyframe, sensor=sensor)
+            volume.integrate(keyframe)
+        except (MapError, DecodeError, InvalidKeyframe) as error:
+            left_out[str(error)] += 1
+        watch(index + 1, volume.keyframes, len(keyframes))
+    return JournalMap(volume, dict(left_out), [] if paint is None else paint.legend)
+
+
+def choose(
+    source: Path, *, until: str | None = None, only: Collection[str] = (), watch: OnProgress = lambda *_: None
+) -> JournaledKeyframes:
+    """The keyframes of a journal that a person names.
+
+    Args:
+        source: what `state_folder.find_journal` takes.
+        until: a time, as `journaled_keyframes.moment_ns` reads it: also later corrections are left out.
+        only: sessions or clients, as `journaled_keyframes.sessions_named` reads them; empty = all.
+
+    Raises:
+        InvalidConfig, JournalError: for a time or a name that is none, or when it leaves nothing.
+    """
+    place = state_folder.find_journal(source)
+    last_ns = journaled_keyframes.last_logged_ns(place)
+    until_ns = None if until is None else journaled_keyframes.moment_ns(until, last_ns)
+    found = JournaledKeyframes(place, until_ns=until_ns, watch=watch)
+    if only:
+        clients = {key: one.client for key, one in found.sessions.items()}
+        if clients:
+            found.keep_only(
+                {key for name in only for key in journaled_keyframes.sessions_named(name, clients)}
+            )
+    if not len(found) and (only or until is not None):
+        begins = JournaledKeyframes(place).sessions.values()
+        first = journaled_keyframes.clock(min((one.first_ns for one in begins), default=last_ns))
+        raise JournalError(
+            f"the selection leaves no keyframe of {place.path}, which has records from {first} to "
+            f"{journaled_keyframes.clock(last_ns)}"
+        )
+    return found
+
+
+def map_of(
+    source: Path,
+    config: VolumeConfig,
+    *,
+    given: bool = False,
+    until: str | None = None,
+    only: Collection[str] = (),
+    color_by: ColorBy | None = None,
+    memory_for: Callable[[Path | None], int | None] = lambda _saved: None,
+    reading: OnProgress = lambda _done, _all: None,
+    watch: FusionProgress = lambda _read, _fused, _all: None,
+) -> JournalMap:
+    """The map of a state folder or a journal.
+
+    The saved one, with all that the journal holds, where that is what is asked for; otherwise the keyframes
+    of the journal fused anew, with the settings of the saved one.
+
+    Args:
+        given: fuse anew with the settings of `config`. Otherwise only those of how the surface is read and
+            its threads count, and all where there is no saved map.
+        memory_for: gives `memory_bytes` of `Volume` for a saved map's file, or for a new map (None).
+
+    Raises:
+        InvalidConfig, JournalError, CheckpointError: as `choose`, `saved_maps.check_journal` and
+            `Volume.load`.
+    """
+    view = {name: getattr(config, name) for name in VIEW_SETTINGS}
+    saved = source / state_folder.MAP_FILE
+    is_view = bool(only) or until is not None or color_by is not None
+    if saved.is_file() and not given and not is_view and _is_of_server(saved):
+        there = saved_maps.SavedMap(saved, source)
+        settled = saved_maps.opened(there, lambda done, total: watch(done, done, total), reading)
+        with settled as (file, left_out):
+            volume = Volume.load(file, config.threads, memory_bytes=memory_for(file), **view)
+            lost = left_out.pop(LOST, 0)
+            return JournalMap(volume, dict(left_out), lost=lost)
+    keyframes, missing = choose(source, until=until, only=only, watch=reading), 0
+    if saved.is_file():
+        if given and not is_view:
+            saved_maps.check_journal(saved, keyframes.recorded)
+        with checkpoint.reading(saved) as (header, _):
+            missing = saved_maps.missing(header, keyframes.recorded)
+            if not given:
+                config = override(msgspec.structs.replace(header.config, threads=config.threads), **view)
+    if color_by is not None:
+        config = override(config, color=True)
+    volume = Volume(config, memory_bytes=memory_for(None))
+    made = fuse(keyframes, volume, paint=None if color_by is None else Painter(color_by), watch=watch)
+    made.missing, made.lost = missing, keyframes.lost
+    return made
+
+
+def _is_of_server(saved: Path) -> bool:
+    """True if a map says how far it is with the journal beside it; one that was put there does not."""
+    with checkpoint.reading(saved) as (header, _):
+        return "done" in header.meta

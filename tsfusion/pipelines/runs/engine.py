@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: MIT
+"""Steps that replay and scan share: the pace of sending, the wait for the map, and progress.
+
+A replay has its poses already and sends every keyframe; a scan finds poses and chooses among frames. From the
+client on they are the same: each hands keyframes to the clients of one `Target` and asks this engine when the
+next one may go and when all of them are in the map.
+"""
+
+import logging
+import time
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from typing import Protocol
+
+from tsfusion.client import Client, ClientStats
+from tsfusion.core.errors import FlushTimeout, KeyframeRefused, TransportError
+from tsfusion.pipelines.runs.target_server import Target
+from tsfusion.scanner.scanner import ScanState
+
+AHEAD = 3  # keyframes of a recording under way: fusing, waiting, travelling
+# Seconds without progress before a run that needs the map gives up: a server restarts a stuck fuser after 60.
+STALL_TIMEOUT = 120.0
+_PATIENCE = 5.0  # seconds without progress before the reason is logged
+LINGER = 10.0  # seconds without progress before what a distant server does not take is left in the spool
+_STAMPS_TIMEOUT = 5.0  # seconds for a distant server to say when it fused the last ones: for the figures only
+_POLL = 0.01  # seconds
+
+log = logging.getLogger(__name__)
+
+STARTING = "starting a server (the first start compiles kernels)"
+
+
+class Progress(Protocol):
+    """Shows a person how far a run is."""
+
+    def stage(self, text: str) -> None:
+        """Announce the next part of the run."""
+
+    def update(
+        self, total: int | None, stats: ClientStats, *, link: str = "", scan: ScanState | None = None
+    ) -> None:
+        """Show the counts; called often.
+
+        Args:
+            total: frames of the source, without `scan` keyframes; None = nobody knows.
+            stats: of all clients together.
+            link: why the server takes no keyframes at the moment; empty = it does.
+            scan: of a scan: the sensor and its frames.
+        """
+
+
+class Engine:
+    """Watches keyframes on their way into the maps of a target.
+
+    Args:
+        target: where they go.
+        observe: shows how far the run is, and returns the counts of all its clients together.
+        problem: why the server takes nothing at the moment; empty = it does.
+    """
+
+    def __init__(
+        self, target: Target, observe: Callable[[], ClientStats], problem: Callable[[], str] = str
+    ) -> None:
+        self._target, self._observe, self._problem = target, observe, problem
+
+    def check(self) -> ClientStats:
+        """Show how far the run is; raise TransportError when its own server has ended."""
+        self._target.check()
+        return self._observe()
+
+    def wait_until(self, due: float, ended: Callable[[], bool] = bool) -> None:
+        """Wait for a moment of `time.monotonic`, or until the run is `ended`."""
+        self.check()
+        while time.monotonic() < due and not ended():
+            time.sleep(_POLL)
+            self.check()
+
+    def wait_turn(self, ahead: int = AHEAD) -> None:
+        """Wait until fewer than `ahead` keyframes are under way; raise TransportError when nothing moves."""
+        self._wait_map(lambda stats: stats.sent - stats.settled < ahead)
+
+    def wait_fused(self) -> None:
+        """Wait until each keyframe is in the map or turned away; raise TransportError when nothing moves."""
+        self._wait_map(lambda stats: not stats.waiting and stats.settled >= stats.sent)
+
+    def wait_settled(self, clients: Iterable[Client]) -> None:
+        """Wait until each keyframe is at its newest pose; raise TransportError when nothing moves."""
+        for client in clients:
+            self._wait_map(lambda _, client=client: client.is_settled)  # type: ignore[misc]
+
+    def wait_meshed(self, clients: Iterable[Client]) -> None:
+        """Wait until meshes show every keyframe: the last stamp of the ledger, which may be missing."""
+        for client in clients:
+            with suppress(FlushTimeout):
+                client.wait_meshed()
+
+    def wait_acknowledged(self, clients: Iterable[Client]) -> None:
+        """Wait until the server has every keyframe on its disk, or takes none any more."""
+        clients = [client for client in clients if not client.is_of_other_world]
+        if self._wait(lambda _: not any(client.stats.waiting for client in clients), LINGER):
+            for client in clients:
+                # Corrections and stamps are no reason to lose a scan; what was refused is counted.
+                with suppress(FlushTimeout, KeyframeRefused):
+                    client.flush()
+                    client.wait_fused(_STAMPS_TIMEOUT)
+
+    def _wait_map(self, reached: Callable[[ClientStats], bool]) -> None:
+        if not self._wait(reached, STALL_TIMEOUT):
+            raise TransportError(
+                f"the server has fused nothing for {STALL_TIMEOUT:.0f} s, and keyframes wait: "
+                + (self._problem() or "`tsfusion status` says how a server is")
+            )
+
+    def _wait(self, reached: Callable[[ClientStats], bool], timeout: float) -> bool:
+        """Wait for `reached`. Returns False if nothing has moved for `timeout` seconds. Logs why, once."""
+        last, moved, logged = (-1, -1, -1), time.monotonic(), False
+        while True:
+            stats = self.check()
+            if reached(stats):
+                return True
+            now = (stats.waiting, stats.durable + stats.settled, stats.corrections_waiting)
+            if now != last:
+                last, moved, logged = now, time.monotonic(), False
+            elif time.monotonic() - moved > timeout:
+                return False
+            elif not logged and time.monotonic() - moved > _PATIENCE and (why := self._problem()):
+                log.warning("nothing moves: %s; waiting for at most %.0f s", why, timeout)
+                logged = True
+            time.sleep(_POLL)

@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: MIT
+"""The files that every whole run leaves: meshes with their pictures, the latency ledger, `run.json`."""
+
+import dataclasses
+import logging
+import os
+from importlib.util import find_spec
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.client import ClientStats
+from tsfusion.core.output_folder import RECORD
+from tsfusion.datasets.dataset import NOMINAL_NS
+from tsfusion.datasets.trajectory_files import write_tum
+from tsfusion.geometry import up_direction
+from tsfusion.geometry.mesh import Mesh
+from tsfusion.geometry.mesh_arrays import Provenance
+from tsfusion.geometry.up_direction import HeldSensor, Up
+from tsfusion.journal.state_folder import check_no_map_of_a_server
+from tsfusion.pipelines.maps import mesh_finishing
+from tsfusion.pipelines.report import latency_ledger, shortfall
+from tsfusion.pipelines.runs.target_server import Target
+from tsfusion.wire.messages.health import Status
+from tsfusion.wire.messages.keyframe_times import KeyframeTimes
+
+MAP = "map.tsf"
+REPORT = "report.html"
+NO_SURFACE = "the map has no surface to write"
+MORE_SURFACE = (
+    "scan more of the scene, lower --min-weight, or raise --voxel-size where measurements are far apart "
+    "(0.1 to 0.2 suits a LiDAR)"
+)
+log = logging.getLogger(__name__)
+_MESH_FILES = (("mesh", ".ply"), ("mesh", ".glb"), ("preview", ".png"))
+
+
+def check_folder(out: str | os.PathLike[str] | None) -> None:
+    """Raise OutputError where a run's `map.tsf` would take the place of a server's."""
+    if out is not None:
+        check_no_map_of_a_server(Path(out).expanduser() / MAP)
+
+
+class WrittenMap(NamedTuple):
+    """A map whose files were written."""
+
+    status: Status
+    mesh: Mesh  # with its `up`
+    figures: dict[str, Any]  # of the mesh, and what was `left_out` of some files
+
+
+def write_map(
+    work: Path,
+    target: Target,
+    map_name: str,
+    held: HeldSensor,
+    *,
+    suffix: str = "",
+    world: str = "",
+    up: Up | None = None,
+    min_weight: float | None = None,
+    keep_islands: bool | None = None,
+) -> WrittenMap:
+    """Fetch a map's status and mesh; write `mesh.ply`, `mesh.glb` and `preview.png` unless it is empty.
+
+    Args:
+        held: how the sensor was held.
+        suffix: stands before the endings.
+        world: name of the coordinate frame of the poses; empty = that of poses given from elsewhere.
+        up: away from the ground, in the map's frame; None = it is found.
+        min_weight: full-confidence samples a voxel needs to be meshed; None = the sensor's.
+        keep_islands: see `mesh_finishing.write`.
+    """
+    status = target.status(map_name)
+    mesh = target.mesh(map_name, min_weight=min_weight)
+    left_out: dict[str, Any] = {}
+    if len(mesh.faces):
+        mesh = dataclasses.replace(
+            mesh,
+            known_up=up_direction.find(mesh, held, given=up),
+            provenance=_provenance(status, target, world),
+        )
+        files = [work / f"{name}{suffix}{ending}" for name, ending in _MESH_FILES]
+        left_out = mesh_finishing.write(mesh, files, keep_islands=keep_islands)
+    return WrittenMap(status, mesh, {**mesh.figures, "left_out": left_out})
+
+
+def _provenance(status: Status, target: Target, world: str) -> Provenance:
+    """Provenance of a run's meshes; without a hash where others may have changed the map since."""
+    is_own = target.child is not None
+    return Provenance(
+        source=f"map {status.map}",
+        keyframes=status.keyframes_fused,
+        map_hash=status.map_hash if is_own else None,
+        world=world,
+        voxel_size=status.config["volume"]["voxel_size"],
+    )
+
+
+def write_ledger(work: Path, records: list[KeyframeTimes]) -> None:
+    """Write `delay.csv`, and `delay.png` where matplotlib is installed."""
+    latency_ledger.write_csv(records, work / "delay.csv")
+    if find_spec("matplotlib") is not None:
+        latency_ledger.plot(records, work / "delay.png")
+
+
+def write_record(work: Path, summary: msgspec.Struct) -> None:
+    """Write `run.json`."""
+    text = msgspec.json.format(msgspec.json.encode(summary), indent=2)
+    (work / RECORD).write_bytes(text + b"\n")
+
+
+def write_keyframes(path: Path, stamps_ns: list[int], poses: list[NDArray[np.float64]]) -> None:
+    """Write the poses that keyframes were sent with, as `read_tum` reads them.
+
+    Where their times do not grow, as in a recording without times, they are made up.
+    """
+    if any(later <= earlier for earlier, later in pairwise(stamps_ns)):
+        stamps_ns = [(index + 1) * NOMINAL_NS for index in range(len(poses))]
+    write_tum(path, stamps_ns, poses)
+
+
+def write_report(work: Path, meshes: dict[str, Mesh]) -> None:
+    """Write `report.html` and its pictures. A failure of that is logged: it costs no results.
+
+    Args:
+        meshes: that were just written to `work`, by the name of their file.
+    """
+    from tsfusion.pipelines.report import run_report
+
+    try:
+        run_report.write(work, work / REPORT, meshes=meshes)
+    except Exception:
+        log.exception("the report could not be written; `tsfusion report` tries again")
+
+
+def no_surface(stats: ClientStats, rejection: str) -> str:
+    """The error of a run whose map has no triangles.
+
+    Args:
+        rejection: why the map did not take the first keyframe that it rejected; empty = it took all.
+    """
+    if lost := shortfall.of_disk(stats):
+        return f"{NO_SURFACE}: {lost}"
+    why = rejection if not stats.fused and rejection else MORE_SURFACE
+    return f"{NO_SURFACE}: {stats.fused} of {stats.sent} keyframes fused; {why}"

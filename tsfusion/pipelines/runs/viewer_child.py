@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: MIT
+"""A live page beside a run: `tsfusion view` as a child process, which can break nothing."""
+
+import json
+import logging
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+
+import msgspec
+
+from tsfusion.core import process
+from tsfusion.core.config import DEFAULT_MAP
+from tsfusion.pipelines.runs.target_server import Target
+from tsfusion.viewer.page.page_place import check_installed, listen, parse_place
+from tsfusion.wire.sockets import sockets
+from tsfusion.wire.sockets.curve import ClientKeys
+
+_COMMAND = (sys.executable, "-m", "tsfusion", "view", "--json", "--from-parent")
+_ANYWHERE = {"0.0.0.0": "127.0.0.1", "*": "127.0.0.1", "::": "::1"}  # how it is reached from here
+_WARNING = "tsfusion view: WARNING: "
+_END_SECONDS = 5.0
+_FOR_THE_VIEWER = ("TSFUSION_TOKEN", "TSFUSION_NO_BROWSER")
+
+log = logging.getLogger(__name__)
+
+
+class ViewerChild:
+    """A `tsfusion view` that ends with this process, however that ends.
+
+    Args:
+        place: HOST:PORT of the page.
+        tell: called in a thread with the page's address, once it can be opened.
+        truth: known surface of the map, as `tsfusion view --truth` takes it.
+
+    Raises:
+        MissingDependency: without viser.
+        InvalidConfig: for a bad place.
+        TransportError: when the port is taken.
+    """
+
+    def __init__(self, place: str, tell: Callable[[str], None], *, truth: str | None = None) -> None:
+        check_installed()
+        listen(*parse_place(place)).close()
+        self._place = place
+        self._truth = truth
+        self._tell = tell
+        self._process: subprocess.Popen[str] | None = None
+        self._reader = threading.Thread(target=self._follow, name="page", daemon=True)
+        self._is_ending = False
+
+    def start(
+        self,
+        address: str,
+        *,
+        control: str | None = None,
+        publish: str | None = None,
+        map_name: str = DEFAULT_MAP,
+        keys: ClientKeys | None = None,
+        again: str | None = None,
+    ) -> None:
+        """Show a map of the server that listens at `address`. What goes wrong is a warning, no error.
+
+        Args:
+            again: what `tsfusion view` shows when the run has ended; the page then says so.
+        """
+        given = {
+            "--control": control and _reached(control),
+            "--publish": publish and _reached(publish),
+            "--truth": self._truth,
+            "--map": map_name,
+            "--listen": self._place,
+            "--again": again,
+        }
+        flags = [f"{flag}={value}" for flag, value in given.items() if value is not None]
+        try:
+            self._process = subprocess.Popen(
+                [*_COMMAND, _reached(address), *flags],
+                stdin=subprocess.PIPE,  # closes when we die, however we die: it then ends by itself
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                text=True,
+                env=_environment(),
+                **process.OWN_GROUP,  # Ctrl-C is ours to handle
+            )
+            assert self._process.stdin is not None
+            self._process.stdin.write(json.dumps(keys and msgspec.to_builtins(keys)) + "\n")
+            self._process.stdin.flush()
+        except OSError as error:
+            log.warning("the page cannot be shown: %s; everything else goes on", error.strerror)
+        if self._process is not None:
+            self._reader.start()
+
+    def close(self) -> None:
+        """End the page."""
+        self._is_ending = True
+        if self._process is None:
+            return
+        self._process.terminate()
+        try:
+            self._process.wait(_END_SECONDS)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+        self._reader.join(_END_SECONDS)
+        with suppress(OSError), self._process:  # closes its pipes
+            pass
+
+    def _follow(self) -> None:
+        """Pass on what it says, until it ends."""
+        child, why = self._process, ""
+        assert child is not None
+        assert child.stdout is not None
+        for line in map(str.strip, child.stdout):
+            if line.startswith('{"url"'):
+                self._tell(json.loads(line)["url"])
+            elif line.startswith(_WARNING):
+                log.warning("page: %s", line.removeprefix(_WARNING))
+            elif line:  # the last one says why it ends
+                why = f": {line.removeprefix('tsfusion: ')}"
+        status = child.wait()
+        if not self._is_ending:
+            log.warning("the page has ended with status %d%s; everything else goes on", status, why)
+
+
+def _reached(address: str) -> str:
+    """The address to connect to, of one that is listened at."""
+    host, port = sockets.parse_address(address)
+    return sockets.format_address(_ANYWHERE.get(host, host), port)
+
+
+def _environment() -> dict[str, str]:
+    """Our environment, without the flags that are meant for the run."""
+    return {
+        name: value
+        for name, value in os.environ.items()
+        if not name.startswith("TSFUSION_") or name in _FOR_THE_VIEWER
+    }
+
+
+@contextmanager
+def showing(viewer: ViewerChild | None, target: Target, again: str) -> Iterator[None]:
+    """Show the map that a run sends to, until the end of the block; afterwards `again` has it."""
+    if viewer is None:
+        yield
+        return
+    link = target.link
+    try:
+        viewer.start(link.address, control=link.control, map_name=link.map, keys=target.keys, again=again)
+        yield
+    finally:
+        viewer.close()

@@ -1,0 +1,186 @@
+# SPDX-License-Identifier: MIT
+"""Saved maps as feeds of a page: a file, a run's folder, or a state folder with the times of its journals."""
+
+import os
+import socket
+import subprocess
+import sys
+import threading
+from collections import deque
+from contextlib import suppress
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core import process
+from tsfusion.core.errors import MapError
+from tsfusion.journal import state_folder
+from tsfusion.pipelines.shown.view_messages import Open, Opened, Seek, Told, Took, ViewFailed, Weigh, Weighed
+from tsfusion.viewer.map_feed import TimeLine
+from tsfusion.wire.asking.map_events import LinkSeen, MapEvent
+
+_ANSWER_S = 5.0  # that `weights` waits: a large map may be being read
+_END_S = 3.0
+_COMMAND = (sys.executable, "-m", "tsfusion.pipelines.shown.view_process")
+_GONE = "the process that reads the map has ended: was there memory enough? Start the page again"
+
+
+def open_feed(path: Path, *, map_name: str | None = None) -> "SavedMapFeed":
+    """The feed of a saved map.
+
+    Args:
+        path: `MAP.tsf`, the folder of a run, a state folder, or the folder of one of its maps.
+        map_name: of the map, where the state folder has several; None = `default`, else the first, of those
+            that have been saved.
+
+    Raises:
+        CheckpointError, JournalError: when there is no such map, or it cannot be read.
+    """
+    return SavedMapFeed(Path(path), map_name)
+
+
+class SavedMapFeed:
+    """A `MapFeed` of a saved map; a process of its own reads it. All but `events` from any thread."""
+
+    def __init__(self, path: Path, map_name: str | None) -> None:
+        self._path = path
+        self._changed = threading.Condition()
+        self._messages: deque[Opened | Told | ViewFailed] = deque()
+        self._awaited = set[int]()  # numbers of questions
+        self._weights: dict[int, NDArray[np.float32] | None] = {}
+        self._asked = self._number = 0
+        self._has_ended = False
+        self._sending = threading.Lock()
+        self._socket, self._process = _start()
+        self._link: Connection[object, Any] = Connection(os.dup(self._socket.fileno()))
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+        self.title = ""
+        self.time_line: TimeLine | None = None
+        try:
+            self._send(Open(0, path, map_name))
+            self._note_first()
+        except BaseException:
+            self.close()
+            raise
+
+    def _note_first(self) -> None:
+        with self._changed:
+            self._changed.wait_for(lambda: self._messages)
+            message = self._messages.popleft()
+        if isinstance(message, ViewFailed):
+            raise message.error
+        assert isinstance(message, Opened)
+        self._note(message)
+
+    def _note(self, message: Opened) -> None:
+        self.title = self._path.absolute().name
+        if state_folder.is_state_folder(self._path):
+            self.title += f", map {message.name}"
+        self.time_line = message.time_line
+
+    def maps(self) -> list[str]:
+        """See `MapFeed`."""
+        if state_folder.is_state_folder(self._path):
+            return state_folder.map_names(self._path)
+        return [self._path.absolute().stem]
+
+    def choose(self, map_name: str) -> None:
+        """See `MapFeed`; raises JournalError when the state folder has no such map."""
+        if state_folder.is_state_folder(self._path):
+            state_folder.resolve_map(self._path, map_name)
+            with self._changed:
+                self._number += 1
+                number = self._number
+            self._send(Open(number, self._path, map_name))
+
+    def seek(self, keyframes: int) -> None:
+        """See `MapFeed`."""
+        self._send(Seek(keyframes))
+
+    def events(self, timeout: float) -> list[MapEvent]:
+        """See `MapFeed`."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._messages, max(timeout, 0.0))
+            messages, self._messages = self._messages, deque()
+            number = self._number
+        found: list[MapEvent] = []
+        for message in messages:
+            if isinstance(message, Told):
+                self._send(Took(message.nbytes))
+            if message.number != number:
+                continue  # of a map that was shown before
+            if isinstance(message, Told):
+                found += message.events
+            elif isinstance(message, Opened):
+                self._note(message)
+            else:
+                found.append(LinkSeen(str(message.error)))
+        return found
+
+    def weights(self, points: NDArray[np.float32]) -> NDArray[np.float32] | None:
+        """See `MapFeed`; waits some seconds at most."""
+        with self._changed:
+            self._asked += 1
+            number = self._asked
+            self._awaited.add(number)
+        self._send(Weigh(number, np.ascontiguousarray(points, np.float32)))
+        with self._changed:
+            self._changed.wait_for(lambda: number in self._weights or self._has_ended, _ANSWER_S)
+            self._awaited.discard(number)
+            return self._weights.pop(number, None)
+
+    def close(self) -> None:
+        """See `MapFeed`."""
+        with suppress(OSError):  # it may have ended
+            self._socket.shutdown(socket.SHUT_RDWR)
+        try:
+            self._process.wait(_END_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._reader.join()
+        self._link.close()
+        self._socket.close()
+
+    def _send(self, message: object) -> None:
+        with self._sending, suppress(OSError):  # one that has ended says so once, among the events
+            self._link.send(message)
+
+    def _read(self) -> None:
+        """Take what the process sends, in a thread: it never waits for the page."""
+        try:
+            while True:
+                message = self._link.recv()
+                with self._changed:
+                    if not isinstance(message, Weighed):
+                        self._messages.append(message)
+                    elif message.number in self._awaited:
+                        self._weights[message.number] = message.weights
+                    self._changed.notify_all()
+        except (EOFError, OSError):
+            with self._changed:
+                self._has_ended = True
+                self._messages.append(ViewFailed(self._number, MapError(_GONE)))
+                self._changed.notify_all()
+
+
+def _start() -> tuple[socket.socket, "subprocess.Popen[bytes]"]:
+    """The process, and our end of its connection."""
+    ours, theirs = socket.socketpair()
+    with theirs:
+        try:
+            started = subprocess.Popen(
+                [*_COMMAND, str(theirs.fileno())],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                pass_fds=[theirs.fileno()],
+                **process.OWN_GROUP,
+            )
+        except BaseException:
+            ours.close()
+            raise
+    return ours, started

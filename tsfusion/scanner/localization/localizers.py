@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: MIT
+"""Choice and construction of the localizer that a scan's settings and its first frame ask for."""
+
+import logging
+
+from tsfusion.core.config import LocalizerName, ScanConfig
+from tsfusion.core.errors import InvalidConfig, MissingDependency
+from tsfusion.geometry.frame import Frame
+from tsfusion.scanner.localization.localizer import Localizer
+
+_DEFAULT_FOR_KIND: dict[str, LocalizerName] = {
+    "depth": "rgbd",
+    "disparity": "rgbd",
+    "pair": "stereo",
+    "points": "lidar",
+}
+
+_ACCEPTED_KINDS: dict[str, tuple[str, ...]] = {
+    "rgbd": ("depth", "disparity"),
+    "stereo": ("pair", "depth", "disparity"),
+    "lidar": ("points",),
+}
+_INPUT_NAMES = {"rgbd": "depth images", "stereo": "stereo pairs, or depth with an image", "lidar": "points"}
+_KIND_NAMES = {
+    "depth": "depth images",
+    "disparity": "disparity images",
+    "pair": "stereo pairs",
+    "points": "points",
+}
+
+log = logging.getLogger(__name__)
+
+
+def localizer_name(config: ScanConfig, first: Frame) -> LocalizerName:
+    """Name of the localizer: the setting's, or for `auto` the one that fits the first frame's kind."""
+    if config.localizer != "auto":
+        return config.localizer
+    if config.trajectory is not None:
+        return "trajectory"
+    if config.feed is not None:
+        return "feed"
+    return _DEFAULT_FOR_KIND[first.kind]
+
+
+def create_localizer(config: ScanConfig, first: Frame) -> Localizer:
+    """Construct the localizer that `localizer_name` names, with loop closure if it tracks by images.
+
+    Raises:
+        InvalidConfig: its file or address is missing, or it cannot track frames of this kind.
+        MissingDependency: its optional package is not installed.
+    """
+    name = localizer_name(config, first)
+    if first.kind not in _ACCEPTED_KINDS.get(name, (first.kind,)):
+        raise InvalidConfig(
+            f"the localizer {name} follows {_INPUT_NAMES[name]}, "
+            f"and this source gives {_KIND_NAMES[first.kind]}"
+        )
+    if name == "given":
+        from tsfusion.scanner.localization.given_poses import GivenPoses
+
+        return GivenPoses()
+    if name == "trajectory":
+        from tsfusion.scanner.localization.given_poses import TrajectoryFilePoses
+
+        return TrajectoryFilePoses(
+            _required(config.trajectory, "--trajectory FILE"),
+            max_gap_s=config.max_gap,
+            time_offset_s=config.time_offset,
+            origin=config.origin,
+        )
+    if name == "feed":
+        from tsfusion.scanner.localization.pose_feed.feed import PoseFeed
+
+        return PoseFeed(
+            _required(config.feed, "--feed ADDRESS"),
+            max_gap_s=config.max_gap,
+            time_offset_s=config.time_offset,
+        )
+    if name == "lidar":
+        from tsfusion.scanner.localization.lidar import LidarLocalizer
+
+        return LidarLocalizer()
+    return _with_loops(_tracker(name), wanted=config.loop_closure)
+
+
+def _required(value: str | None, flag: str) -> str:
+    if value is None:
+        raise InvalidConfig(f"this localizer needs {flag}")
+    return value
+
+
+def _tracker(name: LocalizerName) -> Localizer:
+    if name == "stereo":
+        from tsfusion.scanner.localization.stereo.stereo_tracker import StereoLocalizer
+
+        return StereoLocalizer()
+    from tsfusion.scanner.localization.rgbd.rgbd_tracker import RGBDLocalizer
+
+    return RGBDLocalizer()
+
+
+def _with_loops(tracker: Localizer, *, wanted: bool) -> Localizer:
+    if not wanted:
+        return tracker
+    from tsfusion.scanner.localization.loop_closure.loop_closing import LoopClosing
+
+    try:
+        return LoopClosing(tracker, beside=True)
+    except MissingDependency as error:
+        log.warning("no loop closure: %s", error)
+        return tracker

@@ -1,0 +1,219 @@
+# SPDX-License-Identifier: MIT
+"""RGB-D odometry: every frame against the last tracking keyframe, by corners and planes together."""
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.geometry import se3
+from tsfusion.geometry.frame import Frame
+from tsfusion.scanner.localization import features
+from tsfusion.scanner.localization.localizer import Localizer, Lost, TrackedPose
+from tsfusion.scanner.localization.rgbd import point_to_plane, pose_acceptance, pose_solver
+from tsfusion.scanner.localization.rgbd.rgbd_frame import RGBDFrame, TrackingKeyframe
+
+MAX_KEYFRAMES = 40  # tracking keyframes kept, about 0.3 MB each at 640×480
+KEYFRAME_DISTANCE, KEYFRAME_ANGLE = 0.1, np.radians(10)  # metres and radians to the next one
+KEYFRAME_OVERLAP = 0.6  # share of the last one's view, below which the next one begins
+MIN_PLANES = 0.03  # share of the depth image that must show planes
+MIN_INLIERS = 12  # corners
+PIXEL_TOLERANCE = 2.0  # pixels at 640 columns
+NEWEST_COMPARED, COMPARED = 4, 10  # keyframes whose ORB corners a lost frame is compared with: always, in all
+MAX_RECALLED = 4  # the most similar of them, from which the pose is sought
+MAX_EXTRAPOLATION = 3.0  # times the last interval between frames, over which the motion is thought to go on
+
+MAX_OLDER = 2  # keyframes that take part beside the last one
+MAX_OLDER_ANGLE = np.radians(60)
+MIN_OLDER_OVERLAP, MIN_OLDER_AGREEING = 0.5, 0.75  # shares
+COARSE_AGREEMENT = 0.03  # metres, beside three deviations: depth that agrees before the pose is settled
+# Corners lie on something that moves where they raise the misfit by more than this factor and offset.
+MISFIT_FACTOR, MISFIT_OFFSET = 1.2, 0.3  # the offset in deviations
+
+_NO_CORNERS = (np.empty((0, 3)), np.empty((0, 2), np.float32))
+
+
+@dataclass(frozen=True, eq=False)
+class _Attempt:
+    keyframe: TrackingKeyframe
+    T_keyframe_camera: se3.Transform
+    evidence: pose_acceptance.PoseEvidence
+
+
+class RGBDLocalizer(Localizer):
+    """`Localizer` of depth cameras, with colour where there is some.
+
+    Corners are followed from the tracking keyframe (Lucas and Kanade); the pose they give begins a
+    Gauss-Newton over their reprojection and the distances of the frame's points to the planes of that
+    keyframe and of the two oldest that see the same. Frames without an image go by depth alone. A pose is
+    accepted only where depth, image and geometry support it. A lost camera is sought near the last pose,
+    then by ORB corners of the last keyframes.
+    """
+
+    absolute = False
+
+    def __init__(self) -> None:
+        self._next = self._turn = 0
+        self._kept: deque[TrackingKeyframe] = deque(maxlen=MAX_KEYFRAMES)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the world: the next frame's camera is the origin of the new one."""
+        self._kept.clear()
+        self._last: se3.Transform = np.eye(4)
+        self._last_ns = self._interval_ns = 0
+        self._motion: se3.Transform | None = None  # between the last two frames; None = not known
+        self._is_lost = False
+
+    def track(self, frame: Frame) -> TrackedPose | Lost:
+        """Find the camera's pose.
+
+        Raises:
+            InvalidKeyframe: when the frame has no depth image.
+        """
+        current = RGBDFrame.of(frame)
+        if current.surface.covered < MIN_PLANES:
+            return self._lost(frame, f"{current.surface.covered:.1%} of the depth image shows a surface")
+        if not self._kept:
+            return self._start(frame, current, np.eye(4), 1.0)
+        reason: str | None = None
+        for keyframe, guess in self._guesses(frame, current):
+            found = self._attempt(current, keyframe, guess)
+            doubt = found.evidence.doubt(strict=self._is_lost)
+            if doubt is None:
+                return self._accept(frame, current, found)
+            reason = reason or doubt
+        return self._lost(frame, reason or "nothing known is in view")
+
+    def _guesses(self, frame: Frame, current: RGBDFrame) -> Iterator[tuple[TrackingKeyframe, se3.Transform]]:
+        """Keyframes and first guesses of T_keyframe_camera, the likeliest first.
+
+        After the last pose itself the camera counts as lost.
+        """
+        last = self._kept[-1]
+        T_keyframe_last = se3.inverse(last.T_world_camera) @ self._last
+        if self._motion is not None:
+            yield last, T_keyframe_last @ self._expected_motion(frame)
+        yield last, T_keyframe_last
+        self._is_lost = True
+        if current.gray is None:
+            return
+        for keyframe, points, pixels in self._recalled(current):
+            tolerance = 1.5 * PIXEL_TOLERANCE * current.columns / 640
+            resected = features.resection(points, pixels, current.intrinsics, tolerance=tolerance)
+            if resected is not None and resected[1].sum() >= MIN_INLIERS:
+                yield keyframe, resected[0]
+
+    def _recalled(
+        self, current: RGBDFrame
+    ) -> list[tuple[TrackingKeyframe, NDArray[np.float64], features.Pixels]]:
+        """The most similar of the newest keyframes and of some others in turn, with matched corners."""
+        newest, others = list(self._kept)[-NEWEST_COMPARED:][::-1], list(self._kept)[:-NEWEST_COMPARED]
+        self._turn += COMPARED - NEWEST_COMPARED
+        turned = others[self._turn % len(others) :] + others if others else []
+        keyframes = newest + turned[: min(len(others), COMPARED - NEWEST_COMPARED)]
+        recalled = [(keyframe, *keyframe.recall(current)) for keyframe in keyframes]
+        return sorted(recalled, key=lambda entry: -len(entry[1]))[:MAX_RECALLED]
+
+    def _expected_motion(self, frame: Frame) -> se3.Transform:
+        """The last motion, continued over the time since the last frame."""
+        assert self._motion is not None
+        now_ns = frame.timestamp_ns - self._last_ns
+        if now_ns <= 0 or self._interval_ns <= 0:
+            return self._motion
+        longer = now_ns / self._interval_ns
+        return se3.exp(se3.log(self._motion) * longer) if longer <= MAX_EXTRAPOLATION else np.eye(4)
+
+    def _attempt(self, current: RGBDFrame, keyframe: TrackingKeyframe, guess: se3.Transform) -> _Attempt:
+        """Find the best T_keyframe_camera near `guess`, and the evidence for it."""
+        points, pixels = keyframe.follow(current, guess)
+        tolerance = PIXEL_TOLERANCE * current.columns / 640
+        resected = features.resection(points, pixels, current.intrinsics, guess=guess, tolerance=tolerance)
+        agree = np.zeros(len(points), bool)
+        if resected is not None and resected[1].sum() >= MIN_INLIERS:
+            before, after = (_misfit(current, keyframe, T) for T in (guess, resected[0]))
+            if after < MISFIT_FACTOR * before + MISFIT_OFFSET:
+                guess, agree = resected
+        points, pixels = points[agree], pixels[agree]
+        targets = [pose_solver.AlignmentTarget(np.eye(4), keyframe.frame.surface, points, pixels)]
+        for older in self._older(current, keyframe.T_world_camera @ guess, keyframe):
+            T_older_keyframe = se3.inverse(older.T_world_camera) @ keyframe.T_world_camera
+            targets.append(pose_solver.AlignmentTarget(T_older_keyframe, older.frame.surface, *_NO_CORNERS))
+        estimate = pose_solver.solve(targets, current.surface, current.intrinsics, current.columns, guess)
+        return _Attempt(
+            keyframe,
+            estimate.T_anchor_camera,
+            pose_acceptance.pose_evidence(current, keyframe, estimate, len(points)),
+        )
+
+    def _older(
+        self, current: RGBDFrame, T_world_camera: se3.Transform, keyframe: TrackingKeyframe
+    ) -> list[TrackingKeyframe]:
+        """The oldest keyframes that see the same surface as the frame, and agree about its pose."""
+        some, chosen = current.surface.every(8), list[TrackingKeyframe]()
+        for older in self._kept:
+            if len(chosen) == MAX_OLDER or older is keyframe:
+                break
+            T_older_camera = se3.inverse(older.T_world_camera) @ T_world_camera
+            if se3.angle(T_older_camera) < MAX_OLDER_ANGLE:
+                found = point_to_plane.match(older.frame.surface, current.surface, T_older_camera, some)
+                agree = np.abs(found.distance) < COARSE_AGREEMENT + 3 * found.sigma
+                enough = max(1.0, MIN_OLDER_OVERLAP * len(some))
+                if len(agree) >= enough and agree.mean() >= MIN_OLDER_AGREEING:
+                    chosen.append(older)
+        return chosen
+
+    def _accept(self, frame: Frame, current: RGBDFrame, found: _Attempt) -> TrackedPose:
+        away, evidence, known = found.T_keyframe_camera, found.evidence, not self._is_lost
+        T = se3.nearest(found.keyframe.T_world_camera @ away)
+        self._motion = se3.inverse(self._last) @ T if known else None
+        self._interval_ns = frame.timestamp_ns - self._last_ns if known else 0
+        far = (
+            se3.distance(away) > KEYFRAME_DISTANCE
+            or se3.angle(away) > KEYFRAME_ANGLE
+            or evidence.overlap < KEYFRAME_OVERLAP
+        )
+        if far or found.keyframe is not self._kept[-1]:
+            return self._start(frame, current, T, evidence.agreeing)
+        self._remember_pose(T, frame)
+        return TrackedPose(
+            T_world_camera=T,
+            timestamp_ns=frame.timestamp_ns,
+            anchor=found.keyframe.number,
+            T_anchor_camera=away,
+            quality=evidence.agreeing,
+        )
+
+    def _start(self, frame: Frame, current: RGBDFrame, T: se3.Transform, quality: float) -> TrackedPose:
+        """Make the frame the newest tracking keyframe."""
+        keyframe = TrackingKeyframe.of(current, self._next, T)
+        self._next += 1
+        if self._kept:
+            self._kept[-1] = self._kept[-1].packed()
+        self._kept.append(keyframe)
+        self._remember_pose(T, frame)
+        return TrackedPose(
+            T_world_camera=T,
+            timestamp_ns=frame.timestamp_ns,
+            anchor=keyframe.number,
+            T_anchor_camera=np.eye(4),
+            starts_anchor=True,
+            quality=quality,
+        )
+
+    def _remember_pose(self, T: se3.Transform, frame: Frame) -> None:
+        self._last, self._last_ns, self._is_lost = T, frame.timestamp_ns, False
+
+    def _lost(self, frame: Frame, reason: str) -> Lost:
+        self._motion, self._is_lost = None, True
+        return Lost(reason=reason, timestamp_ns=frame.timestamp_ns)
+
+
+def _misfit(current: RGBDFrame, keyframe: TrackingKeyframe, T_keyframe_camera: se3.Transform) -> float:
+    """Median distance of the frame's points from the keyframe's planes, in deviations of the sensor."""
+    found = point_to_plane.match(
+        keyframe.frame.surface, current.surface, T_keyframe_camera, current.surface.every(4)
+    )
+    return float(np.median(np.abs(found.distance) / found.sigma)) if len(found.distance) else np.inf

@@ -1,0 +1,301 @@
+# SPDX-License-Identifier: MIT
+"""Stereo odometry from frame to frame: corners, their disparity, and the motion they agree on."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core.errors import InvalidKeyframe
+from tsfusion.geometry import se3
+from tsfusion.geometry.frame import Frame
+from tsfusion.scanner.localization import features
+from tsfusion.scanner.localization.localizer import Localizer, Lost, TrackedPose, TrackingKeyframes
+from tsfusion.scanner.localization.stereo.rectification_check import RectificationCheck, RectificationMonitor
+from tsfusion.scanner.localization.stereo.reprojection import StereoCamera, refine
+
+MAX_CORNERS = 1000
+MIN_POINTS = 25  # that must agree
+MIN_SHARE, MIN_SHARE_SUDDEN = 0.25, 0.4  # of the followed points that must agree; in a sudden motion
+MIN_POINTS_EXPECTED = 15  # that must agree on the motion that was expected, after a gap
+PIXEL_TOLERANCE = 1.0  # KITTI 06 drifts by 0.82 % with it, by 0.90 % with 1.5
+MAX_OFFSET_ERROR = 3.0  # pixels: points with larger errors are left out of the search for offsets
+MIN_MOTION = 1.0  # pixels of median motion below which the old frame stays the reference
+MIN_DISPARITY = 1.0  # pixels
+SUDDEN_DISTANCE = 0.1  # of the points' median depth by which a motion may differ from the last one
+SUDDEN_ANGLE = np.radians(10)
+BELIEVED_S = 1.5  # seconds that the last velocity is believed when frames were missed
+KEYFRAME_DISTANCE = 0.15  # of the points' median depth to the next tracking keyframe
+HINT = " (is the view blank, the pair rectified, and left the left camera's?)"
+DEPTH_CAMERA_BASELINE_FX = 43.0  # px·m, of depth cameras without a known one (Kinect: 0.075 m × 575 px)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Reference:
+    """Corners with disparity of the frame that the next ones are compared with."""
+
+    gray: NDArray[np.uint8]
+    pixels: features.Pixels  # (n, 2) corners with depth
+    disparity: NDArray[np.float32]  # (n,)
+    dense: NDArray[np.float32]  # (H, W) disparity of the whole image; 0 = none
+    rig: StereoCamera
+    timestamp_ns: int
+    T_world_camera: se3.Transform
+
+    @cached_property
+    def points(self) -> NDArray[np.float64]:
+        """Points of the corners, (n, 3) metres in the camera's axes."""
+        return self.rig.lift(self.pixels, self.disparity)
+
+    @property
+    def median_depth(self) -> float:
+        return float(np.median(self.points[:, 2]))
+
+
+@dataclass(frozen=True, eq=False)
+class _StereoView:
+    """One frame as the tracker sees it; its corners are found when they are asked for."""
+
+    frame: Frame
+    gray: NDArray[np.uint8]
+    rig: StereoCamera
+
+    @classmethod
+    def of(cls, frame: Frame) -> "_StereoView":
+        """Make the view of a frame. Raises InvalidKeyframe without an image or without depth."""
+        gray = frame.gray
+        if gray is None or (frame.depth_m is None and frame.right is None):
+            raise InvalidKeyframe(
+                f"the localizer stereo follows stereo pairs, or depth with a colour image; got {frame.kind}"
+                + ("" if frame.kind == "points" else " without colour")
+            )
+        assert frame.intrinsics is not None
+        return cls(frame, gray, StereoCamera(frame.intrinsics, frame.baseline_fx or DEPTH_CAMERA_BASELINE_FX))
+
+    @cached_property
+    def disparity(self) -> NDArray[np.float32]:
+        """(H, W) pixels of disparity; 0 = none."""
+        quick, depth = self.frame.tracking_disparity, self.frame.depth_m
+        if quick is not None:
+            return quick
+        assert depth is not None
+        return np.divide(self.rig.baseline_fx, depth, out=np.zeros_like(depth), where=depth > 0)
+
+    @cached_property
+    def corners(self) -> tuple[features.Pixels, NDArray[np.float32]]:
+        """Corners of the left image, (n, 2) pixels, and their (n,) disparities."""
+        pixels = features.corners(self.gray, MAX_CORNERS)
+        return pixels, features.bilinear(self.disparity, pixels)
+
+    def reference(self, T_world_camera: se3.Transform) -> _Reference:
+        """The corners with disparity, at the frame's pose."""
+        pixels, disparity = self.corners
+        deep = disparity > MIN_DISPARITY
+        return _Reference(
+            gray=self.gray,
+            pixels=pixels[deep],
+            disparity=disparity[deep],
+            dense=self.disparity,
+            rig=self.rig,
+            timestamp_ns=self.frame.timestamp_ns,
+            T_world_camera=T_world_camera,
+        )
+
+
+class StereoLocalizer(Localizer):
+    """`Localizer` of rectified stereo pairs; also of disparity or depth images with an image beside them.
+
+    A frame is compared with the last one that had a pose and had moved: a few bad or missing frames are
+    bridged, and a camera that stands still does not drift. (Keyframes several metres apart were worse in
+    turns.)
+    """
+
+    absolute = False
+
+    def __init__(self) -> None:
+        self._anchors = TrackingKeyframes()
+        self._rectification = RectificationMonitor()
+        self._reference: _Reference | None = None
+        self._velocity: NDArray[np.float64] | None = None  # twist a second; a frame without timestamps
+        # The last frame, with its pose where it may be the next reference, until `prepare`.
+        self._newest: tuple[_StereoView, se3.Transform | None] | None = None
+
+    @property
+    def rectification(self) -> RectificationCheck | None:
+        """Check of the rectification by the pairs so far; None until there were eight."""
+        self.prepare()
+        return self._rectification.check
+
+    def track(self, frame: Frame) -> TrackedPose | Lost:
+        """Find the left camera's pose in the axes of the first one."""
+        self.prepare()
+        view = _StereoView.of(frame)
+        if self._reference is None:
+            return self._start(view)
+        found = self._compare(self._reference, view.gray, frame.timestamp_ns)
+        if isinstance(found, str):
+            self._newest = view, None
+            return Lost(reason=found, timestamp_ns=frame.timestamp_ns)
+        T_reference_camera, quality, moved = found
+        T = se3.nearest(self._reference.T_world_camera @ T_reference_camera)
+        self._newest = view, T if moved > MIN_MOTION else None
+        return self._anchors.pose(T, frame.timestamp_ns, quality=quality)
+
+    def prepare(self) -> None:
+        """Find the corners of the last frame and their disparity, with which the next one is compared."""
+        newest, self._newest = self._newest, None
+        if newest is None:
+            return
+        view, T = newest
+        if view.frame.right is not None and self._rectification.wants_pair:
+            self._check_rows(view, view.frame.right)
+        if T is None:
+            return
+        reference = view.reference(T)
+        if len(reference.pixels) >= MIN_POINTS:
+            self._reference = reference
+            self._anchors.distance = KEYFRAME_DISTANCE * reference.median_depth
+
+    def reset(self) -> None:
+        """Begin a new world at the next frame."""
+        self._reference = self._velocity = self._newest = None
+        self._anchors.reset()
+
+    def _start(self, view: _StereoView) -> TrackedPose | Lost:
+        """Make a frame the first of a world, if it has enough corners with depth."""
+        self._newest = view, np.eye(4)
+        self.prepare()
+        if self._reference is None:
+            count = np.count_nonzero(view.corners[1] > MIN_DISPARITY)
+            reason = f"only {count} corners with depth" + HINT * (view.frame.kind == "pair")
+            return Lost(reason=reason, timestamp_ns=view.frame.timestamp_ns)
+        return self._anchors.pose(np.eye(4), view.frame.timestamp_ns)
+
+    def _compare(
+        self, reference: _Reference, gray: NDArray[np.uint8], timestamp_ns: int
+    ) -> tuple[se3.Transform, float, float] | str:
+        """T_reference_camera, share of points that agree, their median motion in pixels; or why not."""
+        if gray.shape != reference.gray.shape:
+            return f"the image is {gray.shape[1]}×{gray.shape[0]}, unlike those before"
+        elapsed = _elapsed(reference.timestamp_ns, timestamp_ns)
+        if elapsed > BELIEVED_S:
+            self._velocity = None
+        expected = None if self._velocity is None else se3.exp(self._velocity * elapsed)
+        matches = _follow(reference, gray, expected, thorough=self._rectification.wants_motion)
+        found = self._motion(reference, *matches, expected)
+        if isinstance(found, str) and expected is not None:  # frames were missed, and all looks larger now
+            matches = _follow_warped(reference, gray, expected)
+            again = self._motion(reference, *matches, expected, only_expected=True)
+            found = found if isinstance(again, str) else again
+        if isinstance(found, str):
+            return found
+        self._velocity = se3.log(found[0]) / elapsed
+        return found
+
+    def _motion(
+        self,
+        reference: _Reference,
+        pixels: features.Pixels,
+        followed: NDArray[np.bool_],
+        expected: se3.Transform | None,
+        *,
+        only_expected: bool = False,
+    ) -> tuple[se3.Transform, float, float] | str:
+        """The motion that corners agree on, as `_compare`: (n, 2) where they are, (n,) which are known.
+
+        `only_expected`: fewer are enough, but for the expected motion alone.
+        """
+        least = MIN_POINTS_EXPECTED if only_expected else MIN_POINTS
+        old, disparity, new = reference.pixels[followed], reference.disparity[followed], pixels[followed]
+        if len(new) < least:
+            return f"{len(new)} of {len(followed)} corners were found again"
+        found = features.resection(
+            reference.points[followed],
+            new,
+            reference.rig.intrinsics,
+            guess=expected,
+            tolerance=PIXEL_TOLERANCE,
+        )
+        agree = np.zeros(len(new), bool) if found is None else found[1]
+        share = float(agree.mean())
+        if found is None or agree.sum() < least or share < MIN_SHARE:
+            return f"{agree.sum()} of {len(new)} points agree"
+        is_sudden = _is_sudden(expected, found[0], reference.median_depth)
+        if is_sudden and (only_expected or share < MIN_SHARE_SUDDEN):
+            return f"{agree.sum()} of {len(new)} points agree on a sudden motion"
+        motion = refine(found[0], old[agree], disparity[agree], new[agree], reference.rig)
+        if motion is None:
+            return f"{agree.sum()} points do not fix the motion"
+        self._check_disparity(motion.T_old_new, reference, followed, new)
+        return motion.T_old_new, share, float(np.median(np.abs(new - old)[agree].max(axis=1)))
+
+    def _check_rows(self, view: _StereoView, right: NDArray[np.uint8]) -> None:
+        """Add a pair to the check, also corners without disparity: bad rectification may be the reason."""
+        pixels, disparity = view.corners
+        matched = disparity > 0
+        guess = pixels.copy()
+        guess[:, 0] -= np.where(matched, disparity, np.median(disparity[matched]) if matched.any() else 0)
+        other, found = features.follow(view.gray, right, pixels, guess=guess)
+        self._rectification.add_pair(pixels[found], other[found], right.shape)
+
+    def _check_disparity(
+        self, T: se3.Transform, reference: _Reference, followed: NDArray[np.bool_], new: features.Pixels
+    ) -> None:
+        if not self._rectification.wants_motion:
+            return
+        points = se3.apply(se3.inverse(T), reference.points[followed])
+        near = np.linalg.norm(reference.rig.project(points) - new, axis=1) < MAX_OFFSET_ERROR
+        old, disparity = reference.pixels[followed][near], reference.disparity[followed][near]
+        motion = refine(T, old, disparity, new[near], reference.rig, with_offset=True)
+        if motion is not None:
+            self._rectification.add_motion(motion.offset, motion.offset_sigma)
+
+
+def _elapsed(before_ns: int, now_ns: int) -> float:
+    """Seconds between two timestamps; 1 where one is unknown or they do not grow."""
+    return (now_ns - before_ns) / 1e9 if 0 < before_ns < now_ns else 1.0
+
+
+def _follow(
+    reference: _Reference, gray: NDArray[np.uint8], expected: se3.Transform | None, *, thorough: bool
+) -> tuple[features.Pixels, NDArray[np.bool_]]:
+    """Follow the reference's corners into the new image, first from where they are expected."""
+    if expected is not None:
+        guess = reference.rig.project(se3.apply(se3.inverse(expected), reference.points))
+        pixels, found = features.follow(
+            reference.gray, gray, reference.pixels, guess=guess, thorough=thorough
+        )
+        if found.mean() > 0.5:
+            return pixels, found
+    return features.follow(reference.gray, gray, reference.pixels)
+
+
+def _follow_warped(
+    reference: _Reference, gray: NDArray[np.uint8], expected: se3.Transform
+) -> tuple[features.Pixels, NDArray[np.bool_]]:
+    """Follow the reference's corners into the new image as the reference's camera would see it.
+
+    After a gap all that is near has grown; seen from the same place it has its old size, but for what the
+    expected motion is wrong by.
+    """
+    rig, T = reference.rig, se3.inverse(expected)
+    K, (height, width) = rig.intrinsics, gray.shape
+    u, v = np.arange(width), np.arange(height)[:, None]
+    x, y = ((u - K.cx) / K.fx).astype(np.float32), ((v - K.cy) / K.fy).astype(np.float32)
+    inverse_depth = reference.dense * np.float32(1 / rig.baseline_fx)  # 0: as far as can be
+    R, t = T[:3, :3].astype(np.float32), T[:3, 3].astype(np.float32)
+    X, Y, Z = (R[k, 0] * x + R[k, 1] * y + R[k, 2] + t[k] * inverse_depth for k in range(3))
+    ahead = np.maximum(Z, 1e-3)
+    at = np.dstack([K.fx * X / ahead + K.cx, K.fy * Y / ahead + K.cy]).astype(np.float32)
+    warped = cv2.remap(gray, at, None, cv2.INTER_LINEAR)
+    pixels, found = features.follow(reference.gray, warped, reference.pixels)
+    return rig.project(se3.apply(T, rig.lift(pixels, reference.disparity))), found
+
+
+def _is_sudden(expected: se3.Transform | None, found: se3.Transform, depth: float) -> bool:
+    if expected is None:
+        return True
+    apart = se3.inverse(expected) @ found
+    return bool(se3.distance(apart) > SUDDEN_DISTANCE * depth or se3.angle(apart) > SUDDEN_ANGLE)

@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: MIT
+"""View of a map's surface by a pinhole camera; the work is in `kernels/answers/rasterizer.py`."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.geometry.keyframe import Intrinsics
+from tsfusion.geometry.map_answers import View
+from tsfusion.geometry.mesh import Mesh
+from tsfusion.kernels.answers import rasterizer
+from tsfusion.tsdf.store.block_store import unpack_keys
+from tsfusion.tsdf.surface.surface_tiles import SurfaceTiles
+
+NEAR = 0.05  # metres in front of the eye where the view starts
+MOST_TRIANGLES = 1 << 21  # that are drawn at a time
+
+
+class _Wanted(NamedTuple):
+    """Images of a view beside depth."""
+
+    normals: bool
+    colors: bool
+
+
+_ALL = _Wanted(normals=True, colors=True)
+_NOTHING = Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
+
+
+def cast(
+    tiles: SurfaceTiles,
+    intrinsics: Intrinsics,
+    T_world_camera: NDArray[np.float64],
+    shape: tuple[int, int],
+    *,
+    normals: bool = True,
+    colors: bool = True,
+) -> View:
+    """The view, (H, W), of a surface: of the tiles before the camera; `normals`, `colors`: if with them."""
+    camera = intrinsics, T_world_camera, shape
+    with np.errstate(over="ignore", invalid="ignore"):  # a focal length may be next to none
+        numbers = _in_view(tiles, *camera).tolist()
+        wanted = _Wanted(normals, colors and tiles.has_color)
+        seen = _of_meshes(tiles.meshes(numbers), *camera, wanted)
+    tiles.settle(numbers)
+    return seen
+
+
+def cast_settled(
+    tiles: SurfaceTiles,
+    intrinsics: Intrinsics,
+    T_world_camera: NDArray[np.float64],
+    shape: tuple[int, int],
+    *,
+    normals: bool = True,
+    colors: bool = True,
+) -> View | None:
+    """As `cast`, of the map as it was when it was settled; None where that is not kept any more."""
+    camera = intrinsics, T_world_camera, shape
+    with np.errstate(over="ignore", invalid="ignore"):
+        meshes = tiles.settled_meshes(_in_view(tiles, *camera).tolist())
+        if meshes is None:
+            return None
+        return _of_meshes(iter(meshes), *camera, _Wanted(normals, colors and tiles.has_color))
+
+
+def _of_meshes(
+    meshes: Iterator[Mesh],
+    intrinsics: Intrinsics,
+    T_world_camera: NDArray[np.float64],
+    shape: tuple[int, int],
+    wanted: _Wanted,
+) -> View:
+    """The view of all of some meshes."""
+    camera = intrinsics, T_world_camera, shape
+    parts = _parts(meshes, wanted)
+    seen = look_at(next(parts, _NOTHING), *camera, wanted)
+    for mesh in parts:
+        seen = _nearer(seen, look_at(mesh, *camera, wanted))
+    if wanted.colors and seen.colors is None:
+        return View(seen.depth, seen.normals, np.zeros((*shape, 3), np.uint8))
+    return seen
+
+
+def look_at(
+    mesh: Mesh,
+    intrinsics: Intrinsics,
+    T_world_camera: NDArray[np.float64],
+    shape: tuple[int, int],
+    wanted: _Wanted = _ALL,
+) -> View:
+    """The view of a mesh, (H, W): depth, and normals and colours that are wanted, of the first front side."""
+    focal = intrinsics.fx
+    seen, vertices, faces = rasterised(mesh, intrinsics, T_world_camera, shape)
+    of_normals = mesh.normals if wanted.normals else _NOTHING.normals
+    of_colors = mesh.colors if wanted.colors and mesh.colors is not None else np.zeros((0, 3), np.uint8)
+    depth = np.zeros(shape, np.float32)
+    normals = np.zeros((*shape, 3) if wanted.normals else (1, 1, 3), np.float32)
+    colors = np.zeros((*shape, 3) if len(of_colors) else (1, 1, 3), np.uint8)
+    rasterizer.look_up(
+        seen, vertices, faces, of_normals, of_colors, focal, rasterizer.EMPTY, depth, normals, colors
+    )
+    return View(depth, normals if wanted.normals else None, colors if len(of_colors) else None)
+
+
+def rasterised(
+    mesh: Mesh, intrinsics: Intrinsics, T_world_camera: NDArray[np.float64], shape: tuple[int, int]
+) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.int32]]:
+    """View of each pixel, as `rasterizer.rasterise` writes it, and the vertices and faces that it drew.
+
+    The rasteriser knows one focal length and a centred image. A shear of space that keeps z makes any
+    pinhole camera such a one.
+    """
+    height, width = shape
+    K, focal = intrinsics, intrinsics.fx
+    shear = np.diag([1, K.fy / focal, 1])  # from the right: rows are points
+    shear[2, :2] = (K.cx - 0.5 * (width - 1)) / focal, (K.cy - 0.5 * (height - 1)) / focal
+    from_eye = (mesh.vertices - T_world_camera[:3, 3]).astype(np.float32)
+    vertices = from_eye @ (T_world_camera[:3, :3] @ shear).astype(np.float32)
+    faces = np.ascontiguousarray(mesh.faces if K.fy > 0 else mesh.faces[:, ::-1], np.int32)
+    seen = np.full(shape, rasterizer.EMPTY, np.int64)
+    rasterizer.rasterise(seen, vertices, faces, focal, NEAR)
+    return seen, vertices, faces
+
+
+def _in_view(
+    tiles: SurfaceTiles, intrinsics: Intrinsics, T_world_camera: NDArray[np.float64], shape: tuple[int, int]
+) -> NDArray[np.int64]:
+    """Numbers of the tiles that may be seen, the nearest first."""
+    numbers, side = tiles.numbers(), tiles.side_m
+    centres = (unpack_keys(numbers) + 0.5) * side - T_world_camera[:3, 3]
+    centres = centres @ T_world_camera[:3, :3]
+    K, (height, width) = intrinsics, shape
+    down = np.sort([-0.5 - K.cy, height - 0.5 - K.cy] / np.float64(K.fy))
+    planes = np.array([  # inwards, through the eye and the sides of the image
+        (1, 0, (0.5 + K.cx) / K.fx), (-1, 0, (width - 0.5 - K.cx) / K.fx), (0, 1, -down[0]), (0, -1, down[1]),
+        (0, 0, 1),
+    ])  # fmt: skip
+    planes /= np.linalg.norm(planes, axis=1, keepdims=True)
+    radius = 0.5 * np.sqrt(3) * side * 1.05  # cells reach a voxel further
+    shown = np.flatnonzero((centres @ planes.T > -radius).all(axis=1))
+    nearest_first = np.argsort(centres[shown, 2], kind="stable")
+    return np.asarray(numbers[shown[nearest_first]])
+
+
+def _parts(meshes: Iterator[Mesh], wanted: _Wanted) -> Iterator[Mesh]:
+    """Meshes with what is wanted of them, joined up to `MOST_TRIANGLES`."""
+    part: list[Mesh] = []
+    triangles = 0
+    for mesh in meshes:
+        part.append(mesh)
+        triangles += len(mesh.faces)
+        if triangles >= MOST_TRIANGLES:
+            yield _joined(part, wanted)
+            part, triangles = [], 0
+    if triangles:
+        yield _joined(part, wanted)
+
+
+def _joined(meshes: list[Mesh], wanted: _Wanted) -> Mesh:
+    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)]).tolist()
+    return Mesh(
+        np.concatenate([mesh.vertices for mesh in meshes]),
+        np.concatenate([mesh.faces + np.int32(s) for mesh, s in zip(meshes, starts, strict=False)]),
+        np.concatenate([mesh.normals for mesh in meshes]) if wanted.normals else _NOTHING.normals,
+        None
+        if meshes[0].colors is None or not wanted.colors
+        else np.concatenate([mesh.colors for mesh in meshes]),
+    )
+
+
+def _nearer(one: View, other: View) -> View:
+    """Nearer of two views of a camera, pixel by pixel."""
+    is_other = (other.depth > 0) & ((one.depth == 0) | (other.depth < one.depth))
+    for ours, theirs in ((one.depth, other.depth), (one.normals, other.normals), (one.colors, other.colors)):
+        if ours is not None and theirs is not None:
+            ours[is_other] = theirs[is_other]
+    return one

@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: MIT
+"""Rays and integration where the map's blocks are on a device: the transaction is `Integrator`'s."""
+
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core.config import VolumeConfig
+from tsfusion.kernels.base.sensor_noise import WEIGHT_ONE
+from tsfusion.kernels.base.voxel_traversal import BAND_FIELDS, DEFERRED, UPDATES
+from tsfusion.kernels.device.device_told import BANDS_AT, FRESH_AT, LACKING, NEW
+from tsfusion.kernels.integration.integrate import (
+    ALL,
+    ONLY_ADDED,
+    TOUCHED_COUNT,
+    TOUCHED_HEADER,
+    TOUCHED_MISSING,
+    TOUCHED_OVERFLOW,
+)
+from tsfusion.tsdf.device.device_blocks import DeviceBlocks
+from tsfusion.tsdf.integration.integrator import BLOCK_COST, NO_LIMIT, PART_WEIGHT, Integrator, RayShare
+from tsfusion.tsdf.integration.ray_buffers import RayBuffers
+from tsfusion.tsdf.store.block_store import BlockStore
+
+
+class DeviceRayBuffers(RayBuffers):
+    """The rays stay on the device; here are their bands, and what a launch says about blocks."""
+
+    def __init__(self, *, color: bool) -> None:
+        super().__init__(color=color, regularised=False)
+        self._missing_keys = np.empty(0, np.int64)
+        self.asked: tuple[Any, ...] = ()  # for which rays: a kernel's name and its arguments
+        self.is_light = False  # whether no lane can overflow that has reserve for a part
+
+    def note_told(self, told: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Take over what a launch tells of blocks; returns the slots of those that are touched for the first
+        time."""
+        new = told[FRESH_AT + 2 * told[NEW] :]
+        self._touched.reserve(TOUCHED_HEADER)
+        self.touched[:TOUCHED_HEADER] = told[:TOUCHED_HEADER]
+        self.touched[TOUCHED_OVERFLOW] = 0  # which on the CPU is said of `missing`
+        self.touched[TOUCHED_COUNT] -= len(new)
+        self.note_touched(new)
+        return new
+
+    def note_touched(self, slots: NDArray[np.int32]) -> None:
+        """Note blocks that are touched for the first time."""
+        first = TOUCHED_HEADER + int(self.touched[TOUCHED_COUNT])
+        self._touched.reserve(first + len(slots))
+        self.touched[first : first + len(slots)] = slots
+        self.touched[TOUCHED_COUNT] += len(slots)
+
+    def share_out(self, units: int) -> None:
+        """Nothing: each ray has a thread of its own."""
+
+    def note_missing(self, keys: NDArray[np.int64]) -> None:
+        """Take over the keys of missing blocks, in order."""
+        self._missing_keys = keys
+        self.touched[TOUCHED_MISSING] = len(keys)
+
+    @property
+    def most_missing(self) -> int:
+        return NO_LIMIT
+
+    def take_missing(self) -> NDArray[np.int64]:
+        keys = self._missing_keys
+        self.forget_missing()
+        return keys
+
+    def forget_missing(self) -> None:
+        self._missing_keys = np.empty(0, np.int64)
+        self.touched[TOUCHED_MISSING] = 0
+
+    @staticmethod
+    def as_read(image: NDArray[Any]) -> NDArray[Any]:
+        return np.ascontiguousarray(image)  # half of the bytes, where it is uint16
+
+    def _rays_of_points(self, points: NDArray[Any], *rest: Any) -> None:
+        self._ask("point_rays", points, *rest)
+
+    def _rays_of_image(self, image: NDArray[Any], *rest: Any) -> None:
+        self._ask("image_rays", image, *rest)
+
+    def _ask(self, kind: str, measured: NDArray[Any], *rest: Any) -> None:
+        """Note which rays are to be made: that and what is to be done with them is one call."""
+        self.asked = kind, measured, *rest
+        samples = len(measured) if kind == "point_rays" else measured.size
+        self.is_light = samples * WEIGHT_ONE < PART_WEIGHT
+
+
+class DeviceIntegrator(Integrator):
+    """The one writer of a map's sums on a device."""
+
+    _buffers: DeviceRayBuffers
+
+    def __init__(
+        self, store: BlockStore, device: DeviceBlocks, buffers: DeviceRayBuffers, config: VolumeConfig
+    ) -> None:
+        super().__init__(store, buffers, config)
+        self._device = device
+        # What the first launch told, and keys of missing blocks, when it was made
+        self._ahead: tuple[NDArray[np.int32], NDArray[np.int64]] | None = None
+        self._has_inserted = False  # it has inserted the missing blocks, too
+
+    def _begin(self, sign: int) -> None:
+        """Make the rays, and add them in the same call: nearly always all of them are one part."""
+        super()._begin(sign)
+        store, buffers, config = self._store, self._buffers, self._config
+        store.send()
+        kind, *arguments = buffers.asked
+        job = (ALL, 0, len(buffers.bands), sign, 0, store.stamp, self._vote)
+        new = min(self._most_missing(), store.spare) if sign > 0 else 0
+        room = new, config.max_blocks_per_keyframe, self._most_cost, BLOCK_COST
+        self._ahead, self._has_inserted = None, False
+        found = self._device.call("fuse", kind, job if buffers.is_light else None, room, *arguments)
+        told = found[0].copy()
+        buffers.bands = _bands(told).copy()
+        buffers.bands[:, UPDATES] = buffers.bands[:, DEFERRED] = 0
+        if buffers.is_light:
+            self._ahead = told, keys_told(told, found)
+
+    def _take_back(self, added: list[RayShare], sign: int, before: int) -> None:
+        if self._ahead is not None:  # refused before it was looked at
+            self._ahead, added = None, [(0, len(self._buffers.bands))]
+        super()._take_back(added, sign, before)
+
+    def _admit(self, part: RayShare, sign: int) -> None:
+        if self._has_inserted:
+            self._note_admitted(self._store.count - self._admitted)
+        else:
+            super()._admit(part, sign)
+
+    def _insert(self, keys: NDArray[np.int64]) -> None:
+        self._insert_when("later", keys)
+
+    def _insert_when(self, when: Literal["later", "never"], keys: NDArray[np.int64]) -> None:
+        self._device.sends_blocks = when
+        try:
+            self._store.insert(keys)
+        finally:
+            self._device.sends_blocks = "now"
+
+    def _launch(
+        self, part: RayShare, sign: int, *, which: int = ALL, oldest: int = 0, most_missing: int = NO_LIMIT
+    ) -> None:
+        store, buffers = self._store, self._buffers
+        ahead, self._ahead = self._ahead, None
+        if ahead is None:
+            job = which, *part, sign, oldest, store.stamp, self._vote
+            found = self._device.call("add", job)
+            told = found[0].copy()
+            missing = keys_told(told, found)
+        else:
+            told, missing = ahead
+        self._has_inserted = bool(told[NEW])
+        touched = buffers.note_told(told)
+        if self._has_inserted:
+            self._insert_when("never", missing)
+        else:
+            buffers.note_missing(missing)
+        store.note_touched(touched)
+        if which != ONLY_ADDED:
+            made = _bands(told)[:, UPDATES].sum()
+            if self._has_inserted:
+                made += _bands(told)[:, LACKING].sum()
+            buffers.bands[part[0], UPDATES] += made
+            buffers.bands[part[0], DEFERRED] = len(missing)
+
+    def _add_free(self, slots: NDArray[np.int32], sign: int) -> None:
+        store, carved = self._store, self._buffers.carved
+        self._device.call("add_free", slots, carved.amounts, carved.masks, sign)
+        self._buffers.note_touched(slots[store.stamps[slots] != store.stamp])
+        store.note_touched(slots)
+
+    def _measure_touched(self) -> None:
+        slots = self._buffers.touched_slots
+        if len(slots):
+            (self._store.bounds[slots],) = self._device.call("largest_weights", slots)
+
+
+def keys_told(told: NDArray[np.int32], found: Sequence[NDArray[Any]]) -> NDArray[np.int64]:
+    """Keys of the blocks that a launch has made blocks of the map, or of those that it found missing."""
+    if new := int(told[NEW]):
+        return told[FRESH_AT : FRESH_AT + 2 * new].view(np.int64)
+    return found[1].copy() if len(found) > 1 else np.empty(0, np.int64)
+
+
+def _bands(told: NDArray[np.int32]) -> NDArray[np.int32]:
+    """The bands in what a launch tells."""
+    return told[BANDS_AT:FRESH_AT].reshape(-1, BAND_FIELDS)

@@ -1,0 +1,203 @@
+# SPDX-License-Identifier: MIT
+"""Near end of the connection to the process that has a device (`device_process`)."""
+
+import atexit
+import logging
+import select
+import subprocess
+import sys
+import threading
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core import process
+from tsfusion.core.config import Arch
+from tsfusion.core.shared_arrays import (
+    MOST_SAID,
+    SharedArrays,
+    SharedSlot,
+    look_out,
+    make_file,
+    talking_sockets,
+)
+
+log = logging.getLogger(__name__)
+
+Step = tuple[str, tuple[Any, ...]]  # a method and its arguments
+SentArray = tuple[int, str, tuple[int, ...], bytes | int]  # which argument, dtype, shape, content or offset
+
+_COMMAND = (sys.executable, "-m", "tsfusion.tsdf.device.device_process")
+_START_S = 120.0  # a device's first start compiles its driver's own kernels, too
+_END_S = 3.0
+_SENT_BYTES = 1 << 10
+_ANSWER_S = 0.002  # in which a GPU answers
+
+
+class DeviceLost(RuntimeError):
+    """The process with the device has ended, or a kernel failed on it: what it had added since the map was
+    last read is lost.
+
+    This is no TsfusionError on purpose: no keyframe is to blame, and nothing may go on with the map. A fuser
+    that ends with it is started again, and fuses what its journal has beyond the last checkpoint.
+    """
+
+
+class DeviceLink:
+    """Calls to a device, one after the other, from the thread that uses maps."""
+
+    def __init__(self, arch: Arch) -> None:
+        """Start the process.
+
+        Raises:
+            DeviceLost: when there is no such device; the message says why.
+        """
+        self.arch = arch
+        self.is_trusted = False  # whether it was tried
+        self._has_ended = False
+        self._maps = 0
+        self._forgotten: list[int] = []
+        try:
+            self._link, theirs = talking_sockets()
+        except OSError as error:
+            raise DeviceLost(f"the device {arch} cannot be used: {error}") from error
+        descriptors = make_file(), make_file()
+        self._requests, self._replies = (SharedArrays(one) for one in descriptors)
+        with theirs:
+            passed = [theirs.fileno(), *descriptors]
+            ends_with_thread = threading.current_thread() is threading.main_thread()
+            self._process = subprocess.Popen(
+                [*_COMMAND, *map(str, passed), arch, str(int(ends_with_thread))],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                pass_fds=passed,
+                **process.OWN_GROUP,
+            )
+        atexit.register(self.close)
+        self._receive(_START_S)
+
+    @property
+    def has_ended(self) -> bool:
+        return self._has_ended
+
+    def new_map(self, layers: tuple[str, ...]) -> int:
+        """Make an empty map on the device; returns its number.
+
+        Raises:
+            MemoryError, DeviceLost: as `call`.
+        """
+        self._maps += 1
+        self.call(self._maps, "make", layers)
+        return self._maps
+
+    def forget_later(self, number: int) -> None:
+        """Let a map go before the next call: this may be called at any time, also during one."""
+        self._forgotten.append(number)
+
+    def call(self, number: int, verb: str, *arguments: Any, first: Sequence[Step] = ()) -> Any:
+        """Call a method of a map (`DeviceMap`); arrays in the result are valid until the next call.
+
+        Args:
+            number: of the map.
+            verb: name of the method.
+            arguments: of the method; arrays are copied.
+            first: methods that are called before, and their arguments; if one fails, the others are not.
+
+        Raises:
+            MemoryError: the device has no memory for more; the map is as it was.
+            DeviceLost: the device is gone.
+        """
+        with process.uninterrupted():  # an answer that nobody took would be the next call's
+            while self._forgotten:
+                self._ask(self._forgotten.pop(), [("forget", ())])
+            return self._ask(number, [*first, (verb, arguments)])
+
+    def _ask(self, number: int, steps: list[Step]) -> Any:
+        if self._has_ended:
+            raise DeviceLost(f"the process with the device {self.arch} has ended")
+        self._requests.begin()
+        packed = [(verb, *self._packed(arguments)) for verb, arguments in steps]
+        try:
+            self._link.send(msgspec.msgpack.encode((number, packed)))
+        except OSError as error:
+            self.close()
+            raise DeviceLost(f"the process with the device {self.arch} has ended") from error
+        return self._receive(None)
+
+    def _packed(self, arguments: Sequence[Any]) -> tuple[list[Any], list[SentArray]]:
+        """Arguments as they are sent, and the arrays among them: of large ones the place in the memory that
+        both processes have."""
+        values, arrays = list(arguments), list[SentArray]()
+        for i, one in enumerate(arguments):
+            if isinstance(one, np.ndarray):
+                values[i] = None
+                is_large = one.nbytes > _SENT_BYTES
+                where = self._requests.write([one])[0].offset if is_large else one.tobytes()
+                arrays.append((i, one.dtype.str, one.shape, where))
+        return values, arrays
+
+    def _receive(self, timeout: float | None) -> Any:
+        how: str = "failed"
+        found: Any = "its process has ended"
+        with suppress(OSError):
+            if timeout is None:
+                look_out(self._link.fileno(), _ANSWER_S)
+            if timeout is not None and not select.select([self._link], [], [], timeout)[0]:
+                found = "it does not start"
+            elif answer := self._link.recv(MOST_SAID):
+                how, found = msgspec.msgpack.decode(answer)
+        if how == "memory":
+            raise MemoryError(f"the device {self.arch} has no memory for more of the map ({found})")
+        if how == "failed":
+            self.close()
+            raise DeviceLost(f"the device {self.arch} cannot be used: {found}")
+        if isinstance(found, list):
+            arrays: list[NDArray[Any]] = [self._replies.read(SharedSlot(*place)) for place in found]
+            return arrays
+        return found
+
+    def close(self) -> None:
+        """End the process, and with it its maps."""
+        if self._has_ended:
+            return
+        self._has_ended = True
+        atexit.unregister(self.close)
+        self._link.close()
+        try:
+            self._process.wait(_END_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._requests.close()
+        self._replies.close()
+
+
+_links: dict[Arch, DeviceLink] = {}  # process-wide, as Taichi's own state is: a process a device
+_missing = set[Arch]()
+
+
+def link_to(arch: Arch) -> DeviceLink | None:
+    """The process with a device, which all maps of this process share; None = there is none, which is logged
+    once."""
+    if arch == "cpu" or arch in _missing:
+        return None
+    link = _links.get(arch)
+    if link is None or link.has_ended:
+        try:
+            link = _links[arch] = DeviceLink(arch)
+        except DeviceLost as error:
+            _missing.add(arch)
+            log.warning("%s; keyframes are fused on the CPU", error)
+            return None
+    return link
+
+
+def refuse(link: DeviceLink, why: str) -> None:
+    """Let all maps of this process be on the CPU, and say why."""
+    link.close()
+    _missing.add(link.arch)
+    log.warning("the device %s cannot be used: %s; keyframes are fused on the CPU", link.arch, why)

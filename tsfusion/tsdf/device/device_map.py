@@ -1,0 +1,309 @@
+# SPDX-License-Identifier: MIT
+"""A map's blocks in the memory of a device: all that integration reads and writes (`ti.ndarray`).
+
+`device_process` has one for each map of its parent's, whose `BlockStore` gives out slots and keeps what
+nobody adds to. A call brings in a keyframe, or takes out what it touched; nothing else is copied.
+"""
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core.distinct_integers import distinct
+from tsfusion.kernels import taichi as ti
+from tsfusion.kernels.base.voxel_traversal import BAND_FIELDS, COST, RAY_FIELDS, UPDATES
+from tsfusion.kernels.device import device_integration as kernels
+from tsfusion.kernels.device import device_rays, device_rows
+from tsfusion.kernels.device.device_copies import Copies
+from tsfusion.kernels.device.device_told import (
+    BANDS,
+    BANDS_AT,
+    CLAIMS,
+    FEW_NEW,
+    FIRST_BLOCKS,
+    FIRST_HASH,
+    FRESH_AT,
+    LACKING,
+    NEW,
+    TOUCHED_AT,
+)
+from tsfusion.kernels.integration import integrate, rays_from_images
+from tsfusion.kernels.integration.integrate import CUBE, TOUCHED_COUNT, TOUCHED_MISSING, TOUCHED_OVERFLOW
+from tsfusion.tsdf.store.growing_array import LAYER_DTYPES
+
+_LISTED = 1 << 22  # updates, 16 bytes each, that a launch lists
+_FEW_TOUCHED = 4096  # blocks whose numbers are read at once
+_DTYPES = {"sums": ti.i64, "color_rgn": ti.i64, "color_b": ti.i32, "hits": ti.i32}
+
+
+class LaunchJob(NamedTuple):
+    """Task of a launch (kernels/integration/integrate.py)."""
+
+    which: int
+    first_band: int
+    end_band: int
+    sign: int
+    oldest: int
+    stamp: int
+    kind: int  # of votes
+
+
+class Room(NamedTuple):
+    """Limits of a keyframe: new blocks for which all memory is there, blocks touched, and Σ of what its rays
+    and its new blocks cost (`integrator.KeyframeQuota`)."""
+
+    new: int
+    touched: int
+    cost: int
+    block_cost: int
+
+
+class DeviceMap:
+    """The blocks of one map, as numbered by its `BlockStore`, and the rays of its current keyframe."""
+
+    def __init__(self, layers: tuple[str, ...], copies: Copies) -> None:
+        self._layer_names = layers
+        self._copies = copies
+        self._count = 0
+        self._layers = {name: _zeros(dtype, 1, CUBE) for name, dtype in _DTYPES.items()}
+        self._stamps = _zeros(ti.i32, 1)
+        self._hash_keys, self._hash_slots = _zeros(ti.i64, FIRST_HASH), _zeros(ti.i32, FIRST_HASH)
+        self._told = _zeros(ti.i32, TOUCHED_AT)
+        self._winners, self._missing = _zeros(ti.i32, 2 * kernels.WINNERS), _zeros(ti.i64, 1)
+        self._places, self._claims = _zeros(ti.i32, FEW_NEW, 2), _zeros(ti.i32, CLAIMS)
+        self._rays, self._marks = _zeros(ti.i32, 1, RAY_FIELDS), _zeros(ti.i32, 1)
+        self._depths, self._tiles = _zeros(ti.i32, 1), _zeros(ti.i32, 1, device_rays.TILE_FIELDS)
+        self._groups, self._totals = _zeros(ti.i32, 1, kernels.GROUP_FIELDS), _zeros(ti.i64, 2)
+        self._shared = 0, 0  # units of work, and places of each
+        self._begins = np.zeros(BANDS + 1, np.int64)  # first places of bands, and the last one's end
+        self._costs = np.zeros(BANDS, np.int64)  # of the bands' rays
+        self._known = 0  # touched blocks that were told of
+        self._listed = _zeros(ti.i32, 1, kernels.LISTED_FIELDS)
+        self._reserve(FIRST_BLOCKS)
+        self._reserve_list(_LISTED)
+
+    def fuse(
+        self, kind: str, job: tuple[int, ...] | None, room: tuple[int, ...], *arguments: Any
+    ) -> tuple[NDArray[Any], ...]:
+        """Make a keyframe's rays, as the function of this name in `device_rays` of these arguments,
+        and add them, if there is a `LaunchJob`. Missing blocks are then blocks of the map, if there is `Room`
+        for them, and `NEW` of what is told says so.
+
+        Returns:
+            As `add`.
+        """
+        is_image = kind == "image_rays"
+        kernel = device_rays.fuse_image if is_image else device_rays.fuse_points
+        shape = arguments[0].shape
+        scratch = self._room_for_image(*shape) if is_image else self._room_for_points(shape[0])
+        limits = Room(*room)
+        spare = min(self._stamps.shape[0], self._hash_keys.shape[0] // 2) - self._count
+        limits = limits._replace(new=min(limits.new, FEW_NEW, spare))
+        count, sign, stamp, votes = (int(self._begins[-1]), *job[3:6:2], job[6]) if job else (0, 0, 0, 0)
+        arrays = [i for i, one in enumerate(arguments) if isinstance(one, np.ndarray)]
+        *given, limit = self._copies.given(*(arguments[i] for i in arrays), np.array(limits, np.int64))
+        handed = list(arguments)
+        for i, one in zip(arrays, given, strict=True):
+            handed[i] = one
+        at = self._layers
+        kernel(
+            *handed, *scratch, self._rays, count, votes, sign, stamp, self._count, limit, self._hash_keys,
+            self._hash_slots, self._winners, self._missing, self._places, self._claims, self._stamps,
+            self._told, self._groups, self._totals, self._listed, self._marks, at["sums"], at["color_rgn"],
+            at[last_layer(votes)],
+        )  # fmt: skip
+        self._known = 0
+        told, missing = self._read_results()
+        self._costs = bands_of(told)[:, COST].astype(np.int64)
+        if told[NEW]:
+            self._count += int(told[NEW])
+        elif told[TOUCHED_OVERFLOW] and job:
+            return self.add(job)
+        return self._news(told, missing)
+
+    def _room_for_image(self, height: int, width: int) -> tuple[Any, Any]:
+        """Make room for an image's rays; returns the scratch arrays of its kernel."""
+        tiles = rays_from_images.tiles_of(height, width)
+        self._share_places(tiles, rays_from_images.TILE_SAMPLES)
+        self._depths = _at_least(self._depths, ti.i32, rays_from_images.most_rays(height, width))
+        self._tiles = _at_least(self._tiles, ti.i32, tiles, device_rays.TILE_FIELDS)
+        return self._depths, self._tiles
+
+    def _room_for_points(self, count: int) -> tuple[Any]:
+        """Likewise for points."""
+        self._share_places(count, 1)
+        self._depths = _at_least(self._depths, ti.i32, count)
+        return (self._depths,)
+
+    def _share_places(self, units: int, places: int) -> None:
+        """Share out units of work to the bands, each of so many places for rays."""
+        if (units, places) == self._shared:
+            return
+        self._shared = units, places
+        self._begins = np.arange(BANDS + 1, dtype=np.int64) * units // BANDS * places
+        self._rays = _at_least(self._rays, ti.i32, units * places, RAY_FIELDS)
+        self._marks = _at_least(self._marks, ti.i32, units * places)
+        self._groups = _at_least(
+            self._groups, ti.i32, units * places // kernels.GROUP + 1, kernels.GROUP_FIELDS
+        )
+
+    def add(self, given: tuple[int, ...]) -> tuple[NDArray[Any], ...]:
+        """Add rays to the map's blocks.
+
+        Returns:
+            What is told of the keyframe (`device_integration`), with the slots of blocks that it
+            touches for the first time; and, if any are missing, the keys of missing blocks, in order.
+        """
+        job = LaunchJob(*given)
+        self._launch(job, job.first_band, job.end_band)
+        told, missing = self._read_results()
+        if told[TOUCHED_OVERFLOW]:
+            found, counted = [], np.zeros((BANDS, BAND_FIELDS), np.int32)
+            for first, end in self._runs(job.first_band, job.end_band):
+                self._launch(job, first, end)
+                told, missing = self._read_results()
+                counted += bands_of(told)
+                found.append(missing)
+            missing = np.concatenate(found)
+            for field in (UPDATES, LACKING):
+                bands_of(told)[:, field] = counted[:, field]
+        return self._news(told, missing if job.which == integrate.ALL else missing[:0])
+
+    def _news(self, told: NDArray[np.int32], missing: NDArray[np.int64]) -> tuple[NDArray[Any], ...]:
+        """The answer to the host: what a launch told, without slots that an earlier one told of and places
+        without a key; and missing blocks, in order."""
+        known, self._known = self._known, int(told[TOUCHED_COUNT])
+        told = np.concatenate([told[: FRESH_AT + 2 * told[NEW]], told[TOUCHED_AT + known :]])
+        return (told, distinct(missing)) if len(missing) else (told,)
+
+    def _launch(self, job: LaunchJob, first: int, end: int) -> None:
+        at, first_ray, end_ray = self._layers, int(self._begins[first]), int(self._begins[end])
+        kernels.add_rays(
+            self._rays, first_ray, end_ray, *job[3:], self._hash_keys, self._hash_slots, self._winners,
+            self._missing, self._places, self._claims, self._stamps, self._told, self._groups, self._totals,
+            self._listed, self._marks, at["sums"], at["color_rgn"], at[last_layer(job.kind)],
+        )  # fmt: skip
+
+    def _read_results(self) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+        """`told` of the last launch, and the keys of missing blocks, of which some may be there twice."""
+        size = TOUCHED_AT + min(_FEW_TOUCHED, self._stamps.shape[0])
+        for _ in range(2):  # the second time, if it was not all
+            (told,) = self._copies.read((self._told, size))
+            all_ = TOUCHED_AT + int(told[TOUCHED_COUNT] + told[NEW])
+            if all_ <= size:
+                break
+            size = all_
+        told = told[:all_].copy()  # for some bytes are read anew
+        told[TOUCHED_COUNT] += told[NEW]
+        if told[NEW] or not told[TOUCHED_MISSING]:
+            return told, np.empty(0, np.int64)
+        (found,) = self._copies.read((self._missing, int(told[TOUCHED_MISSING])))
+        return told, found.copy()
+
+    def _runs(self, first: int, end: int) -> Iterator[tuple[int, int]]:
+        """Runs of the bands whose updates fit into the list; it grows for a band that does not."""
+        # what a ray costs is no less than the voxels that it crosses
+        costs = np.concatenate([[0], np.cumsum(self._costs)])
+        while first < end:
+            fits = int(np.searchsorted(costs, costs[first] + _LISTED, side="right")) - 1
+            last = min(max(fits, first + 1), end)
+            self._reserve_list(int(costs[last] - costs[first]))
+            yield first, last
+            first = last
+
+    def _reserve_list(self, updates: int) -> None:
+        self._listed = _at_least(self._listed, ti.i32, updates, kernels.LISTED_FIELDS)
+        self._missing = _at_least(self._missing, ti.i64, updates)
+
+    def add_free(
+        self, slots: NDArray[np.int32], amounts: NDArray[np.int64], masks: NDArray[np.int64], sign: int
+    ) -> None:
+        """Add to the voxels that an image looks through."""
+        device_rows.add_free_blocks(*self._copies.given(slots, amounts, masks), sign, self._layers["sums"])
+        self._copies.finish()
+
+    def insert(
+        self,
+        count: int,
+        size: int,
+        places: NDArray[np.int32],
+        keys: NDArray[np.int64],
+        slots: NDArray[np.int32],
+    ) -> None:
+        """Have `count` blocks, new ones with voxels of zero; their keys and slots are at these places of the
+        hash, which has `size` of them. With another size than before it is empty first."""
+        self._reserve(count)
+        self._count = count
+        if self._hash_keys.shape[0] != size:
+            self._hash_keys, self._hash_slots = _zeros(ti.i64, size), _zeros(ti.i32, size)
+        if len(places):
+            handed = self._copies.given(places, keys, slots)
+            device_rows.write_hash(*handed, self._hash_keys, self._hash_slots)
+            self._copies.finish()
+
+    def drop(self, count: int) -> None:
+        """Have `count` blocks, and none of them in the hash; voxels of slots beyond become zero."""
+        gone = np.arange(count, self._count, dtype=np.int32)
+        for name in self._layer_names:
+            if len(gone):
+                rows = np.zeros((len(gone), CUBE), LAYER_DTYPES[name])
+                device_rows.write_rows(self._layers[name], gone, rows)
+        self._count = count
+        self._hash_keys.fill(0)
+
+    def largest_weights(self, slots: NDArray[np.int32]) -> NDArray[np.int32]:
+        """The largest weight in each of these blocks."""
+        self._marks = _at_least(self._marks, ti.i32, len(slots))
+        handed = self._copies.given(slots)
+        device_rows.largest_weights(self._layers["sums"], *handed, len(slots), self._marks)
+        (found,) = self._copies.read((self._marks, len(slots)))
+        return found
+
+    def read(self, name: str, slots: NDArray[np.int32], rows: NDArray[Any]) -> None:
+        """Copy blocks' rows of a layer."""
+        device_rows.read_rows(self._layers[name], slots, rows)
+
+    def write(self, name: str, slots: NDArray[np.int32], rows: NDArray[Any]) -> None:
+        """Set blocks' rows of a layer."""
+        device_rows.write_rows(self._layers[name], slots, rows)
+
+    def _reserve(self, count: int) -> None:
+        """Make room for so many blocks.
+
+        Raises:
+            RuntimeError: when the device has none; the map is as it was.
+        """
+        capacity = self._stamps.shape[0]
+        if count > capacity:
+            size = max(count, 2 * capacity)
+            stamps, told = _zeros(ti.i32, size), _zeros(ti.i32, TOUCHED_AT + size)
+            layers = {name: _zeros(_DTYPES[name], size, CUBE) for name in self._layer_names}
+            for here, there in ((self._stamps, stamps), (self._told, told)):
+                device_rows.move_list(here, there)
+            for name, larger in layers.items():
+                device_rows.move_rows(self._layers[name], self._count, larger)
+            self._stamps, self._told = stamps, told
+            self._layers |= layers
+
+
+def bands_of(told: NDArray[np.int32]) -> NDArray[np.int32]:
+    """The bands in what is told."""
+    return told[BANDS_AT:FRESH_AT].reshape(BANDS, BAND_FIELDS)
+
+
+def last_layer(kind: int) -> str:
+    """The layer that votes of this kind need beside `color_rgn`."""
+    return "hits" if kind == integrate.HIT_VOTE else "color_b"
+
+
+def _zeros(dtype: Any, *shape: int) -> Any:
+    array = ti.ndarray(dtype, shape)
+    array.fill(0)
+    return array
+
+
+def _at_least(array: Any, dtype: Any, *shape: int) -> Any:
+    """The array, or a larger one of zeros."""
+    return array if array.shape[0] >= shape[0] else _zeros(dtype, *shape)

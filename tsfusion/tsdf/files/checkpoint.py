@@ -1,0 +1,398 @@
+# SPDX-License-Identifier: MIT
+"""A saved map: one file, written whole or not at all, verified when read.
+
+    TSFMAP1\\n | header | chunk … | digest      each but the first: uint32 length, then its bytes
+
+The header is msgpack; a chunk is one zstd frame with the keys and then each layer of up to 1024 blocks,
+blocks in key order (a sum of maps has shorter chunks among them); the digest is blake2b-128 of
+everything before it.
+"""
+
+import hashlib
+import os
+import struct
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple
+
+import msgspec
+import numpy as np
+import zstandard
+from numpy.typing import NDArray
+
+from tsfusion.core import durable_files
+from tsfusion.core.config import SYMMETRIC, VolumeConfig
+from tsfusion.core.errors import CheckpointError, DamagedCheckpoint
+from tsfusion.core.side_thread import SideThread
+from tsfusion.tsdf.files import map_history
+from tsfusion.tsdf.store import clear_blocks
+from tsfusion.tsdf.store.growing_array import LAYER_DTYPES
+
+MAGIC = b"TSFMAP1\n"
+CHUNK = 1024  # blocks
+CUBE = 512  # voxels a block
+_DIGEST_BYTES = 16
+_PART = 1 << 20  # bytes that are copied at a time
+_ROWS = 128  # that are gathered at a time
+_MAX_WINDOW_BYTES = 1 << 24  # of zstd; level 1 uses less
+
+NamedArrays = Iterable[tuple[str, NDArray[Any]]]  # some rows of a chunk at a time, by the name of their layer
+
+
+class CheckpointHeader(msgspec.Struct, kw_only=True):
+    """First part of a checkpoint: the settings and history of the map, and what follows."""
+
+    config: VolumeConfig
+    keyframes: int
+    map_hash: str
+    layers: list[str]
+    meta: dict[str, Any]
+    blocks: int = 0
+    clear: bytes = b""  # blocks that keyframes look through (`clear_blocks.encoded`)
+
+    def clear_blocks(self, path: Path) -> "clear_blocks.ClearCounts":
+        """The blocks that keyframes look through, and by how many. Raises DamagedCheckpoint."""
+        try:
+            return clear_blocks.decoded(self.clear, self.config.max_blocks)
+        except ValueError as error:
+            raise DamagedCheckpoint(f"{path} is malformed: {error}") from error
+
+
+class _SavedSettings(msgspec.Struct):
+    """The settings of a header as its writer named them."""
+
+    config: dict[str, Any]
+
+
+class Chunk(NamedTuple):
+    """Up to 1024 blocks of a checkpoint that is being read.
+
+    `fill` reads the next bytes into an array: first the keys (blocks,) int64, then for each layer of the
+    header, in its order, rows (blocks, 512) of the layer's dtype. `frame`: all of it as it is stored.
+    """
+
+    first: int
+    blocks: int
+    fill: Callable[[NDArray[Any]], None]
+    frame: bytes
+
+
+class Piece(NamedTuple):
+    """Up to 1024 blocks of a checkpoint that is being written.
+
+    Either `rows`: the keys, then the layers of the header in its order; or all of that in one array,
+    `content`; or the `frame` of a `Chunk`.
+    """
+
+    blocks: int
+    rows: NamedArrays = ()
+    content: NDArray[np.uint8] | None = None
+    frame: bytes = b""
+
+
+def write(
+    path: Path,
+    header: CheckpointHeader,
+    keys: NDArray[np.int64],
+    slots: NDArray[np.int64],
+    layers: dict[str, NDArray[Any]],
+    *,
+    map_digest: "hashlib.blake2b | None" = None,
+    between: Callable[[], None] = lambda: None,
+) -> Path:
+    """Write blocks `slots` of each layer (…, 512) under their keys.
+
+    What was at `path` stays as it was until the new file is whole and on the disk. A part that a killed
+    writer left is overwritten.
+
+    Args:
+        map_digest: takes the keys and sums, so that they are read once; what it comes to is the header's
+            `map_hash`.
+        between: called after each 1024 blocks are read.
+
+    Raises:
+        CheckpointError: when the file cannot be written.
+    """
+    with SideThread() as side:
+
+        def hashed(rows: NamedArrays) -> NamedArrays:
+            for name, some in rows:
+                if map_digest is not None and name in ("keys", "sums"):
+                    side.do(partial(map_digest.update, some.data))
+                yield name, some
+
+        def map_hash() -> str:
+            side.wait()
+            return "" if map_digest is None else map_digest.hexdigest()
+
+        pieces = (
+            Piece(len(chunk), hashed(_rows(keys[i : i + CHUNK], chunk, layers)))
+            for i in range(0, len(keys), CHUNK)
+            for chunk in (slots[i : i + CHUNK],)
+        )
+        if map_digest is not None:
+            header.map_hash = "0" * 2 * map_digest.digest_size
+        hash_at_end = None if map_digest is None else map_hash
+        return write_pieces(path, header, len(keys), pieces, map_hash=hash_at_end, between=between)
+
+
+def write_pieces(
+    path: Path,
+    header: CheckpointHeader,
+    blocks: int,
+    pieces: Iterable[Piece],
+    *,
+    map_hash: Callable[[], str] | None = None,
+    between: Callable[[], None] = lambda: None,
+) -> Path:
+    """Write a map whose blocks come in pieces, as `write`, with no more than one of them in memory.
+
+    Args:
+        blocks: number of all of them.
+        pieces: in the order of their keys.
+        map_hash: what the header says, known when all pieces were taken; until then it has one as long.
+    """
+    header.blocks = blocks
+    try:
+        with durable_files.replacing(path) as file:
+            file.write(MAGIC)
+            _write_header(file, header)
+            for payload in _payloads(header, pieces, between):
+                for part in (struct.pack("<I", sum(map(len, payload))), *payload):
+                    file.write(part)
+            if map_hash is not None:
+                header.map_hash = map_hash()
+                file.seek(len(MAGIC))
+                _write_header(file, header)
+                file.seek(0, os.SEEK_END)
+            _write_digest(file)
+    except OSError as error:
+        raise CheckpointError(f"cannot write the map {path}: {error.strerror}") from error
+    return path
+
+
+def _write_header(file: BinaryIO, header: CheckpointHeader) -> None:
+    encoded = msgspec.msgpack.encode(header)
+    file.write(struct.pack("<I", len(encoded)) + encoded)
+
+
+def _write_digest(file: BinaryIO) -> None:
+    """Append the digest of a file that is written."""
+    file.flush()
+    with open(file.name, "rb") as written:
+        file.write(_digest(written, file.tell()))
+
+
+def copy(source: Path, target: Path, alter: Callable[[CheckpointHeader], None]) -> Path:
+    """Write a checkpoint whose header is another one; the blocks are copied as they are.
+
+    Raises:
+        DamagedCheckpoint, CheckpointError: as `reading` and `write`.
+    """
+    try:
+        with source.open("rb") as old, durable_files.replacing(target) as file:
+            _check_magic(old, source)
+            _check_digest(old, source)
+            header = _read_header(old, source)
+            alter(header)
+            file.write(MAGIC)
+            _write_header(file, header)
+            left = os.fstat(old.fileno()).st_size - old.tell() - _DIGEST_BYTES
+            for at in range(0, left, _PART):
+                file.write(old.read(min(_PART, left - at)))
+            _write_digest(file)
+    except OSError as error:
+        raise CheckpointError(f"cannot copy the map {source} to {target}: {error.strerror}") from error
+    return target
+
+
+def split(content: NDArray[np.uint8], layers: Iterable[str]) -> tuple[NDArray[np.int64], dict[str, Any]]:
+    """The keys (n,) and the rows (n, 512) of each layer that lie in a chunk's bytes one after the other.
+
+    Args:
+        content: as `array_for` makes it, or a whole chunk; the arrays are views of it.
+    """
+    layers = list(layers)
+    blocks = len(content) // _block_bytes(layers)
+    rows, at = dict[str, Any](), 8 * blocks
+    for name in layers:
+        end = at + blocks * CUBE * np.dtype(LAYER_DTYPES[name]).itemsize
+        rows[name] = content[at:end].view(LAYER_DTYPES[name]).reshape(blocks, CUBE)
+        at = end
+    return content[: 8 * blocks].view(np.int64), rows
+
+
+def array_for(blocks: int, layers: Iterable[str]) -> NDArray[np.uint8]:
+    """Room for the bytes of a chunk of some blocks."""
+    return np.empty(blocks * _block_bytes(layers), np.uint8)
+
+
+@contextmanager
+def reading(path: Path, *, is_checked: bool = False) -> Iterator[tuple[CheckpointHeader, Iterator[Chunk]]]:
+    """Header and chunks of a checkpoint, for the block to put straight into their place.
+
+    No more than a chunk is held beside that place. A MemoryError of the block is one of the checkpoint.
+
+    Args:
+        is_checked: the caller has read the file just now: its digest is not compared again.
+
+    Raises:
+        DamagedCheckpoint: when a byte differs from what was written.
+        CheckpointError: when the file is missing, cannot be read now, or is of another version.
+    """
+    try:
+        with path.open("rb") as file:
+            _check_magic(file, path)
+            if not is_checked:
+                _check_digest(file, path)
+            header = _read_header(file, path)
+            yield header, _read_chunks(file, path, header)
+    except OSError as error:
+        missing = isinstance(error, FileNotFoundError)
+        raise CheckpointError(f"cannot read the map {path}: {error.strerror}", missing=missing) from error
+    except MemoryError as error:
+        raise CheckpointError(f"the map {path} does not fit into this machine's memory") from error
+
+
+def keys_of(path: Path, *, is_checked: bool = False) -> tuple[CheckpointHeader, NDArray[np.int64]]:
+    """The header of a checkpoint and the keys of its blocks, sorted. Arguments and errors as of `reading`."""
+    with reading(path, is_checked=is_checked) as (header, chunks):
+        keys = np.empty(header.blocks, np.int64)
+        for chunk in chunks:
+            chunk.fill(keys[chunk.first : chunk.first + chunk.blocks])
+    return header, keys
+
+
+def verify(path: Path, header: CheckpointHeader, map_hash: str) -> None:
+    """Raise DamagedCheckpoint unless the loaded map has the hash that was saved."""
+    if map_hash != header.map_hash:
+        raise DamagedCheckpoint(f"{path} says its map hash is {header.map_hash}, but it loads as {map_hash}")
+
+
+def _payloads(
+    header: CheckpointHeader, pieces: Iterable[Piece], between: Callable[[], None]
+) -> Iterator[list[bytes]]:
+    """Each piece as it is written, in parts: the map may have left little memory."""
+    left = header.blocks
+    for piece in pieces:
+        left -= piece.blocks
+        if piece.frame:
+            yield [piece.frame]
+            continue
+        if piece.content is not None:  # at once is a quarter faster than bit by bit
+            yield [zstandard.ZstdCompressor(level=1).compress(piece.content.data)]
+            continue
+        size = piece.blocks * _block_bytes(header.layers)
+        compressor = zstandard.ZstdCompressor(level=1).compressobj(size=size)
+        parts = [compressor.compress(rows.data) for _, rows in piece.rows]
+        between()
+        yield [*parts, compressor.flush()]
+    assert left == 0, "the pieces are not all blocks"
+
+
+def _rows(
+    keys: NDArray[np.int64], slots: NDArray[np.int64], layers: dict[str, NDArray[Any]]
+) -> Iterator[tuple[str, NDArray[Any]]]:
+    """The keys of a chunk, and its rows, some at a time."""
+    yield "keys", keys
+    for name, layer in layers.items():
+        for j in range(0, len(slots), _ROWS):
+            yield name, layer[slots[j : j + _ROWS]]
+
+
+def _check_magic(file: BinaryIO, path: Path) -> None:
+    magic = file.read(len(MAGIC))
+    if magic == MAGIC:
+        return
+    is_of_another_version = len(magic) == len(MAGIC) and magic.startswith(MAGIC[:-2])
+    kind = CheckpointError if is_of_another_version else DamagedCheckpoint
+    raise kind(
+        f"{path} is not a tsfusion map of version 1 (it starts with {magic!r}); "
+        "expected the map.tsf of a server"
+    )
+
+
+def _read_header(file: BinaryIO, path: Path) -> CheckpointHeader:
+    (length,) = struct.unpack("<I", _read_exactly(file, 4, path))
+    encoded = _read_exactly(file, length, path)
+    try:
+        header = msgspec.msgpack.decode(encoded, type=CheckpointHeader)
+        if "min_behind" not in msgspec.msgpack.decode(encoded, type=_SavedSettings).config:
+            # of a version whose rays reach as far behind their ends as before them: so do those to come
+            header.config = msgspec.structs.replace(header.config, min_behind=SYMMETRIC)
+    except msgspec.ValidationError as error:  # the digest agrees: it is as its writer meant it
+        raise CheckpointError(f"{path} is of another version: {error}") from error
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise DamagedCheckpoint(f"{path} is malformed: {error}") from error
+    if not {"sums"} <= set(header.layers) <= set(LAYER_DTYPES):
+        raise CheckpointError(f"{path} is of another version: it has layers {header.layers}")
+    if not 0 <= header.blocks <= header.config.max_blocks or header.keyframes < 0:
+        claim = f"{header.blocks} blocks of {header.keyframes} keyframes"
+        raise DamagedCheckpoint(f"{path} is malformed: it claims {claim}")
+    try:
+        map_history.check_readable(header.meta)
+    except (TypeError, ValueError, LookupError, AttributeError) as error:
+        raise DamagedCheckpoint(f"{path} is malformed: its list of keyframes cannot be read") from error
+    return header
+
+
+def _block_bytes(layers: Iterable[str]) -> int:
+    """Bytes of a block: its key and its row in each layer."""
+    return 8 + sum(CUBE * np.dtype(LAYER_DTYPES[name]).itemsize for name in layers)
+
+
+def _read_chunks(file: BinaryIO, path: Path, header: CheckpointHeader) -> Iterator[Chunk]:
+    decompressor = zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW_BYTES)
+    each, first, blocks = _block_bytes(header.layers), 0, header.blocks
+    while first < blocks:
+        (length,) = struct.unpack("<I", _read_exactly(file, 4, path))
+        frame = _read_exactly(file, length, path)
+        try:
+            size = zstandard.get_frame_parameters(frame).content_size
+            if size % each or not 0 < size <= each * min(CHUNK, blocks - first):
+                raise DamagedCheckpoint(f"{path} is damaged: a chunk is not of the size expected")
+            with decompressor.stream_reader(frame) as stream:
+                yield Chunk(first, size // each, partial(_fill, stream, path), frame)
+        except zstandard.ZstdError as error:
+            raise DamagedCheckpoint(f"{path} is damaged: {error}") from error
+        first += size // each
+
+
+def _fill(stream: zstandard.ZstdDecompressionReader, path: Path, rows: NDArray[Any]) -> None:
+    """Read the next bytes of a chunk into `rows`, which are contiguous."""
+    try:
+        read = stream.readinto(rows.data)
+    except zstandard.ZstdError as error:
+        raise DamagedCheckpoint(f"{path} is damaged: {error}") from error
+    if read != rows.nbytes:
+        raise DamagedCheckpoint(f"{path} is damaged: a chunk ends {rows.nbytes - read} bytes early")
+
+
+def _check_digest(file: BinaryIO, path: Path) -> None:
+    """Compare the digest of the whole file; leaves the position in `file` as it was.
+
+    This comes before any allocation: a header with one flipped bit may ask for all memory there is.
+    """
+    here = file.tell()
+    size = file.seek(0, os.SEEK_END) - _DIGEST_BYTES
+    if size < 0 or _digest(file, size) != file.read():
+        raise DamagedCheckpoint(f"{path} is cut short or altered: its digest does not match")
+    file.seek(here)
+
+
+def _digest(file: BinaryIO, size: int) -> bytes:
+    """The digest of the first bytes of a file, whose position is behind them then."""
+    file.seek(0)
+    digest = hashlib.blake2b(digest_size=_DIGEST_BYTES)
+    for at in range(0, size, _PART):
+        digest.update(file.read(min(_PART, size - at)))
+    return digest.digest()
+
+
+def _read_exactly(file: BinaryIO, size: int, path: Path) -> bytes:
+    """Read `size` bytes, or raise DamagedCheckpoint where the file ends before."""
+    if size > os.fstat(file.fileno()).st_size or len(content := file.read(size)) != size:
+        raise DamagedCheckpoint(f"{path} is cut short")
+    return content

@@ -1,0 +1,301 @@
+# SPDX-License-Identifier: MIT
+"""A map as arrays of voxels in a file: `.npz` for NumPy, `.zarr` for what reads parts, `.vdb` for OpenVDB.
+
+Both kinds of arrays hold `voxel_size` (metres) and, for each voxel, `tsdf` float32 (signed distance to the
+surface in metres, positive in front of it, NaN where nothing was seen), `weight` float32 (votes, in
+full-confidence samples) and, where the map has colour, `color` uint8 RGB (0 where none was seen). Of the
+distance field they hold `distance` float32 (metres, at most `max_distance`) instead.
+
+Blocks: `blocks` (n, 3) int32, and `tsdf`, `weight` (n, 8, 8, 8), `color` (n, 8, 8, 8, 3). The centre of voxel
+(i, j, k) of block b is at (8 · blocks[b] + (i, j, k) + 0.5) · voxel_size.
+
+Dense: `tsdf`, `weight` (X, Y, Z), `color` (X, Y, Z, 3), and `origin` (3,) float64: the centre of voxel
+(i, j, k) is at origin + ((i, j, k) + 0.5) · voxel_size.
+
+OpenVDB: one grid, `tsdf` or `distance`; where nothing was seen, or nothing is near, it has its background.
+"""
+
+import tempfile
+import zipfile
+from collections.abc import Callable, Iterator
+from itertools import chain, pairwise
+from pathlib import Path
+from typing import IO, Any, Literal, NamedTuple, get_args
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from tsfusion.core import durable_files
+from tsfusion.core.errors import InvalidConfig, MissingDependency, OutputError
+from tsfusion.core.readable_numbers import OnProgress
+from tsfusion.geometry import openvdb_files
+from tsfusion.geometry.mesh_arrays import generator
+from tsfusion.kernels.base.sensor_noise import WEIGHT_ONE
+from tsfusion.kernels.integration.integrate import MAX_DISTANCE, QUANTA_PER_VOXEL, WEIGHT_MASK
+from tsfusion.tsdf.answers import distance_fields
+from tsfusion.tsdf.store.block_store import BlockStore, unpack_keys
+from tsfusion.tsdf.surface.surface_values import values_of
+
+MOST_DENSE = 1 << 31  # voxels
+_CHUNK = 256  # blocks at a time
+_LANE = (1 << 24) - 1  # of Σ R and Σ G
+_VOTES = (1 << 16) - 1
+_EARLIEST = (1980, 1, 1, 0, 0, 0)  # as the date of every part: the same map gives the same file
+
+
+class _GridField(NamedTuple):
+    """Values written of each voxel."""
+
+    dtype: DTypeLike
+    unseen: float
+    units: str
+    shape: tuple[int, ...] = ()
+
+
+_FIELDS = {
+    "tsdf": _GridField(np.float32, np.nan, "m"),
+    "weight": _GridField(np.float32, 0, "1"),
+    "color": _GridField(np.uint8, 0, "1", (3,)),
+    "distance": _GridField(np.float32, np.nan, "m"),
+}
+
+_HELD = {
+    "tsdf": "signed distance along rays, at most the truncation; NaN where nothing was seen",
+    "distance": "Euclidean distance to the nearest surface, at most max_distance",
+}
+FieldName = Literal["tsdf", "distance"]
+FORMATS = (".npz", ".zarr", ".vdb")
+
+
+class _Voxels(NamedTuple):
+    """Arrays of voxels, of which no more than a part is in memory."""
+
+    plain: dict[str, NDArray[Any]]  # what stands beside them
+    names: list[str]  # of `_FIELDS`
+    shape: tuple[int, ...]  # without a field's own
+    parts: Callable[[str], Iterator[NDArray[Any]]]  # of a field, in order along the first axis
+
+
+def write(
+    store: BlockStore,
+    path: Path,
+    *,
+    dense: bool,
+    field: FieldName = "tsdf",
+    max_distance: float = 0.5,
+    min_weight: float = 0.0,
+    watch: OnProgress = lambda _done, _all: None,
+) -> None:
+    """Write the voxels of a map; complete or not at all, in little memory.
+
+    Args:
+        dense: one box around the whole map, instead of its blocks.
+        field: signed distances as fused, with weights and colours; or the distance field.
+        max_distance, min_weight: of the distance field, as for `AskableMap.distance_blocks`.
+
+    Raises:
+        InvalidConfig: for another suffix or field; OutputError: when it cannot be written, a map is empty, or
+            the box has more than `MOST_DENSE` voxels; MissingDependency: zarr is not installed.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in FORMATS or field not in get_args(FieldName) or (dense and suffix == ".vdb"):
+        raise InvalidConfig(
+            f"voxels are written to {', '.join(FORMATS)}, a .vdb file never dense, and their field is one of "
+            f"{', '.join(get_args(FieldName))}; got {path}, {field!r}"
+        )
+    if not store.count or not len(used := store.used()):
+        raise OutputError(f"nothing to write to {path}: the map is empty")
+    near = distance_fields.in_blocks(store, max_distance, min_weight) if field == "distance" else iter(())
+    if suffix == ".vdb":
+        _write_vdb(path, store, used, near if field == "distance" else None, max_distance)
+        return
+    writer = _write_zarr if suffix == ".zarr" else _write_npz
+    try:
+        with tempfile.TemporaryFile(dir=path.parent) as spool:
+            if field == "tsdf":
+                voxels = _fused(store, used, dense=dense)
+            elif dense:
+                voxels = _dense_distances(store, max_distance, min_weight)
+            else:
+                voxels = _spooled_distances(store, near, max_distance, spool)
+            each = [np.dtype((_FIELDS[n].dtype, _FIELDS[n].shape)).itemsize for n in voxels.names]
+            writer(path, voxels, _Counted(watch, int(np.prod(voxels.shape)) * sum(each)))
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {error.strerror}") from error
+
+
+def _fused(store: BlockStore, used: NDArray[np.int64], *, dense: bool) -> _Voxels:
+    """The sums of a map as values."""
+    blocks = unpack_keys(store.keys[used])
+    low, high = blocks.min(axis=0), blocks.max(axis=0) + 1
+    shape = tuple(int(length) for length in 8 * (high - low)) if dense else (len(used), 8, 8, 8)
+    if dense and np.prod(shape, dtype=np.float64) > MOST_DENSE:
+        raise OutputError(
+            f"a dense box of {' × '.join(map(str, shape))} voxels is too large (at most {MOST_DENSE}): "
+            "crop the map first, or write its blocks"
+        )
+    plain: dict[str, Any] = {"voxel_size": np.float64(store.voxel_size)}
+    plain |= {"origin": 8 * low * store.voxel_size} if dense else {"blocks": blocks}
+    names = ["tsdf", "weight", "color"] if store.color else ["tsdf", "weight"]
+    if dense:
+        return _Voxels(plain, names, shape, lambda name: _slabs(store, used, blocks, name))
+    return _Voxels(plain, names, shape, lambda name: _blocks(store, used, name))
+
+
+def _dense_distances(store: BlockStore, max_distance: float, min_weight: float) -> _Voxels:
+    """The distance field around a map."""
+    found = distance_fields.in_box(store, None, max_distance, min_weight, subvoxel=True)
+    plain = {"voxel_size": np.float64(store.voxel_size), "origin": found.origin}
+    plain["max_distance"] = np.float64(max_distance)
+    slabs = np.array_split(found.distance, found.distance.shape[0] // 8)
+    return _Voxels(plain, ["distance"], found.distance.shape, lambda _: iter(slabs))
+
+
+def _spooled_distances(
+    store: BlockStore, near: Iterator[distance_fields.FieldBlocks], max_distance: float, spool: IO[bytes]
+) -> _Voxels:
+    """The distance field near a map's surfaces, which waits in a file until it is known how long it is."""
+    blocks = []
+    for one in near:
+        spool.write(one.distance.data)
+        blocks.append(one.blocks)
+    plain = {"voxel_size": np.float64(store.voxel_size), "max_distance": np.float64(max_distance)}
+    if not blocks:
+        raise OutputError("nothing to write: the map has no surface with so much weight; lower min_weight")
+    plain["blocks"] = np.concatenate(blocks)
+    count = len(plain["blocks"])
+
+    def parts(_: str) -> Iterator[NDArray[Any]]:
+        spool.seek(0)
+        for i in range(0, count, _CHUNK):
+            part = min(_CHUNK, count - i)
+            yield np.frombuffer(spool.read(part * 2048), np.float32).reshape(part, 8, 8, 8)
+
+    return _Voxels(plain, ["distance"], (count, 8, 8, 8), parts)
+
+
+def _write_npz(path: Path, voxels: _Voxels, progress: "_Counted") -> None:
+    with durable_files.replacing(path) as file, zipfile.ZipFile(file, "w") as archive:
+        for name, value in voxels.plain.items():
+            _write_array(archive, name, np.shape(value), iter([np.asarray(value)]))
+        for name in voxels.names:
+            shape = voxels.shape + _FIELDS[name].shape
+            _write_array(archive, name, shape, map(progress, voxels.parts(name)))
+
+
+def _write_zarr(path: Path, voxels: _Voxels, progress: "_Counted") -> None:
+    """A folder in which each array has chunks of `_CHUNK` blocks, or of 8 planes across x."""
+    try:
+        import zarr
+    except ImportError as error:
+        raise MissingDependency(
+            f"writing {path} needs zarr and Python 3.11 or later: pip install '.[zarr]' in your clone of "
+            "tsfusion"
+        ) from error
+    if path.is_dir() and any(path.iterdir()) and not (path / "zarr.json").exists():
+        raise OutputError(f"cannot write {path}: it is a folder of something else; choose another name")
+    with durable_files.replacing_folder(path) as folder:
+        about: dict[str, Any] = {"generator": generator(), "unit": "metre", "field": _HELD[voxels.names[0]]}
+        about["voxel_size"] = float(voxels.plain["voxel_size"])
+        group = zarr.open_group(folder, mode="w", attributes=about)
+        for name, value in voxels.plain.items():
+            names = ("block", "axis") if np.ndim(value) == 2 else ("axis",)[: np.ndim(value)]
+            group.create_array(name, data=np.asarray(value), dimension_names=names)
+        places = ("x", "y", "z") if "origin" in voxels.plain else ("block", "i", "j", "k")
+        for name in voxels.names:
+            field = _FIELDS[name]
+            first = min(8 if "origin" in voxels.plain else _CHUNK, voxels.shape[0])
+            array = group.create_array(
+                name, shape=voxels.shape + field.shape, chunks=(first, *voxels.shape[1:], *field.shape),
+                dtype=np.dtype(field.dtype), fill_value=field.unseen,
+                dimension_names=(*places, "channel")[: len(voxels.shape + field.shape)],
+                attributes={"units": field.units},
+            )  # fmt: skip
+            at = 0
+            for part in map(progress, voxels.parts(name)):
+                array[at : at + len(part)] = part.reshape(len(part), *voxels.shape[1:], *field.shape)
+                at += len(part)
+
+
+def _write_vdb(
+    path: Path,
+    store: BlockStore,
+    used: NDArray[np.int64],
+    near: Iterator[distance_fields.FieldBlocks] | None,
+    max_distance: float,
+) -> None:
+    """One grid for OpenVDB."""
+    size = store.voxel_size
+    if near is not None:
+        openvdb_files.write(path, near, name="distance", voxel_size=size, background=max_distance)
+        return
+    beyond = size * (MAX_DISTANCE + 1) / QUANTA_PER_VOXEL  # no distance that was fused is as large
+    used = used[openvdb_files.order_of(unpack_keys(store.keys[used]))]
+    parts = (
+        (unpack_keys(store.keys[part]), np.nan_to_num(decoded(store, part, "tsdf"), nan=beyond))
+        for part in (used[i : i + _CHUNK] for i in range(0, len(used), _CHUNK))
+    )
+    openvdb_files.write(path, parts, name="tsdf", voxel_size=size, background=beyond)
+
+
+class _Counted:
+    """Tells how many bytes have passed."""
+
+    def __init__(self, watch: OnProgress, total: int) -> None:
+        self._watch, self._total, self._done = watch, total, 0
+
+    def __call__(self, part: NDArray[Any]) -> NDArray[Any]:
+        self._done += part.nbytes
+        self._watch(self._done, self._total)
+        return part
+
+
+def _write_array(
+    archive: zipfile.ZipFile, name: str, shape: tuple[int, ...], parts: Iterator[NDArray[Any]]
+) -> None:
+    """Write an array of this shape whose parts, in order, are those given."""
+    entry = zipfile.ZipInfo(f"{name}.npy", _EARLIEST)
+    entry.compress_type = zipfile.ZIP_DEFLATED
+    with archive.open(entry, "w", force_zip64=True) as file:
+        first = next(parts)
+        header = {"descr": np.lib.format.dtype_to_descr(first.dtype), "fortran_order": False, "shape": shape}
+        np.lib.format.write_array_header_2_0(file, header)
+        for part in chain([first], parts):
+            file.write(np.ascontiguousarray(part).data)
+
+
+def _blocks(store: BlockStore, used: NDArray[np.int64], name: str) -> Iterator[NDArray[Any]]:
+    """Parts (m, 8, 8, 8, …) of a field."""
+    for i in range(0, len(used), _CHUNK):
+        yield decoded(store, used[i : i + _CHUNK], name)
+
+
+def _slabs(
+    store: BlockStore, used: NDArray[np.int64], blocks: NDArray[np.int32], name: str
+) -> Iterator[NDArray[Any]]:
+    """Parts (8, Y, Z, …) of a field: one for each block along x."""
+    field, low = _FIELDS[name], blocks.min(axis=0)
+    x, y, z = (blocks - low).T
+    wide, high = int(y.max()) + 1, int(z.max()) + 1
+    ends = np.searchsorted(x, np.arange(int(x.max()) + 2))
+    for first, end in pairwise(ends.tolist()):
+        slab = np.full((8, wide, 8, high, 8, *field.shape), field.unseen, field.dtype)
+        for i in range(first, end, _CHUNK):
+            part = slice(i, min(i + _CHUNK, end))
+            slab[:, y[part], :, z[part]] = decoded(store, used[part], name)
+        yield slab
+
+
+def decoded(store: BlockStore, slots: NDArray[np.int64], name: str) -> NDArray[Any]:
+    """(m, 8, 8, 8, …) of a field in blocks: `tsdf`, `weight` or `color`."""
+    shape = (len(slots), 8, 8, 8, *_FIELDS[name].shape)
+    if name == "tsdf":
+        quanta = values_of(store.keys[slots], store, 0.0)
+        return np.reshape(quanta * np.float32(store.voxel_size / QUANTA_PER_VOXEL), shape)
+    if name == "weight":
+        weights = (store.sums[slots] & WEIGHT_MASK).astype(np.float32) / np.float32(WEIGHT_ONE)
+        return np.reshape(weights, shape)
+    rgn = store.color_rgn[slots]
+    votes = np.maximum(rgn & _VOTES, 1)
+    sums = (rgn >> 40, rgn >> 16 & _LANE, store.color_b[slots])
+    return np.reshape(np.stack([np.rint(one / votes) for one in sums], axis=-1).astype(np.uint8), shape)

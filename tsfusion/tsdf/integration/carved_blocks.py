@@ -1,0 +1,366 @@
+# SPDX-License-Identifier: MIT
+"""The space that the current keyframe looks through: found on the CPU, whatever adds to the map.
+
+Blocks and which of their voxels an image carves; or, where the map does not carve, the blocks that an image
+or points look through as a whole.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core.distinct_integers import distinct
+from tsfusion.geometry.keyframe import Intrinsics, Keyframe
+from tsfusion.kernels.base.sensor_noise import MAX_CARVED, MAX_RANGE, VOXEL_SIZE
+from tsfusion.kernels.base.voxel_traversal import VOXEL_LIMIT
+from tsfusion.kernels.integration import space_carving
+from tsfusion.kernels.integration.space_carving import (
+    BLOCKS,
+    FINEST,
+    NEAREST,
+    NO_SAMPLE,
+    PATCH,
+    SCALE,
+    SIDE,
+    VIEW_TANGENT,
+    VIEWS,
+    VOXELS,
+    WORDS,
+)
+
+_FEW = 1024  # blocks of the first list
+_MOST_UNITS = 1 << 30  # of a place in an image
+_COARSEST = 64  # units a voxel
+_MOST_CUBES = VOXEL_LIMIT // SIDE - 1  # from the map's origin each way
+_FARTHEST = VOXEL_LIMIT - SIDE  # voxels, of a camera from there
+_LEAST_CUBE = 0.12  # metres: no smaller ones are looked for, where voxels are fine
+_THINNEST = 4  # only every fourth pixel of every fourth row is looked at, or more of them
+_THIN_VOXELS = 2.0  # that such a pixel is wide at the most
+_POINTS = 1 << 14  # about as many are looked at
+_PATCHES = 80  # a side of the images of points
+_GAP = 8.0  # voxels, a block: what lies farther apart than this between points is not looked through
+_GAPS = 3  # patches: so far from a point, less one, others are closed
+_MOST_STANDS = 4  # parts of a sweep that are seen from one place each
+_STAND = 2.0  # voxels that a point's own start may be away from there
+
+# The image, whether it has disparities, scale, confidence or anything, whether there is confidence: as the
+# kernels take them.
+Read = tuple[NDArray[np.float32], int, float, NDArray[Any], int]
+Optics = tuple[NDArray[np.float64], ...]
+
+
+class PointRays(NamedTuple):
+    """Points (n, 3) and the starts of their rays, (1, 3) or (n, 3), sensor frame; their confidence, and
+    whether there is any."""
+
+    points: NDArray[np.float32]
+    starts: NDArray[np.float32]
+    confidence: NDArray[Any]
+    has_confidence: int
+
+
+class _Sight(NamedTuple):
+    """A view as the kernels read it (`space_carving`), and rays of depth one through the corners of
+    its image, (3, 4)."""
+
+    numbers: NDArray[np.float64]
+    rays: NDArray[np.float64]
+
+
+class CarvedBlocks:
+    """Keys of blocks, which of their voxels are clear, and what is added to each of these.
+
+    Attributes:
+        clear: distinct keys of the blocks that are clear as a whole, where the map does not carve.
+    """
+
+    def __init__(self) -> None:
+        self.voxels = 0  # clear ones
+        self.keys = np.empty(0, np.int64)
+        self.amounts = np.empty(0, np.int64)
+        self.masks = np.empty((0, WORDS), np.int64)
+        self.clear = np.empty(0, np.int64)
+        self._room = _list_of(0)
+        self._counts = np.zeros(2, np.int32)
+        self._kind: tuple[object, ...] = ()  # of the camera that this is:
+        self._found: Optics = ()
+        self._image, self._points = _PatchImages(), _PatchImages()
+
+    def __len__(self) -> int:
+        return len(self.keys)
+
+    def forget(self) -> None:
+        """Have no blocks: the keyframe carves nothing."""
+        self.voxels = 0
+        self.keys, self.amounts, self.masks = (array[:0] for array in self._room)
+        self.clear = self.clear[:0]
+
+    def find(self, keyframe: Keyframe, read: Read, model: NDArray[np.float64], most: int) -> None:
+        """Find the blocks of a keyframe's image.
+
+        Args:
+            keyframe: one with an image.
+            read: its image, and how it is read.
+            model: the sensor model, as for `rays_from_images`.
+            most: blocks that a keyframe may touch; if there are more, one more than that is listed.
+        """
+        assert keyframe.intrinsics is not None  # checked by Keyframe
+        self.forget()
+        view = self._see(keyframe.intrinsics, keyframe.T_world_camera, read, model)
+        if view is None:
+            return
+        image, cubes = self._image, _cubes_in([view], self._image)[0, 1:]
+        if not len(self._room[0]):
+            self._room = _list_of(_FEW)
+        while True:
+            self._counts[:] = 0
+            space_carving.list_free_blocks(
+                image.clear, *image.pixels, image.levels, image.least, image.most, view.numbers, model, cubes,
+                *self._room, self._counts,
+            )  # fmt: skip
+            count, room = int(self._counts[BLOCKS]), len(self._room[0])
+            if count <= room or room > most:
+                break
+            self._room = _list_of(min(4 * room, most + 1))
+        self.keys, self.amounts, self.masks = (array[:count] for array in self._room)
+        self.voxels = int(self._counts[VOXELS])
+
+    def find_clear(self, keyframe: Keyframe, read: Read, model: NDArray[np.float64], most: int) -> None:
+        """Find the blocks that an image looks through as a whole; none where there are more than `most`.
+
+        Arguments as of `find`.
+        """
+        assert keyframe.intrinsics is not None
+        self.forget()
+        K, read = _thinned(keyframe.intrinsics, read, model)
+        if 0 in read[0].shape:
+            return
+        view = self._see(K, keyframe.T_world_camera, read, model)
+        if view is not None:
+            self.clear = self._listed([view], self._image, model[VOXEL_SIZE], most)
+
+    def find_clear_of_points(
+        self, points: PointRays, T_world_sensor: NDArray[np.float64], model: NDArray[np.float64], most: int
+    ) -> None:
+        """Likewise of points, which are drawn into images around where they are seen from."""
+        self.forget()
+        found = [self.clear]
+        for part, centre in _stands(points, model[VOXEL_SIZE]):
+            found.append(self._seen_from(centre, part, T_world_sensor, model, most))
+        clear = distinct(np.concatenate(found))
+        self.clear = clear[: len(clear) if len(clear) <= most else 0]
+
+    def _seen_from(
+        self,
+        centre: NDArray[np.float32],
+        points: PointRays,
+        T_world_sensor: NDArray[np.float64],
+        model: NDArray[np.float64],
+        most: int,
+    ) -> NDArray[np.int64]:
+        """Blocks that points look through, by images around a centre."""
+        images, side, T = self._points, _PATCHES * PATCH, T_world_sensor
+        images.make_room(side, side)
+        focal, middle = side / (2 * VIEW_TANGENT), (side - 1) / 2
+        camera = self._camera(Intrinsics(focal, focal, middle, middle), (side, side), model)
+        where = T[:3] @ np.append(centre.astype(np.float64), 1.0)
+        far, scale = camera[2][:2]
+        if far <= NEAREST or np.abs(where).max() > _FARTHEST * model[VOXEL_SIZE]:
+            return self.clear
+        ends, seen = np.full((VIEWS * _PATCHES, _PATCHES), NO_SAMPLE, np.int32), np.zeros(VIEWS, np.int32)
+        step = -(-len(points.points) // _POINTS)
+        space_carving.see_points(*points, step, centre, model, scale, ends, seen)
+        used = np.flatnonzero(seen)
+        if not len(used):
+            return self.clear
+        images.use(_closed(ends.reshape(VIEWS, _PATCHES, _PATCHES)[used], scale, far))
+        views = [_view(camera, where, T[:3, :3] @ _AXES[v], model) for v in used]
+        return self._listed(views, images, model[VOXEL_SIZE], most)
+
+    def _see(
+        self, K: Intrinsics, T: NDArray[np.float64], read: Read, model: NDArray[np.float64]
+    ) -> _Sight | None:
+        """Find how far the image's patches are clear; returns the view that it is, None = there is none."""
+        self._image.make_room(*read[0].shape)
+        camera = self._camera(K, read[0].shape, model)
+        read = (np.ascontiguousarray(read[0], np.float32), *read[1:])
+        if camera[2][0] <= NEAREST or np.abs(T[:3, 3]).max() > _FARTHEST * model[VOXEL_SIZE]:
+            return None
+        view = _view(camera, T[:3, 3], T[:3, :3], model)
+        image = self._image
+        space_carving.find_clear_depths(
+            *read, view.numbers, model, image.levels, image.clear, image.least, image.most
+        )
+        return view
+
+    def _listed(
+        self, views: Sequence[_Sight], images: "_PatchImages", voxel_size: float, most: int
+    ) -> NDArray[np.int64]:
+        """Keys of the blocks that some images look through, in no order; none where there are too many."""
+        cubes, numbers = _cubes_in(views, images), np.concatenate([view.numbers for view in views])
+        power = max(0, min(3, math.ceil(math.log2(_LEAST_CUBE / (8 * voxel_size)))))
+        keys, count = np.empty(0, np.int64), _FEW
+        while len(keys) < count <= most:
+            keys = np.empty(count, np.int64)
+            self._counts[:] = 0
+            space_carving.list_clear_blocks(
+                images.clear, *images.pixels, images.levels, images.least, images.most, numbers, cubes, power,
+                keys, self._counts,
+            )  # fmt: skip
+            count = int(self._counts[BLOCKS])
+        return keys[: count if count <= most else 0]
+
+    def _camera(self, K: Intrinsics, shape: tuple[int, ...], model: NDArray[np.float64]) -> Optics:
+        """`_camera_of` images, nearly always that of the images before."""
+        kind = K, shape, model[MAX_RANGE], model[VOXEL_SIZE]
+        if kind != self._kind:
+            self._kind, self._found = kind, _camera_of(K, shape, model)
+        return self._found
+
+    @property
+    def nbytes(self) -> int:
+        """Memory, bytes."""
+        return sum(array.nbytes for array in self._room) + self._image.nbytes + self._points.nbytes
+
+
+class _PatchImages:
+    """How far the patches of images are clear, and the least and the most in squares of them."""
+
+    def __init__(self) -> None:
+        self.pixels = 0, 0  # height, width of each
+        self.clear = np.zeros((0, 0), np.int32)
+        self.levels = np.zeros((0, 4), np.int32)
+        self.least = self.most = np.zeros(0, np.int32)
+
+    def make_room(self, height: int, width: int) -> None:
+        """Have an image of (height, width) pixels."""
+        if self.pixels == (height, width):
+            return
+        rows, columns = -(-height // PATCH), -(-width // PATCH)
+        clear = np.zeros((rows, columns), np.int32)
+        levels = [(0, -(-rows // 2), -(-columns // 2), rows)]
+        while levels[-1][1:3] != (1, 1):
+            begin, high, wide, _ = levels[-1]
+            levels.append((begin + high * wide, -(-high // 2), -(-wide // 2), rows))
+        least, most = (np.zeros(levels[-1][0] + 1, np.int32) for _ in range(2))
+        # all of them, or none where there is no memory
+        self.pixels, self.clear, self.levels = (height, width), clear, np.array(levels, np.int32)
+        self.least, self.most = least, most
+
+    def use(self, clear: NDArray[np.int32]) -> None:
+        """Have the patches of some images, (n, rows, columns)."""
+        squares = int(self.levels[-1, 0]) + 1
+        self.clear = clear.reshape(-1, clear.shape[2])
+        self.least, self.most = (np.empty(len(clear) * squares, np.int32) for _ in range(2))
+        space_carving.fill_levels(self.clear, self.levels, self.least, self.most)
+
+    @property
+    def nbytes(self) -> int:
+        return sum(array.nbytes for array in (self.clear, self.levels, self.least, self.most))
+
+
+# Of images of points: where their columns, rows and depths go in the sensor's frame
+_AXES = np.array(
+    [np.roll(np.eye(3), axis, axis=0)[:, [1, 2, 0]] * [1, 1, sign] for axis in range(3) for sign in (1, -1)]
+)
+
+
+def _list_of(blocks: int) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    return np.zeros(blocks, np.int64), np.zeros(blocks, np.int64), np.zeros((blocks, WORDS), np.int64)
+
+
+def _view(
+    camera: Optics, centre: NDArray[np.float64], orientation: NDArray[np.float64], model: NDArray[np.float64]
+) -> _Sight:
+    """The view of a camera at a centre, metres."""
+    matrix, corners, rest = camera
+    # sums one after the other, as every processor makes them
+    directions = matrix[:, :1] * orientation[:, 0] + matrix[:, 1:2] * orientation[:, 1]
+    directions += matrix[:, 2:] * orientation[:, 2]
+    numbers = np.concatenate([centre / model[VOXEL_SIZE], directions.ravel(), rest])
+    return _Sight(numbers, orientation @ corners)
+
+
+def _cubes_in(views: Sequence[_Sight], images: _PatchImages) -> NDArray[np.int32]:
+    """Cubes of 64 voxels that each view is to look at: where they begin in the list of all, the first of
+    them, and how many on each axis; (views + 1, 7)."""
+    found = np.zeros((len(views) + 1, 7), np.int32)
+    deepest = images.most.reshape(len(views), -1)[:, -1]
+    for n, (numbers, rays) in enumerate(views):
+        centre = numbers[:3]
+        ends = centre[:, None] + float(deepest[n]) / numbers[SCALE] * rays
+        # a voxel's centre is no cube's border
+        low, high = np.minimum(centre, ends.min(axis=1)), np.maximum(centre, ends.max(axis=1))
+        found[n, 1:] = np.clip(np.floor(np.concatenate([low, high]) / SIDE), -_MOST_CUBES, _MOST_CUBES)
+        found[n, 4:] -= found[n, 1:4] - 1
+        found[n + 1, 0] = found[n, 0] + found[n, 4:].prod()
+    return found
+
+
+def _thinned(K: Intrinsics, read: Read, model: NDArray[np.float64]) -> tuple[Intrinsics, Read]:
+    """A camera's image of fewer pixels, none of which is wide; what they miss has hits in the map."""
+    image, is_disparity, scale, confidence, has_confidence = read
+    widest = _THIN_VOXELS * model[VOXEL_SIZE] / model[MAX_RANGE]
+    step = max(1, min(_THINNEST, int(min(K.fx, abs(K.fy), 1e6) * widest)))
+    if step == 1:
+        return K, read
+    first, (height, width) = step // 2, image.shape
+    chosen = tuple(slice(first, first + step * (side // step), step) for side in (height, width))
+    thin = np.ascontiguousarray(image[chosen], np.float32)
+    if has_confidence:
+        confidence = np.ascontiguousarray(confidence[chosen])
+    camera = Intrinsics(K.fx / step, K.fy / step, (K.cx - first) / step, (K.cy - first) / step)
+    return camera, (thin, is_disparity, scale, confidence, has_confidence)
+
+
+def _stands(points: PointRays, voxel_size: float) -> Iterator[tuple[PointRays, NDArray[np.float32]]]:
+    """Parts of a sweep, and where each is seen from; without those of a place that varies by too much."""
+    count, reach = len(points.points), _STAND * voxel_size
+    parts = min(1 if len(points.starts) == 1 else _MOST_STANDS, count)
+    for part in range(parts):
+        chosen = slice(count * part // parts, count * (part + 1) // parts)
+        starts = points.starts if len(points.starts) == 1 else points.starts[chosen]
+        centre = (starts.min(axis=0) + starts.max(axis=0)) / 2
+        if np.abs(starts - centre).max() <= reach:
+            confidence = points.confidence[chosen] if points.has_confidence else points.confidence
+            yield PointRays(points.points[chosen], starts, confidence, points.has_confidence), centre
+
+
+def _closed(ends: NDArray[np.int32], scale: float, far: float) -> NDArray[np.int32]:
+    """Depths up to which patches (n, rows, columns) are clear, from where points end in them, units.
+
+    A patch without a point is as clear as those around it. Points that lie far apart say nothing about what
+    is between them: the wider such a gap, the nearer it ends.
+    """
+    near, clear = ends, np.zeros_like(ends)
+    for gap in range(_GAPS):
+        if gap:
+            near = np.pad(near, ((0, 0), (1, 1), (1, 1)), constant_values=NO_SAMPLE)
+            near = np.minimum(np.minimum(near[:, :-2], near[:, 1:-1]), near[:, 2:])
+            near = np.minimum(np.minimum(near[..., :-2], near[..., 1:-1]), near[..., 2:])
+        patch = (2 * gap + 2) * 2 * VIEW_TANGENT / _PATCHES  # at depth one, at the most between two points
+        most = np.int32(min(_GAP / patch, far) * scale)
+        np.maximum(clear, np.minimum(near, most) * (near < NO_SAMPLE), out=clear)
+    return clear
+
+
+def _camera_of(K: Intrinsics, shape: tuple[int, ...], model: NDArray[np.float64]) -> Optics:
+    """A camera: what a step right, down and forward adds to column · depth, row · depth and depth, (3, 3);
+    rays of depth one through the image's corners, (3, 4); and the last six numbers of a view."""
+    height, width = shape[:2]
+    middle = (K.cx + 0.5) / PATCH, (K.cy + 0.5) / PATCH
+    matrix = np.array([(K.fx / PATCH, 0, middle[0]), (0, K.fy / PATCH, middle[1]), (0, 0, 1)])
+    x = [(u - 0.5 - K.cx) / K.fx for u in (0, width)]
+    y = [(v - 0.5 - K.cy) / K.fy for v in (0, height)]
+    corners = np.array([(a, b, 1.0) for a in x for b in y])
+    widest = max(math.hypot(*corner) for corner in corners)
+    # the most units of a place in the image, of one that lies a voxel away
+    most = _MOST_UNITS / math.sqrt(3) / max(math.hypot(*row) for row in matrix)
+    far = min(MAX_CARVED / widest, model[MAX_RANGE] / model[VOXEL_SIZE], (most / _COARSEST - SIDE) / widest)
+    if not far > NEAREST:  # as wide an image is no camera's; also where numbers are too large
+        return matrix, corners.T, np.zeros(6)
+    scale = min(2.0 ** math.floor(math.log2(most / (far * widest + SIDE))), FINEST)
+    return matrix, corners.T, np.array([far, scale, K.fx, K.fy, K.cx, K.cy])

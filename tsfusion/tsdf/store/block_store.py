@@ -1,0 +1,471 @@
+# SPDX-License-Identifier: MIT
+"""The map's memory: blocks of 8³ voxels in slots, found by their packed coordinates."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core import process
+from tsfusion.core.config import CacheConfig
+from tsfusion.core.distinct_integers import distinct
+from tsfusion.core.errors import MapFull
+from tsfusion.kernels.base import block_hash, runtime
+from tsfusion.kernels.integration.integrate import CHANGED, CUBE, WEIGHT_MASK
+from tsfusion.kernels.surface import voxel_values
+from tsfusion.kernels.surface.surface_cells import NO_LIMITS
+from tsfusion.tsdf.store.clear_blocks import ClearBlocks
+from tsfusion.tsdf.store.growing_array import LAYER_DTYPES, MAX_ITEMS, FileArray, GrowingArray
+from tsfusion.tsdf.store.residency import Residency
+
+# Who follows the changes of blocks: `Volume.take_dirty`, what is kept of answers, `shows_surface`
+MESHED, ASKED, SURFACES = 1, 2, 4
+_FIRST_CAPACITY = 1024
+_CHUNK = 1024  # blocks read at a time where a whole layer would be copied
+_HASH_BYTES = 4 * 12  # most that a block takes in the hash, which is a quarter full or fuller
+# What the keys of a block and of its neighbours towards −x, −y, −z are smaller by
+CELL_STEPS = np.array([x << 42 | y << 21 | z for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+
+
+class DeviceRows:
+    """Rows of a store on a device as well; these are on none, and `DeviceBlocks` on one.
+
+    Attributes:
+        first_blocks: number of blocks for which a store has room at first.
+        is_none: whether there is no device.
+        sends_blocks: when `insert` tells the device; later = with the next call, never = it has them.
+    """
+
+    first_blocks = _FIRST_CAPACITY
+    is_none = True
+    sends_blocks: Literal["now", "later", "never"] = "never"
+
+    def fetch(self, layers: dict[str, GrowingArray]) -> None:
+        """Bring the store's rows up to date."""
+
+    def send(self, layers: dict[str, GrowingArray], count: int) -> None:
+        """Bring the device's rows of `count` blocks up to date."""
+
+    def note_written(self, slots: NDArray[Any]) -> None:
+        """Note that the store's rows have been written to."""
+
+    def note_added(self, slots: NDArray[np.int32], count: int) -> None:
+        """Note that the device has added to blocks, of `count` in all."""
+
+    def insert(
+        self,
+        count: int,
+        places: NDArray[np.int32],
+        hash_keys: NDArray[np.int64],
+        hash_slots: NDArray[np.int32],
+    ) -> None:
+        """Let the device have `count` blocks: new are those at these places of the hash, or all of another
+        size of it.
+
+        Raises:
+            MemoryError: there is no room for them; the device has those that it had. Where they are sent
+                later, the next call raises it.
+        """
+
+    def drop(self, count: int, hash_keys: NDArray[np.int64], hash_slots: NDArray[np.int32]) -> None:
+        """Let the device have `count` blocks, as the hash has them, and no others."""
+
+
+class BlockStore:
+    """Slots 0 … count-1, each with a key and one row of 512 voxels in every layer.
+
+    Layers, (slot, 512): `sums` int64; with colour `color_rgn` int64 and `color_b` int32; when smoothing
+    `correction` float32; where hits are counted `hits` int32 (see kernels/integration/integrate.py and
+    kernels/integration/ray_smoothing.py). Beside them, one number a
+    block: `dirty` uint8 (a bit for each that follows the changes), and int32 `stamps` (the last keyframe that
+    touched it), `places` (where in that keyframe's list), `bounds` (no voxel has more weight than this).
+    A layer the map does not have is one row of zeros, so that kernels can be handed it.
+
+    With a `cache` the layers lie in files, and blocks that no keyframe has changed for long leave memory:
+    whoever touches rows of many blocks calls `keep_within_memory` now and then.
+
+    With a `device` keyframes are added there. Rows that are read here are brought up to date first; whoever
+    writes to rows says which (`note_written`).
+    """
+
+    def __init__(
+        self,
+        *,
+        voxel_size: float,
+        color: bool,
+        corrected: bool,
+        hits: bool = False,
+        back_limits: tuple[float, float] = NO_LIMITS,
+        cache: CacheConfig | None = None,
+        device: DeviceRows | None = None,
+    ) -> None:
+        self.voxel_size = voxel_size
+        self.back_limits = back_limits  # of a mesh (`mesh_extraction.back_limits`)
+        self.color, self.corrected, self.counts_hits = color, corrected, hits
+        self.count = 0
+        self.drops = 0  # how often blocks have gone, or moved to other slots
+        self.stamp = 0  # number of the last keyframe, added or taken away; a map that is opened begins at 0
+        self.most_blocks = MAX_ITEMS
+        self.pause: Callable[[], None] = lambda: None  # between two steps of a long pass that only reads
+        self._device = device or DeviceRows()
+        self._room = self._device.first_blocks  # that fit into the memory that is there
+        self._hash_keys = np.zeros(4 * self._room, np.int64)
+        self._hash_slots = np.zeros(4 * self._room, np.int32)
+        self._hashed = 0  # blocks that are in the hash; the others follow when somebody asks
+        self._keys = GrowingArray((), np.int64, self._room)
+        self._dirty = GrowingArray((), np.uint8, self._room)
+        self._stamps, self._places, self._bounds = (GrowingArray((), np.int32, self._room) for _ in range(3))
+        present = {"sums": True, "color_rgn": color, "color_b": color, "correction": corrected, "hits": hits}
+        self._present = [name for name, there in present.items() if there]
+        self.clear = ClearBlocks()
+        self._layers = {name: self._layer(name, cache) for name in present}
+        self._residency: Residency | None = None
+        self._memory_bytes = 0
+        if cache:
+            self._residency = Residency(self._files, cache.disk_bytes)
+            self.most_blocks = min(MAX_ITEMS, cache.disk_bytes // self._residency.row_bytes)
+
+    def _layer(self, name: str, cache: CacheConfig | None) -> GrowingArray:
+        kind = (CUBE,), LAYER_DTYPES[name]
+        if name not in self._present:
+            return GrowingArray(*kind, 1)
+        if cache is None:
+            return GrowingArray(*kind, self._room)
+        return FileArray(*kind, self._room, Path(cache.folder), cache.min_free_bytes)
+
+    @property
+    def _files(self) -> list[FileArray]:
+        return [layer for layer in self._layers.values() if isinstance(layer, FileArray)]
+
+    @contextmanager
+    def opening(self, blocks: int) -> Iterator[None]:
+        """Take so many blocks of a saved map in the block, whatever limits one that grows has."""
+        limits = self.most_blocks, [file.min_free_bytes for file in self._files]
+        self.most_blocks = MAX_ITEMS
+        for file in self._files:
+            file.min_free_bytes = None
+        try:
+            self.reserve(blocks)
+            yield
+        finally:
+            self.most_blocks = limits[0]
+            for file, least in zip(self._files, limits[1], strict=True):
+                file.min_free_bytes = least
+
+    def shown(self, layer: str) -> NDArray[Any] | None:
+        """(count, 512) rows of a layer, not copied (`GrowingArray.shown`); None if there is none."""
+        self._fetch()
+        return self._layers[layer].shown(self.count) if layer in self._present else None
+
+    @property
+    def hash_keys(self) -> NDArray[np.int64]:
+        """The hash from block to slot (kernels/base/block_hash.py): keys."""
+        self._hash()
+        return self._hash_keys
+
+    @property
+    def hash_slots(self) -> NDArray[np.int32]:
+        """Likewise slots."""
+        self._hash()
+        return self._hash_slots
+
+    @property
+    def keys(self) -> NDArray[np.int64]:
+        return self._keys.array[: self.count]
+
+    @property
+    def sums(self) -> NDArray[np.int64]:
+        return self._rows("sums")
+
+    @property
+    def color_rgn(self) -> NDArray[np.int64]:
+        return self._rows("color_rgn")
+
+    @property
+    def color_b(self) -> NDArray[np.int32]:
+        return self._rows("color_b")
+
+    @property
+    def correction(self) -> NDArray[np.float32]:
+        return self._rows("correction")
+
+    @property
+    def hits(self) -> NDArray[np.int32]:
+        return self._rows("hits")
+
+    @property
+    def ray_ends(self) -> tuple[NDArray[np.int64], NDArray[np.int32], int]:
+        """Layers that count the rays which end in a voxel, and which of them the map has
+        (`voxel_values.held`)."""
+        return self.color_rgn, self.hits, self.color + 2 * self.counts_hits
+
+    @property
+    def clear_blocks(self) -> tuple[NDArray[Any], ...]:
+        """By slot, whether a block shows a surface or hits; and the blocks that keyframes look through
+        (`voxel_values.is_clear`)."""
+        clear = self.clear
+        if len(clear):
+            with process.uninterrupted():
+                slots = clear.take_unknown(self.drops, self.count, self.take_dirty(SURFACES))
+                for i in range(0, len(slots), _CHUNK):
+                    chunk = slots[i : i + _CHUNK]
+                    voxel_values.find_surfaces(chunk, self.sums, *self.ray_ends, clear.shows_surface)
+                    self.keep_within_memory()
+        return clear.shows_surface, *clear.table
+
+    @property
+    def dirty(self) -> NDArray[np.uint8]:
+        return self._dirty.array
+
+    @property
+    def stamps(self) -> NDArray[np.int32]:
+        return self._stamps.array
+
+    @property
+    def places(self) -> NDArray[np.int32]:
+        return self._places.array
+
+    @property
+    def bounds(self) -> NDArray[np.int32]:
+        return self._bounds.array
+
+    def layers(self) -> dict[str, NDArray[Any]]:
+        """The layers the map has, by name."""
+        self._fetch()
+        return {name: self._layers[name].array for name in self._present}
+
+    def _rows(self, layer: str) -> NDArray[Any]:
+        self._fetch()
+        return self._layers[layer].array
+
+    def _fetch(self) -> None:
+        self._device.fetch(self._layers)
+
+    def send(self) -> None:
+        """Bring what was written to rows to the device."""
+        self._device.send(self._layers, self.count)
+
+    def note_written(self, slots: NDArray[Any]) -> None:
+        """Note that rows have been written to, from outside."""
+        self._device.note_written(slots)
+
+    def note_touched(self, slots: NDArray[np.int32]) -> None:
+        """Note that the current keyframe has changed blocks on the device."""
+        self._device.note_added(slots, self.count)
+        self.stamps[slots], self.dirty[slots] = self.stamp, CHANGED
+
+    def limit(self, nbytes: int) -> None:
+        """Let the map take no more than so many bytes of memory from now on; a larger one stays as it is.
+
+        The number of blocks that this allows depends on the layers alone, never on how the map has grown.
+        With a cache the map may grow on; its coldest blocks leave memory.
+        """
+        if self._residency is None:
+            self.most_blocks = nbytes // (self.bytes_per_block + _HASH_BYTES)
+        else:
+            self._memory_bytes = nbytes
+            self.keep_within_memory()
+
+    @property
+    def is_in_files(self) -> bool:
+        return self._residency is not None
+
+    def keep_within_memory(self) -> None:
+        """Let the coldest blocks leave memory if there are too many: call it after rows were touched."""
+        if self._residency is not None:
+            index = self.nbytes - self.count * self._residency.row_bytes
+            self._residency.keep_within(max(self._memory_bytes - index, 0), self.stamps[: self.count])
+
+    def rest(self) -> None:
+        """Let blocks leave memory, and others have their turn: call it between the steps of a long pass.
+
+        Only of one that reads, and can bear that others read meanwhile.
+        """
+        self.keep_within_memory()
+        self.pause()
+
+    def reserve(self, count: int) -> None:
+        """Make room for `count` blocks in all.
+
+        Raises:
+            MemoryError: when there is not enough; the map is as it was.
+            MapFull: likewise on the disk of the cache.
+        """
+        if count > max(self.most_blocks, self.count) and self._residency is not None:
+            raise MapFull(
+                f"the map may take disk_bytes = {self._residency.disk_bytes} bytes on the disk, which are "
+                f"{self.most_blocks} blocks; it has {self.count}, and {count - self.count} more are needed"
+            )
+        if count > max(self.most_blocks, self.count):
+            raise MemoryError(
+                f"the map may have {self.most_blocks} blocks in the memory that is set; "
+                f"it has {self.count}, and {count - self.count} more are needed"
+            )
+        if count <= self._room:
+            return
+        for array in self._arrays():
+            array.reserve(count)
+        if 2 * count > len(self._hash_keys):
+            size = 1 << (2 * count - 1).bit_length()  # of the count alone, not of how it was reached
+            self._hash_keys, self._hash_slots = np.zeros(size, np.int64), np.zeros(size, np.int32)
+            self._hashed = 0
+        self._room = min(len(self._hash_keys) // 2, *(array.capacity for array in self._arrays()))
+
+    @property
+    def spare(self) -> int:
+        """Number of blocks that `insert` takes without more memory."""
+        return max(min(self._room, self.most_blocks) - self.count, 0)
+
+    def insert(self, keys: NDArray[np.int64]) -> None:
+        """Append blocks with distinct new keys; their voxels are zero. Raises as `reserve`."""
+        first, count = self.count, self.count + len(keys)
+        self.reserve(count)
+        self._keys.array[first:count] = keys
+        self.count = count
+        if self._device.sends_blocks != "never":
+            places = np.empty(len(keys), np.int32)
+            block_hash.find_places(keys, self.hash_keys, places)
+            try:
+                self._device.insert(count, places, self.hash_keys, self.hash_slots)
+            except MemoryError:
+                self.drop(first)
+                raise
+
+    def drop(self, count: int) -> None:
+        """Take back the newest blocks, so that `count` remain; their voxels must be zero."""
+        for array in (self._keys, self._dirty, self._stamps, self._places, self._bounds):
+            array.array[count : self.count] = 0
+        self.count = count
+        self.drops += 1
+        self._hash_keys[:] = self._hash_slots[:] = 0
+        self._hashed = 0
+        if not self._device.is_none:
+            self._device.drop(count, self.hash_keys, self.hash_slots)
+
+    def release(self, slots: NDArray[np.int64]) -> None:
+        """Give up blocks without votes: the last ones take their slots, and new ones the room."""
+        self._fetch()
+        left = self.count - len(slots)
+        is_free = np.zeros(self.count, bool)
+        is_free[slots] = True
+        to, moved = np.flatnonzero(is_free[:left]), left + np.flatnonzero(~is_free[left:])
+        for rows in (array.array for array in self._arrays()):
+            for i in range(0, len(to), _CHUNK):
+                rows[to[i : i + _CHUNK]] = rows[moved[i : i + _CHUNK]]
+            rows[left : self.count] = 0
+            self.keep_within_memory()
+        self.drop(left)
+        self.note_written(to)
+
+    def slots_of(self, keys: NDArray[np.int64]) -> NDArray[np.int32]:
+        """(n,) slots of (n,) keys, −1 where there is no such block."""
+        slots = np.empty(len(keys), np.int32)
+        block_hash.find_blocks(keys, self.hash_keys, self.hash_slots, slots)
+        return slots
+
+    def copy_from(self, other: "BlockStore") -> None:
+        """Become a copy of another store with the same layers, as long as this one is empty. As `reserve`."""
+        self.most_blocks, self._memory_bytes = other.most_blocks, other._memory_bytes
+        with self.opening(other.count):
+            self.insert(other.keys)
+        other._fetch()
+        for mine, theirs in zip(self._arrays(), other._arrays(), strict=True):
+            for i in range(0, self.count, _CHUNK):
+                chunk = slice(i, min(i + _CHUNK, self.count))
+                mine.array[chunk] = theirs.array[chunk]
+                self.keep_within_memory()
+                other.keep_within_memory()
+        self.clear.replace(other.clear.counts())
+        self.stamp, self.drops = other.stamp, other.drops
+        self.note_written(np.arange(self.count))
+
+    def measure_bounds(self) -> None:
+        """Set `bounds` from the sums."""
+        for i in range(0, self.count, _CHUNK):
+            chunk = slice(i, min(i + _CHUNK, self.count))
+            self.bounds[chunk] = (self.sums[chunk] & WEIGHT_MASK).max(axis=1)
+            self.keep_within_memory()
+
+    def take_dirty(self, follower: int) -> NDArray[np.int64]:
+        """Slots of the blocks changed since the last call for this follower: `MESHED` or `ASKED`."""
+        slots = np.flatnonzero(self.dirty[: self.count] & follower)
+        self.dirty[slots] &= 255 - follower
+        return slots
+
+    def used(self) -> NDArray[np.int64]:
+        """Slots with any vote left, in the order of their keys."""
+        has_votes = np.empty(self.count, bool)
+        for i in range(0, self.count, _CHUNK):
+            chunk = slice(i, min(i + _CHUNK, self.count))
+            self.sums[chunk].any(axis=1, out=has_votes[chunk])
+            self.rest()
+        order = np.argsort(self.keys)
+        return order[has_votes[order]]
+
+    def in_order(self, layer: str) -> Iterator[tuple[NDArray[np.int64], NDArray[Any]]]:
+        """Keys and rows of the used blocks in key order, up to 1024 at a time."""
+        used, rows = self.used(), self._rows(layer)
+        for i in range(0, len(used), _CHUNK):
+            chunk = used[i : i + _CHUNK]
+            if (np.diff(chunk) == 1).all():  # as in a map that was just loaded: nothing has to be gathered
+                yield self.keys[chunk], rows[chunk[0] : chunk[-1] + 1]
+            else:
+                yield self.keys[chunk], rows[chunk]
+            self.rest()
+
+    def _hash(self) -> None:
+        """Put the blocks into the hash that are not there yet. For the thread that kernels run in."""
+        runtime.check_thread()
+        first, self._hashed = self._hashed, self.count
+        if first < self.count:
+            block_hash.insert_blocks(
+                self._keys.array, first, self.count - first, first, self._hash_keys, self._hash_slots
+            )
+
+    @cached_property
+    def bytes_per_block(self) -> int:
+        """Memory of one block in all arrays, without the hash."""
+        return sum(array.item_bytes for array in self._arrays())
+
+    def _arrays(self) -> tuple[GrowingArray, ...]:
+        layers = (self._layers[name] for name in self._present)
+        return (self._keys, self._dirty, self._stamps, self._places, self._bounds, *layers)
+
+    @property
+    def nbytes(self) -> int:
+        """Size of the blocks and their hash, bytes."""
+        clear = self.clear.nbytes
+        return self.count * self.bytes_per_block + self._hash_keys.nbytes + self._hash_slots.nbytes + clear
+
+    @property
+    def resident_bytes(self) -> int:
+        """Memory that the blocks and their hash take, bytes: less than `nbytes` where some are in files."""
+        if self._residency is None:
+            return self.nbytes
+        return self.nbytes - self.count * self._residency.row_bytes + self._residency.nbytes
+
+
+def pack_keys(coordinates: NDArray[np.int32]) -> NDArray[np.int64]:
+    """(n, 3) block coordinates → (n,) int64 keys, as `kernels.base.voxel_traversal.pack`."""
+    x, y, z = (np.asarray(coordinates, np.int64) + (1 << 20)).reshape(-1, 3).T
+    return np.ascontiguousarray(x << 42 | y << 21 | z)
+
+
+def unpack_keys(keys: NDArray[np.int64]) -> NDArray[np.int32]:
+    """(n,) keys → (n, 3) int32 block coordinates."""
+    mask = (1 << 21) - 1
+    return (np.stack([keys >> 42, keys >> 21, keys], axis=1) & mask).astype(np.int32) - (1 << 20)
+
+
+def distinct_blocks(coordinates: NDArray[np.int32]) -> NDArray[np.int32]:
+    """(n, 3) block coordinates, each once, in the order of their keys: (m, 3) int32."""
+    return unpack_keys(distinct(pack_keys(coordinates)))
+
+
+def cells_of(coordinates: NDArray[np.int32]) -> NDArray[np.int32]:
+    """The blocks whose cells read these blocks: themselves and their neighbours towards −x, −y, −z."""
+    return unpack_keys(distinct(pack_keys(coordinates)[:, None] - CELL_STEPS))

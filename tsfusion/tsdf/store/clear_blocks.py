@@ -1,0 +1,184 @@
+# SPDX-License-Identifier: MIT
+"""How many keyframes look through each block as a whole: free space that no voxel holds.
+
+What a keyframe looks through (`carved_blocks`) is a function of the keyframe alone: counts are sums as
+the voxels' are, and a keyframe that is taken away takes its own. A block is free where one keyframe or more
+looks through it and its voxels show neither a hit nor a surface.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core.distinct_integers import distinct
+from tsfusion.core.errors import MapFull
+from tsfusion.kernels.base import block_hash
+from tsfusion.tsdf.store.growing_array import MAX_ITEMS, GrowingArray
+
+_FIRST = 64  # blocks
+_MOST_NOTED = 1 << 16  # blocks that became free or ceased to be, for those who follow
+_A_BLOCK = 8  # for each block that a map may have: they take a tenth of its memory at the most
+
+ClearCounts = tuple[
+    NDArray[np.int64], NDArray[np.int32]
+]  # distinct keys of blocks, ascending, and their counts
+
+
+class ClearBlocks:
+    """Blocks by their keys in slots of their own, each with its count.
+
+    A count below one is none: a map of an earlier version did not count the keyframe that was taken away.
+    """
+
+    def __init__(self) -> None:
+        self._count = 0
+        self._keys, self._counts = GrowingArray((), np.int64, _FIRST), GrowingArray((), np.int32, _FIRST)
+        self._hash = np.zeros(4 * _FIRST, np.int64), np.zeros(4 * _FIRST, np.int32)
+        self._noted: list[NDArray[np.int64]] = []
+        self.noted = 0  # number of blocks that were noted ever
+        self.shows_surface = np.zeros(1, np.uint8)  # by slot of the map's blocks: a hit, or a surface
+        self._known = 0, 0  # drops and blocks of the map that this is of
+
+    def __len__(self) -> int:
+        return self._count
+
+    @property
+    def table(self) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.int32]]:
+        """Hash from key to slot, and counts by slot, as kernels read them (`voxel_values.is_clear`)."""
+        return *self._hash, self._counts.array
+
+    def counts(self) -> ClearCounts:
+        """All blocks with a count."""
+        slots = np.flatnonzero(self._counts.array[: self._count])
+        slots = slots[np.argsort(self._keys.array[slots])]
+        return self._keys.array[slots], self._counts.array[slots]
+
+    def add(self, keys: NDArray[np.int64], amount: int | NDArray[np.int32], most: int) -> None:
+        """Add to the counts of blocks, all or none; what is taken from blocks without a count is nothing.
+
+        Args:
+            keys: distinct.
+            amount: of all, or of each.
+            most: blocks with voxels that the map may have.
+
+        Raises:
+            MapFull: there would be too many; MemoryError: there is no room.
+        """
+        slots = self._slots_of(keys)
+        missing = keys[slots < 0]
+        if len(missing) and np.max(amount) > 0:
+            self._insert(np.sort(missing), most)
+            slots = self._slots_of(keys)
+        keys, slots = keys[slots >= 0], slots[slots >= 0]
+        before = self._counts.array[slots]
+        self._counts.array[slots] = after = before + np.asarray(amount, np.int32)
+        self._note(keys[(before > 0) != (after > 0)])
+
+    def replace(self, counts: ClearCounts) -> None:
+        """Have these counts instead. Raises MemoryError."""
+        self._keys.array[: self._count] = self._counts.array[: self._count] = 0
+        for array in self._hash:
+            array[:] = 0
+        self._count = 0
+        self.add(*counts, MAX_ITEMS // _A_BLOCK)
+        self._noted, self.noted = [], self.noted + _MOST_NOTED + 1  # more than anybody follows
+
+    def changed_since(self, noted: int) -> NDArray[np.int64] | None:
+        """Keys of the blocks that are looked through, or not any more, since so many were `noted`; None = too
+        many."""
+        found, left = [np.empty(0, np.int64)], self.noted - noted
+        for keys in reversed(self._noted):
+            if left <= 0:
+                break
+            found.append(keys[-left:])
+            left -= len(keys)
+        return None if left > 0 else distinct(np.concatenate(found))
+
+    def take_unknown(self, drops: int, blocks: int, changed: NDArray[np.int64]) -> NDArray[np.int32]:
+        """Slots of the map's blocks to look at again: those that have changed, and new ones.
+
+        Args:
+            drops, blocks: how often blocks have moved, and how many there are.
+        """
+        first = self._known[1] if self._known[0] == drops else 0
+        if blocks > len(self.shows_surface):
+            self.shows_surface = np.append(self.shows_surface, np.zeros(blocks, np.uint8))
+        self._known = drops, blocks
+        return np.union1d(changed, np.arange(first, blocks)).astype(np.int32)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory, bytes."""
+        return len(self.shows_surface) + 12 * self._count + sum(array.nbytes for array in self._hash)
+
+    def _slots_of(self, keys: NDArray[np.int64]) -> NDArray[np.int32]:
+        slots = np.empty(len(keys), np.int32)
+        block_hash.find_blocks(keys, *self._hash, slots)
+        return slots
+
+    def _insert(self, keys: NDArray[np.int64], most: int) -> None:
+        if self._count + len(keys) > min(_A_BLOCK * most, len(self._hash[0]) // 2):
+            self._forget_empty()
+        first, count = self._count, self._count + len(keys)
+        check_count(count, most)
+        for array in (self._keys, self._counts):
+            array.reserve(count)
+        if 2 * count > len(self._hash[0]):
+            size = 1 << (4 * count - 1).bit_length()
+            self._hash = np.zeros(size, np.int64), np.zeros(size, np.int32)
+            first = 0
+        self._keys.array[self._count : count] = keys
+        block_hash.insert_blocks(self._keys.array, first, count - first, first, *self._hash)
+        self._count = count
+
+    def _forget_empty(self) -> None:
+        """Make room: let go of blocks whose keyframes have all been taken away."""
+        counts = self.counts()
+        if len(counts[0]) <= self._count // 2:
+            noted = self._noted, self.noted
+            self.replace(counts)
+            self._noted, self.noted = noted
+
+    def _note(self, keys: NDArray[np.int64]) -> None:
+        if len(keys):
+            self._noted.append(keys)
+            self.noted += len(keys)
+            while sum(map(len, self._noted)) > _MOST_NOTED and len(self._noted) > 1:
+                del self._noted[0]
+
+
+def check_count(blocks: int, most: int) -> None:
+    """Raise MapFull where so many are too many for a map of `most` blocks."""
+    if blocks > _A_BLOCK * most:
+        raise MapFull(
+            f"the map may hold at most {_A_BLOCK * most} blocks of free space, {_A_BLOCK} times max_blocks, "
+            f"and would have {blocks}: raise max_blocks or voxel_size"
+        )
+
+
+def summed(several: list[ClearCounts], add: "np.ufunc" = np.add) -> ClearCounts:
+    """The counts of several maps, added; of parts of one map, which share keyframes, their `np.maximum`."""
+    keys = np.concatenate([one[0] for one in several])
+    found = distinct(keys)
+    counts = np.zeros(len(found), np.int32)
+    add.at(counts, np.searchsorted(found, keys), np.concatenate([one[1] for one in several]))
+    return found[counts != 0], counts[counts != 0]
+
+
+def encoded(counts: ClearCounts) -> bytes:
+    """ClearCounts as they are saved: keys (int64), then counts (int32), little-endian."""
+    return counts[0].astype("<i8").tobytes() + counts[1].astype("<i4").tobytes()
+
+
+def decoded(saved: bytes, most: int) -> ClearCounts:
+    """ClearCounts that `encoded` made.
+
+    Raises:
+        ValueError: they are not what it makes, or too many for a map of `most` blocks.
+    """
+    count = len(saved) // 12
+    if len(saved) != 12 * count or count > _A_BLOCK * most:
+        raise ValueError("its blocks of free space are not of the size expected")
+    keys = np.frombuffer(saved, "<i8", count).astype(np.int64)
+    if (np.diff(keys, prepend=0) <= 0).any():
+        raise ValueError("its blocks of free space are out of order")
+    return keys, np.frombuffer(saved, "<i4", count, 8 * count).astype(np.int32)

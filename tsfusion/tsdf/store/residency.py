@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: MIT
+"""Blocks of a map in files that are in memory, and those that leave it when they take too much."""
+
+import mmap
+import os
+import sys
+from collections.abc import Collection, Iterator
+from contextlib import suppress
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core import durable_files, process
+from tsfusion.core.config import CacheConfig
+from tsfusion.core.errors import InvalidConfig
+from tsfusion.tsdf.store.growing_array import FileArray
+
+GROUP = 32  # blocks that leave memory together: whole pages of every layer, also where a page has 64 kB
+_LOW = 7 / 8  # of the budget, down to which blocks leave once it is passed
+_PART = 1 << 17  # entries of the page table read at a time
+_PRESENT = np.uint64(63)  # bit of an entry: the page is in memory
+
+
+class Residency:
+    """Keeps the pages of some layers that are in this process's memory within a budget."""
+
+    def __init__(self, layers: Collection[FileArray], disk_bytes: int = 0) -> None:
+        self._layers, self.disk_bytes = layers, disk_bytes
+        self._measured = 0  # bytes of the layers that were in memory when it was last looked at,
+        self._shared = process.shared_rss_bytes()  # and of all files then
+
+    @cached_property
+    def row_bytes(self) -> int:
+        """Size of a block, bytes."""
+        return sum(layer.item_bytes for layer in self._layers)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the blocks that are here, bytes; a library that was loaded meanwhile counts, too."""
+        return max(0, self._measured + process.shared_rss_bytes() - self._shared)
+
+    def keep_within(self, budget: int, stamps: NDArray[np.int32]) -> None:
+        """Let blocks go if they take more bytes than `budget`, those changed longest ago first.
+
+        Args:
+            stamps: (count,) the last keyframe that changed each block.
+        """
+        if self.nbytes <= budget or not len(stamps):
+            return
+        held = self._held(-(-len(stamps) // GROUP))
+        total = int(held.sum())
+        if total > budget:
+            newest = np.maximum.reduceat(stamps, np.arange(0, len(stamps), GROUP))
+            here = np.flatnonzero(held)
+            here = here[np.argsort(newest[here], kind="stable")]
+            freed = np.cumsum(held[here])
+            leaving = here[: int(np.searchsorted(freed, total - _LOW * budget)) + 1]
+            self._let_go(np.sort(leaving))
+            total -= int(held[leaving].sum())
+        self._measured, self._shared = total, process.shared_rss_bytes()
+
+    def _held(self, groups: int) -> NDArray[np.int64]:
+        """Bytes of each of the first groups in memory; of whole groups where the system does not tell."""
+        held = np.zeros(groups, np.int64)
+        for layer in self._layers:
+            pages = GROUP * layer.item_bytes // mmap.PAGESIZE  # of a group
+            is_here = _pages_in_memory(layer.address // mmap.PAGESIZE, groups * pages)
+            held += is_here.reshape(groups, pages).sum(axis=1) * mmap.PAGESIZE
+        return held
+
+    def _let_go(self, groups: NDArray[np.int64]) -> None:
+        for first, end in _runs(groups):
+            for layer in self._layers:
+                layer.let_go(first * GROUP, end * GROUP)
+
+
+def _pages_in_memory(first: int, count: int) -> NDArray[np.bool_]:
+    """Pages, of `count` from number `first` on, that are in this process's memory (Linux)."""
+    found = np.ones(count, bool)
+    with suppress(OSError), open("/proc/self/pagemap", "rb", buffering=0) as table:
+        for i in range(0, count, _PART):
+            part = os.pread(table.fileno(), 8 * min(_PART, count - i), 8 * (first + i))
+            entries = np.frombuffer(part, np.uint64)
+            found[i : i + len(entries)] = entries >> _PRESENT != 0
+    return found
+
+
+def _runs(numbers: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
+    """First and end of each run of consecutive numbers, which are sorted."""
+    cuts = np.flatnonzero(np.diff(numbers) != 1) + 1
+    for part in np.split(numbers, cuts):
+        yield int(part[0]), int(part[-1]) + 1
+
+
+def checked_cache(memory_bytes: int, cache: str | os.PathLike[str] | CacheConfig | None) -> CacheConfig:
+    """Folder in which blocks may wait that are not in memory."""
+    if memory_bytes < 1:
+        raise InvalidConfig(f"memory_bytes must be > 0, got {memory_bytes}")
+    if sys.platform != "linux" or not process.shared_rss_bytes():
+        raise InvalidConfig("memory_bytes needs Linux and its /proc: elsewhere all blocks stay in memory")
+    if not isinstance(cache, CacheConfig):
+        cache = CacheConfig(folder=os.fspath(cache or os.environ.get("TMPDIR") or "/var/tmp"))
+    if durable_files.is_in_memory(Path(cache.folder)):
+        raise InvalidConfig(
+            f"the folder {cache.folder} is a RAM disk: what lies there takes memory; choose one on a disk "
+            "for `cache`"
+        )
+    return cache

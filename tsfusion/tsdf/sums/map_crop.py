@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: MIT
+"""The part of a map in a box, voxel by voxel; and parts of one map, which may be put together again."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import msgspec
+import numpy as np
+from msgspec import Struct
+from numpy.typing import NDArray
+
+from tsfusion.core.errors import InvalidConfig
+from tsfusion.kernels.integration.integrate import CHANGED
+from tsfusion.tsdf.store.block_store import BlockStore, unpack_keys
+
+PART_OF = "part_of"  # in a map's meta: `Part`
+_CHUNK = 1024  # blocks at a time
+_MOST = 1 << 24  # voxels from the origin: beyond any map
+
+
+class Part(Struct, frozen=True):
+    """A map's place in another one of which it is a part, for as long as its own hash stays.
+
+    Attributes:
+        whole: hash of that map.
+        boxes: first x, y, z and last + 1 of the voxels that were taken over; those of several are disjoint.
+    """
+
+    whole: str
+    own: str
+    boxes: list[list[int]]
+
+    def within(self, first: NDArray[np.int64], end: NDArray[np.int64], own: str) -> "Part":
+        """The part of this part in another box, whose hash is `own`."""
+        cut = [[*np.maximum(box[:3], first), *np.minimum(box[3:], end)] for box in self.boxes]
+        return Part(self.whole, own, [list(map(int, box)) for box in cut if _overlap(box, box)])
+
+    def is_beside(self, other: "Part") -> bool:
+        """True if both parts are of one map, and share no voxel."""
+        return self.whole == other.whole and not any(_overlap(a, b) for a in self.boxes for b in other.boxes)
+
+
+def part_of(meta: Mapping[str, Any], own: str) -> Part | None:
+    """The place of a map of this meta and hash in another one; None = it is no part, or has changed."""
+    found = msgspec.convert(meta[PART_OF], Part) if PART_OF in meta else None
+    return found if found is not None and found.own == own else None
+
+
+def _overlap(one: Sequence[int], other: Sequence[int]) -> bool:
+    return all(one[a] < other[a + 3] and other[a] < one[a + 3] for a in range(3))
+
+
+def voxel_range(box: Sequence[float], voxel_size: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The voxels whose centres lie in a box: first (3,), and last + 1 (3,). Boxes side by side share none.
+
+    Args:
+        box: x0, y0, z0, x1, y1, z1 in metres; a centre on the upper side is outside.
+
+    Raises:
+        InvalidConfig: for anything else.
+    """
+    corners = np.asarray(box, np.float64)
+    if corners.shape != (6,) or not np.isfinite(corners).all() or (corners[:3] >= corners[3:]).any():
+        raise InvalidConfig(f"a box must be x0 y0 z0 x1 y1 z1 in metres, each 0 less than its 1, got {box}")
+    edges = np.ceil(np.clip(corners / voxel_size, -_MOST, _MOST) - 0.5).astype(np.int64)
+    return edges[:3], edges[3:]
+
+
+def copy(store: BlockStore, into: BlockStore, first: NDArray[np.int64], end: NDArray[np.int64]) -> None:
+    """Copy the voxels `first` ≤ (x, y, z) < `end` to a store without blocks; those around them stay zero.
+
+    Raises:
+        MemoryError: when there is no room.
+    """
+    used = store.used()
+    corners = 8 * unpack_keys(store.keys[used]).astype(np.int64)
+    used = used[((corners < end) & (corners + 8 > first)).all(axis=1)]
+    steps = np.arange(8)
+    for i in range(0, len(used), _CHUNK):
+        slots = used[i : i + _CHUNK]
+        along = 8 * unpack_keys(store.keys[slots]).astype(np.int64)[:, :, None] + steps  # (n, 3, 8)
+        x, y, z = ((along >= first[:, None]) & (along < end[:, None])).transpose(1, 0, 2)
+        inside = (x[:, :, None, None] & y[:, None, :, None] & z[:, None, None, :]).reshape(-1, 512)
+        kept = (np.where(inside, store.sums[slots], 0) != 0).any(axis=1)
+        slots, inside = slots[kept], inside[kept]
+        here = into.count
+        into.insert(store.keys[slots])
+        for name, layer in into.layers().items():
+            layer[here : into.count] = np.where(inside, store.layers()[name][slots], 0)
+        into.note_written(np.arange(here, into.count))
+        store.keep_within_memory()
+    keys, counts = store.clear.counts()
+    corners = 8 * unpack_keys(keys).astype(np.int64)
+    whole = ((corners >= first) & (corners + 8 <= end)).all(axis=1)  # others may lack what they show
+    into.clear.replace((keys[whole], counts[whole]))
+    into.measure_bounds()
+    into.dirty[: into.count] = CHANGED

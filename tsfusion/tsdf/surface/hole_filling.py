@@ -1,0 +1,184 @@
+# SPDX-License-Identifier: MIT
+"""Holes closed by the field: a guess of the surface where nothing was seen, and which triangles are guessed.
+
+1. A rim is where a surface breaks off: a seen voxel that it passes, beside an unseen one.
+2. The unseen voxels within half a hole of a rim get values: paper eq. 3 with seen voxels as data and no
+   weight elsewhere, so that second differences are least; a ramp goes on as it is. Seen voxels keep theirs.
+3. Marching cubes meshes seen and guessed voxels together. A triangle is guessed if its cell has a voxel that
+   nobody saw; all others are those of the mesh without guesses.
+4. A guessed patch stays if it closes (`geometry/guessed_patches.py`).
+"""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core.distinct_integers import distinct
+from tsfusion.core.errors import InvalidConfig
+from tsfusion.geometry import guessed_patches
+from tsfusion.geometry.mesh import Mesh
+from tsfusion.kernels.integration.integrate import CUBE
+from tsfusion.kernels.surface import field_smoothing, marching_tables
+from tsfusion.kernels.surface import hole_kernels as kernels
+from tsfusion.tsdf.store.block_store import BlockStore
+from tsfusion.tsdf.surface import field_regularizer
+from tsfusion.tsdf.surface.mesh_extraction import MeshBuffers, extract_rows
+from tsfusion.tsdf.surface.surface_values import SurfaceView
+
+MOST_VOXELS = 64
+BATCH = 4096  # blocks solved at once, beside their halo
+_STIFFEST = 48.0  # most that the operator of the preconditioner's units has: 4 · 4 an axis
+_SOFTEST = 500.0  # least eigenvalue of D2ᵀD2 between two held ends, times the distance⁴: (4.73)⁴
+_SLAB, _SLOPE = 2.5, 0.5  # voxels from the plane of a rim that are solved, and how that grows with distance
+_TOLERANCE = 1e-2  # of the first guess's error
+
+
+def checked(voxels: int) -> int:
+    """The width of holes to close; raises InvalidConfig for one that is none."""
+    if not 1 <= voxels <= MOST_VOXELS:
+        raise InvalidConfig(f"holes are filled up to 1 to {MOST_VOXELS} voxels, got {voxels}")
+    return voxels
+
+
+def extract_filled(store: BlockStore, min_weight: float, view: SurfaceView, voxels: int) -> Mesh:
+    """The mesh of the whole map with its holes up to so many voxels closed; `guessed` says where."""
+    own, buffers = np.sort(store.keys), MeshBuffers()
+    seen = view(own, store, min_weight)
+    more, filled = _fill(own, seen, voxels)
+    union = distinct(np.append(own, more))
+
+    def both(
+        keys: NDArray[np.int64],
+        store: BlockStore,
+        min_weight: float,
+        out: NDArray[np.float32] | None = None,
+    ) -> NDArray[np.float32]:
+        assert out is not None  # `mesh_extraction` has rows for them
+        out[: len(keys)] = np.nan
+        out[np.searchsorted(keys, own)] = seen
+        if keys is union:
+            at = np.searchsorted(keys, more)
+            out[at] = np.where(np.isnan(filled), out[at], filled)
+        return out[: len(keys)]
+
+    plain, _ = extract_rows(own, store, min_weight, buffers, both, keys=own)
+    mesh, _ = extract_rows(union, store, min_weight, buffers, both, keys=union)
+    unseen = np.zeros((len(union) + 1, 8), np.uint64)
+    bits = np.packbits(~np.isnan(filled), axis=1, bitorder="little")
+    unseen[np.searchsorted(union, more)] = bits.view("<u8")
+    guessed = np.zeros(len(mesh.faces), np.uint8)
+    kernels.mark_guessed_faces(
+        len(union), buffers.around.array, unseen, buffers.inside.array, buffers.active.array,
+        buffers.first.array, marching_tables.TRIANGLE_COUNT, guessed,
+    )  # fmt: skip
+    seen_vertices = np.unique(mesh.faces[guessed == 0])
+    mesh.normals[seen_vertices] = plain.normals  # not bent by what was guessed beside them
+    guess = replace(mesh, guessed=guessed.astype(bool))
+    return guessed_patches.with_rim_colors(guessed_patches.closing(guess))
+
+
+def _fill(
+    keys: NDArray[np.int64], seen: NDArray[np.float32], voxels: int
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Sorted keys of blocks with guessed values, and their (n, 512) values; NaN where nothing is guessed."""
+    rims = np.zeros((len(keys), CUBE), np.uint8)
+    kernels.find_rims(_rows(keys, keys[:, None] + field_regularizer.AROUND), seen, rims)
+    rings = math.ceil(_reach(voxels) / 8)
+    wanted = _spread(keys[rims.any(axis=1)], rings)
+    found_keys, found = [keys[:0]], [np.zeros((0, CUBE), np.float32)]
+    for first in range(0, len(wanted), BATCH):
+        part = wanted[first : first + BATCH]
+        local = _spread(part, rings + 1)
+        local = local[np.isin(local, wanted) | np.isin(local, keys)]
+        filled = _solve(part, local, *_taken(local, keys, seen, rims), voxels)
+        used = ~np.isnan(filled).all(axis=1)
+        found_keys.append(part[used])
+        found.append(filled[used])
+    return np.concatenate(found_keys), np.concatenate(found)
+
+
+def _taken(
+    local: NDArray[np.int64], keys: NDArray[np.int64], seen: NDArray[np.float32], rims: NDArray[np.uint8]
+) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """Values and rims of some blocks; nothing was seen in those that the map does not have."""
+    at = _rows(keys, local)
+    values, marks = np.full((len(local), CUBE), np.nan, np.float32), np.zeros((len(local), CUBE), np.uint8)
+    values[at >= 0], marks[at >= 0] = seen[at[at >= 0]], rims[at[at >= 0]]
+    return values, marks
+
+
+def _solve(
+    part: NDArray[np.int64],
+    local: NDArray[np.int64],
+    values: NDArray[np.float32],
+    rims: NDArray[np.uint8],
+    voxels: int,
+) -> NDArray[np.float32]:
+    """Guessed values of the blocks `part`, from those of the blocks `local` around them."""
+    marks = np.zeros((len(local), CUBE), np.uint8)
+    around = _rows(local, local[:, None] + field_regularizer.AROUND)
+    kernels.mark_unseen(local, around, values, rims, _ball(voxels), _SLAB, _SLOPE, marks)
+    level, layer = _list(local, around, values, marks)
+    if level.links.size:
+        _relax(level, voxels)
+    level.x[layer == kernels.EARLY] = np.nan
+    values.fill(np.nan)
+    field_smoothing.write_values(level.planes, level.places, level.x, values)
+    values[marks != kernels.UNSEEN] = np.nan  # they are not asked for
+    return values[_rows(local, part)]
+
+
+def _list(
+    local: NDArray[np.int64],
+    around: NDArray[np.int32],
+    values: NDArray[np.float32],
+    marks: NDArray[np.uint8],
+) -> tuple[field_regularizer.GridLevel, NDArray[np.int32]]:
+    """The marked voxels with first values and the seen ones beside them; the layer of each, 0 where seen."""
+    planes, counts = field_regularizer.marks_of(len(local), CUBE)
+    kernels.take_marked(around, values, marks, planes, counts)
+    level = field_regularizer.GridLevel.make(3, planes, counts)
+    layer = np.full(len(level.x), kernels.EARLY, np.int32)
+    sides = _rows(local, local[:, None] + field_regularizer.SIDES)
+    kernels.list_marked(
+        sides, values, marks, level.planes, level.places, level.links, level.y, level.weight, level.x, layer
+    )
+    sweep = 1
+    while level.links.size and kernels.extend(sweep, level.links, layer, level.x):
+        sweep += 1
+    return level, layer
+
+
+def _relax(level: field_regularizer.GridLevel, voxels: int) -> None:
+    """Least second differences between the seen values: as many steps as a hole of this width needs."""
+    lowest = _SOFTEST / _STIFFEST / (voxels + 2) ** 4
+    steps = math.ceil(0.5 * math.log(2 / _TOLERANCE) / math.sqrt(lowest))
+    level.relax(1.0, [(math.inf, lowest, steps)])
+
+
+def _reach(voxels: int) -> float:
+    """Voxels from a rim to the middle of the widest hole, and half a voxel along the normal."""
+    return (voxels + 1) / 2 + 0.5
+
+
+def _ball(voxels: int) -> NDArray[np.int32]:
+    """(n, 3) columns of the ball that is marked around a rim: x, y, and how far it reaches up and down."""
+    radius = _reach(voxels)
+    n = int(radius)
+    x, y = np.mgrid[-n : n + 1, -n : n + 1].reshape(2, -1)
+    left = radius**2 - x**2 - y**2
+    inside = left >= 0
+    return np.stack((x[inside], y[inside], np.sqrt(left[inside])), axis=1).astype(np.int32)
+
+
+def _spread(keys: NDArray[np.int64], rings: int) -> NDArray[np.int64]:
+    """Keys of the blocks up to so many blocks away, whether the map has them or not; sorted."""
+    for _ in range(rings):
+        keys = distinct(keys[:, None] + field_regularizer.AROUND)
+    return keys
+
+
+def _rows(keys: NDArray[np.int64], queries: NDArray[np.int64]) -> NDArray[np.int32]:
+    return field_regularizer.index_of(keys, queries)

@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: MIT
+"""Mesh extraction: which blocks are read, and working memory; the work is in
+`kernels/surface/surface_cells.py` and `kernels/surface/marching_cubes.py`."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core.config import VolumeConfig
+from tsfusion.geometry.mesh import Mesh
+from tsfusion.kernels.base.block_hash import insert_blocks
+from tsfusion.kernels.integration.integrate import CUBE, QUANTA_PER_VOXEL
+from tsfusion.kernels.surface import marching_cubes, marching_tables, surface_cells
+from tsfusion.kernels.surface.voxel_values import BANDS
+from tsfusion.tsdf.store.block_store import BlockStore
+from tsfusion.tsdf.store.growing_array import GrowingArray
+from tsfusion.tsdf.surface.field_regularizer import around
+from tsfusion.tsdf.surface.surface_values import SurfaceView, values_of
+
+_BEHIND, _CLEAR = 2 / 3, 0.97  # of a band's half-width, of the support
+KEPT_BLOCKS = 1 << 14  # working memory for so many is kept for the next mesh: 45 MB
+
+
+class MeshBuffers:
+    """Working memory of one extraction: a row a block, and one row for the blocks that are not there.
+
+    `kernels/surface/surface_cells.py` explains what the arrays hold.
+    """
+
+    def __init__(self) -> None:
+        self.padded = np.empty((BANDS, marching_cubes.PADDED), np.float32)
+        self._forget()
+
+    def _forget(self) -> None:
+        self._table = np.zeros(0, np.int64)
+        self._table_rows = np.zeros(0, np.int32)
+        self.values = GrowingArray((CUBE,), np.float32, 0)
+        self.around = GrowingArray((surface_cells.AROUND,), np.int32, 0)
+        self.seen = GrowingArray((8,), np.uint64, 0)
+        self.inside = GrowingArray((8,), np.uint64, 0)
+        self.active = GrowingArray((8,), np.uint64, 0)
+        self.edges = GrowingArray((surface_cells.PLANES,), np.uint64, 0)
+        self.starts = GrowingArray((surface_cells.PLANES,), np.int32, 0)
+        self.state = GrowingArray((4,), np.int32, 0)
+        self.first = GrowingArray((2,), np.int32, 0)
+
+    def _arrays(self) -> list[GrowingArray]:
+        return [value for value in vars(self).values() if isinstance(value, GrowingArray)]
+
+    def reserve(self, rows: int) -> None:
+        for array in self._arrays():
+            array.reserve(rows + 1)
+
+    def release(self) -> None:
+        """Give the memory of a large mesh back to the system."""
+        if self.values.capacity > KEPT_BLOCKS:
+            self._forget()
+
+    def table(self, keys: int) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+        """An empty hash with room for some keys."""
+        size = 1 << max(4, (2 * keys).bit_length())
+        if len(self._table) < size:
+            self._table, self._table_rows = np.zeros(size, np.int64), np.zeros(size, np.int32)
+        self._table[:size] = 0
+        return self._table[:size], self._table_rows[:size]
+
+    def keys_around(self, wanted: NDArray[np.int64], store: BlockStore) -> NDArray[np.int64]:
+        """Sorted keys of the map's blocks that are, or touch, a wanted one."""
+        if len(wanted) == store.count:
+            return wanted
+        return around(wanted, store)
+
+    @property
+    def nbytes(self) -> int:
+        return self.padded.nbytes + self._table.nbytes + self._table_rows.nbytes + sum(
+            array.array.nbytes for array in self._arrays()
+        )  # fmt: skip
+
+
+def back_limits(config: VolumeConfig) -> tuple[float, float]:
+    """From where on voxels are far behind a surface, and clear: quanta. A voxel that all looked through has
+    the least support or more. No voxel is either where bands vary, or nothing is carved.
+
+    Seen at a grazing angle, a street far ahead has voxels with quite different distances side by side: where
+    noise widens the bands, as of stereo pairs, and where no planes are known, as of points, whose noise does
+    not grow with their distance.
+    """
+    model = config.model()
+    away = model.max_range / 2 - model.sigma_z0
+    noise = 3 * (model.sigma_floor + model.sigma_slope * away**2) / config.voxel_size
+    if not config.space_carving or model.sigma_slope == 0 or noise > model.min_support:
+        return surface_cells.NO_LIMITS
+    band = min(model.min_behind, model.min_support)
+    return -_BEHIND * band * QUANTA_PER_VOXEL, _CLEAR * model.min_support * QUANTA_PER_VOXEL
+
+
+def extract(
+    wanted: NDArray[np.int64],
+    store: BlockStore,
+    min_weight: float,
+    buffers: MeshBuffers | None = None,
+    view: SurfaceView = values_of,
+) -> Mesh:
+    """Mesh of the cells of the map's blocks `wanted` (sorted distinct keys)."""
+    return extract_cells(wanted, store, min_weight, buffers, view)[0]
+
+
+def extract_cells(
+    wanted: NDArray[np.int64],
+    store: BlockStore,
+    min_weight: float,
+    buffers: MeshBuffers | None = None,
+    view: SurfaceView = values_of,
+) -> tuple[Mesh, NDArray[np.int32]]:
+    """The mesh as of `extract`, and (n + 1,) where the faces of each block's cells begin."""
+    buffers = buffers or MeshBuffers()
+    try:
+        mesh, keys = extract_rows(wanted, store, min_weight, buffers, view)
+        first = buffers.first.array[np.searchsorted(keys, wanted), 1]
+        return mesh, np.append(first, np.int32(len(mesh.faces)))
+    finally:
+        buffers.release()  # also of a mesh that there was no memory for
+
+
+def extract_rows(
+    wanted: NDArray[np.int64],
+    store: BlockStore,
+    min_weight: float,
+    buffers: MeshBuffers,
+    view: SurfaceView,
+    *,
+    keys: NDArray[np.int64] | None = None,
+) -> tuple[Mesh, NDArray[np.int64]]:
+    """The mesh as of `extract`, and the (n,) keys of the blocks that rows of `buffers` are about.
+
+    Args:
+        keys: the wanted blocks and those around them, of which `view` knows more than the map has.
+    """
+    keys = buffers.keys_around(wanted, store) if keys is None else keys
+    count = len(keys)
+    buffers.reserve(count)
+    values = view(keys, store, min_weight, buffers.values.array)
+    table, table_rows = buffers.table(count)
+    insert_blocks(keys, 0, count, 0, table, table_rows)
+    around, inside, active = buffers.around.array, buffers.inside.array, buffers.active.array
+    edges, starts, first = buffers.edges.array, buffers.starts.array, buffers.first.array
+    surface_cells.find_cells(
+        count, keys, len(wanted), wanted, table, table_rows, values, *store.back_limits,
+        marching_tables.TRIANGLE_COUNT, around, buffers.seen.array, inside, active, edges, starts,
+        buffers.state.array, first,
+    )  # fmt: skip
+    store.pause()
+    vertices, triangles = first[count]
+    positions, normals = np.empty((vertices, 3), np.float32), np.empty((vertices, 3), np.float32)
+    colors = np.empty((vertices if store.color else 0, 3), np.uint8)
+    slots = np.append(store.slots_of(keys), np.int32(-1))  # the last stands for the blocks that are not there
+    marching_cubes.emit_vertices(
+        count, keys, around, values, edges, first, buffers.padded, store.voxel_size, slots,
+        store.color_rgn, store.color_b, int(store.color),
+        positions, normals, colors,
+    )  # fmt: skip
+    store.rest()
+    faces = np.empty((triangles, 3), np.int32)
+    marching_cubes.emit_faces(
+        count, around, inside, active, edges, starts, first,
+        marching_tables.TRIANGLE_COUNT, marching_tables.TRIANGLE_STARTS, faces,
+    )  # fmt: skip
+    return Mesh(positions, faces, normals, colors if store.color else None), keys

@@ -1,0 +1,251 @@
+# SPDX-License-Identifier: MIT
+"""The mesh of a whole map in tiles, with memory for one tile: together the same vertices and triangles.
+
+A tile is a run of blocks in the order of their keys: it has the vertices on its blocks' voxel edges and the
+triangles of their cells. Tiles come last first: a cell's other vertices lie towards +x, +y, +z, in tiles that
+are known by then. Vertices are counted from the end of the whole mesh, whose length shows with the last tile.
+"""
+
+from collections.abc import Iterable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core.distinct_integers import distinct
+from tsfusion.geometry.mesh_parts import MeshPart
+from tsfusion.tsdf.store.block_store import CELL_STEPS, BlockStore
+from tsfusion.tsdf.surface import field_regularizer, mesh_extraction
+from tsfusion.tsdf.surface.surface_values import SurfaceView
+
+_FARTHEST = int(CELL_STEPS.max())  # what the keys of blocks that share a cell differ by at most
+
+
+class Numbered(NamedTuple):
+    """Blocks whose vertices have numbers: (n,) sorted keys, (n, 24) edges with a vertex, and (n,) the number
+    of the first vertex, from the end."""
+
+    keys: NDArray[np.int64]
+    edges: NDArray[np.uint64]
+    first: NDArray[np.int64]
+
+    def before(self, later: "Numbered", last: np.int64) -> "Numbered":
+        """Join these blocks and later ones, up to a key."""
+        n = int(np.searchsorted(later.keys, last, side="right"))
+        return Numbered(
+            np.concatenate([self.keys, later.keys[:n]]),
+            np.concatenate([self.edges, later.edges[:n]]),
+            np.concatenate([self.first, later.first[:n]]),
+        )
+
+    def numbers(self, vertices: "_Vertices") -> NDArray[np.int64]:
+        """(n,) numbers from the end of vertices on edges of these blocks."""
+        at, of = np.unique(np.searchsorted(self.keys, vertices.keys), return_inverse=True)
+        rank = np.cumsum(_bits(self.edges[at]), axis=1, dtype=np.int16) - 1
+        numbers: NDArray[np.int64] = self.first[at][of] - rank[of, vertices.edges]
+        return numbers
+
+
+class _Vertices(NamedTuple):
+    """Vertices of other tiles, (n,) each: the key of the block, and which of its edges they are on."""
+
+    keys: NDArray[np.int64]
+    edges: NDArray[np.int64]
+
+    def of(self, chosen: NDArray[np.bool_]) -> "_Vertices":
+        return _Vertices(self.keys[chosen], self.edges[chosen])
+
+
+_NOBODY = Numbered(np.zeros(0, np.int64), np.zeros((0, 24), np.uint64), np.zeros(0, np.int64))
+
+
+class MeshRun(NamedTuple):
+    """The mesh of some tiles, one after the other, that is made without the others.
+
+    Attributes:
+        part: its numbers are from the end of these tiles; 0 stands for vertices behind them.
+        open_at: (n,) where these zeros are, in the corners of all faces.
+        open_keys, open_edges: (n,) which vertices they are: the key of the block, and the edge of it.
+        border: the first blocks, whose vertices those before may need.
+        first: key of the first block.
+    """
+
+    part: MeshPart
+    open_at: NDArray[np.int64]
+    open_keys: NDArray[np.int64]
+    open_edges: NDArray[np.int64]
+    border: Numbered
+    first: np.int64
+
+
+def tiles(store: BlockStore, min_weight: float, view: SurfaceView) -> Iterator[MeshPart]:
+    """Parts of the mesh that `mesh_extraction.extract` makes of all blocks, the last first.
+
+    Beside a tile and its neighbours, memory holds the values of up to three layers of blocks, across x.
+    """
+    keys = np.sort(store.keys)
+    for made in _tiles(keys, range(tile_count(len(keys))), store, min_weight, view):
+        yield made.part
+
+
+def tile_count(blocks: int) -> int:
+    """Number of tiles of a map."""
+    return -(-blocks // field_regularizer.BATCH)
+
+
+def run(
+    keys: NDArray[np.int64], which: range, store: BlockStore, min_weight: float, view: SurfaceView
+) -> MeshRun:
+    """Some tiles of a map, of which the store holds what they depend on: `blocks_of_run`, and around them.
+
+    Args:
+        keys: of all of its blocks, sorted.
+    """
+    made = list(_tiles(keys, which, store, min_weight, view))[::-1]
+    corners = np.array([one.part.faces.size for one in made])
+    begin = np.cumsum(corners) - corners
+    colors = [one.part.colors for one in made if one.part.colors is not None]
+    part = MeshPart(
+        np.concatenate([one.part.vertices for one in made]),
+        np.concatenate([one.part.faces for one in made]),
+        np.concatenate([one.part.normals for one in made]),
+        np.concatenate(colors) if colors else None,
+    )
+    open_at = np.concatenate([at + one.open_at for at, one in zip(begin, made, strict=True)])
+    open_keys = np.concatenate([one.open_keys for one in made])
+    open_edges = np.concatenate([one.open_edges for one in made])
+    return MeshRun(part, open_at, open_keys, open_edges, made[0].border, made[0].first)
+
+
+def blocks_of_run(keys: NDArray[np.int64], which: range) -> NDArray[np.int64]:
+    """Keys of the blocks whose values a run of tiles needs: all that are solved with those at its cells."""
+    size = field_regularizer.BATCH
+    own = keys[which.start * size : which.stop * size]
+    low, high = int(own[0]) - 2 * _FARTHEST, int(own[-1]) + _FARTHEST
+    begin = int(np.searchsorted(keys, low)) // size * size
+    end = -(-int(np.searchsorted(keys, high, side="right")) // size) * size
+    return keys[begin:end]
+
+
+def together(runs: Iterable[MeshRun]) -> Iterator[MeshPart]:
+    """The parts of the whole mesh, as of `tiles`, of its runs, the last first."""
+    done, known = 0, _NOBODY
+    for one in runs:
+        faces = one.part.faces.astype(np.int64) + done
+        vertices = _Vertices(one.open_keys, one.open_edges)
+        faces.reshape(-1)[one.open_at] = known.numbers(vertices)
+        yield one.part._replace(faces=faces.astype(np.int32))
+        border = one.border._replace(first=one.border.first + done)
+        known = border.before(known, one.first + _FARTHEST)
+        done += len(one.part.vertices)
+
+
+def _tiles(
+    keys: NDArray[np.int64], which: range, store: BlockStore, min_weight: float, view: SurfaceView
+) -> Iterator[MeshRun]:
+    """Single tiles, the last first; their numbers are from the end of the last one."""
+    size = field_regularizer.BATCH
+    values = WholeMapValues(keys, view, size)
+    buffers = mesh_extraction.MeshBuffers()
+    beyond, done = _NOBODY, 0
+    last_key = keys[min(which.stop * size, len(keys)) - 1] if len(keys) else np.int64(0)
+    for number in reversed(which):
+        begin = number * size
+        own = keys[begin : begin + size]
+        wanted = distinct(own[:, None] - CELL_STEPS)  # they share the edges of these blocks
+        wanted = wanted[store.slots_of(wanted) >= 0]
+        mesh, rows = mesh_extraction.extract_rows(wanted, store, min_weight, buffers, values)
+        a = int(np.searchsorted(rows, own[0]))
+        b = a + len(own)
+        first, edges = buffers.first.array, buffers.edges.array
+        (start, face), (end, last_face) = first[a], first[b]
+        faces = (done + int(end) - mesh.faces[face:last_face].astype(np.int64)).reshape(-1)
+        outside = np.flatnonzero(faces <= done)
+        local = done + int(end) - faces[outside]
+        vertices = _vertices(local, rows, first[: len(rows), 0], edges)
+        is_open = vertices.keys > last_key
+        faces[outside[~is_open]] = beyond.numbers(vertices.of(~is_open))
+        faces[outside[is_open]] = 0
+        part = MeshPart(
+            mesh.vertices[start:end],
+            faces.astype(np.int32).reshape(-1, 3),
+            mesh.normals[start:end],
+            None if mesh.colors is None else mesh.colors[start:end],
+        )
+        numbered = Numbered(own, edges[a:b].copy(), done + int(end) - first[a:b, 0].astype(np.int64))
+        beyond = numbered.before(beyond, own[0] + _FARTHEST)
+        yield MeshRun(part, outside[is_open], *vertices.of(is_open), beyond, own[0])
+        values.forget_beyond(int(own[0]) + _FARTHEST)
+        done += int(end - start)
+
+
+def _vertices(
+    local: NDArray[np.int64], rows: NDArray[np.int64], first: NDArray[np.int32], edges: NDArray[np.uint64]
+) -> _Vertices:
+    """Vertices on other tiles' edges, of which a tile knows but its own numbers.
+
+    Args:
+        local: (n,) the tile's numbers.
+        rows, first, edges: the tile's blocks, their first vertices, and their edges that its cells use.
+    """
+    ids, back = np.unique(local, return_inverse=True)
+    row = np.searchsorted(first, ids, side="right") - 1
+    blocks, of = np.unique(row, return_inverse=True)
+    used = _bits(edges[blocks])
+    counts = used.sum(axis=1, dtype=np.int64)
+    edge = np.nonzero(used)[1][np.cumsum(counts)[of] - counts[of] + ids - first[row]]
+    back = back.reshape(-1)
+    return _Vertices(rows[row][back], edge[back])
+
+
+def _bits(planes: NDArray[np.uint64]) -> NDArray[np.uint8]:
+    """(n, 24) planes of 64 bits → (n, 1536) 0 or 1, in the order of the vertices."""
+    octets = np.ascontiguousarray(planes, "<u8").view(np.uint8)
+    return np.unpackbits(octets, axis=1, bitorder="little")
+
+
+class WholeMapValues:
+    """A `SurfaceView` whose values are those of the whole map: its blocks are solved in the same batches.
+
+    Of use as long as the map stays as it is.
+
+    Args:
+        keys: sorted, of all blocks of the map.
+        view: reads the surface.
+        size: blocks a batch.
+    """
+
+    def __init__(self, keys: NDArray[np.int64], view: SurfaceView, size: int) -> None:
+        self._keys, self._view, self._size = keys, view, size
+        self._solved: dict[int, NDArray[np.float32]] = {}
+
+    def __call__(
+        self,
+        keys: NDArray[np.int64],
+        store: BlockStore,
+        min_weight: float,
+        out: NDArray[np.float32] | None = None,
+    ) -> NDArray[np.float32]:
+        """See `SurfaceView`."""
+        assert out is not None  # `mesh_extraction` has rows for them
+        at = np.searchsorted(self._keys, keys)
+        for number in np.unique(at // self._size).tolist():
+            begin = number * self._size
+            if number not in self._solved:
+                self._solved[number] = self._view(self._keys[begin : begin + self._size], store, min_weight)
+            here = at // self._size == number
+            out[: len(keys)][here] = self._solved[number][at[here] - begin]
+        return out[: len(keys)]
+
+    def forget_beyond(self, key: int) -> None:
+        """Let go of batches in which every key is larger."""
+        for number in [one for one in self._solved if self._keys[one * self._size] > key]:
+            del self._solved[number]
+
+    def forget_before(self, key: int) -> None:
+        """Let go of batches that no cell from this key on reads."""
+        for number in [one for one in self._solved if self._last(one) < key - _FARTHEST]:
+            del self._solved[number]
+
+    def _last(self, number: int) -> int:
+        return int(self._keys[min((number + 1) * self._size, len(self._keys)) - 1])

@@ -1,0 +1,273 @@
+# SPDX-License-Identifier: MIT
+"""A surface's values and meshes in cubes of 8³ blocks, kept while the map stays as it is.
+
+What a cube holds depends on the map alone: not on what was asked before, nor on how the map came about.
+
+The last state of which a view was made whole stays while the map goes on, as long as a newer one is not
+whole: meshes of cubes that change are kept beside the new ones. A view of it is of that state in every cube,
+for a cube that has not changed since is the same now.
+"""
+
+from collections import OrderedDict
+from collections.abc import Iterator, Sequence
+from typing import Generic, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core.distinct_integers import distinct
+from tsfusion.geometry.mesh import Mesh
+from tsfusion.kernels.integration.integrate import CUBE
+from tsfusion.tsdf.store.block_store import BlockStore, pack_keys, unpack_keys
+from tsfusion.tsdf.surface import field_regularizer, mesh_extraction
+from tsfusion.tsdf.surface.surface_values import SurfaceView, values_of
+
+SIDE = 8  # blocks
+AT_ONCE = 16  # cubes that are meshed together
+MOST_BYTES = 32 << 20  # of values that are kept, of meshes, and of meshes before a change
+
+_INSIDE = np.stack(np.meshgrid(*[np.arange(SIDE)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+class SurfaceTiles:
+    """Values and meshes of one surface.
+
+    Args:
+        view: reads its values.
+        reach: blocks whose sums a block's values depend on lie so many blocks away at the most.
+    """
+
+    def __init__(self, store: BlockStore, view: SurfaceView, min_weight: float, reach: int) -> None:
+        self._store, self._view, self._min_weight, self._reach = store, view, min_weight, reach
+        self._values = _Kept[_Values]()
+        self._meshes = _Kept[_CubeMesh]()
+        self._buffers = mesh_extraction.MeshBuffers()
+        self._listed, self._numbers = 0, np.empty(0, np.int64)
+        self._drops = store.drops
+        self.settled: int | None = None  # stamp of the state that was whole last
+        self._shown: list[int] = []  # cubes of that view
+        self._settled_numbers = self._numbers
+        self._changed: set[int] = set()  # cubes with other meshes since
+        self._before: dict[int, _CubeMesh] = {}  # meshes that some of them had
+        self._lacking: list[int] | None = None  # cubes to mesh until it is settled; None: not looked for
+
+    @property
+    def values(self) -> SurfaceView:
+        """The function that reads these values."""
+        return values_of if self._view is values_of else self._read
+
+    @property
+    def has_color(self) -> bool:
+        return self._store.color
+
+    @property
+    def side_m(self) -> float:
+        """Side of a cube, metres."""
+        return 8 * SIDE * self._store.voxel_size
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of what is kept."""
+        before = sum(piece.nbytes for piece in self._before.values())
+        return self._values.nbytes + self._meshes.nbytes + before + self._buffers.nbytes
+
+    def forget(self, changed: NDArray[np.int64]) -> None:
+        """Let go of what depends on blocks that have changed: sorted keys."""
+        if self._drops != self._store.drops:  # blocks have gone
+            self._drops = self._store.drops
+            self._values.clear()
+            self._meshes.clear()
+            self._listed, self._numbers = 0, self._numbers[:0]
+            self._forget_settled()
+        elif len(changed):
+            reached = field_regularizer.around(changed, self._store, self._reach)
+            self._values.forget(_tiles_of(reached))
+            others = _tiles_of(field_regularizer.around(reached, self._store, 1))
+            self._keep_before(others)
+            self._meshes.forget(others)
+            self._lacking = None
+
+    def _keep_before(self, numbers: NDArray[np.int64]) -> None:
+        """Keep the meshes that cubes had when the map was settled."""
+        if self.settled is None:
+            return
+        for number in set(numbers.tolist()) - self._changed:
+            self._changed.add(number)
+            if (piece := self._meshes.get(number)) is not None:
+                self._before[number] = piece
+        if sum(piece.nbytes for piece in self._before.values()) > MOST_BYTES:
+            self._forget_settled()  # the map has become another one while nobody looked at all of it
+
+    def _forget_settled(self) -> None:
+        self.settled = None
+        self._changed, self._before, self._lacking = set(), {}, None
+
+    def settle(self, numbers: Sequence[int]) -> None:
+        """Note that a view of these cubes has been made of the map as it is."""
+        self.settled, self._shown = self._store.stamp, list(numbers)
+        self._settled_numbers = self.numbers()
+        self._changed, self._before, self._lacking = set(), {}, None
+
+    def settle_some(self, most: int) -> bool:
+        """Mesh again a few cubes of the last view; whether the map is settled then."""
+        if self._lacking is None:  # what does not fit into what is kept is made once
+            self._lacking = [number for number in self._shown if self._meshes.get(number) is None]
+        for _ in self.meshes(self._lacking[:most]):
+            pass
+        self._lacking = self._lacking[most:]
+        if is_done := not self._lacking:
+            self.settle(self._shown)
+        return is_done
+
+    def settled_meshes(self, numbers: Sequence[int]) -> list[Mesh] | None:
+        """The meshes of some cubes as the map was when it was settled; None where one is not kept."""
+        if self.settled is None:
+            return None
+        there = set(self._settled_numbers.tolist()).intersection(numbers)
+        others = self._changed & there
+        if not others <= self._before.keys():
+            return None
+        same = sorted(there - others)
+        return [*(self._before[number].mesh for number in sorted(others)), *self.meshes(same)]
+
+    def numbers(self) -> NDArray[np.int64]:
+        """(n,) sorted numbers of the cubes with a block of the map."""
+        if self._listed < self._store.count:  # new blocks come last
+            new = _tiles_of(self._store.keys[self._listed :])
+            self._numbers = distinct(np.append(self._numbers, new))
+            self._listed = self._store.count
+        return self._numbers
+
+    def affordable(self, keys: NDArray[np.int64], most: int) -> int:
+        """Number of the first blocks that lie in cubes that are kept, and in so many that are not."""
+        if self._view is values_of:
+            return len(keys)
+        numbers, first = np.unique(_tile_of(keys), return_index=True)
+        new = sorted(
+            place
+            for number, place in zip(numbers.tolist(), first.tolist(), strict=True)
+            if self._values.get(number) is None
+        )
+        return new[most] if len(new) > most else len(keys)
+
+    def meshes(self, numbers: Sequence[int]) -> Iterator[Mesh]:
+        """The meshes of the cells of some cubes; what is not kept is made several at a time."""
+        for i in range(0, len(numbers), AT_ONCE):
+            some = numbers[i : i + AT_ONCE]
+            pieces = {number: self._meshes.get(number) for number in some}
+            made = self._made([number for number, piece in pieces.items() if piece is None])
+            for number in some:
+                yield (pieces[number] or made[number]).mesh
+
+    def _made(self, numbers: list[int]) -> dict[int, "_CubeMesh"]:
+        """Meshes of cubes, each as it would be without the others: a launch costs as much as a small one."""
+        if not numbers:
+            return {}
+        keys, cube_of = self._keys(numbers)
+        order = np.argsort(keys)
+        whole, first_face = mesh_extraction.extract_cells(
+            keys[order], self._store, self._min_weight, self._buffers, self.values
+        )
+        cube_of = np.repeat(cube_of[order], np.diff(first_face))
+        faces = np.argsort(cube_of, kind="stable")
+        parts = np.split(faces, np.searchsorted(cube_of[faces], np.arange(1, len(numbers))))
+        return {
+            number: self._meshes.put(number, _CubeMesh(whole.of_faces(part)))
+            for number, part in zip(numbers, parts, strict=True)
+        }
+
+    def _read(
+        self,
+        keys: NDArray[np.int64],
+        store: BlockStore,
+        min_weight: float,
+        out: NDArray[np.float32] | None = None,
+    ) -> NDArray[np.float32]:
+        """See `SurfaceView`; `store` and `min_weight` are those that it was made with."""
+        if out is None:
+            out = np.empty((len(keys), CUBE), np.float32)
+        order = np.argsort(tiles := _tile_of(keys), kind="stable")
+        cuts = np.flatnonzero(np.diff(tiles[order])) + 1
+        for rows in np.split(order, cuts) if len(keys) else ():
+            number = int(tiles[rows[0]])
+            solved = self._values.get(number)
+            if solved is None:
+                own, _ = self._keys([number])
+                solved = self._values.put(number, _Values(own, self._view(own, store, min_weight)))
+            out[rows] = solved.of(keys[rows])
+        return out[: len(keys)]
+
+    def _keys(self, numbers: Sequence[int]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Keys of the map's blocks in some cubes, sorted in each, and which cube each lies in."""
+        corners = SIDE * unpack_keys(np.array(numbers))
+        keys = pack_keys((corners[:, None] + _INSIDE).reshape(-1, 3))
+        held = np.flatnonzero(self._store.slots_of(keys) >= 0)
+        return keys[held], held // len(_INSIDE)
+
+
+class _Sized(Protocol):
+    nbytes: int
+
+
+class _Values:
+    """Sorted keys of blocks, and a row of values of each."""
+
+    def __init__(self, keys: NDArray[np.int64], values: NDArray[np.float32]) -> None:
+        self.keys, self.values = keys, values
+        self.nbytes = keys.nbytes + values.nbytes
+
+    def of(self, keys: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Rows of some blocks; NaN for one that is not there."""
+        if not len(self.keys):
+            return np.full((len(keys), CUBE), np.nan, np.float32)
+        at = np.minimum(np.searchsorted(self.keys, keys), len(self.keys) - 1)
+        rows = self.values[at]
+        rows[self.keys[at] != keys] = np.nan
+        return rows
+
+
+class _CubeMesh:
+    def __init__(self, mesh: Mesh) -> None:
+        self.mesh = mesh
+        arrays = (mesh.vertices, mesh.faces, mesh.normals, mesh.colors)
+        self.nbytes = sum(array.nbytes for array in arrays if array is not None)
+
+
+Item = TypeVar("Item", bound=_Sized)
+
+
+class _Kept(Generic[Item]):
+    """Things by number; those asked for longest ago go when they are too many."""
+
+    def __init__(self) -> None:
+        self._items: OrderedDict[int, Item] = OrderedDict()
+        self.nbytes = 0
+
+    def get(self, number: int) -> Item | None:
+        if number in self._items:
+            self._items.move_to_end(number)
+        return self._items.get(number)
+
+    def put(self, number: int, item: Item) -> Item:
+        self._items[number] = item
+        self.nbytes += item.nbytes
+        while self.nbytes > MOST_BYTES and len(self._items) > 1:
+            self.nbytes -= self._items.popitem(last=False)[1].nbytes
+        return item
+
+    def forget(self, numbers: NDArray[np.int64]) -> None:
+        for number in self._items.keys() & set(numbers.tolist()):
+            self.nbytes -= self._items.pop(number).nbytes
+
+    def clear(self) -> None:
+        self._items.clear()
+        self.nbytes = 0
+
+
+def _tile_of(keys: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Number of the cube that each block lies in."""
+    return pack_keys(unpack_keys(keys) >> 3)
+
+
+def _tiles_of(keys: NDArray[np.int64]) -> NDArray[np.int64]:
+    return distinct(_tile_of(keys))

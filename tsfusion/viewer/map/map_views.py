@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: MIT
+"""From where a map is looked at, and the point of it that a ray of the pointer meets."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.viewer.map.clipping import Clipping
+from tsfusion.viewer.map.map_tiles import MapTiles, Tile
+
+FOV = math.radians(50)  # from top to bottom of the picture
+_ELEVATION = math.radians(42)
+_SIDES = 12  # that are tried
+_SAMPLE = 20  # points of a tile
+_SHARE = (0.5, 99.5)  # percent of the points that are in the picture
+_FILLED = 0.92  # of the picture
+_MOST_VIEWS = 16  # of the whole map that are kept: for windows of so many shapes
+
+
+class PageCamera(NamedTuple):
+    """A camera: where it is, what it looks at, both (3,) metres, and its up direction."""
+
+    position: NDArray[np.float64]
+    target: NDArray[np.float64]
+    up: NDArray[np.float64]
+
+
+class ShownPoint(NamedTuple):
+    """(n, 3) points of a surface and its normals there."""
+
+    points: NDArray[np.float64]
+    normals: NDArray[np.float64]
+
+
+def sample(tiles: MapTiles) -> ShownPoint:
+    """A few points of each tile, as many as its triangles are its share of the map."""
+    meshes = [tile.mesh for tile in list(tiles.tiles.values())]
+    total = sum(len(mesh.vertices) for mesh in meshes)
+    step = max(1, total // (_SAMPLE * max(len(meshes), 50)))
+    if not meshes:
+        return ShownPoint(np.zeros((0, 3)), np.zeros((0, 3)))
+    points = np.concatenate([mesh.vertices[::step] for mesh in meshes]).astype(np.float64)
+    return ShownPoint(points, np.concatenate([mesh.normals[::step] for mesh in meshes]).astype(np.float64))
+
+
+def whole(
+    surface: ShownPoint, up: NDArray[np.float64], aspect: float, *, covered: float = 0.0
+) -> PageCamera | None:
+    """From above, from the side that shows most of the surface; None = there is nothing to see.
+
+    Args:
+        aspect: width / height of the picture.
+        covered: share of the picture's height, at its lower end, that is not to be seen.
+    """
+    if len(surface.points) < 3:
+        return None
+    east = np.cross(up, (1.0, 0, 0) if abs(up[0]) < 0.7 else (0.0, 1, 0))
+    east /= np.linalg.norm(east)
+    north = np.cross(up, east)
+    turns = 2 * np.pi * np.arange(_SIDES) / _SIDES
+    level = np.cos(turns)[:, None] * east + np.sin(turns)[:, None] * north
+    toward = math.cos(_ELEVATION) * level + math.sin(_ELEVATION) * up  # from the target to the camera
+    best = np.maximum(surface.normals @ toward.T, 0).sum(axis=0).argmax()
+    return _fitted(surface.points, (toward[best], up), aspect, covered)
+
+
+class WholeViews:
+    """Views of all of a map, each found once until `refresh` notes that the map has changed."""
+
+    def __init__(self, tiles: MapTiles) -> None:
+        self._tiles = tiles
+        self._up: NDArray[np.float64] = np.array((0.0, 0.0, 1.0))
+        self._version = -1
+        self._sample: ShownPoint | None = None
+        self._views: dict[tuple[float, float], PageCamera] = {}
+
+    def forget(self) -> None:
+        """Find every view anew."""
+        self._sample = None
+        self._views.clear()
+
+    def refresh(self, up: NDArray[np.float64]) -> None:
+        """Find views anew where the tiles, or the direction up, are others than before."""
+        if self._version != self._tiles.version or not np.array_equal(up, self._up):
+            self._up, self._version = up, self._tiles.version
+            self.forget()
+
+    def of(self, aspect: float, covered: float) -> PageCamera | None:
+        """See `whole`; None is not kept: what comes first is seen at once."""
+        view = self._views.get((aspect, covered))
+        if view is None:
+            if self._sample is None or not len(self._sample.points):
+                self._sample = sample(self._tiles)
+            view = whole(self._sample, self._up, aspect, covered=covered)
+            if view is not None:
+                if len(self._views) >= _MOST_VIEWS:  # a window that is drawn larger has many
+                    self._views.clear()
+                self._views[aspect, covered] = view
+        return view
+
+
+def _fitted(
+    points: NDArray[np.float64],
+    directions: tuple[NDArray[np.float64], NDArray[np.float64]],
+    aspect: float,
+    covered: float,
+) -> PageCamera:
+    """The nearest camera in a direction from which nearly all points are in the picture."""
+    toward, up = directions
+    right = np.cross(up, toward)
+    right /= np.linalg.norm(right)
+    above = np.cross(toward, right)
+    low, high = np.percentile(points, _SHARE, axis=0)
+    inside = points[((points >= low) & (points <= high)).all(axis=1)]
+    points = inside if len(inside) > 2 else points
+    x, y, z = points @ right, points @ above, points @ toward
+    tall = _FILLED * math.tan(FOV / 2)
+    # A camera at (cx, cy, d) sees what has −first (d − z) ≤ x − cx ≤ last (d − z), and y alike
+    sides = [(x, tall * aspect, tall * aspect), (y, tall * (1 - 2 * covered), tall)]
+    ends = [((p - first * z).min(), (p + last * z).max(), first, last) for p, first, last in sides]
+    d = max((high - low) / (first + last) for low, high, first, last in ends)
+    cx, cy = ((low + first * d + high - last * d) / 2 for low, high, first, last in ends)
+    middle = float(np.median(z))
+    target = cx * right + cy * above + middle * toward
+    return PageCamera(target + (d - middle) * toward, target, up)
+
+
+def behind(T_world_camera: NDArray[np.float64], up: NDArray[np.float64], *, distance: float) -> PageCamera:
+    """From behind and above a scanner, looking where it looks.
+
+    Args:
+        T_world_camera: (4, 4), OpenCV axes.
+        distance: metres.
+    """
+    position, forward = T_world_camera[:3, 3], T_world_camera[:3, 2]
+    level = forward - (forward @ up) * up
+    length = float(np.linalg.norm(level))
+    level = level / length if length > 0.1 else -T_world_camera[:3, 1]
+    return PageCamera(position - distance * level + 0.7 * distance * up, position + distance * level, up)
+
+
+def first_hit(
+    tiles: MapTiles, clipping: Clipping, origin: NDArray[np.float64], direction: NDArray[np.float64]
+) -> NDArray[np.float64] | None:
+    """(3,) the nearest point of what is shown of the front of a surface; None = the ray meets none.
+
+    Args:
+        origin, direction: (3,) of the ray, in the map's frame.
+    """
+    direction = direction / np.linalg.norm(direction)
+    nearest, found = np.inf, None
+    entries = [(_entry(tile.bounds, origin, direction), tile) for tile in list(tiles.tiles.values())]
+    for entry, tile in sorted(entries, key=lambda one: one[0]):
+        if entry >= nearest or not np.isfinite(entry):
+            break
+        for distance in _hits(tile, origin, direction):
+            point = origin + distance * direction
+            if distance < nearest and clipping.shows(point[None])[0]:
+                nearest, found = distance, point
+                break
+    return found
+
+
+def _entry(bounds: NDArray[np.float32], origin: NDArray[np.float64], direction: NDArray[np.float64]) -> float:
+    """Where a ray comes into a box; infinity where it does not."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ends = (bounds - origin) / direction
+    ends = np.where(np.isnan(ends), np.array((-np.inf, np.inf))[:, None], ends)
+    enters, leaves = float(ends.min(axis=0).max()), float(ends.max(axis=0).min())
+    return max(enters, 0.0) if leaves >= max(enters, 0.0) else np.inf
+
+
+def _hits(tile: Tile, origin: NDArray[np.float64], direction: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Distances at which a ray meets front sides of triangles, the nearest first (Möller and Trumbore)."""
+    a, b, c = tile.mesh.vertices[tile.mesh.faces].astype(np.float64).transpose(1, 0, 2)
+    ab, ac = b - a, c - a
+    p = np.cross(direction, ac)
+    facing = (ab * p).sum(axis=1)
+    front = facing > 1e-12
+    scale = 1 / np.where(front, facing, 1.0)
+    t = origin - a
+    u = (t * p).sum(axis=1) * scale
+    q = np.cross(t, ab)
+    v = (q @ direction) * scale
+    distance = (ac * q).sum(axis=1) * scale
+    grain = 1e-9
+    met = front & (u >= -grain) & (v >= -grain) & (u + v <= 1 + grain) & (distance > 0)
+    found: NDArray[np.float64] = np.sort(distance[met])
+    return found

@@ -1,0 +1,208 @@
+# SPDX-License-Identifier: MIT
+"""The tiles of a map in the scene of all browsers: the newest wins, and bytes a second are bounded."""
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tsfusion.core.rates import Bucket
+from tsfusion.geometry.mesh import Mesh
+from tsfusion.viewer.map import tile_glb
+from tsfusion.viewer.map.clipping import Clipping, ClipSide
+from tsfusion.viewer.map.map_tiles import CELL, CellKey, MapTiles, Tile
+from tsfusion.viewer.map.vertex_colors import VertexColors
+
+if TYPE_CHECKING:
+    import viser
+
+# Seconds between two versions of a tile, at least. A browser drops a model as soon as it is given another
+# one, and shows that only once it is read: so a tile has two nodes in turn, and the last one stays meanwhile.
+# A node costs viser ten times as much to make as to change: the other is kept, empty, while it may be needed.
+PAUSE = 1.0
+STEADY_PAUSE = 2.0  # of a tile that changes all the time: half of the work for everybody, and nobody sees it
+_SPARED = 5.0  # seconds that an empty node is kept after its last version
+_SOON = 0.5  # seconds after a pause within which a change is one of many
+_CUT_PAUSE = 0.25  # while somebody moves the clip plane
+ROOT = "/map"  # of the names of nodes
+_MARGIN = 1.0  # of a tile's edge that its triangles may reach beyond it
+
+
+class TileNodes:
+    """Sends tiles that have changed, whoever waits longest first.
+
+    Args:
+        bucket: of bytes a second, of all tiles together.
+        root: of the names of nodes.
+        keeps: whether browsers that come later get what has been sent.
+    """
+
+    def __init__(
+        self,
+        scene: "viser.SceneApi",
+        tiles: MapTiles,
+        colors: VertexColors,
+        bucket: Bucket,
+        *,
+        root: str = ROOT,
+        keeps: bool = True,
+    ) -> None:
+        self._root, self._keeps = root, keeps
+        self._scene, self._tiles, self._colors = scene, tiles, colors
+        self._bucket = bucket
+        self.waiting: dict[CellKey, None] = {}  # in the order in which they are sent
+        self._sent_at: dict[CellKey, float] = {}
+        self._pauses: dict[CellKey, float] = {}  # until the next version
+        self._sides: dict[CellKey, ClipSide] = {}  # of what is in the scene
+        self._nodes: dict[CellKey, viser.GlbHandle] = {}
+        self._last: dict[CellKey, tuple[viser.GlbHandle, float]] = {}  # versions before, and when they go
+        self._spare: dict[CellKey, tuple[viser.GlbHandle, float]] = {}  # empty nodes, and when they go
+        self._cut: set[CellKey] = set()  # wait because of the clipping
+        self._hidden: set[CellKey] = set()  # have changed while they were not to be seen
+        self.clipping = Clipping()
+        self.voxel_size = 1.0
+        self.bytes_sent = 0
+
+    def is_due(self, now: float) -> bool:
+        ends = (end for nodes in (self._last, self._spare) for _, end in nodes.values())
+        return any(now >= end for end in ends) or any(now >= self._due(key) for key in self.waiting)
+
+    def has(self, key: CellKey) -> bool:
+        return key in self._nodes
+
+    def clear(self) -> None:
+        """Take everything out of the scene."""
+        older = (node for nodes in (self._last, self._spare) for node, _ in nodes.values())
+        for node in (*self._nodes.values(), *older):
+            node.remove()
+        for kept in (
+            self._nodes,
+            self._last,
+            self._spare,
+            self.waiting,
+            self._sent_at,
+            self._pauses,
+            self._sides,
+            self._hidden,
+            self._cut,
+        ):
+            kept.clear()
+
+    def changed(self, keys: Iterable[CellKey]) -> None:
+        """Note tiles that look different now."""
+        for key in keys:
+            self.waiting.setdefault(key)
+
+    def clip(self, clipping: Clipping) -> None:
+        """Hide what lies beyond, at once; tiles that are cut follow."""
+        self.clipping = clipping
+        for key, tile in list(self._tiles.tiles.items()):
+            side, shown = clipping.side(tile.bounds), self._sides.get(key)
+            node = self._nodes.get(key)
+            if side == "hidden":
+                if node is not None:
+                    self._hide(key, node)
+            elif key in self._hidden or side == "part" or side != shown:
+                self._hidden.discard(key)
+                self._cut.add(key)
+                self.changed((key,))
+            elif node is not None:
+                node.visible = True
+
+    def send(self, now: float) -> int:
+        """Send what is due; the number of tiles that were."""
+        count = 0
+        for key, (_, end) in list(self._last.items()):
+            if now >= end:
+                self._empty_last(key, now)
+        for key, (node, end) in list(self._spare.items()):
+            if now >= end:
+                del self._spare[key]
+                node.remove()
+        for key in list(self.waiting):
+            due = self._due(key)
+            if due > now:
+                continue
+            if self._bucket.wait(1.0, now) > 0:
+                break
+            del self.waiting[key]
+            size = self._send(key, now)
+            self._cut.discard(key)
+            if size:
+                self._sent_at[key] = now
+                self._pauses[key] = STEADY_PAUSE if now < due + _SOON else PAUSE
+                self._bucket.spend(size)
+                self.bytes_sent += size
+                count += 1
+        return count
+
+    def _due(self, key: CellKey) -> float:
+        """When a tile may be sent."""
+        pause = _CUT_PAUSE if key in self._cut else self._pauses.get(key, PAUSE)
+        return self._sent_at.get(key, -np.inf) + pause
+
+    def shown_mesh(self, key: CellKey, tile: Tile) -> Mesh:
+        """Shown part of a tile, in the chosen colours."""
+        mesh = Mesh(tile.mesh.vertices, tile.mesh.faces, tile.mesh.normals, self._colors.colors(key, tile))
+        return mesh if self.clipping.side(tile.bounds) == "whole" else self.clipping.cut(mesh)
+
+    def _send(self, key: CellKey, now: float) -> int:
+        """Bring a tile into the scene as it is now; the bytes that takes."""
+        tile, node = self._tiles.tiles.get(key), self._nodes.get(key)
+        if tile is None:
+            if node is not None:
+                self._hide(key, node)
+                self._nodes.pop(key).remove()
+            if key in self._spare:
+                self._spare.pop(key)[0].remove()
+            self._sides.pop(key, None)
+            return 0
+        side = self.clipping.side(tile.bounds)
+        mesh = None if side == "hidden" else self.shown_mesh(key, tile)
+        if mesh is None or not len(mesh.faces):
+            self._hidden.add(key)
+            if node is not None:
+                self._hide(key, node)
+            return 0
+        self._sides[key] = side
+        return self._put(key, mesh, now)
+
+    def _hide(self, key: CellKey, node: "viser.GlbHandle") -> None:
+        node.visible = False
+        if key in self._last:
+            self._last.pop(key)[0].remove()
+
+    def _put(self, key: CellKey, mesh: Mesh, now: float) -> int:
+        edge = self._tiles.edge * CELL * self.voxel_size
+        corner = edge * (np.array(key, np.float64) - _MARGIN)
+        assert mesh.colors is not None
+        content = tile_glb.encode(mesh.vertices, mesh.faces, mesh.colors, corner, self.voxel_size)
+        if key in self._last:
+            self._empty_last(key, now)
+        node = self._nodes.get(key)
+        if node is not None:
+            self._last[key] = (node, now + (_CUT_PAUSE if key in self._cut else PAUSE))
+        if key in self._spare:
+            other, _ = self._spare.pop(key)
+        else:
+            other = self._add(key, node)
+        other.glb_data = content
+        if not self._keeps:
+            other._impl.props.glb_data = b""
+        if not other.visible:
+            other.visible = True
+        self._nodes[key] = other
+        return len(content)
+
+    def _add(self, key: CellKey, node: "viser.GlbHandle | None") -> "viser.GlbHandle":
+        """An empty node beside another one: what it is made with stays in viser's memory as long as it."""
+        names = [f"{self._root}/" + "_".join(map(str, key)) + version for version in ("", "b")]
+        if node is not None:
+            names.remove(node.name)
+        return self._scene.add_glb(names[0], tile_glb.EMPTY, cast_shadow=False, receive_shadow=False)
+
+    def _empty_last(self, key: CellKey, now: float) -> None:
+        """Take the version before out of the scene, and keep its node."""
+        node, _ = self._last.pop(key)
+        node.glb_data = tile_glb.EMPTY
+        self._spare[key] = (node, now + _SPARED)

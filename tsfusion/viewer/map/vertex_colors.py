@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: MIT
+"""Colours of a tile's vertices: as seen, or by height, direction, weight, scanner, age or a measure."""
+
+import html
+import math
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.geometry.color_scales import as_hex, of_number, ramp, rounded_up
+from tsfusion.viewer.map.map_tiles import GREY, CellKey, MapTiles, Tile
+from tsfusion.viewer.map.vertex_values import Function, VertexValues
+
+PICTURE, HEIGHT, NORMAL, WEIGHT, CLIENT, AGE = "Picture", "Height", "Normal", "Weight", "Scanner", "Age"
+_UNKNOWN = (125, 125, 125)
+_FEW = 64  # values of a tile that the scale's ends are found from
+_UNIT = re.compile(r"(.*) \[(.+)\]")  # of a measure, in its name
+_LIGHT = 0.45  # how much darker a surface is that faces away from the light
+_STOPS = 9  # of a legend's bar
+
+
+@dataclass(frozen=True)
+class Scale:
+    """The values of the first and the last colour."""
+
+    low: float
+    high: float
+
+    def colors(self, values: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:
+        """(n, 3) RGB of (n,) values; grey where there is none (NaN)."""
+        share = np.nan_to_num((values - self.low) / (self.high - self.low))
+        colors: NDArray[np.uint8] = ramp()[np.rint(255 * np.clip(share, 0, 1)).astype(np.uint8)]
+        colors[np.isnan(values)] = _UNKNOWN
+        return colors
+
+
+class VertexColors:
+    """Present meaning of colours.
+
+    Args:
+        tiles: that get colours.
+        weights: of the map at points.
+        measures: further quantities by name; a unit stands in brackets at its end: `error [m]`.
+    """
+
+    def __init__(self, tiles: MapTiles, weights: Function, measures: Mapping[str, Function]) -> None:
+        self._tiles = tiles
+        self.values = VertexValues({WEIGHT: weights, **measures})
+        self.names = [PICTURE, HEIGHT, NORMAL, WEIGHT, CLIENT, AGE, *measures]
+        self.mode = PICTURE
+        self.scale: Scale | None = None
+        self.up = np.array((0.0, 0.0, 1.0))
+        self._of_client: Callable[[bytes], str] = lambda session: session.hex()[:8]
+
+    def choose(self, mode: str) -> None:
+        """Colour by something else."""
+        self.mode, self.scale = mode, None
+        self.values.choose(mode)
+
+    def name_clients(self, name: Callable[[bytes], str]) -> None:
+        """Take a session's name from a function."""
+        self._of_client = name
+
+    @property
+    def is_asked_for(self) -> bool:
+        """True if the values come from elsewhere, later than the triangles."""
+        return self.mode in self.values.names
+
+    def colors(self, key: CellKey, tile: Tile) -> NDArray[np.uint8]:
+        """(n, 3) sRGB colours of a tile's vertices."""
+        mesh = tile.mesh
+        assert mesh.colors is not None
+        if self.mode == PICTURE:
+            return mesh.colors if self._tiles.has_colors else self._shaded(mesh.colors, mesh.normals)
+        if self.mode == NORMAL:
+            facing: NDArray[np.uint8] = np.rint(127.5 * (mesh.normals + 1)).astype(np.uint8)
+            return facing
+        if self.mode == CLIENT:
+            palette = np.array([*map(of_number, range(len(self._tiles.clients))), _UNKNOWN], np.uint8)
+            return self._shaded(palette[tile.client[tile.cell_of_vertex]], mesh.normals)
+        values = self._values(key, tile)
+        if values is None or self.scale is None:
+            return self._shaded(np.full(mesh.vertices.shape, GREY, np.uint8), mesh.normals)
+        return self._shaded(self.scale.colors(values), mesh.normals)
+
+    def fit_scale(self) -> bool:
+        """Fit the scale's ends to what is there; whether they are others now, so that all colours are."""
+        before = self.scale
+        if self.mode in {HEIGHT, AGE} or self.is_asked_for:
+            self.scale = self._fitted()
+        return self.scale != before
+
+    def legend(self) -> str:
+        """Legend of the colours, as HTML."""
+        if self.mode == CLIENT:
+            names = [html.escape(self._of_client(session)) for session in self._tiles.clients]
+            return " ".join(_swatch(of_number(i)) + name for i, name in enumerate(names)) or "not known"
+        if self.mode == NORMAL:
+            return "red, green, blue: facing +x, +y, +z of the map"
+        if self.is_asked_for and self.scale is None:
+            return "not known now" if self.values.is_unknown else "being asked for …"
+        if self.scale is None:
+            return ""
+        name, unit = self._unit()
+        return _bar(f"{html.escape(name)}", self.scale, html.escape(unit))
+
+    def _unit(self) -> tuple[str, str]:
+        known = {HEIGHT: ("height", "m"), WEIGHT: ("weight: samples", ""), AGE: ("last change, after", "s")}
+        if self.mode in known:
+            return known[self.mode]
+        found = _UNIT.fullmatch(self.mode)
+        return (found[1], found[2]) if found else (self.mode, "")
+
+    def _values(self, key: CellKey, tile: Tile) -> NDArray[np.floating[Any]] | None:
+        if self.mode == HEIGHT:
+            return tile.mesh.vertices @ self.up.astype(np.float32)
+        if self.mode == AGE:
+            return tile.changed_s[tile.cell_of_vertex]
+        return self.values.of(key, tile)
+
+    def _fitted(self) -> Scale | None:
+        if self.mode == HEIGHT:
+            up = self.up.astype(np.float32)
+            parts = [_few(tile.mesh.vertices) @ up for tile in list(self._tiles.tiles.values())]
+        elif self.mode == AGE:
+            parts = [tile.changed_s[_few(tile.cell)] for tile in list(self._tiles.tiles.values())]
+        else:
+            parts = [_few(values) for values in self.values.known()]
+        found = np.concatenate(parts) if parts else np.zeros(0)
+        found = found[np.isfinite(found)]
+        if not len(found):
+            return None
+        low, high = (float(end) for end in np.percentile(found, (1, 99)))
+        if self.mode in {HEIGHT, AGE}:
+            grain = rounded_up(max(high - low, 0.1)) / 10
+            first = math.floor(low / grain)
+            return Scale(grain * first, grain * max(math.ceil(high / grain), first + 1))
+        return Scale(-rounded_up(-low) if low < 0 else 0.0, rounded_up(high))
+
+    def _shaded(self, colors: NDArray[np.uint8], normals: NDArray[np.float32]) -> NDArray[np.uint8]:
+        """Colours under a light from above and aside, so that shape reads where no picture shows it."""
+        side = np.roll(self.up, 1)
+        light = self.up + 0.6 * (side - (side @ self.up) * self.up)
+        light /= np.linalg.norm(light)
+        facing = 0.5 + 0.5 * (normals @ light.astype(np.float32))
+        found: NDArray[np.uint8] = np.rint(colors * (1 - _LIGHT + _LIGHT * facing[:, None])).astype(np.uint8)
+        return found
+
+
+def _few(values: NDArray[Any]) -> NDArray[Any]:
+    return values[:: max(len(values) // _FEW, 1)]
+
+
+def _swatch(rgb: tuple[int, int, int]) -> str:
+    style = f"display:inline-block;width:.8em;height:.8em;border-radius:2px;background:{as_hex(rgb)}"
+    return f'<span style="{style}"></span>&nbsp;'
+
+
+def _bar(name: str, scale: Scale, unit: str) -> str:
+    """A bar of the colours with the numbers of its ends and middle."""
+    colors = [as_hex(tuple(color)) for color in ramp()[np.linspace(0, 255, _STOPS).astype(int)].tolist()]
+    unit = f"&nbsp;{unit}" if unit else ""
+    numbers = [f"{number:.4g}" for number in (scale.low, (scale.low + scale.high) / 2, scale.high)]
+    numbers[2] += unit
+    bar = f"height:.8em;border-radius:3px;background:linear-gradient(90deg,{','.join(colors)})"
+    row = "display:flex;justify-content:space-between"
+    return (
+        f'<div>{name}</div><div style="{bar}"></div>'
+        f'<div style="{row}"><span>{"</span><span>".join(numbers)}</span></div>'
+    )

@@ -1,0 +1,171 @@
+# SPDX-License-Identifier: MIT
+"""Guard of a page: requests are judged by their Host, Origin and token.
+
+A foreign page can make a browser send requests to this machine, and a foreign name can be made to lead to it:
+so Host must name this server, and the Origin of a WebSocket must be that Host. Beyond loopback, a token must
+be in the address of the first visit; a cookie stands for it from then on.
+"""
+
+import hashlib
+import hmac
+import re
+import secrets
+import socket
+from http import HTTPStatus
+from http.cookies import CookieError, SimpleCookie
+from ipaddress import ip_address
+from typing import NamedTuple, Protocol
+from urllib.parse import parse_qs
+
+from tsfusion.core.errors import InvalidConfig
+from tsfusion.wire.sockets.sockets import is_loopback
+
+_TOKEN = re.compile(r"[\w.~-]{8,128}", re.ASCII)  # as it stands in an address
+_HOST = re.compile(r"(?:\[(?P<host6>[0-9A-Fa-f:.]+)\]|(?P<host>[\w.-]+))(?::[0-9]{1,5})?", re.ASCII)
+_ANY = ("0.0.0.0", "::")
+_FARAWAY = "192.0.2.1"  # of no machine (RFC 5737)
+
+
+class Headers(Protocol):
+    """Headers of a request."""
+
+    def get_all(self, key: str) -> list[str]:
+        """Every value of the header of that name."""
+        ...
+
+
+class Refusal(NamedTuple):
+    """The answer to a request that is refused, and a word for the reason."""
+
+    reason: str
+    status: HTTPStatus
+    text: str
+
+
+class PageGuard:
+    """Judges the requests to one page.
+
+    Args:
+        host: where the page listens: a name or number.
+        port: its real port.
+        token: 8 to 128 letters, digits and . _ ~ -; None = a random one where others than this machine can
+            reach the page, else none is needed.
+
+    Attributes:
+        token: the one that is needed; None = none is.
+        url: address to open the page with, token included.
+
+    Raises:
+        InvalidConfig: for a bad token.
+    """
+
+    def __init__(self, host: str, port: int, token: str | None = None) -> None:
+        if token is not None and not _TOKEN.fullmatch(token):
+            raise InvalidConfig("a token is 8 to 128 letters, digits and . _ ~ -")
+        is_private = is_loopback(host)
+        if token is None and not is_private:
+            token = secrets.token_urlsafe(18)
+        self.token = token
+        self._secret = hashlib.sha256(f"tsfusion page {token}".encode()).hexdigest()
+        self._cookie = f"tsfusion-{port}"  # browsers share cookies among the ports of a host
+        self._is_any = host in _ANY
+        self._names = {"localhost", host.lower()} | (set() if is_private else _own_names())
+        shown = _own_address(host) if self._is_any else host
+        place = f"[{shown}]:{port}" if ":" in shown else f"{shown}:{port}"
+        self.url = f"http://{place}" + (f"/?token={token}" if token is not None else "")
+
+    def refusal(self, path: str, headers: Headers) -> Refusal | None:
+        """Reason why a request is refused; None = it is not."""
+        hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
+        if len(hosts) != 1 or not self._is_own(hosts[0]):
+            return Refusal(
+                "host",
+                HTTPStatus.FORBIDDEN,
+                "open this page at the address that `tsfusion view` has printed, or at localhost by `ssh -L`",
+            )
+        if (origins or is_websocket(headers)) and not _is_from(origins, hosts[0]):
+            return Refusal("origin", HTTPStatus.FORBIDDEN, "another page may not use this one")
+        if self.token is not None and not (self.is_given(path) or self._has_cookie(headers)):
+            return Refusal(
+                "token",
+                HTTPStatus.FORBIDDEN,
+                "this page needs its token: open the address that `tsfusion view` has printed",
+            )
+        return None
+
+    def is_given(self, path: str) -> bool:
+        """True if a token is needed, and stands in the address that is asked for."""
+        if self.token is None:
+            return False
+        given = parse_qs(path.partition("?")[2]).get("token", [""])[0]
+        return hmac.compare_digest(given.encode(errors="surrogateescape"), self.token.encode())
+
+    def answer_headers(self, path: str, headers: Headers) -> dict[str, str]:
+        """Headers of the answer to a request that is not refused: nothing is loaded from elsewhere."""
+        (host,) = headers.get_all("Host")
+        policy = (
+            "default-src 'self' data: blob: 'unsafe-inline' 'unsafe-eval'",
+            f"connect-src 'self' data: blob: ws://{host} wss://{host}",
+            *("object-src 'none'", "base-uri 'none'", "form-action 'none'", "frame-ancestors 'none'"),
+        )
+        found = {
+            "Content-Security-Policy": "; ".join(policy),
+            "Referrer-Policy": "no-referrer",
+            "X-Content-Type-Options": "nosniff",
+            "Cache-Control": "no-store",
+        }
+        if self.is_given(path):
+            found["Set-Cookie"] = f"{self._cookie}={self._secret}; Path=/; HttpOnly; SameSite=Strict"
+        return found
+
+    def _is_own(self, host: str) -> bool:
+        match = _HOST.fullmatch(host)
+        if match is None:
+            return False
+        name = (match["host6"] or match["host"]).lower()
+        if name in self._names:
+            return True
+        try:
+            ip_address(name)
+        except ValueError:  # a name that may be anybody's
+            return False
+        return self._is_any or is_loopback(name)
+
+    def _has_cookie(self, headers: Headers) -> bool:
+        for line in headers.get_all("Cookie"):
+            try:
+                found = SimpleCookie(line).get(self._cookie)
+            except CookieError:
+                continue
+            if found is not None and hmac.compare_digest(found.value.encode(), self._secret.encode()):
+                return True
+        return False
+
+
+def is_websocket(headers: Headers) -> bool:
+    return any("websocket" in value.lower() for value in headers.get_all("Upgrade"))
+
+
+def _is_from(origins: list[str], host: str) -> bool:
+    """True if a browser says that a page of `host` sends the request."""
+    if len(origins) != 1:
+        return False
+    scheme, _, place = origins[0].lower().partition("://")
+    return scheme in ("http", "https") and place == host.lower()
+
+
+def _own_names() -> set[str]:
+    """Names under which others may know this machine."""
+    name = socket.gethostname().lower()
+    return {name, f"{name.partition('.')[0]}.local"} if name else set()
+
+
+def _own_address(host: str) -> str:
+    """The address of this machine that others see; nothing is sent to find it out."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            probe.connect((_FARAWAY, 9))
+            return str(probe.getsockname()[0])
+    except OSError:  # no network
+        return "127.0.0.1" if family == socket.AF_INET else "::1"

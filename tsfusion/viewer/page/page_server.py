@@ -1,0 +1,236 @@
+# SPDX-License-Identifier: MIT
+"""The web server of a page: viser's, behind a door that says who may come in.
+
+viser's own listens for every Origin, takes another port when one is in use, and prints. So it is given a
+`websockets.asyncio.server.serve` of ours while it starts; where it does not use that, nothing is served.
+"""
+
+import asyncio
+import gzip
+import logging
+import socket
+import threading
+from collections import Counter
+from collections.abc import AsyncIterator, Callable
+from contextlib import AsyncExitStack, ExitStack, asynccontextmanager
+from functools import lru_cache, partial
+from http import HTTPStatus
+from importlib import resources
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+from msgspec import MsgspecError
+
+from tsfusion.core.errors import TransportError
+from tsfusion.viewer.page import page_messages
+from tsfusion.viewer.page.page_guard import PageGuard, Refusal, is_websocket
+from tsfusion.viewer.page.page_place import check_installed, listen
+
+if TYPE_CHECKING:
+    import viser
+    from websockets.asyncio.server import Server, ServerConnection
+    from websockets.http11 import Request, Response
+
+BROWSERS = 32  # at once
+KNOCKING = 64  # connections at once that are no browser yet; the oldest makes room for a new one
+_MAX_MESSAGE = 16 << 20  # bytes: a browser sends a picture of its page
+_OPEN_SECONDS = 10.0  # for a request and its answer
+_CLOSE_SECONDS = 1.0
+_PAUSE = 0.005  # seconds between two messages of a browser: viser's page sends 50 a second at most
+_START = threading.Lock()
+_FULL = f"{BROWSERS} browsers show this page already: close one"
+_MISFITS = (TypeError, ValueError, LookupError, AttributeError, OSError, RuntimeError)
+
+log = logging.getLogger(__name__)
+
+
+class PageServer:
+    """A running web server with an empty page.
+
+    Args:
+        host: where it listens; by default only this machine reaches it.
+        port: 0 = a free one.
+        token: needed to open the page; None = none on this machine, else a random one.
+
+    Attributes:
+        server: to fill the page with.
+        url: to open it with.
+        port, token: the real ones; the token is None where none is needed.
+        refused: requests that were turned away, by reason: host, origin, token, full, message.
+
+    Raises:
+        MissingDependency: without viser.
+        InvalidConfig: for a bad token.
+        TransportError: when the port is taken, or viser cannot be guarded.
+    """
+
+    def __init__(self, host: str = "127.0.0.1", port: int = 0, *, token: str | None = None) -> None:
+        check_installed()
+        self.refused: Counter[str] = Counter()
+        self._running: Server | None = None
+        self._is_closing = False
+        self._problem = "it starts in another way"
+        with ExitStack() as failed:
+            listener = failed.enter_context(listen(host, port))
+            self.port = listener.getsockname()[1]
+            self._guard = PageGuard(host, self.port, token)
+            self.url, self.token = self._guard.url, self._guard.token
+            self.server = self._start(listener)
+            failed.pop_all()
+        self.server.gui.configure_theme(show_logo=False, show_share_button=False)
+
+    def close(self) -> None:
+        """End it, and every connection to it."""
+        if not self._is_closing:
+            self._is_closing = True
+            self.server.get_event_loop().call_soon_threadsafe(self._end_connections)
+            self.server.stop()
+
+    def _start(self, listener: socket.socket) -> "viser.ViserServer":
+        import rich
+        import viser
+        import websockets.asyncio.server as module
+
+        rich.reconfigure(quiet=True)  # viser prints there, and stdout is the command's own
+        with _START:
+            usual = module.serve
+            module.serve = partial(self._serve, usual, listener)  # type: ignore[assignment, misc]
+            try:
+                server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+            finally:
+                module.serve = usual  # type: ignore[misc]
+        if self._running is None:
+            server.stop()
+            raise TransportError(
+                f"this version of viser cannot be guarded, so nothing is shown: {self._problem}"
+            )
+        return server
+
+    @asynccontextmanager
+    async def _serve(
+        self, usual: Any, listener: socket.socket, handler: Any, host: str, port: int, **options: Any
+    ) -> AsyncIterator[Any]:
+        """Stand in for `websockets.asyncio.server.serve`. Always yields: viser waits for that without end."""
+        asyncio.get_running_loop().set_exception_handler(_note_failure)
+        async with AsyncExitStack() as stack:
+            try:
+                guarded = options | self._guarded(options["process_request"])
+                running = await stack.enter_async_context(usual(handler, sock=listener, **guarded))
+                self._running = running
+            except _MISFITS as error:  # of another viser or websockets; `_start` tells
+                self._problem = repr(error)
+                running = SimpleNamespace(server=SimpleNamespace(sockets=()))
+            yield running
+
+    def _guarded(self, answer: "Callable[[ServerConnection, Request], Response | None]") -> dict[str, Any]:
+        """Options of a server that lets in whom the guard lets in.
+
+        Args:
+            answer: what viser answers to a request.
+        """
+        from websockets.asyncio.server import ServerConnection
+        from websockets.frames import CloseCode
+
+        page = self
+
+        class Knocking(ServerConnection):
+            """A connection that gives viser what our page sends, and makes room for others.
+
+            Of those that are no browser yet, the oldest is ended.
+            """
+
+            def connection_made(self, transport: asyncio.BaseTransport) -> None:
+                super().connection_made(transport)
+                links = [one for one in self.server.handlers if not one.transport.is_closing()]
+                waiting = [one for one in links if one.state.name != "OPEN"]
+                if page._is_closing:
+                    self.transport.abort()
+                elif len(waiting) > KNOCKING:
+                    waiting[0].transport.abort()
+
+            async def recv(self, decode: bool | None = None) -> Any:
+                while True:
+                    await asyncio.sleep(_PAUSE)
+                    message = await super().recv(decode)
+                    try:
+                        found = page_messages.checked(message, page._control)
+                    except (MsgspecError, RecursionError, TypeError) as error:
+                        page._note_refused(self, "message", f"no page of ours sends this: {error}")
+                        await self.close(CloseCode.POLICY_VIOLATION)
+                    else:
+                        if found is not None:
+                            return found
+
+        return {
+            "process_request": lambda one, request: self._refused(one, request) or answer(one, request),
+            "process_response": self._with_headers,
+            "create_connection": Knocking,
+            "server_header": None,
+            "max_size": _MAX_MESSAGE,
+            "open_timeout": _OPEN_SECONDS,
+            "close_timeout": _CLOSE_SECONDS,
+            "logger": _quiet_logger(),
+        }
+
+    def _refused(self, connection: "ServerConnection", request: "Request") -> "Response | None":
+        refusal = self._guard.refusal(request.path, request.headers)
+        if (
+            refusal is None
+            and is_websocket(request.headers)
+            and len(connection.server.connections) >= BROWSERS
+        ):
+            refusal = Refusal("full", HTTPStatus.SERVICE_UNAVAILABLE, _FULL)
+        if refusal is None:
+            return None
+        self._note_refused(connection, refusal.reason, refusal.text)
+        return connection.respond(refusal.status, f"{refusal.text}\n")
+
+    def _note_refused(self, connection: "ServerConnection", reason: str, text: str) -> None:
+        self.refused[reason] += 1
+        peer = connection.remote_address or ("somewhere",)
+        log.warning("a browser at %s is turned away (%s): %s", peer[0], reason, text)
+
+    def _control(self, name: str) -> Any:
+        """The control of that name, of all browsers or of one; None = there is none."""
+        panels = [self.server.gui, *(client.gui for client in self.server.get_clients().values())]
+        found = [
+            one._gui_input_handle_from_uuid[name] for one in panels if name in one._gui_input_handle_from_uuid
+        ]
+        return found[0] if found else None
+
+    def _with_headers(self, connection: "ServerConnection", request: "Request", response: "Response") -> None:
+        if response.status_code == HTTPStatus.OK:
+            if response.headers.get("Content-Type", "").startswith("text/html"):
+                response.body = _with_our_head(bytes(response.body))
+                del response.headers["Content-Length"]
+                response.headers["Content-Length"] = str(len(response.body))
+            for name, value in self._guard.answer_headers(request.path, request.headers).items():
+                response.headers[name] = value
+
+    def _end_connections(self) -> None:
+        assert self._running is not None
+        for connection in self._running.handlers:
+            connection.transport.abort()
+
+
+@lru_cache(2)
+def _with_our_head(html: bytes) -> bytes:
+    """viser's page, packed or not, with names for its controls, a title and more contrast."""
+    is_packed = html.startswith(b"\x1f\x8b")
+    html = gzip.decompress(html) if is_packed else html
+    ours = resources.files(__package__).joinpath("page_head.html").read_bytes()
+    html = html.replace(b"<title>Viser</title>", b"<title>tsfusion</title>" + ours, 1)
+    return gzip.compress(html) if is_packed else html
+
+
+def _quiet_logger() -> logging.Logger:
+    """A logger for connections, of which browsers and others may break as many as they like."""
+    made = logging.Logger(f"{__name__}.connections")
+    made.addHandler(logging.NullHandler())
+    made.addFilter(lambda record: record.getMessage() == "connection handler failed")
+    return made
+
+
+def _note_failure(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    """Log in a line what viser did not expect of a browser."""
+    log.warning("the page had an error: %s", context.get("exception") or context.get("message"))

@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: MIT
+"""Where a map's keyframes are, as one follows it: asked for page by page, again whenever some have moved."""
+
+from collections import defaultdict
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core.errors import DecodeError
+from tsfusion.geometry.up_direction import HeldSensor
+from tsfusion.wire.asking.map_events import MapEvent, PathsFound, ScannerSeen
+from tsfusion.wire.messages.health import MapHealth
+from tsfusion.wire.messages.mesh_updates import Scanned
+from tsfusion.wire.messages.questions import Keyframes
+
+_PAUSE_S = 2.0  # for each answer of the last time, until all are asked for again
+_PathRows = tuple[NDArray[np.int64], NDArray[np.float64]]
+
+
+class FollowedPaths:
+    """The paths of a map's scanners, and the next question about them."""
+
+    def __init__(self) -> None:
+        self._is_due = True
+        self._next = 0.0  # time.monotonic()
+        self._asked: Keyframes | None = None
+        self._answers = 0  # of this time, or the last
+        self._pages: dict[bytes, list[_PathRows]] = defaultdict(list)
+        self._epoch = ""
+        self._moved: dict[bytes, NDArray[np.float64]] = {}  # T_map_odometry by session
+        self._counts: tuple[int, ...] | None = None
+        self._number: tuple[str, int] | None = None
+        self._fused = self._fused_then = 0  # keyframes in the map, as it tells, and when they were asked for
+        self._scanned = 0  # that scanners have sent since then
+
+    def question(self, now: float) -> Keyframes | None:
+        """Next question; None = none."""
+        if self._asked is None and self._is_due and now >= self._next:
+            self._is_due, self._next = False, now + _PAUSE_S * max(self._answers, 1)
+            self._asked, self._answers = Keyframes(), 0
+            self._fused_then, self._scanned = self._fused, 0
+            self._pages.clear()
+        return self._asked
+
+    def on_keyframes(self, epoch: str, arrays: dict[str, NDArray[Any]]) -> list[MapEvent]:
+        """Take the answer to the last question.
+
+        Raises:
+            DecodeError: when it is none; ask again.
+        """
+        asked = self._asked
+        if asked is None:
+            return []
+        if asked.session and epoch != self._epoch:  # another process: what was asked before is not of it
+            self._asked, self._is_due = None, True
+            return []
+        self._epoch = epoch
+        self._answers += 1
+        try:
+            self._add_page(arrays)
+            last = arrays["last_session"].tobytes(), int(arrays["last"])
+            held = HeldSensor(arrays["held"].tolist())
+        except (KeyError, IndexError, TypeError, ValueError) as error:
+            raise DecodeError(f"an answer about keyframes is malformed: {error!r}") from error
+        if last[0]:
+            if last == (asked.session, asked.after):
+                raise DecodeError("an answer about keyframes has no end")
+            self._asked = Keyframes(session=last[0], after=last[1])
+            return []
+        self._asked = None
+        return [PathsFound({key: _joined(pages) for key, pages in self._pages.items()}, held)]
+
+    def _add_page(self, arrays: dict[str, NDArray[Any]]) -> None:
+        upper = arrays["poses"].reshape(-1, 3, 4)
+        poses = np.tile(np.eye(4), (len(upper), 1, 1))
+        poses[:, :3] = upper
+        rows, seqs = arrays["session"], arrays["seqs"]
+        if not len(rows) == len(seqs) == len(poses):
+            raise ValueError("columns of different lengths")
+        for row, session in enumerate(arrays["sessions"]):
+            key, of_it = session.tobytes(), rows == row
+            self._moved[key] = arrays["T_map_odometry"][row]
+            if of_it.any():
+                self._pages[key].append((seqs[of_it], poses[of_it]))
+
+    def on_scanned(self, scanned: Scanned, picture: bytes | None) -> ScannerSeen:
+        """Take a keyframe that a scanner sent."""
+        known, self._number = self._number, (scanned.epoch, scanned.number)
+        if known is not None and self._number not in (known, (known[0], known[1] + 1)):
+            self._is_due = True  # some were missed
+        self._scanned += self._number != known
+        T = np.array([*scanned.pose, 0.0, 0.0, 0.0, 1.0]).reshape(4, 4)
+        moved = self._moved.get(scanned.session)
+        return ScannerSeen(
+            session=scanned.session,
+            seq=scanned.seq,
+            T_world_camera=T if moved is None else moved @ T,
+            intrinsics=scanned.intrinsics,
+            shape=scanned.shape,
+            picture=picture,
+            client=scanned.client,
+        )
+
+    def on_health(self, health: MapHealth) -> None:
+        """Take the map's health: it shows when keyframes have moved, gone, or come from the journal alone."""
+        counts = (
+            health.corrections,
+            health.keyframes_moved,
+            health.keyframes_forgotten,
+            health.corrections_waiting,
+            health.fuser_restarts,
+        )
+        before, self._counts = self._counts, counts
+        self._fused = health.keyframes_fused
+        came_alone = not health.waiting and self._fused - self._fused_then > self._scanned
+        self._is_due |= came_alone or before not in (None, counts)
+
+
+def _joined(pages: list[_PathRows]) -> _PathRows:
+    seqs, poses = zip(*pages, strict=True)
+    return np.concatenate(seqs), np.concatenate(poses)

@@ -1,0 +1,172 @@
+# SPDX-License-Identifier: MIT
+"""A connection to a server's control address over which one asks again and again, and never waits."""
+
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from typing import Any
+
+import zmq
+
+from tsfusion.core.errors import DecodeError
+from tsfusion.wire.asking.queries import open_connection
+from tsfusion.wire.messages import messages
+from tsfusion.wire.messages.messages import Command, Reply
+from tsfusion.wire.messages.questions import Question
+from tsfusion.wire.sockets import sockets
+from tsfusion.wire.sockets.connection import ServerLink
+from tsfusion.wire.sockets.curve import ClientKeys
+
+_HEALTH_INTERVAL = 1.0  # seconds
+_SILENT_AFTER = 4.0  # seconds without the health that was asked for
+_GRACE_S = 1.0  # in which a connection may be made again
+_QUESTION_S = 5.0  # that a question may take
+_MOST_AT_ONCE = 32  # replies
+OnReply = Callable[[Reply, list[memoryview]], None]
+
+
+class Inquiry:
+    """Asks a server for its health once a second, and one question at a time.
+
+    Attributes:
+        map: whose other server is asked about with the health, where it has one.
+        version: the server's `PROTOCOL_VERSION`; None = not known yet.
+    """
+
+    def __init__(
+        self, context: "zmq.Context[Any]", address: str, keys: ClientKeys | None, map_name: str
+    ) -> None:
+        self._connection: ServerLink = open_connection(context, sockets.connect_address(address), keys)
+        self.address, self.map = address, map_name
+        self.version: int | None = None
+        self._greeted = 0  # on which connection
+        self._seen = time.monotonic()  # when there was a connection, or none could be yet
+        self._health_due = 0.0
+        self._health_asked: float | None = None
+        self._number = 0  # of the question
+        self._asked_until: float | None = None
+
+    @property
+    def polled(self) -> list[tuple[sockets.AnySocket, int]]:
+        """Sockets and events for which it is worth to call `step`."""
+        return [(self._connection.socket, zmq.POLLIN), (self._connection.events, zmq.POLLIN)]
+
+    @property
+    def due(self) -> float:
+        """When to call `step` without an event (`time.monotonic()`)."""
+        waits = [self._health_due if self._health_asked is None else self._health_asked + _SILENT_AFTER]
+        if self._connection.due:
+            waits.append(self._connection.due)
+        return min(waits) if self._connection.is_made else self._connection.due or time.monotonic() + 0.2
+
+    @property
+    def problem(self) -> str:
+        """Reason why the server does not answer, in words; empty = it does, or it is too early to say."""
+        now = time.monotonic()
+        if self._connection.is_made:
+            is_late = self._health_asked is not None and now - self._health_asked > _SILENT_AFTER / 2
+            return f"the server at {self.address} does not answer" if is_late else ""
+        if now - self._seen < _GRACE_S:
+            return ""
+        if self._connection.problem:
+            return self._connection.problem
+        return f"no server answers at {self.address}: is `tsfusion serve` running there?"
+
+    @property
+    def may_ask(self) -> bool:
+        return (
+            self.version == messages.PROTOCOL_VERSION
+            and self._connection.is_made
+            and self._asked_until is None
+        )
+
+    def ask(self, map_name: str, question: Question, *, compress: bool) -> None:
+        """Ask; the reply comes by `step`, or never: then it is over after some seconds."""
+        self._number += 1
+        self._asked_until = time.monotonic() + _QUESTION_S + 1.0
+        self._send(
+            Command(
+                name="ask",
+                map=map_name,
+                question=question,
+                number=self._number,
+                timeout_s=_QUESTION_S,
+                compress=compress,
+            )
+        )
+
+    def move_to(self, address: str) -> None:
+        """Ask another server from now on."""
+        self.drop_question()
+        self.address, self.version, self._health_asked = address, None, None
+        self._seen = time.monotonic()
+        self._connection.move_to(address)
+
+    def drop_question(self) -> None:
+        """Take no answer to the question that is under way."""
+        self._number += 1
+        self._asked_until = None
+
+    def step(self, on_reply: OnReply) -> None:
+        """Read the replies that came, and ask for the health if it is time.
+
+        Args:
+            on_reply: takes replies about health, and to the last question.
+        """
+        now, connection = time.monotonic(), self._connection
+        connection.check(now)
+        self._read(on_reply)
+        if not connection.is_made:
+            self._asked_until = self._health_asked = None
+            return
+        self._seen = now
+        if connection.made > self._greeted:
+            self._greeted, self.version = connection.made, None
+            self._asked_until = self._health_asked = None
+            self._health_due = now
+            self._send(Command(name="ping"))
+        if self._asked_until is not None and now > self._asked_until:
+            self.drop_question()
+        if self._health_asked is not None and now - self._health_asked > _SILENT_AFTER:
+            self._health_asked, self._seen = None, now - _GRACE_S
+            connection.reopen()  # what stands may lead nowhere, and nobody would notice
+        elif self._health_asked is None and now >= self._health_due:
+            self._health_due, self._health_asked = now + _HEALTH_INTERVAL, now
+            self._send(Command(name="health", map=self.map))
+
+    def _send(self, command: Command) -> None:
+        with suppress(zmq.Again):  # the connection has ended: all is asked again on the next one
+            self._connection.socket.send(messages.encode_sealed(command), zmq.NOBLOCK)
+
+    def _read(self, on_reply: OnReply) -> None:
+        for _ in range(_MOST_AT_ONCE):
+            if not sockets.has_message(self._connection.socket):
+                return
+            head, *frames = self._connection.socket.recv_multipart(zmq.NOBLOCK, copy=False)
+            try:
+                reply = messages.decode_to_client(head.buffer)
+            except DecodeError:
+                continue  # damaged on its way: it is asked again
+            if isinstance(reply, Reply) and self._is_expected(reply):
+                on_reply(reply, _buffers(frames))
+                if reply.elsewhere is not None:
+                    return  # the connection may be another one now
+
+    def _is_expected(self, reply: Reply) -> bool:
+        if reply.name == "ping":
+            self.version = reply.version
+        elif reply.name == "health":
+            self._health_asked = None
+            return reply.health is not None
+        elif reply.name == "ask" and reply.number == self._number and self._asked_until is not None:
+            self._asked_until = None
+            return True
+        return False
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._connection.close()
+
+
+def _buffers(frames: Sequence[zmq.Frame]) -> list[memoryview]:
+    return [frame.buffer for frame in frames]

@@ -1,0 +1,377 @@
+# SPDX-License-Identifier: MIT
+"""The map of a running server, asked from a machine without Taichi: how far is it to the wall?"""
+
+import time
+from collections.abc import Sequence
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
+
+import numpy as np
+from msgspec import Struct
+from numpy.typing import ArrayLike, NDArray
+
+from tsfusion.core.config import DEFAULT_MAP, Surface
+from tsfusion.core.errors import AnswerLate, DecodeError, InvalidConfig, ServerUnreachable, TransportError
+from tsfusion.geometry import up_direction
+from tsfusion.geometry.keyframe import Intrinsics
+from tsfusion.geometry.map_answers import Samples, View, checked_camera, checked_points
+from tsfusion.geometry.map_grids import DistanceField, DistanceSlice, OccupancySlice, SliceGrid, blocked
+from tsfusion.geometry.up_direction import Up
+from tsfusion.wire.asking.queries import CommandRefused, Exchange, open_connection, place_of
+from tsfusion.wire.messages import questions
+from tsfusion.wire.messages.messages import Command, Reply
+from tsfusion.wire.messages.questions import Answer, Field, MapVersion, Question, Raycast, Sample, Slice
+from tsfusion.wire.sockets import sockets
+from tsfusion.wire.sockets.curve import ClientKeys, client_keys
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+    from tsfusion.geometry.map_grids import SliceSettings
+
+Result = TypeVar("Result")
+_MOST_HOPS = 4  # from server to server, after a map
+_GRID = ("origin", "resolution", "heights", "axes")
+
+
+class Answered(Struct, Generic[Result], frozen=True, kw_only=True, eq=False):
+    """Answer of a map, of which state of it, and how long it took.
+
+    Attributes:
+        result: as of the method of `Volume` with the same name.
+        state: the one state of the map that all of the result is of.
+        delay_s: from the question to the answer, here.
+        waited_s, took_s: of it, seconds in the server: until the map was free, and to answer.
+    """
+
+    result: Result
+    state: MapVersion
+    delay_s: float
+    waited_s: float = 0.0
+    took_s: float = 0.0
+
+
+class MapClient:
+    """A map on a server, asked by the methods of `Volume`: each returns an `Answered` of what that returns.
+
+    The map answers between two keyframes, within milliseconds; one that has moved to another server is asked
+    there (without keys, on this machine alone). A question that is not answered in its time
+    raises, and never hangs. By custom the surface is the raw one here, as it was fused: smoothing it takes
+    the server longer. Use it from one thread.
+
+    Args:
+        address: of the server: tcp://HOST:PORT.
+        map_: which of its maps.
+        control: its control address; None = the port after the other.
+        timeout: seconds that a question may take, unless it says otherwise.
+        key, server_key: for a server with keys: one's own secret key, a file, and the server's public key, a
+            file or its 40 characters, as `Client` takes them.
+        keys: of `curve.client_keys`, in place of the two.
+        compress: large answers, for a slow link; None = unless the server is on this machine.
+
+    Raises:
+        InvalidConfig: for an address that is none.
+
+    Examples:
+        >>> with tsfusion.MapClient("tcp://127.0.0.1:5555", timeout=5.0) as live:
+        ...     found = live.sample(np.zeros((4, 3)))
+        >>> found.result.distance.shape, found.state.keyframes > 0
+        ((4,), True)
+    """
+
+    def __init__(
+        self,
+        address: str,
+        map_: str = DEFAULT_MAP,
+        *,
+        control: str | None = None,
+        timeout: float = 1.0,
+        key: str | None = None,
+        server_key: str | None = None,
+        keys: ClientKeys | None = None,
+        compress: bool | None = None,
+    ) -> None:
+        self.address, self.map = sockets.connect_address(address), map_
+        self.timeout = timeout
+        host, _ = sockets.parse_address(address)
+        self._compress = not sockets.is_loopback(host) if compress is None else compress
+        self._context = sockets.open_context()
+        keys = client_keys(key, server_key) if keys is None else keys
+        place = sockets.control_address(self.address, control)
+        self._connection = open_connection(self._context, sockets.connect_address(place), keys)
+        self._server = Exchange(self._connection)
+        self._keys = keys
+        self._number = 0
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._connection.close()
+        self._context.term()
+
+    def __enter__(self) -> "MapClient":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, where: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def sample(
+        self,
+        points: ArrayLike,
+        *,
+        min_weight: float | None = None,
+        surface: Surface | None = "raw",
+        timeout: float | None = None,
+    ) -> Answered[Samples]:
+        """The signed distance, its weight and its gradient at points; see `Volume.sample`.
+
+        Args:
+            points: (n, 3) metres, at most `questions.MOST_POINTS`: an answer is of one state of the map.
+            min_weight, surface: as for `Volume.extract_mesh`; None = as the map's settings say.
+            timeout: seconds; None = the client's.
+
+        Raises:
+            InvalidConfig: for an array that holds no points, or too many.
+            AnswerLate: when the map did not answer in time.
+            ServerUnreachable: when no server answers.
+            TransportError: when the server cannot answer, with the reason.
+        """
+        rows = checked_points(points).astype(np.float32)
+        if not len(rows):
+            raise InvalidConfig("there is no point to ask about")
+        frames = questions.point_frames(rows)
+        crc = questions.crc_of(frames)
+        question = Sample(points=len(rows), crc=crc, min_weight=min_weight, surface=surface)
+        answer, arrays, delay = self._ask(question, frames, timeout)
+        found = Samples(**_all(arrays, "distance", "weight", "gradient"), reach=answer.reach)
+        return _answered(found, answer, delay)
+
+    def raycast(
+        self,
+        intrinsics: Intrinsics | ArrayLike,
+        T_world_camera: ArrayLike,
+        shape: tuple[int, int],
+        *,
+        min_weight: float | None = None,
+        surface: Surface | None = "raw",
+        max_age: float = 0.0,
+        normals: bool = True,
+        colors: bool = True,
+        timeout: float | None = None,
+    ) -> Answered[View]:
+        """View of the surface by a pinhole camera; see `Volume.raycast`. Raises as `sample`.
+
+        Args:
+            intrinsics, T_world_camera, shape, min_weight, surface: as for `Volume.raycast`.
+            max_age: seconds for which the state that is shown may be behind the newest one. Of 0 the view is
+                of the newest, and what has just changed is meshed first. With 0.2 that is done ahead, for
+                cameras that look where the last one did; `state` says which state was shown.
+            normals, colors: whether with them. Depth alone is a fifth of the bytes.
+            timeout: seconds; None = the client's.
+        """
+        camera, T, (height, width) = checked_camera(intrinsics, T_world_camera, shape)
+        question = Raycast(
+            intrinsics=(camera.fx, camera.fy, camera.cx, camera.cy),
+            pose=tuple(T.ravel().tolist()),
+            shape=(height, width),
+            min_weight=min_weight,
+            surface=surface,
+            max_age=_number(max_age, "max_age"),
+            normals=bool(normals),
+            colors=bool(colors),
+        )
+        answer, arrays, delay = self._ask(question, [], timeout)
+        found_colors = arrays.pop("colors", None)  # some maps have none
+        names = ["depth", "normals"] if normals else ["depth"]
+        view = View(**_all(arrays, *names), colors=found_colors)
+        return _answered(view, answer, delay)
+
+    def occupancy_slice(
+        self, low: float, high: float, *, up: Up | str, timeout: float | None = None,
+        **how: "Unpack[SliceSettings]",
+    ) -> Answered[OccupancySlice]:  # fmt: skip
+        """Costmap of what stands between two heights; see `Volume.occupancy_slice`.
+
+        Args:
+            low, high, up, timeout, how: as for `distance_slice`, without `max_distance`.
+        """
+        answer, arrays, delay = self._ask_slice("occupancy", low, high, up=up, timeout=timeout, **how)
+        found = _all(arrays, "cells", "knows_free_space", *_GRID)
+        sliced = OccupancySlice(_grid(found), found["cells"], bool(found["knows_free_space"]))
+        return _answered(sliced, answer, delay)
+
+    def distance_slice(
+        self, low: float, high: float, *, up: Up | str, unseen_is_free: bool = False,
+        timeout: float | None = None, **how: "Unpack[SliceSettings]",
+    ) -> Answered[DistanceSlice]:  # fmt: skip
+        """Horizontal distances to what stands between two heights; see `Volume.distance_slice`.
+
+        The server keeps the slices of a `box` that were asked last, and brings them up to date: the first
+        answer takes it longest. Raises as `sample`.
+
+        Args:
+            low, high: metres along `up`, such as "z".
+            unseen_is_free: as for `Volume.distance_slice`.
+            timeout: seconds; None = the client's.
+            how: `box`, `resolution`, `max_distance`, `min_weight`: as for `Volume.distance_slice`.
+        """
+        answer, arrays, delay = self._ask_slice("distance", low, high, up=up, timeout=timeout, **how)
+        found = _all(arrays, "cells", "distance", "max_distance", *_GRID)
+        farthest = float(found["max_distance"])
+        distance = blocked(found["distance"], found["cells"], unseen_is_free=unseen_is_free)
+        sliced = DistanceSlice(_grid(found), distance, found["cells"], farthest)
+        return _answered(sliced, answer, delay)
+
+    def _ask_slice(
+        self,
+        kind: Literal["occupancy", "distance"],
+        low: float,
+        high: float,
+        *,
+        up: Up | str,
+        box: Sequence[float] | None = None,
+        resolution: float | None = None,
+        max_distance: float = 2.0,
+        min_weight: float | None = None,
+        timeout: float | None = None,
+    ) -> tuple[Answer, dict[str, NDArray[Any]], float]:
+        given = up_direction.parse(up) if isinstance(up, str) else up
+        question = Slice(
+            kind=kind,
+            low=float(low),
+            high=float(high),
+            up=given.direction,
+            box=None if box is None else _numbers(box, 4),  # type: ignore[arg-type]
+            resolution=resolution,
+            max_distance=max_distance,
+            min_weight=min_weight,
+        )
+        return self._ask(question, [], timeout)
+
+    def distance_field(
+        self,
+        box: Sequence[float],
+        *,
+        max_distance: float = 0.5,
+        subvoxel: bool = True,
+        min_weight: float | None = None,
+        unseen_is_free: bool = False,
+        timeout: float | None = None,
+    ) -> Answered[DistanceField]:
+        """Distance of each voxel in a box to the nearest surface; see `Volume.distance_field`.
+
+        Raises as `sample`.
+
+        Args:
+            box: x0 y0 z0 x1 y1 z1, metres in the map's frame.
+            max_distance: metres; the cost grows with its cube.
+            subvoxel, min_weight, unseen_is_free: as for `Volume.distance_field`.
+            timeout: seconds; None = the client's.
+        """
+        question = Field(
+            box=_numbers(box, 6),  # type: ignore[arg-type]
+            max_distance=max_distance,
+            subvoxel=subvoxel,
+            min_weight=min_weight,
+        )
+        answer, arrays, delay = self._ask(question, [], timeout)
+        found = _all(arrays, "distance", "occupancy", "origin", "voxel_size", "max_distance")
+        edge, farthest = float(found["voxel_size"]), float(found["max_distance"])
+        distance = blocked(found["distance"], found["occupancy"], unseen_is_free=unseen_is_free)
+        field = DistanceField(found["origin"], edge, distance, found["occupancy"], farthest)
+        return _answered(field, answer, delay)
+
+    def _ask(
+        self, question: Question, frames: Sequence[Any], timeout: float | None
+    ) -> tuple[Answer, dict[str, NDArray[Any]], float]:
+        """The answer, its arrays, and the seconds that it took."""
+        seconds = self.timeout if timeout is None else timeout
+        if not 0 < seconds <= questions.LONGEST_S:
+            raise InvalidConfig(f"timeout must be > 0 and up to {questions.LONGEST_S:g} s, got {seconds:g}")
+        if problem := question.problem([memoryview(frame) for frame in frames]):
+            raise InvalidConfig(problem)
+        began, self._number = time.monotonic(), self._number + 1
+        command = Command(
+            name="ask",
+            map=self.map,
+            question=question,
+            number=self._number,
+            timeout_s=seconds,
+            compress=self._compress,
+        )
+        reply, arrays = self._exchange(command, frames, began + seconds)
+        for _ in range(_MOST_HOPS):
+            if reply.elsewhere is None:
+                break
+            self.address, place = place_of(reply.elsewhere, self._keys)
+            self._connection.move_to(place)
+            reply, arrays = self._exchange(command, frames, began + seconds)
+        delay = time.monotonic() - began
+        if reply.late:
+            raise AnswerLate(f"the map {self.map} at {self.address}: {reply.error}")
+        if reply.error is not None:
+            raise CommandRefused(self.address, reply.error, retry=reply.retry)
+        if reply.answer is None:
+            raise TransportError(f"the server at {self.address} sent a reply without an answer")
+        try:
+            return reply.answer, questions.unpack(reply.answer, arrays), delay
+        except DecodeError as error:
+            raise TransportError(f"the server at {self.address}: {error}") from error
+
+    def _exchange(
+        self, command: Command, frames: Sequence[Any], deadline: float
+    ) -> tuple[Reply, list[memoryview]]:
+        """Send a question; the reply to it."""
+        left = max(deadline - time.monotonic(), 0.0)
+        try:
+            return self._server.ask(command, frames, timeout=left)
+        except ServerUnreachable as error:
+            if self._server.is_there:
+                raise AnswerLate(
+                    f"the map {self.map} at {self.address} did not answer within {command.timeout_s:g} s: "
+                    "ask again, or give it longer (timeout)"
+                ) from error
+            self._connection.reopen()  # what stands may lead nowhere, and nobody would notice
+            raise
+
+
+def _all(arrays: dict[str, NDArray[Any]], *names: str) -> dict[str, NDArray[Any]]:
+    """The arrays of these names, and no others."""
+    if sorted(arrays) != sorted(names):
+        raise TransportError(f"an answer has {', '.join(arrays) or 'nothing'} instead of {', '.join(names)}")
+    return arrays
+
+
+def _numbers(given: Sequence[float], count: int) -> tuple[float, ...]:
+    numbers = np.asarray(given, np.float64)
+    if numbers.shape != (count,):
+        raise InvalidConfig(f"a box must be {count} numbers in metres, got {given}")
+    return tuple(numbers.tolist())
+
+
+def _number(given: Any, name: str) -> float:
+    if isinstance(given, str | bytes):
+        raise InvalidConfig(f"{name} must be a number, got {given!r}")
+    try:
+        return float(given)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InvalidConfig(f"{name} must be a number, got {given!r}") from error
+
+
+def _grid(found: dict[str, NDArray[Any]]) -> SliceGrid:
+    """The cells of a slice, from the arrays of an answer: `SliceGrid.figures`."""
+    rows, columns = found["cells"].shape
+    u, v = found["origin"].tolist()
+    low, high = found["heights"].tolist()
+    return SliceGrid((u, v), float(found["resolution"]), (rows, columns), low, high, found["axes"])
+
+
+def _answered(result: Result, answer: Answer, delay_s: float) -> Answered[Result]:
+    return Answered(
+        result=result,
+        state=answer.state,
+        delay_s=delay_s,
+        waited_s=answer.waited_s,
+        took_s=answer.took_s,
+    )

@@ -1,0 +1,383 @@
+# SPDX-License-Identifier: MIT
+"""Queries to a running server: its health, the status of a map, the mesh of a map."""
+
+import math
+import time
+from collections.abc import Sequence
+from contextlib import closing, suppress
+from typing import Any
+
+import numpy as np
+import zmq
+from numpy.typing import NDArray
+
+from tsfusion.core.config import DEFAULT_MAP
+from tsfusion.core.errors import DecodeError, InvalidConfig, NotAllowed, ServerUnreachable, TransportError
+from tsfusion.geometry.mesh import Mesh
+from tsfusion.wire.messages import messages
+from tsfusion.wire.messages.forget_messages import Forgotten, Selection
+from tsfusion.wire.messages.health import Health, MeshLayout, Status
+from tsfusion.wire.messages.messages import Command, Elsewhere, Reply
+from tsfusion.wire.messages.migration_messages import Moved
+from tsfusion.wire.sockets import sockets
+from tsfusion.wire.sockets.connection import ServerLink
+from tsfusion.wire.sockets.curve import ClientKeys
+from tsfusion.wire.sockets.sockets import control_address
+
+_AGAIN_INTERVAL = 0.25  # seconds
+_MOST_HOPS = 4  # from server to server, after a map
+_PING_TIMEOUT = 5.0  # seconds; the gateway is never busy: without an answer for so long there is none
+
+
+class CommandRefused(TransportError):
+    """The server answered that it cannot do what a command asks."""
+
+    def __init__(
+        self, address: str, reason: str, *, retry: bool = False, elsewhere: Elsewhere | None = None
+    ) -> None:
+        super().__init__(f"the server at {address}: {reason}")
+        self.reason = reason  # the server's words, without its address
+        self.retry = retry  # whether the same command may succeed soon
+        self.elsewhere = elsewhere  # the server that has the map; None = no other is known
+
+
+def fetch_health(
+    address: str,
+    *,
+    control: str | None = None,
+    map_name: str | None = None,
+    timeout: float = 10.0,
+    keys: ClientKeys | None = None,
+) -> Health:
+    """Ask the server at a data address for its health; it answers at once, whatever its fusers do.
+
+    Args:
+        map_name: where that map is at another server by now, that one is asked.
+        keys: of `curve.client_keys`, for a server with keys.
+
+    Raises:
+        NotAllowed: when the server turns the connection away.
+        ServerUnreachable: when nobody answers in `timeout` seconds.
+    """
+    command = Command(name="health", map=map_name or DEFAULT_MAP)
+    reply, _ = _request_if_present(address, control, command, timeout, keys, follow=map_name is not None)
+    if reply.health is None:
+        raise TransportError(f"the server at {address} answered without its health")
+    return reply.health
+
+
+def fetch_status(
+    address: str,
+    *,
+    control: str | None = None,
+    map_name: str = DEFAULT_MAP,
+    timeout: float = 10.0,
+    keys: ClientKeys | None = None,
+) -> Status:
+    """Ask the server at a data address for the status of a map. See `fetch_health`.
+
+    Raises:
+        TransportError: when the server cannot say.
+    """
+    command = Command(name="status", map=map_name, timeout_s=timeout)
+    reply, _ = _request_if_present(address, control, command, timeout, keys)
+    if reply.status is None:
+        raise TransportError(f"the server at {address} answered without a status")
+    return reply.status
+
+
+def fetch_new_map(
+    address: str,
+    like: str = DEFAULT_MAP,
+    *,
+    control: str | None = None,
+    timeout: float = 10.0,
+    keys: ClientKeys | None = None,
+) -> str:
+    """Ask the server at a data address for the name of a map that nobody has: NAME, NAME-2, NAME-3, …
+
+    The server gives it to nobody else for some minutes. See `fetch_health`.
+
+    Raises:
+        TransportError: when it has no room for another map.
+    """
+    command = Command(name="new_map", map=like)
+    reply, _ = _request_if_present(address, control, command, timeout, keys)
+    if reply.map is None:
+        raise TransportError(f"the server at {address} answered without the name of a map")
+    return reply.map
+
+
+def fetch_mesh(
+    address: str,
+    *,
+    control: str | None = None,
+    map_name: str = DEFAULT_MAP,
+    min_weight: float | None = None,
+    timeout: float = 60.0,
+    keys: ClientKeys | None = None,
+) -> Mesh:
+    """Ask the server at a data address for the present mesh of a map. See `fetch_health`.
+
+    A server makes one at a time, and none while keyframes have to come first: it is asked again.
+
+    Raises:
+        ServerUnreachable: when nobody is there (known after a few seconds), or the mesh takes longer than
+            `timeout` seconds.
+        TransportError: when the server cannot make it, or not within `timeout` seconds.
+    """
+    command = Command(name="mesh", map=map_name, min_weight=min_weight, timeout_s=timeout)
+    deadline = time.monotonic() + timeout
+    refused: CommandRefused | None = None
+    while True:
+        try:
+            left = max(deadline - time.monotonic(), 0.0)
+            reply, frames = _request_if_present(address, control, command, left, keys)
+            break
+        except CommandRefused as error:
+            if not error.retry or time.monotonic() + 2 * _AGAIN_INTERVAL > deadline:
+                raise
+            refused = error
+        except ServerUnreachable as error:
+            if refused is None:
+                raise
+            raise refused from error  # it is there, and said why not
+        time.sleep(_AGAIN_INTERVAL)
+    if reply.mesh is None:
+        raise TransportError(f"the server at {address} answered without a mesh")
+    return mesh_of(reply.mesh, frames)
+
+
+def forget(
+    address: str,
+    selection: Selection,
+    *,
+    erase: bool = False,
+    dry_run: bool = False,
+    control: str | None = None,
+    map_name: str = DEFAULT_MAP,
+    timeout: float = 600.0,
+    keys: ClientKeys | None = None,
+) -> Forgotten:
+    """Tell the server at a data address to forget keyframes of a map. See `fetch_health`.
+
+    Args:
+        erase: also delete them from its journal; it answers when that is done.
+        dry_run: only ask which that would be.
+        timeout: seconds; a server that does not answer in time may still forget them.
+
+    Raises:
+        ServerUnreachable: when nobody is there, or it takes longer.
+        TransportError: when the server cannot, or this client may not.
+    """
+    command = Command(
+        name="forget", map=map_name, selection=selection, erase=erase, dry_run=dry_run, timeout_s=timeout
+    )
+    reply, _ = _request_if_present(address, control, command, timeout, keys)
+    if reply.forgotten is None:
+        raise TransportError(f"the server at {address} answered without what it forgot")
+    return reply.forgotten
+
+
+def move_map(
+    name: str, source: str, to: str, *, timeout: float = 3600.0, keys: ClientKeys | None = None
+) -> Moved:
+    """Tell the server at a data address, `to`, to take over a map from another one. See `fetch_health`.
+
+    Raises:
+        ServerUnreachable: when nobody is there, or it takes longer; the move may go on then.
+        TransportError: when it cannot, or this client may not; the map stays where it is.
+    """
+    command = Command(name="move", map=name, source=sockets.connect_address(source))
+    reply, _ = _request_if_present(to, None, command, timeout, keys)
+    if reply.moved is None:
+        raise TransportError(f"the server at {to} answered without how the move went")
+    return reply.moved
+
+
+def _request_if_present(
+    address: str,
+    control: str | None,
+    command: Command,
+    timeout: float,
+    keys: ClientKeys | None,
+    *,
+    follow: bool = True,
+) -> tuple[Reply, list[memoryview]]:
+    """Send a command, also to the server that its map has moved to.
+
+    Args:
+        follow: ask the server that the map is at, where the first one says so.
+    """
+    address = sockets.connect_address(address)
+    for hops_left in reversed(range(_MOST_HOPS + 1)):
+        place = control_address(address, control)
+        name = f"{address} (control {place})"
+        try:
+            reply, frames = request(place, command, timeout=timeout, keys=keys, name=name)
+        except CommandRefused as error:
+            if error.elsewhere is None or not follow or not hops_left:
+                raise
+            elsewhere = error.elsewhere
+        else:
+            if reply.elsewhere is None or not follow or not hops_left:
+                return reply, frames
+            elsewhere = reply.elsewhere
+        address, control = place_of(elsewhere, keys)
+    raise AssertionError("the last hop returns or raises")
+
+
+def place_of(elsewhere: Elsewhere, keys: ClientKeys | None) -> tuple[str, str]:
+    """Data and control address of a server that a map is said to be at.
+
+    Raises:
+        TransportError: as `sockets.place_of` raises InvalidConfig.
+    """
+    try:
+        return sockets.place_of(elsewhere.address, elsewhere.control, has_keys=keys is not None)
+    except InvalidConfig as error:
+        raise TransportError(f"the map is said to be at {elsewhere.address}: {error}") from error
+
+
+def mesh_of(layout: MeshLayout, frames: list[memoryview]) -> Mesh:
+    """Build a mesh from its frames (see `MeshLayout`).
+
+    Raises:
+        TransportError: when the frames are not what the layout says.
+    """
+    wanted: list[tuple[int, type]] = [(layout.vertices, np.float32), (layout.faces, np.int32)]
+    wanted.append((layout.vertices, np.float32))
+    if layout.colors:
+        wanted.append((layout.vertices, np.uint8))
+    sizes = [rows * 3 * np.dtype(dtype).itemsize for rows, dtype in wanted]
+    if sizes != [frame.nbytes for frame in frames]:
+        raise TransportError(f"a mesh of {sizes} bytes was announced, got {[f.nbytes for f in frames]}")
+    arrays: list[NDArray[Any]] = [
+        np.frombuffer(frame, dtype).reshape(-1, 3) for frame, (_, dtype) in zip(frames, wanted, strict=True)
+    ]
+    return Mesh(*arrays, known_up=layout.up)
+
+
+_POLL_S = 0.2  # seconds
+_MAX_TIMEOUT_S = 1e6  # seconds; a poll takes no more than 2³¹ ms
+
+
+def request(
+    address: str,
+    command: messages.Command,
+    *,
+    timeout: float,
+    keys: ClientKeys | None = None,
+    name: str = "",
+) -> tuple[messages.Reply, list[memoryview]]:
+    """Send a command to a server's control address; its reply and the raw frames that came with it.
+
+    Args:
+        timeout: seconds.
+        keys: of `curve.client_keys`; None = a connection without.
+        name: of the server, in errors; empty = the address.
+
+    Raises:
+        InvalidConfig: for a malformed address.
+        NotAllowed: as soon as the server turns the connection away.
+        ServerUnreachable: when nobody answered within `timeout` seconds.
+        CommandRefused: when the server answered that it cannot.
+        TransportError: when what answers is no tsfusion server, or too few files can be opened.
+    """
+    address = sockets.connect_address(address)
+    with sockets.open_context() as context, closing(open_connection(context, address, keys)) as connection:
+        reply, frames = Exchange(connection, name).ask(command, timeout=timeout)
+    if reply.error is not None:
+        raise CommandRefused(name or address, reply.error, retry=reply.retry, elsewhere=reply.elsewhere)
+    return reply, frames
+
+
+def open_connection(context: "zmq.Context[Any]", address: str, keys: ClientKeys | None) -> ServerLink:
+    """A connection to a server's control address. Raises TransportError."""
+    try:
+        return ServerLink(context, sockets.dealer, address, keys)
+    except zmq.ZMQError as error:
+        raise TransportError(f"cannot open a socket: {error.strerror}") from error
+
+
+class Exchange:
+    """Commands to a server, one after the other, each sent again on a connection that is made anew.
+
+    A ping goes before the first one on each connection, and behind one that is not answered at once.
+
+    Attributes:
+        is_there: whether the server has answered a ping, for which it is never too busy, since it was asked.
+    """
+
+    def __init__(self, connection: ServerLink, name: str = "") -> None:
+        self.is_there = False
+        self._connection, self._name = connection, name  # of the server, in errors; empty = the address
+        self._asked = self._greeted = 0  # connections on which the command was sent, and a ping answered
+        self._ping_at = 0.0  # time.monotonic()
+        self._why = ""  # there is no connection
+
+    def ask(
+        self, command: Command, frames: Sequence[Any] = (), *, timeout: float
+    ) -> tuple[Reply, list[memoryview]]:
+        """Send a command and its frames; its reply, and the raw frames that came with it.
+
+        Raises:
+            NotAllowed: as soon as the server turns the connection away.
+            ServerUnreachable: when nobody answered within `timeout` seconds, or the ping in a few.
+            TransportError: when what answers is no tsfusion server, or one of another version.
+        """
+        began, timeout = time.monotonic(), min(timeout, _MAX_TIMEOUT_S)
+        self.is_there, self._asked, self._ping_at = False, 0, began + min(timeout / 2, _POLL_S)
+        sent = [messages.encode_sealed(command), *frames]
+        while True:
+            seconds = timeout if self.is_there else min(timeout, _PING_TIMEOUT)
+            if (left := began + seconds - time.monotonic()) <= 0:
+                raise self._unreachable(seconds)
+            if (message := self._step(sent, left)) is None:
+                continue
+            reply, found = self._read(message)
+            if reply.number == command.number and (reply.name != "ping" or command.name == "ping"):
+                return reply, found
+
+    def _step(self, sent: list[Any], left: float) -> list[zmq.Frame] | None:
+        """Send what is due, and wait a moment for a message."""
+        connection, now = self._connection, time.monotonic()
+        link, is_new = connection.socket, connection.made > self._asked
+        polled = [(link, zmq.POLLIN | (zmq.POLLOUT if is_new else 0)), (connection.events, zmq.POLLIN)]
+        seconds = min(left, _POLL_S, max(self._ping_at - now, 0.0))
+        events = dict(zmq.zmq_poll(polled, int(seconds * 1000) + 1)).get(link, 0)
+        if events & zmq.POLLIN:
+            return link.recv_multipart(copy=False)
+        with suppress(zmq.Again):  # the connection has ended: all is sent on the next one
+            if (events and connection.made > self._greeted) or time.monotonic() >= self._ping_at:
+                self._ping_at = math.inf
+                link.send(messages.encode_sealed(Command(name="ping")), zmq.NOBLOCK)
+            if events & zmq.POLLOUT:
+                self._asked = connection.made
+                link.send_multipart(sent, zmq.NOBLOCK)
+        news, _ = connection.check(time.monotonic())
+        self._why = self._why if news is None else news
+        if connection.gave_up:
+            raise (NotAllowed if connection.refused else TransportError)(self._why)
+        return None
+
+    def _read(self, message: list[zmq.Frame]) -> tuple[Reply, list[memoryview]]:
+        address, (head, *frames) = self._name or self._connection.address, message
+        try:
+            reply = messages.decode_to_client(head.buffer)
+        except DecodeError as error:
+            raise TransportError(f"what answers at {address} is no tsfusion server: {error}") from error
+        if not isinstance(reply, Reply):
+            raise TransportError(f"the server at {address} answered a command with a {type(reply).__name__}")
+        if reply.name == "ping":
+            if other := messages.other_version(server=reply.version, client=messages.PROTOCOL_VERSION):
+                raise TransportError(f"cannot ask {address}: {other}")
+            self.is_there, self._greeted = True, self._asked
+        return reply, [frame.buffer for frame in frames]
+
+    def _unreachable(self, seconds: float) -> ServerUnreachable:
+        reason = f": {self._why}" if self._why else ""
+        return ServerUnreachable(
+            f"no server answered at {self._name or self._connection.address} within {round(seconds, 2):g} s"
+            f"{reason}; is `tsfusion serve` running there, and is the port right?"
+        )

@@ -1,0 +1,308 @@
+# SPDX-License-Identifier: MIT
+"""A folder of keys: this machine's own pairs and, on a server, the list of those that may connect.
+
+| file | holds |
+|---|---|
+| `NAME.key_secret`, `NAME.key` | a pair, and its public half to give away; `server` is the server's own |
+| `allowed.toml` | the server's allow-list: names, public keys, the maps they may use; and revoked keys |
+
+In `[allowed]` stands `"NAME" = "KEY"` for a client that may use every map, and `"NAME" = { key = "KEY",
+maps = ["house", "yard-*"] }` for one that may use these: a map's name, or with a `*` all that begin so.
+With `forget = true` in the braces it may make the server forget keyframes of other clients, too.
+
+The folder is its owner's alone (0700), every file 0600 from its first byte, and replaced whole.
+"""
+
+import math
+import os
+import re
+import stat
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import zmq
+from msgspec import Meta, Struct
+
+from tsfusion.core import durable_files, folder_lock
+from tsfusion.core.config import ClientName, MapPattern
+from tsfusion.core.errors import InvalidConfig, OutputError
+from tsfusion.wire.sockets import curve
+
+ALLOWED = "allowed.toml"
+
+_MAX_LIST_BYTES = 1 << 20
+_LIST_HEAD = "# Who may connect: written by `tsfusion keys allow` and `revoke`, read by the server at once.\n"
+_PAIR_HEAD = "#   ZeroMQ CURVE {}: written by `tsfusion keys new`.\n"
+
+Folder = str | os.PathLike[str]
+
+
+class Allowed(Struct, frozen=True):
+    """The allow-list of a server. No key is in it twice."""
+
+    allowed: dict[str, str] = {}  # name → public key
+    revoked: dict[str, str] = {}  # public key → the name it had
+    maps: dict[str, tuple[str, ...]] = {}  # name → the maps it may use; a name without may use every map
+    forget: tuple[str, ...] = ()  # names that may make the server forget keyframes of other clients
+
+
+_KeyText = Annotated[str, Meta(max_length=64)]
+
+
+class _Entry(Struct, frozen=True, forbid_unknown_fields=True):
+    """A client in the file that may not use every map, or may make the server forget."""
+
+    key: _KeyText
+    maps: Annotated[tuple[MapPattern, ...], Meta(max_length=256)] = ("*",)
+    forget: bool = False
+
+
+class _ListFile(Struct, frozen=True, forbid_unknown_fields=True):
+    """The allow-list as it stands in its file."""
+
+    allowed: dict[ClientName, _KeyText | _Entry] = {}
+    revoked: dict[str, ClientName] = {}
+
+
+class Pair(Struct, frozen=True):
+    """The name and public key of a pair in the folder."""
+
+    name: str
+    public: str
+
+
+def create_pair(folder: Folder, name: str, *, force: bool = False) -> Pair:
+    """Make a pair of keys under this name.
+
+    Args:
+        force: replace the pair that is there.
+
+    Raises:
+        InvalidConfig: for a bad name, or one that has keys already.
+        OutputError: when the files cannot be written.
+    """
+    check_name(name)
+    place = Path(folder).expanduser()
+    durable_files.make_private_folder(place)
+    with folder_lock.hold(place, wait=math.inf):
+        paths = [place / f"{name}{ending}" for ending in (curve.SECRET, curve.PUBLIC)]
+        for path in paths:
+            if path.exists() and not force:
+                raise InvalidConfig(f"{path} exists; choose another name, or replace it by --force")
+        public, secret = _new_pair()
+        lines = f'curve\n    public-key = "{public}"\n'
+        secret_line = f'    secret-key = "{secret}"\n'
+        _write(paths[0], _PAIR_HEAD.format("**Secret** Certificate") + lines + secret_line)
+        _write(paths[1], _PAIR_HEAD.format("Public Certificate") + lines)
+        if name == curve.SERVER and not (place / ALLOWED).exists():
+            _write(place / ALLOWED, _format_list(Allowed()))
+    return Pair(name, public)
+
+
+def allow(
+    folder: Folder,
+    name: str,
+    key: str | None = None,
+    *,
+    maps: Iterable[str] | None = None,
+    forget: bool | None = None,
+) -> str | None:
+    """Allow a client with this public key under this name; the name's earlier key is revoked.
+
+    Args:
+        key: 40 characters, or a file; None = the one that the name has.
+        maps: that it may use: names, or with a `*` at the end how names begin. None = those that the name
+            may use already, of a new name every map.
+        forget: whether it may make the server forget keyframes of other clients; None = as before, and a
+            new name may not.
+
+    Returns:
+        The name's earlier key, if it has another one now.
+
+    Raises:
+        InvalidConfig: for a bad name, key or map, a key that is taken, or a folder without a server's keys.
+        OutputError: when the list cannot be written.
+    """
+    check_name(name)
+    given = None if key is None else curve.public_key(key)
+    patterns = None if maps is None else _checked_patterns(maps)
+    place = _existing_folder(folder)
+    with folder_lock.hold(place, wait=math.inf):
+        own = curve.server_keys(place).public
+        listed = read_allow_list(place) if has_allow_list(place) else Allowed()
+        earlier = listed.allowed.get(name)
+        public = given or earlier
+        if public is None:
+            raise InvalidConfig(f"no key is allowed under the name {name!r} yet: give its public key, too")
+        _check_not_taken(name, public, own, listed)
+        revoked = {key: was for key, was in listed.revoked.items() if key != public}
+        if earlier not in (None, public):
+            revoked[str(earlier)] = name
+        rights = dict(listed.maps)
+        if patterns is not None:
+            rights[name] = patterns
+        forgets = {one for one in listed.forget if one != name or forget is not False}
+        forgets |= {name} if forget else set()
+        changed = Allowed({**listed.allowed, name: public}, revoked, _limits(rights), tuple(sorted(forgets)))
+        if changed != listed:
+            _write(place / ALLOWED, _format_list(changed))
+    return None if earlier == public else earlier
+
+
+def revoke(folder: Folder, name: str) -> str:
+    """Revoke the key of the client of this name; returns the key.
+
+    Raises:
+        InvalidConfig: when no key is allowed under the name.
+        OutputError: when the list cannot be written.
+    """
+    place = _existing_folder(folder)
+    with folder_lock.hold(place, wait=math.inf):
+        listed = read_allow_list(place)
+        if name not in listed.allowed:
+            names = ", ".join(sorted(listed.allowed))
+            there = f"under these: {names}" if names else "nor under any other"
+            raise InvalidConfig(f"no key is allowed under the name {name!r}, {there} (`tsfusion keys list`)")
+        left = dict(listed.allowed)
+        key = left.pop(name)
+        rights = {other: maps for other, maps in listed.maps.items() if other != name}
+        forgets = tuple(other for other in listed.forget if other != name)
+        _write(place / ALLOWED, _format_list(Allowed(left, {**listed.revoked, key: name}, rights, forgets)))
+    return key
+
+
+def list_pairs(folder: Folder) -> list[Pair]:
+    """List the folder's own pairs by name.
+
+    Raises:
+        InvalidConfig: when the folder or a pair cannot be read.
+    """
+    place = _existing_folder(folder)
+    found = sorted(place.glob(f"*{curve.SECRET}"))
+    return [Pair(path.name.removesuffix(curve.SECRET), curve.read_pair(path)[0]) for path in found]
+
+
+def has_allow_list(folder: Folder) -> bool:
+    """True if a folder has an allow-list, as only a server's has."""
+    return os.path.lexists(Path(folder).expanduser() / ALLOWED)
+
+
+def read_allow_list(folder: Folder) -> Allowed:
+    """Read the allow-list of a server's folder.
+
+    Raises:
+        InvalidConfig: when it is missing or malformed, or others could change it.
+    """
+    path = Path(folder).expanduser() / ALLOWED
+    try:
+        with path.open("rb") as file:
+            mode = os.fstat(file.fileno()).st_mode
+            content = file.read(_MAX_LIST_BYTES + 1)
+    except OSError as error:
+        raise InvalidConfig(f"cannot read the allow-list {path}: {error.strerror}") from error
+    if durable_files.others_can_write(mode):
+        raise InvalidConfig(f"others can change the allow-list {path} (mode {stat.S_IMODE(mode):04o})")
+    return _parse_list(content, path)
+
+
+def check_name(name: str) -> None:
+    """Raise InvalidConfig unless a client can have this name."""
+    try:
+        msgspec.convert(name, ClientName)
+    except msgspec.ValidationError as error:
+        raise InvalidConfig(
+            f"a name is 1 to 32 letters, digits and . _ -, the first a letter or digit; got {name!r}"
+        ) from error
+
+
+def _checked_patterns(maps: Iterable[str]) -> tuple[str, ...]:
+    found = tuple(dict.fromkeys(maps))
+    try:
+        msgspec.convert(found, _Entry.__annotations__["maps"])
+    except msgspec.ValidationError as error:
+        raise InvalidConfig(
+            "maps are names of 1 to 32 of a-z, 0-9, - and _, a letter or digit first, or the like with "
+            f"`*` behind; got {', '.join(found)!r}"
+        ) from error
+    return found
+
+
+def _limits(rights: dict[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
+    """The rights without those of names that may use every map."""
+    return {name: maps for name, maps in rights.items() if "*" not in maps}
+
+
+def _existing_folder(folder: Folder) -> Path:
+    place = Path(folder).expanduser()
+    try:
+        durable_files.check_private_folder(place)
+    except InvalidConfig as error:
+        raise InvalidConfig(
+            f"{error}; `tsfusion keys new {curve.SERVER}` makes a server's folder of keys, "
+            "`tsfusion keys new NAME` a scanner's"
+        ) from error
+    return place
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        with durable_files.replacing(path, private=True) as file:
+            file.write(text.encode())
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {error.strerror}") from error
+
+
+def _parse_list(content: bytes, path: Path) -> Allowed:
+    try:
+        listed = _listed(msgspec.toml.decode(content, type=_ListFile))
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise InvalidConfig(f"the allow-list {path} is damaged: {error}") from error
+    keys = [*listed.allowed.values(), *listed.revoked]
+    if len(content) > _MAX_LIST_BYTES or not all(map(curve.is_key, keys)):
+        raise InvalidConfig(f"the allow-list {path} is damaged: it holds what is no key, or too much")
+    if len(set(keys)) < len(keys):
+        raise InvalidConfig(f"the allow-list {path} is damaged: a key is in it twice")
+    return listed
+
+
+def _listed(file: _ListFile) -> Allowed:
+    entries = {name: one for name, one in file.allowed.items() if isinstance(one, _Entry)}
+    keys = {name: one.key if isinstance(one, _Entry) else one for name, one in file.allowed.items()}
+    limits = _limits({name: one.maps for name, one in entries.items()})
+    return Allowed(
+        keys, file.revoked, limits, tuple(sorted(name for name, one in entries.items() if one.forget))
+    )
+
+
+def _format_list(listed: Allowed) -> str:
+    lines = [_LIST_HEAD, "[allowed]"]  # a Z85 key has no quote and no backslash, nor has a map's name
+    for name, key in sorted(listed.allowed.items()):
+        rights = [f'key = "{key}"']
+        if (maps := listed.maps.get(name)) is not None:
+            rights.append(f"maps = [{', '.join(f'{chr(34)}{one}{chr(34)}' for one in maps)}]")
+        if name in listed.forget:
+            rights.append("forget = true")
+        lines.append(f'"{name}" = ' + (f'"{key}"' if len(rights) == 1 else f"{{ {', '.join(rights)} }}"))
+    lines += ["", "[revoked]"]
+    lines += [f'"{key}" = "{name}"' for key, name in listed.revoked.items()]
+    return "\n".join(lines) + "\n"
+
+
+def _check_not_taken(name: str, public: str, own: str, listed: Allowed) -> None:
+    if name == curve.SERVER or public == own:
+        raise InvalidConfig("that is the server's own: a client has a name and a pair of keys of its own")
+    for other, key in listed.allowed.items():
+        if key == public and other != name:
+            raise InvalidConfig(
+                f"this key is allowed under the name {other} already; `tsfusion keys revoke {other}` frees it"
+            )
+
+
+def _new_pair() -> tuple[str, str]:
+    """Draw a pair whose public key cannot be taken for an option."""
+    while True:
+        public, secret = (key.decode("ascii") for key in zmq.curve_keypair())
+        if re.match("[0-9a-zA-Z]", public):
+            return public, secret

@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: MIT
+"""Health and status of a server and its maps, as they are sent to whoever asks."""
+
+from typing import Annotated, Any, Literal, NamedTuple
+
+from msgspec import Struct
+
+from tsfusion.geometry.up_direction import Up
+from tsfusion.wire.messages.keyframe_times import Spread
+
+
+class MeshLayout(Struct, frozen=True, kw_only=True):
+    """Row counts of the frames that follow: vertices float32, faces int32, normals float32, colors uint8.
+
+    `up` is of a whole map; None = not known.
+    """
+
+    vertices: int
+    faces: int
+    colors: bool
+    up: Up | None = None
+
+
+MapState = Literal["opening", "idle", "busy", "restarting", "failed"]
+
+
+class Figure(NamedTuple):
+    """Figure of `/metrics` that a field of `MapHealth` is, for each map.
+
+    Attributes:
+        words: sentence that explains it.
+        name: without `tsfusion_`; empty = the field's.
+        by: name of the label, where the field is a count by reason.
+        grows: whether it never falls while the server runs: a counter.
+        unit: what one of the field is of the figure.
+    """
+
+    words: str
+    name: str = ""
+    by: str = ""
+    grows: bool = False
+    unit: float = 1.0
+
+
+class MapCounts(Struct, frozen=True, kw_only=True):
+    """Counts of one map that both its health and its status have."""
+
+    keyframes_durable: Annotated[int, Figure("Keyframes that were journaled.")]
+    keyframes_fused: Annotated[int, Figure("Keyframes in the map.")]
+    sessions: Annotated[int, Figure("Sessions that sent keyframes.")]
+    journal_bytes: Annotated[int, Figure("Bytes of the journal.")]
+    journal_damaged: Annotated[int, Figure("Records of the journal that could not be read.")]
+    fuser_restarts: Annotated[int, Figure("Fusers that took over from a dead one.", grows=True)]
+    blocks: Annotated[int, Figure("Blocks of 8³ voxels.", "map_blocks")]
+    map_bytes: Annotated[int, Figure("Bytes of the map's blocks.")]
+    delay_ms: Spread  # capture to fused, of the last 1024 keyframes
+    # Half the best round trip of the worst client
+    delay_bound_ms: Annotated[
+        float, Figure("The total delays are right to within ±.", "delay_bound_seconds", unit=1e-3)
+    ]
+    # Those whose newest pose is not fused yet; 0 = the map is settled
+    corrections_waiting: Annotated[int, Figure("Keyframes not yet at their new pose.")] = 0
+    # They stay where they were fused: the journal has them no more
+    corrections_unavailable: Annotated[int, Figure("Keyframes that a correction cannot move any more.")] = 0
+    keyframes_moved: int = 0  # fused at a corrected pose, or taken out, since the fuser began
+    moving_s: float = 0.0  # seconds of the fuser for that
+    # By `tsfusion map forget` or a setting
+    keyframes_forgotten: Annotated[int, Figure("Keyframes taken out of the map for good.")] = 0
+
+
+class MapHealth(MapCounts, frozen=True, kw_only=True):
+    """Health of one map, as far as the gateway knows it without asking the fuser."""
+
+    state: MapState
+    # Reason why keyframes are not accepted or not fused; empty = they are
+    problem: Annotated[str, Figure("Whether something keeps it from taking or fusing.", "map_problem")]
+    waiting: Annotated[int, Figure("Keyframes journaled and not yet fused.", "keyframes_waiting")]
+    rejected: Annotated[
+        dict[str, int], Figure("Keyframes journaled, but not fusable.", "keyframes_rejected", "reason")
+    ]
+    quarantined: Annotated[int, Figure("Keyframes kept aside for inspection.", "keyframes_quarantined")]
+    # Seconds since the last keyframe was journaled; None = none since the server began
+    last_keyframe_s: float | None
+    # Records of corrected poses: in the journal at the start, and journaled since
+    corrections: Annotated[int, Figure("Corrections of keyframes' poses in the journal.", grows=True)] = 0
+    checkpoints: int = 0  # written since the server began
+    journal_missing: Annotated[int, Figure("Segments of the journal that are gone.")] = 0
+    journal_put_back: int = 0  # times that the segment being written was taken away, and written again
+    fusing_s: float = 0.0  # seconds since the fuser's last answer, while keyframes wait for one
+    # By outcome: answered, refused, late, failed; since the map was opened
+    questions: Annotated[
+        dict[str, int], Figure("Questions to the map, by what became of them.", by="outcome", grows=True)
+    ] = {}
+    mesh_epoch: str = ""  # of the newest mesh update (`mesh_updates.MeshUpdate`); empty = none yet
+    mesh_number: int = 0
+    question_ms: Spread = Spread()  # from question to answer, in the server, of the newest 1024
+
+
+ClientState = Literal["connected", "silent", "gone"]
+
+
+class ClientHealth(Struct, frozen=True, kw_only=True):
+    """Health of one session that sent a message since the server began."""
+
+    client: str  # name that its key is allowed under; empty without keys
+    session: str  # first 8 hexadecimal digits of its number
+    map: str
+    heard_s: float  # seconds since its last message
+    durable: int  # keyframes: in the journal when the server began, or journaled since
+    fused: int  # of those, the keyframes in the map
+    received_bytes: int
+    waiting: int  # number of keyframes in its spool, as in its last Ping
+    skipped: dict[str, int]  # number of keyframes that it never sent, by reason, as in its last Ping
+    held: str  # reason why no keyframe of it is accepted now; empty = they are
+    corrections: int = 0  # in the journal
+    # silent: nothing was heard for 5 s; gone: it said goodbye, or nothing was heard for 30 s
+    state: ClientState = "connected"
+    address: str = ""  # of its machine; empty = not known
+    refused: int = 0  # number of its keyframes and corrections that were turned away for good, not journaled
+    rejected: int = 0  # number of its keyframes that the map could not take, since the server began
+
+
+class Health(Struct, frozen=True, kw_only=True):
+    """Health of a server, answered at once whatever its fusers do. Counts begin with its start.
+
+    `ready`: keyframes are accepted, journaled and fused, into one map at least: a server with three good maps
+    and a bad one is ready, for whoever sends to the good ones. Not ready is a server that starts or ends,
+    that nobody can connect to, or of which every map has a `MapHealth.problem`.
+
+    `problems`: why it is not ready, and all else that a person has to know of and may put right: a map that
+    takes or fuses nothing, whose fuser starts again, or that cannot be opened; a client of which next to no
+    keyframe comes into the map. One line each, with how long it has been so; it is gone when it is over.
+    """
+
+    ready: bool
+    problems: tuple[str, ...]
+    epoch: str
+    uptime_s: float
+    rss_bytes: int  # of the gateway
+    refused: dict[str, int]  # messages never journaled: reason → count
+    duplicates: int
+    maps: dict[str, MapHealth]
+    clients: tuple[ClientHealth, ...]
+
+
+class Status(MapCounts, frozen=True, kw_only=True):
+    """Status of a map. Counts are of the whole journal and map, the delay is of this process."""
+
+    epoch: str
+    map: str
+    state: str  # the map's folder
+    fuser: Literal["starting", "idle", "busy"]
+    uptime_s: float
+    keyframes_rejected: dict[str, int]  # journaled, but not fusable: reason → count
+    messages_refused: dict[str, int]  # never journaled: reason → count
+    duplicates: int
+    voxels: int
+    map_hash: str
+    color_hash: str
+    peak_rss_bytes: dict[str, int]  # server (gateway), fuser
+    config: dict[str, Any]  # server and volume settings
+    versions: dict[str, str]

@@ -1,0 +1,247 @@
+# SPDX-License-Identifier: MIT
+"""Control messages between scanner and server (msgpack of tagged structs).
+
+All `*_ns` stamps of the server are its own monotonic clock; the client shifts them to its own.
+"""
+
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta, Struct
+
+from tsfusion.core.config import MapName
+from tsfusion.core.errors import DecodeError
+from tsfusion.core.readable_numbers import counted
+from tsfusion.wire.messages.forget_messages import Forgotten, Selection
+from tsfusion.wire.messages.health import Health, MeshLayout, Status
+from tsfusion.wire.messages.keyframe_times import Seq, Stamps
+from tsfusion.wire.messages.migration_messages import Address, HandOver, Moved, Parcel
+from tsfusion.wire.messages.questions import Answer, Question
+from tsfusion.wire.records.record_header import SessionId, WorldName
+from tsfusion.wire.records.seal import is_damaged, seal
+
+PROTOCOL_VERSION = 3  # of these messages and of which kinds of records a server takes
+# Why a client never sends a keyframe: the reasons in `Ping.skipped`, in words
+SKIP_REASONS = {
+    "thinned": "the map was too far behind",
+    "room": "the spool's room ran short",
+    "dropped": "newer ones came first",
+    "spool": "the spool was full",
+    "disk": "the spool's disk was full or failed",
+}
+Counts = dict[Annotated[str, Meta(max_length=32)], Annotated[int, Meta(ge=0)]]  # by reason
+
+
+def other_version(*, server: int, client: int) -> str:
+    """Reason why a server and a client do not talk; empty = they speak one version."""
+    if server == client:
+        return ""
+    return (
+        f"the server speaks version {server} of the wire format, this client {client}: update the older one"
+    )
+
+
+def explained(counts: dict[str, int]) -> str:
+    """{"thinned": 2} → 2 × thinned (the map was too far behind)."""
+    named = {reason: f"{reason} ({SKIP_REASONS[reason]})" for reason in counts if reason in SKIP_REASONS}
+    return counted({named.get(reason, reason): count for reason, count in counts.items()})
+
+
+class Hello(Struct, frozen=True, tag="hello", omit_defaults=True):
+    """A client opens (or re-opens) its session.
+
+    Attributes:
+        version: `PROTOCOL_VERSION` of the client.
+        world, same_frame: as in the headers of its records.
+    """
+
+    session: SessionId
+    version: int
+    map: MapName = "default"
+    world: WorldName = ""
+    same_frame: bool = False
+
+
+class Welcome(Struct, frozen=True, tag="welcome"):
+    """The server's answer. A new `epoch` is a new server process: resend everything after `durable`."""
+
+    epoch: str
+    version: int
+    durable: Seq  # the highest seq of this session that is on the server's disk; 0 = none
+    fused: Seq  # the highest that the map has taken or refused; 0 = none
+    window_keyframes: int  # credit: sent, not yet durable
+    window_bytes: int
+    max_frame_bytes: int
+
+
+class Ack(Struct, frozen=True, tag="ack"):
+    """Progress. Everything up to `durable` may leave the spool.
+
+    `resend` asks to go back to durable + 1 at once: something in between never came.
+    """
+
+    session: SessionId
+    durable: Seq
+    fused: Seq
+    stamps: tuple[Stamps, ...] = ()
+    resend: bool = False
+
+
+class Nack(Struct, frozen=True, tag="nack"):
+    """Refusal of a record, a keyframe or a correction, that will never count.
+
+    Attributes:
+        stage: `door` = it was not journaled and must not be sent again; `map` = it is journaled, but the
+            map could not take it.
+    """
+
+    session: SessionId
+    seq: Seq
+    stage: Literal["door", "map"]
+    reason: str
+    message: str
+
+
+class Hold(Struct, frozen=True, tag="hold"):
+    """No keyframe of this session is accepted for `seconds`: keep all, then go on from durable + 1.
+
+    `reason`: `disk` (full or failing) or `quota`; `message` explains it to a person.
+    """
+
+    session: SessionId
+    seconds: float
+    reason: str
+    message: str
+
+
+class Denied(Struct, frozen=True, tag="denied", omit_defaults=True):
+    """The answer to a Hello that opens no session (yet): ask again, but tell the user why.
+
+    Also the answer to a record whose session must be opened first, or whose world the map is not of.
+
+    Attributes:
+        reason: `opening` (the map is being opened), `map` (there is no such map, and no room for one, or it
+            cannot be opened), `session` (it is another client's), `world` (the map has keyframes of another
+            world), `moved` (another server has the map) or `version`.
+        free_map: of `world`, the name of a map that nobody has yet.
+        address, control: of `moved`, the data and control address of that server.
+    """
+
+    session: SessionId
+    reason: str
+    message: str
+    free_map: str = ""
+    address: Address = ""
+    control: Address = ""
+
+
+class Ping(Struct, frozen=True, tag="ping", omit_defaults=True):
+    """Sign of life of a client, and how it is doing.
+
+    Attributes:
+        offset_ns: the client's estimate of the server's clock minus its own (None = not yet known).
+        bound_ns: error bound of this estimate.
+        waiting: number of keyframes in its spool.
+        skipped: number of keyframes that were not spooled or left the spool unsent, by reason, since the
+            client began.
+        leaving: whether it is the client's last message.
+    """
+
+    session: Annotated[bytes, Meta(max_length=16)]
+    sent_ns: int
+    offset_ns: int | None = None
+    bound_ns: int = 0
+    waiting: Annotated[int, Meta(ge=0)] = 0
+    skipped: Annotated[Counts, Meta(max_length=16)] = {}
+    leaving: bool = False
+
+
+class Pong(Struct, frozen=True, tag="pong"):
+    """The answer to a Ping.
+
+    `corrections_waiting`: as in `MapHealth`, when the map had everything up to `fused`; None = not known.
+    """
+
+    epoch: str
+    ping_sent_ns: int
+    received_ns: int
+    sent_ns: int
+    durable: Seq = 0
+    fused: Seq = 0
+    corrections_waiting: int | None = None
+
+
+class Command(Struct, frozen=True, tag="command", kw_only=True):
+    """A request of a person or program; answered by one Reply. The points of an `ask` follow as frames."""
+
+    name: Literal["ping", "health", "status", "mesh", "new_map", "forget", "ask", "move", "hand_over"]
+    map: MapName = "default"  # of `new_map`: the name to begin with, where that is free
+    min_weight: float | None = None
+    selection: Selection | None = None  # of `forget`, with the two that follow
+    erase: bool = False  # also delete the records' bytes
+    dry_run: bool = False  # only say what would be forgotten
+    source: Address = ""  # of `move`: the data address of the server that has the map
+    source_control: Address = ""  # its control address; empty = the next port
+    hand_over: HandOver | None = None
+    question: Question | None = None  # of `ask`, with what follows
+    number: Annotated[int, Meta(ge=0)] = 0  # comes back with the answer
+    timeout_s: float = 1.0  # then nobody waits for the answer any more
+    compress: bool = False  # large arrays of the answer
+
+
+class Elsewhere(Struct, frozen=True):
+    """Data and control address of the server that a map is at; an empty one is the port after the other."""
+
+    address: str
+    control: str = ""
+
+
+class Reply(Struct, frozen=True, tag="reply", kw_only=True, omit_defaults=True):
+    """The answer to a Command; arrays of a mesh follow as raw frames."""
+
+    name: str
+    error: str | None = None  # why there is no answer, for a person
+    retry: bool = False  # whether the same command may be answered soon, though it is not now
+    map: MapName | None = None  # a name that is free, and kept for who asked
+    health: "Health | None" = None
+    status: "Status | None" = None
+    mesh: "MeshLayout | None" = None
+    forgotten: Forgotten | None = None
+    moved: Moved | None = None
+    elsewhere: Elsewhere | None = None  # where the command's map is, if another server has it
+    parcel: Parcel | None = None  # of `hand_over`
+    version: int = 2  # of a ping: the server's `PROTOCOL_VERSION`, which servers of version 2 leave out
+    number: int = 0  # of the question
+    late: bool = False  # whether its time was over
+    answer: Answer | None = None  # arrays follow as frames
+
+
+ToServer = Hello | Ping | Command
+ToClient = Welcome | Denied | Hold | Ack | Nack | Pong | Reply
+_TO_SERVER = msgspec.msgpack.Decoder(ToServer)
+_TO_CLIENT = msgspec.msgpack.Decoder(ToClient)
+encode = msgspec.msgpack.encode
+
+
+def encode_sealed(message: ToServer | ToClient) -> bytes:
+    """Encode a message for the way, with a seal by which the other end knows that it is whole."""
+    return seal(encode(message))
+
+
+def decode_to_server(frame: Any) -> ToServer:
+    """Decode a message to the server; raises DecodeError for anything else."""
+    return _decode(_TO_SERVER, frame)  # type: ignore[no-any-return]
+
+
+def decode_to_client(frame: Any) -> ToClient:
+    """Decode a message to the client; raises DecodeError for anything else."""
+    return _decode(_TO_CLIENT, frame)  # type: ignore[no-any-return]
+
+
+def _decode(decoder: Any, frame: Any) -> Any:
+    if is_damaged(frame):
+        raise DecodeError("a control message was damaged on its way (CRC-32 differs)")
+    try:
+        return decoder.decode(frame)
+    except Exception as error:  # msgspec also raises UnicodeDecodeError and RecursionError
+        raise DecodeError(f"not a control message: {error}") from error

@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: MIT
+"""Frame 0 of a record: three bytes that name its kind, one byte of major version, then a header as msgpack.
+
+A session's records are keyframes (`TSF`) and corrections of them (`TSC`), numbered in one line. The version
+byte changes when an old reader must not try; new optional fields are minor changes that an old reader skips.
+"""
+
+import sys
+from typing import Annotated, Any, ClassVar, Literal, TypeAlias
+
+import msgspec
+from msgspec import Meta, Struct
+
+from tsfusion.core.config import MapName
+from tsfusion.core.errors import DecodeError
+from tsfusion.geometry.keyframe import MAX_SENSOR_NAME, Intrinsics
+from tsfusion.wire.records.seal import is_damaged, seal
+
+MAGIC_BYTES = 3
+VERSION = 1  # of both kinds
+MAX_HEADER_BYTES = 4096
+
+ArrayName = Literal["depth", "disparity", "points", "origins", "color", "confidence"]
+ArrayCodec = Literal["dzp+zstd", "mm+dzp+zstd", "jpeg", "png"]
+Length = Annotated[int, Meta(ge=0, le=2_000_000)]
+Natural = Annotated[int, Meta(ge=0, le=(1 << 63) - 1)]
+Crc32 = Annotated[int, Meta(ge=0, le=(1 << 32) - 1)]
+SessionId = Annotated[bytes, Meta(min_length=16, max_length=16)]
+WORLD_NAME = "[A-Za-z0-9_-]{1,64}"
+WorldName = Annotated[str, Meta(pattern=rf"\A({WORLD_NAME})?\Z")]
+RecordNumber = Annotated[int, Meta(ge=1, le=(1 << 63) - 1)]
+TransformRows = Annotated[tuple[float, ...], Meta(min_length=12, max_length=12)]
+
+
+class Refused(DecodeError):
+    """A message that is no record; `reason` is the short name it is counted under."""
+
+    def __init__(self, reason: str, message: str) -> None:
+        super().__init__(message)
+        self.reason = reason
+
+
+class Damaged(Refused):
+    """A message that is not what it announces: its bytes changed on the way; what was sent may be well."""
+
+
+class Buffer(Struct, frozen=True, kw_only=True):
+    """One array of the keyframe and the frame that carries it (buffers[i] is frame i + 1)."""
+
+    name: ArrayName
+    codec: ArrayCodec
+    dtype: Literal["uint8", "uint16", "float32"]  # of the decoded array
+    shape: Annotated[tuple[Length, ...], Meta(min_length=1, max_length=3)]
+    bytes: Annotated[int, Meta(ge=0)]  # length of the frame
+    crc32: Crc32  # of the frame
+
+
+class KeyframeHeader(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """Everything of a keyframe but its arrays.
+
+    Attributes:
+        session: 16 random bytes, one value a spool.
+        seq: number of the record in its session, rising by one.
+        previous: the seq before this one among those the sender still offers, 0 = none: what lies
+            between the two was dropped on purpose.
+        map: the map it is for.
+        world: name of the coordinate frame of its pose, drawn by whoever localised it; empty = the pose was
+            given from elsewhere.
+        same_frame: the sender declares that this frame is the map's, whatever worlds the map has.
+        sent_ns: the sender's monotonic clock when this copy was handed to the socket.
+        pose: the upper three rows of `T_world_camera`, row by row.
+        scale: `depth_scale` or `disparity_scale`.
+    """
+
+    kind: ClassVar[str] = "keyframe"
+
+    session: SessionId
+    seq: RecordNumber
+    previous: Natural
+    pose: TransformRows
+    buffers: Annotated[tuple[Buffer, ...], Meta(min_length=1, max_length=4)]
+    map: MapName = "default"
+    world: WorldName = ""
+    same_frame: bool = False
+    sent_ns: Natural = 0
+    scale: float | None = None
+    intrinsics: Intrinsics | None = None
+    baseline_fx: float | None = None
+    sensor: Annotated[str, Meta(max_length=MAX_SENSOR_NAME)] | None = None
+    timestamp_ns: Natural = 0
+    captured_ns: Natural = 0
+
+
+class CorrectionHeader(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """The first frame of a correction, before the numbers and poses of its body.
+
+    Attributes:
+        session, seq, previous, map, world, same_frame, sent_ns: as of a keyframe.
+        count: keyframes that get another pose.
+        removed: keyframes that are to be taken out of the map.
+        crc32: of the body.
+        T_map_odometry: the upper three rows, row by row, of what poses after the last keyframe are to be
+            multiplied by from the left; None = as before.
+        target: the session whose keyframes it removes, for good; only a server writes it. None = its own.
+    """
+
+    kind: ClassVar[str] = "correction"
+
+    session: SessionId
+    seq: RecordNumber
+    previous: Natural
+    count: Natural
+    crc32: Crc32
+    map: MapName = "default"
+    world: WorldName = ""
+    same_frame: bool = False
+    sent_ns: Natural = 0
+    removed: Natural = 0
+    T_map_odometry: TransformRows | None = None
+    target: SessionId | None = None
+
+
+RecordHeader: TypeAlias = KeyframeHeader | CorrectionHeader
+_MAGIC: dict[type[RecordHeader], bytes] = {KeyframeHeader: b"TSF", CorrectionHeader: b"TSC"}
+_DECODERS: dict[bytes, Any] = {
+    magic: msgspec.msgpack.Decoder(header_type) for header_type, magic in _MAGIC.items()
+}
+
+
+def pack(header: RecordHeader) -> bytes:
+    """The bytes of frame 0."""
+    return _MAGIC[type(header)] + bytes([VERSION]) + msgspec.msgpack.encode(header)
+
+
+def unpack(frame: Any) -> RecordHeader:
+    """Read frame 0 (any bytes-like object) of a keyframe or a correction.
+
+    Raises:
+        Refused: `header` (too long, or not such a struct), `magic`, `version` or `crc`.
+    """
+    view = memoryview(frame)
+    if view.nbytes > MAX_HEADER_BYTES:
+        raise Refused("header", f"the header must be at most {MAX_HEADER_BYTES} bytes, got {view.nbytes}")
+    magic, version = bytes(view[:MAGIC_BYTES]), bytes(view[MAGIC_BYTES : MAGIC_BYTES + 1])
+    if magic not in _DECODERS:
+        raise Refused("magic", f"a record starts with {' or '.join(map(str, _DECODERS))}, got {magic!r}")
+    if version != bytes([VERSION]):
+        raise Refused("version", f"this is record format {VERSION}, got {version.hex() or 'nothing'}")
+    content = view[MAGIC_BYTES + 1 :]
+    if is_damaged(content):
+        raise Damaged("crc", "the header was damaged on its way (CRC-32 differs)")
+    try:
+        return _DECODERS[magic].decode(content)  # type: ignore[no-any-return]
+    except Exception as error:  # msgspec also raises UnicodeDecodeError and RecursionError
+        raise Refused("header", f"the header is malformed: {error}") from error
+
+
+def unpack_keyframe(frame: Any) -> KeyframeHeader:
+    """Read frame 0 of a keyframe; raises Refused as `unpack`, and (`magic`) for a correction."""
+    header = unpack(frame)
+    if not isinstance(header, KeyframeHeader):
+        raise Refused("magic", f"a keyframe is expected, got a {header.kind}")
+    return header
+
+
+def is_correction(frame: Any) -> bool:
+    """True if frame 0 begins as that of a correction; the rest of it is not looked at."""
+    return bytes(memoryview(frame)[:MAGIC_BYTES]) == _MAGIC[CorrectionHeader]
+
+
+def world_of(frame: Any) -> str:
+    """The world that frame 0 names; empty also when it is no header."""
+    try:
+        return sys.intern(unpack(frame).world)
+    except Refused:
+        return ""
+
+
+def stamp(frame: Any, **fields: Any) -> bytes:
+    """Frame 0 again, sealed, with these fields: what is known only when the record is sent."""
+    stamped = pack(msgspec.structs.replace(unpack(frame), **fields))
+    return stamped[: MAGIC_BYTES + 1] + seal(stamped[MAGIC_BYTES + 1 :])

@@ -1,0 +1,376 @@
+# SPDX-License-Identifier: MIT
+"""ZeroMQ sockets with their limits and keys: every socket of the package is made here.
+
+No ZeroMQ heartbeats: a full PULL stops reading them and drops live connections (libzmq #3937). No
+socket lingers: keyframes that must survive are in the spool.
+"""
+
+import os
+import re
+import socket
+from contextlib import ExitStack
+from ipaddress import IPv4Address, IPv6Address, ip_address
+from typing import Any
+
+import zmq
+from msgspec import Struct
+
+from tsfusion.core.config import DEFAULT_MAP, MAP_NAME
+from tsfusion.core.errors import InvalidConfig, TransportError
+from tsfusion.wire.sockets.curve import ClientKeys, ServerKeys
+
+CONTROL_MAX_BYTES = 64 << 10
+# XPUB keeps a subscription at some fifty times its size; a greeting with keys needs about 330 bytes.
+TOPIC_MAX_BYTES = 512
+_KINDS = (b"mesh/", b"scan/")  # of topics
+# HANDSHAKE_IVL, ms: then a connection that is not made is closed. The others end a connection whose other end
+# has left without a word. Seconds: KEEPALIVE_IDLE and _INTVL between the probes of one that is idle, of which
+# KEEPALIVE_CNT are lost. Milliseconds: TCP_MAXRT without an answer to what is under way.
+_LISTENING: dict[int, int] = {
+    zmq.HANDSHAKE_IVL: 5000,
+    zmq.TCP_MAXRT: 30_000,
+    zmq.TCP_KEEPALIVE: 1,
+    zmq.TCP_KEEPALIVE_IDLE: 10,
+    zmq.TCP_KEEPALIVE_INTVL: 5,
+    zmq.TCP_KEEPALIVE_CNT: 3,
+}
+_CONNECTING: dict[int, int] = {
+    zmq.IMMEDIATE: 1,
+    zmq.RECONNECT_IVL: 100,
+    zmq.RECONNECT_IVL_MAX: 1000,  # ms
+    zmq.CONNECT_TIMEOUT: 3000,
+    zmq.HANDSHAKE_IVL: 3000,
+    zmq.TCP_MAXRT: 5000,
+    zmq.TCP_KEEPALIVE: 1,
+    zmq.TCP_KEEPALIVE_IDLE: 2,
+    zmq.TCP_KEEPALIVE_INTVL: 1,
+    zmq.TCP_KEEPALIVE_CNT: 3,
+}
+_CONTEXT_FILES = 8  # that libzmq opens for a context, and a few for others
+_RANDOM_PORT_TRIES = 32
+LAST_PORT = 65535
+_MAPS_TOPIC = re.compile(rf"(mesh|scan)/({MAP_NAME}/?)?".encode())  # or its beginning
+_HOST6 = r"[0-9A-Fa-f]*:[0-9A-Fa-f:.]*(%[\w.-]+)?"
+_PORT = r"[0-9]{1,5}|\*"
+_ADDRESS = re.compile(rf"tcp://((?P<host>[\w.*-]+)|\[(?P<host6>{_HOST6})\]):(?P<port>{_PORT})", re.ASCII)
+MAPPED = "::ffff:"  # in front of an IPv4 address, where a socket takes both
+
+AnySocket = zmq.Socket[Any]
+
+
+class Addresses(Struct, frozen=True):
+    """Addresses on which a server listens, with the real port numbers."""
+
+    data: str
+    control: str
+    publish: str  # mesh updates
+
+
+def check_context() -> None:
+    """Raise OSError when too few files can be opened for a context; libzmq would end this process then."""
+    with ExitStack() as tried:
+        for _ in range(_CONTEXT_FILES):
+            tried.enter_context(open(os.devnull))
+
+
+def open_context() -> "zmq.Context[Any]":
+    """A context for a few sockets.
+
+    Raises:
+        TransportError: when too few files can be opened for it.
+    """
+    try:
+        check_context()
+        return zmq.Context()
+    except OSError as error:
+        raise TransportError(f"cannot open a socket: {error.strerror}") from error
+
+
+def push(context: "zmq.Context[Any]", keys: ClientKeys | None = None) -> AnySocket:
+    """The scanner's data socket. IMMEDIATE: nothing is queued for a server that is not there."""
+    return _make(context, zmq.PUSH, {**_CONNECTING, zmq.SNDHWM: 10}, keys)
+
+
+def pull(context: "zmq.Context[Any]", max_frame_bytes: int, keys: ServerKeys | None = None) -> AnySocket:
+    """The server's data socket; a larger frame is dropped with its connection before it is in memory."""
+    return _make(context, zmq.PULL, {**_LISTENING, zmq.RCVHWM: 16, zmq.MAXMSGSIZE: max_frame_bytes}, keys)
+
+
+def dealer(context: "zmq.Context[Any]", keys: ClientKeys | None = None) -> AnySocket:
+    """The scanner's control socket. IMMEDIATE: greetings do not pile up for a server that is not there."""
+    return _make(context, zmq.DEALER, {**_CONNECTING, zmq.SNDHWM: 100, zmq.RCVHWM: 1000}, keys)
+
+
+def router(context: "zmq.Context[Any]", keys: ServerKeys | None = None) -> AnySocket:
+    """The server's control socket."""
+    limits: dict[int, int] = {zmq.SNDHWM: 1000, zmq.RCVHWM: 100, zmq.MAXMSGSIZE: CONTROL_MAX_BYTES}
+    return _make(context, zmq.ROUTER, {**_LISTENING, **limits}, keys)
+
+
+def publisher(
+    context: "zmq.Context[Any]", keys: ServerKeys | None = None, *, manual: bool = False
+) -> AnySocket:
+    """The server's mesh updates; a slow viewer misses some, never holds the server up.
+
+    Args:
+        manual: who subscribes gets nothing before SUBSCRIBE is set for it: at once, since that counts for the
+            sender of the message that was received last.
+    """
+    limits: dict[int, int] = {zmq.SNDHWM: 16, zmq.MAXMSGSIZE: TOPIC_MAX_BYTES, zmq.XPUB_MANUAL: int(manual)}
+    return _make(context, zmq.XPUB, {**_LISTENING, **limits}, keys)
+
+
+def mesh_topic(map_name: str) -> bytes:
+    """Topic of a map's mesh updates. No map's topic is the beginning of another map's."""
+    return topics_of(map_name)[0]
+
+
+def scan_topic(map_name: str) -> bytes:
+    """Topic of the keyframes that a map's scanners send."""
+    return topics_of(map_name)[1]
+
+
+def topics_of(map_name: str) -> list[bytes]:
+    """All topics of a map."""
+    return [kind + map_name.encode() + b"/" for kind in _KINDS]
+
+
+def is_topic(topic: bytes) -> bool:
+    """True if a subscription is for what comes of one map or of all maps; no other is allowed."""
+    return any(kind.startswith(topic) for kind in _KINDS) or _MAPS_TOPIC.fullmatch(topic) is not None
+
+
+def subscriber(
+    context: "zmq.Context[Any]", keys: ClientKeys | None = None, *, map_name: str = DEFAULT_MAP
+) -> AnySocket:
+    """A viewer's socket for a map's mesh updates (`wire/messages/mesh_updates.py`). Use `connect`."""
+    made = _make(context, zmq.SUB, {**_CONNECTING, zmq.IMMEDIATE: 0, zmq.RCVHWM: 16}, keys)
+    made.setsockopt(zmq.SUBSCRIBE, mesh_topic(map_name))
+    return made
+
+
+def pose_feed(context: "zmq.Context[Any]", max_frame_bytes: int) -> AnySocket:
+    """A scanner's socket for the poses of another process; a flood of them fills its queue and no more."""
+    limits: dict[int, int] = {zmq.IMMEDIATE: 0, zmq.RCVHWM: 256, zmq.MAXMSGSIZE: max_frame_bytes}
+    made = _make(context, zmq.SUB, {**_CONNECTING, **limits})
+    made.setsockopt(zmq.SUBSCRIBE, b"")
+    return made
+
+
+def pair(context: "zmq.Context[Any]") -> AnySocket:
+    """The socket between gateway and fuser, over a file that only this user can open."""
+    return _make(context, zmq.PAIR, {zmq.SNDHWM: 64, zmq.RCVHWM: 64})
+
+
+def _make(
+    context: "zmq.Context[Any]",
+    kind: int,
+    options: dict[int, int],
+    keys: ServerKeys | ClientKeys | None = None,
+) -> AnySocket:
+    made: AnySocket = context.socket(kind)
+    made.setsockopt(zmq.LINGER, 0)
+    for option, value in options.items():
+        made.setsockopt(option, value)
+    if keys is not None:
+        keys.secure(made)
+    return made
+
+
+def has_message(made: AnySocket) -> bool:
+    """True if a message can be read at once: asking costs a tenth of an exception."""
+    waiting: Any = made.getsockopt(zmq.EVENTS)
+    return bool(waiting & zmq.POLLIN)
+
+
+def peer_address(frame: zmq.Frame) -> str:
+    """Address of the machine that sent a frame; empty where ZeroMQ does not know it."""
+    try:
+        return str(frame.get("Peer-Address")).removeprefix(MAPPED)
+    except zmq.ZMQError:
+        return ""
+
+
+def file_of(frame: zmq.Frame) -> int | None:
+    """File number of the connection over which a frame came; None where ZeroMQ does not know it."""
+    try:
+        return int(frame.get(zmq.SRCFD))
+    except (zmq.ZMQError, ValueError):
+        return None
+
+
+def parse_address(address: str) -> tuple[str, int]:
+    """Host and port of `tcp://host:port` (port `*` or 0 = random); an IPv6 address stands in brackets.
+
+    Raises:
+        InvalidConfig: for anything else.
+    """
+    match = _ADDRESS.fullmatch(address)
+    port = LAST_PORT + 1 if match is None else int(match["port"].replace("*", "0"))
+    if match is None or port > LAST_PORT or (match["host6"] and _ip(match["host6"]) is None):
+        raise InvalidConfig(
+            f"an address looks like tcp://127.0.0.1:5555, of IPv6 tcp://[::1]:5555, got {address!r}"
+        )
+    host = match["host"] or match["host6"]
+    if (found := _ip(host)) is not None and found.version == 6 and found.is_link_local and "%" not in host:
+        raise InvalidConfig(
+            f"a link-local address names its interface, as in tcp://[fe80::1%eth0]:5555, got {address!r}"
+        )
+    return host, port
+
+
+def _ip(host: str) -> IPv4Address | IPv6Address | None:
+    """A host that is a number; None = it is a name. The IPv4 address, where it is one in the form of IPv6."""
+    try:
+        found = ip_address(host)
+    except ValueError:
+        return None
+    return getattr(found, "ipv4_mapped", None) or found
+
+
+def is_name(address: str) -> bool:
+    """True if the host of an address is a name, which may stand for an IPv4 and an IPv6 address."""
+    return _ip(parse_address(address)[0]) is None
+
+
+def connect(made: AnySocket, address: str, *, named_ipv6: bool = False) -> None:
+    """Connect a socket.
+
+    Args:
+        named_ipv6: of a name, take the IPv6 address; libzmq itself tries one of the two and no other.
+    """
+    host, port = parse_address(address)
+    if named_ipv6 and host == "localhost":
+        host = "::1"  # also where the system's list of names lacks it
+    made.setsockopt(zmq.IPV6, ":" in host or (named_ipv6 and _ip(host) is None))
+    made.connect(format_address(host, port))
+
+
+def format_address(host: str, port: int) -> str:
+    """`tcp://host:port`."""
+    return f"tcp://[{host}]:{port}" if ":" in host else f"tcp://{host}:{port}"
+
+
+def publish_address(address: str, control: str | None = None, publish: str | None = None) -> str:
+    """Address at which a server publishes: `publish` if given, else the port after its control address."""
+    if publish is not None:
+        return format_address(*parse_address(publish))
+    return _next_port(control_address(address, control), "mesh updates")
+
+
+def control_address(address: str, control: str | None = None) -> str:
+    """The control address of a server: `control` if given, else the port after that of the data address."""
+    if control is not None:
+        return format_address(*parse_address(control))
+    return _next_port(address, "control")
+
+
+def _next_port(address: str, purpose: str) -> str:
+    host, port = parse_address(address)
+    if port == LAST_PORT:
+        raise InvalidConfig(f"{address} has no next port for {purpose}: choose a lower one")
+    return format_address(host, port + 1)
+
+
+def connect_address(address: str) -> str:
+    """Check an address to connect to; returns its plain form. Raises InvalidConfig."""
+    host, port = parse_address(address)
+    if port == 0:
+        raise InvalidConfig(f"connecting needs a port, got {address}")
+    return format_address(host, port)
+
+
+def check_reachable(address: str, *, has_keys: bool) -> None:
+    """Raise InvalidConfig when other machines can reach the address and there are no keys."""
+    if has_keys or is_loopback(parse_address(address)[0]):
+        return
+    raise InvalidConfig(
+        f"without keys the server listens on tcp://127.0.0.1 only, got {address}; run `tsfusion keys new "
+        "server` here and `tsfusion keys new NAME` on the scanner, let that in by `tsfusion keys allow NAME "
+        "NAME.key`, and serve with `--keys tsfusion-keys`; or have scanners come through "
+        "`ssh -L 5555:127.0.0.1:5555 -L 5556:127.0.0.1:5556 host`"
+    )
+
+
+def place_of(address: str, control: str, *, has_keys: bool) -> tuple[str, str]:
+    """Data and control address of a server that a map is said to be at; an empty one is the next port.
+
+    Raises:
+        InvalidConfig: for addresses that are none, and without keys for those of other machines: anybody may
+            have said so.
+    """
+    place = connect_address(address), connect_address(control_address(address, control or None))
+    for one in place:
+        check_reachable(one, has_keys=has_keys)
+    return place
+
+
+def check_own_machine(address: str) -> None:
+    """Raise InvalidConfig when other machines can reach the address."""
+    if not is_loopback(parse_address(address)[0]):
+        raise InvalidConfig(
+            f"there are no keys here, so that only tcp://127.0.0.1 can be bound, got {address}; let the "
+            "sender bind, or come through an ssh tunnel"
+        )
+
+
+def is_loopback(host: str) -> bool:
+    """True if a host, name or number, is this machine."""
+    found = _ip(host)
+    return host == "localhost" if found is None else found.is_loopback
+
+
+def check_free(address: str) -> None:
+    """Raise TransportError when a server could not listen on an address; no port is opened for that."""
+    host, port = parse_address(address)
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        with socket.socket(family, socket.SOCK_STREAM) as probe:
+            place = socket.getaddrinfo(host.replace("*", "0.0.0.0"), port, family)[0][-1]
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(place)
+    except OSError as error:
+        raise TransportError(
+            f"cannot listen on {address}: {error.strerror}; choose another address (--listen), or end "
+            "what has it"
+        ) from error
+
+
+def bind(data: AnySocket, control: AnySocket, publish: AnySocket, listen: str, to: str | None) -> Addresses:
+    """Bind a server's three sockets: `listen`, `to` (default: the next port), and the one after that.
+
+    Raises:
+        TransportError: when a port is taken (a random one is drawn again until its neighbours are free).
+    """
+    host, port = parse_address(listen)
+    tries = _RANDOM_PORT_TRIES if port == 0 else 1
+    for last in reversed(range(tries)):
+        bound: list[tuple[AnySocket, str]] = []
+        try:
+            bound.append((data, bind_socket(data, format_address(host, port))))
+            bound.append((control, bind_socket(control, control_address(bound[0][1], to))))
+            bound.append((publish, bind_socket(publish, publish_address("", bound[1][1]))))
+            return Addresses(*(address for _, address in bound))
+        except (TransportError, InvalidConfig):
+            for made, address in bound:
+                made.unbind(address)
+            if not last:
+                raise
+    raise AssertionError("the last try returns or raises")
+
+
+def bind_socket(made: AnySocket, address: str) -> str:
+    """Bind a socket; returns its address with the real port number. Raises TransportError.
+
+    `[::]` takes connections over IPv6 and IPv4, `*` and `0.0.0.0` over IPv4 alone.
+    """
+    host, port = parse_address(address)
+    try:
+        made.setsockopt(zmq.IPV6, ":" in host)
+        made.bind(format_address(host, port) if port else format_address(host, 0).replace(":0", ":*"))
+    except zmq.ZMQError as error:
+        raise TransportError(
+            f"cannot listen on {address}: {error.strerror}; choose another address (--listen), or end "
+            "what has it"
+        ) from error
+    return made.getsockopt_string(zmq.LAST_ENDPOINT)
