@@ -142,10 +142,6 @@ def test_earlier_names_are_understood(here: Here, asked: dict[str, Any]) -> None
         assert "nowhere does not exist" in here("scan", *words).stderr
 
 
-def test_a_missing_source_is_named(here: Here) -> None:
-    assert "Missing argument 'PATH|SOURCE'" in here("scan").stderr
-
-
 SHELL = """
 tsfusion --install-completion >&2
 . "$HOME/.bashrc"

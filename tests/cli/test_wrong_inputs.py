@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Wrong inputs, over two hundred: each gives one line with cause and cure, and a status that is not 0."""
+"""Wrong inputs, over three hundred: each gives one line with cause and cure, and a status that is not 0."""
 
 import os
 import subprocess
@@ -11,7 +11,8 @@ import pytest
 from command_processes import python, tsfusion
 from wrong_inputs import CALLS, COMMANDS, Wrong, addresses, make_files, run_call, run_command
 
-LEAST = 110
+LEAST = 300
+KEPT = {"tsfusion-state", "tsfusion-spool", "s", "out"}  # state folders, and what scans without a server keep
 OF_A_PROCESS = [row for row in COMMANDS if not row.line.startswith("TSFUSION_")][:: len(COMMANDS) // 3]
 ON_A_BAD_DISK = (
     "keys new robot --dir {disk}/k",
@@ -53,9 +54,14 @@ def test_the_table_is_long_and_every_row_asks_for_cause_and_cure() -> None:
 
 @pytest.mark.usefixtures("quick_servers")
 @pytest.mark.parametrize("row", COMMANDS, ids=lambda row: row.line)
-def test_a_wrong_command_says_cause_and_cure(row: Wrong, named: dict[str, str]) -> None:
+def test_a_wrong_command_says_cause_and_cure_and_leaves_nothing(
+    row: Wrong, files: Path, named: dict[str, str]
+) -> None:
+    before = listed(files)
     status, said = run_command(row.line.format(**named))
     check(row, status, said)
+    assert listed(files) - before == set()
+    assert (files / "file").read_text() == "here first"
 
 
 @pytest.mark.parametrize("row", CALLS, ids=lambda row: row.line)
@@ -94,6 +100,11 @@ def test_a_disk_that_is_full_or_read_only_is_named(
 def test_an_uncaught_error_of_python_names_the_error_last(files: Path) -> None:
     done = python("import tsfusion; tsfusion.Volume(voxel_size=-1)")
     assert done.stderr.splitlines()[-1].endswith("InvalidConfig: voxel_size must be > 0, got -1")
+
+
+def listed(folder: Path) -> set[Path]:
+    """All below a folder but what a run keeps on purpose."""
+    return {path for path in folder.rglob("*") if path.relative_to(folder).parts[0] not in KEPT}
 
 
 def check(row: Wrong, status: int, said: str) -> None:

@@ -253,31 +253,6 @@ def test_a_recording_with_a_broken_frame_goes_on_without_it(here: Here, tmp_path
     assert (tmp_path / "out" / "mesh.ply").exists()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "status", "words"),
-    [
-        (["nowhere"], 1, "nowhere does not exist"),
-        ([SOURCE, "--localizer", "trajectory"], 1, "needs --trajectory FILE"),
-        ([SOURCE, "--localizer", "gps"], 1, "localizer must be one of auto, rgbd"),
-        ([SOURCE, "--localizer", "lidar"], 1, "points"),
-        ([SOURCE, "--spool", "spool"], 1, "--spool has no effect without --connect"),
-        ([SOURCE, "--connect", NOBODY, "--voxel-size", "1"], 1, "tsfusion serve"),
-        (["realsense", "--rate", "2"], 1, "--rate is for recordings"),
-        ([SOURCE, "--calibration", "a.yaml"], 1, "of a camera: leave out --calibration"),
-        (["folder:nowhere"], 1, "nowhere"),
-        ([], 2, "Missing argument 'PATH|SOURCE'"),
-    ],
-)
-def test_what_cannot_be_scanned_is_one_clear_line(
-    here: Here, tmp_path: Path, arguments: list[str], status: int, words: str
-) -> None:
-    done = here("scan", *arguments, "--out", tmp_path / "out")
-    assert done.returncode == status
-    assert words in done.stderr
-    assert "Traceback" not in done.stderr
-    assert not list(tmp_path.iterdir())
-
-
 @pytest.mark.usefixtures("quick_servers")
 def test_a_sensor_that_is_never_localised(here: Here, tmp_path: Path) -> None:
     seven_scenes(tmp_path / "flat", 4, (48, 64))  # no texture, nothing near enough to be seen

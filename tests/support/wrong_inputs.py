@@ -90,6 +90,8 @@ replay synthetic:room:sonar | got 'sonar' | must be kinect, tof, stereo or lidar
 replay synthetic:room --option count=0 | got count 0 | expected count >= 1
 replay synthetic:room --option focal=3 | takes no `focal` | it takes world, sensor
 replay synthetic:room --option path=spiral | got 'spiral' | path must be one of circle
+scan synthetic:room --option focal=3 | takes no `focal` | it takes world, sensor
+replay synthetic:room --sequence 06 | a synthetic dataset takes no `sequence` | it takes world, sensor
 replay synthetic:room --start 99 | none after the first 99 | has 40 keyframes
 replay synthetic:room --stride 0 | '--stride' | x>=1 | 2
 replay synthetic:room --rate nan | '--rate': a number is expected, got nan | see --help | 2
@@ -140,6 +142,7 @@ config dump --config maps.toml | got 'My Map' | a map's name must be 1 to 32 of 
 # output
 replay synthetic:room --out file | it is not a folder | choose another name
 replay synthetic:room --out file/out | cannot write to | choose another folder
+replay synthetic:room --up 0,0 | got '0,0' | up must be x, y, z, -x, -y, -z or three numbers
 replay synthetic:room --out /proc/out | cannot write to /proc/out | choose another folder
 demo --out file | it is not a folder | choose another name
 mesh garbage.tsf a.xyz | cannot write a.xyz | a name ending in .ply, .glb, .obj, .stl
@@ -149,8 +152,12 @@ mesh garbage.tsf /proc/a.ply | cannot write /proc/a.ply | choose another place
 mesh garbage.tsf a.ply --map yard | --map has no effect on a saved map | give the state folder
 mesh garbage.tsf folder.ply | it is a folder | choose another name
 mesh garbage.tsf a.ply --preview a.gif | cannot write a.gif | a name ending in .png
+mesh garbage.tsf a.ply --up w | got 'w' | up must be x, y, z, -x, -y, -z or three numbers
+mesh garbage.tsf a.ply --memory all | got 'all' | expected a number of bytes such as 2GB
+mesh garbage.tsf a.ply --key file | --key has no effect on garbage.tsf | only a live server
+mesh garbage.tsf a.ply --control {nobody} | --control has no effect on garbage.tsf | only a live server
 # servers that are not there, or are no servers
-replay synthetic:room --connect {nobody} --config quick.toml | no server answers at tcp://127.0.0.1:9 (control tcp://127.0.0.1:10) | is `tsfusion serve` running there
+replay synthetic:room --connect {nobody} --config quick.toml --out new/folders/out | no server answers at tcp://127.0.0.1:9 (control tcp://127.0.0.1:10) | is `tsfusion serve` running there
 replay synthetic:room --connect {busy} --config quick.toml | no server answers at | is `tsfusion serve` running there
 replay synthetic:room --connect tcp://no-such-host.invalid:5555 --config quick.toml | no server answers at tcp://no-such-host | is the port right?
 replay synthetic:room --connect 127.0.0.1:5555 | got '127.0.0.1:5555' | an address looks like tcp://127.0.0.1:5555
@@ -165,10 +172,17 @@ replay synthetic:room --connect {nobody} --key missing --server-key missing | ca
 replay synthetic:room --connect {nobody} --key keys/server.key --server-key keys/server.key | holds no secret key | expected a file NAME.key_secret
 replay synthetic:room --key file | --key has no effect | without --connect
 replay synthetic:room --control {nobody} | --control has no effect | without --connect
+replay synthetic:room --connect {nobody} --state s | --state has no effect with | --connect
+{scan} synthetic:room --connect {nobody} --up z | --up has no effect with | --connect
+{scan} synthetic:room --connect {nobody} --voxel-size 1 | has no effect with --connect | give it to the `tsfusion serve`
 replay synthetic:room --state file | cannot write the state folder file | choose another
 mesh {nobody} a.ply | no server answered | is `tsfusion serve` running there
 mesh nonsense://x a.ply | got 'nonsense://x' | an address looks like
 mesh {nobody} a.ply --voxel-size 1 | has no effect on a live server's map | give it to `tsfusion serve`
+mesh {nobody} a.ply --memory 1GB | --memory has no effect on a live server's map | give it to
+mesh {nobody} a.ply --threads 1 | --threads has no effect on a live server's map | give it to
+mesh {nobody} a.ply --server-key K | server_key needs key, too | key
+map move yard --from {nobody} --to {nobody} --timeout 0.2 | no server answered at tcp://127.0.0.1:9 (control tcp://127.0.0.1:10) within 0.2 s | is the port right?
 status --connect {nobody} --timeout 0.2 | no server answered | is the port right?
 status --connect nonsense | got 'nonsense' | an address looks like
 status --timeout 0 | '--timeout' | x>=0.1 | 2
@@ -185,6 +199,8 @@ serve --keys missing | server.key_secret does not exist | `tsfusion keys new ser
 serve --directory tum | cannot use the directory of maps tum: unable to open | expected a file
 serve --voxel-size 20 | too large for max_range | suits a room
 serve --max-range 0.01 | got 0.01 m | max_range must be larger than min_range
+serve --threads 0 | got 0 | threads must be >= 1
+serve --config file | file is not TOML | `tsfusion config dump` shows
 # scan
 {scan} nowhere | nowhere does not exist | realsense, camera:0, folder:PATH
 {scan} empty | in no layout known | `tsfusion datasets`
@@ -220,6 +236,8 @@ serve --max-range 0.01 | got 0.01 m | max_range must be larger than min_range
 {scan} synthetic:corridor --option count=12 --connect {nobody} | of 12 frames were localised | move more slowly
 {scan} scenes_blank --connect {nobody} | not localised in any of 2 frames | check the camera
 {scan} camera:0 --rate 2 | --rate is for recordings | leave it out
+{scan} realsense --rate 2 | --rate is for recordings | leave it out
+{scan} synthetic:room --calibration a.yaml | of a camera | leave out --calibration
 # other verbs
 mesh missing a.ply | missing does not exist | expected a map (.tsf)
 mesh empty a.ply | no keyframes in empty | expected a state folder
@@ -275,6 +293,9 @@ fly | No such command 'fly' | see --help | 2
 replai synthetic:room | No such command 'replai' | Did you mean 'replay'? | 2
 config dum | No such command 'dum' | Did you mean 'dump'? | 2
 replay --voxel-size 0.02 | Missing argument 'PATH' | see --help | 2
+scan | Missing argument 'PATH|SOURCE' | see --help | 2
+config | Missing command | see --help | 2
+serve --voxel-size small | '--voxel-size' | is not a valid float | 2
 mesh state | Missing argument 'OUT' | see --help | 2
 replay synthetic:room --fast | No such option: --fast | Possible options | 2
 replay synthetic:room --voxelsize 0.02 | No such option: --voxelsize | --voxel-size | 2
@@ -284,6 +305,9 @@ scan tum_no_camera | the camera of these 64×48 images is not known | or --calib
 check tum_no_camera | is not known | give --intrinsics
 replay scenes_nan_pose --intrinsics 60,60 | got '60,60' | must be fx,fy,cx,cy in pixels
 replay tum --intrinsics 60,60,31.5,nan | got '60,60,31.5,nan' | must be fx,fy,cx,cy in pixels
+scan tum --intrinsics 0,1,2,3 | got '0,1,2,3' | must be fx,fy,cx,cy in pixels
+check tum --intrinsics a,b,c,d | got 'a,b,c,d' | must be fx,fy,cx,cy in pixels
+check kitti --intrinsics 5,5,4,3 | a KITTI odometry dataset comes with what it needs of a camera | leave out --intrinsics
 replay tum --intrinsics 585,585,320,240 | cx 320 lies outside of the images, which are 64×48 | in pixels of these images
 replay tum --intrinsics 60,60,31.5,23.5 --calibration file | exclude each other | give one of them
 replay tum --calibration missing.yaml | missing.yaml is missing | expected
