@@ -11,6 +11,8 @@ from pathlib import Path
 import pytest
 from repository import ROOT
 
+pytestmark = pytest.mark.nightly
+
 SCRIPT = ROOT / "lab" / "evaluation" / "accuracy.py"
 
 

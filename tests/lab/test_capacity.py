@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 from repository import ROOT
 
+pytestmark = pytest.mark.nightly
+
 POINTS = ROOT / "docs" / "scale-points.jsonl"
 SCRIPT = ROOT / "lab" / "bench" / "capacity.py"
 

@@ -12,6 +12,8 @@ from lab.worlds.street_drive import StreetDrive
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets import KITTI, open_dataset
 
+pytestmark = pytest.mark.nightly
+
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory):

@@ -36,6 +36,8 @@ from tsfusion.datasets.dataset import frame_of
 from tsfusion.evaluation.trajectory_error import TrajectoryError
 from tsfusion.wire.messages.keyframe_times import Spread
 
+pytestmark = pytest.mark.nightly
+
 SCRIPT = ROOT / "lab" / "paper" / "reproduce_paper.py"
 WORLD = PaperWorld(
     name="kitti06", title="a street", stands_for="06_KITTI", source="synthetic:street:stereo",
@@ -437,7 +439,6 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     assert "Traceback" not in told
 
 
-@pytest.mark.nightly
 def test_two_modes_from_end_to_end(interrupted: tuple[str, ...], tmp_path: Path) -> None:
     with reproduce(*interrupted, data=tmp_path) as running:
         said, told = running.communicate(timeout=240)

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from lab.evaluation import stanford_bunny
 
+pytestmark = pytest.mark.nightly
+
 scipy_spatial = pytest.importorskip("scipy.spatial")
 
 

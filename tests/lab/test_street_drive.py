@@ -15,6 +15,8 @@ from lab.worlds import roadside
 from lab.worlds.street_drive import StreetDrive
 from tsfusion.datasets.worlds import worlds
 
+pytestmark = pytest.mark.nightly
+
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory):
@@ -126,7 +128,7 @@ def test_the_right_picture_agrees_with_the_left_ones_depth(path):
     assert min(error(-2), error(2)) > 2 * error(0)
 
 
-@pytest.mark.parametrize("name", [pytest.param("kitti06", marks=pytest.mark.nightly), "kitti07"])
+@pytest.mark.parametrize("name", ["kitti06", "kitti07"])
 def test_nothing_stands_in_the_way(data, name):
     drive = StreetDrive(name, kitti=data("kitti_odometry"))
     cameras = np.array(drive._poses)[::3, :3, 3]
