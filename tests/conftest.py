@@ -3,6 +3,7 @@
 
 import atexit
 import faulthandler
+import fcntl
 import logging
 import os
 import shutil
@@ -14,13 +15,12 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import quick_fusers
 import small_disks
-from command_processes import Here
+from command_processes import Here, tsfusion
 from keyframes_and_servers import Server, serving
 
 from tsfusion.cli import main
@@ -167,14 +167,34 @@ def here(
     signal.signal(signal.SIGTERM, handler)
 
 
+@pytest.fixture(scope="session")
+def room_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A replay of the room's first six keyframes of 40, once for all workers: `out`, `state`, `stdout.json`.
+
+    Tests read it, and change copies.
+    """
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "room_run"
+    (folder / "out").mkdir(parents=True, exist_ok=True)
+    with (folder / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (folder / "stdout.json").exists():
+            (folder / "out" / "notes.txt").write_text("mine")
+            done = tsfusion(
+                "replay", "synthetic:room", "--max-frames", 6, "--voxel-size", 0.08, "--rate", 10,
+                "--state", folder / "state", "--out", folder / "out", "--overwrite", "--json",
+            )  # fmt: skip
+            assert done.returncode == 0, done.stderr
+            (folder / "stdout.json").write_text(done.stdout)
+    return folder
+
+
 @pytest.fixture
 def quick_servers(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have servers of runs in this process start quick fusers (`quick_fusers.LAZY`)."""
     from tsfusion.pipelines.runs import target_server
 
-    names = {name: getattr(subprocess, name) for name in ("PIPE", "TimeoutExpired")}
-    made = SimpleNamespace(Popen=quick_fusers.quick_server, **names)
-    monkeypatch.setattr(target_server, "subprocess", made)
+    monkeypatch.setattr(target_server, "subprocess", quick_fusers.with_quick_servers(quick_fusers.LAZY))
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ from pathlib import Path
 import laspy
 import numpy as np
 import pytest
-from command_processes import tsfusion
+from command_processes import Here
 from numpy.typing import NDArray
 
 from tsfusion import Volume, open_dataset
@@ -33,17 +33,19 @@ def recorded(root: Path, shift: NDArray[np.integer], *, poses: bool = True) -> P
     return root
 
 
-def replayed(tmp_path: Path, *arguments: object) -> tuple[Path, str]:
-    out = tmp_path / "run"
-    done = tsfusion("replay", *arguments, "--voxel-size", "0.05", "--no-check", "--out", out)
+def replayed(here: Here, out: Path, *arguments: object) -> tuple[Path, str]:
+    done = here("replay", *arguments, "--voxel-size", "0.05", "--no-check", "--out", out)
     assert done.returncode == 0, done.stderr
     return out, done.stderr
 
 
 @pytest.mark.slow
-def test_a_map_in_utm(tmp_path: Path) -> None:
+@pytest.mark.usefixtures("quick_servers")
+def test_a_map_in_utm(here: Here, tmp_path: Path) -> None:
     utm = recorded(tmp_path / "utm", ORIGIN)
-    out, said = replayed(tmp_path, utm, "--option", "crs=EPSG:25832", "--state", tmp_path / "state")
+    out, said = replayed(
+        here, tmp_path / "run", utm, "--option", "crs=EPSG:25832", "--state", tmp_path / "state"
+    )
     assert "positions count from the origin 447000 5411000 0 EPSG:25832" in said
     record = json.loads((out / "run.json").read_text())
     assert record["origin_m"] == ORIGIN.tolist()
@@ -52,10 +54,10 @@ def test_a_map_in_utm(tmp_path: Path) -> None:
         plain.integrate(keyframe)
     assert record["map_hash"] == plain.map_hash()
     assert b"comment origin_m 447000 5411000 0 EPSG:25832\n" in (out / "mesh.ply").read_bytes()[:800]
-    info = tsfusion("map", "info", out / "map.tsf")
+    info = here("map", "info", out / "map.tsf")
     assert "poses given, from the origin 447000 5411000 0 EPSG:25832" in info.stdout
 
-    made = tsfusion("mesh", out / "map.tsf", tmp_path / "room.las")
+    made = here("mesh", out / "map.tsf", tmp_path / "room.las")
     assert made.returncode == 0, made.stderr
     cloud, mesh = laspy.read(tmp_path / "room.las"), plain.extract_mesh()
     low = np.array(cloud.xyz).min(axis=0) - ORIGIN
@@ -63,19 +65,19 @@ def test_a_map_in_utm(tmp_path: Path) -> None:
     assert cloud.header.parse_crs().to_epsg() == 25832
 
     # The journal knows it, and so do maps that are made of it.
-    again, _ = replayed(tmp_path / "again", tmp_path / "state")
+    again, _ = replayed(here, tmp_path / "again", tmp_path / "state")
     assert json.loads((again / "run.json").read_text())["origin_m"] == ORIGIN.tolist()
-    fused = tsfusion("fuse", utm, "--voxel-size", "0.05", "--workers", "1", "--out", tmp_path / "fused")
+    fused = here("fuse", utm, "--voxel-size", "0.05", "--workers", "1", "--out", tmp_path / "fused")
     assert fused.returncode == 0, fused.stderr
     assert b"comment origin_m 447000 5411000 0\n" in (tmp_path / "fused" / "mesh.ply").read_bytes()[:800]
 
     # A map from another origin is another frame.
-    other, _ = replayed(tmp_path / "other", utm, "--origin", "446000,5411000,0")
-    refused = tsfusion("map", "merge", out / "map.tsf", other / "map.tsf", "--out", tmp_path / "sum.tsf")
+    other, _ = replayed(here, tmp_path / "other", utm, "--origin", "446000,5411000,0")
+    refused = here("map", "merge", out / "map.tsf", other / "map.tsf", "--out", tmp_path / "sum.tsf")
     assert refused.returncode == 1
     cure = "(447000 5411000 0 EPSG:25832 and 446000 5411000 0): give all one (--origin 447000,5411000,0)"
     assert f"the other map counts from another origin {cure}" in refused.stderr
-    refused = tsfusion("fuse", utm, tmp_path / "state", "--out", tmp_path / "none")
+    refused = here("fuse", utm, tmp_path / "state", "--out", tmp_path / "none")
     assert (refused.returncode, "counts from another origin" in refused.stderr) == (1, True)
 
 

@@ -20,6 +20,8 @@ import own_recordings
 import pytest
 import trimesh
 from command_processes import (
+    FORGETFUL_RUN,
+    QUICK_RUN,
     Here,
     alive,
     descendants,
@@ -47,21 +49,6 @@ RESULTS = {
 }  # fmt: skip
 WITH_TRUTH = {"error.npy", "report-error1.png", "report-error2.png"}
 VOXEL = 0.08
-
-
-@pytest.fixture(scope="module")
-def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A replay of six keyframes, with its state kept."""
-    folder = tmp_path_factory.mktemp("run")
-    (folder / "out").mkdir()
-    (folder / "out" / "notes.txt").write_text("mine")
-    done = tsfusion(
-        "replay", "synthetic:room", "--max-frames", 6, "--voxel-size", VOXEL, "--state", folder / "state",
-        "--rate", 10, "--out", folder / "out", "--overwrite", "--json",
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    (folder / "stdout.json").write_text(done.stdout)
-    return folder
 
 
 class Clock:
@@ -107,12 +94,12 @@ def test_a_keyframe_at_a_rate_is_read_shortly_before_its_time(
     assert clock.reads == reads
 
 
-def test_replay_leaves_everything(run_folder: Path) -> None:
-    out = run_folder / "out"
+def test_replay_leaves_everything(room_run: Path) -> None:
+    out = room_run / "out"
     assert {path.name for path in out.iterdir()} == RESULTS | WITH_TRUTH | {"notes.txt"}
     assert (out / "notes.txt").read_text() == "mine"
     run = json.loads((out / "run.json").read_text())
-    assert run == json.loads((run_folder / "stdout.json").read_text())
+    assert run == json.loads((room_run / "stdout.json").read_text())
     assert (run["keyframes_sent"], run["keyframes_fused"], run["keyframes_rejected"]) == (6, 6, {})
     assert run["camera"].endswith(", 320×240, from its frames")
     assert set(run["delay_ms"]) >= {"mean", "p50", "p95", "p99", "max"}
@@ -131,6 +118,7 @@ def test_replay_leaves_everything(run_folder: Path) -> None:
     assert all(float(row["delay_ms"]) > 0 for row in rows)
 
 
+@pytest.mark.nightly  # else `test_a_recording_or_its_sensor_brings_usual_settings`
 def test_a_lidars_map_has_voxels_that_its_points_fill(data: Callable[[str], Path], tmp_path: Path) -> None:
     done = tsfusion("replay", data("kitti07_lidar_keyframes"), "--out", tmp_path / "out")
     assert done.returncode == 0, done.stderr
@@ -140,6 +128,7 @@ def test_a_lidars_map_has_voxels_that_its_points_fill(data: Callable[[str], Path
     assert run["mesh"]["triangles"] > 50_000
 
 
+@pytest.mark.nightly  # else `test_a_recording_or_its_sensor_brings_usual_settings`
 def test_a_streets_map_has_voxels_that_a_keyframe_can_fill_in_time(
     data: Callable[[str], Path], tmp_path: Path
 ) -> None:
@@ -153,9 +142,9 @@ def test_a_streets_map_has_voxels_that_a_keyframe_can_fill_in_time(
     assert (run["keyframes_fused"], run["keyframes_rejected"]) == (2, {})
 
 
-def test_a_replay_says_where_up_is_and_its_glb_stands(run_folder: Path) -> None:
+def test_a_replay_says_where_up_is_and_its_glb_stands(room_run: Path) -> None:
     """The room's z is up: found by its floor, named in run.json and in the PLY, +Y in the GLB."""
-    out = run_folder / "out"
+    out = room_run / "out"
     up = json.loads((out / "run.json").read_text())["mesh"]["up"]
     assert up["found_by"] == "floor"
     assert up["direction"] == pytest.approx((0, 0, 1), abs=0.01)
@@ -165,23 +154,23 @@ def test_a_replay_says_where_up_is_and_its_glb_stands(run_folder: Path) -> None:
     assert stands.extents[1] == pytest.approx(flat.extents[2], abs=0.05)
 
 
-def test_replay_over_sockets_is_the_map_of_the_library(run_folder: Path) -> None:
-    run = json.loads((run_folder / "out" / "run.json").read_text())
+def test_replay_over_sockets_is_the_map_of_the_library(room_run: Path) -> None:
+    run = json.loads((room_run / "out" / "run.json").read_text())
     assert run["map_hash"] == map_hash(reversed(first_views(6)), VolumeConfig(voxel_size=VOXEL, threads=1))
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("quick_servers")
 def test_a_journal_replays_to_the_same_map_under_a_new_name(
-    run_folder: Path, here: Here, tmp_path: Path
+    room_run: Path, here: Here, tmp_path: Path
 ) -> None:
     done = here(
-        "replay", run_folder / "state", "--out", tmp_path / "again", "--json",
+        "replay", room_run / "state", "--out", tmp_path / "again", "--json",
         "--state", tmp_path / "kept", "--map", "new",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "kept" / "maps" / "new" / "map.tsf").is_file()
-    first = json.loads((run_folder / "out" / "run.json").read_text())
+    first = json.loads((room_run / "out" / "run.json").read_text())
     assert json.loads(done.stdout)["map_hash"] == first["map_hash"], "with the saved map's settings"
     assert {path.name for path in (tmp_path / "again").iterdir()} == RESULTS
     assert (tmp_path / "again").stat().st_mode & 0o777 == 0o777 & ~_umask()
@@ -204,9 +193,9 @@ def test_the_server_table_of_a_file_counts_for_a_runs_own_server(here: Here, tmp
 @pytest.mark.slow
 @pytest.mark.parametrize(("damaged", "found"), [(2, (2, 1, 0)), (5, (3, 0, 1)), (None, (3, 0, 0))])
 def test_what_damage_costs_is_told_by_where_it_is(
-    run_folder: Path, tmp_path: Path, damaged: int | None, found: tuple[int, int, int]
+    room_run: Path, tmp_path: Path, damaged: int | None, found: tuple[int, int, int]
 ) -> None:
-    folder = shutil.copytree(run_folder / "state" / "maps" / "default", tmp_path / "map")
+    folder = shutil.copytree(room_run / "state" / "maps" / "default", tmp_path / "map")
     (file,) = (folder / "journal").glob("*.mcap")
     records, _ = journal.list_records(file)
     if damaged is not None:
@@ -223,9 +212,9 @@ def test_what_damage_costs_is_told_by_where_it_is(
 @pytest.mark.slow
 @pytest.mark.usefixtures("quick_servers")
 def test_a_saved_map_lacks_what_was_damaged_before_it_was_made(
-    run_folder: Path, here: Here, tmp_path: Path
+    room_run: Path, here: Here, tmp_path: Path
 ) -> None:
-    state = shutil.copytree(run_folder / "state", tmp_path / "state")
+    state = shutil.copytree(room_run / "state", tmp_path / "state")
     file = next((state / "maps" / "default" / "journal").glob("*.mcap"))
     content = bytearray(file.read_bytes())
     content[len(content) // 2] ^= 16
@@ -246,9 +235,9 @@ def test_a_saved_map_lacks_what_was_damaged_before_it_was_made(
 @pytest.mark.usefixtures("quick_servers")
 @pytest.mark.parametrize("command", ["replay", "mesh"])
 def test_a_damaged_journal_leaves_its_results_and_status_1(
-    run_folder: Path, here: Here, tmp_path: Path, command: str
+    room_run: Path, here: Here, tmp_path: Path, command: str
 ) -> None:
-    shutil.copytree(run_folder / "state" / "maps" / "default" / "journal", tmp_path / "journal")
+    shutil.copytree(room_run / "state" / "maps" / "default" / "journal", tmp_path / "journal")
     file = next((tmp_path / "journal").glob("*.mcap"))
     content = bytearray(file.read_bytes())
     content[len(content) // 2] ^= 16
@@ -268,7 +257,9 @@ def test_a_damaged_journal_leaves_its_results_and_status_1(
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("quick_servers")
-@pytest.mark.parametrize("flags", [(), ("--no-check",)])  # the check reads that image first
+@pytest.mark.parametrize(
+    "flags", [("--no-check",), pytest.param((), marks=pytest.mark.nightly)]
+)  # the check reads that image first
 def test_an_image_that_cannot_be_read_is_left_out_and_said(
     here: Here, tmp_path: Path, flags: tuple[str, ...], caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -291,9 +282,9 @@ def test_an_image_that_cannot_be_read_is_left_out_and_said(
 @pytest.mark.slow
 @pytest.mark.usefixtures("quick_servers")
 def test_poses_added_to_a_map_are_said_to_be_in_its_frame(
-    run_folder: Path, here: Here, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    room_run: Path, here: Here, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    shutil.copytree(run_folder / "state", tmp_path / "state")
+    shutil.copytree(room_run / "state", tmp_path / "state")
     done = here(
         "replay", "synthetic:room", "--max-frames", 1, "--voxel-size", VOXEL,
         "--state", tmp_path / "state", "--out", tmp_path / "again",
@@ -302,9 +293,10 @@ def test_poses_added_to_a_map_are_said_to_be_in_its_frame(
     assert "the map default has 6 keyframes already, and these are added to them" in caplog.text
 
 
-def slow_replay(out: Path, *flags: object) -> "subprocess.Popen[str]":
+def slow_replay(out: Path, *flags: object, command: list[str] = FORGETFUL_RUN) -> "subprocess.Popen[str]":
     """A replay that takes 80 s if nobody ends it."""
-    return started("replay", "synthetic:room", "--rate", 0.5, "--voxel-size", VOXEL, "--out", out, *flags)
+    words = ("replay", "synthetic:room", "--rate", 0.5, "--voxel-size", VOXEL, "--out", out)
+    return started(*words, *flags, command=command)
 
 
 def _umask() -> int:
@@ -319,7 +311,7 @@ def _umask() -> int:
     ("number", "word"),
     [
         (signal.SIGINT, "interrupted"),
-        pytest.param(signal.SIGTERM, "terminated", marks=pytest.mark.slow),
+        pytest.param(signal.SIGTERM, "terminated", marks=[pytest.mark.slow, pytest.mark.nightly]),
     ],
 )
 def test_replay_interrupted_twice_leaves_nothing(number: signal.Signals, word: str, tmp_path: Path) -> None:
@@ -339,11 +331,11 @@ def test_replay_interrupted_twice_leaves_nothing(number: signal.Signals, word: s
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("hangs_up")
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGHUP, marks=pytest.mark.nightly)])
 def test_an_ended_replay_leaves_what_was_fused_and_says_what_stays(
     number: signal.Signals, tmp_path: Path
 ) -> None:
-    process = slow_replay(tmp_path / "out", "--state", tmp_path / "state")
+    process = slow_replay(tmp_path / "out", "--state", tmp_path / "state", command=QUICK_RUN)
     read_until(process, "fused 1 of")
     process.send_signal(number)
     printed = process.communicate(timeout=120)[0]
@@ -409,7 +401,8 @@ def test_demo(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("count", [12, pytest.param(125, marks=pytest.mark.nightly)])
+@pytest.mark.nightly
+@pytest.mark.parametrize("count", [12, 125])
 def test_red_kitchen(data, tmp_path: Path, count: int) -> None:
     done = tsfusion(
         "replay", data("7scenes/redkitchen"), "--max-frames", count, "--voxel-size", 0.02, "--rate", 4,

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from clients_and_spools import NOBODY
 from command_processes import (
+    QUICK_RUN,
     Here,
     end,
     environment,
@@ -122,10 +123,11 @@ def test_a_scan_leaves_mesh_trajectory_and_figures(walk: Path, here: Here, tmp_p
     assert "ATE" not in shown.stdout  # given poses have no error against themselves
 
 
-@pytest.mark.usefixtures("quick_servers")
 def test_poses_may_be_given_by_time_and_in_order(
     walk: Path, here: Here, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Which poses are taken is said without a server, too."""
+    monkeypatch.setattr(engine, "LINGER", 0.0)
     poses = [keyframe.T_world_camera[:3].ravel() for keyframe in open_dataset(walk)]
     rows = (" ".join(f"{number:.9f}" for number in pose) + "\n" for pose in poses)
     (tmp_path / "kitti.txt").write_text("".join(rows))
@@ -133,36 +135,33 @@ def test_poses_may_be_given_by_time_and_in_order(
     in_order = ("--trajectory", tmp_path / "kitti.txt")
     by_time = ("--trajectory", walk / "groundtruth.txt", "--time-offset", 0.0)
     settings = ("--config", tmp_path / "settings.toml")
-    for flags, by in (
-        (in_order, "given"),
-        ((*in_order, "--localizer", "given"), "given"),
-        ((*by_time, "--localizer", "auto"), "trajectory"),
-        ((*by_time, "--localizer", "trajectory", *settings), "trajectory"),
-        ((*by_time, *settings), "trajectory"),
+    feed = {"TSFUSION_FEED": "tcp://127.0.0.1:1"}
+    trajectory = {"TSFUSION_TRAJECTORY": str(tmp_path / "kitti.txt")}
+    rgbd = ("--localizer", "rgbd")
+    for variables, flags, words in (
+        ({}, in_order, "12/12 localised by given"),
+        ({}, (*in_order, "--localizer", "given"), "12/12 localised by given"),
+        ({}, (*by_time, "--localizer", "auto"), "12/12 localised by trajectory"),
+        ({}, (*by_time, "--localizer", "trajectory", *settings), "12/12 localised by trajectory"),
+        ({}, (*by_time, *settings), "12/12 localised by trajectory"),
+        (feed, by_time, "12/12 localised by trajectory"),
+        (feed | trajectory, rgbd, "two sources of poses"),
+        (trajectory, rgbd, "12/12 localised by rgbd"),
+        ({}, (*in_order, "--time-offset", 1), "--time-offset is for poses that are looked up by time"),
     ):
-        done = here(
-            "scan", walk, *COARSE, *flags, "--max-frames", 12, "--out", tmp_path / "out", "--overwrite"
-        )
-        assert f"12/12 localised by {by}" in done.stdout, done.stderr
-    monkeypatch.setenv("TSFUSION_FEED", "tcp://127.0.0.1:1")
-    done = here("scan", walk, *COARSE, *by_time, "--out", tmp_path / "out", "--overwrite")
-    assert "12/12 localised by trajectory" in done.stdout, done.stderr
-    monkeypatch.setenv("TSFUSION_TRAJECTORY", str(tmp_path / "kitti.txt"))
-    done = here("scan", walk, *COARSE, "--localizer", "rgbd", "--out", tmp_path / "none")
-    assert "two sources of poses" in done.stderr
-    monkeypatch.delenv("TSFUSION_FEED")
-    done = here("scan", walk, *COARSE, "--localizer", "rgbd", "--out", tmp_path / "out", "--overwrite")
-    assert "12/12 localised by rgbd" in done.stdout, done.stderr
-    monkeypatch.delenv("TSFUSION_TRAJECTORY")
-    done = here("scan", walk, *COARSE, *in_order, "--time-offset", 1, "--out", tmp_path / "none")
-    assert "--time-offset is for poses that are looked up by time" in done.stderr
+        with monkeypatch.context() as patched:
+            for name, value in variables.items():
+                patched.setenv(name, value)
+            nowhere = ("--connect", NOBODY, "--spool", tmp_path / "spool", "--out", tmp_path / "out")
+            done = here("scan", walk, *flags, *nowhere, "--overwrite")
+        assert words in done.stdout + done.stderr
 
 
 @pytest.mark.usefixtures("hangs_up")
 @pytest.mark.slow
 def test_a_terminal_that_goes_away_ends_a_scan_with_its_results(walk: Path, tmp_path: Path) -> None:
     """The shell and the kernel may both send SIGHUP."""
-    process = started("scan", walk, "--rate", 2, *COARSE, "--out", tmp_path / "out")
+    process = started("scan", walk, "--rate", 2, *COARSE, "--out", tmp_path / "out", command=QUICK_RUN)
     read_until(process, "frames 6 of")
     process.send_signal(signal.SIGHUP)
     time.sleep(0.3)
@@ -227,8 +226,10 @@ def test_ctrl_c_without_a_server_keeps_all_for_the_next_scan(walk: Path, here: H
         assert eventually(lambda: fetch_health(address).maps["default"].keyframes_durable == run["left"])
 
 
+@pytest.mark.nightly  # else a replay that is ended so, and a scan whose terminal goes away
 def test_ctrl_c_ends_a_scan_with_its_results(tmp_path: Path) -> None:
-    process = started("scan", SOURCE, "--rate", 4, "--voxel-size", 0.1, "--out", tmp_path / "out")
+    words = ("scan", SOURCE, "--rate", 4, "--voxel-size", 0.1, "--out", tmp_path / "out")
+    process = started(*words, command=QUICK_RUN)
     read_until(process, "frames ")
     read_until(process, "frames ")
     process.send_signal(signal.SIGINT)
@@ -276,9 +277,9 @@ def test_the_client_is_light() -> None:
     assert rss < 100e6
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.usefixtures("quick_servers")
-@pytest.mark.parametrize("count", [25, pytest.param(125, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("count", [25, 125])
 def test_a_mesh_with_poses_of_its_own_is_as_good_as_with_the_true_ones(
     data, here: Here, tmp_path: Path, count: int
 ) -> None:

@@ -15,6 +15,8 @@ from tsfusion.core.errors import InvalidConfig, TransportError
 from tsfusion.gateway.maps import moved_maps
 from tsfusion.pipelines.runs import target_server
 
+pytestmark = pytest.mark.usefixtures("quick_servers")
+
 
 @pytest.mark.skipif(sys.platform == "darwin", reason="Metal is there")
 def test_warnings_of_a_start_reach_who_runs_it(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -18,6 +18,8 @@ import quick_fusers
 
 COMMAND = [sys.executable, "-m", "tsfusion"]
 QUICK = quick_fusers.server_command(quick_fusers.LAZY)  # the same, its servers sooner ready
+QUICK_RUN = quick_fusers.run_command(quick_fusers.LAZY)  # and those of its runs
+FORGETFUL_RUN = quick_fusers.run_command(quick_fusers.SUMS)  # for runs that end before their map is asked for
 DEADLINE = 240.0  # seconds: a cold kernel compilation on a slow machine that does other things as well
 Here = Callable[..., "subprocess.CompletedProcess[str]"]  # of the fixture `here`
 

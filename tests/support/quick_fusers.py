@@ -9,6 +9,7 @@ import subprocess
 import sys
 from itertools import islice
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 _PROGRAM = """
@@ -34,10 +35,28 @@ def server_command(fuser: tuple[str, ...]) -> list[str]:
     return [sys.executable, "-c", f"{chosen(fuser)}from tsfusion.__main__ import main\nmain()"]
 
 
-def quick_server(command: list[str], **more: Any) -> "subprocess.Popen[str]":
-    """Start the server of a run as `subprocess.Popen` does, with quick fusers."""
-    assert command[1:4] == ["-m", "tsfusion", "serve"], command
-    return subprocess.Popen([*server_command(LAZY), *command[3:]], **more)
+def run_command(fuser: tuple[str, ...]) -> list[str]:
+    """The command `tsfusion`, whose runs start a server with such fusers."""
+    program = f"import quick_fusers\nquick_fusers.quicken_runs({fuser!r})\n"
+    return [sys.executable, "-c", f"{program}from tsfusion.__main__ import main\nmain()"]
+
+
+def quicken_runs(fuser: tuple[str, ...]) -> None:
+    """Have runs of this process start servers with such fusers."""
+    from tsfusion.pipelines.runs import target_server
+
+    target_server.subprocess = with_quick_servers(fuser)  # type: ignore[attr-defined]
+
+
+def with_quick_servers(fuser: tuple[str, ...]) -> SimpleNamespace:
+    """As much of `subprocess` as a run uses to start its server."""
+
+    def start(command: list[str], **more: Any) -> "subprocess.Popen[str]":
+        assert command[1:4] == ["-m", "tsfusion", "serve"], command
+        return subprocess.Popen([*server_command(fuser), *command[3:]], **more)
+
+    names = {name: getattr(subprocess, name) for name in ("PIPE", "TimeoutExpired")}
+    return SimpleNamespace(Popen=start, **names)
 
 
 def compile_no_more_than_keyframes_need() -> None:

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-from command_processes import Here, tsfusion
+from command_processes import Here
 from headless_browser import browser
 
 from tsfusion.core.errors import OutputError
@@ -182,8 +182,8 @@ def test_a_run_of_an_old_version_still_has_a_report(tmp_path: Path) -> None:
     assert "old camera" in page.text
 
 
-def test_names_are_text_whatever_they_hold(tmp_path: Path) -> None:
-    plain, _ = page_of(a_run(tmp_path / "plain"))
+def test_names_are_text_whatever_they_hold(folder: Path, tmp_path: Path) -> None:
+    plain = Structure((folder / "report.html").read_text(encoding="utf-8"))
     page, text = page_of(
         a_run(tmp_path / "run", dataset=HOSTILE, missed=HOSTILE, camera=HOSTILE, map_hash=HOSTILE,
               keyframes_rejected={HOSTILE: 2}, versions={HOSTILE: HOSTILE}, config={HOSTILE: HOSTILE},
@@ -253,7 +253,7 @@ def test_a_large_mesh_becomes_a_small_one_of_the_same_shape() -> None:
 
 
 def test_the_command_writes_a_page_of_a_run_and_of_a_map(folder: Path, here: Here, tmp_path: Path) -> None:
-    done = tsfusion("report", folder, "--out", tmp_path / "page.html")
+    done = here("report", folder, "--out", tmp_path / "page.html")
     assert done.returncode == 0, done.stderr
     assert "page.html" in done.stdout
     assert (tmp_path / "page-side4.png").exists()
@@ -305,25 +305,17 @@ def test_the_page_in_a_browser(folder: Path) -> None:
         assert len({url for url in chromium.requests if url.startswith("file:")}) == 1
 
 
-@pytest.mark.usefixtures("quick_servers")
-def test_a_state_folder_and_a_file_have_a_report(here: Here, tmp_path: Path) -> None:
+def test_a_state_folder_and_a_file_have_a_report(room_run: Path, here: Here, tmp_path: Path) -> None:
     """With the keyframes of its journal, whose they are, and the hash of the map that they make."""
-    state = tmp_path / "my-maps"
-    done = here(
-        "replay", "synthetic:room", "--max-frames", 4, "--voxel-size", 0.1, "--state", state,
-        "--out", tmp_path / "out", "--json",
-    )  # fmt: skip
-    run = json.loads(done.stdout)
-    about = map_report.read(state, None)
+    run = json.loads((room_run / "stdout.json").read_text())
+    about = map_report.read(room_run / "state", None)
     assert about.poses is not None
-    assert np.allclose(about.poses, read_poses(tmp_path / "out" / "keyframes.txt")[1], atol=1e-8)
-    file = tmp_path / "out" / "map.tsf"
-    for source, words in ((state, ("000001.mcap", "closed")), (file, ("no journal",))):
-        page = tmp_path / f"{source.name}.html"
-        done = here("report", source, "--out", page, "--json")
+    assert np.allclose(about.poses, read_poses(room_run / "out" / "keyframes.txt")[1], atol=1e-8)
+    for source, words in (("state", ("000001.mcap", "closed")), ("out/map.tsf", ("no journal",))):
+        done = here("report", room_run / source, "--out", "page.html", "--json")
         assert done.returncode == 0, done.stderr
-        assert json.loads(done.stdout)["files"][-1] == str(page)
-        found = Structure(page.read_text(encoding="utf-8"))
+        assert json.loads(done.stdout)["files"][-1].endswith("page.html")
+        found = Structure((tmp_path / "page.html").read_text(encoding="utf-8"))
         assert run["map_hash"] in found.text
         assert all(word in found.text for word in words)
 
