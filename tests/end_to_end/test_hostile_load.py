@@ -35,7 +35,9 @@ LOADED = Bounds(delay_s=10.0, control_s=10.0, slack_bytes=128 << 20)  # a machin
 
 
 @pytest.mark.parametrize("seconds", [0.1, pytest.param(3.0, marks=pytest.mark.nightly)])
-@pytest.mark.parametrize("access", ["open", "stranger", pytest.param("allowed", marks=pytest.mark.nightly)])
+@pytest.mark.parametrize(
+    "access", ["open", *(pytest.param(one, marks=pytest.mark.nightly) for one in ("stranger", "allowed"))]
+)
 def test_attacks_harm_nobody(tmp_path: Path, access: Access, seconds: float) -> None:
     outcome = run(tmp_path, seconds, ATTACKS_OF[access], access=access, bounds=LOADED)
     assert not outcome.problems, f"{outcome.problems}\n{table(outcome)}"
