@@ -17,6 +17,7 @@ from tsfusion.geometry.frame import Frame
 
 ORIGIN = np.array([447_000, 5_411_000, 0])
 COUNT = 4
+VOXEL = 0.2
 
 
 def recorded(root: Path, shift: NDArray[np.integer], *, poses: bool = True) -> Path:
@@ -34,7 +35,7 @@ def recorded(root: Path, shift: NDArray[np.integer], *, poses: bool = True) -> P
 
 
 def replayed(here: Here, out: Path, *arguments: object) -> tuple[Path, str]:
-    done = here("replay", *arguments, "--voxel-size", "0.05", "--no-check", "--out", out)
+    done = here("replay", *arguments, "--voxel-size", VOXEL, "--no-check", "--out", out)
     assert done.returncode == 0, done.stderr
     return out, done.stderr
 
@@ -49,7 +50,7 @@ def test_a_map_in_utm(here: Here, tmp_path: Path) -> None:
     assert "positions count from the origin 447000 5411000 0 EPSG:25832" in said
     record = json.loads((out / "run.json").read_text())
     assert record["origin_m"] == ORIGIN.tolist()
-    plain = Volume(0.05, sensor="lidar")
+    plain = Volume(VOXEL, sensor="lidar")
     for keyframe in open_dataset(recorded(tmp_path / "plain", 0 * ORIGIN)):
         plain.integrate(keyframe)
     assert record["map_hash"] == plain.map_hash()
@@ -67,7 +68,7 @@ def test_a_map_in_utm(here: Here, tmp_path: Path) -> None:
     # The journal knows it, and so do maps that are made of it.
     again, _ = replayed(here, tmp_path / "again", tmp_path / "state")
     assert json.loads((again / "run.json").read_text())["origin_m"] == ORIGIN.tolist()
-    fused = here("fuse", utm, "--voxel-size", "0.05", "--workers", "1", "--out", tmp_path / "fused")
+    fused = here("fuse", utm, "--voxel-size", VOXEL, "--workers", "1", "--out", tmp_path / "fused")
     assert fused.returncode == 0, fused.stderr
     assert b"comment origin_m 447000 5411000 0\n" in (tmp_path / "fused" / "mesh.ply").read_bytes()[:800]
 
