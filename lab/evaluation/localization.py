@@ -47,7 +47,7 @@ from tsfusion.geometry.frame import Frame
 from tsfusion.scanner.localization import localizers
 from tsfusion.scanner.localization.localizer import Localizer, Lost
 from tsfusion.scanner.localization.loop_closure.loop_closing import LoopClosing
-from tsfusion.scanner.sources.recorded import RecordedSource
+from tsfusion.scanner.sources.source import RecordedSource
 from tsfusion.scanner.tracked_trajectory import TrackedTrajectory
 
 DOCS = Path(__file__).parents[2] / "docs" / "localization.md"

@@ -550,13 +550,13 @@ FAULTS = (
         "geometry/test_origin.py::test_a_cloud_in_a_grid_is_no_scan",
     ),
     Fault(
-        "datasets/point_times.py",
+        "datasets/scan_files.py",
         "    if step > _COARSE * span:",
         "    if False:",
         "datasets/test_point_times.py::test_times_of_no_use_are_named",
     ),
     Fault(
-        "datasets/point_times.py",
+        "datasets/scan_files.py",
         " & np.isfinite(points).all(axis=1) & points.any(axis=1)",
         "",
         "datasets/test_point_times.py::test_points_without_a_return_may_have_any_time",

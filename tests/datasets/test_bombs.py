@@ -20,8 +20,7 @@ from rosbag_writing import writing
 
 from tsfusion.core import read_limits
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets.depth_files import read_depth
-from tsfusion.datasets.readers import read_image, read_lines
+from tsfusion.datasets.readers import read_depth, read_image, read_lines
 from tsfusion.datasets.rosbag.bag import Bag
 from tsfusion.datasets.scan_files import read_scan
 
@@ -165,10 +164,7 @@ def test_an_exr_that_claims_a_gigapixel(tmp_path: Path) -> None:
     content, window = path.read_bytes(), b"dataWindow\0box2i\0" + struct.pack("<5i", 16, 0, 0, 3, 3)
     assert window in content
     path.write_bytes(content.replace(window, window[:-8] + struct.pack("<2i", 29_999, 29_999)))
-    with (
-        little_memory(),
-        pytest.raises(DatasetError, match=r"needs 3\.6 GB of memory"),
-    ):
+    with little_memory(), pytest.raises(DatasetError, match=r"needs 3\.6 GB of memory"):
         read_depth(path)
 
 

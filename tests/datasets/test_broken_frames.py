@@ -6,15 +6,14 @@ import logging
 import cv2
 import numpy as np
 import pytest
-from support.small_recordings import POSE, ROW, hololens, one_line, seven_scenes
+from support.small_recordings import one_line, seven_scenes
 
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets import HoloLens, SevenScenes, open_dataset, select
+from tsfusion.datasets import SevenScenes, open_dataset, select
 from tsfusion.datasets.dataset import UnreadableFrame, UnreadableRecording
-from tsfusion.datasets.depth_files import check_byte_order
+from tsfusion.datasets.readers import check_byte_order
 from tsfusion.datasets.scan_files import read_scan
 from tsfusion.datasets.trajectory_files import read_tum
-from tsfusion.scanner.sources.recorded import RecordedSource
 
 STEM = "frame-000002"
 IDENTITY = "0 0 0 0 0 0 1"
@@ -24,33 +23,8 @@ def _cut(file):
     file.write_bytes(file.read_bytes()[:-20])
 
 
-BROKEN = {
-    "cut depth": lambda root: _cut(root / f"{STEM}.depth.png"),
-    "cut colour": lambda root: _cut(root / f"{STEM}.color.png"),
-    "empty depth": lambda root: (root / f"{STEM}.depth.png").write_bytes(b""),
-    "no colour": lambda root: (root / f"{STEM}.color.png").unlink(),
-    "no depth": lambda root: (root / f"{STEM}.depth.png").unlink(),
-    "nan pose": lambda root: (root / f"{STEM}.pose.txt").write_text(POSE.replace("0.5", "nan")),
-    "zero pose": lambda root: (root / f"{STEM}.pose.txt").write_text("0 0 0 0\n" * 4),
-    "cut pose": lambda root: (root / f"{STEM}.pose.txt").write_text("1 0 0 0\n0 1"),
-    "first of another size": lambda root: cv2.imwrite(
-        str(root / "frame-000000.depth.png"), np.ones((3, 4), np.uint16)
-    ),
-}
-
-
-@pytest.mark.parametrize("how", BROKEN)
-def test_one_broken_frame_of_six_is_left_out(tmp_path, how):
-    BROKEN[how](seven_scenes(tmp_path, count=6))
-    dataset = SevenScenes(tmp_path)
-    assert len(list(dataset)) == 5
-    assert sum(dataset.skipped.values()) == 1
-    scanned = SevenScenes(tmp_path, posed=False)
-    assert len(list(RecordedSource(scanned))) == (6 if "pose" in how else 5)
-
-
 def test_the_first_broken_frame_is_said_once_and_again_read_counts_once(tmp_path, caplog):
-    BROKEN["cut depth"](seven_scenes(tmp_path, count=6))
+    _cut(seven_scenes(tmp_path, count=6) / f"{STEM}.depth.png")
     part = select(SevenScenes(tmp_path), stride=2)
     with caplog.at_level(logging.WARNING):
         assert [len(list(part)), len(list(part))] == [2, 2]
@@ -72,15 +46,6 @@ def test_a_recording_of_which_most_is_broken_is_an_error_with_the_cause(tmp_path
         (tmp_path / f"frame-{index:06d}.pose.txt").write_text("nan\n")
     with pytest.raises(DatasetError, match=r"frame-000001\.pose\.txt:1: "):
         SevenScenes(tmp_path)
-
-
-def test_a_broken_line_of_poses_keeps_its_place(tmp_path):
-    hololens(tmp_path, count=3)
-    (tmp_path / "poses.txt").write_text(f"{ROW}\n{ROW.replace('0.5', 'nan')}\n{ROW.replace('0.5', '0.7')}\n")
-    dataset = HoloLens(tmp_path)
-    assert [int(one.depth[0, 0]) for one in dataset] == [7, 9]
-    assert dataset[1].T_world_camera[0, 3] == 0.7
-    assert dataset.skipped == {"without a pose": 1}
 
 
 def test_nothing_is_interpolated_across_a_broken_pose(tmp_path):

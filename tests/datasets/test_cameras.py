@@ -10,16 +10,7 @@ import pytest
 from geometry_checks import warp_residual
 from own_recordings import KINECT
 from small_recordings import CAMERA, corbs, hololens, kitti, one_line, redwood, seven_scenes
-from written_recordings import (
-    check,
-    matrix,
-    millimetres,
-    scannet,
-    through_lens,
-    transforms,
-    views,
-    write,
-)
+from written_recordings import check, matrix, millimetres, scannet, through_lens, transforms, views, write
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets import TUM, Redwood, describe, open_dataset, select
@@ -27,7 +18,7 @@ from tsfusion.datasets.cameras import camera_line
 from tsfusion.datasets.formats.folder_table import KINECT as SEVEN_SCENES
 from tsfusion.geometry.calibration import Camera
 from tsfusion.geometry.keyframe import Intrinsics
-from tsfusion.scanner.sources.recorded import RecordedSource
+from tsfusion.scanner.sources.source import RecordedSource
 from tsfusion.scanner.sources.watched_folder import WatchedFolder
 
 GIVEN = Intrinsics(585, 585, 320, 240)

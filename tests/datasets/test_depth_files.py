@@ -14,8 +14,7 @@ from written_recordings import check, matrix, millimetres, views, write
 
 from tsfusion.core.errors import DatasetError, MissingDependency
 from tsfusion.datasets import open_dataset
-from tsfusion.datasets.depth_files import check_metres, read_depth
-from tsfusion.datasets.readers import read_color, read_image
+from tsfusion.datasets.readers import check_metres, read_color, read_depth, read_image
 from tsfusion.datasets.rosbag import bag_messages
 from tsfusion.geometry.keyframe import depth_metres
 from tsfusion.viewer.map.scanner_marks import small_picture

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tsfusion.datasets.point_times import Scan, point_times, time_field
+from tsfusion.datasets.scan_files import Scan, point_times, time_field
 
 STAMP = 1_700_000_000_000_000_000
 SHARE = np.linspace(0, 1, 11)

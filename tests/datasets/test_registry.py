@@ -3,7 +3,6 @@
 
 import json
 import logging
-import re
 import shutil
 import zipfile
 from pathlib import Path
@@ -12,11 +11,11 @@ import cv2
 import numpy as np
 import pytest
 from command_processes import tsfusion
-from small_recordings import claim_size, hololens, kitti, one_line, redwood, seven_scenes
+from small_recordings import claim_size, kitti, one_line, redwood, seven_scenes
 from written_recordings import replica, scannet, transforms, write
 
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets import Dataset, PartOfDataset, describe, find, layouts, open_dataset, select
+from tsfusion.datasets import PartOfDataset, describe, find, layouts, open_dataset, select
 from tsfusion.datasets.dataset import pose_of
 from tsfusion.geometry.keyframe import Intrinsics
 
@@ -32,41 +31,6 @@ def tum(root: Path) -> Path:
         (root / f"{name}.txt").write_text("".join(lines))
     (root / "K.txt").write_text("525 0 319.5\n0 525 239.5\n0 0 1\n")
     return root
-
-
-def without_poses(root: Path, layout: str) -> Path:
-    """A recording of a layout as it is before any SLAM has run."""
-    if layout == "7-Scenes":
-        seven_scenes(root)
-        for path in root.glob("*.pose.txt"):
-            path.unlink()
-    elif layout == "HoloLens":
-        (hololens(root) / "poses.txt").unlink()
-    elif layout == "RGB-D folders":
-        (redwood(root, [0, 1, 2], [0]) / "trajectory.log").unlink()
-    elif layout == "KITTI odometry":
-        shutil.rmtree(kitti(root, count=3) / "poses")
-    elif layout == "TUM RGB-D":
-        tum(root)
-    elif layout == "ScanNet":
-        shutil.rmtree(scannet(root, count=3) / "pose")
-    return root
-
-
-@pytest.mark.parametrize(
-    "layout", ["7-Scenes", "HoloLens", "RGB-D folders", "KITTI odometry", "TUM RGB-D", "ScanNet"]
-)
-def test_a_recording_without_poses_is_there_for_a_scan(tmp_path, layout):
-    root = without_poses(tmp_path / "recording", layout)
-    assert find(root).layout.name == layout
-    dataset = open_dataset(root, posed=False)
-    assert isinstance(dataset, Dataset)
-    assert (len(dataset), dataset.skipped) == (3, {})
-    assert all(dataset.frame(index).T_world_camera is None for index in range(3))
-    assert re.search(r", no poses; (depth unit .*; )?camera fx ", describe(dataset))
-    with pytest.raises(DatasetError, match=r"frame 2 of .* has no pose; `tsfusion scan PATH` finds"):
-        dataset[2]
-    one_line(lambda: open_dataset(root), "pose|trajectory|groundtruth")
 
 
 def test_some_poses_are_given_where_they_are_known(tmp_path):

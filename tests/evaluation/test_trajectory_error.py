@@ -20,7 +20,7 @@ from tsfusion.datasets.trajectory_files import read_poses, read_tum, write_tum
 from tsfusion.evaluation.trajectory_error import absolute_error, associate, paired, umeyama
 from tsfusion.geometry import se3
 from tsfusion.geometry.trajectory import quaternion, rigid
-from tsfusion.scanner.sources.recorded import RecordedSource
+from tsfusion.scanner.sources.source import RecordedSource
 
 RNG = np.random.default_rng(7)
 FREIBURG = "tum_rgbd/trajectories/freiburg1_xyz"

@@ -22,8 +22,8 @@ from tsfusion import (
     journal,
     open_dataset,
 )
-from tsfusion.evaluation import surface_registration
-from tsfusion.evaluation.surface_registration import SurfaceRegistration
+from tsfusion.evaluation import surface_fit
+from tsfusion.evaluation.surface_fit import SurfaceRegistration
 from tsfusion.geometry import se3
 from tsfusion.journal import state_folder
 from tsfusion.pipelines.maps import map_alignment
@@ -76,7 +76,7 @@ class Given(SurfaceRegistration):
 def given(monkeypatch: pytest.MonkeyPatch) -> type[Given]:
     monkeypatch.setattr(map_alignment, "SurfaceRegistration", Given)
     monkeypatch.setattr(Given, "found", [se3.inverse(START)])
-    monkeypatch.setattr(surface_registration, "check_installed", lambda: None)
+    monkeypatch.setattr(surface_fit, "check_installed", lambda: None)
     return Given
 
 
@@ -232,7 +232,7 @@ def test_maps_that_cannot_be_aligned(here: Here, maps: tuple[AlignedMap, Aligned
 def test_without_open3d_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "open3d", None)
     with pytest.raises(MissingDependency, match=r"pip install '\.\[align\]' in your clone"):
-        surface_registration.open3d()
+        surface_fit.open3d()
 
 
 @pytest.mark.slow

@@ -29,7 +29,7 @@ from tsfusion.pipelines.runs import scan as pipelines_scan
 from tsfusion.pipelines.runs.scan_results import ScanSummary
 from tsfusion.scanner.keyframe_selection import KeyframeSelector
 from tsfusion.scanner.localization.localizer import Lost, PoseCorrections, TrackedPose
-from tsfusion.scanner.sources.recorded import RecordedSource
+from tsfusion.scanner.sources.source import RecordedSource
 
 CONFIG = VolumeConfig(voxel_size=0.05, threads=1)
 T = unknown_start(2)  # T_map_world

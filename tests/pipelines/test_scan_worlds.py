@@ -23,7 +23,7 @@ from tsfusion.journal.journaled_keyframes import JournalRecording
 from tsfusion.pipelines.runs import engine
 from tsfusion.pipelines.runs import scan as pipelines_scan
 from tsfusion.pipelines.runs.scan_results import ScanSummary
-from tsfusion.scanner.sources.recorded import RecordedSource
+from tsfusion.scanner.sources.source import RecordedSource
 from tsfusion.wire.asking.queries import fetch_health
 
 FRAMES = 3

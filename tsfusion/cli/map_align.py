@@ -50,7 +50,7 @@ def align(
     from tsfusion.cli import output, progress
     from tsfusion.core.errors import IncompleteRun
     from tsfusion.core.output_folder import check_writable
-    from tsfusion.evaluation.surface_registration import check_installed
+    from tsfusion.evaluation.surface_fit import check_installed
     from tsfusion.journal.state_folder import check_no_map_of_a_server
     from tsfusion.pipelines.maps import map_alignment
     from tsfusion.pipelines.report import shortfall

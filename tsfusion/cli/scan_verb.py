@@ -104,7 +104,7 @@ def scan(
         )
     given_up = options.up_direction(up)
     if align:
-        from tsfusion.evaluation.surface_registration import check_installed
+        from tsfusion.evaluation.surface_fit import check_installed
 
         options.refuse(context, ("same_frame",), "and --align exclude each other: one says that it is known")
         check_installed()
@@ -219,7 +219,7 @@ def _open(
     Where the recording or the trajectory in `settings` has no times, its poses are made the recording's own.
     """
     from tsfusion.scanner.sources.named_sources import is_live, open_source
-    from tsfusion.scanner.sources.recorded import LimitedSource
+    from tsfusion.scanner.sources.source import LimitedSource
 
     if is_live(spec):
         options.refuse(
@@ -233,7 +233,7 @@ def _open(
     from tsfusion.core.errors import DatasetError
     from tsfusion.datasets import select
     from tsfusion.datasets.given_trajectory import WithTrajectory, pairs_by_time
-    from tsfusion.scanner.sources.recorded import RecordedSource
+    from tsfusion.scanner.sources.source import RecordedSource
 
     path = Path(spec)
     if not spec.startswith("synthetic:") and not path.expanduser().exists():

@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tsfusion.core.errors import DatasetError, InvalidKeyframe, TsfusionError
-from tsfusion.datasets.depth_files import check_byte_order
-from tsfusion.datasets.point_times import PointTimes, Scan, point_times
-from tsfusion.datasets.readers import numbers, read_lines
+from tsfusion.datasets.readers import check_byte_order, numbers, read_lines
+from tsfusion.datasets.scan_files import PointTimes, Scan, point_times
 from tsfusion.geometry import origin, se3
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Keyframe

@@ -19,7 +19,7 @@ from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.dataset import Dataset, Frames
 from tsfusion.datasets.download import archives
 from tsfusion.datasets.folder_frames import FolderFrames
-from tsfusion.datasets.formats import kitti, kitti_raw
+from tsfusion.datasets.formats import kitti
 from tsfusion.datasets.formats.euroc import EuRoC
 from tsfusion.datasets.formats.folder_table import (
     PLAIN_EXPECTED,
@@ -29,9 +29,8 @@ from tsfusion.datasets.formats.folder_table import (
     ScanNet,
     SevenScenes,
 )
-from tsfusion.datasets.formats.gtsam_points import LidarDump
 from tsfusion.datasets.formats.nerfstudio import Nerfstudio
-from tsfusion.datasets.formats.scan_folders import ScanFolder
+from tsfusion.datasets.formats.scan_folders import LidarDump, ScanFolder
 from tsfusion.datasets.formats.stereo_folders import StereoFolder
 from tsfusion.datasets.formats.tum import TUM
 from tsfusion.datasets.given_trajectory import WithTrajectory
@@ -94,7 +93,7 @@ def _row(layout: type[FolderFrames], name: str = "", also: str = "") -> Layout:
 BUILT_IN = (
     _row(EuRoC),
     Layout("KITTI odometry", kitti.EXPECTED, kitti.recognises, kitti.open_kitti),
-    Layout("KITTI raw", kitti_raw.EXPECTED, kitti_raw.recognises, kitti_raw.KITTIRaw),
+    Layout("KITTI raw", kitti.RAW_EXPECTED, kitti.recognises_raw, kitti.KITTIRaw),
     _row(SevenScenes),
     _row(ScanNet),
     _row(Replica),

@@ -13,13 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tsfusion.evaluation.fitted_factors import AS_GOOD, MIN_FOCAL_SIGMA, FittedFactor, sure_gain, zoomed
-from tsfusion.evaluation.frame_pairs import (
-    Fits,
-    FramePair,
-    best_fits_near,
-    fits_of,
-    share_of_best,
-)
+from tsfusion.evaluation.frame_pairs import Fits, FramePair, best_fits_near, fits_of, share_of_best
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.se3 import Transform
 

@@ -9,9 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.datasets.dataset import Dataset, frame_of, readable
-from tsfusion.evaluation.color_registration import Outlines, outlines
-from tsfusion.evaluation.depth_units import UnitEvidence, unit_evidence
-from tsfusion.evaluation.depth_views import DepthView, depth_view
+from tsfusion.evaluation.depth_views import (
+    DepthView,
+    Outlines,
+    UnitEvidence,
+    depth_view,
+    outlines,
+    unit_evidence,
+)
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import FrameKind
 from tsfusion.geometry.keyframe import Intrinsics

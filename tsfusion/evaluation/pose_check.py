@@ -27,14 +27,21 @@ from tsfusion.evaluation.camera_check import (
     is_outside,
     likely_cameras,
 )
-from tsfusion.evaluation.color_registration import misplaced_color, outlines
-from tsfusion.evaluation.depth_units import doubtful_depth, unit_evidence, unusable_depth
+from tsfusion.evaluation.depth_views import (
+    doubtful_depth,
+    misplaced_color,
+    outlines,
+    unit_evidence,
+    unusable_depth,
+)
 from tsfusion.evaluation.fitted_factors import (
     AS_GOOD,
     MIN_FOCAL_SIGMA,
     FittedFactor,
     fitted_focal_length,
     fitted_scale,
+    time_shift,
+    time_text,
 )
 from tsfusion.evaluation.frame_pairs import (
     MIN_FIT,
@@ -59,7 +66,6 @@ from tsfusion.evaluation.pose_mistakes import (
     not_ruled_out_text,
     scale_text,
 )
-from tsfusion.evaluation.time_shift import time_shift, time_text
 from tsfusion.evaluation.trajectory_check import find_fault
 from tsfusion.geometry.se3 import Transform
 

@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Fit of two surfaces of one place, and what speaks against it."""
+"""Registration of two surfaces of one place, their fit, and what speaks against it."""
+
+from collections.abc import Sequence
+from importlib.util import find_spec
+from typing import Any
 
 import cv2
 import msgspec
@@ -17,6 +21,19 @@ _REACH = 2.0  # cells within which the other surface is looked for
 _PARALLEL = 0.95  # least cosine between normals of one surface, of which places are compared
 _LEAST_PART, _HALVINGS = 50, 3  # cells
 _DEPTH_MARGIN = 0.02  # of the depth, by which a point lies before a measurement at least to be seen through
+_INSTALL = (
+    "maps are aligned with Open3D and scipy: pip install '.[align]' in your clone of tsfusion, with a Python "
+    "up to 3.12"
+)
+_SEEDS = 4  # runs of RANSAC
+_FEATURE_RADIUS = 5.0  # cells
+_FEATURE_POINTS = 100
+_NEAREST = 1.5  # cells between points that belong together
+_EDGE_LENGTHS = 0.9  # least ratio of two sides of a triangle that belong together
+_ITERATIONS, _CONFIDENCE = 100_000, 0.999
+_ICP_ITERATIONS = 60
+_LOSS = 0.7  # of the reach: distances beyond it do not pull
+_ICP_REACH = (3.0, 1.5, 0.6)  # cells, one after the other
 
 
 class SurfaceFit(msgspec.Struct, frozen=True):
@@ -190,3 +207,78 @@ def _depth_range(keyframe: Keyframe) -> tuple[NDArray[np.float32], NDArray[np.fl
     near, far = cv2.erode(depth, window), cv2.dilate(depth, window)
     near[near == 0] = np.nan
     return np.asarray(near, np.float32), np.asarray(far, np.float32)
+
+
+def open3d() -> Any:
+    """The library.
+
+    Raises:
+        MissingDependency: without it.
+    """
+    try:
+        import open3d
+    except ImportError as error:
+        raise MissingDependency(_INSTALL) from error
+    open3d.utility.set_verbosity_level(open3d.utility.VerbosityLevel.Error)  # it warns of every bad guess
+    return open3d
+
+
+def check_installed() -> None:
+    """Raise MissingDependency where Open3D or scipy is not installed, without loading them."""
+    for name in ("open3d", "scipy"):
+        if find_spec(name) is None:
+            raise MissingDependency(_INSTALL)
+
+
+class SurfaceRegistration:
+    """Two surfaces, of which the second is brought onto the first: two cells, points and features each."""
+
+    def __init__(self, a: SampledSurface, b: SampledSurface) -> None:
+        self._o3d = open3d()
+        self._registration = self._o3d.pipelines.registration
+        self._a, self._b = self._cloud(a), self._cloud(b)
+        self._cell = a.cell
+
+    def candidates(self) -> list[Transform]:
+        """Likely `T_a_b`, (4, 4) each, as RANSAC finds them from several seeds; not refined."""
+        found, registration = [], self._registration
+        features = [self._features(cloud) for cloud in (self._b, self._a)]
+        reach = _NEAREST * self._cell
+        checks = [
+            registration.CorrespondenceCheckerBasedOnEdgeLength(_EDGE_LENGTHS),
+            registration.CorrespondenceCheckerBasedOnDistance(reach),
+        ]
+        for seed in range(_SEEDS):
+            self._o3d.utility.random.seed(seed)
+            result = registration.registration_ransac_based_on_feature_matching(
+                self._b, self._a, *features, True, reach,
+                registration.TransformationEstimationPointToPoint(False), 3, checks,
+                registration.RANSACConvergenceCriteria(_ITERATIONS, _CONFIDENCE),
+            )  # fmt: skip
+            if result.fitness > 0:
+                found.append(se3.nearest(np.array(result.transformation)))
+        return found
+
+    def refined(self, T_a_b: Transform, reaches: Sequence[float] = _ICP_REACH) -> Transform:
+        """The transform after point-to-plane ICP, with a shorter reach each time, in cells."""
+        T = T_a_b
+        registration = self._registration
+        enough = registration.ICPConvergenceCriteria(1e-7, 1e-7, _ICP_ITERATIONS)
+        for reach in reaches:
+            loss = registration.TukeyLoss(_LOSS * reach * self._cell)
+            method = registration.TransformationEstimationPointToPlane(loss)
+            result = registration.registration_icp(self._b, self._a, reach * self._cell, T, method, enough)
+            T = np.array(result.transformation)
+        return se3.nearest(T)
+
+    def _cloud(self, surface: SampledSurface) -> Any:
+        vectors = self._o3d.utility.Vector3dVector
+        cloud = self._o3d.geometry.PointCloud(vectors(surface.points))
+        cloud.normals = vectors(surface.normals)
+        return cloud
+
+    def _features(self, cloud: Any) -> Any:
+        around = self._o3d.geometry.KDTreeSearchParamHybrid(
+            radius=_FEATURE_RADIUS * self._cell, max_nn=_FEATURE_POINTS
+        )
+        return self._registration.compute_fpfh_feature(cloud, around)

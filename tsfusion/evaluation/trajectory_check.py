@@ -28,12 +28,7 @@ SURE_GAIN = 0.15  # by which it must fit better
 AS_GOOD = 0.02  # difference of two fits that counts as none
 STRONGEST = 30.0  # m/s²; no sensor that is carried or driven accelerates more from frame to frame
 VIOLENT = 100.0  # m/s², where the frames show nothing
-COARSE = (
-    16.0,
-    8.0,
-    4.0,
-    2.0,
-)  # tolerances over the sensor's own, to search for a shift from far off
+COARSE = (16.0, 8.0, 4.0, 2.0)  # tolerances over the sensor's own, to search for a shift from far off
 MOST_POSES = 300  # among which places seen again are searched for
 MOST_REVISITS = 8
 MIN_WAY = 1.0  # between two visits: metres over the depth, plus radians

@@ -13,7 +13,7 @@ import pytest
 from small_recordings import one_line
 
 from lab.reliability.fuzz_folders import WRITERS
-from tsfusion.datasets import find, open_dataset
+from tsfusion.datasets import describe, find, open_dataset
 from tsfusion.datasets.dataset import frame_of, readable
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.se3 import Transform
@@ -58,9 +58,11 @@ ROWS = (
         refused=_NUMBERS),
     Row("EuRoC", "euroc", "mav0/cam0/data/*", "mav0/cam1/data/*"),
     Row("LiDAR scans", "scans", "*.bin", "", "poses_kitti.txt", refused=_ORDER, is_watched=True),
-    Row("LiDAR scans", "scans-pcd", "*.pcd", "", "poses_tum.txt", is_watched=True),
+    *(Row("LiDAR scans", f"scans-{suffix}", f"*.{suffix}", "", "poses_tum.txt", is_watched=True)
+      for suffix in ("pcd", "ply", "laz")),
     Row("LiDAR keyframes", "lidar-keyframes", "*/points.bin", "", "graph.txt"),
 )  # fmt: skip
+ONE_EACH = ("*.pose.txt", "pose/*", _RAW.format("oxts"))  # files of poses
 WITHOUT_POSES = ("plain", "flat", "stereo")
 # Colour that is not there is no loss where it lies beside its depth
 UNSEEN = {"flat": ("second missing", "second renamed")}
@@ -110,26 +112,30 @@ class Harmed(NamedTuple):
         middle = len(sides["first"]) // 2
         side, change = self.change.split(" ", 1)
         if side == "pose":
-            self._harm_pose(root, middle)
+            self._harm_pose(root, middle, change)
         elif change == "swapped with the second":
             swap(sides["first"][middle], sides["second"][middle])
         else:
             CHANGES[change](sides[side][middle])
 
-    def _harm_pose(self, root: Path, middle: int) -> None:
+    def _harm_pose(self, root: Path, middle: int, change: str) -> None:
         found = sorted(root.glob(self.row.poses))
         file, frame = (found[middle], 0) if len(found) > 1 else (found[0], middle)
+        if change == "missing":
+            file.unlink()
+            return
         lines = file.read_text().splitlines()
         each, before = self.row.lines
         words = lines[frame * each + before].split()
-        lines[frame * each + before] = " ".join([*words[:-1], "nan"])
+        lines[frame * each + before] = " ".join([*words[:-1], "nan"] if change == "of nan" else words[:-1])
         file.write_text("\n".join(lines) + "\n")
 
 
 def harms(row: Row) -> list[Harmed]:
     changes = [f"{side} {change}" for side in ("first", "second") if getattr(row, side) for change in CHANGES]
     is_depth = row.second and "image_0" not in row.first and row.first != "left/*" and "cam0" not in row.first
-    changes += ["first swapped with the second"] * bool(is_depth) + ["pose of nan"] * bool(row.poses)
+    changes += ["first swapped with the second"] * bool(is_depth)
+    changes += ["pose of nan", "pose cut"] * bool(row.poses) + ["pose missing"] * (row.poses in ONE_EACH)
     return [Harmed(row, change) for change in changes]
 
 
@@ -170,6 +176,24 @@ def test_a_layout_is_recognised_and_has_all_frames_and_poses(
     poses = [T for T in frames.values() if T is not None]
     assert len(poses) == (0 if row.writer in WITHOUT_POSES else count)
     assert len({T.tobytes() for T in poses}) == len(poses)
+
+
+@pytest.mark.parametrize("row", [row for row in ROWS if row.poses], ids=lambda row: row.writer + row.first)
+def test_a_recording_without_poses_is_there_for_a_scan(
+    unharmed: Callable[[Row], tuple[Path, Found]], tmp_path: Path, row: Row
+) -> None:
+    whole, frames = unharmed(row)
+    root = Path(shutil.copytree(whole, tmp_path / whole.name))
+    for file in root.glob(row.poses):
+        file.unlink()
+    dataset = open_dataset(root, posed=False, **row.options)
+    found = [frame_of(dataset, index) for index in range(len(dataset))]
+    assert {measured(frame) for frame in found} == set(frames)
+    assert [frame.T_world_camera for frame in found] == [None] * len(frames)
+    assert dataset.skipped == {}
+    assert ", no poses" in describe(dataset)
+    one_line(lambda: dataset[1], r"frame 1 of .* has no pose; `tsfusion scan PATH` finds")
+    one_line(lambda: open_dataset(root, **row.options), "pose|trajectory|groundtruth|packets")
 
 
 @pytest.mark.parametrize("harmed", [one for row in ROWS for one in harms(row)], ids=str)

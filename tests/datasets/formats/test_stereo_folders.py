@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from small_recordings import Change, LeftOut, one_line, one_line_of, put, textured_pair
 
-from tsfusion.datasets import StereoFolder, find, open_dataset
-from tsfusion.scanner.sources.watched_folder import WatchedFolder
+from tsfusion.datasets import open_dataset
 
 DISPARITY = 8
 ROW = "1 0 0 {} 0 1 0 0 0 0 1 0\n"
@@ -28,22 +27,6 @@ def pairs(root: Path, count: int = 4) -> Path:
     return root
 
 
-def test_a_recording_and_a_watched_folder_give_the_same_frames(tmp_path: Path) -> None:
-    root = pairs(tmp_path / "pairs")
-    assert find(root).layout.name == "stereo folders"
-    dataset = open_dataset(root, posed=False)
-    (root / "DONE").touch()
-    with WatchedFolder(root) as source:
-        watched = list(source)
-    assert len(dataset) == len(watched) == 4
-    for index, other in enumerate(watched):
-        frame = dataset.frame(index)
-        for name in ("left", "right", "color"):
-            np.testing.assert_array_equal(getattr(frame, name), getattr(other, name))
-        assert (frame.intrinsics, frame.baseline_fx) == (other.intrinsics, other.baseline_fx)
-        assert frame.sensor == "stereo"
-
-
 def test_poses_come_from_a_file(tmp_path: Path) -> None:
     root = pairs(tmp_path / "pairs")
     (tmp_path / "poses.txt").write_text("".join(ROW.format(x) for x in range(4)))
@@ -58,7 +41,6 @@ def test_poses_come_from_a_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
-        (put("right/0002.png", "x"), LeftOut(r"right/0002\.png cannot be decoded", {"unreadable": 1})),
         (lambda root: cv2.imwrite(str(root / "left" / "0001.png"), np.zeros((40, 160), np.uint8)),
          LeftOut(r"images of \(160, 48\) pixels, got \(160, 40\)", {"unreadable": 1})),
         (put("baseline.txt", None), r"has no baseline\.txt \(metres\)"),
@@ -70,10 +52,3 @@ def test_a_broken_folder_is_one_clear_line(tmp_path: Path, change: Change, expec
     change(pairs(tmp_path / "pairs"))
     (tmp_path / "poses.txt").write_text("".join(ROW.format(x) for x in range(4)))
     one_line_of(lambda: open_dataset(tmp_path / "pairs", trajectory=tmp_path / "poses.txt"), expected)
-
-
-def test_images_without_their_other_half_are_counted(tmp_path: Path) -> None:
-    pairs(tmp_path)
-    (tmp_path / "left" / "0001.png").rename(tmp_path / "left" / "0009.png")
-    dataset = StereoFolder(tmp_path, posed=False)
-    assert (len(dataset), dataset.skipped) == (3, {"without their other half": 2})

@@ -14,7 +14,7 @@ from rosbag_writing import BODY, OPTICAL, WORLD, BagWriter, writing
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.rosbag.bag import Bag
 from tsfusion.datasets.rosbag.bag_cameras import RECTIFIED, REGISTERED
-from tsfusion.datasets.rosbag.transforms import PoseSamples
+from tsfusion.datasets.rosbag.poses import PoseSamples
 from tsfusion.geometry import se3
 
 pytest.importorskip("rosbags")

@@ -13,16 +13,21 @@ from drifting_localizer import Drifting
 from tsfusion.core.errors import MissingDependency
 from tsfusion.datasets import Dataset, Synthetic, open_dataset
 from tsfusion.datasets.dataset import frame_of
-from tsfusion.datasets.worlds import loop_worlds
+from tsfusion.datasets.worlds import worlds
 from tsfusion.evaluation.trajectory_error import TrajectoryError, absolute_error
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
 from tsfusion.scanner.localization.localizer import Lost, PoseCorrections, TrackedPose
 from tsfusion.scanner.localization.loop_closure.loop_closing import LoopClosing
-from tsfusion.scanner.localization.loop_closure.loop_consensus import Loop, LoopConsensus
-from tsfusion.scanner.localization.loop_closure.odometry_drift import OdometryChain, OdometryDrift
+from tsfusion.scanner.localization.loop_closure.loop_consensus import (
+    Loop,
+    LoopConsensus,
+    OdometryChain,
+    OdometryDrift,
+    check,
+    matches,
+)
 from tsfusion.scanner.localization.loop_closure.place_index import PlaceIndex, PlaceView, place_view
-from tsfusion.scanner.localization.loop_closure.verification import check, matches
 from tsfusion.scanner.localization.rgbd.rgbd_tracker import RGBDLocalizer
 from tsfusion.scanner.tracked_trajectory import TrackedTrajectory
 
@@ -111,7 +116,7 @@ def test_rooms_all_alike_are_not_one_room():
 @pytest.mark.slow
 @pytest.mark.parametrize("identical", [True, pytest.param(False, marks=pytest.mark.nightly)])
 def test_the_way_back_closes_each_room_with_itself(identical):
-    run = Run(frames_of(Synthetic(loop_worlds.rooms(identical=identical), count=120, path="return")))
+    run = Run(frames_of(Synthetic(worlds.rooms(identical=identical), count=120, path="return")))
     assert len(run.loops) >= 30
     assert run.wrong() == []
     assert run.error(run.corrections[-1]).rmse <= 0.3 * run.error(None).rmse
@@ -422,10 +427,10 @@ def test_the_corridor_has_two_laps_and_the_rooms_are_equal():
     assert between.max() < 0.3
     rooms = open_dataset("synthetic:rooms", count=60, width=64, noise=False)
     assert rooms.distance(np.array([rooms.pose(index)[:3, 3] for index in range(60)])).min() > 0.3
-    step = loop_worlds.PITCH / (rooms.pose(1)[0, 3] - rooms.pose(0)[0, 3])
+    step = worlds.PITCH / (rooms.pose(1)[0, 3] - rooms.pose(0)[0, 3])
     assert step == pytest.approx(round(step))
     one, two = rooms.frame(5), rooms.frame(5 + round(step))
     assert (one.color == two.color).mean() > 0.97
     assert (one.depth == two.depth).mean() > 0.97
-    other = Synthetic(loop_worlds.rooms(identical=False), count=60, width=64, noise=False)
+    other = Synthetic(worlds.rooms(identical=False), count=60, width=64, noise=False)
     assert (other.frame(5).color == other.frame(5 + round(step)).color).mean() < 0.5

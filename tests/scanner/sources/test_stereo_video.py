@@ -222,10 +222,7 @@ def test_pictures_of_another_size(numbered: str) -> None:
 @pytest.mark.parametrize(
     ("place", "message"),
     [
-        (
-            "97",
-            "camera 97 cannot be opened: there is no /dev/video97; (expected one of|no camera is)",
-        ),
+        ("97", "camera 97 cannot be opened: there is no /dev/video97; (expected one of|no camera is)"),
         ("/dev/video97", "camera /dev/video97 cannot be opened: there is no /dev/video97"),
         ("/dev/null", "camera /dev/null cannot be opened: another program uses /dev/null, or"),
         ("missing.avi", "missing.avi does not exist; expected a camera's number, a device, a URL or a video"),

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.cameras import DepthUnit, PublishedCamera
 from tsfusion.datasets.dataset import SCAN, WITHOUT_DEPTH, FramePoses, NoPoses, Times
-from tsfusion.datasets.depth_files import SUFFIXES
 from tsfusion.datasets.file_names import in_order, in_time, numbers_in, series_of
 from tsfusion.datasets.formats.image_folders import (
     COLOR,
@@ -26,7 +25,7 @@ from tsfusion.datasets.formats.image_folders import (
     resample_for_camera,
 )
 from tsfusion.datasets.formats.image_folders import SUFFIXES as COLOR_SUFFIXES
-from tsfusion.datasets.readers import intrinsics_of, read_color, read_numbers
+from tsfusion.datasets.readers import DEPTH_SUFFIXES, intrinsics_of, read_color, read_numbers
 from tsfusion.datasets.trajectory_files import is_log, read_log
 from tsfusion.geometry.depth_registration import Registration
 from tsfusion.geometry.keyframe import Intrinsics
@@ -52,7 +51,7 @@ _REDWOODS_NAMES = re.compile(
     r"|open3d[-_]rgbd|augmented[-_]icl"
 )
 _REDWOODS_FILES = ("livingroom[12]-traj.txt", "office[12]-traj.txt")
-_IMAGES = {*SUFFIXES, *COLOR_SUFFIXES}
+_IMAGES = {*DEPTH_SUFFIXES, *COLOR_SUFFIXES}
 _LOGS = ("trajectory.log", "scene/trajectory.log", "odometry.log")  # by preference
 _LOG_NAMES = ("*traj*.log", "*-traj.txt")
 # In the name of an image that has its colour beside it: depth_3, depth16_3, depth_raw_3
@@ -340,7 +339,8 @@ def _beside(root: Path) -> list[dict[Path, Path | None]]:
     if not root.is_dir():
         return []
     files = {file.name.lower(): file for file in root.glob("[!.]*") if file.suffix.lower() in _IMAGES}
-    named = [file for file in files.values() if file.suffix.lower() in SUFFIXES and _DEPTH.search(file.stem)]
+    deep = (file for file in files.values() if file.suffix.lower() in DEPTH_SUFFIXES)
+    named = [file for file in deep if _DEPTH.search(file.stem)]
     found = []
     for series in series_of(named):
         pairs = {file: _partner(file, files) for file in series}

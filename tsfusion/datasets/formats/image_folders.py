@@ -12,13 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets import depth_files
+from tsfusion.datasets import readers
 from tsfusion.datasets.cameras import MILLIMETRES, PublishedCamera, RecordedCamera, find_camera
 from tsfusion.datasets.dataset import SCAN, FramePoses, NoPoses, Times
-from tsfusion.datasets.depth_files import check_metres, read_depth
 from tsfusion.datasets.file_names import in_order, numbers_in, series_of
 from tsfusion.datasets.folder_frames import FolderFrames
-from tsfusion.datasets.readers import read_color, read_lines
+from tsfusion.datasets.readers import check_metres, read_color, read_depth, read_lines
 from tsfusion.datasets.trajectory_files import read_matrix, read_matrix_rows, usable
 from tsfusion.geometry.calibration import Size
 from tsfusion.geometry.frame import Frame
@@ -265,7 +264,7 @@ def depth_images(root: Path, at: ImagesAt, expected: str) -> list[Path]:
     Raises:
         DatasetError: they are of several kinds.
     """
-    found = at.files(root, expected, depth_files.SUFFIXES)
+    found = at.files(root, expected, readers.DEPTH_SUFFIXES)
     kinds = sorted({path.suffix.lower() for path in found})
     if len(kinds) > 1:
         raise DatasetError(

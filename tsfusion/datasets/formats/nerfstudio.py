@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from tsfusion.core.errors import DatasetError, InvalidConfig, InvalidKeyframe
 from tsfusion.datasets.cameras import MILLIMETRES, DepthUnit, RecordedCamera, given_camera
 from tsfusion.datasets.dataset import WITHOUT_DEPTH, FramePoses, Times, first_frame
-from tsfusion.datasets.depth_files import check_metres, read_depth
 from tsfusion.datasets.formats.image_folders import DepthImages, resample_for_camera
-from tsfusion.datasets.readers import listed_file, read_color, turned_by_exif
+from tsfusion.datasets.readers import check_metres, listed_file, read_color, read_depth, turned_by_exif
 from tsfusion.datasets.trajectory_files import usable
 from tsfusion.geometry.calibration import Camera, Size, Undistorter
 from tsfusion.geometry.calibration_files import read_text

@@ -16,7 +16,7 @@ import numpy as np
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.cameras import DepthUnit, RecordedCamera
 from tsfusion.datasets.dataset import CLOCK, NO_POSE_IN_TIME, Frames, clock_parts, nearest_in_time
-from tsfusion.datasets.depth_files import check_metres
+from tsfusion.datasets.readers import check_metres
 from tsfusion.datasets.rosbag import bag_messages
 from tsfusion.datasets.rosbag.bag_cameras import CameraWatch
 from tsfusion.datasets.rosbag.poses import ImuTopics, PoseFinder, pose_streams

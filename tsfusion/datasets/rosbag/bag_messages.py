@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets.point_times import Scan, time_field
 from tsfusion.datasets.readers import decode_image
+from tsfusion.datasets.scan_files import Scan, time_field
 from tsfusion.geometry.keyframe import MAX_IMAGE_SIDE
 
 IMAGE = "sensor_msgs/msg/Image"

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.dataset import STREET, Frames
-from tsfusion.datasets.worlds import loop_worlds, worlds
+from tsfusion.datasets.worlds import worlds
 from tsfusion.datasets.worlds.worlds import GROUND, ROOM, Solids
 from tsfusion.geometry.frame import Frame
 
@@ -57,8 +57,8 @@ LIDARS = {"room": SyntheticLidar(lowest=-45.0, highest=45.0, max_range=30.0), "s
 WORLDS: dict[str, Callable[[int], worlds.World]] = {  # by the number of keyframes
     "room": lambda _: worlds.room(),
     "street": lambda count: worlds.street(max(80.0, count + 40.0)),
-    "corridor": lambda _: loop_worlds.ring(),
-    "rooms": lambda _: loop_worlds.rooms(),
+    "corridor": lambda _: worlds.ring(),
+    "rooms": lambda _: worlds.rooms(),
     **{
         name: lambda _, name=name: worlds.room(name)  # type: ignore[misc]
         for name in ("room-untextured", "room-plain", "room-bare")

@@ -14,8 +14,14 @@ from numpy.typing import NDArray
 from tsfusion.core.config import VolumeConfig
 from tsfusion.core.errors import AlignmentRefused, JournalError, MapError
 from tsfusion.core.readable_numbers import count_of
-from tsfusion.evaluation.surface_fit import SampledSurface, SeenDepth, SurfaceFit, fit, parts_spread
-from tsfusion.evaluation.surface_registration import SurfaceRegistration
+from tsfusion.evaluation.surface_fit import (
+    SampledSurface,
+    SeenDepth,
+    SurfaceFit,
+    SurfaceRegistration,
+    fit,
+    parts_spread,
+)
 from tsfusion.geometry import se3
 from tsfusion.geometry.keyframe import MAX_POINTS, Keyframe
 from tsfusion.geometry.mesh import Mesh

@@ -38,12 +38,7 @@ class TrajectoryFilePoses(Localizer):
     absolute = True
 
     def __init__(
-        self,
-        path: str | Path,
-        *,
-        max_gap_s: float,
-        time_offset_s: float = 0.0,
-        origin: object = None,
+        self, path: str | Path, *, max_gap_s: float, time_offset_s: float = 0.0, origin: object = None
     ) -> None:
         self._trajectory = read_trajectory(Path(path).expanduser())
         known = self._trajectory.translations[np.isfinite(self._trajectory.translations[:, 0])]

@@ -49,11 +49,7 @@ class LidarLocalizer(Localizer):
     absolute = False
 
     def __init__(
-        self,
-        *,
-        max_range: float | None = None,
-        voxel_size: float | None = None,
-        threads: int = 1,
+        self, *, max_range: float | None = None, voxel_size: float | None = None, threads: int = 1
     ) -> None:
         try:
             import kiss_icp.kiss_icp

@@ -13,20 +13,13 @@ import cv2
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError, InvalidConfig, InvalidKeyframe, SourceError
-from tsfusion.datasets import depth_files, file_names, scan_files, stereo_pairs
-from tsfusion.datasets.cameras import (
-    FILES,
-    UnknownCamera,
-    camera_files,
-    find_camera,
-)
+from tsfusion.datasets import file_names, readers, scan_files, stereo_pairs
+from tsfusion.datasets.cameras import FILES, UnknownCamera, camera_files, find_camera
 from tsfusion.datasets.dataset import UNREADABLE
-from tsfusion.datasets.depth_files import read_depth
 from tsfusion.datasets.formats.folder_table import NOT_MEASURED, Replica, SevenScenes
 from tsfusion.datasets.formats.image_folders import COLOR, SUFFIXES, DepthImages, DepthReader, ImagesAt
-from tsfusion.datasets.point_times import PointTimes, point_times
-from tsfusion.datasets.readers import read_image
-from tsfusion.datasets.scan_files import read_scan
+from tsfusion.datasets.readers import read_depth, read_image
+from tsfusion.datasets.scan_files import PointTimes, point_times, read_scan
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.scanner.sources.source import LiveSource, monotonic_of
@@ -60,7 +53,7 @@ class FolderLayout(NamedTuple):
     files: str
     first: ImagesAt
     second: ImagesAt | None = None
-    suffixes: tuple[str, ...] = depth_files.SUFFIXES  # of the first
+    suffixes: tuple[str, ...] = readers.DEPTH_SUFFIXES  # of the first
     of: type[DepthImages] = DepthImages
 
     def is_in(self, root: Path) -> bool:

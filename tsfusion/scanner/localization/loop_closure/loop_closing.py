@@ -18,9 +18,13 @@ from numpy.typing import NDArray
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
 from tsfusion.scanner.localization.localizer import Localizer, Lost, PoseCorrections, TrackedPose
-from tsfusion.scanner.localization.loop_closure import pose_graph, verification
-from tsfusion.scanner.localization.loop_closure.loop_consensus import Loop, LoopConsensus
-from tsfusion.scanner.localization.loop_closure.odometry_drift import OdometryChain, OdometryDrift
+from tsfusion.scanner.localization.loop_closure import loop_consensus, pose_graph
+from tsfusion.scanner.localization.loop_closure.loop_consensus import (
+    Loop,
+    LoopConsensus,
+    OdometryChain,
+    OdometryDrift,
+)
 from tsfusion.scanner.localization.loop_closure.place_index import CAPACITY, PlaceIndex, PlaceView, place_view
 
 MIN_KEYFRAMES, MIN_WAY = 10, 3.0  # keyframes, and metres plus radians of way: younger places are no loops
@@ -154,7 +158,7 @@ class LoopClosing:
             return None
         found = []
         for place in self._places.most_similar(seen, count=MAX_CHECKS):
-            result = verification.check(self._places.views[place], seen)
+            result = loop_consensus.check_loop(self._places.views[place], seen)
             if (
                 result.refused is None
                 and result.T_old_new is not None
@@ -208,7 +212,7 @@ class LoopClosing:
         ]
         found: list[Loop] = []
         for place in list(dict.fromkeys(likely))[:MAX_CHECKS]:
-            result = verification.check(self._places.views[place], seen)
+            result = loop_consensus.check_loop(self._places.views[place], seen)
             self.counts.checks += 1
             if result.refused is None and result.T_old_new is not None:
                 self.counts.verified += 1

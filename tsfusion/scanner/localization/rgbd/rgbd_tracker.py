@@ -12,7 +12,7 @@ from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
 from tsfusion.scanner.localization import features
 from tsfusion.scanner.localization.localizer import Localizer, Lost, TrackedPose
-from tsfusion.scanner.localization.rgbd import point_to_plane, pose_acceptance, pose_solver
+from tsfusion.scanner.localization.rgbd import point_to_plane, pose_solver
 from tsfusion.scanner.localization.rgbd.rgbd_frame import RGBDFrame, TrackingKeyframe
 
 MAX_KEYFRAMES = 40  # tracking keyframes kept, about 0.3 MB each at 640×480
@@ -39,7 +39,7 @@ _NO_CORNERS = (np.empty((0, 3)), np.empty((0, 2), np.float32))
 class _Attempt:
     keyframe: TrackingKeyframe
     T_keyframe_camera: se3.Transform
-    evidence: pose_acceptance.PoseEvidence
+    evidence: pose_solver.PoseEvidence
 
 
 class RGBDLocalizer(Localizer):
@@ -145,7 +145,7 @@ class RGBDLocalizer(Localizer):
         return _Attempt(
             keyframe,
             estimate.T_anchor_camera,
-            pose_acceptance.pose_evidence(current, keyframe, estimate, len(points)),
+            pose_solver.pose_evidence(current, keyframe, estimate, len(points)),
         )
 
     def _older(
