@@ -14,14 +14,8 @@ from numpy.typing import NDArray
 from tsfusion.core.config import VolumeConfig
 from tsfusion.core.errors import AlignmentRefused, JournalError, MapError
 from tsfusion.core.readable_numbers import count_of
-from tsfusion.evaluation.surface_fit import (
-    SampledSurface,
-    SeenDepth,
-    SurfaceFit,
-    SurfaceRegistration,
-    fit,
-    parts_spread,
-)
+from tsfusion.evaluation import surface_fit
+from tsfusion.evaluation.surface_fit import SampledSurface, SeenDepth, SurfaceFit, SurfaceRegistration, fit
 from tsfusion.geometry import se3
 from tsfusion.geometry.keyframe import MAX_POINTS, Keyframe
 from tsfusion.geometry.mesh import Mesh
@@ -287,7 +281,7 @@ class _MapPair:
 
     def spread(self, T: Transform) -> float:
         """Distance between the places where parts of the common surface want the second map, metres."""
-        return parts_spread(*self._sampled(self._voxel), T, _PART_REACH * self._voxel)
+        return surface_fit.parts_spread(*self._sampled(self._voxel), T, _PART_REACH * self._voxel)
 
     def _looks_at(self, for_a: NDArray[np.float64], for_b: NDArray[np.float64]) -> _Looks:
         """How map `a` sees some points, and map `b` others, (n, 3) in the world of each."""
