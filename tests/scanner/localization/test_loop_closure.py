@@ -24,7 +24,7 @@ from tsfusion.scanner.localization.loop_closure.loop_consensus import (
     LoopConsensus,
     OdometryChain,
     OdometryDrift,
-    check,
+    check_loop,
     matches,
 )
 from tsfusion.scanner.localization.loop_closure.place_index import PlaceIndex, PlaceView, place_view
@@ -142,18 +142,18 @@ def test_a_street_driven_back_closes_from_stereo_pairs(data):
 
 def test_a_view_is_itself_and_not_another():
     a, b, c = views()[0], views()[1], seen(two_laps()[30])
-    same = check(a, a)
+    same = check_loop(a, a)
     assert same.refused is None
     np.testing.assert_allclose(same.T_old_new, np.eye(4), atol=1e-4)
     truth = [frame.T_world_camera for frame in two_laps()]
-    near = check(a, b)
+    near = check_loop(a, b)
     error = truth[1] @ se3.inverse(near.T_old_new) @ se3.inverse(truth[0])
     assert near.refused is None
     assert se3.distance(error @ np.eye(4)) < 0.1  # in the world's axes: the lever arm of the position
     relative = se3.inverse(se3.inverse(truth[0]) @ truth[1]) @ near.T_old_new
     assert se3.distance(relative) < 0.02
     assert np.degrees(se3.angle(relative)) < 0.5
-    assert check(a, c).refused is not None
+    assert check_loop(a, c).refused is not None
 
 
 @pytest.mark.parametrize(("side", "word"), [("old", "see through"), ("new", "see through")])
@@ -164,7 +164,7 @@ def test_depth_that_sees_through_a_surface_is_evidence_against(side, word):
     deeper[:30, :40] += 600
     other = replace(a, depth_mm=deeper)
     old, new = (other, a) if side == "old" else (a, other)
-    assert word in check(old, new).refused
+    assert word in check_loop(old, new).refused
 
 
 def test_matches_are_mutual_and_clear():
