@@ -24,10 +24,15 @@ REFUSED_BYTES = 64 << 20
 
 
 class RefusedRecords:
-    """The refused records of a spool, in a folder inside it. A temporary spool keeps none."""
+    """Records that were turned away: told, counted, and if refused kept in a folder of the spool.
+
+    A temporary spool keeps none.
+    """
 
     def __init__(self, outbox: Outbox) -> None:
         self._outbox = outbox
+        self._warning_due = 0.0  # time.monotonic(), when rejected records may be named again
+        self._unsaid = 0  # records that were rejected since they were
         self._kept = Quarantine(outbox.spool.folder / REFUSED_FOLDER, REFUSED_BYTES)
 
     def give_up(self, entry: Waiting, reason: str, message: str, *, readable: bool = True) -> None:
@@ -36,6 +41,22 @@ class RefusedRecords:
         if readable and not self._outbox.spool.temporary:
             self._keep(entry, reason)
         self._outbox.refuse(entry, reason, message)
+
+    def note_rejected(self, nack: messages.Nack, now: float) -> None:
+        """Say at once that the map did not take a record, the first of each reason as an error."""
+        counted = self._outbox.reject(nack.seq, nack.reason, nack.message)
+        if counted is None:  # it was told twice
+            return
+        kind, is_first = counted
+        self._unsaid += not is_first and nack.reason != NO_SAMPLES
+        what = (kind, nack.seq, nack.reason, nack.message)
+        if is_first:
+            log.error("%s %d is not in the map (%s): %s", *what)
+        elif now >= self._warning_due and nack.reason != NO_SAMPLES:
+            more = f", the last of {self._unsaid} more that are not" if self._unsaid > 1 else ""
+            log.warning("%s %d is not in the map (%s): %s%s", *what, more)
+            self._unsaid = 0
+            self._warning_due = now + _WARNING_INTERVAL
 
     def _keep(self, entry: Waiting, reason: str) -> None:
         try:
@@ -95,8 +116,6 @@ class ControlSession:
         self._hello_interval = _HELLO_INTERVAL[0]
         self._asked_again = False
         self._tries = False  # since a hold: one record, until the server says what became of it
-        self._warning_due = 0.0  # when rejected records may be named again
-        self._unsaid = 0  # records that were rejected since they were
         self._is_lost = False  # whether it was said that the server is gone or silent
         self._moved_to: tuple[str, str] | None = None
         self._hops = 0  # to other servers, since one let us in
@@ -359,25 +378,9 @@ class ControlSession:
         self.last_moved = self.last_progress = self.last_heard
         self._tries = False
         if nack.stage == "map":
-            self._on_rejected(nack)
+            self._refused.note_rejected(nack, self.last_heard)
         elif (entry := self._outbox.find_sent(nack.seq)) is not None:
             self._refused.give_up(entry, nack.reason, nack.message)
-
-    def _on_rejected(self, nack: messages.Nack) -> None:
-        """Say at once that the map did not take a record, the first of each reason as an error."""
-        counted = self._outbox.reject(nack.seq, nack.reason, nack.message)
-        if counted is None:  # it was told twice
-            return
-        kind, is_first = counted
-        self._unsaid += not is_first and nack.reason != NO_SAMPLES
-        what = (kind, nack.seq, nack.reason, nack.message)
-        if is_first:
-            log.error("%s %d is not in the map (%s): %s", *what)
-        elif self.last_heard >= self._warning_due and nack.reason != NO_SAMPLES:
-            more = f", the last of {self._unsaid} more that are not" if self._unsaid > 1 else ""
-            log.warning("%s %d is not in the map (%s): %s%s", *what, more)
-            self._unsaid = 0
-            self._warning_due = self.last_heard + _WARNING_INTERVAL
 
     def _on_hold(self, hold: messages.Hold) -> None:
         shortest, longest = _HOLD
