@@ -43,8 +43,12 @@ def saying(health: Health | Callable[[], Health], *, error: str = "") -> Answer:
 
 
 @contextmanager
-def serving(answer: Answer) -> Iterator[tuple[str, list[Command]]]:
-    """The control address of a server that answers so, and what it was asked; None = no answer at all."""
+def serving(answer: Answer, pings: list[Command] | None = None) -> Iterator[tuple[str, list[Command]]]:
+    """The control address of a server that answers so, and what it was asked; None = no answer at all.
+
+    Args:
+        pings: takes the pings, which it answers by itself.
+    """
     context: zmq.Context[Any] = zmq.Context()
     router = sockets.router(context)
     port = router.bind_to_random_port("tcp://127.0.0.1")
@@ -54,9 +58,11 @@ def serving(answer: Answer) -> Iterator[tuple[str, list[Command]]]:
     def serve() -> None:
         while not end.is_set():
             if router.poll(20):
-                identity, frame = router.recv_multipart()
+                identity, frame, *_ = router.recv_multipart()
                 command = messages.decode_to_server(frame)
                 if isinstance(command, Command) and command.name == "ping":
+                    if pings is not None:
+                        pings.append(command)
                     pong = Reply(name="ping", version=messages.PROTOCOL_VERSION)
                     router.send_multipart([identity, messages.encode(pong)])
                     continue

@@ -1,12 +1,18 @@
 # SPDX-License-Identifier: MIT
-"""Questions at the door of a server: whatever they ask, it finds a reason or none, and raises nothing."""
+"""Questions on their way, and at the door of a server: whatever they ask, it finds a reason or none."""
 
 import random
 
+import fake_server
 import msgspec
+import numpy as np
 import odd_questions
 import pytest
 
+from tsfusion.core.errors import AnswerLate
+from tsfusion.wire.asking.map_client import MapClient
+from tsfusion.wire.asking.queries import CommandRefused
+from tsfusion.wire.messages.messages import Command, Reply
 from tsfusion.wire.messages.questions import Question, Slice
 
 
@@ -32,3 +38,24 @@ def test_odd_questions_are_refused_or_passed_on() -> None:
         reasons.add(came.problem(frames)[:20])
     assert "" in reasons
     assert len(reasons) > 10
+
+
+def test_a_server_is_greeted_once_and_again_where_it_does_not_answer() -> None:
+    pings: list[Command] = []
+    told: list[Reply | None] = [Reply(name="ask", error="no")] * 3
+    with (
+        fake_server.serving(lambda one: _numbered(told.pop(0), one), pings) as (control, asked),
+        MapClient("tcp://127.0.0.1:1", control=control, timeout=10.0) as client,
+    ):
+        for _ in range(3):
+            with pytest.raises(CommandRefused):
+                client.sample(np.zeros((1, 3)))
+        assert (len(asked), len(pings)) == (3, 1)
+        told += [None]
+        with pytest.raises(AnswerLate):
+            client.sample(np.zeros((1, 3)), timeout=0.2)
+        assert len(pings) == 2, "it is there, and its map is late"
+
+
+def _numbered(reply: Reply | None, command: Command) -> Reply | None:
+    return None if reply is None else msgspec.structs.replace(reply, number=command.number)
