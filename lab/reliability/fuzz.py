@@ -45,7 +45,7 @@ FOLDERS = {f"folder-{layout}": 0.001 for layout in LAYOUTS}  # of a recording's 
 SHARES |= FOLDERS
 INSTRUMENTED = ["tsfusion.wire", "tsfusion.journal", "tsfusion.tsdf.files.checkpoint",
 
-                "tsfusion.geometry.keyframe", "tsfusion.gateway.intake.quotas"]  # fmt: skip
+                "tsfusion.geometry.keyframe", "tsfusion.gateway.intake.keyframe_intake"]  # fmt: skip
 UNGUIDED = {"control", *FOLDERS}  # decided in C, whose coverage is not seen
 _STATUS = re.compile(r"^#(\d+)\s+(\w+)\s+cov: (\d+) ft: (\d+) corp: (\d+)", re.MULTILINE)
 _FINAL = re.compile(r"^stat::(\w+):\s+(\d+)", re.MULTILINE)

@@ -19,7 +19,7 @@ from lab.reliability import fuzz_mutate
 from tsfusion import Keyframe, journal
 from tsfusion.core.config import ServerConfig, VolumeConfig
 from tsfusion.core.errors import CheckpointError, DecodeError, InvalidKeyframe, JournalError
-from tsfusion.gateway.intake.quotas import Quotas
+from tsfusion.gateway.intake.keyframe_intake import Quotas
 from tsfusion.geometry import se3
 from tsfusion.tsdf.files import checkpoint
 from tsfusion.tsdf.store.growing_array import LAYER_DTYPES

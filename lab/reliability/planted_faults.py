@@ -256,10 +256,10 @@ FAULTS = (
         "gateway/test_journaled_together.py::test_a_disk_that_refuses_holds_every_client_and_loses_nothing",
     ),
     Fault(
-        "gateway/maps/journal_retention.py",
+        "gateway/maps/map_journal.py",
         "            below = self._in_previous\n",
         "            below = self._in_last\n",
-        "gateway/test_journal_retention.py::test_what_two_checkpoints_hold_may_go",
+        "gateway/test_map_journal.py::test_what_two_checkpoints_hold_may_go",
     ),
     Fault(
         "gateway/ports/access_control.py",
@@ -274,7 +274,7 @@ FAULTS = (
         "gateway/test_ports.py::test_a_message_of_frames_without_end_is_not_read_to_its_end",
     ),
     Fault(
-        "gateway/ports/memory_guard.py",
+        "gateway/ports/connection_limits.py",
         "        exceeded = held > self._bound\n",
         "        exceeded = False\n",
         "end_to_end/test_hostile_load.py::test_memory_that_does_not_come_back_is_reported_once",

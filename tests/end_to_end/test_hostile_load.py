@@ -9,7 +9,7 @@ from attacks import ATTACKS_OF
 
 from lab.reliability.hostile_run import Bounds, run, table
 from tsfusion.core import process
-from tsfusion.gateway.ports.memory_guard import MemoryGuard
+from tsfusion.gateway.ports.connection_limits import MemoryGuard
 
 
 def test_memory_that_does_not_come_back_is_reported_once(monkeypatch: pytest.MonkeyPatch) -> None:

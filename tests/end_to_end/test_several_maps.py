@@ -23,7 +23,7 @@ from tsfusion.core.config import ServerConfig, VolumeConfig
 from tsfusion.core.errors import JournalError, ServerUnreachable, TransportError
 from tsfusion.gateway.clients.client_routes import ClientRoutes
 from tsfusion.gateway.health.metrics import Metrics
-from tsfusion.gateway.intake.quotas import Quotas
+from tsfusion.gateway.intake.keyframe_intake import Quotas
 from tsfusion.gateway.maps import map_registry
 from tsfusion.gateway.maps.map_registry import MapRegistry
 from tsfusion.journal import state_folder

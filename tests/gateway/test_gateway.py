@@ -476,7 +476,7 @@ def test_a_gap_in_the_journal_is_said_from_the_start(start: Start, tmp_path: Pat
 def test_a_checkpoint_that_cannot_be_written_is_a_problem_and_tried_again(
     start: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("tsfusion.gateway.maps.journal_retention._SAVE_PAUSE", 0.0)
+    monkeypatch.setattr("tsfusion.gateway.maps.map_journal._SAVE_PAUSE", 0.0)
     gateway = start(f"""{fusing("pass")}
         say(fuser_messages.Saved(False, "No space left on device"))
     if isinstance(message, fuser_messages.Save):

@@ -19,7 +19,7 @@ from tsfusion.core import config
 from tsfusion.core.errors import InvalidConfig, ServerUnreachable, TransportError
 from tsfusion.fuser import fuser_messages
 from tsfusion.gateway.people.fuser_queries import FuserQueries
-from tsfusion.gateway.ports.memory_guard import PendingReplies
+from tsfusion.gateway.ports.connection_limits import PendingReplies
 from tsfusion.gateway.ports.ports import Ports
 from tsfusion.wire.asking import queries
 from tsfusion.wire.asking.queries import fetch_mesh, fetch_status, request

@@ -8,15 +8,13 @@ from typing import Any, cast
 import pytest
 
 from tsfusion.fuser.fuser_messages import Done, Fuse
-from tsfusion.gateway.clients.client_routes import ClientRoutes
-from tsfusion.gateway.clients.recent_fates import RecentFates
+from tsfusion.gateway.clients.client_routes import ClientRoutes, RecentFates
 from tsfusion.gateway.clients.sessions import Session, Sessions
 from tsfusion.gateway.fusers.fuser_supervisor import FuserSupervisor
 from tsfusion.gateway.health.metrics import Metrics
 from tsfusion.gateway.maps.keyframe_outcomes import DelayStatistics, KeyframeOutcomes
 from tsfusion.gateway.maps.map_records import MapRecords
-from tsfusion.gateway.records.fuser_backlog import FuserBacklog
-from tsfusion.gateway.records.fuser_time import FuserTime
+from tsfusion.gateway.records.fuser_backlog import FuserBacklog, FuserTime
 from tsfusion.gateway.records.keyframe_index import KeyframeIndex
 from tsfusion.geometry.sample_ranges import NO_SAMPLES
 from tsfusion.journal import Position, RecordEntry
@@ -219,7 +217,7 @@ def test_a_fuser_that_ended_owes_no_answers() -> None:
 
 
 def test_accounts_of_clients_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tsfusion.gateway.records.fuser_time._MAX_CLIENTS", 8)
+    monkeypatch.setattr("tsfusion.gateway.records.fuser_backlog._MAX_CLIENTS", 8)
     time = FuserTime()
     for index in range(100):
         time.charge(f"client {index}", index)

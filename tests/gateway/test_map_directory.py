@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tsfusion.core.errors import JournalError
-from tsfusion.gateway.maps.map_directory import MapDirectory
+from tsfusion.gateway.maps.moved_maps import MapDirectory
 
 ONE, TWO = ("tcp://one:5555", "tcp://one:5556"), ("tcp://two:5555", "tcp://two:5556")
 

@@ -26,7 +26,7 @@ from tsfusion.gateway.maps.hosted_map import HostedMap
 from tsfusion.gateway.maps.map_records import IncomingRecord
 from tsfusion.gateway.maps.map_registry import MapRegistry
 from tsfusion.journal import Journal, quarantine, state_folder
-from tsfusion.wire.keys.allow_list import AllowedMaps
+from tsfusion.wire.keys.key_folder import AllowedMaps
 from tsfusion.wire.messages import messages
 from tsfusion.wire.messages.messages import Command, Denied, Nack, Welcome
 from tsfusion.wire.records.record_header import unpack

@@ -15,9 +15,8 @@ from keyframes_and_servers import Server, pose, until, wall
 
 from tsfusion import Client
 from tsfusion.core import process
-from tsfusion.gateway.clients import recent_fates
-from tsfusion.gateway.clients.client_routes import ClientRoute
-from tsfusion.gateway.clients.recent_fates import RecentFates
+from tsfusion.gateway.clients import client_routes
+from tsfusion.gateway.clients.client_routes import ClientRoute, RecentFates
 from tsfusion.gateway.fusers import fuser_supervisor
 from tsfusion.gateway.fusers.fuser_supervisor import FuserSilence
 from tsfusion.gateway.health.problems import Problem, ProblemTimes, span
@@ -38,7 +37,7 @@ class Clock:
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     """The clock of what measures here."""
     made = Clock()
-    for module in (recent_fates, fuser_supervisor):
+    for module in (client_routes, fuser_supervisor):
         monkeypatch.setattr(module.time, "monotonic", made)
     return made
 

@@ -13,7 +13,7 @@ from tsfusion.gateway.health.metrics import Metrics
 from tsfusion.gateway.maps.keyframe_outcomes import QuestionCounts
 from tsfusion.gateway.people import map_questions
 from tsfusion.gateway.people.map_questions import MOST_OF_A_CLIENT, MOST_UNREAD, MOST_WAITING, MapQuestions
-from tsfusion.gateway.ports.memory_guard import PendingReplies
+from tsfusion.gateway.ports.connection_limits import PendingReplies
 from tsfusion.wire.messages import messages
 from tsfusion.wire.messages.messages import Command
 from tsfusion.wire.messages.questions import Answer, Field, MapVersion, Raycast

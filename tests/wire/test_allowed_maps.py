@@ -3,7 +3,7 @@
 
 import pytest
 
-from tsfusion.wire.keys.allow_list import ALL_MAPS, AllowedMaps
+from tsfusion.wire.keys.key_folder import ALL_MAPS, AllowedMaps
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from repository import GOLDEN
 
 from tsfusion.core.config import ServerConfig
 from tsfusion.core.errors import InvalidKeyframe
-from tsfusion.gateway.intake.quotas import Quotas
+from tsfusion.gateway.intake.keyframe_intake import Quotas
 from tsfusion.geometry import se3
 from tsfusion.wire.records import codec, corrections
 from tsfusion.wire.records.corrections import Correction, checked

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tsfusion.wire.records import array_encoding, image_headers
+from tsfusion.wire.records import array_encoding
 from tsfusion.wire.records.record_header import Refused
 
 SHAPE = (48, 64)
@@ -62,7 +62,7 @@ def two_sizes(marker: bytes) -> bytes:
     ids=str,
 )
 def test_what_cameras_write_is_taken(image: bytes) -> None:
-    assert image_headers.size(image) == image_headers.size(memoryview(image)) == SHAPE
+    assert array_encoding.image_size(image) == array_encoding.image_size(memoryview(image)) == SHAPE
 
 
 def header_again() -> bytes:
@@ -99,7 +99,7 @@ def header_again() -> bytes:
 )
 def test_what_would_cost_more_than_it_announces_is_refused(image: Callable[[], bytes], problem: str) -> None:
     with pytest.raises(Refused, match=problem) as refused:
-        image_headers.size(image())
+        array_encoding.image_size(image())
     assert refused.value.reason == "payload"
 
 
@@ -127,7 +127,7 @@ def with_pixels(*parts: bytes) -> bytes:
     ids=str,
 )
 def test_an_image_that_unfolds_to_its_pixels_is_decoded(image: bytes) -> None:
-    image_headers.check_unfolding(image)
+    array_encoding.check_unfolding(image)
     assert cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_UNCHANGED) is not None
 
 
@@ -150,7 +150,7 @@ def test_no_more_is_unfolded_than_shows_that_it_is_too_much(monkeypatch: pytest.
     real = zlib.decompressobj
     monkeypatch.setattr(zlib, "decompressobj", Inflater)
     with pytest.raises(Refused, match="more bytes"):
-        image_headers.check_unfolding(with_pixels(zlib.compress(ROWS + bytes(4_000_000))))
+        array_encoding.check_unfolding(with_pixels(zlib.compress(ROWS + bytes(4_000_000))))
     assert unfolded <= len(ROWS) + 1
 
 

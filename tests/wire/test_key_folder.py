@@ -19,8 +19,8 @@ from command_processes import Here, tsfusion
 from failures import refuse
 
 from tsfusion.core.errors import InvalidConfig, OutputError
-from tsfusion.wire.keys import allow_list, key_folder
-from tsfusion.wire.keys.allow_list import AllowList
+from tsfusion.wire.keys import key_folder
+from tsfusion.wire.keys.key_folder import AllowList
 from tsfusion.wire.sockets import curve
 from tsfusion.wire.sockets.curve import client_keys
 
@@ -395,7 +395,7 @@ def test_the_list_is_read_again_only_when_it_changes(server: Path, monkeypatch: 
         reads.append(folder)
         return real(folder)
 
-    monkeypatch.setattr(allow_list, "read_allow_list", counted)
+    monkeypatch.setattr(key_folder, "read_allow_list", counted)
     assert not allowed.refresh()
     assert not reads
     key_folder.allow(server, "robot1", one)

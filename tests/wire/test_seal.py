@@ -12,8 +12,7 @@ from tsfusion.core.errors import DecodeError
 from tsfusion.wire.messages import messages
 from tsfusion.wire.messages.keyframe_times import Stamps
 from tsfusion.wire.records import codec, corrections
-from tsfusion.wire.records.record_header import stamp, unpack
-from tsfusion.wire.records.seal import is_damaged, seal
+from tsfusion.wire.records.record_header import is_damaged, seal, stamp, unpack
 
 SESSION = bytes(range(16))
 

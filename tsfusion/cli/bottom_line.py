@@ -12,8 +12,7 @@ from rich.text import Text
 from tsfusion.cli.progress_rows import styled
 from tsfusion.core.rates import Rates
 from tsfusion.core.readable_numbers import count_of
-from tsfusion.wire.messages.health import Health
-from tsfusion.wire.messages.health_headline import headline
+from tsfusion.wire.messages.health import Health, headline
 
 _LEAST_ROWS = 6  # of a terminal that has a line to spare
 _SAVE, _RESTORE = "\x1b7", "\x1b8"  # the cursor's place

@@ -14,8 +14,14 @@ from tsfusion.cli.output import size
 from tsfusion.cli.progress_rows import styled
 from tsfusion.core.logs import printable
 from tsfusion.core.readable_numbers import span
-from tsfusion.wire.messages.health import ClientHealth, Health, MapHealth
-from tsfusion.wire.messages.health_headline import headline, lost_of_client, lost_of_map
+from tsfusion.wire.messages.health import (
+    ClientHealth,
+    Health,
+    MapHealth,
+    headline,
+    lost_of_client,
+    lost_of_map,
+)
 from tsfusion.wire.messages.keyframe_times import Spread
 
 MAX_CLIENTS = 40  # rows: the clients with the newest messages

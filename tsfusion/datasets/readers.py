@@ -19,7 +19,7 @@ from tsfusion.geometry.calibration import MAX_NO_SKEW
 from tsfusion.geometry.calibration_files import read_text
 from tsfusion.geometry.keyframe import MAX_IMAGE_SIDE, Intrinsics, check_intrinsics
 from tsfusion.geometry.sample_ranges import FARTHEST_M, NEAREST_M
-from tsfusion.wire.records import image_headers
+from tsfusion.wire.records import array_encoding
 from tsfusion.wire.records.record_header import Refused
 
 _PNG = b"\x89PNG\r\n\x1a\n"
@@ -110,7 +110,7 @@ def _whole(file: BinaryIO) -> bytes | None:
     file.seek(0)
     content = file.read() if nbytes <= read_limits.MAX_FILE_BYTES else b""
     with suppress(Refused):  # neither a JPEG, nor one that can be read in one way alone
-        if max(image_headers.size(content)) > MAX_IMAGE_SIDE:
+        if max(array_encoding.image_size(content)) > MAX_IMAGE_SIDE:
             return None
     return content
 

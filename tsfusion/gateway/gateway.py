@@ -32,10 +32,9 @@ from tsfusion.gateway.people.fuser_queries import FuserQueries
 from tsfusion.gateway.people.map_questions import MapQuestions
 from tsfusion.gateway.people.scan_updates import ScanUpdates
 from tsfusion.gateway.ports.access_control import AccessControl
-from tsfusion.gateway.ports.connection_limits import ConnectionLimits
-from tsfusion.gateway.ports.memory_guard import PendingReplies
+from tsfusion.gateway.ports.connection_limits import ConnectionLimits, PendingReplies
 from tsfusion.gateway.ports.ports import Flood, Ports, Subscriptions, receive_some
-from tsfusion.wire.keys.allow_list import ALL_MAPS, AllowedMaps
+from tsfusion.wire.keys.key_folder import ALL_MAPS, AllowedMaps
 from tsfusion.wire.messages import messages, questions
 from tsfusion.wire.messages.forget_messages import Forgotten
 from tsfusion.wire.messages.health import Health

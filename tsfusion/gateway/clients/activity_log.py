@@ -8,8 +8,7 @@ from collections.abc import Callable
 from tsfusion.core import logs
 from tsfusion.core.readable_numbers import count_of
 from tsfusion.gateway.clients.client_routes import ABANDONED_AFTER
-from tsfusion.wire.messages.health import ClientHealth, Health, MapHealth
-from tsfusion.wire.messages.health_headline import headline
+from tsfusion.wire.messages.health import ClientHealth, Health, MapHealth, headline
 from tsfusion.wire.messages.messages import SKIP_REASONS
 
 log = logging.getLogger(__name__)

@@ -18,10 +18,10 @@ from tsfusion.gateway.clients.client_routes import ClientRoutes
 from tsfusion.gateway.fusers.fuser_supervisor import FuserSupervisor
 from tsfusion.gateway.fusers.spare_fusers import SpareFusers
 from tsfusion.gateway.health.metrics import Metrics
-from tsfusion.gateway.maps import map_opening
+from tsfusion.gateway.maps import map_journal
 from tsfusion.gateway.maps.forgetting import Forgetting
-from tsfusion.gateway.maps.journal_retention import CheckpointOrders
 from tsfusion.gateway.maps.keyframe_outcomes import KeyframeOutcomes, QuestionCounts
+from tsfusion.gateway.maps.map_journal import CheckpointOrders
 from tsfusion.gateway.maps.map_records import IncomingRecord, MapRecords
 from tsfusion.gateway.records.fuser_backlog import FuserBacklog
 from tsfusion.journal import ReadingWatcher
@@ -267,7 +267,7 @@ class HostedMap:
     def _on_ready(self, ready: fuser_messages.Ready) -> None:
         records = self.records
         if not self.warm:
-            map_opening.compare(self.name, records.journal, records.sessions, ready)
+            map_journal.warn_of_shorter_journal(self.name, records.journal, records.sessions, ready)
         for key, progress in ready.done.items():
             session = records.sessions.open(key, progress.client, progress.world)
             session.durable = max(session.durable, progress.seq)
@@ -280,6 +280,6 @@ class HostedMap:
         self.forgetting.on_ready()
         if not self.warm:
             self.warm, self.backlog.last_progress = True, time.monotonic()
-            found = map_opening.contents(ready, self.backlog.keyframes)
+            found = map_journal.describe_contents(ready, self.backlog.keyframes)
             log.info("%s", found, extra=logs.about(map=self.name))
-        records.loss = map_opening.loss(self.name, records.journal, ready)
+        records.loss = map_journal.find_loss(self.name, records.journal, ready)

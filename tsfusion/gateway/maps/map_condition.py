@@ -14,7 +14,7 @@ from tsfusion.gateway.maps.hosted_map import HostedMap
 from tsfusion.gateway.maps.map_registry import MapRegistry
 from tsfusion.gateway.ports.access_control import AccessControl
 from tsfusion.gateway.ports.ports import Ports
-from tsfusion.wire.keys.allow_list import ALL_MAPS, AllowedMaps
+from tsfusion.wire.keys.key_folder import ALL_MAPS, AllowedMaps
 from tsfusion.wire.messages.health import Health, MapHealth, MapState
 
 _FOR_GONE = "what no checkpoint holds of them is lost, unless they are put back"

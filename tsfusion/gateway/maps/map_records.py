@@ -12,8 +12,8 @@ from tsfusion.core.errors import MISSING, JournalError
 from tsfusion.gateway.clients.client_routes import ClientRoute
 from tsfusion.gateway.clients.sessions import Sessions
 from tsfusion.gateway.health.problems import Problem
-from tsfusion.gateway.maps import map_opening, moved_maps
-from tsfusion.gateway.maps.journal_retention import JournalRetention
+from tsfusion.gateway.maps import map_journal, moved_maps
+from tsfusion.gateway.maps.map_journal import JournalRetention
 from tsfusion.gateway.records.keyframe_index import KeyframeIndex
 from tsfusion.journal import Journal, Position, ReadingWatcher, Unwritten, state_folder
 from tsfusion.journal.quarantine import Quarantine
@@ -66,8 +66,8 @@ class MapRecords:
     def __init__(self, name: str, server: ServerConfig, watch: ReadingWatcher) -> None:
         self.folder = folder = state_folder.map_folder(server.state, name)
         self.is_new = not state_folder.holds_a_map(folder)
-        self.journal = map_opening.open_journal(folder, server, watch)
-        map_opening.warn_of_old_corrections(folder)
+        self.journal = map_journal.open_journal(folder, server, watch)
+        map_journal.warn_of_old_corrections(folder)
         self.disk = DiskPause(self.journal, name)
         self.quarantine = Quarantine(folder / state_folder.QUARANTINE_FOLDER, server.quarantine_bytes)
         self.sessions, self.index = Sessions(), KeyframeIndex()

@@ -22,10 +22,10 @@ from tsfusion.gateway.fusers.spare_fusers import SpareFusers
 from tsfusion.gateway.health.metrics import Metrics
 from tsfusion.gateway.maps import moved_maps
 from tsfusion.gateway.maps.hosted_map import ForPeople, HostedMap
-from tsfusion.gateway.maps.map_directory import AddressPair, MapDirectory
+from tsfusion.gateway.maps.moved_maps import AddressPair, MapDirectory
 from tsfusion.journal import state_folder
 from tsfusion.journal.record_scan import journal_error
-from tsfusion.wire.keys.allow_list import ALL_MAPS, AllowedMaps
+from tsfusion.wire.keys.key_folder import ALL_MAPS, AllowedMaps
 from tsfusion.wire.messages.messages import Denied, Hello
 from tsfusion.wire.records.record_header import RecordHeader
 

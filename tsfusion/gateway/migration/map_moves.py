@@ -19,7 +19,7 @@ from tsfusion.gateway.migration import map_arrivals
 from tsfusion.gateway.migration.map_arrivals import MapArrival, MoveRequest
 from tsfusion.gateway.migration.map_departures import MapDepartures
 from tsfusion.gateway.ports.access_control import AccessControl
-from tsfusion.gateway.ports.memory_guard import PendingReplies
+from tsfusion.gateway.ports.connection_limits import PendingReplies
 from tsfusion.gateway.ports.ports import Ports
 from tsfusion.wire.messages import messages
 from tsfusion.wire.messages.messages import Command, Reply

@@ -16,7 +16,7 @@ from tsfusion.core import process
 from tsfusion.core.config import ServerConfig
 from tsfusion.fuser import fuser_messages
 from tsfusion.gateway.maps.hosted_map import HostedMap
-from tsfusion.gateway.ports.memory_guard import PendingReplies
+from tsfusion.gateway.ports.connection_limits import PendingReplies
 from tsfusion.gateway.ports.ports import Ports
 from tsfusion.wire.messages import health, messages
 from tsfusion.wire.messages.health import Health, MapCounts, Status

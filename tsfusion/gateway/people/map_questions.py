@@ -19,7 +19,7 @@ from tsfusion.fuser import fuser_messages
 from tsfusion.gateway.health.metrics import Metrics
 from tsfusion.gateway.maps.hosted_map import HostedMap
 from tsfusion.gateway.maps.keyframe_outcomes import QuestionCounts
-from tsfusion.gateway.ports.memory_guard import PendingReplies
+from tsfusion.gateway.ports.connection_limits import PendingReplies
 from tsfusion.gateway.ports.ports import Ports
 from tsfusion.wire.messages import messages, questions
 

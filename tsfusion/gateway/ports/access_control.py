@@ -12,7 +12,7 @@ import zmq
 from zmq.utils import z85
 
 from tsfusion.core.errors import InvalidConfig
-from tsfusion.wire.keys.allow_list import ALL_MAPS, AllowedMaps, AllowList
+from tsfusion.wire.keys.key_folder import ALL_MAPS, AllowedMaps, AllowList
 from tsfusion.wire.sockets.curve import DOMAIN, ServerKeys, server_keys
 
 log = logging.getLogger(__name__)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tsfusion.geometry.color_scales import of_number
 from tsfusion.geometry.trajectory import quaternion
 from tsfusion.wire.asking.map_events import PathsFound, ScannerSeen
-from tsfusion.wire.records import image_headers
+from tsfusion.wire.records import array_encoding
 from tsfusion.wire.records.record_header import Refused
 
 if TYPE_CHECKING:
@@ -240,7 +240,7 @@ def _is_frustum(node: Any) -> bool:
 def small_picture(jpeg: bytes) -> NDArray[np.uint8] | None:
     """(h, w, 3) RGB of a JPEG, at most 320 pixels wide; None = it cannot be read."""
     try:
-        height, width = image_headers.size(jpeg)
+        height, width = array_encoding.image_size(jpeg)
     except Refused:
         return None
     if height * width > _MOST_PIXELS:

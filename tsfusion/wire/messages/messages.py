@@ -17,8 +17,7 @@ from tsfusion.wire.messages.health import Health, MeshLayout, Status
 from tsfusion.wire.messages.keyframe_times import Seq, Stamps
 from tsfusion.wire.messages.migration_messages import Address, HandOver, Moved, Parcel
 from tsfusion.wire.messages.questions import Answer, Question
-from tsfusion.wire.records.record_header import SessionId, WorldName
-from tsfusion.wire.records.seal import is_damaged, seal
+from tsfusion.wire.records.record_header import SessionId, WorldName, is_damaged, seal
 
 PROTOCOL_VERSION = 3  # of these messages and of which kinds of records a server takes
 # Why a client never sends a keyframe: the reasons in `Ping.skipped`, in words

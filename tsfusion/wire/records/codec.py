@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from tsfusion.core.config import DEFAULT_MAP
 from tsfusion.core.errors import InvalidKeyframe
 from tsfusion.geometry.keyframe import MAX_IMAGE_SIDE, MAX_POINTS, Keyframe, check_intrinsics, check_pose
-from tsfusion.wire.records import array_encoding, corrections, image_headers
+from tsfusion.wire.records import array_encoding, corrections
 from tsfusion.wire.records.corrections import Correction
 from tsfusion.wire.records.record_header import (
     ArrayCodec,
@@ -214,7 +214,7 @@ def _check_unfolded_sizes(header: KeyframeHeader, frames: Sequence[Any]) -> None
     for buffer, frame in zip(header.buffers, frames[1:], strict=True):
         if buffer.codec in _ZSTD:
             array_encoding.check_zstd(frame, _decoded_bytes(buffer))
-        elif image_headers.size(frame) != buffer.shape[:2]:
+        elif array_encoding.image_size(frame) != buffer.shape[:2]:
             raise Refused("limits", f"the image of {buffer.name} is not {buffer.shape} as announced")
 
 
