@@ -128,11 +128,7 @@ class Thinning:
         self._left_out = self._in_a_row = 0
 
     def reason(self, room: int) -> str:
-        """Reason why the next keyframe is left out: `thinned` or `room`; empty = it is kept.
-
-        Args:
-            room: bytes that the spool may still take.
-        """
+        """Reason why the next keyframe is left out: `thinned` or `room`; empty = it is kept."""
         self._arrivals.append(self._outbox.clock())
         lag, full = self._outbox.lag, self._fullness(room)
         shortage = max(lag.seconds / self._catch_up, full)  # 1 = act, 0.5 = enough
@@ -204,12 +200,7 @@ _MAX_WAITING = 1_000_000  # records: some 200 bytes of memory each
 
 
 class SpoolLimits:
-    """The limits of a spool; `outbox.state` says whether it is at one. For one thread at a time.
-
-    Args:
-        spool_bytes: of the disk the spool may take.
-        min_free_bytes: stay free on it.
-    """
+    """The limits of a spool; `outbox.state` says whether it is at one. For one thread at a time."""
 
     def __init__(self, outbox: Outbox, spool_bytes: int, min_free_bytes: int) -> None:
         self._outbox = outbox

@@ -88,7 +88,6 @@ class ControlSession:
 
     Args:
         send: sends a message, or drops it when it cannot leave at once: it is sent again when due.
-        address: of the control socket, for messages to people.
     """
 
     def __init__(

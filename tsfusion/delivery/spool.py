@@ -139,7 +139,6 @@ class Spool:
 
     Args:
         folder: None = a temporary folder, deleted at `close` with all that is in it.
-        map_name: the map that records are for.
         world: name of the coordinate frame of their poses, empty = given from elsewhere; None = that of the
             records that wait. One that waits and names none takes this one.
         same_frame: that frame is declared to be the map's; what waits may have declared it before.

@@ -32,12 +32,7 @@ _INSIDE = 0.9  # share of a keyframe's points: noise, or a look out of a window,
 
 
 class KeyframeSearch:
-    """A search for selected keyframes in the journal. Call `go_on` when `wait` is over, until it gives them.
-
-    Args:
-        folder: the map's.
-        done: how far the map is with each session.
-    """
+    """A search for selected keyframes in the journal. Call `go_on` when `wait` is over, until it gives them."""
 
     def __init__(
         self, find: Find, folder: Path, poses: KeyframePoses, done: dict[bytes, SessionProgress]
@@ -168,7 +163,6 @@ class KeepWindow:
         seconds: between a keyframe's coming to the server and the newest one's; None = no bound.
         keyframes: how many, of all sessions together; None = no bound.
         radius: metres from sensor to sensor; None = no bound.
-        send: takes the message.
     """
 
     def __init__(
@@ -271,12 +265,7 @@ class KeepWindow:
 
 
 class Departures:
-    """The searches of one map. Call `look` when `wait` is over: the gateway journals what is found.
-
-    Args:
-        done: how far the map is with each session.
-        send: takes a message.
-    """
+    """The searches of one map. Call `look` when `wait` is over: the gateway journals what is found."""
 
     def __init__(
         self,

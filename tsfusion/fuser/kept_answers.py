@@ -89,11 +89,7 @@ class _ViewOptions(TypedDict):
 
 
 class KeptViews:
-    """Views of one map, each of one state of it.
-
-    Args:
-        state: of the map, now.
-    """
+    """Views of one map, each of one state of it."""
 
     def __init__(self, volume: "Volume", state: Callable[[], MapVersion]) -> None:
         self._volume, self._state = volume, state

@@ -59,12 +59,7 @@ class LiveMesh:
     """The mesh of a map for its viewers.
 
     Args:
-        interval: seconds between two meshes, at least.
         sparing: limits the memory while a mesh is made, so that the next keyframe finds some.
-        send: takes a message and its frames.
-        touched_by: whose keyframes the map has.
-        epoch: of this process.
-        on_taken: told of the changed blocks that were taken.
     """
 
     def __init__(

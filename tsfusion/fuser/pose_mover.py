@@ -34,9 +34,6 @@ class PoseMover:
 
     Args:
         integrate: adds a keyframe of a session to the map, within the bounds of its client.
-        is_away: whether the journal's folder is not to be found.
-        say: takes each message of progress.
-        begin: told whose keyframe is moved next.
         moves: False = none is moved; those that wait for it count as unavailable.
         expects: how many more will wait in a moment; counted, that nobody takes the map for settled.
         rest_factor: after a move, so many times as long as it took none is made while keyframes come.

@@ -79,10 +79,7 @@ class QuestionAnswers:
     """Answers the questions of an inbox.
 
     Args:
-        watched: answers those of who follows the map.
-        state: of the map, now.
         at_work: says whether a keyframe is under way, and hears that a question is no part of it.
-        send: takes a message and its frames.
     """
 
     def __init__(

@@ -56,7 +56,6 @@ def moment_ns(text: str, last_ns: int) -> int:
     Args:
         text: seconds before the last record, such as `90`, or an ISO time such as `2026-05-01 14:30` (this
             machine's zone) or `2026-05-01T12:30:00Z`.
-        last_ns: of the last record.
 
     Raises:
         InvalidConfig: for anything else.

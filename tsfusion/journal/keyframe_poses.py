@@ -217,11 +217,7 @@ class KeyframePoses:
         poses.fused.extend(keyframe.T_world_camera[:3].ravel())
 
     def fused_after(self, session: bytes, seq: int, most: int) -> "FusedKeyframes":
-        """Poses at which keyframes are fused, in the order of sessions and numbers: those behind this one.
-
-        Args:
-            most: how many are looked at.
-        """
+        """Poses at which keyframes are fused, in the order of sessions and numbers: those behind this one."""
         sessions = sorted(key for key in self._sessions if key >= session)
         chosen: list[bytes] = []
         numbers, poses, rows = [np.zeros(0, np.int64)], [np.zeros((0, _POSE))], [np.zeros(0, np.int32)]

@@ -188,9 +188,6 @@ class Erased(Damage, frozen=True):
 def scan_records(path: Path, on_read: Callable[[], None] = lambda: None) -> Iterator[Record | Damage]:
     """The records and damaged places of a segment file in their order; one record at a time is read.
 
-    Args:
-        on_read: called before each read.
-
     Raises:
         JournalError: when the file cannot be opened or read.
     """

@@ -191,7 +191,6 @@ def list_records(
 
     Args:
         watch: called at each read with the byte that the list has come to, and its records so far.
-        damaged: called with each damaged place.
 
     Raises:
         JournalError: when the file cannot be opened or read.

@@ -17,11 +17,7 @@ _INTERVAL = 60.0  # seconds between two summaries
 
 
 class ActivityLog:
-    """Compares health snapshots, and logs what changed. A server at which nothing happens logs nothing.
-
-    Args:
-        clock: seconds, monotonic.
-    """
+    """Compares health snapshots, and logs what changed. A server at which nothing happens logs nothing."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock

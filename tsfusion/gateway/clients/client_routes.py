@@ -137,12 +137,7 @@ class ClientRoute(Struct, eq=False):
         return Problem(text, self.map, f"client {who}, session {self.session.hex()[:8]}") if text else None
 
     def health(self, now: float, session: Session | None) -> ClientHealth:
-        """Health of the client.
-
-        Args:
-            now: `time.monotonic()`.
-            session: None = nothing of it is in the journal.
-        """
+        """Health of the client."""
         own = session or Session(self.session, -1)
         return ClientHealth(
             client=self.client,
@@ -181,11 +176,7 @@ class ClientRoutes:
     def connect(
         self, session: bytes, map_name: str, identity: bytes, client: str = "", *, scans: bool = False
     ) -> ClientRoute:
-        """Send messages for a session to this connection from now on.
-
-        Args:
-            scans: whether a keyframe of the session is in the journal.
-        """
+        """Send messages for a session to this connection from now on."""
         route = self._by_session.get(session)
         if route is None or route.client != client or route.map != map_name:
             self._drop(route)
@@ -288,11 +279,7 @@ class Admission:
         return self._access.maps_of(client)
 
     def denial_of_map(self, client: str, map_name: str, *, sends: bool = False) -> str:
-        """Reason why a client may not use a map, which is counted; empty = it may.
-
-        Args:
-            sends: whether it is to send keyframes into it.
-        """
+        """Reason why a client may not use a map, which is counted; empty = it may."""
         maps = self._access.maps_of(client)
         if map_name in maps and not (sends and client == GUEST):
             return ""

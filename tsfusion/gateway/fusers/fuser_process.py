@@ -29,7 +29,6 @@ class FuserProcess:
 
     Args:
         name: of the map, for the log lines; empty = that of a `Begin` that comes later.
-        waits: for `start`.
 
     Attributes:
         has_started: whether it has said so, and takes messages.

@@ -44,9 +44,6 @@ class FuserSilence:
 
     A process that is stopped (SIGSTOP, a debugger) or that waits for a disk does nothing, so that no keyframe
     is to blame. Nor is one while the gateway stands still, too: the machine or the container was suspended.
-
-    Args:
-        pid: of the process.
     """
 
     def __init__(self, pid: int) -> None:
@@ -86,8 +83,6 @@ class FuserSupervisor:
 
     Args:
         ahead: another folder, in which the map is read until `begin_work` says that it lies in its own.
-        spares: processes that have all but the map.
-        waits: for `begin`.
 
     Attributes:
         is_prepared: whether the map was read ahead.

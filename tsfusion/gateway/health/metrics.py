@@ -34,7 +34,6 @@ class Metrics(Collector):
 
     Args:
         server: None = without the limits of the disk and what is free on it.
-        clock: seconds, monotonic.
     """
 
     def __init__(

@@ -46,11 +46,7 @@ class Problem(Struct, frozen=True):
 
 
 class ProblemTimes:
-    """Since when each problem is there; a line in the log when one begins, and when it ends.
-
-    Args:
-        clock: seconds, monotonic.
-    """
+    """Since when each problem is there; a line in the log when one begins, and when it ends."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock

@@ -46,11 +46,7 @@ _ANY_MAP = VolumeConfig()
 
 
 class Allowance:
-    """The keyframes and bytes that may come in a second.
-
-    Args:
-        part: the divisor of both rates.
-    """
+    """The keyframes and bytes that may come in a second."""
 
     def __init__(self, server: ServerConfig, now: float, part: int = 1) -> None:
         self._keyframes = Bucket(server.quota_keyframes / part, now)
@@ -80,7 +76,6 @@ class Quotas:
 
         Args:
             owner: the client's name. Without keys all clients are one: new sessions cost nothing.
-            now: `time.monotonic()`.
             connection: over which the message came; None = that is not known.
         """
         allowance = self._clients.get(owner)

@@ -42,11 +42,7 @@ _Stage = Literal["ask", "find", "settle", "save", "erase"]
 
 
 class ForgetRequest:
-    """One request, and how far it is.
-
-    Args:
-        on_answer: takes what was forgotten, or why nothing was.
-    """
+    """One request, and how far it is."""
 
     def __init__(
         self, selection: Selection, on_answer: OnAnswer, *, erase: bool = False, dry_run: bool = False

@@ -41,7 +41,6 @@ class HostedMap:
     Args:
         watch: told how far the journal is read: that may take minutes, in which nothing else is done.
         fuser: that read the map ahead; None = one begins now.
-        spares: processes that it may take.
         waits: for `fuser.begin`, until when nothing is fused.
 
     Attributes:
@@ -132,11 +131,7 @@ class HostedMap:
         return self.drained and (last is None or last < since)
 
     def close(self, *, wait: bool = True) -> None:
-        """End the fuser and finish the journal. A journal that cannot be finished is logged.
-
-        Args:
-            wait: until the fuser has ended, for some seconds.
-        """
+        """End the fuser and finish the journal. A journal that cannot be finished is logged."""
         self.fuser.close(wait=wait)
         try:
             self.records.journal.close()
@@ -200,9 +195,6 @@ class HostedMap:
 
         In this order: whether it has ended is asked before its last messages are read, and what it answered
         is out of the way before the next one begins, or work is handed out.
-
-        Args:
-            pass_on: takes the messages for viewers and for those who asked, with their frames.
 
         Raises:
             TsfusionError: when the map cannot be opened.

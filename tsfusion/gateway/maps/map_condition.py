@@ -115,11 +115,7 @@ def all_blocked(maps: dict[str, MapHealth]) -> bool:
 
 
 class ServerCondition:
-    """The condition of a server, of which the log and the metrics hear about once a second.
-
-    Args:
-        on_health: told of it as often.
-    """
+    """The condition of a server, of which the log and the metrics hear about once a second."""
 
     def __init__(
         self,

@@ -91,11 +91,7 @@ _SAVE_INTERVAL = 10.0  # seconds between checkpoints that are made only for the 
 
 
 class JournalRetention:
-    """Keep a journal to its limit. It holds more only while two checkpoints do not have its keyframes.
-
-    Args:
-        max_bytes: None = no limit.
-    """
+    """Keep a journal to its limit. It holds more only while two checkpoints do not have its keyframes."""
 
     def __init__(
         self, journal: Journal, index: KeyframeIndex, sessions: Sessions, max_bytes: int | None

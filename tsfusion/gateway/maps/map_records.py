@@ -52,9 +52,6 @@ class IncomingRecord(NamedTuple):
 class MapRecords:
     """The records of one map, those in the journal and those kept aside.
 
-    Args:
-        watch: told how far the journal is read: that may take minutes, in which nothing else is done.
-
     Attributes:
         is_new: whether there was nothing of the map.
         has_arrived: whether the server from which it came has said what it has.

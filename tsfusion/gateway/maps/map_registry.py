@@ -105,11 +105,7 @@ class MapRegistry:
             self._open_map(name, waits=name in later)
 
     def end_start(self, place: AddressPair) -> None:
-        """Go on when a map cannot be opened, from here on; before, that is an error of the server.
-
-        Args:
-            place: where clients reach this server.
-        """
+        """Go on when a map cannot be opened, from here on; before, that is an error of the server."""
         self._started, self.place = True, place
         for hosted in self:
             if not hosted.is_empty:
@@ -205,9 +201,6 @@ class MapRegistry:
 
     def take_in(self, name: str, fuser: FuserSupervisor | None = None) -> None:
         """Open a map that has come from another server.
-
-        Args:
-            fuser: that has read it ahead.
 
         Raises:
             TsfusionError: when it cannot be opened; its files are here then, and the next start tries again.
@@ -362,9 +355,6 @@ class MapRegistry:
 
     def step(self, pass_on: Callable[[HostedMap, ForPeople, Sequence[zmq.Frame]], None]) -> None:
         """Step every map.
-
-        Args:
-            pass_on: takes the fusers' messages for viewers and for those who asked.
 
         Raises:
             TsfusionError: when a map that was to be opened at the start cannot be.

@@ -115,11 +115,7 @@ def put_aside(state: str | Path, name: str) -> None:
 
 
 def left_behind(folder: Path) -> list[Path]:
-    """Folders with the files that a map has left here, one for each time that it moved away.
-
-    Args:
-        folder: of the map in a state folder.
-    """
+    """Folders with the files that a map has left here, one for each time that it moved away."""
     where = folder.parent.parent / state_folder.MOVED_FOLDER
     return sorted(path for path in where.glob(f"{folder.name}*") if _is_aside(path, folder.name))
 

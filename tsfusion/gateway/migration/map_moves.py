@@ -36,7 +36,6 @@ class MapMoves:
     """Answer the commands about moves, and call `step` again and again.
 
     Args:
-        unread: large replies that wait to be read.
         max_bytes: of these; no piece of a map is added beyond.
         on_left: told the name of a map that is closed here: nobody answers questions about it any more.
     """

@@ -47,7 +47,6 @@ class FuserQueries:
     """The commands that wait for a fuser's answer.
 
     Args:
-        unread: meshes and other large replies that wait to be read.
         max_bytes: of replies that wait to be read; a single one may be larger.
     """
 
@@ -66,12 +65,7 @@ class FuserQueries:
     def submit(
         self, identity: bytes, command: messages.Command, hosted: HostedMap | None, client: str = ""
     ) -> None:
-        """Pass a command on to the map's fuser, or reply why not.
-
-        Args:
-            hosted: the map; None = it is not open.
-            client: the name that the sender's key is allowed under; empty without keys.
-        """
+        """Pass a command on to the map's fuser, or reply why not."""
         query = PendingQuery(identity, client.encode() or identity, command, time.monotonic())
         if hosted is None:
             self._refuse(query, f"no map {command.map} is open")

@@ -51,10 +51,7 @@ class MapQuestions:
     """The questions under way. Call `step` again and again.
 
     Args:
-        refused: counts what is not passed on, under `question`.
-        unread: large answers that wait to be read.
         max_bytes: of those, and of the answers that are still to come; a single one may be larger.
-        rate: questions a second of each client.
     """
 
     def __init__(
@@ -81,13 +78,7 @@ class MapQuestions:
         hosted: HostedMap | None,
         client: str = "",
     ) -> None:
-        """Pass a question on to the map's fuser, or reply why not.
-
-        Args:
-            frames: the points that came with it.
-            hosted: the map; None = it is not open.
-            client: the name that the sender's key is allowed under; empty without keys.
-        """
+        """Pass a question on to the map's fuser, or reply why not."""
         now_ns, timeout = time.monotonic_ns(), command.timeout_s
         waiting = WaitingQuestion(
             identity,

@@ -35,12 +35,7 @@ class ScanUpdates:
         self._waiting: dict[tuple[bytes, bytes], tuple[Scanned, Any]] = {}  # topic, session → and its picture
 
     def note(self, map_name: str, header: KeyframeHeader, buffers: Sequence[Any], client: str) -> None:
-        """Tell viewers of a keyframe.
-
-        Args:
-            buffers: its frames.
-            client: name that its sender's key is allowed under.
-        """
+        """Tell viewers of a keyframe."""
         self._numbers[map_name] += 1
         topic = scan_topic(map_name)
         self._waiting.pop((topic, header.session), None)

@@ -22,9 +22,6 @@ class MemoryGuard:
 
     Dropping them frees memory, but not at once (ZeroMQ's threads do it) and perhaps not all (this process may
     need some). So after an alarm the bound rises above what is held then; otherwise it would never end.
-
-    Args:
-        max_bytes: of this process.
     """
 
     def __init__(self, max_bytes: int) -> None:
@@ -32,11 +29,7 @@ class MemoryGuard:
         self._next_return = 0.0  # time.monotonic()
 
     def excess(self, uncounted: int) -> int:
-        """Bytes that this process holds, when they are too many; otherwise 0.
-
-        Args:
-            uncounted: bytes of this process that are no connection's fault.
-        """
+        """Bytes that this process holds, when they are too many; otherwise 0."""
         held = process.rss_bytes() - uncounted
         now = time.monotonic()
         # Perhaps freed already, and only kept for later.
@@ -98,12 +91,7 @@ _UNNOTICED = 4  # one part in so many of the memory is for what comes in until i
 
 
 class ConnectionLimits:
-    """Limits of what connections may do to a gateway. Call `step` and `all_must_go` again and again.
-
-    Args:
-        refused: counts what is cut off, by reason.
-        memory_bytes: that the process may have.
-    """
+    """Limits of what connections may do to a gateway. Call `step` and `all_must_go` again and again."""
 
     def __init__(self, ports: Ports, access: AccessControl, refused: Counter[str], memory_bytes: int) -> None:
         self._ports = ports

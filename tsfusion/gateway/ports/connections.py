@@ -44,11 +44,7 @@ class OpenConnection(Struct, frozen=True):
 
 
 class Connections:
-    """The connections to some ports of this process. Call `step` again and again.
-
-    Args:
-        memory_bytes: that the process may have.
-    """
+    """The connections to some ports of this process. Call `step` again and again."""
 
     def __init__(self, memory_bytes: int) -> None:
         files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)

@@ -83,7 +83,6 @@ class KeyframeIndex:
         """Forget the records of deleted segments, up to the first that is still to be handed out.
 
         Args:
-            before_segment: number of the oldest segment that is still there.
             needed: indices of records that must not be forgotten.
         """
         deleted = bisect_left(self._columns["segment"], before_segment)

@@ -108,11 +108,7 @@ class Inquiry:
         self._asked_until = None
 
     def step(self, on_reply: OnReply) -> None:
-        """Read the replies that came, and ask for the health if it is time.
-
-        Args:
-            on_reply: takes replies about health, and to the last question.
-        """
+        """Read the replies that came, and ask for the health if it is time."""
         now, connection = time.monotonic(), self._connection
         connection.check(now)
         self._read(on_reply)

@@ -273,7 +273,6 @@ def request(
     """Send a command to a server's control address; its reply and the raw frames that came with it.
 
     Args:
-        timeout: seconds.
         keys: of `curve.client_keys`; None = a connection without.
         name: of the server, in errors; empty = the address.
 

@@ -47,9 +47,6 @@ def part_of_update(meshed: Meshed, frames: Sequence[Any]) -> SurfacePart:
 def part_of_answer(arrays: Arrays, *, is_raw: bool) -> SurfacePart:
     """The part that an answer about cells brings.
 
-    Args:
-        is_raw: what was asked for.
-
     Raises:
         DecodeError: when it is none.
     """

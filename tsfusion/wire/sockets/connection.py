@@ -19,9 +19,6 @@ class ServerLink:
 
     A name may stand for an IPv4 and an IPv6 address. Where nobody listens at the one, the other is tried.
 
-    Args:
-        make: `sockets.push` or `sockets.dealer`.
-
     Raises:
         zmq.ZMQError: when no socket can be opened, here and where one is replaced: close it then.
     """
@@ -150,9 +147,6 @@ class Patience:
     TCP itself waits a quarter of an hour where a path is no more: the scanner roamed to another address, or a
     NAT forgot the connection. Each wait in vain doubles the next: a link may be slow, not dead, and what was
     under way is sent over it again.
-
-    Args:
-        least: seconds.
     """
 
     def __init__(self, least: float) -> None:
