@@ -14,8 +14,7 @@ from tsfusion.gateway.fusers.fuser_supervisor import FuserSupervisor
 from tsfusion.gateway.health.metrics import Metrics
 from tsfusion.gateway.maps.keyframe_outcomes import DelayStatistics, KeyframeOutcomes
 from tsfusion.gateway.maps.map_records import MapRecords
-from tsfusion.gateway.records.fuser_backlog import FuserBacklog, FuserTime
-from tsfusion.gateway.records.keyframe_index import KeyframeIndex
+from tsfusion.gateway.records.journaled_records import FuserBacklog, FuserTime, KeyframeIndex
 from tsfusion.geometry.sample_ranges import NO_SAMPLES
 from tsfusion.journal import Position, RecordEntry
 from tsfusion.journal.quarantine import Quarantine
@@ -217,7 +216,7 @@ def test_a_fuser_that_ended_owes_no_answers() -> None:
 
 
 def test_accounts_of_clients_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tsfusion.gateway.records.fuser_backlog._MAX_CLIENTS", 8)
+    monkeypatch.setattr("tsfusion.gateway.records.journaled_records._MAX_CLIENTS", 8)
     time = FuserTime()
     for index in range(100):
         time.charge(f"client {index}", index)

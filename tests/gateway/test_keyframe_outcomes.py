@@ -14,7 +14,7 @@ from tsfusion.gateway.health.metrics import Metrics
 from tsfusion.gateway.maps.keyframe_outcomes import KeyframeOutcomes
 from tsfusion.gateway.maps.map_records import MapRecords
 from tsfusion.gateway.ports.ports import Ports
-from tsfusion.gateway.records.keyframe_index import KeyframeIndex
+from tsfusion.gateway.records.journaled_records import KeyframeIndex
 from tsfusion.journal import Position
 from tsfusion.journal.quarantine import Quarantine
 from tsfusion.wire.messages.messages import Ack, Nack, ToClient

@@ -7,7 +7,7 @@ from tsfusion.fuser import fuser_messages
 from tsfusion.gateway.clients.sessions import Session, Sessions
 from tsfusion.gateway.fusers.fuser_supervisor import FuserSupervisor
 from tsfusion.gateway.maps.map_journal import JournalRetention
-from tsfusion.gateway.records.keyframe_index import KeyframeIndex
+from tsfusion.gateway.records.journaled_records import KeyframeIndex
 from tsfusion.journal import Journal, Position
 
 

@@ -32,7 +32,7 @@ _INSIDE = 0.9  # share of a keyframe's points: noise, or a look out of a window,
 
 
 class KeyframeSearch:
-    """A search for selected keyframes in the journal. Call `go_on` when `wait` is over, until it gives them."""
+    """A search for keyframes in the journal. Call `go_on` when `wait` is over, until it gives them."""
 
     def __init__(
         self, find: Find, folder: Path, poses: KeyframePoses, done: dict[bytes, SessionProgress]

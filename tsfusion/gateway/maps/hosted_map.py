@@ -23,7 +23,7 @@ from tsfusion.gateway.maps.forgetting import Forgetting
 from tsfusion.gateway.maps.keyframe_outcomes import KeyframeOutcomes, QuestionCounts
 from tsfusion.gateway.maps.map_journal import CheckpointOrders
 from tsfusion.gateway.maps.map_records import IncomingRecord, MapRecords
-from tsfusion.gateway.records.fuser_backlog import FuserBacklog
+from tsfusion.gateway.records.journaled_records import FuserBacklog
 from tsfusion.journal import ReadingWatcher
 from tsfusion.wire.messages.mesh_updates import Meshed
 from tsfusion.wire.records import corrections

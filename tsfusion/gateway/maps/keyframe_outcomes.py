@@ -17,7 +17,7 @@ from tsfusion.gateway.clients.client_routes import ClientRoutes
 from tsfusion.gateway.clients.sessions import Session
 from tsfusion.gateway.health.metrics import Metrics
 from tsfusion.gateway.maps.map_records import IncomingRecord, MapRecords
-from tsfusion.gateway.records.keyframe_index import IndexEntry
+from tsfusion.gateway.records.journaled_records import IndexEntry
 from tsfusion.geometry.sample_ranges import NO_SAMPLES
 from tsfusion.journal import read
 from tsfusion.wire.messages import keyframe_times, messages

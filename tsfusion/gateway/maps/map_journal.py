@@ -18,7 +18,7 @@ from tsfusion.fuser import fuser_messages
 from tsfusion.fuser.fuser_messages import Ready
 from tsfusion.gateway.clients.sessions import Sessions
 from tsfusion.gateway.fusers.fuser_supervisor import FuserSupervisor
-from tsfusion.gateway.records.keyframe_index import KeyframeIndex
+from tsfusion.gateway.records.journaled_records import KeyframeIndex
 from tsfusion.journal import Journal, ReadingWatcher, state_folder
 
 _SEGMENTS_KEPT = 4  # a journal with a limit is deleted in quarters of that limit

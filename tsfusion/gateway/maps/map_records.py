@@ -14,7 +14,7 @@ from tsfusion.gateway.clients.sessions import Sessions
 from tsfusion.gateway.health.problems import Problem
 from tsfusion.gateway.maps import map_journal, moved_maps
 from tsfusion.gateway.maps.map_journal import JournalRetention
-from tsfusion.gateway.records.keyframe_index import KeyframeIndex
+from tsfusion.gateway.records.journaled_records import KeyframeIndex
 from tsfusion.journal import Journal, Position, ReadingWatcher, Unwritten, state_folder
 from tsfusion.journal.quarantine import Quarantine
 from tsfusion.wire.records.record_header import CorrectionHeader, RecordHeader
