@@ -30,7 +30,7 @@ while True:
         link.send(fuser_messages.encode(fuser_messages.Saved(False)))
     elif isinstance(message, fuser_messages.FuserQuery) and message.command.name == "status":
         link.send(fuser_messages.encode(fuser_messages.FuserReply(message.number, error="it has no map")))
-    elif isinstance(message, fuser_messages.Warm | fuser_messages.Open):
+    elif isinstance(message, fuser_messages.Warm | fuser_messages.ReadAhead):
         link.send(fuser_messages.encode(fuser_messages.Prepared()))
     elif isinstance(message, fuser_messages.Finish):
         sys.exit(0)
