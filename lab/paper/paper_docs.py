@@ -7,7 +7,7 @@ from pathlib import Path
 
 from lab.paper.paper_report import AteRow
 from lab.paper.paper_verdicts import Findings, Verdict
-from tsfusion.pipelines.report import findings
+from tsfusion.pipelines.report import run_record
 
 BEGIN, END = "<!-- table: python lab/paper/reproduce_paper.py --write-docs -->", "<!-- end of table -->"
 _STATE = {True: "met", False: "**not met**", None: "not measured"}
@@ -18,7 +18,7 @@ def write(
 ) -> Path:
     """Write what stands between the marks of paper.md, and copy the figures beside it."""
     page, images = docs / "paper.md", docs / "images"
-    where = findings.circumstances()
+    where = run_record.circumstances()
     parts = [
         f"{where.cpu}, {where.cores} cores, {where.finished[:10]}; "
         + "; ".join(f"{world.stands_for}: {world.title}" for world in found.worlds)

@@ -18,7 +18,7 @@ from lab.paper.paper_runs import MODES, Limits
 from lab.paper.paper_verdicts import Findings, Verdict
 from tsfusion.core import durable_files
 from tsfusion.evaluation.trajectory_error import TrajectoryError
-from tsfusion.pipelines.report import findings, page
+from tsfusion.pipelines.report import page, run_record
 from tsfusion.pipelines.report.page import Page
 
 RECORD, REPORT = "run.json", "report.html"
@@ -177,8 +177,8 @@ def write_record(
     record = {
         "verdicts": made, "limits": limits, **told, "paper": PAPER,
         "worlds": [msgspec.structs.replace(world, cache="") for world in found.worlds],
-        "runs": found.outcomes, "sweep": found.sweep, "versions": findings.versions(),
-        "made": findings.circumstances(),
+        "runs": found.outcomes, "sweep": found.sweep, "versions": run_record.versions(),
+        "made": run_record.circumstances(),
     }  # fmt: skip
     with durable_files.replacing(folder / RECORD) as file:
         file.write(msgspec.json.format(msgspec.json.encode(record), indent=2) + b"\n")

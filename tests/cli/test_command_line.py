@@ -21,7 +21,7 @@ from tsfusion.cli import options
 from tsfusion.core import config
 from tsfusion.core.config import Config
 from tsfusion.core.errors import InvalidConfig, OutputError
-from tsfusion.datasets import Dataset
+from tsfusion.pipelines.runs.run import RunPlan
 
 NOBODY = "tcp://127.0.0.1:9"  # the discard port: nobody listens there, and nobody may without being root
 VERBS = [
@@ -163,11 +163,11 @@ def replayed(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """Arguments that `replay` hands to the pipeline, which is not run."""
     asked: dict[str, Any] = {}
 
-    def record(dataset: Dataset, out: Path, **settings: Any) -> None:
-        asked.update(settings, dataset=dataset)
+    def record(plan: RunPlan, *_: object, **__: object) -> None:
+        asked.update(plan=plan)
         raise OutputError("recorded")
 
-    monkeypatch.setattr("tsfusion.pipelines.runs.replay.replay", record)
+    monkeypatch.setattr("tsfusion.pipelines.runs.run.run", record)
     return asked
 
 
@@ -188,7 +188,7 @@ def test_a_sensor_that_was_chosen_beats_the_datasets(
 ) -> None:  # fmt: skip
     (tmp_path / "a.toml").write_text(toml)
     assert "recorded" in one_line(here(*command, "--config", "a.toml", *flags))
-    assert replayed["volume"].sensor == sensor
+    assert replayed["plan"].volume.sensor == sensor
 
 
 def test_a_sensor_chosen_in_the_environment_counts(
@@ -196,7 +196,7 @@ def test_a_sensor_chosen_in_the_environment_counts(
 ) -> None:
     monkeypatch.setenv("TSFUSION_SENSOR", "kinect")
     here("replay", "synthetic:street:stereo")
-    assert replayed["volume"].sensor == "kinect"
+    assert replayed["plan"].volume.sensor == "kinect"
 
 
 def test_flags_of_the_environment_are_not_refused(here: Here, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,7 +17,7 @@ from repository import GOLDEN
 from tsfusion import cli
 from tsfusion.cli import verbs
 from tsfusion.core.errors import OutputError
-from tsfusion.datasets import Dataset
+from tsfusion.pipelines.runs.run import RunPlan
 
 WIDTH, MOST_LINES = 80, 40  # a terminal as it opens
 
@@ -112,11 +112,11 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """Arguments that `replay` hands to the pipeline, which is not run."""
     found: dict[str, Any] = {}
 
-    def record(dataset: Dataset, out: Path | None, **settings: Any) -> None:
-        found.update(settings, dataset=dataset, out=out)
+    def record(plan: RunPlan, out: Path | None, *_: object, **__: object) -> None:
+        found.update(plan=plan, out=out)
         raise OutputError("recorded")
 
-    monkeypatch.setattr("tsfusion.pipelines.runs.replay.replay", record)
+    monkeypatch.setattr("tsfusion.pipelines.runs.run.run", record)
     return found
 
 
@@ -126,16 +126,20 @@ def test_every_flag_has_a_variable(
     for name, value in {"MAX_FRAMES": "3", "VOXEL_SIZE": "0.5", "OUT": "there", "NO_SUCH_FLAG": "1"}.items():
         monkeypatch.setenv(f"{verbs.PREFIX}{name}", value)
     here("replay", "synthetic:room")
-    assert (len(asked["dataset"]), asked["volume"].voxel_size, asked["out"]) == (3, 0.5, Path("there"))
+    assert (asked["plan"].source.length, asked["plan"].volume.voxel_size, asked["out"]) == (
+        3,
+        0.5,
+        Path("there"),
+    )
     here("replay", "synthetic:room", "--max-frames", 2)
-    assert len(asked["dataset"]) == 2
+    assert asked["plan"].source.length == 2
 
 
 def test_earlier_names_are_understood(here: Here, asked: dict[str, Any]) -> None:
     here("replay", "synthetic:room", "--max-keyframes", 3)
-    assert len(asked["dataset"]) == 3
+    assert asked["plan"].source.length == 3
     here("replay", "synthetic:room", "--max-keyframes=2")
-    assert len(asked["dataset"]) == 2
+    assert asked["plan"].source.length == 2
     done = here("replay", "synthetic:room", "--poses", "a.txt")
     assert "a.txt is missing; expected a trajectory" in done.stderr
     for words in (["--source", "nowhere"], ["--source=nowhere"]):

@@ -108,16 +108,16 @@ def test_poses_that_cannot_be_paired_are_an_error_that_says_so(
 def test_a_scan_of_images_without_times_takes_one_pose_a_frame(
     kitchen: list[Keyframe], tmp_path: Path, poses: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from tsfusion.cli.scan_verb import _open
+    from tsfusion.cli.options import RUN_OPTIONS
+    from tsfusion.cli.runs import _open
 
     root = own_recordings.images(tmp_path / "mine", kitchen, poses=False)
     slam = str(poses_file(tmp_path / "slam.txt", poses, kitchen))
-    settings = {"trajectory": slam, "localizer": None, "origin": None}
-    more = {"part": {"start": 2, "stride": 2, "limit": None}, "settings": settings}
-    source, _ = _open(None, str(root), None, camera={}, rate=None, recording={}, **more)
+    flags = dict.fromkeys([*RUN_OPTIONS, "localizer"]) | {"trajectory": slam, "start": 2, "stride": 2}
+    source, _ = _open(None, str(root), flags)
     with source:
         found = [frame.T_world_camera for frame in source]
-    assert settings == {"trajectory": None, "localizer": "given", "origin": None}
+    assert (flags["trajectory"], flags["localizer"]) == (None, "given")
     np.testing.assert_allclose(found, [kitchen[2].T_world_camera, kitchen[4].T_world_camera], atol=1e-6)
     assert "one a frame in order" in capsys.readouterr().err
 

@@ -410,7 +410,7 @@ def test_verb_says_which_focal_length_fits(data: Data, capsys: pytest.CaptureFix
 def test_replay_of_a_wrong_camera_ends_with_status_1(
     data: Data, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from tsfusion.cli import replay_verb
+    from tsfusion.cli import runs
 
     whole = data(FOLDERS["7scenes"])
     wrong = tmp_path / "wrong"
@@ -423,6 +423,6 @@ def test_replay_of_a_wrong_camera_ends_with_status_1(
     wanted = "nothing is fused, as camera and depth disagree: frames fit best with a focal length of about 58"
     assert captured.err.strip().splitlines()[-1].startswith(f"tsfusion: {wanted}")
     assert not out.exists()
-    monkeypatch.setattr(replay_verb, "_run", lambda *_, **__: None)
+    monkeypatch.setattr(runs, "_run", lambda *_, **__: None)
     assert run("replay", wrong, "--no-check") == 0
     assert run("replay", whole) == 0

@@ -290,13 +290,13 @@ def inverted(place: Path, folder: Path) -> Path:
 def test_replay_stops_before_it_fuses_what_is_wrong(
     data: Data, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from tsfusion.cli import replay_verb
+    from tsfusion.cli import runs
     from tsfusion.core.errors import IncompleteRun
 
     wrong = inverted(data(FOLDERS["open3d"]), tmp_path)
     with pytest.raises(IncompleteRun, match=r"nothing is fused, .* the poses are world-to-camera"):
-        replay_verb._checked(open_dataset(wrong))
-    assert replay_verb._checked(open_dataset(data(FOLDERS["open3d"]))) == ("", [])
+        runs._checked(open_dataset(wrong))
+    assert runs._checked(open_dataset(data(FOLDERS["open3d"]))) == ("", [])
     assert capsys.readouterr().err == ""
 
 

@@ -38,9 +38,9 @@ from tsfusion.core.errors import InvalidConfig, InvalidKeyframe
 from tsfusion.datasets.trajectory_files import read_tum, write_tum
 from tsfusion.geometry.frame import Frame
 from tsfusion.journal.journaled_keyframes import JournalRecording
+from tsfusion.pipelines.report.run_record import RunRecord
 from tsfusion.pipelines.runs import engine
-from tsfusion.pipelines.runs import scan as pipelines_scan
-from tsfusion.pipelines.runs.scan_results import ScanSummary
+from tsfusion.pipelines.runs.run import RunPlan, run
 from tsfusion.scanner.sources.source import LiveSource
 from tsfusion.wire.asking.queries import fetch_health
 
@@ -313,14 +313,13 @@ class Frames(LiveSource):
 
 
 @pytest.fixture
-def scanned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., ScanSummary]:
+def scanned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., RunRecord]:
     """Scan in this process for a server that does not answer, and do not wait for it."""
     monkeypatch.setattr(engine, "LINGER", 0.2)
-    usual = {"config": ScanConfig(), "volume": VolumeConfig(), "progress": Quiet(), "overwrite": True}
 
-    def scan(source: Frames, out: str = "out", **settings: Any) -> ScanSummary:
-        spool = tmp_path / "spool"
-        return pipelines_scan.scan(source, tmp_path / out, connect=NOBODY, spool=spool, **usual | settings)
+    def scan(source: Frames, out: str = "out", **settings: Any) -> RunRecord:
+        usual = {"volume": VolumeConfig(), "connect": NOBODY, "spool": tmp_path / "spool"}
+        return run(RunPlan(source=source, **usual | settings), tmp_path / out, Quiet(), overwrite=True)
 
     return scan
 
@@ -336,7 +335,7 @@ def unposed(count: int) -> list[Frame]:
 
 @pytest.mark.parametrize(("count", "gap_ns", "taken"), [(1, 0, 1), (3, 0, 3), (3, 3 * 10**9, 2)])
 def test_a_live_sources_first_frame_is_taken_unless_it_is_old(
-    count: int, gap_ns: int, taken: int, scanned: Callable[..., ScanSummary]
+    count: int, gap_ns: int, taken: int, scanned: Callable[..., RunRecord]
 ) -> None:
     first, *others = unposed(count)
     later = [dataclasses.replace(frame, timestamp_ns=frame.timestamp_ns + gap_ns) for frame in others]
@@ -345,16 +344,16 @@ def test_a_live_sources_first_frame_is_taken_unless_it_is_old(
 
 
 def test_a_frame_that_cannot_be_followed_keeps_what_came_before(
-    scanned: Callable[..., ScanSummary], tmp_path: Path
+    scanned: Callable[..., RunRecord], tmp_path: Path
 ) -> None:
     points = Frame(sensor="lidar", points=np.ones((9, 3), np.float32), timestamp_ns=10**9)
     with pytest.raises(InvalidKeyframe, match="needs a depth"):
-        scanned(Frames([*unposed(4), points]), config=ScanConfig(loop_closure=False))
+        scanned(Frames([*unposed(4), points]), scan=ScanConfig(loop_closure=False))
     run = json.loads((tmp_path / "out" / "run.json").read_text())
     assert (run["frames_tracked"], run["complete"]) == (4, False)
     assert len(read_tum(tmp_path / "out" / "trajectory.txt").timestamps_ns) == 4
     with pytest.raises(InvalidConfig, match="rgbd follows depth images, and this source gives points"):
-        scanned(Frames([points]), "none", config=ScanConfig(localizer="rgbd"))
+        scanned(Frames([points]), "none", scan=ScanConfig(localizer="rgbd"))
     assert not (tmp_path / "none").exists()
 
 
@@ -386,12 +385,12 @@ def test_a_map_without_a_surface_keeps_the_trajectory(walk: Path, here: Here, tm
 
 
 @pytest.mark.parametrize("live", [True, False])
-def test_only_what_cannot_wait_is_left_out(live: bool, scanned: Callable[..., ScanSummary]) -> None:
+def test_only_what_cannot_wait_is_left_out(live: bool, scanned: Callable[..., RunRecord]) -> None:
     """Also where nobody knows how many frames there will be, as in a folder or a camera's recording."""
     source = Frames(unposed(6), live=live)
     source.length = None
     result = scanned(
-        source, config=ScanConfig(distance=1e-6), client=ClientConfig(policy="drop_oldest", backlog=1)
+        source, scan=ScanConfig(distance=1e-6), client=ClientConfig(policy="drop_oldest", backlog=1)
     )
     assert bool(result.keyframes_rejected.get("dropped")) == live
     assert live or result.left == 6

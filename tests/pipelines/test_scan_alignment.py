@@ -25,8 +25,8 @@ from tsfusion.journal import state_folder
 from tsfusion.journal.journaled_keyframes import JournalRecording
 from tsfusion.pipelines.maps import scan_alignment
 from tsfusion.pipelines.maps.scan_alignment import ExistingMap, PlacedLocalizer, PlacementTry, find_place
-from tsfusion.pipelines.runs import scan as pipelines_scan
-from tsfusion.pipelines.runs.scan_results import ScanSummary
+from tsfusion.pipelines.report.run_record import RunRecord
+from tsfusion.pipelines.runs import run as pipelines_run
 from tsfusion.scanner.keyframe_selection import KeyframeSelector
 from tsfusion.scanner.localization.localizer import Lost, PoseCorrections, TrackedPose
 from tsfusion.scanner.sources.source import RecordedSource
@@ -167,18 +167,18 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
 
 
 @pytest.fixture
-def scan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, server: Server) -> Callable[..., ScanSummary]:
+def scan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, server: Server) -> Callable[..., RunRecord]:
     """A scan of a few frames, into a map that is said to have a surface."""
-    monkeypatch.setattr(pipelines_scan, "_existing_map", lambda target: MAP._replace(name=target.link.map))
+    monkeypatch.setattr(pipelines_run, "_existing_map", lambda target: MAP._replace(name=target.link.map))
     monkeypatch.setattr(concurrent.futures, "ProcessPoolExecutor", Inline)
 
-    def run(map_name: str, *, align: bool) -> ScanSummary:
-        return pipelines_scan.scan(
-            RecordedSource(select(open_dataset("synthetic:room"), limit=FRAMES)), tmp_path / "out",
-            overwrite=True, connect=server.address, spool=tmp_path / "spool", align=align,
-            config=ScanConfig(localizer="rgbd"), client=ClientConfig(map=map_name), volume=CONFIG,
-            progress=Quiet(),
-        )  # type: ignore[arg-type]  # fmt: skip
+    def run(map_name: str, *, align: bool) -> RunRecord:
+        plan = pipelines_run.RunPlan(
+            source=RecordedSource(select(open_dataset("synthetic:room"), limit=FRAMES)),
+            scan=ScanConfig(localizer="rgbd"), volume=CONFIG, connect=server.address,
+            client=ClientConfig(map=map_name), spool=tmp_path / "spool", align=align,
+        )  # fmt: skip
+        return pipelines_run.run(plan, tmp_path / "out", Quiet(), overwrite=True)
 
     return run
 
@@ -189,7 +189,7 @@ def poses(server: Server, map_name: str) -> list[np.ndarray]:
 
 
 def test_a_placed_scan_is_of_the_maps_frame(
-    scan: Callable[..., ScanSummary], server: Server, monkeypatch: pytest.MonkeyPatch
+    scan: Callable[..., RunRecord], server: Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scan("hall", align=False)
     before = poses(server, "hall")
@@ -202,7 +202,7 @@ def test_a_placed_scan_is_of_the_maps_frame(
 
 
 def test_an_unplaced_scan_goes_into_a_map_of_its_own(
-    scan: Callable[..., ScanSummary], server: Server, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    scan: Callable[..., RunRecord], server: Server, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     scan("yard", align=False)
     before = poses(server, "yard")

@@ -20,15 +20,16 @@ from tsfusion.datasets import select
 from tsfusion.datasets.trajectory_files import read_tum
 from tsfusion.geometry.frame import Frame
 from tsfusion.journal.journaled_keyframes import JournalRecording
+from tsfusion.pipelines.report.run_record import RunRecord
 from tsfusion.pipelines.runs import engine
-from tsfusion.pipelines.runs import scan as pipelines_scan
-from tsfusion.pipelines.runs.scan_results import ScanSummary
+from tsfusion.pipelines.runs.run import RunPlan
+from tsfusion.pipelines.runs.run import run as carry_out
 from tsfusion.scanner.sources.source import RecordedSource
 from tsfusion.wire.asking.queries import fetch_health
 
 FRAMES = 3
 OWN_WORLD = ("synthetic:room", "--localizer", "rgbd", "--max-frames", FRAMES)
-Scan = Callable[..., ScanSummary]
+Scan = Callable[..., RunRecord]
 
 
 @pytest.fixture(scope="module")
@@ -41,14 +42,14 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
 def scan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Scan:
     """A scan in this process that localises itself; what no server takes is soon left."""
 
-    def run(connect: str, map_name: str = "default", *, localizer: str = "rgbd") -> ScanSummary:
+    def run(connect: str, map_name: str = "default", *, localizer: str = "rgbd") -> RunRecord:
         monkeypatch.setattr(engine, "LINGER", 0.2 if connect == NOBODY else 30.0)
         source = RecordedSource(select(open_dataset("synthetic:room"), limit=FRAMES))
-        return pipelines_scan.scan(
-            source, tmp_path / "out", overwrite=True, connect=connect, spool=tmp_path / "spool",
-            config=ScanConfig(localizer=localizer), client=ClientConfig(map=map_name), progress=Quiet(),
-            volume=VolumeConfig(),
-        )  # type: ignore[arg-type]  # fmt: skip
+        plan = RunPlan(
+            source=source, scan=ScanConfig(localizer=localizer), volume=VolumeConfig(), connect=connect,
+            client=ClientConfig(map=map_name), spool=tmp_path / "spool",
+        )  # fmt: skip
+        return carry_out(plan, tmp_path / "out", Quiet(), overwrite=True)
 
     return run
 
@@ -107,13 +108,14 @@ def test_a_refusal_that_comes_late_keeps_the_keyframes_and_names_them(scan: Scan
                 yield frame
 
     said = r"map yard has 9 .*: use --map yard-2 or --map auto, .*; [0-9]+ keyframes? waits? in .*spool/yard "
-    with scripted(denial=("opening", "wait")) as server, pytest.raises(WorldRefused, match=said) as error:
-        pipelines_scan.scan(
-            Walk(select(open_dataset("synthetic:room", count=150), limit=20)), tmp_path / "out",
-            connect=server.address, spool=tmp_path / "spool", volume=VolumeConfig(), progress=Quiet(),
-            config=ScanConfig(localizer="rgbd", distance=0.01),
-            client=ClientConfig(map="yard", control=server.control),
+    with scripted(denial=("opening", "wait")) as server:
+        plan = RunPlan(
+            source=Walk(select(open_dataset("synthetic:room", count=150), limit=20)), volume=VolumeConfig(),
+            scan=ScanConfig(localizer="rgbd", distance=0.01), connect=server.address,
+            client=ClientConfig(map="yard", control=server.control), spool=tmp_path / "spool",
         )  # fmt: skip
+        with pytest.raises(WorldRefused, match=said) as error:
+            carry_out(plan, tmp_path / "out", Quiet())
     assert not server.taken
     assert f"; {waiting(tmp_path / 'spool/yard')} keyframe" in str(error.value)
     assert 4 <= len(read_tum(tmp_path / "out" / "trajectory.txt").timestamps_ns) < 20

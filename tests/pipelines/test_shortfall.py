@@ -10,7 +10,8 @@ import pytest
 from tsfusion import Intrinsics, InvalidConfig, Keyframe, VolumeConfig
 from tsfusion.client import ClientStats
 from tsfusion.datasets.dataset import UNREADABLE
-from tsfusion.pipelines.report import shortfall
+from tsfusion.pipelines.report import run_record, shortfall
+from tsfusion.pipelines.report.run_record import RunRecord
 from tsfusion.pipelines.runs import map_growth
 
 STATS = ClientStats(
@@ -77,8 +78,8 @@ def test_frames_lost() -> None:
     ],
 )  # fmt: skip
 def test_a_run_is_as_good_as_its_worst_finding(changed: dict[str, Any], level: str, headline: str) -> None:
-    record = {"keyframes_sent": 90, "keyframes_fused": 90, "missed": "", **changed}
-    found = shortfall.verdict(record)
+    counts = {"keyframes_sent": 90, "keyframes_fused": 90, **changed}
+    found = run_record.verdict(RunRecord(kind="scan", source="a camera", **counts))
     assert (found.level, found.headline) == (level, headline)
 
 

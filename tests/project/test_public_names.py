@@ -85,7 +85,7 @@ def test_a_scan_loads_nothing_that_only_some_scans_need() -> None:
     """Pages, a place in a map and worlds that are made up: ten megabytes of a robot's memory."""
     program = (
         # NumPy and OpenCV load some of it themselves, by their version
-        "import sys, numpy, cv2; there = set(sys.modules); import tsfusion.pipelines.runs.scan; "
+        "import sys, numpy, cv2; there = set(sys.modules); import tsfusion.pipelines.runs.run; "
         "few = {'asyncio', 'multiprocessing', 'numpy.random', 'ssl'} - there; "
         "sys.exit(' '.join(few & set(sys.modules)) or None)"
     )

@@ -30,9 +30,8 @@ from tsfusion.cli import (
     map,
     mesh_verb,
     opened_maps,
-    replay_verb,
     report,
-    scan_verb,
+    runs,
     serve,
     spool_verb,
     status,
@@ -56,15 +55,15 @@ app = typer.Typer(
     epilog="Flags are environment variables, too: TSFUSION_VOXEL_SIZE for --voxel-size.",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-verbs.verb(app, "tsfusion demo", "tsfusion demo --world street --rate 2", panel=START)(replay_verb.demo)
+verbs.verb(app, "tsfusion demo", "tsfusion demo --world street --rate 2", panel=START)(runs.demo)
 verbs.verb(
     app, "tsfusion scan my-recording --voxel-size 0.02",
     "tsfusion scan realsense --connect tcp://server:5555 --map yard", panel=START,
-)(scan_verb.scan)  # fmt: skip
+)(runs.scan)  # fmt: skip
 verbs.verb(
     app, "tsfusion replay my-recording --voxel-size 0.02",
     "tsfusion replay kitchen.bag --trajectory slam.txt", panel=START,
-)(replay_verb.replay)  # fmt: skip
+)(runs.replay)  # fmt: skip
 verbs.verb(
     app, "tsfusion check my-recording", "tsfusion check my-recording --trajectory slam.txt", panel=OWN
 )(check.check)

@@ -63,7 +63,7 @@ def _truth(reference: Path, given: dict[str, Any]) -> "Path | Dataset":
     """A trajectory file as it is, or a dataset with all its frames: those without a pose count too."""
     if reference.is_file() and not given:
         return reference
-    from tsfusion.cli.replay_verb import open_recording
+    from tsfusion.cli.runs import open_recording
 
     return open_recording(reference, **{"posed": False} | given)
 

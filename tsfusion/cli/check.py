@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from tsfusion.cli import options, replay_verb, verbs
+from tsfusion.cli import options, runs, verbs
 
 
 def check(
@@ -36,7 +36,7 @@ def check(
     from tsfusion.evaluation import pose_check
     from tsfusion.pipelines.report import shortfall
 
-    dataset = replay_verb.open_recording(
+    dataset = runs.open_recording(
         path,
         **options.dataset_options(
             option, unpack=unpack, sequence=sequence, modality=modality, trajectory=trajectory,

@@ -70,7 +70,9 @@ def takes_map_settings(verb: Callable[..., Any], also: dict[str, Any] | None = N
     own = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
     added = {**(also or {}), **MAP_OPTIONS, "help_all": verbs.HelpAll}
     shared = [
-        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=option)
+        inspect.Parameter(
+            name, inspect.Parameter.KEYWORD_ONLY, default=_DEFAULTS.get(name), annotation=option
+        )
         for name, option in added.items()
     ]
     verb.__signature__ = signature.replace(parameters=[*own, *shared])  # type: ignore[attr-defined]
@@ -152,6 +154,34 @@ KeepIslands = Annotated[
         rare=True,
     ),
 ]  # fmt: skip
+
+# By name: flags of a run's results, of a run, and of the recording that it takes
+RESULT_OPTIONS: dict[str, Any] = {
+    "out": OutFlag, "overwrite": Overwrite, "config": ConfigFile, "view": ViewFlag, "json": RunJson,
+}  # fmt: skip
+RECORDING_OPTIONS: dict[str, Any] = {
+    "origin": OriginFlag, "sequence": Sequence, "modality": ModalityFlag, "calibration": Calibration,
+    "intrinsics": IntrinsicsFlag, "option": DatasetOptions, "unpack": Unpack,
+}  # fmt: skip
+RUN_OPTIONS: dict[str, Any] = {
+    **RESULT_OPTIONS, "state": StateFlag, "connect": Connect, "map_": NewMap, "same_frame": SameFrame,
+    "control": Control, "key": KeyFlag, "server_key": ServerKey, **RECORDING_OPTIONS, "rate": Rate,
+    "max_frames": MaxFrames, "start": Start, "stride": Stride, "up": UpDirection,
+    "keep_islands": KeepIslands,
+}  # fmt: skip
+_DEFAULTS = dict.fromkeys(("overwrite", "json", "same_frame", "unpack"), False) | {"start": 0, "stride": 1}
+
+
+def settings(flags: Mapping[str, Any]) -> dict[str, Any]:
+    """Those of a run's flags that are settings of a file, too."""
+    return {name: value for name, value in flags.items() if name not in RUN_OPTIONS or name == "origin"}
+
+
+def recording_options(flags: Mapping[str, Any], **more: Any) -> dict[str, Any]:
+    """Settings of a dataset that flags and `--option` give."""
+    names = ("unpack", "sequence", "modality", "origin")
+    given = {name: flags[name] for name in names} | more
+    return dataset_options(flags["option"], **given, **camera(flags["intrinsics"], flags["calibration"]))
 
 
 def is_typed(context: typer.Context, name: str) -> bool:

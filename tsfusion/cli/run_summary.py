@@ -12,16 +12,26 @@ from tsfusion.wire.messages.messages import explained
 
 if TYPE_CHECKING:
     from tsfusion.evaluation.trajectory_error import TrajectoryError
-    from tsfusion.pipelines.runs.replay_results import ReplaySummary
-    from tsfusion.pipelines.runs.scan_results import MapResult, ScanSummary
+    from tsfusion.pipelines.report.run_record import MapResult, RunRecord
 
 
-def print_replay(run: "ReplaySummary") -> None:
-    """Print a replay in a few lines."""
+def print_run(run: "RunRecord", spool: Path | None, connect: str | None) -> None:
+    """Print a run in a few lines.
+
+    Args:
+        spool: where a scan's keyframes wait for a server.
+        connect: address of the server elsewhere that has the map; None = it was the run's own.
+    """
+    lines = _replay_lines(run) if run.kind == "replay" else _scan_lines(run, spool, connect)
+    output.text("\n".join([*_head(run), *lines, _results(run.folder)]), indent=11)
+
+
+def _replay_lines(run: "RunRecord") -> list[str]:
     delay = run.delay_ms
     lines = [
         f"keyframes  {run.keyframes_fused}/{run.keyframes_sent} fused in {run.seconds:.1f} s, "
         f"lost {sum(run.keyframes_rejected.values())}",
+        *_left_out(run),
         f"delay      mean {delay.mean:.0f} ms, p50 {delay.p50:.0f}, p95 {delay.p95:.0f}, "
         f"p99 {delay.p99:.0f}, max {delay.max:.0f}; slope {run.delay_slope_ms_per_keyframe:+.2f} ms/keyframe",
         "stages     "
@@ -31,54 +41,46 @@ def print_replay(run: "ReplaySummary") -> None:
         f"map        {grouped(run.blocks)} blocks, hash {run.map_hash}",
         "memory     " + ", ".join(f"{name} {size(peak)}" for name, peak in run.peak_rss_bytes.items()),
     ]
-    if run.keyframes_rejected:
-        lines.insert(1, f"not in map {explained(run.keyframes_rejected)}")
-    if run.frames_skipped:
-        lines.insert(1, f"left out   {counted(run.frames_skipped)}")
     if run.accuracy is not None:
         error = run.accuracy
         lines.append(
             f"accuracy   mean {error.mean_mm:.2f} mm, p50 {error.p50_mm:.2f}, p95 {error.p95_mm:.2f} mm "
             "from the known surface"
         )
-    output.text("\n".join([*_head(run), *lines, _results(run.folder)]), indent=11)
+    return lines
 
 
-def print_scan(result: "ScanSummary", spool: Path, connect: str | None) -> None:
-    """Print a scan in a few lines.
-
-    Args:
-        connect: address of the server elsewhere that has the map; None = it was the scan's own.
-    """
-    delay = result.delay_ms
-    ended = "" if result.complete else "; the source was not read to its end"
+def _scan_lines(run: "RunRecord", spool: Path | None, connect: str | None) -> list[str]:
+    delay = run.delay_ms
+    ended = "" if run.complete else "; the source was not read to its end"
     lines = [
-        f"frames     {result.frames_tracked}/{result.frames} localised by {result.localizer}, "
-        f"{result.tracking_cpu_ms:.0f} CPU ms each{ended}",
-        f"keyframes  {result.keyframes_sent} sent, {result.keyframes_durable} acknowledged, "
-        f"{result.keyframes_fused} fused ({counted(result.keyframes_by_rule)}), "
-        f"lost {sum(result.keyframes_rejected.values())}",
+        f"frames     {run.frames_tracked}/{run.frames} localised by {run.localizer}, "
+        f"{run.tracking_cpu_ms:.0f} CPU ms each{ended}",
+        f"keyframes  {run.keyframes_sent} sent, {run.keyframes_durable} acknowledged, "
+        f"{run.keyframes_fused} fused ({counted(run.keyframes_by_rule)}), "
+        f"lost {sum(run.keyframes_rejected.values())}",
         f"delay      mean {delay.mean:.0f} ms, p50 {delay.p50:.0f}, p95 {delay.p95:.0f}, max {delay.max:.0f}"
         if delay.count
         else "delay      not known: nothing was fused yet",
+        *_left_out(run),
     ]
-    if result.frames_skipped:
-        lines.append(f"left out   {counted(result.frames_skipped)}")
-    if result.keyframes_rejected:
-        lines.append(f"not in map {explained(result.keyframes_rejected)}")
-    for found in result.maps:
-        lines += _map_lines(found, given=result.localizer == "given")
-    if result.left:
-        why = f" ({result.link})" if result.link else ""
+    for found in run.maps:
+        lines += _map_lines(found, given=run.localizer == "given")
+    if run.left:
+        why = f" ({run.link})" if run.link else ""
         lines.append(
-            f"spool      {count_of(result.left, 'keyframe is', 'keyframes are')} not acknowledged{why}: "
+            f"spool      {count_of(run.left, 'keyframe is', 'keyframes are')} not acknowledged{why}: "
             f"`tsfusion spool send --spool {spool}` or the next scan sends them"
         )
-    if connect is not None and result.keyframes_durable:
-        lines.append(
-            f"mesh       tsfusion mesh {connect} {result.maps[0].name}.glb --map {result.maps[0].name}"
-        )
-    output.text("\n".join([*_head(result), *lines, _results(result.folder)]), indent=11)
+    if connect is not None and run.keyframes_durable:
+        lines.append(f"mesh       tsfusion mesh {connect} {run.maps[0].name}.glb --map {run.maps[0].name}")
+    return lines
+
+
+def _left_out(run: "RunRecord") -> list[str]:
+    """Frames and keyframes that are not in the map: a line each."""
+    frames, keyframes = counted(run.frames_skipped), explained(run.keyframes_rejected)
+    return [f"left out   {frames}"] * bool(frames) + [f"not in map {keyframes}"] * bool(keyframes)
 
 
 def _results(folder: str) -> str:
@@ -116,7 +118,7 @@ def mesh_notes(figures: dict[str, Any]) -> list[str]:
     return notes
 
 
-def check(run: "ReplaySummary | ScanSummary") -> None:
+def check(run: "RunRecord") -> None:
     """Raise IncompleteRun when the run has missed what it was for: the last line, and status 1."""
     from tsfusion.core.errors import IncompleteRun
 
@@ -124,7 +126,7 @@ def check(run: "ReplaySummary | ScanSummary") -> None:
         raise IncompleteRun(run.verdict.text)
 
 
-def _head(run: "ReplaySummary | ScanSummary") -> list[str]:
+def _head(run: "RunRecord") -> list[str]:
     """The verdict with its sign, unless `check` is to say it, and the camera: a line each."""
     camera, verdict = [f"camera     {run.camera}"] if run.camera else [], run.verdict
     if verdict is None or verdict.level == "bad":

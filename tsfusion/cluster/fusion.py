@@ -24,8 +24,8 @@ from tsfusion.core.config import VIEW_SETTINGS, VolumeConfig
 from tsfusion.core.durable_files import make_folder, replacing
 from tsfusion.core.errors import InvalidConfig, OutputError
 from tsfusion.geometry.up_direction import Up
-from tsfusion.pipelines.report import findings
-from tsfusion.pipelines.report.findings import Circumstances
+from tsfusion.pipelines.report import run_record
+from tsfusion.pipelines.report.run_record import Circumstances
 from tsfusion.pipelines.runs import run_files
 from tsfusion.tsdf.files import checkpoint
 
@@ -173,7 +173,7 @@ def fuse(
             run = _Run(found, config, work, display, wishes)
             with _closing(make_scheduler()) as scheduler:
                 made = run.carry_out(scheduler, results, folder)
-            run_files.write_record(results, made)
+            run_record.write(results, made)
             if out is not None:
                 shutil.rmtree(place / TILES, ignore_errors=True)  # of an earlier run that is replaced
         shutil.rmtree(place / WORK, ignore_errors=True)
@@ -271,8 +271,8 @@ class _Run:
             mesh={name: value for name, value in mesh.figures.items() if name != "is_whole"},
             tiles=sum(bool(one.files) for one in tiles),
             config=msgspec.to_builtins(self._config),
-            versions=findings.versions(),
-            made=findings.circumstances(),
+            versions=run_record.versions(),
+            made=run_record.circumstances(),
         )
 
     # --- steps ---

@@ -338,9 +338,12 @@ class PartOfDataset(Wrapped):
 
 
 def frame_of(dataset: Dataset, index: int) -> Frame:
-    """Frame `index` of any dataset: without its pose's help where the dataset has frames of its own."""
+    """Frame `index` of any dataset: without its pose's help where the dataset has frames of its own.
+
+    A keyframe that names no sensor is a frame that names none: whoever fuses it says which.
+    """
     own: Callable[[int], Frame] | None = getattr(dataset, "frame", None)
-    return own(index) if own is not None else Frame.of(dataset[index], dataset.sensor)
+    return own(index) if own is not None else Frame.of(dataset[index], "")
 
 
 def readable(read: Callable[[int], _T], indices: Iterable[int]) -> Iterator[tuple[int, _T]]:

@@ -25,7 +25,8 @@ class Frame:
     Fields of the same name mean the same as in a `Keyframe` and are checked in the same way.
 
     Attributes:
-        sensor: name of the sensor model (`kinect`, `tof`, `realsense`, `stereo`, `lidar`, `scanner`).
+        sensor: name of the sensor model (`kinect`, `tof`, `realsense`, `stereo`, `lidar`, `scanner`);
+            empty = it says none.
         timestamp_ns: the sensor's clock; 0 = unknown.
         captured_ns: `time.monotonic_ns()` at capture; 0 = unknown.
         T_world_camera: (4, 4) float64, the source's own pose (ground truth, another SLAM); None = it has
@@ -205,7 +206,7 @@ class Frame:
             color=self.color,
             confidence=self.confidence,
             intrinsics=self.intrinsics,
-            sensor=self.sensor,
+            sensor=self.sensor or None,
             timestamp_ns=self.timestamp_ns,
             captured_ns=self.captured_ns,
         )

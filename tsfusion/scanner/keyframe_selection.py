@@ -74,6 +74,19 @@ class KeyframeSelector:
         self._last = self._overlap = None
 
 
+class EveryFrame:
+    """Selector of a replay, whose frames are keyframes already."""
+
+    def reason(self, _frame: Frame, _T_world_camera: NDArray[np.float64]) -> str:
+        return "every"
+
+    def accept(self, _frame: Frame, _T_world_camera: NDArray[np.float64]) -> None:
+        pass
+
+    def reset(self) -> None:
+        pass
+
+
 def _overlap(frame: Frame) -> Callable[[NDArray[np.float64]], float] | None:
     """Function from T_now_last to the share of this frame's pixels that are in the view from there."""
     K, depth = frame.intrinsics, frame.depth_m

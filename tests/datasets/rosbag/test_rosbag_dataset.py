@@ -17,7 +17,7 @@ from mcap.writer import CompressionType, Writer
 from rosbag_scenes import DEPTH, FRAME_NS, T0, T_BODY_OPTICAL, infos, journal_of, only_depth, scan
 from rosbag_writing import BODY, FORMS, OPTICAL, WORLD, BagWriter, writing
 
-from tsfusion.cli import replay_verb
+from tsfusion.cli import runs
 from tsfusion.core.errors import DatasetError, MissingDependency
 from tsfusion.datasets import open_dataset
 from tsfusion.datasets.dataset import clock_parts
@@ -179,10 +179,10 @@ def test_a_journal_and_a_ros_recording_are_told_apart(tmp_path: Path) -> None:
     export(place, tmp_path / "out.mcap", lambda _done, _all: None)
     bag = walls(tmp_path)
     for journaled in (tmp_path, place.path, segment):
-        assert isinstance(replay_verb.open_recording(journaled), JournalRecording)
+        assert isinstance(runs.open_recording(journaled), JournalRecording)
         assert not recognises(journaled) or journaled == tmp_path
     for recorded in (tmp_path / "out.mcap", bag, bag / "recorded.mcap"):
-        assert isinstance(replay_verb.open_recording(recorded), Bag)
+        assert isinstance(runs.open_recording(recorded), Bag)
     with pytest.raises(DatasetError, match=r"a ROS recording .*reads a journal of tsfusion"):
         Bag(segment)
     torn = tmp_path / "torn.mcap"

@@ -2,30 +2,22 @@
 """Files of a run's folder, read for a report: old runs have fewer, and none of them is required."""
 
 import csv
-import json
-import os
-import platform
 import re
-import shlex
-import sys
 import time
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core import process
 from tsfusion.core.errors import DatasetError, OutputError
 from tsfusion.core.output_folder import RECORD
-from tsfusion.core.process import version_of
 from tsfusion.datasets.trajectory_files import read_poses
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.se3 import Poses
 from tsfusion.geometry.up_direction import Up
+from tsfusion.pipelines.report import run_record
+from tsfusion.pipelines.report.run_record import MapResult, RunRecord
 from tsfusion.wire.messages.keyframe_times import KeyframeTimes
 
 Paths = dict[str, tuple[NDArray[np.int64] | None, Poses]]  # of a file's name, timestamps and poses
@@ -37,14 +29,12 @@ class MapFindings:
     """A map of a run.
 
     Attributes:
-        figures: of `MapResult` or `ReplaySummary`.
         mesh: None = the run has none, as it is on a server.
         error_m: (n,) signed metres of the vertices from the true surface; None = nobody knows it.
         paths: trajectories by the name of their file without its ending.
     """
 
-    name: str
-    figures: dict[str, Any]
+    figures: MapResult
     mesh: Mesh | None = None
     error_m: NDArray[np.float32] | None = None
     paths: Paths = field(default_factory=dict)
@@ -61,7 +51,7 @@ class RunFindings:
         files: name and bytes of what is in its folder.
     """
 
-    record: dict[str, Any]
+    record: RunRecord
     maps: list[MapFindings]
     times: list[KeyframeTimes]
     growth: dict[str, NDArray[np.float64]]
@@ -81,15 +71,11 @@ def read(folder: Path, meshes: dict[str, Mesh] | None = None) -> RunFindings:
     Raises:
         OutputError: when its `run.json` cannot be read or is of no run.
     """
-    record = _record(folder / RECORD)
-    if isinstance(record.get("maps"), list):
-        figures = [one for one in record["maps"] if isinstance(one, dict)]
-    else:
-        figures = [record]
+    record = run_record.read(folder)
     maps = []
-    for number, one in enumerate(figures, 1):
+    for number, one in enumerate(record.maps, 1):
         suffix = "" if number == 1 else f"-{number}"
-        found = MapFindings(str(one.get("name", "")), one)
+        found = MapFindings(one)
         found.mesh = _mesh(folder / f"mesh{suffix}.ply", one, meshes or {})
         found.error_m = _errors(folder / f"error{suffix}.npy", found.mesh)
         found.paths = _paths(folder, suffix)
@@ -98,17 +84,7 @@ def read(folder: Path, meshes: dict[str, Mesh] | None = None) -> RunFindings:
     return RunFindings(record, maps, _times(folder / "delay.csv"), _growth(folder / "growth.csv"), files)
 
 
-def _record(path: Path) -> dict[str, Any]:
-    try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise OutputError(f"cannot read {path}: {error}; expected the results of a run") from error
-    if not isinstance(record, dict) or not ({"dataset", "source"} & record.keys()):
-        raise OutputError(f"{path} is of no run; expected what replay, scan or demo left")
-    return record
-
-
-def _mesh(path: Path, figures: dict[str, Any], meshes: dict[str, Mesh]) -> Mesh | None:
+def _mesh(path: Path, figures: MapResult, meshes: dict[str, Mesh]) -> Mesh | None:
     if path.name in meshes:
         return meshes[path.name]
     if not path.is_file():
@@ -123,7 +99,7 @@ def _mesh(path: Path, figures: dict[str, Any], meshes: dict[str, Mesh]) -> Mesh 
     if not len(arrays[1]):
         return None
     colors = np.asarray(read.visual.vertex_colors)[:, :3] if read.visual.kind == "vertex" else None
-    up = (figures.get("mesh") or {}).get("up")
+    up = figures.mesh.get("up")
     known = Up(tuple(up["direction"]), up["found_by"]) if up else None
     return Mesh(*arrays, None if colors is None else np.uint8(colors), known_up=known)
 
@@ -172,56 +148,12 @@ def _rows(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def date_of(record: dict[str, Any], path: Path) -> str:
+def date_of(record: RunRecord, path: Path) -> str:
     """Time at which a run ended: as it wrote down, or by its folder's name, or by its file."""
-    made = record.get("made") or {}
-    if made.get("finished"):
-        return str(made["finished"])
+    if record.made is not None and record.made.finished:
+        return record.made.finished
     named = re.search(r"(\d{4}-\d{2}-\d{2})_(\d{2})-(\d{2})-\d{2}", path.absolute().name)
     if named:
         return f"{named[1]} {named[2]}:{named[3]}"
 
     return time.strftime("%Y-%m-%d %H:%M", time.localtime((path / RECORD).stat().st_mtime))
-
-
-class Circumstances(msgspec.Struct, frozen=True, kw_only=True):
-    """Time and place of a run's end, and its command. `finished` is local time."""
-
-    finished: str
-    command: str  # empty = it was not started by the `tsfusion` command
-    host: str
-    cpu: str
-    cores: int
-    memory_bytes: int
-
-
-def circumstances() -> Circumstances:
-    """Circumstances of this process: when, where and by which command."""
-    started = Path(sys.argv[0])
-    is_command = started.stem == "tsfusion" or (
-        started.name == "__main__.py" and started.parent.name == "tsfusion"
-    )
-    return Circumstances(
-        finished=time.strftime("%Y-%m-%d %H:%M"),
-        command=shlex.join(["tsfusion", *sys.argv[1:]]) if is_command else "",
-        host=platform.node(),
-        cpu=_cpu(),
-        cores=os.cpu_count() or 0,
-        memory_bytes=process.physical_memory_bytes(),
-    )
-
-
-def _cpu() -> str:
-    """Name of the processor; where the system does not tell, its architecture."""
-    with suppress(OSError):
-        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.machine()
-
-
-def versions() -> dict[str, str]:
-    """Versions of Python, the platform, tsfusion and the packages it stands on."""
-    packages = "tsfusion taichi numpy opencv-python-headless pyzmq trimesh mcap msgspec zstandard"
-    found = {"python": platform.python_version(), "platform": platform.platform()}
-    return found | {name: version_of(name) for name in packages.split()}

@@ -3,7 +3,9 @@
 
 import time
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+import msgspec
 
 from tsfusion.core.readable_numbers import OnProgress, count_of, counted, grouped, size
 from tsfusion.geometry.se3 import Poses
@@ -12,10 +14,11 @@ from tsfusion.journal.inspection import JournalInfo
 from tsfusion.journal.journaled_keyframes import JournaledKeyframes
 from tsfusion.pipelines.maps import saved_maps
 from tsfusion.pipelines.maps.saved_maps import MapSummary
-from tsfusion.pipelines.report import findings, page, run_sections
+from tsfusion.pipelines.report import page, run_record, run_sections
 from tsfusion.pipelines.report.findings import MapFindings
 from tsfusion.pipelines.report.map_sections import ShownMap
 from tsfusion.pipelines.report.page import Page
+from tsfusion.pipelines.report.run_record import MapResult, RunRecord
 from tsfusion.tsdf.volume import Volume
 
 _NO_DELAY = "A saved map does not hold when its keyframes were fused: a run's report has that."
@@ -52,11 +55,12 @@ def write(about: AboutMap, file: Path, out: Path, *, memory_bytes: int | None = 
     """
     volume = Volume.load(file, memory_bytes=memory_bytes)
     mesh, stats = volume.extract_mesh(), volume.stats()
-    figures = {"mesh": _builtins(mesh.figures), "blocks": stats.blocks, "map_hash": volume.map_hash()}
-    found = MapFindings("", figures, mesh if len(mesh.faces) else None)
+    in_json = msgspec.to_builtins(mesh.figures)
+    figures = MapResult(mesh=in_json, blocks=stats.blocks, map_hash=volume.map_hash())
+    found = MapFindings(figures, mesh if len(mesh.faces) else None)
     if about.poses is not None and len(about.poses):
         found.paths["keyframes"] = (None, about.poses)
-    made = _page(about, stats.keyframes, figures)
+    made = _page(about, stats.keyframes, in_json)
     drawn: page.Pictures = {}
     if found.mesh is None:
         made.sections.append(
@@ -77,15 +81,13 @@ def write(about: AboutMap, file: Path, out: Path, *, memory_bytes: int | None = 
             "Delay",
             page.note(_NO_DELAY),
         ),
-        ("Where and with what", run_sections.setting(_setting(about))),
+        ("Where and with what", run_sections.setting(_setting(about.summary))),
     ]
     return page.write(made.html(), drawn, out)
 
 
-def _page(about: AboutMap, keyframes: int, figures: dict[str, object]) -> Page:
+def _page(about: AboutMap, keyframes: int, mesh: dict[str, Any]) -> Page:
     summary, journal = about.summary, about.journal
-    mesh = figures["mesh"]
-    assert isinstance(mesh, dict)
     damaged = [] if journal is None else [one for one in journal.problems if one.kind == "damage"]
     warnings = [f"The journal is damaged: {one.what} ({one.segment})." for one in damaged]
     if summary.rejected:
@@ -143,13 +145,8 @@ def _journal(journal: JournalInfo | None) -> str:
     return page.table(("file", "size", "keyframes", "state"), rows)
 
 
-def _setting(about: AboutMap) -> dict[str, object]:
-    summary = about.summary
-    return {"folder": summary.path, "config": summary.settings, "versions": findings.versions()}
-
-
-def _builtins(figures: dict[str, object]) -> dict[str, object]:
-    import msgspec
-
-    built: dict[str, object] = msgspec.to_builtins(figures)
-    return built
+def _setting(summary: MapSummary) -> RunRecord:
+    return RunRecord(
+        kind="replay", source="", folder=summary.path, config=summary.settings,
+        versions=run_record.versions(),
+    )  # fmt: skip

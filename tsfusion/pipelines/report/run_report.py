@@ -2,14 +2,14 @@
 """The report of a run: what it reached, at a glance and in detail."""
 
 from pathlib import Path
-from typing import Any
 
 from tsfusion.core.readable_numbers import count_of, counted, figure, grouped, size
 from tsfusion.geometry.mesh import Mesh
-from tsfusion.pipelines.report import findings, map_sections, page, run_sections, shortfall
+from tsfusion.pipelines.report import findings, map_sections, page, run_record, run_sections
 from tsfusion.pipelines.report.findings import MapFindings, RunFindings
 from tsfusion.pipelines.report.map_sections import ShownMap
 from tsfusion.pipelines.report.page import Page, Pictures
+from tsfusion.pipelines.report.run_record import Accuracy, MapResult
 
 _MOST_MAPS = 4  # that are shown in pictures
 _ELSEWHERE = "The map is on its server, so there is no mesh here: `tsfusion mesh` fetches it."
@@ -36,22 +36,21 @@ def write(folder: Path, out: Path, *, meshes: dict[str, Mesh] | None = None) -> 
 
 def _page(found: RunFindings, date: str) -> tuple[Page, Pictures]:
     record = found.record
-    verdict = shortfall.verdict(record)
-    fused, sent = record.get("keyframes_fused", 0), record.get("keyframes_sent", 0)
-    count = f"{fused} of {count_of(sent, 'keyframe')} fused"
-    version = (record.get("versions") or {}).get("tsfusion", "")
+    verdict = run_record.verdict(record)
+    count = f"{record.keyframes_fused} of {count_of(record.keyframes_sent, 'keyframe')} fused"
+    version = record.versions.get("tsfusion", "")
     made = Page(
-        title=str(record.get("dataset") or record.get("source")),
-        subtitle=f"{_kind(record)} · {count} · {date} · tsfusion {version}",
+        title=record.source,
+        subtitle=f"{record.kind.title()} · {count} · {date} · tsfusion {version}",
         verdict=verdict.headline,
         level=verdict.level,
         warnings=_warnings(found),
         tiles=_tiles(found),
-        footer=f"From {record.get('folder', '')}/run.json. This file needs no network and no other file.",
+        footer=f"From {record.folder}/run.json. This file needs no network and no other file.",
     )
     drawn: Pictures = {}
     for number, one in enumerate(found.maps[:_MOST_MAPS], 1):
-        suffix = f": map {one.name or number}" if len(found.maps) > 1 else ""
+        suffix = f": map {one.figures.name or number}" if len(found.maps) > 1 else ""
         drawn |= _add_map(made, one, found, suffix=suffix, prefix=f"map{number}-" if number > 1 else "")
     if len(found.maps) > _MOST_MAPS:
         rest = count_of(len(found.maps) - _MOST_MAPS, "more map")
@@ -68,9 +67,9 @@ def _page(found: RunFindings, date: str) -> tuple[Page, Pictures]:
 
 def _add_map(made: Page, one: MapFindings, found: RunFindings, *, suffix: str, prefix: str) -> Pictures:
     """Add the sections of a map; its pictures."""
-    errors = run_sections.trajectory_errors(one, is_given=found.record.get("localizer") == "given")
+    errors = run_sections.trajectory_errors(one, is_given=found.record.localizer == "given")
     if one.mesh is None:
-        why = _GONE if one.figures.get("mesh") else _ELSEWHERE
+        why = _GONE if one.figures.mesh else _ELSEWHERE
         made.sections += [
             (f"Map{suffix}", page.note(why) + run_sections.map_facts(one.figures)),
             (f"Trajectory{suffix}", map_sections.plan(None, one.paths) + errors),
@@ -80,59 +79,42 @@ def _add_map(made: Page, one: MapFindings, found: RunFindings, *, suffix: str, p
     made.sections += [
         (f"The map from four sides{suffix}", shown.sides() + run_sections.map_facts(one.figures)),
         (f"In 3-D{suffix}", shown.view()),
-        (f"Accuracy{suffix}", _accuracy(found.record) + shown.error()),
+        (f"Accuracy{suffix}", _accuracy(found.record.accuracy) + shown.error()),
         (f"Trajectory{suffix}", shown.plan() + errors),
     ]
     return shown.pictures
 
 
-def _accuracy(record: dict[str, Any]) -> str:
+def _accuracy(known: Accuracy | None) -> str:
     """The table of the error where the true surface is known; else a word."""
-    known = record.get("accuracy")
-    if not known:
+    if known is None:
         return page.note("The true surface is not known, so there is nothing to compare the mesh with.")
-    names = ("mean", "p50", "p95", "rmse", "max")
-    head = ("distance from the true surface", *(name.upper() if name == "rmse" else name for name in names))
-    row = (f"{grouped(known['vertices'])} vertices", *(f"{known[f'{name}_mm']:.2f} mm" for name in names))
-    return page.table(head, [row])
-
-
-def _kind(record: dict[str, Any]) -> str:
-    return "Replay" if "dataset" in record else "Scan"
+    head = ("distance from the true surface", "mean", "p50", "p95", "RMSE", "max")
+    figures = (known.mean_mm, known.p50_mm, known.p95_mm, known.rmse_mm, known.max_mm)
+    return page.table(head, [(f"{grouped(known.vertices)} vertices", *(f"{one:.2f} mm" for one in figures))])
 
 
 def _tiles(found: RunFindings) -> list[tuple[str, str, str]]:
-    record, first = found.record, found.maps[0] if found.maps else MapFindings("", {})
-    fused, sent = record.get("keyframes_fused", 0), record.get("keyframes_sent", 0)
-    tiles = [("keyframes fused", grouped(fused), f"of {grouped(sent)} sent")]
-    delay = record.get("delay_ms") or {}
-    if delay.get("count"):
-        tiles.append(("delay, 95 % below", f"{delay['p95']:.0f} ms",
-                      f"median {delay['p50']:.0f}, max {delay['max']:.0f} ms"))  # fmt: skip
-    if seconds := record.get("seconds"):
-        tiles.append(("time", f"{seconds:.1f} s", f"{figure(fused / seconds)} keyframes/s"))
-    if mesh := first.figures.get("mesh"):
-        triangles = f"{grouped(mesh['triangles'])} triangles"
-        tiles.append(("map", run_sections.extent(mesh), triangles))
-    if accuracy := record.get("accuracy"):
-        tiles.append(
-            (
-                "error of the surface",
-                f"{accuracy['mean_mm']:.2f} mm",
-                f"mean; 95 % below {accuracy['p95_mm']:.2f}",
-            )
-        )
-    error = first.figures.get("corrected_error") or first.figures.get("trajectory_error")
-    if error and record.get("localizer") != "given":
-        unit, factor = ("mm", 1000) if error["rmse"] < 1 else ("m", 1)
-        tiles.append(
-            (
-                "trajectory error",
-                f"{figure(factor * error['rmse'], 3)} {unit}",
-                f"RMSE over {figure(error['length'], 3)} m",
-            )
-        )
-    peaks = record.get("peak_rss_bytes") or {}
+    record, first = found.record, found.maps[0].figures if found.maps else MapResult()
+    fused, delay, accuracy = record.keyframes_fused, record.delay_ms, record.accuracy
+    tiles = [("keyframes fused", grouped(fused), f"of {grouped(record.keyframes_sent)} sent")]
+    if delay.count:
+        more = f"median {delay.p50:.0f}, max {delay.max:.0f} ms"
+        tiles.append(("delay, 95 % below", f"{delay.p95:.0f} ms", more))
+    if record.seconds:
+        tiles.append(("time", f"{record.seconds:.1f} s", f"{figure(fused / record.seconds)} keyframes/s"))
+    if first.mesh:
+        triangles = f"{grouped(first.mesh['triangles'])} triangles"
+        tiles.append(("map", run_sections.extent(first.mesh), triangles))
+    if accuracy:
+        more = f"mean; 95 % below {accuracy.p95_mm:.2f}"
+        tiles.append(("error of the surface", f"{accuracy.mean_mm:.2f} mm", more))
+    error = first.corrected_error or first.trajectory_error
+    if error and record.localizer != "given":
+        unit, factor = ("mm", 1000) if error.rmse < 1 else ("m", 1)
+        rmse, length = figure(factor * error.rmse, 3), figure(error.length, 3)
+        tiles.append(("trajectory error", f"{rmse} {unit}", f"RMSE over {length} m"))
+    peaks = record.peak_rss_bytes
     if "server" in peaks:
         tiles.append(("peak memory", size(peaks["server"]), f"server; client {size(peaks.get('client', 0))}"))
     return tiles
@@ -140,24 +122,23 @@ def _tiles(found: RunFindings) -> list[tuple[str, str, str]]:
 
 def _warnings(found: RunFindings) -> list[str]:
     record = found.record
-    lines = [f"{line[:1].upper()}{line[1:]}." for line in record.get("warnings") or ()]
-    if rejected := record.get("keyframes_rejected"):
-        lines.append(f"Not in the map: {counted(rejected)}.")
-    if skipped := record.get("frames_skipped"):
-        lines.append(f"Frames left out: {counted(skipped)}.")
-    lost = record.get("frames", 0) - record.get("frames_tracked", 0)
-    if lost:
+    lines = [f"{line[:1].upper()}{line[1:]}." for line in record.warnings]
+    if record.keyframes_rejected:
+        lines.append(f"Not in the map: {counted(record.keyframes_rejected)}.")
+    if record.frames_skipped:
+        lines.append(f"Frames left out: {counted(record.frames_skipped)}.")
+    if lost := record.frames - record.frames_tracked:
         lines.append(f"{count_of(lost, 'frame was', 'frames were')} not localised.")
-    if left := record.get("left"):
-        why = f" ({record['link']})" if record.get("link") else ""
-        lines.append(f"{count_of(left, 'keyframe is', 'keyframes are')} still in the spool{why}.")
-    if (bound := record.get("clock_bound_ms") or 0) > 5:
+    if record.left:
+        why = f" ({record.link})" if record.link else ""
+        lines.append(f"{count_of(record.left, 'keyframe is', 'keyframes are')} still in the spool{why}.")
+    if (bound := record.clock_bound_ms or 0) > 5:
         lines.append(
             f"The clocks of client and server agree to ± {bound:.1f} ms only: small delays are not exact."
         )
     for one in found.maps:
-        if stuck := one.figures.get("corrections_unavailable"):
+        if stuck := one.figures.corrections_unavailable:
             lines.append(f"{count_of(stuck, 'corrected keyframe')} could not be moved.")
-        if one.mesh is not None and not (one.figures.get("mesh") or {}).get("up"):
+        if one.mesh is not None and not one.figures.mesh.get("up"):
             lines.append("Up is not known: pictures have +z above (--up gives it).")
     return lines

@@ -5,17 +5,18 @@ import json
 from collections.abc import Sequence
 from typing import Any
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.core.readable_numbers import counted, figure, grouped, size
 from tsfusion.evaluation import trajectory_error
+from tsfusion.evaluation.trajectory_error import TrajectoryError
 from tsfusion.pipelines.report import charts, latency_ledger, page
 from tsfusion.pipelines.report.charts import Axis, Chart
 from tsfusion.pipelines.report.findings import MapFindings, RunFindings
-from tsfusion.wire.messages.keyframe_times import DELAY, STAGES, KeyframeTimes, spread
+from tsfusion.pipelines.report.run_record import Circumstances, MapResult, RunRecord
+from tsfusion.wire.messages.keyframe_times import DELAY, STAGES, KeyframeTimes, Spread, spread
 from tsfusion.wire.messages.messages import SKIP_REASONS
 
 _COLUMNS = 200  # of a chart by keyframe: more keyframes are drawn together
@@ -32,24 +33,17 @@ _MEANING = {
 def delay(found: RunFindings) -> str:
     """Delay of each keyframe by stage, its distribution, and a table."""
     record, times = found.record, found.times
-    figures = {name: spread for name, spread in (record.get("stages_ms") or {}).items() if name in STAGES}
-    total = record.get("delay_ms") or {}
-    if not total.get("count"):
+    total, figures = record.delay_ms, {name: record.stages_ms.get(name, Spread()) for name in STAGES}
+    if not total.count:
         return page.note("Not known: no keyframe was fused while this run was there to see it.")
-    if not figures and times:
-        figures = {
-            name: msgspec.to_builtins(spread(latency_ledger.durations_ms(times, *ends)))
-            for name, ends in STAGES.items()
-        }
-    rows = [
-        (f"{name}: {_MEANING[name]}", *map(_ms, (one[k] for k in ("mean", "p50", "p95", "p99", "max"))))
-        for name, one in figures.items()
-        if one.get("count")
-    ]
-    styles = [_STYLES[name] for name, one in figures.items() if one.get("count")]
-    rows.append(("delay: captured → fused", *(_ms(total[k]) for k in ("mean", "p50", "p95", "p99", "max"))))
-    table = page.table(("milliseconds", "mean", "p50", "p95", "p99", "max"), rows, styles=[*styles, "k0"])
-    bound = record.get("clock_bound_ms")
+    if not record.stages_ms:
+        figures = {name: spread(latency_ledger.durations_ms(times, *ends)) for name, ends in STAGES.items()}
+    known = {name: one for name, one in figures.items() if one.count}
+    rows = [(f"{name}: {_MEANING[name]}", *_milliseconds(one)) for name, one in known.items()]
+    rows.append(("delay: captured → fused", *_milliseconds(total)))
+    styles = [*(_STYLES[name] for name in known), "k0"]
+    table = page.table(("milliseconds", "mean", "p50", "p95", "p99", "max"), rows, styles=styles)
+    bound = record.clock_bound_ms
     words = "" if bound is None else f"Times between two machines or processes are right to ± {bound:.2f} ms."
     drawn = ""
     if times:
@@ -160,11 +154,12 @@ def trajectory_errors(found: MapFindings, *, is_given: bool) -> str:
     """The table of trajectory errors, and the error along the way; empty where there is no reference."""
     rows, lines = [], []
     for key, name, text in _ERRORS:
-        error = found.figures.get(key)
-        if not error or is_given:
+        error: TrajectoryError | None = getattr(found.figures, key)
+        if error is None or is_given:
             continue
-        rows.append((text, *(_metres(error[k]) for k in ("rmse", "mean", "median", "std", "min", "max")),
-                     f"{figure(error['drift_percent'])} %", f"{figure(error['length'], 3)} m"))  # fmt: skip
+        figures = (error.rmse, error.mean, error.median, error.std, error.min, error.max)
+        drift, length = f"{figure(error.drift_percent)} %", f"{figure(error.length, 3)} m"
+        rows.append((text, *map(_metres, figures), drift, length))
         if (line := _error_along(found, name)) is not None:
             lines.append((*line, f"k{6 if key == 'corrected_error' else 5}", text))
     if not rows:
@@ -180,8 +175,8 @@ def trajectory_errors(found: MapFindings, *, is_given: bool) -> str:
         Axis(0, end, "way, m", 10), Axis(0, 1.08 * most, f"error, {unit}"), "Error along the way",
         width=1060, height=250,
     )  # fmt: skip
-    for way, error, style, _ in lines:
-        chart.line(way, factor * error, style)
+    for way, along, style, _ in lines:
+        chart.line(way, factor * along, style)
     entries = [(style, text) for _, _, style, text in lines]
     return table + page.chart(chart.svg(), "Error along the way", legend=charts.legend(entries), is_wide=True)
 
@@ -208,46 +203,44 @@ def _error_along(found: MapFindings, name: str) -> tuple[NDArray[np.float64], ND
     return np.concatenate([[0.0], np.cumsum(steps)]), np.linalg.norm(aligned - places, axis=1)
 
 
-def keyframes(record: dict[str, Any]) -> str:
+def keyframes(record: RunRecord) -> str:
     """Fates of frames and keyframes."""
-    rejected = record.get("keyframes_rejected") or {}
-    named = {
-        f"{name} ({SKIP_REASONS[name]})" if name in SKIP_REASONS else name: n for name, n in rejected.items()
+    rejected = {
+        f"{name} ({SKIP_REASONS[name]})" if name in SKIP_REASONS else name: n
+        for name, n in record.keyframes_rejected.items()
     }
-    frames = f"{record['frames_tracked']} of {record['frames']} localised" if "frames" in record else ""
-    tracking = record.get("tracking_cpu_ms")
-    fused, sent = record.get("keyframes_fused", 0), record.get("keyframes_sent", 0)
-    rate = fused / record["seconds"] if record.get("seconds") else 0.0
-    return page.facts([
-        ("frames", frames),
-        ("left out", counted(record.get("frames_skipped") or {})),
-        ("localizer", str(record.get("localizer", ""))),
+    fused, seconds, tracking = record.keyframes_fused, record.seconds, record.tracking_cpu_ms
+    found = [  # by a scan
+        ("frames", f"{record.frames_tracked} of {record.frames} localised" if record.frames else ""),
+        ("localizer", record.localizer),
         ("tracking", f"{tracking:.1f} CPU ms a frame" if tracking else ""),
-        ("keyframes", f"{fused} of {sent} sent are fused"),
-        ("chosen by", counted(record.get("keyframes_by_rule") or {})),
-        ("not in the map", counted(named)),
-        ("time", f"{record['seconds']:.1f} s, {figure(rate)} keyframes/s" if record.get("seconds") else ""),
+        ("chosen by", counted(record.keyframes_by_rule)),
+    ]
+    return page.facts([
+        *(found if record.kind == "scan" else ()),
+        ("left out", counted(record.frames_skipped)),
+        ("keyframes", f"{fused} of {record.keyframes_sent} sent are fused"),
+        ("not in the map", counted(rejected)),
+        ("time", f"{seconds:.1f} s, {figure(fused / seconds)} keyframes/s" if seconds else ""),
     ])  # fmt: skip
 
 
-def setting(record: dict[str, Any]) -> str:
+def setting(record: RunRecord) -> str:
     """Where it ran, with what, and its settings."""
-    made, versions = record.get("made") or {}, record.get("versions") or {}
-    machine = [made.get("cpu", ""), f"{made['cores']} cores" if made.get("cores") else "",
-               size(made["memory_bytes"]) if made.get("memory_bytes") else ""]  # fmt: skip
-    memory = ", ".join(f"{name} {size(peak)}" for name, peak in (record.get("peak_rss_bytes") or {}).items())
+    made = record.made or Circumstances()
+    machine = [made.cpu, f"{made.cores} cores" if made.cores else "",
+               size(made.memory_bytes) if made.memory_bytes else ""]  # fmt: skip
     rows = [
-        ("command", made.get("command", "")),
-        ("camera", str(record.get("camera", ""))),
-        ("folder", str(record.get("folder", ""))),
-        ("machine", ", ".join(filter(None, map(str, machine)))),
-        ("host", str(made.get("host", ""))),
-        ("peak memory", memory),
-        ("software", ", ".join(f"{name} {version}" for name, version in versions.items())),
+        ("command", made.command),
+        ("camera", record.camera),
+        ("folder", record.folder),
+        ("machine", ", ".join(filter(None, machine))),
+        ("host", made.host),
+        ("peak memory", ", ".join(f"{name} {size(peak)}" for name, peak in record.peak_rss_bytes.items())),
+        ("software", ", ".join(f"{name} {version}" for name, version in record.versions.items())),
     ]
-    settings = json.dumps(record.get("config") or {}, indent=2, ensure_ascii=False)
-    details = page.folded("all settings", settings) if record.get("config") else ""
-    return page.facts([(name, str(text)) for name, text in rows]) + details
+    settings = json.dumps(record.config, indent=2, ensure_ascii=False)
+    return page.facts(rows) + (page.folded("all settings", settings) if record.config else "")
 
 
 def files(found: RunFindings) -> str:
@@ -255,24 +248,24 @@ def files(found: RunFindings) -> str:
     return page.facts((name, size(nbytes)) for name, nbytes in found.files.items())
 
 
-def map_facts(figures: dict[str, Any]) -> str:
+def map_facts(figures: MapResult) -> str:
     """Figures of a map."""
-    mesh = figures.get("mesh") or {}
+    mesh = figures.mesh
     size_m = " × ".join(f"{length:.2f}" for length in mesh.get("extent_m", ()))
     up = mesh.get("up")
     islands = mesh.get("islands")
     direction = " ".join(f"{round(x, 3) + 0.0:.3f}" for x in up["direction"]) if up else ""
+    moved = figures.keyframes_moved
     return page.facts([
         ("extent", f"{size_m} m" if size_m else ""),
         ("mesh", f"{grouped(mesh['vertices'])} vertices, {grouped(mesh['triangles'])} triangles"
          if mesh else ""),
         ("islands", f"{grouped(islands)} ({grouped(mesh['island_triangles'])} triangles)" if islands else ""),
         ("up", f"{direction} (by {up['found_by']})" if up else ""),
-        ("blocks", grouped(figures["blocks"]) if figures.get("blocks") else ""),
-        ("hash", str(figures.get("map_hash", ""))),
-        ("loops closed", str(figures.get("loops") or "")),
-        ("keyframes moved", f"{figures['keyframes_moved']} in {figures['moving_s']:.1f} s"
-         if figures.get("keyframes_moved") else ""),
+        ("blocks", grouped(figures.blocks) if figures.blocks else ""),
+        ("hash", figures.map_hash),
+        ("loops closed", str(figures.loops or "")),
+        ("keyframes moved", f"{moved} in {figures.moving_s:.1f} s" if moved else ""),
     ])  # fmt: skip
 
 
@@ -282,8 +275,8 @@ def extent(mesh: dict[str, Any]) -> str:
     return "\u2009×\u2009".join(lengths) + " m"
 
 
-def _ms(value: float) -> str:
-    return f"{value:.1f}"
+def _milliseconds(one: Spread) -> list[str]:
+    return [f"{value:.1f}" for value in (one.mean, one.p50, one.p95, one.p99, one.max)]
 
 
 def _metres(value: float) -> str:

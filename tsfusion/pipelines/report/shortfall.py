@@ -3,67 +3,20 @@
 
 One rule for all runs. A run reached its purpose when each keyframe that it sent is on the server's disk and
 in one map (half of them, where the others have no sample in range), and nearly all frames have a pose. What
-falls short of that still leaves its results; the command ends with the line, and with status 1. A run is as
-good as its worst finding: the `Verdict` is its headline on the terminal, in `run.json` and in the report.
+falls short of that still leaves its results; the command ends with the line, and with status 1.
 """
 
 import os
 from collections.abc import Iterable, Mapping
-from typing import Any
-
-import msgspec
 
 from tsfusion.client import Client, ClientStats
-from tsfusion.core.headline import Severity
-from tsfusion.core.readable_numbers import count_of, counted
+from tsfusion.core.readable_numbers import count_of
 from tsfusion.datasets.dataset import CLOCK, UNREADABLE, WITHOUT_POSE
 from tsfusion.geometry.sample_ranges import NO_SAMPLES
 from tsfusion.geometry.sweeps import skewed
 
 FEW = 0.05  # share of the frames that may be without a pose: more are a part of the scene
 _LOST = ("spool", "disk")  # reasons of skipping that no policy asks for
-
-
-class Verdict(msgspec.Struct, frozen=True):
-    """A run in one sentence.
-
-    Attributes:
-        level: of its worst finding; `bad` = the command ends with status 1.
-        text: without a full stop.
-    """
-
-    level: Severity
-    text: str
-
-    @property
-    def headline(self) -> str:
-        """The sentence as it stands at the top of a page."""
-        end = "" if self.text.endswith((".", ")")) else "."
-        return f"{self.text[:1].upper()}{self.text[1:]}{end if self.level != 'bad' else ''}"
-
-
-def verdict(record: Mapping[str, Any]) -> Verdict:
-    """The verdict on a run by its record, as in `run.json`, also of an older version."""
-    if missed := record.get("missed"):
-        return Verdict("bad", missed)
-    sent, fused = record.get("keyframes_sent", 0), record.get("keyframes_fused", 0)
-    fate = f"{count_of(sent, 'keyframe was', 'keyframes were')} fused"
-    if fused < sent == record.get("keyframes_durable"):
-        fate = f"{count_of(sent, 'keyframe is', 'keyframes are')} at the server, {fused} fused so far"
-        fused = sent
-    lost, skipped = record.get("frames", 0) - record.get("frames_tracked", 0), record.get("frames_skipped")
-    notices = [
-        "" if record.get("complete", True) else "the source was not read to its end",
-        f"{count_of(lost, 'frame was', 'frames were')} not localised" if lost else "",
-        f"frames left out: {counted(skipped)}" if skipped else "",
-        f"not in the map: {counted(record['keyframes_rejected'])}"
-        if record.get("keyframes_rejected")
-        else "",
-        "see the warnings" if record.get("warnings") else "",
-    ]
-    if any(notices) or fused < sent:
-        return Verdict("notice", together((f"{fused} of {fate}", *notices)))
-    return Verdict("good", f"complete: all {fate}")
 
 
 def of_delivery(stats: ClientStats, *, spool: str | os.PathLike[str], link: str, rejection: str) -> str:

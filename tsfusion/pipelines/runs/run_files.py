@@ -1,20 +1,17 @@
 # SPDX-License-Identifier: MIT
-"""The files that every whole run leaves: meshes with their pictures, the latency ledger, `run.json`."""
+"""The files that every whole run leaves: meshes with their pictures, trajectories, the latency ledger."""
 
 import dataclasses
 import logging
 import os
 from importlib.util import find_spec
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.client import ClientStats
-from tsfusion.core.output_folder import RECORD
 from tsfusion.datasets.dataset import NOMINAL_NS
 from tsfusion.datasets.trajectory_files import write_tum
 from tsfusion.geometry import up_direction
@@ -25,6 +22,7 @@ from tsfusion.journal.state_folder import check_no_map_of_a_server
 from tsfusion.pipelines.maps import mesh_finishing
 from tsfusion.pipelines.report import latency_ledger, shortfall
 from tsfusion.pipelines.runs.target_server import Target
+from tsfusion.scanner.scanner import Submap
 from tsfusion.wire.messages.health import Status
 from tsfusion.wire.messages.keyframe_times import KeyframeTimes
 
@@ -108,20 +106,33 @@ def write_ledger(work: Path, records: list[KeyframeTimes]) -> None:
         latency_ledger.plot(records, work / "delay.png")
 
 
-def write_record(work: Path, summary: msgspec.Struct) -> None:
-    """Write `run.json`."""
-    text = msgspec.json.format(msgspec.json.encode(summary), indent=2)
-    (work / RECORD).write_bytes(text + b"\n")
+def write_trajectory(work: Path, submap: Submap, suffix: str, *, is_given: bool) -> None:
+    """Write poses in the TUM format: `keyframes.txt` of those in the map, `trajectory.txt` of all frames.
 
+    Where loops were closed, `trajectory-corrected.txt` too; where the source has poses of its own that are
+    not these, `reference.txt`.
 
-def write_keyframes(path: Path, stamps_ns: list[int], poses: list[NDArray[np.float64]]) -> None:
-    """Write the poses that keyframes were sent with, as `read_tum` reads them.
-
-    Where their times do not grow, as in a recording without times, they are made up.
+    Args:
+        is_given: every frame is a keyframe at the source's own pose, so that one file says all.
     """
-    if any(later <= earlier for earlier, later in pairwise(stamps_ns)):
-        stamps_ns = [(index + 1) * NOMINAL_NS for index in range(len(poses))]
-    write_tum(path, stamps_ns, poses)
+    track = submap.located
+    poses, chosen = track.poses(), np.flatnonzero(track.seqs >= 0)
+    which, references = track.with_reference()
+    stamps = np.array(track.stamps_ns, np.int64)
+    if is_given and (np.diff(stamps[chosen]) <= 0).any():  # as in a recording without times: they are made up
+        stamps = NOMINAL_NS * np.arange(1, len(stamps) + 1)
+    _write_tum(work / f"keyframes{suffix}.txt", stamps[chosen], poses[chosen])
+    if is_given:
+        return
+    _write_tum(work / f"trajectory{suffix}.txt", stamps, poses)
+    if len(which) and not np.array_equal(poses[which], references):
+        _write_tum(work / f"reference{suffix}.txt", stamps[which], references)
+    if submap.corrections is not None and submap.corrections.loops:
+        _write_tum(work / f"trajectory-corrected{suffix}.txt", stamps, track.poses(submap.corrections))
+
+
+def _write_tum(path: Path, stamps_ns: NDArray[np.int64], poses: NDArray[np.float64]) -> None:
+    write_tum(path, stamps_ns.tolist(), list(poses))
 
 
 def write_report(work: Path, meshes: dict[str, Mesh]) -> None:

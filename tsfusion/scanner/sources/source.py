@@ -2,6 +2,7 @@
 """The `Source` protocol, the base of sources that wait for frames, and recordings as sources."""
 
 import dataclasses
+import math
 import queue
 import time
 from abc import ABC, abstractmethod
@@ -127,6 +128,9 @@ def monotonic_of(wall_ns: int, *, oldest_s: float) -> int:
     return now - age if 0 <= age <= oldest_s * SECOND else now
 
 
+_READ_AHEAD = 3  # times as long as the last frame took to be read: disks and images differ
+
+
 class RecordedSource(LiveSource):
     """Play a dataset's frames in order, as if they came from a sensor.
 
@@ -148,22 +152,36 @@ class RecordedSource(LiveSource):
         self.camera = str(camera) if isinstance(camera, RecordedCamera) else ""
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yield frames with the recording's timestamps, or nominal ones where it has none."""
-        due = time.monotonic()
+        """Yield frames with the recording's timestamps, or nominal ones where it has none.
+
+        At a rate, a sensor that was late does not catch up, and a frame is read when its time is near: read
+        at once it would take a core while the server fuses the last one, a third of the delay on two cores.
+        """
+        due, ahead = -math.inf, math.inf  # of the last frame; how long before its time the next one is read
         for index in range(len(self._dataset)):
-            if self._rate is not None and index:
-                due = max(due + 1 / self._rate, time.monotonic())  # a sensor that was late does not catch up
-                self._closed.wait(max(0.0, due - time.monotonic()))
+            self._wait_until(self._after(due) - ahead)
             if self._closed.is_set():
                 return
+            began = time.monotonic()
             try:
                 frame = frame_of(self._dataset, index)
             except UnreadableFrame:
                 continue
+            ahead = _READ_AHEAD * (time.monotonic() - began)
+            due = max(self._after(due), time.monotonic())
+            self._wait_until(due)
             stamp = frame.timestamp_ns
             if self._dataset.timestamps_ns is None and not stamp:
                 stamp = (index + 1) * NOMINAL_NS
             yield dataclasses.replace(frame, timestamp_ns=stamp, captured_ns=time.monotonic_ns())
+
+    def _after(self, due: float) -> float:
+        """Time of the frame after one."""
+        return -math.inf if self._rate is None else due + 1 / self._rate
+
+    def _wait_until(self, due: float) -> None:
+        if due > time.monotonic():
+            self._closed.wait(due - time.monotonic())
 
 
 class LimitedSource(LiveSource):

@@ -1,0 +1,219 @@
+# SPDX-License-Identifier: MIT
+"""The record of a run, `run.json`: one type that runs write, and that summary and report read."""
+
+import os
+import platform
+import shlex
+import sys
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+from msgspec import Struct
+from numpy.typing import NDArray
+
+from tsfusion.core import process
+from tsfusion.core.errors import OutputError
+from tsfusion.core.headline import Severity
+from tsfusion.core.output_folder import RECORD
+from tsfusion.core.process import version_of
+from tsfusion.core.readable_numbers import count_of, counted
+from tsfusion.evaluation.trajectory_error import TrajectoryError
+from tsfusion.pipelines.report import shortfall
+from tsfusion.wire.messages.keyframe_times import Spread
+
+RunKind = Literal["replay", "scan"]
+_EARLIER = {"dataset": "source"}  # names that earlier versions wrote → names of today
+
+
+class Verdict(Struct, frozen=True):
+    """A run in one sentence: as good as its worst finding.
+
+    Attributes:
+        level: of its worst finding; `bad` = the command ends with status 1.
+        text: without a full stop.
+    """
+
+    level: Severity
+    text: str
+
+    @property
+    def headline(self) -> str:
+        """The sentence as it stands at the top of a page."""
+        end = "" if self.text.endswith((".", ")")) else "."
+        return f"{self.text[:1].upper()}{self.text[1:]}{end if self.level != 'bad' else ''}"
+
+
+class Circumstances(Struct, frozen=True, kw_only=True):
+    """Time and place of a run's end, and its command. `finished` is local time."""
+
+    finished: str = ""
+    command: str = ""  # empty = it was not started by the `tsfusion` command
+    host: str = ""
+    cpu: str = ""
+    cores: int = 0
+    memory_bytes: int = 0
+
+
+class Accuracy(Struct, frozen=True):
+    """Distance from the mesh's vertices to the known surface, millimetres."""
+
+    vertices: int
+    mean_mm: float
+    p50_mm: float
+    p95_mm: float
+    rmse_mm: float
+    max_mm: float
+
+    @classmethod
+    def of(cls, error_mm: NDArray[np.float64]) -> "Accuracy":
+        """Figures of (n,) distances, millimetres."""
+        p50, p95 = np.percentile(error_mm, (50, 95))
+        rmse = np.sqrt(np.mean(error_mm**2))
+        figures = (error_mm.mean(), p50, p95, rmse, error_mm.max())
+        return cls(len(error_mm), *(round(float(x), 3) for x in figures))
+
+
+class MapResult(Struct, frozen=True, kw_only=True):
+    """One submap in figures. A scan knows nothing of a map that is on a server elsewhere."""
+
+    name: str = ""
+    frames: int = 0  # that have a pose
+    keyframes: int = 0  # of them, sent to the map
+    loops: int = 0  # closed by loop closure
+    trajectory_error: TrajectoryError | None = None  # as tracked; None = the source has no poses
+    corrected_error: TrajectoryError | None = None  # after loop closure; None = there were no corrections
+    map_hash: str = ""
+    keyframes_moved: int = 0  # times that one was fused anew at a corrected pose
+    moving_s: float = 0.0  # seconds for that
+    corrections_unavailable: int = 0  # corrected keyframes that could not be moved: the log says why
+    blocks: int = 0
+    mesh: dict[str, Any] = {}  # `Mesh.figures`, and what `mesh_finishing.write` left out
+
+
+class RunRecord(Struct, frozen=True, kw_only=True):
+    """Contents of `run.json`. Older versions wrote fewer figures, so each has a default."""
+
+    kind: RunKind
+    source: str
+    folder: str = ""  # where this file was written
+    camera: str = ""  # intrinsics, image size and where they came from; empty = no images
+    localizer: str = ""
+    complete: bool = True  # False after a failure, and for a recording after Ctrl-C
+    frames: int = 0
+    frames_tracked: int = 0
+    frames_skipped: dict[str, int] = {}  # left out, by reason
+    keyframes_sent: int = 0
+    keyframes_durable: int = 0
+    keyframes_fused: int = 0
+    keyframes_rejected: dict[str, int] = {}
+    keyframes_by_rule: dict[str, int] = {}
+    warnings: list[str] = []  # what is odd about the recording, a sentence each
+    missed: str = ""  # what the run was for and did not reach; empty = it did
+    verdict: Verdict | None = None  # the headline; None = not known yet
+    left: int = 0  # keyframes still in the spool at the end
+    link: str = ""  # why the server took nothing at the end; empty = it did
+    seconds: float = 0.0  # from the first frame until the last keyframe was fused (a scan elsewhere: sent)
+    server_start_seconds: float | None = None  # None = the server was there already
+    tracking_cpu_ms: float = 0.0  # CPU milliseconds of the localizer a frame
+    map_hash: str = ""  # of the first map, as are `blocks` and `mesh`
+    blocks: int = 0
+    mesh: dict[str, Any] = {}
+    accuracy: Accuracy | None = None  # of the first map's mesh; None = the true surface is not known
+    maps: list[MapResult] = []
+    origin_m: tuple[int, int, int] | None = None  # what was taken off given positions; None = nothing
+    delay_ms: Spread = Spread()
+    delay_slope_ms_per_keyframe: float = 0.0
+    stages_ms: dict[str, Spread] = {}
+    clock_bound_ms: float | None = None
+    peak_rss_bytes: dict[str, int] = {}
+    config: dict[str, Any] = {}
+    versions: dict[str, str] = {}
+    made: Circumstances | None = None
+
+
+def verdict(record: RunRecord) -> Verdict:
+    """The verdict on a run by its record."""
+    if record.missed:
+        return Verdict("bad", record.missed)
+    sent, fused, rejected = record.keyframes_sent, record.keyframes_fused, record.keyframes_rejected
+    fate = f"{count_of(sent, 'keyframe was', 'keyframes were')} fused"
+    if fused + sum(rejected.values()) < sent == record.keyframes_durable:
+        fate = f"{count_of(sent, 'keyframe is', 'keyframes are')} at the server, {fused} fused so far"
+        fused = sent
+    lost, skipped = record.frames - record.frames_tracked, record.frames_skipped
+    notices = [
+        "" if record.complete else "the source was not read to its end",
+        f"{count_of(lost, 'frame was', 'frames were')} not localised" if lost else "",
+        f"frames left out: {counted(skipped)}" if skipped else "",
+        f"not in the map: {counted(rejected)}" if rejected else "",
+        "see the warnings" if record.warnings else "",
+    ]
+    if any(notices) or fused < sent:
+        return Verdict("notice", shortfall.together((f"{fused} of {fate}", *notices)))
+    return Verdict("good", f"complete: all {fate}")
+
+
+def read(folder: Path) -> RunRecord:
+    """Read the record in a run's folder, also of an older version.
+
+    Raises:
+        OutputError: when it cannot be read, or is of no run.
+    """
+    path = folder / RECORD
+    try:
+        found = msgspec.json.decode(path.read_bytes())
+        if not isinstance(found, dict) or not ({"dataset", "source"} & found.keys()):
+            raise OutputError(f"{path} is of no run; expected what replay, scan or demo left")
+        return msgspec.convert(_of_today(found), RunRecord)
+    except (OSError, msgspec.MsgspecError, RecursionError) as error:
+        raise OutputError(f"cannot read {path}: {error}; expected the results of a run") from error
+
+
+def _of_today(found: dict[str, Any]) -> dict[str, Any]:
+    """A record with the names of today. A replay of earlier had its one map's figures beside its own."""
+    kind = "replay" if "dataset" in found else "scan"
+    renamed = {"kind": kind} | {_EARLIER.get(name, name): value for name, value in found.items()}
+    own = {name: renamed[name] for name in ("map_hash", "blocks", "mesh") if name in renamed}
+    return {"maps": [own]} | renamed
+
+
+def write(work: Path, record: Struct) -> None:
+    """Write `run.json`."""
+    text = msgspec.json.format(msgspec.json.encode(record), indent=2)
+    (work / RECORD).write_bytes(text + b"\n")
+
+
+def circumstances() -> Circumstances:
+    """Circumstances of this process: when, where and by which command."""
+    started = Path(sys.argv[0])
+    is_command = started.stem == "tsfusion" or (
+        started.name == "__main__.py" and started.parent.name == "tsfusion"
+    )
+    return Circumstances(
+        finished=time.strftime("%Y-%m-%d %H:%M"),
+        command=shlex.join(["tsfusion", *sys.argv[1:]]) if is_command else "",
+        host=platform.node(),
+        cpu=_cpu(),
+        cores=os.cpu_count() or 0,
+        memory_bytes=process.physical_memory_bytes(),
+    )
+
+
+def _cpu() -> str:
+    """Name of the processor; where the system does not tell, its architecture."""
+    with suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.machine()
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python, the platform, tsfusion and the packages it stands on."""
+    packages = "tsfusion taichi numpy opencv-python-headless pyzmq trimesh mcap msgspec zstandard"
+    found = {"python": platform.python_version(), "platform": platform.platform()}
+    return found | {name: version_of(name) for name in packages.split()}
