@@ -5,7 +5,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, ClassVar, Protocol, TypeVar
 
 import cv2
 import numpy as np
@@ -19,6 +19,7 @@ from tsfusion.geometry.calibration import Rectifier, Size
 from tsfusion.geometry.calibration_files import read_rig
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import MAX_BASELINE_M, Intrinsics
+from tsfusion.geometry.se3 import Transform
 
 _FrameKey = TypeVar("_FrameKey", int, str)
 log = logging.getLogger(__name__)
@@ -44,6 +45,9 @@ class PairRectifier(Protocol):
     @property
     def size(self) -> Size: ...
 
+    @property
+    def T_left_rectified(self) -> Transform: ...  # noqa: N802
+
     def pair(self, left: NDArray[Any], right: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
         """Rectify both images."""
 
@@ -55,6 +59,7 @@ class AlreadyRectified:
     intrinsics: Intrinsics
     baseline_fx: float  # metre · pixels
     size: Size
+    T_left_rectified: ClassVar[Transform] = np.eye(4)
 
     def pair(self, left: NDArray[Any], right: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
         """Return both images as they are.

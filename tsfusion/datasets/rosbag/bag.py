@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from tsfusion.core.errors import DatasetError
-from tsfusion.datasets.cameras import DepthUnit, RecordedCamera
+from tsfusion.core.errors import DatasetError, InvalidConfig
+from tsfusion.datasets.cameras import DepthUnit
 from tsfusion.datasets.dataset import CLOCK, NO_POSE_IN_TIME, Frames, clock_parts, nearest_in_time
 from tsfusion.datasets.readers import check_metres
 from tsfusion.datasets.rosbag import bag_messages
@@ -23,7 +23,6 @@ from tsfusion.datasets.rosbag.poses import ImuTopics, PoseFinder, pose_streams
 from tsfusion.datasets.rosbag.reader import ENDINGS, BagRecording, Message, MessageLocation, recording
 from tsfusion.datasets.rosbag.topics import Modality, TopicChooser, recorded_scale
 from tsfusion.geometry import se3
-from tsfusion.geometry.calibration_files import read_depth_unit
 from tsfusion.geometry.depth_registration import Registration
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
@@ -128,16 +127,11 @@ class Bag(Frames):
             self._recording, topics, intrinsics=intrinsics, calibration=calibration, rectified=rectified
         ).choose(modality)
         self._chosen = chosen
-        if chosen.view is not None:
-            self.camera = RecordedCamera(
-                chosen.view.intrinsics, chosen.size, chosen.view.source, chosen.view.undistorter
-            )
-        elif chosen.rig is not None:
-            self.camera = RecordedCamera(chosen.rig.intrinsics, chosen.size, chosen.rig.source)
+        self.camera = chosen.camera
         self._float_scale = depth_scale or 1.0
         self.name, self.sensor, self.skipped = f"ROS {path.name}", sensor or chosen.sensor, {}
         self._with_color, self._deskew = color, deskew
-        self.depth_unit = self._unit(depth_scale, calibration)
+        self.depth_unit = self._unit(depth_scale)
         self.depth_scale = self.depth_unit.metres
         self.uncolored = 0
         poses = PoseFinder(
@@ -160,14 +154,10 @@ class Bag(Frames):
     def __len__(self) -> int:
         return len(self._mains)
 
-    def _unit(self, given: float | None, calibration: str | Path | None) -> DepthUnit:
-        if given is not None:
-            return DepthUnit(given, "as given")
-        stated = None if calibration is None else read_depth_unit(calibration)
-        if stated is not None:
-            return DepthUnit(stated, f"from {Path(str(calibration)).name}")
+    def _unit(self, given: float | None) -> DepthUnit:
         recorded = recorded_scale(self._recording, self._chosen.main)
-        return DepthUnit(recorded or 0.001, "as ROS has it" if recorded is None else "as recorded")
+        usual = DepthUnit(recorded or 0.001, "as ROS has it" if recorded is None else "as recorded")
+        return usual if self._chosen.camera is None else self._chosen.camera.depth_unit(given, usual)
 
     def _index(
         self, poses: PoseFinder, imu: ImuTopics, part: int | None
@@ -183,8 +173,7 @@ class Bag(Frames):
         check = _CHECKS.get(chosen.main.kind)
         locations: dict[str, list[MessageLocation]] = {one.topic: [] for one in used}
         broken: Counter[str] = Counter()
-        sources = [chosen.view, chosen.rig, chosen.color_camera and chosen.color_camera.view]
-        watch = CameraWatch([one.info for one in sources if one is not None and one.info is not None])
+        watch = CameraWatch([*chosen.infos])
         for message in self._recording.messages([*used, *poses.streams, *imu.streams, *watch.streams]):
             if not isinstance(message, Message):
                 broken[message.topic] += message in used
@@ -257,9 +246,8 @@ class Bag(Frames):
         """Find the frames' poses; leave out those without."""
         assert self.timestamps_ns is not None
         self._poses = [at(stamp + offset_ns) for stamp in self.timestamps_ns.tolist()]
-        rig = self._chosen.rig
-        if rig is not None and rig.rectifier is not None:
-            turned = rig.rectifier.T_left_rectified
+        if self._chosen.pairs is not None:
+            turned = self._chosen.pairs.T_left_rectified
             self._poses = [None if pose is None else pose @ turned for pose in self._poses]
         where = self._recording.path, EXPECTED
         chosen = self._keep(range(len(self._poses)), self._poses, where, posed=posed, reason=NO_POSE_IN_TIME)
@@ -271,7 +259,7 @@ class Bag(Frames):
     def _register(self, poses: PoseFinder) -> Registration | None:
         """Registration that brings the colour of a separate camera onto the depth; None = it is left out."""
         chosen = self._chosen
-        if chosen.color_camera is None or chosen.view is None or not len(self):
+        if chosen.color_camera is None or chosen.camera is None or not len(self):
             return None
         T_color_depth = poses.between(chosen.color_camera.frame, chosen.frame, self._stamp(0))
         if T_color_depth is None:
@@ -284,20 +272,20 @@ class Bag(Frames):
             self._others = [None] * len(self)
             return None
         return Registration(
-            chosen.view.intrinsics,
-            chosen.color_camera.view.intrinsics,
+            chosen.camera.intrinsics,
+            chosen.color_camera.camera.intrinsics,
             T_color_depth,
             chosen.size,
-            color_size=chosen.color_camera.size,
+            color_size=chosen.color_camera.camera.size,
         )
 
     def _from_frame(self, poses: PoseFinder, frame: str) -> Transform | None:
         """The transform from another frame to that of the images or points; None = not known."""
         T_sensor_frame = poses.between(self._chosen.frame, frame, self._stamp(0))
-        rig = self._chosen.rig
-        if T_sensor_frame is None or rig is None or rig.rectifier is None:
+        pairs = self._chosen.pairs
+        if T_sensor_frame is None or pairs is None:
             return T_sensor_frame
-        return se3.inverse(rig.rectifier.T_left_rectified) @ T_sensor_frame
+        return se3.inverse(pairs.T_left_rectified) @ T_sensor_frame
 
     def _frame(self, index: int) -> Frame:
         chosen, location = self._chosen, self._mains[index]
@@ -311,49 +299,40 @@ class Bag(Frames):
             if chosen.modality == "stereo":
                 return self._pair_frame(index, content, beside)
             return self._depth_frame(index, content, beside)
-        except DatasetError as error:
+        except (DatasetError, InvalidConfig) as error:
             raise DatasetError(
                 f"{self._recording.path}: message {index} of {chosen.main.topic} {error}"
             ) from error
 
     def _depth_frame(self, index: int, content: Any, beside: Any) -> Frame:
-        view = self._chosen.view
-        assert view is not None
+        camera = self._chosen.camera
+        assert camera is not None
         depth = bag_messages.depth(content)
         self._chosen.check_size(self._chosen.main, depth.shape)
         if depth.dtype == np.float32:
             depth = depth * np.float32(self._float_scale)
             check_metres(depth, "has floats")
         color = None if beside is None else bag_messages.color(beside)
-        color_view = view if self._chosen.color_camera is None else self._chosen.color_camera.view
-        if view.undistorter is not None:
-            depth = view.undistorter.depth(depth)
-        if color is not None and color_view.undistorter is not None:
-            color = color_view.undistorter.image(color)
+        own = camera if self._chosen.color_camera is None else self._chosen.color_camera.camera
+        depth, color = camera.depth(depth), None if color is None else own.color(color)
         if color is not None and self._registration is not None:
             metres = np.nan_to_num(depth * (1.0 if depth.dtype == np.float32 else self.depth_scale))
             color = self._registration.color_of_depth(color, metres.astype(np.float32))
         return self._posed_frame(
-            index, depth=depth, depth_scale=self.depth_scale, color=color, intrinsics=view.intrinsics
+            index, depth=depth, depth_scale=self.depth_scale, color=color, intrinsics=camera.intrinsics
         )
 
     def _pair_frame(self, index: int, left: Any, right: Any) -> Frame:
-        rig = self._chosen.rig
-        assert rig is not None
-        pair = bag_messages.gray(left), bag_messages.gray(right)
-        color = bag_messages.color(left) if self._with_color else None
-        if rig.rectifier is not None:
-            if color is not None:
-                color = rig.rectifier.pair(color, color)[0]
-            pair = rig.rectifier.pair(*pair)
+        pairs = self._chosen.pairs
+        assert pairs is not None
+        flat = pairs.pair(bag_messages.gray(left), bag_messages.gray(right))
+        color = None
+        if self._with_color:
+            color = pairs.pair(*[bag_messages.color(left)] * 2)[0]
         return self._posed_frame(
-            index,
-            left=pair[0],
-            right=pair[1],
-            color=color,
-            intrinsics=rig.intrinsics,
-            baseline_fx=rig.baseline_fx,
-        )
+            index, left=flat[0], right=flat[1], color=color,
+            intrinsics=pairs.intrinsics, baseline_fx=pairs.baseline_fx,
+        )  # fmt: skip
 
 
 _CHECKS: dict[str, Callable[[Any], None]] = {

@@ -11,11 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError, InvalidConfig
-from tsfusion.datasets.cameras import given_camera
+from tsfusion.datasets.cameras import RecordedCamera, given_camera
 from tsfusion.datasets.readers import checked_intrinsics, intrinsics_of
 from tsfusion.datasets.rosbag import bag_messages
 from tsfusion.datasets.rosbag.bag_messages import CAMERA, CameraInfo
 from tsfusion.datasets.rosbag.reader import BagRecording, Message, Stream, frame_id
+from tsfusion.datasets.stereo_pairs import AlreadyRectified, PairRectifier
 from tsfusion.geometry import se3
 from tsfusion.geometry.calibration import MAX_NO_SKEW, Rectifier, StereoRig, Undistorter
 from tsfusion.geometry.calibration import Camera as Lens
@@ -73,25 +74,6 @@ def image_topic(recording: BagRecording, stream: Stream) -> ImageTopic | None:
     return None
 
 
-class CameraView(NamedTuple):
-    """The pinhole camera that images are turned into; `undistorter` None = they have no distortion."""
-
-    intrinsics: Intrinsics
-    undistorter: Undistorter | None
-    source: str
-    info: Stream | None = None  # whose first CameraInfo it is; None = it was given
-
-
-class CameraRig(NamedTuple):
-    """The two pinhole cameras that pairs are turned into; `rectifier` None = the pairs are rectified."""
-
-    intrinsics: Intrinsics
-    baseline_fx: float
-    rectifier: Rectifier | None
-    source: str
-    info: Stream | None = None  # as in `CameraView`, of the left camera
-
-
 class CameraWatch:
     """Compares each CameraInfo of some topics with the first one, which counts for all images.
 
@@ -139,6 +121,7 @@ class Cameras:
     ) -> None:
         self._recording, self._info_topic = recording, info_topic
         self._intrinsics, self._calibration, self._rectified = intrinsics, calibration, rectified
+        self.used: list[Stream] = []  # whose first CameraInfo is that of some images
 
     def find(self, images: ImageTopic) -> CameraInfo | None:
         """The camera of a topic of images; None = there is no CameraInfo."""
@@ -175,45 +158,49 @@ class Cameras:
         frame = "" if message is None else frame_id(message)
         return not frame or not images.frame or frame == images.frame or bool(REGISTERED.search(images.base))
 
-    def view(self, images: ImageTopic) -> CameraView:
-        """Find how some images become those of a pinhole camera.
+    def view(self, images: ImageTopic) -> RecordedCamera:
+        """Find the camera that took some images.
 
         Raises:
             DatasetError: the camera is missing, not calibrated, of another size, or of an unknown lens.
         """
         given = given_camera(images.size, intrinsics=self._intrinsics, calibration=self._calibration)
-        if given is not None:
-            return CameraView(given.intrinsics, given.undistorter, given.source)
-        return self._recorded_view(images)
+        return given or self._recorded_view(images)
 
-    def _recorded_view(self, images: ImageTopic) -> CameraView:
-        """View of an image as by `view`, with the camera of the images' CameraInfo."""
-        camera = self._checked(images)
-        of = self._of(images)
+    def _recorded_view(self, images: ImageTopic) -> RecordedCamera:
+        """The camera of the images' CameraInfo."""
+        camera, source = self._checked(images), self._source(images)
         if self._is_rectified(images):
             K = camera.P[:, :3] if camera.P[0, 0] else camera.K
             camera = camera._replace(K=K, D=np.zeros(0))
         if _is_pinhole(camera):
-            return CameraView(self._pinhole(images, camera.K), None, *of)
+            return RecordedCamera(self._pinhole(images, camera.K), images.size, source)
         undistorter = Undistorter(self._lens(images, camera))
-        return CameraView(undistorter.intrinsics, undistorter, *of)
+        return RecordedCamera(undistorter.intrinsics, images.size, source, undistorter)
 
-    def _of(self, images: ImageTopic) -> tuple[str, Stream | None]:
-        """Where the camera of some images is from, in words and as a topic."""
+    def _source(self, images: ImageTopic) -> str:
+        """Note the topic that the camera of some images is from; returns it in words."""
         stream = self._info_stream(images)
-        return "from CameraInfo" if stream is None else f"from {stream.topic}", stream
+        if stream is None:
+            return "from CameraInfo"
+        self.used.append(stream)
+        return f"from {stream.topic}"
 
-    def own_view(self, images: ImageTopic) -> CameraView | None:
-        """The view of a camera that is not the depth's; None where it has no CameraInfo of its own."""
+    def own_view(self, images: ImageTopic) -> RecordedCamera | None:
+        """The camera of images that is not the depth's; None where it has no CameraInfo of its own."""
         stream = None if self._info_topic is not None else self._info_stream(images)
         if stream is None or not _is_beside(stream.topic, images.base):
             return None
         return self._recorded_view(images)
 
-    def rig(self, left: ImageTopic, right: ImageTopic) -> CameraRig:
-        """Find how a pair's images become those of two equal cameras with matching rows; raises as `view`."""
+    def pairs(self, left: ImageTopic, right: ImageTopic) -> tuple[PairRectifier, str]:
+        """Find how a pair's images become those of two equal cameras with matching rows, and from what.
+
+        Raises:
+            DatasetError: as of `view`.
+        """
         if self._calibration is not None:
-            return self._rig_of_file(left)
+            return self._pairs_of_file(left, Path(self._calibration).expanduser())
         cameras = [self._checked(one) for one in (left, right)]
         shift = cameras[0].P[0, 3] - cameras[1].P[0, 3]
         if not shift > 0:
@@ -224,22 +211,19 @@ class Cameras:
         if plain or (self._is_rectified(left) and self._is_rectified(right)):
             recorded, _ = (self._pinhole(left, one.P) for one in cameras)
             if self._intrinsics is None:
-                return CameraRig(recorded, float(shift), None, *self._of(left))
+                return AlreadyRectified(recorded, float(shift), left.size), self._source(left)
             given = checked_intrinsics(self._intrinsics, "intrinsics")
-            return CameraRig(given, float(shift) * given.fx / recorded.fx, None, "as given")
+            return AlreadyRectified(given, float(shift) * given.fx / recorded.fx, left.size), "as given"
         if self._intrinsics is not None:
             raise DatasetError(
                 f"{self._recording.path}: pairs that are not rectified need the --calibration of both, not "
                 "--intrinsics (rectified=True says that these images are)"
             )
         lenses = [self._lens(one, camera) for one, camera in zip((left, right), cameras, strict=True)]
-        rectifier = Rectifier(StereoRig(lenses[0], lenses[1], _right_of(*cameras)))
-        return CameraRig(rectifier.intrinsics, rectifier.baseline_fx, rectifier, *self._of(left))
+        return Rectifier(StereoRig(lenses[0], lenses[1], _right_of(*cameras))), self._source(left)
 
-    def _rig_of_file(self, left: ImageTopic) -> CameraRig:
+    def _pairs_of_file(self, left: ImageTopic, path: Path) -> tuple[PairRectifier, str]:
         """Rectification by a stereo camera's file that was given."""
-        assert self._calibration is not None
-        path = Path(self._calibration).expanduser()
         try:
             rectifier = Rectifier(read_rig(path))
         except InvalidConfig as error:
@@ -249,9 +233,7 @@ class Cameras:
                 f"{path} is of images of {rectifier.size[1]}×{rectifier.size[0]}, {left.stream.topic} is "
                 f"{left.size[1]}×{left.size[0]}; expected the calibration of these images"
             )
-        return CameraRig(
-            rectifier.intrinsics, rectifier.baseline_fx, rectifier, f"from the given {path.name}"
-        )
+        return rectifier, f"from the given {path.name}"
 
     def _is_rectified(self, images: ImageTopic) -> bool:
         return bool(RECTIFIED.search(images.base)) if self._rectified is None else self._rectified

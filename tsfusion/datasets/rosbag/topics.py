@@ -8,18 +8,18 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from tsfusion.core.errors import DatasetError
+from tsfusion.datasets.cameras import RecordedCamera
 from tsfusion.datasets.rosbag import bag_messages
 from tsfusion.datasets.rosbag.bag_cameras import (
     RECTIFIED,
     REGISTERED,
-    CameraRig,
     Cameras,
-    CameraView,
     ImageTopic,
     image_topic,
 )
 from tsfusion.datasets.rosbag.bag_messages import CAMERA, CLOUD, COMPRESSED, IMAGE
 from tsfusion.datasets.rosbag.reader import BagRecording, Stream, frame_id
+from tsfusion.datasets.stereo_pairs import PairRectifier
 from tsfusion.geometry.keyframe import Intrinsics
 
 log = logging.getLogger(__name__)
@@ -42,8 +42,7 @@ class ColorCamera(NamedTuple):
     """A colour camera that is not the depth camera."""
 
     frame: str
-    view: CameraView
-    size: tuple[int, int]
+    camera: RecordedCamera
 
 
 class ChosenTopics(NamedTuple):
@@ -55,14 +54,15 @@ class ChosenTopics(NamedTuple):
     sensor: str
     frame: str  # of `main`; empty = its messages name none
     size: tuple[int, int]  # height and width of an image of `main`
-    view: CameraView | None = None  # the camera of depth images
-    rig: CameraRig | None = None  # the cameras of a pair
+    camera: RecordedCamera | None = None  # of depth images, of the left one of rectified pairs
+    pairs: PairRectifier | None = None
+    infos: tuple[Stream, ...] = ()  # whose first CameraInfo is that of all images
     color_camera: ColorCamera | None = None  # of `other`, where its images are registered to the depth
 
     def check_size(self, stream: Stream, size: tuple[int, ...]) -> None:
         """Raise DatasetError for an image of a stream whose size is not that of the stream's first one."""
-        camera = self.color_camera if stream == self.other else None
-        expected = self.size if camera is None else camera.size
+        own = self.color_camera if stream == self.other else None
+        expected = self.size if own is None else own.camera.size
         if self.modality != "lidar" and size != expected:
             raise DatasetError(f"is {size[1]}×{size[0]}, the first {expected[1]}×{expected[0]}")
 
@@ -103,7 +103,7 @@ class TopicChooser:
         wanted = modality or (named[0] if named else None)
         for kind, find in (("depth", self._depth), ("stereo", self._stereo), ("lidar", self._lidar)):
             if wanted in (None, kind) and (chosen := find()) is not None:
-                return chosen
+                return chosen._replace(infos=tuple(self._cameras.used))
         raise self._error(f"no {wanted or 'depth images, stereo pair or point clouds'} found")
 
     @property
@@ -151,9 +151,9 @@ class TopicChooser:
             return None
         other, own_camera = self._color_of(main)
         sensor = next((name for pattern, name in _SENSORS if re.search(pattern, main.base)), "kinect")
-        view = self._cameras.view(main)
+        camera = self._cameras.view(main)
         return ChosenTopics(
-            "depth", main.stream, other, sensor, main.frame, main.size, view, color_camera=own_camera
+            "depth", main.stream, other, sensor, main.frame, main.size, camera, color_camera=own_camera
         )
 
     def _color_of(self, depth: ImageTopic) -> tuple[Stream | None, ColorCamera | None]:
@@ -161,10 +161,8 @@ class TopicChooser:
 
         Images count as registered when they have the depth's size, and its frame or a depth topic named so.
         """
-        given, found = (
-            self._named_images("color_topic"),
-            [one for one in self._image_topics() if one.is_color],
-        )
+        given = self._named_images("color_topic")
+        found = [one for one in self._image_topics() if one.is_color]
         best = given or max(found, key=lambda one: _closeness(one, depth), default=None)
         if best is None:
             return None, None
@@ -172,7 +170,7 @@ class TopicChooser:
         if fits and best.size == depth.size:
             return best.stream, None
         if (view := self._cameras.own_view(best)) is not None:
-            return best.stream, ColorCamera(best.frame, view, best.size)
+            return best.stream, ColorCamera(best.frame, view)
         if given is not None and best.size == depth.size:
             return best.stream, None
         sizes = (
@@ -197,14 +195,10 @@ class TopicChooser:
             return None
         if left is None or right is None:
             raise self._error("left_topic and right_topic go together")
+        rectifier, source = self._cameras.pairs(left, right)
+        camera = RecordedCamera(rectifier.intrinsics, left.size, source)
         return ChosenTopics(
-            "stereo",
-            left.stream,
-            right.stream,
-            "stereo",
-            left.frame,
-            left.size,
-            rig=self._cameras.rig(left, right),
+            "stereo", left.stream, right.stream, "stereo", left.frame, left.size, camera, rectifier
         )
 
     def _pair(self, right: ImageTopic) -> tuple[ImageTopic, ImageTopic] | None:
