@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from command_processes import tsfusion
+from command_processes import Here
 from keyframes_and_servers import DEADLINE, Server, lasting_address, map_hash, pose, serving, until, wall
 from quick_fusers import SUMS
 from sum_map import SumMap, hash_of
@@ -100,16 +100,16 @@ def check_map(state: Path, sent: list[int]) -> None:
     assert saved.map_hash() == hash_of(map(wall, sent))
 
 
-def test_a_live_map_moves_and_every_keyframe_is_in_it_once(tmp_path: Path) -> None:
+def test_a_live_map_moves_and_every_keyframe_is_in_it_once(tmp_path: Path, here: Here) -> None:
     with sending(tmp_path) as (one, two, sender):
         with closing(MapWatcher(one.address)) as watcher:
             see(watcher, lambda: watcher.address == one.address)
-            moved = tsfusion("map", "move", "default", "--from", one.address, "--to", two.address)
+            moved = here("map", "move", "default", "--from", one.address, "--to", two.address)
             assert moved.returncode == 0, moved.stderr
             assert f"map default is at {two.address}" in moved.stdout
             see(watcher, lambda: watcher.address == two.address)
         acknowledged_more(sender)
-        status = tsfusion("status", "--connect", one.address, "--map", "default")
+        status = here("status", "--connect", one.address, "--map", "default")
         assert status.returncode == 0, status.stdout + status.stderr
         with MapClient(one.address, timeout=questions.LONGEST_S) as live:
             assert live.sample([[0.0, 0.0, 1.0]]).state.keyframes >= FEW
@@ -128,12 +128,12 @@ def test_a_live_map_moves_and_every_keyframe_is_in_it_once(tmp_path: Path) -> No
         assert sum(journaled(tmp_path / "one").values()) == len(sent) + 1
         assert len(journal.segments(folder)) >= 3
         expected = map_hash([*map(wall, sent), wall(41, T_world_camera=pose(5.0))])
-        assert tsfusion("map", "hash", tmp_path / "one").stdout.strip() == expected
+        assert here("map", "hash", tmp_path / "one").stdout.strip() == expected
         assert (tmp_path / "two" / "moved" / "default.json").exists()
 
 
 def test_a_map_comes_into_the_process_of_an_empty_one_which_gets_another(tmp_path: Path) -> None:
-    with serving(tmp_path / "one") as one, serving(tmp_path / "two") as two:
+    with serving(tmp_path / "one", fuser=SUMS) as one, serving(tmp_path / "two", fuser=SUMS) as two:
         with Client(one.address, spool=tmp_path / "spool", map="yard", config=QUICK) as client:
             client.send(wall(0))
             client.wait_fused(DEADLINE)
@@ -144,8 +144,8 @@ def test_a_map_comes_into_the_process_of_an_empty_one_which_gets_another(tmp_pat
         assert {each.fuser_restarts for each in queries.fetch_health(two.address).maps.values()} == {0}
         assert two.terminate() == 0
     for name, number in (("yard", 0), ("default", 1)):
-        saved = state_folder.map_folder(tmp_path / "two", name) / state_folder.MAP_FILE
-        assert tsfusion("map", "hash", saved).stdout.strip() == map_hash([wall(number)])
+        saved = SumMap.load(state_folder.map_folder(tmp_path / "two", name) / state_folder.MAP_FILE)
+        assert saved.map_hash() == hash_of([wall(number)])
 
 
 def test_a_map_that_cannot_go_stays_and_goes_on(tmp_path: Path) -> None:
@@ -165,7 +165,7 @@ def test_a_map_that_cannot_go_stays_and_goes_on(tmp_path: Path) -> None:
 
 _DIES_AT = """
 import os, signal
-from tsfusion.gateway.migration import map_arrivals; from tsfusion.gateway.migration import map_departures
+from tsfusion.gateway.migration import map_arrivals, map_departures
 def die(*_arguments, **_more):
     os.kill(os.getpid(), signal.SIGKILL)
 {patch}
@@ -176,7 +176,7 @@ _DEATHS = {
     # The taker: it has all, and died before it asked for the last word.
     "taker": "map_arrivals.MapArrival._commit = die",
     # The taker again: the map is its own by the last word, and it has not opened it.
-    "taker, late": "moved_maps.install = die",
+    "taker, late": "map_departures.moved_maps.install = die",
 }
 
 
