@@ -553,13 +553,13 @@ FAULTS = (
         "datasets/scan_files.py",
         "    if step > _COARSE * span:",
         "    if False:",
-        "datasets/test_point_times.py::test_times_of_no_use_are_named",
+        "datasets/test_readers.py::test_times_of_no_use_are_named",
     ),
     Fault(
         "datasets/scan_files.py",
         " & np.isfinite(points).all(axis=1) & points.any(axis=1)",
         "",
-        "datasets/test_point_times.py::test_points_without_a_return_may_have_any_time",
+        "datasets/test_readers.py::test_points_without_a_return_may_have_any_time",
     ),
     Fault(
         "datasets/trajectory_files.py",
@@ -589,7 +589,7 @@ FAULTS = (
         "datasets/dataset.py",
         "bad = self.skipped[UNREADABLE] = len(self._unread)",
         "bad = len(self._unread)",
-        "datasets/test_broken_frames.py::test_one_broken_frame_of_six_is_left_out",
+        "datasets/formats/test_every_layout.py::test_what_happens_to_one_frame_leaves_the_others_at_their_poses",
     ),
     Fault(
         "datasets/dataset.py",
@@ -601,7 +601,7 @@ FAULTS = (
         "datasets/file_names.py",
         "    if not others or _unevenness(ways[others[0]]) > 2 * _unevenness(ways[best]) + 0.05:",
         "    if True:",
-        "datasets/test_times_in_names.py::test_ambiguous_times_are_refused",
+        "datasets/test_trajectory_files.py::test_ambiguous_times_are_refused",
     ),
     # files that claim much
     Fault(

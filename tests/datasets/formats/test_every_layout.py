@@ -212,7 +212,7 @@ def test_what_happens_to_one_frame_leaves_the_others_at_their_poses(
         expected = frames[key]
         assert (T is None) == (expected is None)
         assert T is None or np.abs(T - expected).max() < 1e-12
-    assert skipped <= 2
+    assert skipped == 1 or (harmed.change.endswith(("missing", "renamed")) and skipped <= 2)
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 """Loop closure: places known again, look-alikes refused, trajectories put right; poses never jump."""
 
 import sys
+import threading
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
@@ -18,7 +19,7 @@ from tsfusion.evaluation.trajectory_error import TrajectoryError, absolute_error
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
 from tsfusion.scanner.localization.localizer import Lost, PoseCorrections, TrackedPose
-from tsfusion.scanner.localization.loop_closure.loop_closing import LoopClosing
+from tsfusion.scanner.localization.loop_closure.loop_closing import LoopClosing, OrderedWork
 from tsfusion.scanner.localization.loop_closure.loop_consensus import (
     Loop,
     LoopConsensus,
@@ -32,6 +33,7 @@ from tsfusion.scanner.localization.rgbd.rgbd_tracker import RGBDLocalizer
 from tsfusion.scanner.tracked_trajectory import TrackedTrajectory
 
 FAR, TURNED = 0.05, 2.0  # metres and degrees: a loop that is farther off is wrong
+SOON = 20.0  # seconds
 
 
 class Run:
@@ -434,3 +436,39 @@ def test_the_corridor_has_two_laps_and_the_rooms_are_equal():
     assert (one.depth == two.depth).mean() > 0.97
     other = Synthetic(worlds.rooms(identical=False), count=60, width=64, noise=False)
     assert (other.frame(5).color == other.frame(5 + round(step)).color).mean() < 0.5
+
+
+def test_calls_are_made_in_order() -> None:
+    work, made = OrderedWork("test", 3), list[int]()
+    for number in range(50):
+        work.add(made.append, number)
+    work.wait()
+    assert made == list(range(50))
+
+
+def test_what_waits_has_an_end() -> None:
+    work, go, began = OrderedWork("test", 2), threading.Event(), threading.Event()
+
+    def slow() -> None:
+        began.set()
+        assert go.wait(SOON)
+
+    work.add(slow)
+    work.add(lambda: None)
+    assert began.wait(SOON)
+    added = threading.Event()
+    adding = threading.Thread(target=lambda: (work.add(lambda: None), added.set()), daemon=True)
+    adding.start()
+    assert not added.is_set()  # there is no room
+    go.set()
+    assert added.wait(SOON)
+    adding.join(SOON)
+    work.wait()
+
+
+def test_an_error_is_raised() -> None:
+    work = OrderedWork("test", 2)
+    work.add(lambda: 1 // 0)  # type: ignore[arg-type,return-value]
+    with pytest.raises(ZeroDivisionError):
+        work.wait()
+    work.wait()
