@@ -666,9 +666,9 @@ FAULTS = (
         "pipelines/test_shortfall.py::test_what_is_not_at_the_server_or_in_its_map",
     ),
     Fault(
-        "pipelines/report/shortfall.py",
-        '    if missed := record.get("missed"):',
-        '    if missed := "":',
+        "pipelines/report/run_record.py",
+        "    if record.missed:",
+        '    if "":',
         "pipelines/test_shortfall.py::test_a_run_is_as_good_as_its_worst_finding",
     ),
     Fault(
