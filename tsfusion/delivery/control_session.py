@@ -352,7 +352,7 @@ class ControlSession:
         self._asked_again = ack.resend or (self._asked_again and not moved)
 
     def _on_progress(self, durable: int, fused: int, stamps: tuple[Stamps, ...] = ()) -> bool:
-        """Note what the server has; whether anything left the spool."""
+        """Note what the server has. Returns True if anything left the spool."""
         if self._is_foreign(durable):
             return False
         offset_ns, bound_ns = self.clock.offset_ns or 0, self.clock.bound_ns

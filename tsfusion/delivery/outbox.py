@@ -181,7 +181,7 @@ class Outbox:
             self._changed.notify_all()
 
     def change_link_state(self, state: LinkState) -> bool:
-        """Replace the link's state; whether that is another one."""
+        """Replace the link's state. Returns True if it is another one."""
         with self._lock:
             is_new = state != self.link_state
             self.link_state = state
@@ -309,7 +309,7 @@ class Outbox:
             self._claimed = 0
 
     def sent(self, entry: Waiting, sent_ns: int) -> bool:
-        """Note that the claimed record is on its way; whether it is the only one."""
+        """Note that the claimed record is on its way. Returns True if it is the only one."""
         with self._lock:
             self._outstanding += 1
             self._perhaps_sent = max(self._perhaps_sent, entry.seq)
@@ -360,7 +360,7 @@ class Outbox:
         offset_ns: int = 0,
         bound_ns: int = 0,
     ) -> bool:
-        """Let go of what the server has, and note its stamps; whether anything left the spool.
+        """Let go of what the server has, and note its stamps. Returns True if anything left the spool.
 
         Args:
             offset_ns, bound_ns: the server's clock minus ours, and how wrong that may be.
@@ -501,7 +501,7 @@ class Outbox:
             )
 
     def close(self) -> bool:
-        """Release the spool; whether that loses what a temporary one still holds."""
+        """Close the spool. Returns True if a temporary one still held records: they are lost."""
         with self._lock:
             loses = self.spool.temporary and bool(self.spool.waiting)
             self.spool.close()

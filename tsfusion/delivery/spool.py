@@ -327,7 +327,7 @@ class Spool:
         self._forget(n for n in self._idle if n < (newest if below is None else below))
 
     def _forget(self, numbers: Iterable[int]) -> bool:
-        """Delete segments, the oldest first, up to one that cannot be deleted now; whether there was none.
+        """Delete segments, the oldest first. Returns False if one cannot be deleted now: the rest stays, too.
 
         Its records are only sent once more, and recognised. Were newer ones deleted, the next scanner would
         take its last number for the last of all.

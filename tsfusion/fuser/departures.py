@@ -298,7 +298,7 @@ class Departures:
         return self._searches[0].wait(idle) if self._searches else self.window.wait(idle)
 
     def look(self) -> bool:
-        """Look for a moment, and send what was found; whether it was the window that was looked at."""
+        """Look for a moment, and send what was found. Returns True if the window was looked at."""
         if not self._searches:
             self.window.look()
             return True

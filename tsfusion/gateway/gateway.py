@@ -167,7 +167,7 @@ class Gateway:
             self.ports.knows_viewer(after_rubbish=True)
 
     def _drop_connections(self) -> bool:
-        """Drop all connections if that has to be; whether it was done."""
+        """Drop all connections if that has to be. Returns True if it was done."""
         if not self._limits.all_must_go(self._queries.nbytes):
             return False
         self.ports.renew()

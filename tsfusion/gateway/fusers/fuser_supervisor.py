@@ -315,7 +315,7 @@ class FuserSupervisor:
         return False
 
     def _replace(self, why: str, *, blame: int) -> bool:
-        """Kill a process that stands still; whether it has ended yet: no other one begins before that."""
+        """Kill a process that hangs. Returns True once it has ended: the next one begins only then."""
         log.error("%s: it is killed", why, extra=logs.about(map=self._map))
         self._blame_current_keyframe(blame)
         self._silence.answered()

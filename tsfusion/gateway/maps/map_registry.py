@@ -393,7 +393,7 @@ class MapRegistry:
         return all(hosted.settled for hosted in self._begun)
 
     def finish(self) -> bool:
-        """Have every fuser write its checkpoint and end; whether all have ended. Call it until they have."""
+        """Have every fuser write its checkpoint and end. Call it until all have ended, which it returns."""
         self._spares.close()
         for hosted in self._begun:
             hosted.fuser.finish()

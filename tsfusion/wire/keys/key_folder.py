@@ -375,7 +375,7 @@ class AllowList:
         self.refresh()
 
     def refresh(self) -> bool:
-        """Read the file again if it changed; whether a key lost its name or has other maps. Never raises."""
+        """Read the file again if it changed. Returns True if a key lost its name or has other maps."""
         seen = self._stamp()
         if seen == self._seen and not (self.problem and time.monotonic() > self._again):
             return False

@@ -124,7 +124,7 @@ class ServerLink:
         return news, ended
 
     def _try_again(self, now: float) -> bool:
-        """Open a new socket when that is due; whether one is replaced that was connected once."""
+        """Open a new socket if its time has come. Returns True if the old one had been connected."""
         is_unknown = self._monitor.retrying and not self._tried_both
         if not is_unknown and now < (self._retry_due or now + 1):
             self._retry_due = self._retry_due or now + _RETRY_INTERVAL
