@@ -202,25 +202,25 @@ FAULTS = (
     ),
     # sessions and admission
     Fault(
-        "gateway/clients/sessions.py",
+        "gateway/clients/client_routes.py",
         '        if seq <= durable:\n            return "duplicate"\n',
         "",
         "gateway/test_keyframe_index.py::test_each_keyframe_is_admitted_once_and_in_order",
     ),
     Fault(
-        "gateway/clients/sessions.py",
+        "gateway/clients/client_routes.py",
         'return "next" if previous <= durable else "gap"',
         'return "next"',
         "gateway/test_keyframe_index.py::test_each_keyframe_is_admitted_once_and_in_order",
     ),
     Fault(
-        "gateway/clients/sessions.py",
+        "gateway/clients/client_routes.py",
         "return not self.client or not client or self.client == client",
         "return True",
         "gateway/test_client_routes.py::test_a_session_is_its_clients_in_the_journal_and_before",
     ),
     Fault(
-        "gateway/clients/sessions.py",
+        "gateway/clients/client_routes.py",
         "return key in self._by_key or len(self) < _MAX_SESSIONS",
         "return True",
         "gateway/test_keyframe_index.py::test_sessions_are_bounded",

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from tsfusion.delivery.timing import CAPACITY, ClockOffset, KeyframeTimesTable, TakingRate
+from tsfusion.delivery.outcomes import CAPACITY, ClockOffset, KeyframeTimesTable, TakingRate
 from tsfusion.wire.messages.keyframe_times import KeyframeTimes, Stamps
 
 

@@ -97,7 +97,7 @@ def test_maps_that_cannot_be_opened_are_remembered_up_to_a_number(
 
 
 def test_a_map_takes_only_so_many_sessions(tmp_path: Path) -> None:
-    code = "import tsfusion.gateway.clients.sessions; tsfusion.gateway.clients.sessions._MAX_SESSIONS = 2\n"
+    code = "from tsfusion.gateway.clients import client_routes; client_routes._MAX_SESSIONS = 2\n"
     with contextlib.closing(Server(tmp_path, code=code, fuser=SUMS)) as server:
         for i in range(2):
             scan(server.address, "default", range(i, i + 1))

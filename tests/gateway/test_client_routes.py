@@ -5,8 +5,7 @@ from typing import cast
 
 import pytest
 
-from tsfusion.gateway.clients.client_routes import Admission, ClientRoutes
-from tsfusion.gateway.clients.sessions import Sessions
+from tsfusion.gateway.clients.client_routes import Admission, ClientRoutes, Sessions
 from tsfusion.gateway.ports.access_control import AccessControl
 from tsfusion.gateway.ports.ports import Ports, Subscriptions
 from tsfusion.wire.messages.messages import Ping

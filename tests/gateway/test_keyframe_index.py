@@ -8,8 +8,7 @@ from typing import Any, cast
 import pytest
 
 from tsfusion.fuser.fuser_messages import Done, Fuse
-from tsfusion.gateway.clients.client_routes import ClientRoutes, RecentFates
-from tsfusion.gateway.clients.sessions import Session, Sessions
+from tsfusion.gateway.clients.client_routes import ClientRoutes, RecentFates, Session, Sessions
 from tsfusion.gateway.fusers.fuser_supervisor import FuserSupervisor
 from tsfusion.gateway.health.metrics import Metrics
 from tsfusion.gateway.maps.keyframe_outcomes import DelayStatistics, KeyframeOutcomes
@@ -105,7 +104,7 @@ def test_each_keyframe_is_admitted_once_and_in_order() -> None:
 
 
 def test_sessions_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tsfusion.gateway.clients.sessions._MAX_SESSIONS", 2)
+    monkeypatch.setattr("tsfusion.gateway.clients.client_routes._MAX_SESSIONS", 2)
     sessions = Sessions()
     for key in (SESSION, bytes(16)):
         assert sessions.room_for(key)

@@ -8,8 +8,7 @@ from typing import cast
 import pytest
 
 from tsfusion.fuser.fuser_messages import Done, Ready
-from tsfusion.gateway.clients.client_routes import ClientRoutes
-from tsfusion.gateway.clients.sessions import Sessions
+from tsfusion.gateway.clients.client_routes import ClientRoutes, Sessions
 from tsfusion.gateway.health.metrics import Metrics
 from tsfusion.gateway.maps.keyframe_outcomes import KeyframeOutcomes
 from tsfusion.gateway.maps.map_records import MapRecords

@@ -4,7 +4,7 @@
 from typing import Any, cast
 
 from tsfusion.fuser import fuser_messages
-from tsfusion.gateway.clients.sessions import Session, Sessions
+from tsfusion.gateway.clients.client_routes import Session, Sessions
 from tsfusion.gateway.fusers.fuser_supervisor import FuserSupervisor
 from tsfusion.gateway.maps.map_journal import JournalRetention
 from tsfusion.gateway.records.journaled_records import KeyframeIndex

@@ -11,8 +11,8 @@ from msgspec.structs import replace
 from tsfusion.core.errors import DecodeError, JournalError
 from tsfusion.core.readable_numbers import count_of
 from tsfusion.delivery.outbox import LinkState, Outbox
+from tsfusion.delivery.outcomes import SAMPLES, ClockOffset
 from tsfusion.delivery.spool import Waiting
-from tsfusion.delivery.timing import SAMPLES, ClockOffset
 from tsfusion.geometry.sample_ranges import NO_SAMPLES
 from tsfusion.journal.quarantine import Quarantine
 from tsfusion.wire.messages import messages

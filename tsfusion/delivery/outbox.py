@@ -16,9 +16,15 @@ from numpy.typing import NDArray
 
 from tsfusion.core.errors import InvalidKeyframe
 from tsfusion.core.readable_numbers import count_of
-from tsfusion.delivery.outcomes import ClientStats, DeliveryProgress, Outcomes
+from tsfusion.delivery.outcomes import (
+    ClientStats,
+    DeliveryProgress,
+    KeyframeTimesTable,
+    Lag,
+    Outcomes,
+    TakingRate,
+)
 from tsfusion.delivery.spool import Spool, Waiting
-from tsfusion.delivery.timing import KeyframeTimesTable, Lag, TakingRate
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.wire.messages.keyframe_times import KeyframeTimes, Stamps
 

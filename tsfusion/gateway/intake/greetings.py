@@ -9,8 +9,7 @@ import zmq
 from tsfusion.core import logs
 from tsfusion.core.config import SERVER_SESSION, ServerConfig
 from tsfusion.core.errors import JournalError
-from tsfusion.gateway.clients.client_routes import Admission, ClientRoutes
-from tsfusion.gateway.clients.sessions import Sessions
+from tsfusion.gateway.clients.client_routes import Admission, ClientRoutes, Sessions
 from tsfusion.gateway.maps.map_registry import MapRegistry
 from tsfusion.gateway.ports.ports import Ports
 from tsfusion.wire.messages import messages

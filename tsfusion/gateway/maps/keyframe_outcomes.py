@@ -13,8 +13,7 @@ import numpy as np
 from tsfusion.core import logs
 from tsfusion.core.errors import JournalError
 from tsfusion.fuser import fuser_messages
-from tsfusion.gateway.clients.client_routes import ClientRoutes
-from tsfusion.gateway.clients.sessions import Session
+from tsfusion.gateway.clients.client_routes import ClientRoutes, Session
 from tsfusion.gateway.health.metrics import Metrics
 from tsfusion.gateway.maps.map_records import IncomingRecord, MapRecords
 from tsfusion.gateway.records.journaled_records import IndexEntry

@@ -16,7 +16,7 @@ from tsfusion.core.errors import JournalError
 from tsfusion.core.readable_numbers import count_of
 from tsfusion.fuser import fuser_messages
 from tsfusion.fuser.fuser_messages import Ready
-from tsfusion.gateway.clients.sessions import Sessions
+from tsfusion.gateway.clients.client_routes import Sessions
 from tsfusion.gateway.fusers.fuser_supervisor import FuserSupervisor
 from tsfusion.gateway.records.journaled_records import KeyframeIndex
 from tsfusion.journal import Journal, ReadingWatcher, state_folder

@@ -9,8 +9,7 @@ from typing import Any, NamedTuple
 from tsfusion.core import logs
 from tsfusion.core.config import ServerConfig
 from tsfusion.core.errors import MISSING, JournalError
-from tsfusion.gateway.clients.client_routes import ClientRoute
-from tsfusion.gateway.clients.sessions import Sessions
+from tsfusion.gateway.clients.client_routes import ClientRoute, Sessions
 from tsfusion.gateway.health.problems import Problem
 from tsfusion.gateway.maps import map_journal, moved_maps
 from tsfusion.gateway.maps.map_journal import JournalRetention

@@ -15,8 +15,7 @@ from tsfusion.core import logs
 from tsfusion.core.config import DEFAULT_MAP, MAP_NAME_LENGTH, ServerConfig, VolumeConfig
 from tsfusion.core.errors import JournalError, TsfusionError
 from tsfusion.core.readable_numbers import count_of
-from tsfusion.gateway.clients.client_routes import ClientRoutes
-from tsfusion.gateway.clients.sessions import Session
+from tsfusion.gateway.clients.client_routes import ClientRoutes, Session
 from tsfusion.gateway.fusers.fuser_supervisor import FuserSupervisor
 from tsfusion.gateway.fusers.spare_fusers import SpareFusers
 from tsfusion.gateway.health.metrics import Metrics

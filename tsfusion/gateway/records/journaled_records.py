@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping
 from msgspec import Struct
 
 from tsfusion.fuser.fuser_messages import Fuse, SessionProgress
-from tsfusion.gateway.clients.sessions import Session, Sessions
+from tsfusion.gateway.clients.client_routes import Session, Sessions
 from tsfusion.gateway.fusers.fuser_supervisor import FuserSupervisor
 from tsfusion.journal import Position, RecordEntry
 from tsfusion.wire.messages.keyframe_times import Stamps
