@@ -13,7 +13,7 @@ from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.worlds.synthetic import WORLDS
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.up_direction import Up
-from tsfusion.pipelines.maps.measured_errors import error_measure
+from tsfusion.pipelines.report.measured_errors import error_measure
 
 POINTS = np.array([[0.2, 0.3, 0.01], [0.2, 0.3, -0.02]], np.float32)
 
@@ -44,7 +44,7 @@ def test_a_world_and_a_run_in_it(tmp_path: Path) -> None:
     assert np.allclose(error_measure("synthetic:room")(mesh.vertices), truth, atol=1e-6)
     mesh.save(tmp_path / "mesh.ply")
     (tmp_path / "run.json").write_text(
-        json.dumps({"dataset": "synthetic room", "config": {"voxel_size": 0.02}})
+        json.dumps({"dataset": "synthetic room", "config": {"volume": {"voxel_size": 0.02}}})
     )
     np.save(tmp_path / "error.npy", truth.astype(np.float32))
     world = WORLDS["room"](1).distance(POINTS.astype(np.float64))

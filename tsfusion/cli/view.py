@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from tsfusion.pipelines.maps.measured_errors import Measure
+    from tsfusion.pipelines.report.measured_errors import Measure
     from tsfusion.viewer.map_feed import MapFeed
     from tsfusion.wire.sockets.curve import ClientKeys
 
@@ -174,7 +174,7 @@ def _feed(target: str | Path, map_: str | None, link: dict[str, Any]) -> "MapFee
 def _measures(target: str | Path, truth: str | None) -> "dict[str, Measure]":
     """Further colours of a map: its error, where the truth is given, or a run has measured it."""
     if truth is not None:
-        from tsfusion.pipelines.maps.measured_errors import error_measure
+        from tsfusion.pipelines.report.measured_errors import error_measure
 
         return {_ERROR: error_measure(truth)}
     if isinstance(target, Path) and (target / "error.npy").exists():
@@ -184,7 +184,7 @@ def _measures(target: str | Path, truth: str | None) -> "dict[str, Measure]":
 
 @cache
 def _measure_of_run(folder: Path) -> "Measure":
-    from tsfusion.pipelines.maps.measured_errors import error_measure
+    from tsfusion.pipelines.report.measured_errors import error_measure
 
     return error_measure(folder)
 

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: MIT
 """How far points of a map are from the truth, where somebody knows it: a mesh, points, a world, a run."""
 
-import json
 import os
 from collections.abc import Callable
 from contextlib import suppress
@@ -11,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core.errors import DatasetError, TsfusionError
-from tsfusion.core.output_folder import RECORD
+from tsfusion.core.errors import DatasetError, OutputError, TsfusionError
 from tsfusion.datasets import Synthetic, open_dataset
 from tsfusion.evaluation.mesh_distance import MeshDistance, tree_of
 from tsfusion.geometry.mesh_encoding import TURNED_BY_NODE
+from tsfusion.pipelines.report import run_record
 
 Measure = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 
@@ -67,17 +66,17 @@ def _of_world(name: str) -> Measure:
 def _of_run(folder: Path) -> Measure:
     """A run's error: by its dataset's world, where that still is the same; else at its mesh's vertices."""
     try:
-        record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
+        record = run_record.read(folder)
         errors = np.load(folder / "error.npy", allow_pickle=False)
-        voxel_size = float(record["config"]["voxel_size"])
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        voxel_size = float(record.config.get("volume", record.config)["voxel_size"])
+    except (OSError, ValueError, KeyError, TypeError, OutputError) as error:
         raise DatasetError(
             f"{folder} holds no error that was measured (error.npy of a run whose dataset knows its surface)"
         ) from error
     vertices, _ = _read(folder / "mesh.ply")
     if errors.shape != (len(vertices),):
         raise DatasetError(f"{folder}/error.npy is not of the mesh beside it: run it again")
-    kind, _, name = str(record.get("dataset")).partition(" ")
+    kind, _, name = record.source.partition(" ")
     if kind == _WORLD:
         with suppress(DatasetError):  # the world is another version's, or of a package that is not here
             measure, some = _of_world(name), slice(None, None, 1 + len(vertices) // _TRIED)
