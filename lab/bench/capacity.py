@@ -29,7 +29,7 @@ import simpy
 from msgspec import Struct
 from msgspec.structs import replace
 
-from tsfusion.cluster import mesh_runs
+from tsfusion.cluster import tiling
 
 DOCS = Path(__file__).parents[2] / "docs"
 POINTS, FUSE_POINTS = DOCS / "scale-points.jsonl", DOCS / "fuse-points.jsonl"
@@ -158,7 +158,7 @@ def simulate_fusing(model: Fusing, keyframes: int, blocks: int, workers: int, co
         yield env.all_of([env.process(job(share)) for _ in range(workers)])
         if workers > 1:
             yield env.process(job(model.adding * blocks))
-        runs = len(mesh_runs.shares(blocks, workers)) or 1
+        runs = len(tiling.shares(blocks, workers)) or 1
         share = model.mesh_start + model.meshing * blocks / runs
         yield env.all_of([env.process(job(share)) for _ in range(runs)])
         if runs > 1:

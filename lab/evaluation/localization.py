@@ -38,7 +38,7 @@ from drifting_localizer import Drifting
 from lab.bench.peers import DATA, surroundings
 from lab.evaluation import odometry_peers
 from tsfusion import open_dataset
-from tsfusion.cli.ate import table
+from tsfusion.cli.check import table
 from tsfusion.core import process
 from tsfusion.core.config import LocalizerName, ScanConfig
 from tsfusion.datasets import Dataset, select

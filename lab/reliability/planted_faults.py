@@ -477,7 +477,7 @@ FAULTS = (
         "tsdf/test_map_addition.py::test_a_sum_without_room_leaves_the_map_as_it_was",
     ),
     Fault(
-        "cluster/carrying_out.py",
+        "cluster/schedulers.py",
         "is_whole = (done.name, done.digests) == (job.name, jobs.digests(self._folder, done.files))",
         "is_whole = True",
         "cluster/test_fusing.py::test_a_part_that_is_not_what_its_job_wrote_is_made_anew",

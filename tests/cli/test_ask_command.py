@@ -18,7 +18,7 @@ from tsfusion import Client, Volume
 from tsfusion.core.errors import DatasetError
 from tsfusion.geometry.map_answers import View
 from tsfusion.pipelines.maps import answer_files
-from tsfusion.pipelines.maps.saved_map_answers import SavedMapAnswers
+from tsfusion.pipelines.maps.saved_maps import SavedMapAnswers
 from tsfusion.wire.messages.questions import MOST_POINTS
 
 POINTS = np.array([[0.0, 0.0, 1.2], [0.1, 0.05, 1.27], [9.0, 9.0, 9.0]])

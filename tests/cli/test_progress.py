@@ -14,7 +14,7 @@ from command_processes import environment
 from msgspec import structs
 from rich.console import Console
 
-from tsfusion.cli import progress, progress_rows
+from tsfusion.cli import progress
 from tsfusion.client import ClientStats
 from tsfusion.core import rates
 from tsfusion.scanner.scanner import ScanState
@@ -53,12 +53,12 @@ class Clock:
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     clock = Clock()
-    for module in (progress_rows, rates):
+    for module in (progress, rates):
         monkeypatch.setattr(module, "time", clock)
     return clock
 
 
-def drawn(screen: progress_rows.Screen, width: int, *, color: bool = False, trouble: str = "") -> list[str]:
+def drawn(screen: progress.Screen, width: int, *, color: bool = False, trouble: str = "") -> list[str]:
     """The lines of a terminal that shows this."""
     console = Console(
         width=width, force_terminal=True, color_system="truecolor", no_color=not color, highlight=False,
@@ -94,7 +94,7 @@ def test_plain_lines(capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize("color", [True, False])
 @pytest.mark.parametrize("width", [80, 120])
 def test_a_table_answers_in_its_first_line_and_fits(width: int, color: bool, clock: Clock) -> None:
-    run = progress_rows.RunProgress()
+    run = progress.RunProgress()
     run.screen(2500, structs.replace(GOING, sent=20, durable=20, fused=19), "", None)
     clock.now += 2.0
     replay = drawn(run.screen(2500, GOING, "", None), width, color=color)
@@ -115,7 +115,7 @@ def test_a_table_answers_in_its_first_line_and_fits(width: int, color: bool, clo
 
 
 def test_columns_stay_while_figures_grow(clock: Clock) -> None:
-    run = progress_rows.RunProgress()
+    run = progress.RunProgress()
     ends = set()
     for sent in (1, 9, 80, 700, 6000):
         clock.now += 1.0
@@ -125,7 +125,7 @@ def test_columns_stay_while_figures_grow(clock: Clock) -> None:
 
 
 def test_what_stands_still_is_said(clock: Clock) -> None:
-    run = progress_rows.RunProgress()
+    run = progress.RunProgress()
     run.screen(60, GOING, "", None)
     clock.now += 7.0
     assert str(run.screen(60, GOING, "", None).headline) == (
@@ -191,7 +191,7 @@ def test_warnings_stand_above_the_table(capsys: pytest.CaptureFixture[str]) -> N
 
 def test_a_terminal_gets_bars_that_go_away() -> None:
     program = (
-        "import time; from tsfusion.cli import progress, progress_rows\n"
+        "import time; from tsfusion.cli import progress\n"
         "with progress.shown(quiet=False) as display:\n"
         "    display.stage('scanning the room'); display.show_steps('shots', 3, 10); time.sleep(1)\n"
         "print('the end')\n"

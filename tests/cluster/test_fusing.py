@@ -25,9 +25,9 @@ from small_recordings import corbs, kitti, redwood
 
 from tsfusion import Volume
 from tsfusion.cluster import fusion, job_runner, jobs, keyframe_sources, ray_scheduler
-from tsfusion.cluster.carrying_out import ATTEMPTS
 from tsfusion.cluster.fusion import FusedRun, Wishes
 from tsfusion.cluster.jobs import AnyJob, JobLost, JobMessage
+from tsfusion.cluster.schedulers import ATTEMPTS
 from tsfusion.core.config import VolumeConfig
 from tsfusion.core.errors import InvalidConfig, JournalError, MapError, OutputError, WorkerLost
 from tsfusion.journal import Journal, segment_path

@@ -11,7 +11,7 @@ import trimesh
 from keyframes_and_servers import pose, wall
 
 from tsfusion import Volume, VolumeConfig
-from tsfusion.cluster import mesh_runs, tiling
+from tsfusion.cluster import tiling
 from tsfusion.core.errors import InvalidConfig
 from tsfusion.geometry.mesh_parts import joined
 from tsfusion.tsdf.surface import field_regularizer, mesh_tiles
@@ -67,20 +67,20 @@ def test_runs_of_a_mesh_are_the_whole_one_bit_for_bit(
     volume: Volume, tmp_path: Path, surface: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(field_regularizer, "BATCH", 64)  # blocks a tile
-    assert mesh_runs.shares(5 * 64, 8) == []
-    assert mesh_runs.shares(6 * 64, 8) == [range(3), range(3, 6)]
-    monkeypatch.setattr(mesh_runs, "LEAST_TILES", 1)
+    assert tiling.shares(5 * 64, 8) == []
+    assert tiling.shares(6 * 64, 8) == [range(3), range(3, 6)]
+    monkeypatch.setattr(tiling, "LEAST_TILES", 1)
     file = volume.save(tmp_path / "map.tsf")
     whole = volume.extract_mesh(surface=surface)
     blocks = volume.stats().blocks
-    assert mesh_runs.shares(64, 8) == []
+    assert tiling.shares(64, 8) == []
     for workers in (2, 5, 1000):
-        shares = mesh_runs.shares(blocks, workers)
+        shares = tiling.shares(blocks, workers)
         assert [one for share in shares for one in share] == list(range(-(-blocks // 64)))
         files = [tmp_path / f"{workers}-{number}.npz" for number in range(len(shares))]
         for path, share in zip(files, shares, strict=True):
-            mesh_runs.write(path, mesh_runs.make(file, share, {"surface": surface}))
-        runs = [mesh_runs.read(path) for path in files]
+            tiling.write_run(path, tiling.make_run(file, share, {"surface": surface}))
+        runs = [tiling.read_run(path) for path in files]
         assert sum(len(one.open_at) for one in runs) > 0
         made = joined(list(mesh_tiles.together(reversed(runs))))
         for name in ("vertices", "faces", "normals", "colors"):

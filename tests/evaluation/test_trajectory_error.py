@@ -13,7 +13,7 @@ import pytest
 from command_processes import tsfusion
 
 from tsfusion import DatasetError
-from tsfusion.cli.ate import table
+from tsfusion.cli.check import table
 from tsfusion.datasets import open_dataset, select
 from tsfusion.datasets.dataset import NOMINAL_NS, Frames, pose_of
 from tsfusion.datasets.trajectory_files import read_poses, read_tum, write_tum

@@ -18,8 +18,7 @@ from tsfusion.core.errors import CheckpointError, JournalError, TsfusionError
 from tsfusion.core.folder_lock import lock_folder
 from tsfusion.journal import state_folder
 from tsfusion.pipelines.shown import view_process, viewed_maps
-from tsfusion.pipelines.shown.view_messages import Open, Opened, Took
-from tsfusion.pipelines.shown.viewed_maps import SavedMapFeed, open_feed
+from tsfusion.pipelines.shown.viewed_maps import Open, Opened, SavedMapFeed, Took, open_feed
 from tsfusion.wire.asking.map_events import LinkSeen, SurfaceUpdate
 
 DEADLINE_S = 60.0

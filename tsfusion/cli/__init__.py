@@ -18,19 +18,15 @@ import typer
 from tsfusion import __version__
 from tsfusion.cli import (
     ask,
-    ate,
     check,
-    config_verb,
     datasets,
     doctor,
-    download_verb,
     fuse,
     journal,
     keys,
     map,
     mesh_verb,
     opened_maps,
-    report,
     runs,
     serve,
     spool_verb,
@@ -69,7 +65,7 @@ verbs.verb(
 )(check.check)
 verbs.verb(
     app, "tsfusion report out/latest", "tsfusion report my-maps --map yard --out yard.html", panel=OWN
-)(report.report)
+)(check.report)
 verbs.verb(
     app, "tsfusion mesh out/latest/map.tsf room.glb", "tsfusion mesh tcp://server:5555 yard.ply --map yard",
     panel=OWN,
@@ -90,10 +86,10 @@ app.add_typer(map.app, name="map", rich_help_panel=OWN)
 verbs.verb(
     app, "tsfusion ate out/latest/trajectory.txt groundtruth.txt",
     "tsfusion ate estimate.txt my-recording --plot error.png", panel=OWN,
-)(ate.ate)  # fmt: skip
+)(check.ate)  # fmt: skip
 app.add_typer(datasets.app, name="datasets", rich_help_panel=OWN)
 verbs.verb(app, "tsfusion download", "tsfusion download tum-fr1-xyz --to datasets", panel=OWN)(
-    download_verb.download
+    datasets.download
 )
 verbs.verb(
     app, "tsfusion serve --state my-maps --voxel-size 0.02",
@@ -106,7 +102,7 @@ app.add_typer(journal.app, name="journal", rich_help_panel=SERVER)
 app.add_typer(keys.app, name="keys", rich_help_panel=SERVER)
 app.add_typer(spool_verb.app, name="spool", rich_help_panel=SERVER)
 verbs.verb(app, "tsfusion doctor", "tsfusion doctor /mnt/maps", panel=SETUP)(doctor.doctor)
-app.add_typer(config_verb.app, name="config", rich_help_panel=SETUP)
+app.add_typer(keys.config_app, name="config", rich_help_panel=SETUP)
 
 
 @app.callback(invoke_without_command=True)

@@ -214,7 +214,7 @@ def _map(where: str, map_: str | None, link: dict[str, Any], *, quiet: bool) -> 
             yield client
         return
     from tsfusion.cli import opened_maps
-    from tsfusion.pipelines.maps.saved_map_answers import SavedMapAnswers
+    from tsfusion.pipelines.maps.saved_maps import SavedMapAnswers
     from tsfusion.tsdf.volume import Volume
 
     with opened_maps.opened(Path(where), map_, quiet=quiet) as file:

@@ -9,7 +9,7 @@ from msgspec.structs import replace
 from rich.console import Console
 from rich.text import Text
 
-from tsfusion.cli.progress_rows import styled
+from tsfusion.cli.progress import styled
 from tsfusion.core.rates import Rates
 from tsfusion.core.readable_numbers import count_of
 from tsfusion.wire.messages.health import Health, headline

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""`tsfusion keys new|list|allow|revoke`."""
+"""`tsfusion keys new|list|allow|revoke`, and `tsfusion config dump`."""
 
 import shlex
 from pathlib import Path
@@ -35,6 +35,7 @@ KeysFlag = Annotated[
 ]
 Name = Annotated[str, typer.Argument(metavar="NAME", help="1 to 32 letters, digits and . _ -")]
 _FOLDER = Path("tsfusion-keys")
+config_app = typer.Typer(cls=verbs.Group, help="The settings and their defaults.")
 
 
 @verbs.verb(app, "tsfusion keys new server", "tsfusion keys new robot1 --dir robot-keys")
@@ -160,3 +161,26 @@ def list_(*, folder: KeysFlag = _FOLDER, json: options.Json = False) -> None:
         maps = f"  maps: {', '.join(limits[name])}" if state == "allowed" and name in limits else ""
         forgets = "  forgets others'" if listed and state == "allowed" and name in listed.forget else ""
         typer.echo(f"{state:<8} {name:<{width}}  {key}{maps}{forgets}")
+
+
+@config_app.callback()
+def _group() -> None:
+    """Keep `dump` a verb of its own while it is the only one."""
+
+
+@verbs.verb(
+    config_app, "tsfusion config dump > tsfusion.toml", "tsfusion config dump --config tsfusion.toml --json"
+)
+def dump(config: options.ConfigFile = None, json: options.Json = False) -> None:
+    """Print every setting as commented TOML: the defaults, or with --config those of FILE."""
+    from tsfusion.core import config as settings
+
+    loaded = settings.load(config)
+    if json:
+        from tsfusion.cli import output
+
+        output.as_json(loaded)
+    else:
+        variable = verbs.variable("--voxel-size")
+        typer.echo(f"# Flags beat variables ({variable} is --voxel-size), and these beat this file.")
+        typer.echo(settings.to_toml(loaded), nl=False)

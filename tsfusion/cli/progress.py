@@ -10,17 +10,20 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
 from types import FrameType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import typer
 
-from tsfusion.cli.progress_rows import STILL, RunProgress, Screen, byte_row, fused_rows, step_row
+from tsfusion.cli.output import size
+from tsfusion.core.headline import Headline
 from tsfusion.core.logs import printable
 from tsfusion.core.rates import Rates
-from tsfusion.core.readable_numbers import span
+from tsfusion.core.readable_numbers import count_of, span
+from tsfusion.wire.messages.messages import explained
 
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
+    from rich.text import Text
 
     from tsfusion.client import ClientStats
     from tsfusion.pipelines.runs.viewer_child import ViewerChild
@@ -29,6 +32,218 @@ if TYPE_CHECKING:
 _LINE_INTERVAL = 2.0  # seconds between plain lines
 _DRAWINGS = 5  # of a table, a second
 _ENDING = b"\nending: what is on its way is finished (press Ctrl-C again to end at once)\n"
+STILL = 5.0  # seconds in which nothing comes, or is fused, until that is said
+_WIDTHS = (9, 13, 8, 18)  # columns at least: name, amount, rate, note
+_BAR_WIDTHS = (8, 26)  # columns at least and at most
+_STYLES = {"good": "green", "notice": "yellow", "bad": "bold red"}
+
+
+class ScreenRow(NamedTuple):
+    """A name and figures; `share`: 0 to 1 of a bar, None = no bar."""
+
+    name: str
+    amount: str
+    rate: str = ""
+    note: str = ""
+    share: float | None = None
+
+    def __str__(self) -> str:
+        return f"{self.name} {', '.join(filter(None, (self.amount, self.rate, self.note)))}"
+
+
+class Note(NamedTuple):
+    """A name and words."""
+
+    name: str
+    text: str
+    alarm: bool = False
+
+    def __str__(self) -> str:
+        return f"{self.name} {printable(self.text)}"
+
+
+class Screen(NamedTuple):
+    """Rows of one moment; `headline` None = there are no keyframes."""
+
+    rows: list[ScreenRow] = []
+    notes: list[Note] = []
+    headline: Headline | None = None
+
+    def line(self) -> str:
+        """All of it on one line."""
+        begin = "  " if self.headline is None else f"{self.headline}; "
+        return begin + "; ".join(map(str, [*self.rows, *self.notes]))
+
+    def table(self, width: int, *, trouble: str = "") -> "RenderableType":
+        """All of it for a terminal of so many columns; `trouble`: what the headline does not know yet."""
+        from msgspec.structs import replace
+        from rich.console import Group
+
+        head = self.headline
+        if head is not None and trouble and not head.trouble:
+            head = replace(head, trouble=trouble)
+        top = [] if head is None else [styled(head)]
+        return Group(*top, *([_grid(self.rows, width)] if self.rows else []), *map(_in_words, self.notes))
+
+
+def styled(headline: Headline) -> "Text":
+    """A headline in colours, which only support its words."""
+    from rich.text import Text
+
+    mark, level = headline.mark
+    line = Text().append(f"{mark} ", style=_STYLES[level])
+    for number, (words, of_part) in enumerate(headline.parts):
+        line.append(" · " if number else "", style="dim").append(words, style=_STYLES[of_part])
+    return line
+
+
+class RunProgress:
+    """Turns the counts of a run into what is shown of it."""
+
+    def __init__(self) -> None:
+        self._rates = Rates()
+        self._step: object = None
+        self._moved = 0.0  # time.monotonic(): a keyframe went a step further, or none was under way
+
+    def screen(self, total: int | None, stats: "ClientStats", link: str, scan: "ScanState | None") -> Screen:
+        """Rows to show; arguments as of `Progress.update`."""
+        taken = stats.sent if scan is None else scan.frames
+        taking, fusing = self._rates(taken, stats.fused)
+        headline = Headline(
+            doing="working" if taken else "starting",
+            trouble=_trouble(link, scan) or self._standstill(stats),
+            waiting=stats.under_way,
+            rate=fusing or 0.0,
+            lost=sum(stats.left_out.values()),
+        )
+        to_send = f"{stats.waiting} to send, {size(stats.waiting_bytes)}" if stats.waiting else ""
+        if scan is None:
+            rows = [ScreenRow("sent", f"{taken}{_of(total)}", _rate(taking), "", _share(taken, total)),
+                    ScreenRow("fused", f"{stats.fused}{_of(total)}", _rate(fusing),
+                        _left(stats.fused, total, fusing), _share(stats.fused, total))]  # fmt: skip
+        else:
+            rows = [ScreenRow("frames", f"{taken}{_of(total)}", _rate(taking), _left(taken, total, taking),
+                        _share(taken, total)),
+                    ScreenRow("keyframes", str(sum(scan.selected.values()))),
+                    ScreenRow("fused", str(stats.fused), _rate(fusing), _delay(scan))]  # fmt: skip
+        return Screen(
+            [*rows, ScreenRow("waiting", str(stats.under_way), "", to_send)],
+            _notes(stats, link, scan),
+            headline,
+        )
+
+    def _standstill(self, stats: "ClientStats") -> str:
+        """For how long keyframes have waited and none was fused; empty = they move, or none waits."""
+        now, step = time.monotonic(), (stats.settled, stats.durable, stats.corrections_waiting)
+        if step != self._step or not stats.under_way:
+            self._step, self._moved = step, now
+        return f"nothing fused for {span(now - self._moved)}" if now - self._moved > STILL else ""
+
+
+def fused_rows(read: int, fused: int, total: int, rates: Rates) -> list[ScreenRow]:
+    """Share of a journal that is read, and fused."""
+    reading, fusing = rates(read, fused)
+    return [
+        ScreenRow(
+            "read", f"{read}{_of(total)}", _rate(reading), _left(read, total, reading), _share(read, total)
+        ),
+        ScreenRow("fused", str(fused), _rate(fusing)),
+    ]
+
+
+def byte_row(text: str, done: int, total: int, rates: Rates) -> ScreenRow:
+    """Bytes that are read, after `text`."""
+    rate, _ = rates(done, 0)
+    shown = "" if rate is None else f"{size(rate)}/s"
+    return ScreenRow(text, f"{size(done)} of {size(total)}", shown, "", _share(done, total))
+
+
+def step_row(text: str, done: int, total: int) -> ScreenRow:
+    """Number of steps done, after `text`."""
+    return ScreenRow(text, f"{done}{_of(total)}", share=_share(done, total))
+
+
+def _trouble(link: str, scan: "ScanState | None") -> str:
+    """Reason why a run does not go on, in two or three words; the notes have the rest."""
+    if scan is not None and scan.state == "lost":
+        return "sensor lost"
+    if scan is not None and scan.state == "starting" and scan.why:
+        return "sensor not localised"
+    return "the server takes nothing" if link else ""
+
+
+def _notes(stats: "ClientStats", link: str, scan: "ScanState | None") -> list[Note]:
+    notes = [] if scan is None else [Note("sensor", _sensor(scan), scan.state == "lost")]
+    if stats.corrections_waiting:
+        moved = count_of(stats.corrections_waiting, "keyframe")
+        notes.append(Note("to move", f"{moved}, to corrected poses"))
+    if stats.left_out:
+        notes.append(Note("lost", explained(stats.left_out), alarm=True))
+    return [*notes, Note("server", link, alarm=True)] if link else notes
+
+
+def _sensor(state: "ScanState") -> str:
+    words = state.state if not state.why else f"{state.state}: {state.why}"
+    if state.submaps > 1:
+        words += f"; map {state.submap} ({state.submaps} so far)"
+    return words + (f"; {count_of(state.loops, 'loop')} closed" if state.loops else "")
+
+
+def _of(total: int | None) -> str:
+    return f" of {total}" if total else ""
+
+
+def _share(count: int, total: int | None) -> float | None:
+    return count / total if total else None
+
+
+def _rate(rate: float | None) -> str:
+    return "" if rate is None else f"{rate:.1f}/s"
+
+
+def _left(count: int, total: int | None, rate: float | None) -> str:
+    return f"{span((total - count) / rate)} left" if total and rate and count < total else ""
+
+
+def _delay(scan: "ScanState") -> str:
+    return "" if scan.keyframe_delay_ms is None else f"delay {scan.keyframe_delay_ms:.0f} ms"
+
+
+def _grid(rows: list[ScreenRow], width: int) -> "RenderableType":
+    """The rows in columns that do not move while the figures grow."""
+    from rich.progress_bar import ProgressBar
+    from rich.table import Table
+    from rich.text import Text
+
+    grid = Table.grid(padding=(0, 2, 0, 0))
+    columns = list(zip(*((row.name, row.amount, row.rate, row.note) for row in rows), strict=True))
+    widths = [max(least, *map(len, texts)) for least, texts in zip(_WIDTHS, columns, strict=True)]
+    for least, align in zip(widths, ("left", "right", "right", "left"), strict=True):
+        grid.add_column(min_width=least, justify=align)  # type: ignore[arg-type]
+    least, most = _BAR_WIDTHS
+    bar = min(most, width - sum(widths) - 2 * len(widths))
+    for row in rows:
+        shown = row.share is not None and bar >= least
+        share = (
+            ProgressBar(1.0, row.share or 0.0, width=bar, complete_style="cyan", finished_style="green")
+            if shown
+            else ""
+        )
+        grid.add_row(Text(row.name, style="dim"), row.amount, row.rate, row.note, share)
+    return grid
+
+
+def _in_words(note: Note) -> "RenderableType":
+    """A name, and words beside it that begin below each other."""
+    from rich.table import Table
+    from rich.text import Text
+
+    grid = Table.grid(padding=(0, 2, 0, 0))
+    grid.add_column(min_width=_WIDTHS[0])
+    grid.add_row(
+        Text(note.name, style="dim"), Text(printable(note.text), style="bold red" if note.alarm else "")
+    )
+    return grid
 
 
 def shown(*, quiet: bool) -> "Quiet":

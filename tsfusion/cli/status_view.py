@@ -11,7 +11,7 @@ from rich.text import Text
 
 from tsfusion.cli.health_poll import ServerSnapshot
 from tsfusion.cli.output import size
-from tsfusion.cli.progress_rows import styled
+from tsfusion.cli.progress import styled
 from tsfusion.core.logs import printable
 from tsfusion.core.readable_numbers import span
 from tsfusion.wire.messages.health import (

@@ -14,11 +14,10 @@ from typing import Any, Protocol
 
 import msgspec
 
-from tsfusion.cluster import jobs, mesh_runs, tiling
-from tsfusion.cluster.carrying_out import CarryingOut
+from tsfusion.cluster import jobs, tiling
 from tsfusion.cluster.jobs import JobDone, JobProgress
 from tsfusion.cluster.keyframe_sources import WORK, Listed
-from tsfusion.cluster.schedulers import Scheduler
+from tsfusion.cluster.schedulers import CarryingOut, Scheduler
 from tsfusion.core import folder_lock, output_folder
 from tsfusion.core.config import VIEW_SETTINGS, VolumeConfig
 from tsfusion.core.durable_files import make_folder, replacing
@@ -332,7 +331,7 @@ class _Run:
                 stop=one.stop,
                 **self._common,
             )
-            for one in mesh_runs.shares(blocks, workers)
+            for one in tiling.shares(blocks, workers)
         )
 
     def _mesh(self, doing: CarryingOut, file: str, runs: list[JobDone]) -> JobDone:

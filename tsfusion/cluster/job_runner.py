@@ -13,7 +13,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from tsfusion.cluster import jobs, keyframe_sources, mesh_runs
+from tsfusion.cluster import jobs, keyframe_sources, tiling
 from tsfusion.cluster.jobs import AnyJob, JobDone, JobFailed, JobMessage, JobProgress
 from tsfusion.core import process
 from tsfusion.core.config import VolumeConfig
@@ -190,7 +190,7 @@ def _add(job: jobs.Add, folder: Path) -> dict[str, Any]:
 
 def _run(job: jobs.MeshRunJob, folder: Path) -> dict[str, Any]:
     path = _new(folder, job.name, ".npz")
-    mesh_runs.write(path, mesh_runs.make(folder / job.file, range(job.first, job.stop), job.view))
+    tiling.write_run(path, tiling.make_run(folder / job.file, range(job.first, job.stop), job.view))
     return {"files": [path.name]}
 
 
@@ -214,7 +214,7 @@ def _mesh(job: jobs.MeshMap, folder: Path) -> dict[str, Any]:
 def _put_together(job: jobs.MeshMap, folder: Path) -> dict[str, Any]:
     with checkpoint.reading(folder / job.file, is_checked=True) as (header, _):
         origin = map_provenance(header)
-    runs = [mesh_runs.read(folder / name) for name in reversed(job.runs)]
+    runs = [tiling.read_run(folder / name) for name in reversed(job.runs)]
     mesh = joined(list(mesh_tiles.together(runs)))
     return _written(job, folder, replace(mesh, held=HeldSensor(header.meta.get(HELD))), origin)
 

@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""A map's blocks in cubes that a worker each meshes, and the index by which viewers find their files.
+"""Parts of a map's mesh: runs of blocks that workers put together, and tiles with the index of their files.
 
 The index is 3D Tiles 1.1 (OGC 22-025r4): a tree of boxes, whose leaves name GLB files. glTF's up is +Y, that
 of 3D Tiles +Z: viewers turn what a GLB holds, (x, y, z) → (x, −z, y).
 """
 
 import json
+import zipfile
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.durable_files import replacing
-from tsfusion.core.errors import InvalidConfig
+from tsfusion.core.errors import InvalidConfig, OutputError
+from tsfusion.geometry.mesh_parts import MeshPart
 from tsfusion.tsdf.files import checkpoint
 from tsfusion.tsdf.store.block_store import distinct_blocks, unpack_keys
+from tsfusion.tsdf.surface import mesh_tiles
+from tsfusion.tsdf.surface.mesh_tiles import MeshRun, Numbered
+from tsfusion.tsdf.volume import Volume
 
 USUAL_BLOCKS = 16_384  # of a tile
 _BLOCK_BYTES = 24 << 10  # of a block that is meshed: its sums, values, the field's solution, triangles
@@ -24,6 +30,8 @@ _HALO = 4  # blocks around a tile, at most
 _LEAST_SIDE, _MOST_SIDE = 4, 1 << 14  # blocks
 
 BlockBox = tuple[tuple[int, int, int], tuple[int, int, int]]
+LEAST_TILES = 3  # of a run: its neighbours' tiles are solved for it, too
+_FARTHEST = 1 << 18  # beyond every block
 
 
 def most_blocks(worker_memory: int | None, base_rss: int) -> int:
@@ -110,3 +118,54 @@ def _box(low: NDArray[np.float64], high: NDArray[np.float64]) -> list[float]:
     """Centre and three half axes."""
     half = np.maximum((high - low) / 2, 1e-3)
     return [*((low + high) / 2).tolist(), *np.diag(half).ravel().tolist()]
+
+
+def shares(blocks: int, workers: int) -> list[range]:
+    """The tiles of a map's mesh in runs, one for each worker; none where a single one does it as fast."""
+    tiles = mesh_tiles.tile_count(blocks)
+    count = min(workers, tiles // LEAST_TILES)
+    if count < 2:
+        return []
+    borders = np.linspace(0, tiles, count + 1).round().astype(int).tolist()
+    return [range(first, stop) for first, stop in pairwise(borders)]
+
+
+def make_run(file: Path, which: range, view: dict[str, Any]) -> MeshRun:
+    """The mesh of some tiles of a saved map, of which no more is loaded than what lies across their x."""
+    _, keys = checkpoint.keys_of(file, is_checked=True)
+    x = unpack_keys(mesh_tiles.blocks_of_run(keys, which))[:, 0]
+    low, high = (int(x.min()), -_FARTHEST, -_FARTHEST), (int(x.max()) + 1, _FARTHEST, _FARTHEST)
+    return Volume.load_blocks(file, low, high, is_checked=True, **view).mesh_run(keys, which)
+
+
+def write_run(path: Path, made: MeshRun) -> None:
+    """Keep a run in a file; raises OutputError when the disk refuses."""
+    part, border = made.part, made.border
+    arrays: dict[str, Any] = {
+        "vertices": part.vertices, "faces": part.faces, "normals": part.normals, "colors": part.colors,
+        "open_at": made.open_at, "open_keys": made.open_keys, "open_edges": made.open_edges,
+        "border_keys": border.keys, "border_edges": border.edges, "border_first": border.first,
+        "first": np.array(made.first),
+    }  # fmt: skip
+    try:
+        with replacing(path) as file:
+            np.savez(file, **{name: one for name, one in arrays.items() if one is not None})
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {error.strerror}") from error
+
+
+def read_run(path: Path) -> MeshRun:
+    """A run that was kept; raises OutputError when it cannot be read."""
+    try:
+        with np.load(path) as found:
+            colors = found["colors"] if "colors" in found.files else None
+            return MeshRun(
+                MeshPart(found["vertices"], found["faces"], found["normals"], colors),
+                found["open_at"],
+                found["open_keys"],
+                found["open_edges"],
+                Numbered(found["border_keys"], found["border_edges"], found["border_first"]),
+                np.int64(found["first"]),
+            )
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        raise OutputError(f"cannot read {path}: {error}") from error

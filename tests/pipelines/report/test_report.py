@@ -20,7 +20,7 @@ from tsfusion.core.errors import OutputError
 from tsfusion.datasets.trajectory_files import read_poses, write_tum
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.up_direction import parse
-from tsfusion.pipelines.report import latency_ledger, map_report, run_report, run_sections, scene
+from tsfusion.pipelines.report import latency_ledger, map_report, pictures, run_report, run_sections
 from tsfusion.pipelines.report.findings import RunFindings
 from tsfusion.wire.messages.keyframe_times import KeyframeTimes
 
@@ -225,9 +225,9 @@ def test_damaged_results_are_one_line(tmp_path: Path, name: str, content: bytes,
 def test_a_scene_unpacks_to_its_mesh() -> None:
     mesh = ball()
     level = np.arange(len(mesh.vertices)).astype(np.uint8)
-    made = scene.make(mesh, level)
+    made = pictures.make_scene(mesh, level)
     head, packed = made.header(np.array((0.0, 0, 1))), base64.b64decode(made.packed())
-    content = scene.zlib.decompress(packed)
+    content = pictures.zlib.decompress(packed)
     n, m = len(mesh.vertices), 3 * len(mesh.faces)
     places = np.cumsum(np.frombuffer(content, "<u2", 3 * n).reshape(3, n), axis=1, dtype=np.uint16).T
     assert np.abs(places / 65535 * head["size"] + head["low"] - mesh.vertices).max() < 1e-4
@@ -242,7 +242,7 @@ def test_a_scene_unpacks_to_its_mesh() -> None:
 def test_a_large_mesh_becomes_a_small_one_of_the_same_shape() -> None:
     shape = trimesh.creation.icosphere(6, 1.0)
     whole = Mesh(np.float32(shape.vertices), np.int32(shape.faces), np.float32(shape.vertex_normals))
-    small = scene.make(whole, most=9000).mesh
+    small = pictures.make_scene(whole, most=9000).mesh
     assert 2000 < len(small.faces) <= 9000
     radius = np.linalg.norm(small.vertices, axis=1)
     assert np.abs(radius - 1).max() < 0.02

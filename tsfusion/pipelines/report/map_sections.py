@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from tsfusion.core.readable_numbers import grouped
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.pipelines.maps import mesh_preview
-from tsfusion.pipelines.report import charts, page, pictures, scene
+from tsfusion.pipelines.report import charts, page, pictures
 from tsfusion.pipelines.report.charts import Axis, Chart
 from tsfusion.pipelines.report.findings import MapFindings, Paths
 from tsfusion.pipelines.report.pictures import ErrorScale, Sides
@@ -66,7 +66,7 @@ class ShownMap:
 
     def view(self) -> str:
         """The 3-D view."""
-        made = scene.make(self.mesh, None if self.scale is None else self.scale.level)
+        made = pictures.make_scene(self.mesh, None if self.scale is None else self.scale.level)
         up = mesh_preview.up_of(self.mesh)
         low, high = np.percentile(self.mesh.vertices @ up, (1, 98))
         azimuth, elevation = self._sides.angles

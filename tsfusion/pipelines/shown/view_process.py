@@ -24,7 +24,7 @@ from tsfusion.pipelines.maps import saved_maps
 from tsfusion.pipelines.runs import run_files
 from tsfusion.pipelines.shown.map_rewinding import RewoundMap
 from tsfusion.pipelines.shown.piecewise_map import PiecewiseMap
-from tsfusion.pipelines.shown.view_messages import Open, Opened, Seek, Told, Took, ViewFailed, Weigh, Weighed
+from tsfusion.pipelines.shown.viewed_maps import Open, Opened, Seek, Told, Took, ViewFailed, Weigh, Weighed
 from tsfusion.tsdf.files import checkpoint
 from tsfusion.viewer.map_feed import TimeLine
 from tsfusion.wire.asking.map_events import MapEvent, SurfaceUpdate

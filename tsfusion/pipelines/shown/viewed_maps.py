@@ -8,6 +8,7 @@ import sys
 import threading
 from collections import deque
 from contextlib import suppress
+from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -16,9 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core import process
-from tsfusion.core.errors import MapError
+from tsfusion.core.errors import MapError, TsfusionError
 from tsfusion.journal import state_folder
-from tsfusion.pipelines.shown.view_messages import Open, Opened, Seek, Told, Took, ViewFailed, Weigh, Weighed
 from tsfusion.viewer.map_feed import TimeLine
 from tsfusion.wire.asking.map_events import LinkSeen, MapEvent
 
@@ -26,6 +26,71 @@ _ANSWER_S = 5.0  # that `weights` waits: a large map may be being read
 _END_S = 3.0
 _COMMAND = (sys.executable, "-m", "tsfusion.pipelines.shown.view_process")
 _GONE = "the process that reads the map has ended: was there memory enough? Start the page again"
+
+
+@dataclass(frozen=True)
+class Open:
+    """Show a map. `number`: that all that follows about it has; `name`: in a state folder."""
+
+    number: int
+    path: Path
+    name: str | None
+
+
+@dataclass(frozen=True)
+class Seek:
+    """Show it after so many keyframes."""
+
+    keyframes: int
+
+
+@dataclass(frozen=True, eq=False)
+class Weigh:
+    """Ask for the weights at (n, 3) points."""
+
+    number: int
+    points: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Took:
+    """So many bytes of triangles were taken."""
+
+    nbytes: int
+
+
+@dataclass(frozen=True)
+class Opened:
+    """A map is shown; `name` = which."""
+
+    number: int
+    name: str
+    time_line: TimeLine | None
+
+
+@dataclass(frozen=True)
+class ViewFailed:
+    """A map cannot be shown."""
+
+    number: int
+    error: TsfusionError
+
+
+@dataclass(frozen=True, eq=False)
+class Told:
+    """Events of a map."""
+
+    number: int
+    events: list[MapEvent]
+    nbytes: int
+
+
+@dataclass(frozen=True, eq=False)
+class Weighed:
+    """The answer to `Weigh`."""
+
+    number: int
+    weights: NDArray[np.float32] | None
 
 
 def open_feed(path: Path, *, map_name: str | None = None) -> "SavedMapFeed":
