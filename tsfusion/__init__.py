@@ -70,7 +70,7 @@ if TYPE_CHECKING:
     from tsfusion.geometry.mesh import Mesh as Mesh
     from tsfusion.scanner.sources.named_sources import open_source as open_source
     from tsfusion.scanner.sources.source import Source as Source
-    from tsfusion.tsdf.files.map_blocks import Blocks as Blocks
+    from tsfusion.tsdf.files.voxel_arrays import Blocks as Blocks
     from tsfusion.tsdf.volume import Volume as Volume
     from tsfusion.wire.asking.map_client import MapClient as MapClient
 
@@ -85,7 +85,7 @@ _ERRORS = (
     "TransportError", "TsfusionError", "WeightOverflow", "WorkerLost", "WorldRefused",
 )  # fmt: skip
 _HOME = {
-    "Blocks": "tsdf.files.map_blocks",
+    "Blocks": "tsdf.files.voxel_arrays",
     "Client": "client",
     "Config": "core.config",
     "DistanceField": "geometry.map_grids",

@@ -11,7 +11,7 @@ from tsfusion.geometry import se3
 from tsfusion.geometry.keyframe import Intrinsics, Keyframe
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.textured_mesh import TexturedMesh, barycentric
-from tsfusion.tsdf.texture.texture_images import TextureImage, image_of
+from tsfusion.tsdf.texture.texture_fitting import TextureImage, image_of
 
 MAX_OFF = 0.05  # metres between the mesh and the measured depth where a pixel is compared
 MIN_CLEARNESS = 0.5  # of its depth's edge: there the registration of colour to depth ends

@@ -385,8 +385,8 @@ FAULTS = (
         "tsdf/test_volume.py::test_whatever_fails_leaves_the_map_as_it_was",
     ),
     Fault(
-        "tsdf/surface/kept_values.py",
-        "        if self._drops != self._store.drops:",
+        "tsdf/surface/surface_tiles.py",
+        "        if self._drops != self._store.drops:  # blocks have other slots now",
         "        if False:",
         "tsdf/test_kept_values.py::test_blocks_that_have_gone_are_forgotten",
     ),
@@ -605,25 +605,25 @@ FAULTS = (
     ),
     # files that claim much
     Fault(
-        "core/read_limits.py",
+        "core/limits.py",
         "    if nbytes > MAX_FILE_BYTES:",
         "    if False:",
         "datasets/test_bombs.py::test_an_exr_that_claims_a_gigapixel",
     ),
     Fault(
-        "core/read_limits.py",
+        "core/limits.py",
         "    if len(found) > MAX_PIECE_BYTES:",
         "    if False:",
         "datasets/test_bombs.py::test_chunks_and_messages_that_unpack_to_too_much",
     ),
     Fault(
-        "core/read_limits.py",
+        "core/limits.py",
         "        if nbytes is not None and nbytes > MAX_PIECE_BYTES:",
         "        if False:",
         "datasets/test_bombs.py::test_chunks_and_messages_that_unpack_to_too_much",
     ),
     Fault(
-        "core/read_limits.py",
+        "core/limits.py",
         "        if self._left < 0:",
         "        if False:",
         "datasets/test_bombs.py::test_a_compressed_database_that_would_fill_the_disk",
@@ -642,7 +642,7 @@ FAULTS = (
     ),
     Fault(
         "datasets/readers.py",
-        'content = file.read() if nbytes <= read_limits.MAX_FILE_BYTES else b""',
+        'content = file.read() if nbytes <= limits.MAX_FILE_BYTES else b""',
         "content = file.read()",
         "datasets/test_bombs.py::test_other_images_with_a_hole",
     ),
@@ -715,14 +715,14 @@ FAULTS = (
         "tsdf/test_thin_obstacles.py::test_hits_are_sums_that_go_with_the_map",
     ),
     Fault(
-        "kernels/surface/voxel_values.py",
+        "kernels/surface/surface_cells.py",
         "ti.select((ended >= SEVERAL) & (value > 0.5), near, value)",
         "value",
         "tsdf/test_thin_obstacles.py::test_poles_that_a_lidar_hits_are_never_free",
     ),
     Fault(
         "tsdf/answers/distance_fields.py",
-        "        voxel_values.hold_hits(store.slots_of(keys[i : i + _PART]), *store.ray_ends, part)\n",
+        "        surface_cells.hold_hits(store.slots_of(keys[i : i + _PART]), *store.ray_ends, part)\n",
         "",
         "tsdf/test_thin_obstacles.py::test_poles_that_a_lidar_hits_are_never_free",
     ),

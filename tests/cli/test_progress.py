@@ -16,7 +16,7 @@ from rich.console import Console
 
 from tsfusion.cli import progress
 from tsfusion.client import ClientStats
-from tsfusion.core import rates
+from tsfusion.core import limits
 from tsfusion.scanner.scanner import ScanState
 from tsfusion.wire.messages.messages import explained
 
@@ -53,7 +53,7 @@ class Clock:
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     clock = Clock()
-    for module in (progress, rates):
+    for module in (progress, limits):
         monkeypatch.setattr(module, "time", clock)
     return clock
 

@@ -2,7 +2,7 @@
 import numpy as np
 import pytest
 
-from tsfusion.core.distinct_integers import distinct
+from tsfusion.core.number_ranges import distinct
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ from functools import partial
 
 import pytest
 
-from tsfusion.core.side_thread import SideThread
+from tsfusion.core.process import SideThread
 
 
 def test_calls_are_done_in_order_in_another_thread() -> None:

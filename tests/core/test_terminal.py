@@ -13,7 +13,7 @@ from typing import TextIO
 
 import pytest
 
-from tsfusion.core.terminal import fitted
+from tsfusion.core.readable_numbers import fitted
 
 TEXT = "ready in 5.6 s: keyframes tcp://127.0.0.1:17755, control tcp://127.0.0.1:17756\nshort"
 

@@ -18,7 +18,7 @@ import pytest
 from rosbag_scenes import DEPTH, T0, infos
 from rosbag_writing import writing
 
-from tsfusion.core import read_limits
+from tsfusion.core import limits
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.readers import read_depth, read_image, read_lines
 from tsfusion.datasets.rosbag.bag import Bag
@@ -68,7 +68,7 @@ def test_chunks_and_messages_that_unpack_to_too_much(
     found = Bag(path, posed=False)
     assert len(found) == 1  # an image of 16 MB is none too large
     assert not found.frame(0).depth.any()
-    monkeypatch.setattr(read_limits, "MAX_PIECE_BYTES", 1 << 20)
+    monkeypatch.setattr(limits, "MAX_PIECE_BYTES", 1 << 20)
     with little_memory(), pytest.raises(DatasetError, match=r"(unpacks to more|is larger) than 1\.05 MB"):
         Bag(path, posed=False)
 
@@ -81,7 +81,7 @@ def test_a_compressed_database_that_would_fill_the_disk(
         infos(bag, shape=LARGE.shape)
         bag.image(DEPTH, LARGE, "16UC1", T0)
     assert len(Bag(path, posed=False)) == 1
-    monkeypatch.setattr(read_limits, "_FEW_BYTES", 1 << 20)
+    monkeypatch.setattr(limits, "_FEW_BYTES", 1 << 20)
     with little_memory(), pytest.raises(DatasetError, match="unpacks to far more than it has"):
         Bag(path, posed=False)
 

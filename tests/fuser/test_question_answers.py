@@ -14,7 +14,7 @@ import zmq
 from keyframes_and_servers import CAMERA, SHAPE, VOLUME, wall
 
 from tsfusion import Volume
-from tsfusion.core.rates import Bucket
+from tsfusion.core.limits import Bucket
 from tsfusion.fuser import question_answers
 from tsfusion.fuser.fuser_messages import (
     NOT_WORKING,

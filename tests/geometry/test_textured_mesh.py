@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from tsfusion.core.errors import OutputError
-from tsfusion.geometry import texture_atlas, texture_charts
+from tsfusion.geometry import texture_charts
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.textured_mesh import Texture, TexturedMesh
 from tsfusion.geometry.up_direction import Up
@@ -101,7 +101,7 @@ def test_charts_lie_apart_on_their_pages() -> None:
     mesh = cube()
     charts = texture_charts.find(mesh.vertices, mesh.faces, mesh.normals)
     for side, several in ((4096, False), (300, True)):
-        layout = texture_atlas.pack(charts, mesh.faces, texel=0.005, side=side)  # 200 texels a side
+        layout = texture_charts.pack(charts, mesh.faces, texel=0.005, side=side)  # 200 texels a side
         assert (len(layout.sizes) > 1) is several
         assert max(max(size) for size in layout.sizes) <= side
         boxes = []
@@ -113,7 +113,7 @@ def test_charts_lie_apart_on_their_pages() -> None:
         for i, (page, low, high) in enumerate(boxes):
             for other, other_low, other_high in boxes[:i]:
                 gap = np.maximum(other_low - high, low - other_high).max()
-                assert page != other or gap >= 2 * texture_atlas.GUARD - 1
+                assert page != other or gap >= 2 * texture_charts.GUARD - 1
 
 
 def test_what_lies_below_another_face_gets_a_chart_of_its_own() -> None:
@@ -129,5 +129,5 @@ def test_triangles_without_area_shrink_to_a_corner() -> None:
     mesh = cube(2)
     faces = np.concatenate([mesh.faces, [[mesh.faces[0, 0], mesh.faces[0, 1], mesh.faces[0, 1]]]])
     charts = texture_charts.find(mesh.vertices, faces.astype(np.int32), mesh.normals)
-    layout = texture_atlas.pack(charts, faces, texel=0.01, side=1024)
+    layout = texture_charts.pack(charts, faces, texel=0.01, side=1024)
     assert np.ptp(layout.corners[-1], axis=0).max() <= 60  # of a face's edge, not across the page

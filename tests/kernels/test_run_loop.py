@@ -9,7 +9,7 @@ import taichi as ti
 from command_processes import python
 
 from tsfusion.kernels.base import runtime
-from tsfusion.kernels.base.run_loop import runs, unit_of
+from tsfusion.kernels.base.quick_launch import runs, unit_of
 
 
 @ti.kernel

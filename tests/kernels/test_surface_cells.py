@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from tsfusion.kernels.base import block_hash, runtime
 from tsfusion.kernels.surface import marching_tables, surface_cells
 from tsfusion.tsdf.store.block_store import cells_of, pack_keys, unpack_keys
+from tsfusion.tsdf.surface.field_regularizer import values_of
 from tsfusion.tsdf.surface.mesh_extraction import MeshBuffers
-from tsfusion.tsdf.surface.surface_values import values_of
 
 PATCH = np.array([(x, y, z) for x in (-2, -1, 0) for y in (-1, 0) for z in (-1, 0, 1) if x + y + z], np.int32)
 

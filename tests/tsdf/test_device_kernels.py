@@ -277,7 +277,7 @@ def test_blocks_that_runs_find_missing_count_together(
 def test_parts_of_limited_weight_are_added_one_after_the_other(
     link: HereLink, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in ("integrator", "device_integrator"):
+    for module in ("integration.integrator", "device.device_integrator"):
         monkeypatch.setattr(f"tsfusion.tsdf.{module}.PART_WEIGHT", 5000)
     here, there = both()
     for keyframe in VIEWS:

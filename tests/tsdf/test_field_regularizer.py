@@ -18,9 +18,8 @@ from scipy.spatial import cKDTree
 
 from tsfusion.tsdf.store.block_store import pack_keys
 from tsfusion.tsdf.surface import field_regularizer
-from tsfusion.tsdf.surface.field_regularizer import FieldSettings, along_normals, solve
+from tsfusion.tsdf.surface.field_regularizer import FieldSettings, along_normals, solve, values_of
 from tsfusion.tsdf.surface.mesh_extraction import extract
-from tsfusion.tsdf.surface.surface_values import values_of
 
 QUANTA = 60
 SETTINGS = FieldSettings(smoothness=10.0, edge=0.03, reweightings=2)

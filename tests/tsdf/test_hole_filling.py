@@ -12,13 +12,12 @@ from numpy.typing import NDArray
 
 from tsfusion import Mesh, Volume
 from tsfusion.core.errors import InvalidConfig
-from tsfusion.geometry import guessed_patches
 from tsfusion.geometry.mesh_simplification import border_edges
 from tsfusion.tsdf.store.block_store import pack_keys
 from tsfusion.tsdf.surface import hole_filling
+from tsfusion.tsdf.surface.field_regularizer import values_of
 from tsfusion.tsdf.surface.hole_filling import extract_filled
 from tsfusion.tsdf.surface.mesh_extraction import extract
-from tsfusion.tsdf.surface.surface_values import values_of
 
 SIDE = 64  # voxels
 QUANTA = 60
@@ -197,6 +196,6 @@ def test_a_patch_is_not_larger_than_what_it_hangs_on() -> None:
         guessed = ball.triangles_center[:, 2] > 1 - 2 * share
         vertices = ball.vertices.astype(np.float32)
         mesh = Mesh(vertices, ball.faces.astype(np.int32), vertices, guessed=guessed)
-        found = guessed_patches.closing(mesh)
+        found = hole_filling.closing(mesh)
         assert (found.guessed is not None) == stays
         assert len(found.faces) == (len(guessed) if stays else (~guessed).sum())

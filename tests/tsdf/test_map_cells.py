@@ -10,7 +10,7 @@ from formula_scenes import sphere_views, volume_of
 from tsfusion import Volume
 from tsfusion.core.config import Surface
 from tsfusion.tsdf.store.block_store import cells_of
-from tsfusion.tsdf.surface.map_cells import CellMeshes
+from tsfusion.tsdf.surface.mesh_extraction import CellMeshes
 
 VOXEL = 0.03
 SURFACES: tuple[Surface, ...] = ("raw", "normal", "field")

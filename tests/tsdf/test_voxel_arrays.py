@@ -12,7 +12,7 @@ from formula_scenes import sphere_views, volume_of
 
 from tsfusion import Volume
 from tsfusion.core.errors import InvalidConfig, MissingDependency, OutputError
-from tsfusion.geometry import openvdb_files
+from tsfusion.geometry import point_files
 from tsfusion.tsdf.files import voxel_arrays
 from tsfusion.tsdf.files.voxel_arrays import FieldName
 
@@ -149,12 +149,12 @@ def test_openvdb_has_read_this_file(tmp_path: Path) -> None:
     """OpenVDB 10.0 has read the file of these bytes, and found these values."""
     random = np.random.default_rng(0)
     blocks = np.unique(random.integers(-600, 600, (40, 3)).astype(np.int32), axis=0)
-    blocks = blocks[openvdb_files.order_of(blocks)]
+    blocks = blocks[point_files.order_of(blocks)]
     values = random.integers(-30, 30, (len(blocks), 8, 8, 8)).astype(np.float32) / 16
     values[random.random(values.shape) < 0.5] = 3
     path = tmp_path / "a.vdb"
     parts = [(blocks[:17], values[:17]), (blocks[17:], values[17:])]
-    openvdb_files.write(path, parts, name="tsdf", voxel_size=0.0625, background=3.0)
+    point_files.write(path, parts, name="tsdf", voxel_size=0.0625, background=3.0)
     assert hashlib.sha256(path.read_bytes()).hexdigest() == READ_BY_OPENVDB
     grid = vdb_reader.read(path)
     for block, leaf in zip(blocks.tolist(), values, strict=True):

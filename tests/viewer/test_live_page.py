@@ -23,7 +23,7 @@ from tsfusion.wire.asking.map_events import LinkSeen
 pytest.importorskip("viser", reason="the page is viser's (pip install 'tsfusion[viewer]')")
 
 from tsfusion.viewer.live_page import LivePage
-from tsfusion.viewer.page.calm_callbacks import calm
+from tsfusion.viewer.page.page_server import calm
 from tsfusion.viewer.panels import browser_panel
 
 DEADLINE = 60.0

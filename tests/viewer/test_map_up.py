@@ -8,7 +8,7 @@ from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.up_direction import HeldSensor
 from tsfusion.viewer.map.map_tiles import MapTiles
-from tsfusion.viewer.map.map_up import MapUp
+from tsfusion.viewer.map.map_views import MapUp
 from tsfusion.wire.asking.map_events import PathsFound, ScannerSeen, SurfaceUpdate
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from drawn_scenes import DrawnScene, decoded
 
-from tsfusion.core.rates import Bucket
+from tsfusion.core.limits import Bucket
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.viewer.map.clipping import Clipping
 from tsfusion.viewer.map.map_tiles import CELL, EDGE, MapTiles

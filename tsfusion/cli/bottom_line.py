@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.text import Text
 
 from tsfusion.cli.progress import styled
-from tsfusion.core.rates import Rates
+from tsfusion.core.limits import Rates
 from tsfusion.core.readable_numbers import count_of
 from tsfusion.wire.messages.health import Health, headline
 

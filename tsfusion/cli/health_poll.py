@@ -8,7 +8,7 @@ import msgspec
 from msgspec import Struct
 
 from tsfusion.core.errors import ServerUnreachable, TransportError
-from tsfusion.core.rates import Rates
+from tsfusion.core.limits import Rates
 from tsfusion.core.readable_numbers import count_of
 from tsfusion.wire.asking.queries import CommandRefused, fetch_health, fetch_status
 from tsfusion.wire.messages.health import Health, MapHealth, Status

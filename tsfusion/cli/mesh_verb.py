@@ -109,9 +109,9 @@ def mesh(
     if texture_size is not None and not texture:
         raise InvalidConfig("--texture-size goes with --texture")
     if texture:
-        from tsfusion.geometry import texture_atlas
+        from tsfusion.geometry import texture_charts
 
-        texture_atlas.check_installed()
+        texture_charts.check_installed()
     given_up = options.up_direction(up)
     check_writable(out, mesh_finishing.SURFACES)
     if preview is not None:

@@ -7,8 +7,7 @@ from typing import Any
 
 import typer
 
-from tsfusion.core.readable_numbers import counted, grouped, size
-from tsfusion.core.terminal import fitted
+from tsfusion.core.readable_numbers import counted, fitted, grouped, size
 
 __all__ = ["as_json", "counted", "grouped", "size", "text"]
 

@@ -16,8 +16,8 @@ import typer
 
 from tsfusion.cli.output import size
 from tsfusion.core.headline import Headline
+from tsfusion.core.limits import Rates
 from tsfusion.core.logs import printable
-from tsfusion.core.rates import Rates
 from tsfusion.core.readable_numbers import count_of, span
 from tsfusion.wire.messages.messages import explained
 

@@ -10,6 +10,8 @@ import json
 import math
 import re
 import sys
+from collections.abc import Iterable
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypedDict, TypeVar
 
@@ -17,7 +19,6 @@ import msgspec
 import numpy as np
 from msgspec import Meta, Struct
 
-from tsfusion.core import other_names
 from tsfusion.core.errors import InvalidConfig
 
 if sys.version_info >= (3, 11):
@@ -51,6 +52,36 @@ LEAST_VOXEL_SIZE = 0.00001  # metres: finer than any sensor
 SYMMETRIC = 16.0  # `min_behind`, voxels: a ray reaches as far behind its end as before it
 ClientName = Annotated[str, Meta(pattern=r"\A[A-Za-z0-9][A-Za-z0-9_.-]{0,31}\Z")]
 Bytes = Annotated[int, Meta(ge=1 << 20)]
+_INVERSE = "T_world_camera, its inverse: T_world_camera=np.linalg.inv({name})"
+_POSE = "T_world_camera, which takes a point of the camera to the world"
+OTHER_NAMES_OF_KEYFRAME = {
+    **dict.fromkeys(("T_camera_world", "extrinsic", "extrinsics", "w2c", "world_to_camera"), _INVERSE),
+    **dict.fromkeys(("pose", "T", "c2w", "camera_to_world", "transform", "T_world_sensor"), _POSE),
+    **dict.fromkeys(("intrinsic", "K", "camera_matrix"), "intrinsics"),
+    **dict.fromkeys(("rgb", "image", "colors"), "color, uint8 in the order BGR: color=rgb[..., ::-1]"),
+    **dict.fromkeys(("scan", "cloud", "xyz"), "points, in the sensor's frame"),
+    **dict.fromkeys(("timestamp", "stamp"), "timestamp_ns, an integer of nanoseconds"),
+    **dict.fromkeys(("depth_max", "depth_trunc"), "max_range, a setting of Volume"),
+}
+_BAND = "min_support=N, max_support=N with N = sdf_trunc / voxel_size; by default the sensor's noise decides"
+OTHER_NAMES_OF_SETTINGS = {
+    **dict.fromkeys(("sdf_trunc", "truncation", "trunc_voxel_multiplier"), _BAND),
+    **dict.fromkeys(("voxel_length", "resolution"), "voxel_size, in metres"),
+    **dict.fromkeys(("depth_max", "depth_trunc"), "max_range, in metres"),
+    **dict.fromkeys(("color_type", "attr_names"), "color=True or color=False"),
+    **dict.fromkeys(("block_count", "block_resolution"), "nothing: blocks are added by need"),
+    "device": "arch: cpu, cuda or vulkan",
+}
+_MESH = "extract_mesh(), whose result has vertices, faces and save('room.glb')"
+OTHER_NAMES_OF_VOLUME = {
+    **dict.fromkeys(("extract_triangle_mesh", "extract_surface_mesh", "get_mesh"), _MESH),
+    **dict.fromkeys(("extract_point_cloud", "extract_voxel_point_cloud"), "extract_mesh().vertices"),
+    **dict.fromkeys(("extract_vdb_grids", "write", "dump"), "save('map.tsf')"),
+    **dict.fromkeys(("fuse", "add", "update", "insert", "push"), "integrate(keyframe)"),
+    "prune": "extract_mesh(min_weight=…)",
+    "reset": "a new Volume",
+    "voxel_size": "config.voxel_size",
+}
 
 
 class Settings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -433,7 +464,7 @@ def _message(struct: type[Struct], settings: dict[str, Any], problem: str) -> st
         for table in filter(None, where.split(".")):
             struct = struct.__annotations__[table]
         known = struct.__struct_fields__
-        hint = other_names.instead(unknown[1], other_names.SETTINGS, known)
+        hint = instead(unknown[1], OTHER_NAMES_OF_SETTINGS, known)
         hint = hint or f"; known are {', '.join(known)}"
         return f"unknown setting {'.'.join(filter(None, (where, unknown[1])))}{hint}"
     wanted = re.match(
@@ -541,3 +572,11 @@ def _field_comments(struct: type[Struct]) -> dict[str, str]:
         return {}
     matches = filter(None, map(_FIELD.match, _WRAPPED_FIELD.sub(r"= \1", source).splitlines()))
     return {match[1]: match["comment"] for match in matches if match["comment"]}
+
+
+def instead(name: str, others: dict[str, str], known: Iterable[str]) -> str:
+    """End of a message about an unknown name: `: write …` where it is known what was meant, else empty."""
+    if name in others:
+        return f": write {others[name].format(name=name)}"
+    close = get_close_matches(name, known, n=1)
+    return f": did you mean {close[0]}?" if close else ""

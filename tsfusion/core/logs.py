@@ -11,7 +11,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from tsfusion.core.config import LogFormat, LogLevel
-from tsfusion.core.terminal import fitted
+from tsfusion.core.readable_numbers import fitted
 
 if TYPE_CHECKING:
     _Handler = logging.StreamHandler[Any]

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: MIT
-"""Memory, limits, signals and the end of this process, as the operating system offers them; versions."""
+"""Memory, limits, signals and the end of this process, as the operating system offers them; versions;
+work in C that a second thread does meanwhile."""
 
 import _signal  # type: ignore[import-not-found]  # `signal` makes enumerations of numbers: 5 µs a call
 import ctypes
@@ -8,10 +9,12 @@ import resource
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from types import FrameType
+from types import FrameType, TracebackType
 from typing import Any
 
 import tsfusion
@@ -25,6 +28,7 @@ _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # malloc.h
 OWN_GROUP: dict[str, Any] = (
     {"process_group": 0} if sys.version_info >= (3, 11) else {"start_new_session": True}
 )
+_MOST_WAITING = 2  # calls: what they hold is memory
 
 
 def peak_rss_bytes() -> int:
@@ -237,3 +241,40 @@ def version_of(package: str) -> str:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
         return "missing"
+
+
+class SideThread:
+    """Does calls one after the other, in their order, beside the thread that uses it as a context.
+
+    Where no thread can be had the calls are done at once.
+    """
+
+    def __init__(self) -> None:
+        self._pool: ThreadPoolExecutor | None = ThreadPoolExecutor(1)
+        self._waiting: deque[Future[None]] = deque()
+
+    def __enter__(self) -> "SideThread":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, where: TracebackType | None
+    ) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+
+    def do(self, call: Callable[[], None]) -> None:
+        """Do a call soon; waits while too many others are to be done. Raises what one of them raised."""
+        if self._pool is not None:
+            try:
+                self._waiting.append(self._pool.submit(call))
+            except RuntimeError:  # no thread, for want of memory
+                self._pool = None
+        if self._pool is None:
+            call()
+        while len(self._waiting) > _MOST_WAITING:
+            self._waiting.popleft().result()
+
+    def wait(self) -> None:
+        """Wait until every call is done; raises what one of them raised."""
+        while self._waiting:
+            self._waiting.popleft().result()

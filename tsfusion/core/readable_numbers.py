@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Numbers and counts as a person reads them, and the progress of long work."""
+"""Numbers and counts as a person reads them, the progress of long work, and lines as wide as a terminal."""
 
+import os
+import textwrap
 from collections.abc import Callable
 from decimal import Decimal
+from typing import TextIO
 
 OnProgress = Callable[[int, int], None]  # done, of how many (0 = unknown): bytes, records or steps
 
@@ -42,3 +45,23 @@ def span(seconds: float) -> str:
 def count_of(number: int, one: str, many: str = "") -> str:
     """`1 keyframe`, `3 keyframes`; give both forms where a verb follows: `keyframe is`, `keyframes are`."""
     return f"{number} {one if number == 1 else many or f'{one}s'}"
+
+
+def fitted(text: str, stream: TextIO, *, indent: int = 2) -> str:
+    """Break lines between words where they are too long for the terminal at `stream`; elsewhere never.
+
+    Args:
+        indent: columns before what follows the first part of a line.
+    """
+    try:
+        columns = os.get_terminal_size(stream.fileno()).columns if stream.isatty() else 0
+    except (OSError, ValueError):  # it has no file, or is closed
+        columns = 0
+    if columns <= 2 * indent:
+        return text
+    wrapper = textwrap.TextWrapper(
+        columns, subsequent_indent=" " * indent, break_long_words=False, break_on_hyphens=False,
+        drop_whitespace=True, replace_whitespace=False,
+    )  # fmt: skip
+    lines = text.split("\n")
+    return "\n".join(line if len(line) <= columns else wrapper.fill(line) for line in lines)

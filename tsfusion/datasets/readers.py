@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core import read_limits
+from tsfusion.core import limits
 from tsfusion.core.errors import DatasetError, InvalidKeyframe, MissingDependency
 from tsfusion.geometry.calibration import MAX_NO_SKEW
 from tsfusion.geometry.calibration_files import read_text
@@ -108,7 +108,7 @@ def _whole(file: BinaryIO) -> bytes | None:
     """The bytes of an image that is no PNG; None where it is far too large."""
     nbytes = file.seek(0, SEEK_END)
     file.seek(0)
-    content = file.read() if nbytes <= read_limits.MAX_FILE_BYTES else b""
+    content = file.read() if nbytes <= limits.MAX_FILE_BYTES else b""
     with suppress(Refused):  # neither a JPEG, nor one that can be read in one way alone
         if max(array_encoding.image_size(content)) > MAX_IMAGE_SIDE:
             return None
@@ -248,7 +248,7 @@ def read_npy(path: Path) -> NDArray[Any]:
     """The array of a `.npy` file; raises DatasetError."""
     try:  # its size is compared with what is there
         found = np.lib.format.open_memmap(path, mode="r")
-        read_limits.check(path, found.nbytes)
+        limits.check(path, found.nbytes)
         return np.array(found)
     except FileNotFoundError as error:
         raise DatasetError(f"{path} is missing; expected an (H, W) array of depth") from error
@@ -276,7 +276,7 @@ def _read_exr(path: Path) -> NDArray[Any]:
             for part in file.parts:
                 low, high = part.header["dataWindow"]
                 pixels = np.prod(np.subtract(high, low, dtype=float) + 1)
-                read_limits.check(path, 4 * len(part.header["channels"]) * pixels)
+                limits.check(path, 4 * len(part.header["channels"]) * pixels)
         with OpenEXR.File(str(path), separate_channels=True) as file:
             channels = [channel.pixels for name, channel in file.channels().items() if name != "A"]
         return channels[0] if len(channels) == 1 else np.dstack(channels)

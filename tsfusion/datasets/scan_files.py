@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core import read_limits
+from tsfusion.core import limits
 from tsfusion.core.errors import DatasetError, InvalidConfig, MissingDependency, TsfusionError
 from tsfusion.geometry import origin
 from tsfusion.geometry.keyframe import are_far
@@ -124,7 +124,7 @@ def read_scan(path: Path, *, fields: int = USUAL_FIELDS) -> Scan:
     """
     suffix = path.suffix.lower()
     try:
-        read_limits.check(path, path.stat().st_size)
+        limits.check(path, path.stat().st_size)
         if path.stat().st_size == 0:
             scan, promised = Scan(np.zeros((0, 3), np.float32)), 0
         elif suffix == ".bin":
@@ -177,7 +177,7 @@ def _pcd(path: Path) -> tuple[Scan, int]:
     content = path.read_bytes()
     head = content[:_HEADER_BYTES]
     sizes = re.search(rb"^DATA binary_?s?compressed\r?\n....(.{4})", head, re.MULTILINE | re.DOTALL)
-    read_limits.check(path, int.from_bytes(sizes[1], "little") if sizes else 0)
+    limits.check(path, int.from_bytes(sizes[1], "little") if sizes else 0)
     whole = BytesIO(_without_empty_fields(head) + content[_HEADER_BYTES:])
     read = PointCloud.from_fileobj(BufferedReader(whole))
     points = np.asarray(read.numpy(("x", "y", "z")))
@@ -218,7 +218,7 @@ def _las(path: Path) -> tuple[Scan, int]:
         raise MissingDependency("to read LAS or LAZ: pip install 'laspy[lazrs]' (or '.[mesh]')") from error
     with laspy.open(path) as opened:
         named = opened.header.point_count  # before it is told what was found
-        read_limits.check(path, named * opened.header.point_format.size)
+        limits.check(path, named * opened.header.point_format.size)
         system, read = _system_in(opened.header), opened.read()
         scan = _timed(np.asarray(read.xyz), read.point_format.dimension_names, read)
         return scan._replace(system=system), named

@@ -16,7 +16,7 @@ from tsfusion.wire.messages.health import MeshLayout
 from tsfusion.wire.messages.mesh_updates import Meshed, MeshUpdate
 
 if TYPE_CHECKING:
-    from tsfusion.tsdf.surface.map_cells import CellMeshes
+    from tsfusion.tsdf.surface.mesh_extraction import CellMeshes
     from tsfusion.tsdf.volume import Volume
 
 _REFINED_AT_ONCE = 512  # blocks: some 20 ms

@@ -15,7 +15,7 @@ import numpy as np
 import zmq
 
 from tsfusion.core.errors import InvalidConfig, TsfusionError
-from tsfusion.core.rates import Bucket
+from tsfusion.core.limits import Bucket
 from tsfusion.fuser import fuser_messages
 from tsfusion.fuser.fuser_messages import CurrentKeyframe, FuserAnswer, FuserQuestion, ToFuser
 from tsfusion.fuser.kept_answers import KeptSlices, KeptViews

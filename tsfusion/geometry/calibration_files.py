@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core import read_limits
+from tsfusion.core import limits
 from tsfusion.core.errors import DatasetError, InvalidConfig
 from tsfusion.geometry.calibration import MODELS, Camera, Size, StereoRig
 from tsfusion.geometry.se3 import inverse, transform
@@ -142,7 +142,7 @@ def rig_of_camera_info(left: Camera, right: Camera, R: Any, P: Any) -> StereoRig
 def read_text(path: Path, content: str) -> str:
     """Read a text file, with or without a byte order mark; DatasetError says that `content` was expected."""
     try:
-        read_limits.check(path, path.stat().st_size)
+        limits.check(path, path.stat().st_size)
         return path.read_text(encoding="utf-8-sig")
     except FileNotFoundError as error:
         raise DatasetError(f"{path} is missing; expected {content}") from error

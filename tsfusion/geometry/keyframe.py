@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core import other_names
+from tsfusion.core import config
 from tsfusion.core.errors import InvalidKeyframe
 from tsfusion.geometry import object_cards, sweeps
 from tsfusion.geometry.origin import FAR
@@ -71,7 +71,7 @@ def _explains_names(cls: type[_T]) -> type[_T]:
     def checked(self: _T, *values: Any, **given: Any) -> None:
         known = cls.__dataclass_fields__  # type: ignore[attr-defined]
         for name in [name for name in given if name not in known]:
-            hint = other_names.instead(name, other_names.KEYFRAME, known)
+            hint = config.instead(name, config.OTHER_NAMES_OF_KEYFRAME, known)
             raise InvalidKeyframe(f"a keyframe has no {name}{hint}")
         if values:
             raise InvalidKeyframe(

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from tsfusion.core import durable_files
 from tsfusion.core.errors import OutputError
-from tsfusion.geometry import mesh_part_islands, up_direction
+from tsfusion.geometry import mesh_islands, up_direction
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.mesh_arrays import Provenance
 from tsfusion.geometry.up_direction import HeldSensor, Up
@@ -126,8 +126,8 @@ class MeshParts:
         try:
             file.truncate(4 * (self.vertices + 1))
             number = np.memmap(file, np.int32, "r+")
-            islands = mesh_part_islands.find(self._arrived(), number, min_extent)
-            kept = mesh_part_islands.without(self._arrived(), number, islands)
+            islands = mesh_islands.find_in_parts(self._arrived(), number, min_extent)
+            kept = mesh_islands.without(self._arrived(), number, islands)
             parts = MeshParts(kept, self._folder, held=self._held, known_up=self.up)
         except OSError as error:
             raise OutputError(f"cannot write the mesh to {self._folder}: {error.strerror}") from error

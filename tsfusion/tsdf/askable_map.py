@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tsfusion.core.config import Surface, VolumeConfig
-from tsfusion.core.distinct_integers import distinct
 from tsfusion.core.errors import MapError
+from tsfusion.core.number_ranges import distinct
 from tsfusion.geometry import up_direction
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.map_answers import PointCloud, Samples, View, checked_camera, checked_points
@@ -20,15 +20,14 @@ from tsfusion.geometry.up_direction import Up
 from tsfusion.tsdf.answers import camera_views, distance_fields, map_slices, point_samples
 from tsfusion.tsdf.answers.distance_fields import FieldBlocks
 from tsfusion.tsdf.answers.map_slices import CurrentSlice
-from tsfusion.tsdf.files import map_blocks
-from tsfusion.tsdf.files.map_blocks import Blocks
+from tsfusion.tsdf.files import voxel_arrays
+from tsfusion.tsdf.files.voxel_arrays import Blocks
 from tsfusion.tsdf.readable_map import ReadableMap
 from tsfusion.tsdf.store.block_store import ASKED, BlockStore, pack_keys, unpack_keys
-from tsfusion.tsdf.surface import map_cells
-from tsfusion.tsdf.surface.map_cells import CellMeshes
-from tsfusion.tsdf.surface.mesh_extraction import extract_cells
+from tsfusion.tsdf.surface import mesh_extraction
+from tsfusion.tsdf.surface.field_regularizer import SurfaceView
+from tsfusion.tsdf.surface.mesh_extraction import CellMeshes, extract_cells
 from tsfusion.tsdf.surface.surface_tiles import SurfaceTiles
-from tsfusion.tsdf.surface.surface_values import SurfaceView
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -163,7 +162,7 @@ class AskableMap(ReadableMap):
         Raises:
             MissingDependency: without Open3D.
         """
-        return map_blocks.to_voxel_block_grid(self._store)
+        return voxel_arrays.to_voxel_block_grid(self._store)
 
     def distance_field(
         self,
@@ -317,7 +316,7 @@ class AskableMap(ReadableMap):
 
         Args:
             cells: (n, 3) int32 block coordinates; of a block that the map does not have there are none.
-            values: of `whole_values`, for the very triangles of the whole map's mesh, or of `kept_values`.
+            values: of `whole_values`, for the very triangles of the whole map's mesh, or of `surface_tiles`.
         """
         keys = distinct(pack_keys(cells))
         return self._mesh_keys(keys, self._checked_min_weight(None), values or self._view(surface))
@@ -352,10 +351,10 @@ class AskableMap(ReadableMap):
         store, surface = self._store, surface or self.model.surface
         start = 0 if first is None else int(pack_keys(np.array([first], np.int32))[0])
         if since is None:
-            keys, rest = map_cells.listed(store, start, most)
+            keys, rest = mesh_extraction.listed(store, start, most)
         else:
             reach = {"raw": 0, "normal": 1, "field": self._field.coarser + 1}[surface]
-            keys, rest = map_cells.listed_since(
+            keys, rest = mesh_extraction.listed_since(
                 store,
                 start,
                 most,
@@ -372,7 +371,7 @@ class AskableMap(ReadableMap):
 
     def cell_stamps(self, cells: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
         """The stamps of the last changes to (n, 3) cells as fused, and to their own blocks: (n,) each."""
-        return map_cells.stamps_of(self._store, pack_keys(cells))
+        return mesh_extraction.stamps_of(self._store, pack_keys(cells))
 
     @property
     def stamp(self) -> int:

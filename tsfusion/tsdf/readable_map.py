@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.config import Surface, VolumeConfig
-from tsfusion.core.distinct_integers import distinct
 from tsfusion.core.errors import InvalidConfig, MapError
+from tsfusion.core.number_ranges import distinct
 from tsfusion.core.readable_numbers import OnProgress, count_of
 from tsfusion.geometry import object_cards
 from tsfusion.geometry.mesh import Mesh
@@ -33,11 +33,11 @@ from tsfusion.tsdf.store.block_store import BlockStore, cells_of, pack_keys, unp
 from tsfusion.tsdf.sums import map_difference
 from tsfusion.tsdf.sums.map_difference import MapDifference
 from tsfusion.tsdf.surface import field_regularizer, hole_filling, mesh_tiles
-from tsfusion.tsdf.surface.kept_values import KeptValues
+from tsfusion.tsdf.surface.field_regularizer import SurfaceView, values_of
 from tsfusion.tsdf.surface.mesh_extraction import MeshBuffers, extract
 from tsfusion.tsdf.surface.mesh_tiles import WholeMapValues, tiles
-from tsfusion.tsdf.surface.surface_values import SurfaceView, values_of
-from tsfusion.tsdf.texture.texture_images import PosedImages
+from tsfusion.tsdf.surface.surface_tiles import KeptValues
+from tsfusion.tsdf.texture.texture_fitting import PosedImages
 
 _MOST_SHOWN = 50_000  # blocks of a map that has a picture: it is meshed for that
 

@@ -19,8 +19,17 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core import other_names, process
-from tsfusion.core.config import Arch, CacheConfig, VolumeConfig, make_settings, override
+from tsfusion.core import process
+from tsfusion.core.config import (
+    OTHER_NAMES_OF_SETTINGS,
+    OTHER_NAMES_OF_VOLUME,
+    Arch,
+    CacheConfig,
+    VolumeConfig,
+    instead,
+    make_settings,
+    override,
+)
 from tsfusion.core.errors import InvalidConfig, MapError, OutputError
 from tsfusion.geometry.keyframe import Keyframe, keyframe_of
 from tsfusion.geometry.mesh import FORMATS as MESHES
@@ -33,7 +42,7 @@ from tsfusion.tsdf.askable_map import AskableMap
 from tsfusion.tsdf.device.device_blocks import DeviceBlocks
 from tsfusion.tsdf.device.device_integrator import DeviceIntegrator, DeviceRayBuffers
 from tsfusion.tsdf.device.device_trial import device_for
-from tsfusion.tsdf.files import checkpoint, map_history, saved_map, voxel_arrays
+from tsfusion.tsdf.files import checkpoint, map_history, voxel_arrays
 from tsfusion.tsdf.files.map_history import HELD
 from tsfusion.tsdf.integration.integrator import Integrator, KeyframeQuota
 from tsfusion.tsdf.integration.ray_buffers import RayBuffers, keyframes_of_every_kind
@@ -132,7 +141,7 @@ class Volume(AskableMap):
         **settings: "Unpack[VolumeSettings]",
     ) -> None:
         if others:  # VDBFusion's: sdf_trunc, space_carving
-            hint = other_names.instead("sdf_trunc", other_names.SETTINGS, ())
+            hint = instead("sdf_trunc", OTHER_NAMES_OF_SETTINGS, ())
             raise InvalidConfig(
                 f"settings are given by name, such as space_carving=True; for sdf_trunc{hint}"
             )
@@ -171,7 +180,7 @@ class Volume(AskableMap):
 
         def __getattr__(self, name: str) -> Any:
             """Say what stands for a name of other libraries."""
-            hint = other_names.instead(name, other_names.VOLUME, dir(type(self)))
+            hint = instead(name, OTHER_NAMES_OF_VOLUME, dir(type(self)))
             raise AttributeError(f"Volume has no {name}{hint}")
 
     def integrate(
@@ -459,12 +468,12 @@ class Volume(AskableMap):
         """
         with ExitStack() as opening, checkpoint.reading(Path(path)) as (header, chunks):
             volume = cls(
-                saved_map.loaded_config(header, threads, changed), memory_bytes=memory_bytes, cache=cache
+                checkpoint.loaded_config(header, threads, changed), memory_bytes=memory_bytes, cache=cache
             )
             store = volume._store
             opening.enter_context(store.opening(header.blocks))
             digest = begin_hash(header.config.voxel_size)
-            saved_map.fill(store, Path(path), header, chunks, digest)
+            checkpoint.fill(store, Path(path), header, chunks, digest)
             store.clear.replace(header.clear_blocks(Path(path)))
             volume.keyframes = header.keyframes
             volume.held = HeldSensor(header.meta.pop(HELD, None))
@@ -496,9 +505,9 @@ class Volume(AskableMap):
             InvalidConfig, CheckpointError: as `load`; the map's own hash is not compared.
         """
         with checkpoint.reading(Path(path), is_checked=is_checked) as (header, chunks):
-            volume = cls(saved_map.loaded_config(header, None, changed))
+            volume = cls(checkpoint.loaded_config(header, None, changed))
             halo = 1 + volume._halo
-            saved_map.fill_box(volume._store, header, chunks, np.array(low) - halo, np.array(high) + halo)
+            checkpoint.fill_box(volume._store, header, chunks, np.array(low) - halo, np.array(high) + halo)
             volume.held = HeldSensor(header.meta.get(HELD))
         return volume
 

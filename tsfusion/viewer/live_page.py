@@ -13,19 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core import process
-from tsfusion.core.rates import Bucket
+from tsfusion.core.limits import Bucket
 from tsfusion.core.readable_numbers import grouped
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.viewer.map import map_views
 from tsfusion.viewer.map.map_tiles import MapTiles
-from tsfusion.viewer.map.map_up import MapUp
-from tsfusion.viewer.map.map_views import PageCamera
+from tsfusion.viewer.map.map_views import MapUp, PageCamera
 from tsfusion.viewer.map.scanner_marks import ScannerMarks
 from tsfusion.viewer.map.tile_look import OwnLook, TileLook
 from tsfusion.viewer.map.tile_nodes import TileNodes
 from tsfusion.viewer.map.vertex_colors import VertexColors
 from tsfusion.viewer.map_feed import MapFeed
-from tsfusion.viewer.page.calm_callbacks import calm
+from tsfusion.viewer.page.page_server import calm
 from tsfusion.viewer.panels.browser_panel import BrowserPanel, set_theme
 from tsfusion.viewer.panels.shared_panel import SharedPanel
 from tsfusion.wire.asking.map_events import (

@@ -16,7 +16,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
-from tsfusion.core import read_limits
+from tsfusion.core import limits
 from tsfusion.core.errors import DatasetError, MissingDependency
 from tsfusion.journal import is_segment
 from tsfusion.journal.mcap_layout import MAGIC
@@ -260,7 +260,7 @@ def _reader(path: Path) -> Any:
     except ImportError as error:
         raise MissingDependency(_INSTALL) from error
     _bound_unpacking()
-    bounded = read_limits.BoundedPath(path)
+    bounded = limits.BoundedPath(path)
     return AnyReader([bounded], default_typestore=_usual_types(path.suffix != ".bag"))
 
 
@@ -274,17 +274,17 @@ def _bound_unpacking() -> Callable[[bytes], bytes]:
     from rosbags.rosbag2 import storage_mcap
 
     openers = {"bz2": bz2.open, "lz4": lz4.frame.open, "zstd": storage_mcap.zstd.open}
-    bounded = {name: partial(read_limits.unpack, opener) for name, opener in openers.items()}
+    bounded = {name: partial(limits.unpack, opener) for name, opener in openers.items()}
     ros1.decompressors.update((name, bounded[name]) for name in ("bz2", "lz4"))
     storage_mcap.DECOMPRESSORS.update((name, bounded[name]) for name in ("lz4", "zstd"))
 
-    def whole_zstd(file: Any, mode: str) -> read_limits.BoundedFile:
-        return read_limits.BoundedFile(openers["zstd"](file, mode), Path(file.raw.name).stat().st_size)
+    def whole_zstd(file: Any, mode: str) -> limits.BoundedFile:
+        return limits.BoundedFile(openers["zstd"](file, mode), Path(file.raw.name).stat().st_size)
 
-    ros2.Path = read_limits.BoundedPath
+    ros2.Path = limits.BoundedPath
     ros2.zstd = SimpleNamespace(decompress=bounded["zstd"], open=whole_zstd)
     hooks: list[Any] = apsw.connection_hooks
-    longest = apsw.SQLITE_LIMIT_LENGTH, read_limits.MAX_PIECE_BYTES
+    longest = apsw.SQLITE_LIMIT_LENGTH, limits.MAX_PIECE_BYTES
     hooks.append(lambda connection: connection.limit(*longest))
     return bounded["zstd"]
 

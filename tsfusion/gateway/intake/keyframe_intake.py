@@ -19,7 +19,7 @@ import zmq
 from tsfusion.core import logs
 from tsfusion.core.config import ServerConfig, VolumeConfig
 from tsfusion.core.errors import InvalidConfig, JournalError
-from tsfusion.core.rates import Bucket
+from tsfusion.core.limits import Bucket
 from tsfusion.gateway.clients.client_routes import Admission, ClientRoutes
 from tsfusion.gateway.maps.hosted_map import HostedMap
 from tsfusion.gateway.maps.map_records import IncomingRecord

@@ -14,7 +14,7 @@ from itertools import count
 import zmq
 from msgspec import Struct
 
-from tsfusion.core.rates import Bucket
+from tsfusion.core.limits import Bucket
 from tsfusion.fuser import fuser_messages
 from tsfusion.gateway.health.metrics import Metrics
 from tsfusion.gateway.maps.hosted_map import HostedMap

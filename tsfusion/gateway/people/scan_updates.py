@@ -12,7 +12,7 @@ from typing import Any
 
 import msgspec
 
-from tsfusion.core.rates import Bucket
+from tsfusion.core.limits import Bucket
 from tsfusion.gateway.ports.ports import Ports, Subscriptions
 from tsfusion.wire.messages import mesh_updates
 from tsfusion.wire.messages.mesh_updates import Scanned

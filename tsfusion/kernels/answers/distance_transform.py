@@ -12,8 +12,7 @@ Grids are flat arrays of (X, Y, Z), z fastest. A site is a voxel at the surface.
 import taichi as ti
 
 from tsfusion.kernels import F32, I32, F32x2, I32x3
-from tsfusion.kernels.base.quick_launch import QuickLaunch
-from tsfusion.kernels.base.run_loop import runs, unit_of
+from tsfusion.kernels.base.quick_launch import QuickLaunch, runs, unit_of
 from tsfusion.kernels.base.voxel_traversal import vec3i
 
 BANDS = 64  # units of parallel work; fixed, so that nothing depends on the thread count
@@ -152,7 +151,7 @@ def spread_along_lines(
     `most`, squared, is far.
     `stack` (bands, length, 2): of each parabola on the envelope its place, and where it begins to count.
     """
-    for run in range(runs(BANDS)):  # run loop: kernels/base/run_loop.py
+    for run in range(runs(BANDS)):  # run loop: kernels/base/quick_launch.py
         band = unit_of(run, BANDS)
         if band < BANDS:
             count = last_line - first_line

@@ -12,8 +12,7 @@ import taichi as ti
 
 from tsfusion.kernels import F32, I32, I64, U8, ANYx2, F32x2, I64x2
 from tsfusion.kernels.base.block_hash import map_find
-from tsfusion.kernels.base.quick_launch import QuickLaunch
-from tsfusion.kernels.base.run_loop import runs, unit_of
+from tsfusion.kernels.base.quick_launch import QuickLaunch, runs, unit_of
 from tsfusion.kernels.base.sensor_noise import WEIGHT_ONE
 from tsfusion.kernels.base.voxel_traversal import VOXEL_LIMIT, offset_in_block, pack, vec3i
 from tsfusion.kernels.integration.integrate import CUBE, QUANTA_PER_VOXEL, lane_distance, lane_weight
@@ -151,7 +150,7 @@ def write_sample(
 def list_blocks(points: ANYx2, per_metre: ti.f64, map_keys: I64, map_slots: I32, is_needed: U8):
     """Mark the slots of the blocks whose voxels `interpolate` reads."""
     count = points.shape[0]
-    for run in range(runs((count + BAND - 1) // BAND)):  # run loop: kernels/base/run_loop.py
+    for run in range(runs((count + BAND - 1) // BAND)):  # run loop: kernels/base/quick_launch.py
         first = unit_of(run, (count + BAND - 1) // BAND) * BAND
         if first < count:
             last = vec3i(2147483647)
@@ -179,7 +178,7 @@ def pair(slots: I32, sums: I64x2, values: F32x2, pairs: I64x2):
 
     What `interpolate` reads of a point lies together then: at points in random order it waits for memory.
     """
-    for run in range(runs(BANDS)):  # run loop: kernels/base/run_loop.py
+    for run in range(runs(BANDS)):  # run loop: kernels/base/quick_launch.py
         band = unit_of(run, BANDS)
         if band < BANDS:
             count = slots.shape[0]
@@ -202,7 +201,7 @@ def interpolate(
     """Distance in metres, weight in full samples, and gradient at every point."""
     count = points.shape[0]
     metres = ti.cast(1.0 / (per_metre * QUANTA_PER_VOXEL), ti.f32)
-    for run in range(runs((count + BAND - 1) // BAND)):  # run loop: kernels/base/run_loop.py
+    for run in range(runs((count + BAND - 1) // BAND)):  # run loop: kernels/base/quick_launch.py
         first = unit_of(run, (count + BAND - 1) // BAND) * BAND
         if first < count:
             last = vec3i(2147483647)
@@ -256,7 +255,7 @@ def interpolate_within(
     count = points.shape[0]
     metres = ti.cast(1.0 / (per_metre * QUANTA_PER_VOXEL), ti.f32)
     along = vec3i(size[1] * size[2], size[2], 1)
-    for run in range(runs((count + BAND - 1) // BAND)):  # run loop: kernels/base/run_loop.py
+    for run in range(runs((count + BAND - 1) // BAND)):  # run loop: kernels/base/quick_launch.py
         band = unit_of(run, (count + BAND - 1) // BAND)
         if band * BAND < count:
             for part in range(BAND // BATCH):

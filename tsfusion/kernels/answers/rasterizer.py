@@ -10,7 +10,7 @@ import taichi as ti
 import taichi.math as tm
 
 from tsfusion.kernels import F32x2, F32x3, I32x2, I64x2, U8x2, U8x3
-from tsfusion.kernels.base.run_loop import runs, unit_of
+from tsfusion.kernels.base.quick_launch import runs, unit_of
 
 EMPTY = (1 << 63) - 1
 OVERLAP = 5e-4  # pixels that a triangle is wider by: where neighbours are rounded otherwise there is no gap
@@ -146,7 +146,7 @@ def look_up(
     height, width = seen.shape[0], seen.shape[1]
     per_pixel = 1.0 / focal
     is_more = normals.shape[0] + colors.shape[0] > 0
-    for run in range(runs(BANDS)):  # run loop: kernels/base/run_loop.py
+    for run in range(runs(BANDS)):  # run loop: kernels/base/quick_launch.py
         band = unit_of(run, BANDS)
         if band < BANDS:
             last = -1  # triangle

@@ -5,10 +5,10 @@ import taichi as ti
 
 from tsfusion.kernels import F32, I32, I64, U8, F32x2, I32x2, I64x2
 from tsfusion.kernels.base.block_hash import map_find
-from tsfusion.kernels.base.run_loop import runs, unit_of
+from tsfusion.kernels.base.quick_launch import runs, unit_of
 from tsfusion.kernels.base.voxel_traversal import VOXEL_LIMIT, block_key, offset_in_block, vec3i
 from tsfusion.kernels.integration.integrate import QUANTA_PER_VOXEL, lane_weight
-from tsfusion.kernels.surface.voxel_values import BANDS, distance_as_float, held, is_clear
+from tsfusion.kernels.surface.surface_cells import BANDS, distance_as_float, held, is_clear
 
 vec3d = ti.types.vector(3, ti.f64)
 
@@ -27,7 +27,7 @@ def read_columns(
     these are `along_row`, `along_column`, `along_height` apart, in voxels, from `corner` on.
     """
     mask = map_keys.shape[0] - 1
-    for run in range(runs(BANDS)):  # run loop: kernels/base/run_loop.py
+    for run in range(runs(BANDS)):  # run loop: kernels/base/quick_launch.py
         band = unit_of(run, BANDS)
         if band < BANDS:
             count = cells.shape[0]

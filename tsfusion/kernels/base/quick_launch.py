@@ -1,9 +1,19 @@
 # SPDX-License-Identifier: MIT
-"""Launches of a kernel in a tenth of the time that Taichi takes for them.
+"""Launches of a kernel in a tenth of the time that Taichi takes, and loops shared out among threads.
 
 Taichi 1.7 looks at the type of every argument anew at each launch: 8 µs an argument, 0.14 ms for the sixteen
 of `integrate.add_rays`. That is as long as a small keyframe's rays take, and one thread's work whatever the
 number of threads.
+
+A run loop is a parallel loop over heavy units of work (a band of rays, a block). Taichi 1.7's CPU backend
+gives each thread one piece of a loop, next to each other and of the same length, at least 512 iterations
+(`make_cpu_multithreaded_range_for.cpp`). Neighbouring units cost alike, and those of one piece more than
+those of another: at 1 cm the rays of an image's lower half cost 1.7 times those of its upper half, and one
+thread waited for the other. So thread t of T takes units t, t + T, t + 2T, …:
+
+    for run in range(runs(count)):  # run loop: kernels/base/quick_launch.py
+        unit = unit_of(run, count)
+        if unit < count:
 """
 
 from collections.abc import Callable
@@ -14,7 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.kernels import taichi as ti
+from tsfusion.kernels.base import runtime
 
+_LEAST = 512  # iterations that Taichi gives to one thread
 _INTEGERS, _FLOATS = (int, np.integer), (float, np.floating)
 _INTEGER, _FLOAT, _OF_TAICHI, _OF_NUMPY, _COPIED = -1, -2, -3, -4, -5
 _WHAT: dict[type, int] = {}  # of the types of arguments that were seen: to ask anew takes half of a launch
@@ -133,3 +145,23 @@ def _what(argument: Any) -> int | None:
         if isinstance(argument, kind):
             return what
     return None
+
+
+@ti.func
+def _piece(count):
+    """Iterations of one thread."""
+    threads = ti.static(runtime.threads())
+    return ti.max((count + threads - 1) // threads, _LEAST)
+
+
+@ti.func
+def runs(count):
+    """Iterations of a run loop over `count` units."""
+    return _piece(count) * ti.static(runtime.threads())
+
+
+@ti.func
+def unit_of(run, count):
+    """The unit of an iteration; `count` or more where it has none."""
+    piece = _piece(count)
+    return run % piece * ti.static(runtime.threads()) + run // piece

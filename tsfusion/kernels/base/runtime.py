@@ -105,10 +105,10 @@ def start_device(arch: str) -> None:
         )  # fmt: skip
     if ti.cfg.arch != getattr(ti, arch):
         raise MissingDependency("Taichi finds no such device, or no driver of one")
-    from tsfusion.kernels.base import device_check
+    from tsfusion.kernels.base import kernel_functions
 
     try:
-        is_exact = device_check.is_exact()
+        is_exact = kernel_functions.is_exact()
     except RuntimeError as error:
         raise MissingDependency(f"the device cannot run the kernels ({first_line(error)})") from error
     if not is_exact:

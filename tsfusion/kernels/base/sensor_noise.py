@@ -7,7 +7,7 @@
 
 import taichi as ti
 
-from tsfusion.kernels.base.unfused import product
+from tsfusion.kernels.base.kernel_functions import product
 from tsfusion.kernels.base.voxel_traversal import VOXEL_LIMIT, vec3i
 
 MODEL_FIELDS = 13

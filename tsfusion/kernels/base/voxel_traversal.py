@@ -9,7 +9,7 @@ Units: position 2⁻¹⁰ voxel, direction 2⁻¹⁶, distance along the ray 2�
 
 import taichi as ti
 
-from tsfusion.kernels.base.unfused import dot, norm, product
+from tsfusion.kernels.base.kernel_functions import dot, norm, product
 
 # First voxel of the band (3), next crossing an axis (3), crossing interval an axis (3), what the distance
 # loses with a step an axis (3), signed distance of the first voxel's centre to the surface along the ray

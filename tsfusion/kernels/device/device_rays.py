@@ -9,6 +9,7 @@ The kernels add the rays, too (`device_integration`): one launch takes half of t
 import taichi as ti
 
 from tsfusion.kernels import F64, I32, I64, U8, ANYx2, F32x2, F64x2, I32x2, I64x2, U8x2
+from tsfusion.kernels.base.kernel_functions import dot
 from tsfusion.kernels.base.quick_launch import QuickLaunch
 from tsfusion.kernels.base.sensor_noise import (
     DROPS_LONE_SAMPLES,
@@ -18,7 +19,6 @@ from tsfusion.kernels.base.sensor_noise import (
     vec3,
     vec3f,
 )
-from tsfusion.kernels.base.unfused import dot
 from tsfusion.kernels.base.voxel_traversal import COST, COUNT, SAMPLES, WEIGHT, WEIGHT_COLOR
 from tsfusion.kernels.device.device_integration import (
     COSTS,

@@ -13,8 +13,7 @@ import taichi as ti
 
 from tsfusion.kernels import I32, I64, U8, I32x2, I64x2
 from tsfusion.kernels.base.block_hash import map_find, set_insert
-from tsfusion.kernels.base.quick_launch import QuickLaunch
-from tsfusion.kernels.base.run_loop import runs, unit_of
+from tsfusion.kernels.base.quick_launch import QuickLaunch, runs, unit_of
 from tsfusion.kernels.base.voxel_traversal import (
     ADDED,
     COUNT,
@@ -29,14 +28,6 @@ from tsfusion.kernels.base.voxel_traversal import (
     parts_of,
     ray_weight,
     voxel_of,
-)
-from tsfusion.kernels.integration.block_windows import (
-    UNKNOWN,
-    WINDOW_BITS,
-    WINDOW_BLOCKS,
-    WINDOW_SCRATCH,
-    WINDOWS,
-    open_window,
 )
 from tsfusion.kernels.integration.rays_abreast import (
     ABREAST,
@@ -53,11 +44,17 @@ from tsfusion.kernels.integration.rays_abreast import (
     RAY_LENGTH,
     STRETCH,
     UNCOLORED,
+    UNKNOWN,
     VOXELS,
     WALKS,
     WINDOW_AT,
+    WINDOW_BITS,
+    WINDOW_BLOCKS,
+    WINDOW_SCRATCH,
+    WINDOWS,
     begin,
     measure,
+    open_window,
     walk,
     window_of,
 )
@@ -403,7 +400,7 @@ def add_rays(
     adds to it alone, without atomics. Rays that cross blocks of other units are listed, too, for
     `add_shared_rays`. The layers are flat: slot · 512 + offset.
     """
-    for run in range(runs(job[UNITS])):  # run loop: kernels/base/run_loop.py
+    for run in range(runs(job[UNITS])):  # run loop: kernels/base/quick_launch.py
         unit = unit_of(run, job[UNITS])
         if unit < job[UNITS]:
             add_bands(
@@ -423,7 +420,7 @@ def add_shared_rays(
 
     A kernel of its own, because one thread need not wait until it is compiled.
     """
-    for run in range(runs(job[UNITS])):  # run loop: kernels/base/run_loop.py
+    for run in range(runs(job[UNITS])):  # run loop: kernels/base/quick_launch.py
         unit = unit_of(run, job[UNITS])
         if unit < job[UNITS]:
             add_bands(
@@ -437,7 +434,7 @@ def add_shared_rays(
 def largest_weights(sums: I64x2, touched: I32, bounds: I32):
     """`bounds[slot]` = the largest weight lane in each touched block."""
     count = touched[TOUCHED_COUNT]
-    for run in range(runs(count)):  # run loop: kernels/base/run_loop.py
+    for run in range(runs(count)):  # run loop: kernels/base/quick_launch.py
         n = unit_of(run, count)
         if n < count:
             slot = touched[TOUCHED_HEADER + n]

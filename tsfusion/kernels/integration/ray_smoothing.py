@@ -16,8 +16,7 @@ import taichi as ti
 
 from tsfusion.kernels import F32, I32, I64, I32x2
 from tsfusion.kernels.base.block_hash import map_find
-from tsfusion.kernels.base.quick_launch import QuickLaunch
-from tsfusion.kernels.base.run_loop import runs, unit_of
+from tsfusion.kernels.base.quick_launch import QuickLaunch, runs, unit_of
 from tsfusion.kernels.base.voxel_traversal import (
     COUNT,
     MAX_CROSSED,
@@ -26,13 +25,6 @@ from tsfusion.kernels.base.voxel_traversal import (
     pack,
     ray_weight,
     voxel_of,
-)
-from tsfusion.kernels.integration.block_windows import (
-    UNKNOWN,
-    WINDOW_BITS,
-    WINDOW_BLOCKS,
-    WINDOWS,
-    open_window,
 )
 from tsfusion.kernels.integration.integrate import (
     CUBE,
@@ -53,11 +45,16 @@ from tsfusion.kernels.integration.rays_abreast import (
     ODD,
     RAY,
     STRETCH,
+    UNKNOWN,
     VOXELS,
     WALKS,
     WINDOW_AT,
+    WINDOW_BITS,
+    WINDOW_BLOCKS,
+    WINDOWS,
     begin,
     measure,
+    open_window,
     walk,
     window_of,
 )
@@ -220,7 +217,7 @@ def smooth_rays(
     the length of the list of voxels that have votes, then their places in `votes`, or `NO_VOXEL`; each unit
     takes `CHUNK` of its places at a time.
     """
-    for run in range(runs(units)):  # run loop: kernels/base/run_loop.py
+    for run in range(runs(units)):  # run loop: kernels/base/quick_launch.py
         unit = unit_of(run, units)
         if unit < units:
             base, at_signal = unit * UNIT_SCRATCH, unit * SIGNAL_FIELDS * SIGNAL

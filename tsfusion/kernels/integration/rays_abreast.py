@@ -4,6 +4,10 @@
 A stretch is up to 64 voxels of each. Its first pass walks and lists voxels: arithmetic without a branch, on
 arrays of the function, which no store to an argument may change: so the rays become lanes of vectors. Whoever
 uses the stretch goes through the list, ray by ray.
+
+A ray crosses about ten voxels and two or three blocks. To look a block up wherever a ray enters one would
+cost more than the voxels: a jump that no processor predicts, and the hash. So a ray walks in a window of 8³
+blocks: each voxel reads the place of its block from a small table.
 """
 
 import taichi as ti
@@ -16,14 +20,15 @@ from tsfusion.kernels.base.voxel_traversal import (
     LOSS,
     NEVER,
     VOXEL,
+    pack,
     parts_of,
     ray_vector,
     steps,
     vec3i,
 )
-from tsfusion.kernels.integration.block_windows import WINDOW_BITS
 
 ABREAST = 8
+WINDOW_BITS = 6  # of a voxel's coordinate in its window
 STRETCH = 1 << WINDOW_BITS  # voxels: a ray leaves its window at most once an axis
 LIST = ABREAST * STRETCH
 
@@ -47,6 +52,10 @@ AT, OFF, ODD, RAY_LENGTH, BAND, COLORED, RAY, MET, VOXELS, FREE, UNCOLORED = (
 WALKS = 26 * ABREAST
 NOBODY = -1  # instead of a ray
 HALF_A_QUANTUM = 1 << 15  # of `OFF`, whose upper bits are rounded so
+WINDOWS = 64  # that a unit keeps: those it used last, one for each place that the low bits of the key name
+WINDOW_BLOCKS = 512
+WINDOW_SCRATCH = WINDOWS * (1 + WINDOW_BLOCKS)  # int64 of a unit: keys, places of blocks in the layers
+UNKNOWN = 8 - (1 << 31)  # instead of a place
 
 
 @ti.func
@@ -149,3 +158,19 @@ def walk(
                 distances[i * ABREAST + k] = off
             m = ti.min(ti.max(off >> 16, -MOST_LISTED), MOST_LISTED)
             listed[i * ABREAST + k] = (m << DISTANCE_AT) | at
+
+
+@ti.func
+def open_window(window, scratch: ti.template(), base):
+    """Where the places of a window's blocks are in the unit's scratch, which begins at `base`.
+
+    They are unknown if it did not have this window.
+    """
+    number = (window[0] & 3) << 4 | (window[1] & 3) << 2 | (window[2] & 3)
+    blocks = base + WINDOWS + number * WINDOW_BLOCKS
+    key = pack(window[0], window[1], window[2])
+    if scratch[base + number] != key:
+        scratch[base + number] = key
+        for i in range(blocks, blocks + WINDOW_BLOCKS):
+            scratch[i] = UNKNOWN
+    return blocks

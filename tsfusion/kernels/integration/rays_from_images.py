@@ -12,8 +12,8 @@ One unit of parallel work is a band, a contiguous run of tiles with a region of 
 import taichi as ti
 
 from tsfusion.kernels import F64, ANYx2, F64x2, I32x2, U8x2
-from tsfusion.kernels.base.quick_launch import QuickLaunch
-from tsfusion.kernels.base.run_loop import runs, unit_of
+from tsfusion.kernels.base.kernel_functions import cross, dot, norm, product, quotient
+from tsfusion.kernels.base.quick_launch import QuickLaunch, runs, unit_of
 from tsfusion.kernels.base.sensor_noise import (
     DROPS_LONE_SAMPLES,
     MAX_RANGE,
@@ -28,7 +28,6 @@ from tsfusion.kernels.base.sensor_noise import (
     support_width,
     vec3,
 )
-from tsfusion.kernels.base.unfused import cross, dot, norm, product, quotient
 from tsfusion.kernels.base.voxel_traversal import vec3i, write_band, write_ray
 
 TILE = 12  # divided by both sides of every cell
@@ -430,7 +429,7 @@ def rays_from_image(
     tiles = tiles_x * ((image.shape[0] + TILE - 1) // TILE)
     count = bands.shape[0]
     unit = model[VOXEL_SIZE] / 1024.0  # metres
-    for run in range(runs(count)):  # run loop: kernels/base/run_loop.py
+    for run in range(runs(count)):  # run loop: kernels/base/quick_launch.py
         band = unit_of(run, count)
         if band < count:
             camera = camera_of(camera_rows)

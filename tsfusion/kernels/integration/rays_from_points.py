@@ -8,8 +8,8 @@ One unit of parallel work is a band, a contiguous run of points with a region of
 import taichi as ti
 
 from tsfusion.kernels import F64, U8, F32x2, F64x2, I32x2, U8x2
-from tsfusion.kernels.base.quick_launch import QuickLaunch
-from tsfusion.kernels.base.run_loop import runs, unit_of
+from tsfusion.kernels.base.kernel_functions import dot, norm
+from tsfusion.kernels.base.quick_launch import QuickLaunch, runs, unit_of
 from tsfusion.kernels.base.sensor_noise import (
     MAX_RANGE,
     MIN_RANGE,
@@ -24,7 +24,6 @@ from tsfusion.kernels.base.sensor_noise import (
     vec3,
     vec3f,
 )
-from tsfusion.kernels.base.unfused import dot, norm
 from tsfusion.kernels.base.voxel_traversal import write_band, write_ray
 
 
@@ -112,7 +111,7 @@ def rays_from_points(
     nearest = ti.cast(model[MIN_RANGE] * model[MIN_RANGE], ti.f32)
     farthest = ti.cast(model[MAX_RANGE] * model[MAX_RANGE], ti.f32)
     spread = ti.cast(model[VOXEL_SIZE] * model[VOXEL_SIZE], ti.f32)
-    for run in range(runs(bands.shape[0])):  # run loop: kernels/base/run_loop.py
+    for run in range(runs(bands.shape[0])):  # run loop: kernels/base/quick_launch.py
         band = unit_of(run, bands.shape[0])
         if band < bands.shape[0]:
             first_point = ti.cast(ti.cast(band, ti.i64) * count // bands.shape[0], ti.i32)

@@ -15,8 +15,8 @@ the one that they are counted from.
 import taichi as ti
 
 from tsfusion.kernels import F32, F64, I32, I64, U8, F32x2, I32x2, I64x2, U8x2
-from tsfusion.kernels.base.quick_launch import QuickLaunch
-from tsfusion.kernels.base.run_loop import runs, unit_of
+from tsfusion.kernels.base.kernel_functions import dot, product
+from tsfusion.kernels.base.quick_launch import QuickLaunch, runs, unit_of
 from tsfusion.kernels.base.sensor_noise import (
     DROPS_LONE_SAMPLES,
     MAX_RANGE,
@@ -28,7 +28,6 @@ from tsfusion.kernels.base.sensor_noise import (
     support_width,
     vec3,
 )
-from tsfusion.kernels.base.unfused import dot, product
 from tsfusion.kernels.base.voxel_traversal import pack, vec3i
 from tsfusion.kernels.integration.integrate import (
     CHANGED,
@@ -151,7 +150,7 @@ def fill_level(
 def fill_levels(clear: I32x2, levels: I32x2, least: I32, most: I32):
     """Fill the squares of some images, whose patches have their rows one below the other in `clear`."""
     views = clear.shape[0] // levels[0, 3]
-    for run in range(runs(views)):  # run loop: kernels/base/run_loop.py
+    for run in range(runs(views)):  # run loop: kernels/base/quick_launch.py
         v = unit_of(run, views)
         if v < views:
             for n in range(levels.shape[0]):
@@ -171,7 +170,7 @@ def find_clear_depths(
 
     `levels`, (n, 4): where the numbers of a level begin, its rows and columns, and the rows of patches.
     """
-    for run in range(runs(clear.shape[0])):  # run loop: kernels/base/run_loop.py
+    for run in range(runs(clear.shape[0])):  # run loop: kernels/base/quick_launch.py
         r = unit_of(run, clear.shape[0])
         if r < clear.shape[0]:
             reading = reading_of(model, is_disparity, scale, has_confidence)
@@ -352,7 +351,7 @@ def list_free_blocks(
     """List the blocks with voxels that an image looks through: their keys, which of their voxels these are,
     and what is added to each of them. `counts`: how many blocks and voxels; if there are more blocks than the
     list takes, it ends there."""
-    for run in range(runs(cubes[3] * cubes[4] * cubes[5])):  # run loop: kernels/base/run_loop.py
+    for run in range(runs(cubes[3] * cubes[4] * cubes[5])):  # run loop: kernels/base/quick_launch.py
         n = unit_of(run, cubes[3] * cubes[4] * cubes[5])
         if n < cubes[3] * cubes[4] * cubes[5]:
             first = vec3i(
@@ -417,7 +416,7 @@ def list_clear_blocks(
     """
     images = cubes.shape[0] - 1
     units, rows, squares = cubes[images, 0], clear.shape[0] // images, least.shape[0] // images
-    for run in range(runs(units)):  # run loop: kernels/base/run_loop.py
+    for run in range(runs(units)):  # run loop: kernels/base/quick_launch.py
         unit = unit_of(run, units)
         if unit < units:
             v = 0
@@ -465,7 +464,7 @@ def see_points(
     """
     near, far = ti.cast(model[MIN_RANGE] ** 2, ti.f32), ti.cast(model[MAX_RANGE] ** 2, ti.f32)
     own_starts = ti.select(starts.shape[0] == 1, 0, 1)
-    for run in range(runs(VIEWS)):  # run loop: kernels/base/run_loop.py
+    for run in range(runs(VIEWS)):  # run loop: kernels/base/quick_launch.py
         v = unit_of(run, VIEWS)
         if v < VIEWS:
             side = ends.shape[1]
@@ -500,7 +499,7 @@ def add_free_blocks(
 ):  # fmt: skip
     """Add to the clear voxels of blocks, whose slots these are, each of them once; list those that keyframe
     `stamp` has not touched yet."""
-    for run in range(runs(slots.shape[0])):  # run loop: kernels/base/run_loop.py
+    for run in range(runs(slots.shape[0])):  # run loop: kernels/base/quick_launch.py
         n = unit_of(run, slots.shape[0])
         if n < slots.shape[0]:
             slot, amount, lanes = slots[n], sign_ * amounts[n], ti.Vector([0] * BITS, dt=ti.i64)

@@ -21,8 +21,7 @@ before one is written: where an array is, LLVM looks up again after each store.
 import taichi as ti
 
 from tsfusion.kernels import F32, I32, F32x2, I32x2, I64x2, U64x2
-from tsfusion.kernels.base.quick_launch import QuickLaunch
-from tsfusion.kernels.base.run_loop import runs, unit_of
+from tsfusion.kernels.base.quick_launch import QuickLaunch, runs, unit_of
 from tsfusion.kernels.base.sensor_noise import WEIGHT_ONE
 from tsfusion.kernels.integration.integrate import lane_weight
 from tsfusion.kernels.surface.surface_cells import lowest
@@ -49,7 +48,7 @@ def without_lowest(plane):
 @ti.kernel
 def mark_voxels(values: F32x2, reach: ti.f32, planes: U64x2, counts: I32x2):
     """Mark the voxels of each block that were seen within `reach` quanta of the surface."""
-    for run in range(runs(values.shape[0])):  # run loop: kernels/base/run_loop.py
+    for run in range(runs(values.shape[0])):  # run loop: kernels/base/quick_launch.py
         b = unit_of(run, values.shape[0])
         if b < values.shape[0]:
             for word in range(planes.shape[1]):
@@ -100,7 +99,7 @@ def list_voxels(
     planes: U64x2, places: I32x2, links: I32x2, y: F32, weight: F32, x: F32,
 ):  # fmt: skip
     """Fill the list: each voxel's value, its weight in full-confidence samples, and its neighbours."""
-    for run in range(runs(values.shape[0])):  # run loop: kernels/base/run_loop.py
+    for run in range(runs(values.shape[0])):  # run loop: kernels/base/quick_launch.py
         b = unit_of(run, values.shape[0])
         if b < values.shape[0]:
             for word in range(planes.shape[1]):
@@ -133,7 +132,7 @@ def mark_parents(
     planes: U64x2, coarse_planes: U64x2, coarse_counts: I32x2,
 ):  # fmt: skip
     """Mark the cells that hold a listed finer cell."""
-    for run in range(runs(planes.shape[0])):  # run loop: kernels/base/run_loop.py
+    for run in range(runs(planes.shape[0])):  # run loop: kernels/base/quick_launch.py
         b = unit_of(run, planes.shape[0])
         if b < planes.shape[0]:
             for word in range(coarse_planes.shape[1]):
@@ -183,7 +182,7 @@ def list_parents(
 
     Each value is moved to the cell's centre along its own slope: ramps stay ramps where cells are missing.
     """
-    for run in range(runs(planes.shape[0])):  # run loop: kernels/base/run_loop.py
+    for run in range(runs(planes.shape[0])):  # run loop: kernels/base/quick_launch.py
         b = unit_of(run, planes.shape[0])
         if b < planes.shape[0]:
             for word in range(coarse_planes.shape[1]):
@@ -224,7 +223,7 @@ def refine(
     coarse_planes: U64x2, coarse_places: I32x2, coarse_x: F32, planes: U64x2, places: I32x2, x: F32,
 ):  # fmt: skip
     """Start the finer cells from the coarse solution, linear inside each coarse cell."""
-    for run in range(runs(planes.shape[0])):  # run loop: kernels/base/run_loop.py
+    for run in range(runs(planes.shape[0])):  # run loop: kernels/base/quick_launch.py
         b = unit_of(run, planes.shape[0])
         if b < planes.shape[0]:
             for word in range(planes.shape[1]):
@@ -331,7 +330,7 @@ def relax(
 @ti.kernel
 def write_values(planes: U64x2, places: I32x2, x: F32, values: F32x2):
     """The field where it was solved; other values stay."""
-    for run in range(runs(planes.shape[0])):  # run loop: kernels/base/run_loop.py
+    for run in range(runs(planes.shape[0])):  # run loop: kernels/base/quick_launch.py
         b = unit_of(run, planes.shape[0])
         if b < planes.shape[0]:
             for word in range(planes.shape[1]):

@@ -8,13 +8,12 @@ regulariser, whose `weigh` and `relax` then solve it: paper eq. 3 with no weight
 import taichi as ti
 
 from tsfusion.kernels import F32, I32, I64, U8, F32x2, I32x2, U8x2, U64x2
-from tsfusion.kernels.base.run_loop import runs, unit_of
+from tsfusion.kernels.base.quick_launch import runs, unit_of
 from tsfusion.kernels.base.voxel_traversal import offset_in_block, vec3i, voxel_of
 from tsfusion.kernels.integration.integrate import CUBE
 from tsfusion.kernels.surface.field_smoothing import count_bits, link, without_lowest
 from tsfusion.kernels.surface.normal_smoothing import block_at, value_at
-from tsfusion.kernels.surface.surface_cells import case_of, corner_planes, lowest
-from tsfusion.kernels.surface.voxel_values import BANDS
+from tsfusion.kernels.surface.surface_cells import BANDS, case_of, corner_planes, lowest
 
 UNSEEN = 1  # voxels to solve
 BESIDE = 2  # seen voxels beside them
@@ -31,7 +30,7 @@ def find_rims(
     values: F32x2, rims: U8x2,
 ):  # fmt: skip
     """1 for each seen voxel that the surface passes and that has an unseen one among the 26 around."""
-    for run in range(runs(values.shape[0])):  # run loop: kernels/base/run_loop.py
+    for run in range(runs(values.shape[0])):  # run loop: kernels/base/quick_launch.py
         b = unit_of(run, values.shape[0])
         if b < values.shape[0]:
             for o in range(CUBE):
@@ -106,7 +105,7 @@ def mark_unseen(
     Threads that meet write the same.
     """
     count = values.shape[0]
-    for run in range(runs(count)):  # run loop: kernels/base/run_loop.py
+    for run in range(runs(count)):  # run loop: kernels/base/quick_launch.py
         b = unit_of(run, count)
         if b < count:
             for o in range(CUBE):
@@ -136,7 +135,7 @@ def mark_unseen(
 @ti.kernel
 def take_marked(around: I32x2, values: F32x2, marks: U8x2, planes: U64x2, counts: I32x2):
     """Take the voxels to solve and the seen ones up to `RING` before or behind them along an axis."""
-    for run in range(runs(values.shape[0])):  # run loop: kernels/base/run_loop.py
+    for run in range(runs(values.shape[0])):  # run loop: kernels/base/quick_launch.py
         b = unit_of(run, values.shape[0])
         if b < values.shape[0]:
             for word in range(planes.shape[1]):
@@ -164,7 +163,7 @@ def list_marked(
     layer: I32,
 ):  # fmt: skip
     """Fill the list: the value and weight of each seen voxel, none of the others, and the neighbours."""
-    for run in range(runs(values.shape[0])):  # run loop: kernels/base/run_loop.py
+    for run in range(runs(values.shape[0])):  # run loop: kernels/base/quick_launch.py
         b = unit_of(run, values.shape[0])
         if b < values.shape[0]:
             for word in range(planes.shape[1]):
@@ -221,7 +220,7 @@ def mark_guessed_faces(
     inside: U64x2, active: U64x2, first: I32x2, triangle_count: I32, guessed: U8,
 ):  # fmt: skip
     """1 for each triangle, in the order of `emit_faces`, of a cell with a corner that nobody saw."""
-    for run in range(runs(BANDS)):  # run loop: kernels/base/run_loop.py
+    for run in range(runs(BANDS)):  # run loop: kernels/base/quick_launch.py
         band = unit_of(run, BANDS)
         if band < BANDS:
             for r in range(count * band // BANDS, count * (band + 1) // BANDS):

@@ -9,11 +9,9 @@ the number of bits before its own.
 import taichi as ti
 
 from tsfusion.kernels import I32, I64, F32x2, I32x2, I64x2, U8x2, U64x2
-from tsfusion.kernels.base.quick_launch import QuickLaunch
-from tsfusion.kernels.base.run_loop import runs, unit_of
+from tsfusion.kernels.base.quick_launch import QuickLaunch, runs, unit_of
 from tsfusion.kernels.base.voxel_traversal import unpack, vec3i
-from tsfusion.kernels.surface.surface_cells import case_of, corner_planes, lowest
-from tsfusion.kernels.surface.voxel_values import BANDS
+from tsfusion.kernels.surface.surface_cells import BANDS, case_of, corner_planes, lowest
 
 PAD = 11  # a block with one voxel before and two behind
 PADDED = PAD * PAD * PAD
@@ -153,7 +151,7 @@ def emit_vertices(
     normals: F32x2, colors: U8x2,
 ):  # fmt: skip
     """Position, unit normal and colour of every vertex: where the value crosses zero along its edge."""
-    for run in range(runs(BANDS)):  # run loop: kernels/base/run_loop.py
+    for run in range(runs(BANDS)):  # run loop: kernels/base/quick_launch.py
         band = unit_of(run, BANDS)
         if band < BANDS:
             for r in range(count * band // BANDS, count * (band + 1) // BANDS):
@@ -206,7 +204,7 @@ def emit_faces(
     triangle_count: I32, triangle_starts: I32x2, faces: I32x2,
 ):  # fmt: skip
     """Triangles of each cell, as the numbers of the vertices on its edges."""
-    for run in range(runs(BANDS)):  # run loop: kernels/base/run_loop.py
+    for run in range(runs(BANDS)):  # run loop: kernels/base/quick_launch.py
         band = unit_of(run, BANDS)
         if band < BANDS:
             for r in range(count * band // BANDS, count * (band + 1) // BANDS):

@@ -8,8 +8,7 @@ the centre row of (I + λ D2ᵀD2)⁻¹, as many samples a side as were seen.
 import taichi as ti
 
 from tsfusion.kernels import I32, F32x2, I32x2
-from tsfusion.kernels.base.quick_launch import QuickLaunch
-from tsfusion.kernels.base.run_loop import runs, unit_of
+from tsfusion.kernels.base.quick_launch import QuickLaunch, runs, unit_of
 from tsfusion.kernels.base.voxel_traversal import offset_in_block, vec3i, voxel_of
 from tsfusion.kernels.integration.integrate import CUBE
 
@@ -60,7 +59,7 @@ def smooth_along_normals(
     smoothed: F32x2,
 ):  # fmt: skip
     """Replace the values within `reach` of the surface."""
-    for run in range(runs(rows.shape[0])):  # run loop: kernels/base/run_loop.py
+    for run in range(runs(rows.shape[0])):  # run loop: kernels/base/quick_launch.py
         r = unit_of(run, rows.shape[0])
         if r < rows.shape[0]:
             for o in range(CUBE):

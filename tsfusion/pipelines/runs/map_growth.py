@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from tsfusion.core import process
 from tsfusion.core.config import SensorModel, VolumeConfig
-from tsfusion.core.distinct_integers import distinct
 from tsfusion.core.errors import InvalidConfig, TsfusionError
+from tsfusion.core.number_ranges import distinct
 from tsfusion.geometry.keyframe import Keyframe, points_camera
 from tsfusion.pipelines.runs.target_server import Target
 

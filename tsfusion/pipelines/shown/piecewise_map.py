@@ -7,13 +7,13 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core.distinct_integers import distinct
 from tsfusion.core.errors import DecodeError, JournalError
+from tsfusion.core.number_ranges import distinct
 from tsfusion.core.readable_numbers import count_of, counted
 from tsfusion.pipelines.shown.map_rewinding import RewoundMap
 from tsfusion.tsdf.files import map_history
 from tsfusion.tsdf.store.block_store import cells_of, pack_keys, unpack_keys
-from tsfusion.tsdf.surface.map_cells import CellMeshes
+from tsfusion.tsdf.surface.mesh_extraction import CellMeshes
 from tsfusion.tsdf.surface.mesh_tiles import WholeMapValues
 from tsfusion.tsdf.volume import Volume
 from tsfusion.wire.asking.map_events import (

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core.distinct_integers import distinct
 from tsfusion.core.errors import InvalidKeyframe, MissingDependency
+from tsfusion.core.number_ranges import distinct
 from tsfusion.geometry import se3, sweeps
 from tsfusion.geometry.frame import Frame
 from tsfusion.scanner.localization.localizer import Localizer, Lost, TrackedPose, TrackingKeyframes

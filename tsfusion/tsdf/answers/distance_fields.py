@@ -15,14 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import InvalidConfig, MapError
-from tsfusion.geometry import openvdb_files
+from tsfusion.geometry import point_files
 from tsfusion.geometry.map_grids import FREE, OCCUPIED, UNSEEN, DistanceField
 from tsfusion.kernels.answers import distance_transform as kernels
 from tsfusion.kernels.integration.integrate import QUANTA_PER_VOXEL
-from tsfusion.kernels.surface import voxel_values
+from tsfusion.kernels.surface import surface_cells
 from tsfusion.tsdf.store.block_store import BlockStore, distinct_blocks, unpack_keys
 from tsfusion.tsdf.sums.map_crop import voxel_range
-from tsfusion.tsdf.surface.surface_values import values_of
+from tsfusion.tsdf.surface.field_regularizer import values_of
 
 MOST_VOXELS = 1 << 27  # at once, 20 bytes each while distances are counted
 _LONGEST = 1 << 14  # voxels along an axis: squares of it fit the kernel's integers
@@ -96,7 +96,7 @@ def in_blocks(store: BlockStore, max_distance: float, min_weight: float) -> Iter
     steps = np.array(list(np.ndindex((2 * around + 1,) * 3)), np.int32) - around
     own = distinct_blocks(blocks // _TILE)
     tiles = distinct_blocks((own[:, None] + steps).reshape(-1, 3))
-    for tile in tiles[openvdb_files.order_of(tiles * _TILE)]:
+    for tile in tiles[point_files.order_of(tiles * _TILE)]:
         first, end = tile * _TILE, (tile + 1) * _TILE
         near = blocks[((blocks >= first - rings) & (blocks < end + rings)).all(axis=1)]
         if len(near):
@@ -169,7 +169,7 @@ def _read(
     for i in range(0, len(keys), _PART):
         x, y, z = places[i : i + _PART].T
         part = values_of(keys[i : i + _PART], store, min_weight) / np.float32(QUANTA_PER_VOXEL)
-        voxel_values.hold_hits(store.slots_of(keys[i : i + _PART]), *store.ray_ends, part)
+        surface_cells.hold_hits(store.slots_of(keys[i : i + _PART]), *store.ray_ends, part)
         grid[x, :, y, :, z] = part.reshape(-1, 8, 8, 8)
     return grid.reshape(-1)
 

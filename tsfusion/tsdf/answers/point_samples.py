@@ -8,7 +8,7 @@ from tsfusion.geometry.map_answers import Samples
 from tsfusion.kernels.answers import point_sampling
 from tsfusion.kernels.base.sensor_noise import WEIGHT_ONE
 from tsfusion.tsdf.store.block_store import BlockStore, unpack_keys
-from tsfusion.tsdf.surface.surface_values import SurfaceView, values_of
+from tsfusion.tsdf.surface.field_regularizer import SurfaceView, values_of
 
 _PART = 1 << 14  # points at a time where their blocks may have to come from a file
 _POINTS_A_BLOCK = 16  # of the map: where there are more, a table of its blocks pays

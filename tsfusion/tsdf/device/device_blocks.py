@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.config import Arch
-from tsfusion.core.distinct_integers import distinct
+from tsfusion.core.number_ranges import distinct
 from tsfusion.kernels.device.device_told import FIRST_BLOCKS, FIRST_HASH
 from tsfusion.tsdf.device.device_link import DeviceLink, Step
 from tsfusion.tsdf.store.block_store import DeviceRows

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core.distinct_integers import distinct
+from tsfusion.core.number_ranges import distinct
 from tsfusion.kernels import taichi as ti
 from tsfusion.kernels.base.voxel_traversal import BAND_FIELDS, COST, RAY_FIELDS, UPDATES
 from tsfusion.kernels.device import device_integration as kernels

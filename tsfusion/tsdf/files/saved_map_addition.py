@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core.distinct_integers import distinct
 from tsfusion.core.errors import MapError, MapFull, WeightOverflow
-from tsfusion.core.side_thread import SideThread
+from tsfusion.core.number_ranges import distinct
+from tsfusion.core.process import SideThread
 from tsfusion.geometry.up_direction import HeldSensor
 from tsfusion.kernels.base.sensor_noise import WEIGHT_ONE
 from tsfusion.kernels.integration.integrate import WEIGHT_LIMIT

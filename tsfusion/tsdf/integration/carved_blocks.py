@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core.distinct_integers import distinct
+from tsfusion.core.number_ranges import distinct
 from tsfusion.geometry.keyframe import Intrinsics, Keyframe
 from tsfusion.kernels.base.sensor_noise import MAX_CARVED, MAX_RANGE, VOXEL_SIZE
 from tsfusion.kernels.base.voxel_traversal import VOXEL_LIMIT

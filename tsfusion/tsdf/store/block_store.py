@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from tsfusion.core import process
 from tsfusion.core.config import CacheConfig
-from tsfusion.core.distinct_integers import distinct
 from tsfusion.core.errors import MapFull
+from tsfusion.core.number_ranges import distinct
 from tsfusion.kernels.base import block_hash, runtime
 from tsfusion.kernels.integration.integrate import CHANGED, CUBE, WEIGHT_MASK
-from tsfusion.kernels.surface import voxel_values
+from tsfusion.kernels.surface import surface_cells
 from tsfusion.kernels.surface.surface_cells import NO_LIMITS
 from tsfusion.tsdf.store.clear_blocks import ClearBlocks
 from tsfusion.tsdf.store.growing_array import LAYER_DTYPES, MAX_ITEMS, FileArray, GrowingArray
@@ -200,20 +200,20 @@ class BlockStore:
     @property
     def ray_ends(self) -> tuple[NDArray[np.int64], NDArray[np.int32], int]:
         """Layers that count the rays which end in a voxel, and which of them the map has
-        (`voxel_values.held`)."""
+        (`surface_cells.held`)."""
         return self.color_rgn, self.hits, self.color + 2 * self.counts_hits
 
     @property
     def clear_blocks(self) -> tuple[NDArray[Any], ...]:
         """By slot, whether a block shows a surface or hits; and the blocks that keyframes look through
-        (`voxel_values.is_clear`)."""
+        (`surface_cells.is_clear`)."""
         clear = self.clear
         if len(clear):
             with process.uninterrupted():
                 slots = clear.take_unknown(self.drops, self.count, self.take_dirty(SURFACES))
                 for i in range(0, len(slots), _CHUNK):
                     chunk = slots[i : i + _CHUNK]
-                    voxel_values.find_surfaces(chunk, self.sums, *self.ray_ends, clear.shows_surface)
+                    surface_cells.find_surfaces(chunk, self.sums, *self.ray_ends, clear.shows_surface)
                     self.keep_within_memory()
         return clear.shows_surface, *clear.table
 

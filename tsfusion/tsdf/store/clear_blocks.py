@@ -9,8 +9,8 @@ looks through it and its voxels show neither a hit nor a surface.
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core.distinct_integers import distinct
 from tsfusion.core.errors import MapFull
+from tsfusion.core.number_ranges import distinct
 from tsfusion.kernels.base import block_hash
 from tsfusion.tsdf.store.growing_array import MAX_ITEMS, GrowingArray
 
@@ -43,7 +43,7 @@ class ClearBlocks:
 
     @property
     def table(self) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.int32]]:
-        """Hash from key to slot, and counts by slot, as kernels read them (`voxel_values.is_clear`)."""
+        """Hash from key to slot, and counts by slot, as kernels read them (`surface_cells.is_clear`)."""
         return *self._hash, self._counts.array
 
     def counts(self) -> ClearCounts:

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: MIT
-"""Plan of the field regulariser: blocks and iterations. `kernels/surface/field_smoothing.py` solves.
+"""Signed distances of a surface, raw or of the regularised field: plan of blocks and iterations.
+`kernels/surface/field_smoothing.py` solves.
 
 A view of the map's sums: no order of keyframes or threads can show. Blocks are solved with a halo of their
 neighbours, so that some blocks' values are nearly those of the whole map (docs/method.md says how nearly).
@@ -8,15 +9,16 @@ neighbours, so that some blocks' values are nearly those of the whole map (docs/
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tsfusion.kernels.base.sensor_noise import WEIGHT_ONE
 from tsfusion.kernels.integration.integrate import CUBE, QUANTA_PER_VOXEL
 from tsfusion.kernels.surface import field_smoothing as kernels
 from tsfusion.kernels.surface import normal_smoothing, surface_cells
 from tsfusion.tsdf.store.block_store import BlockStore
-from tsfusion.tsdf.surface.surface_values import values_of
 
 BATCH = 8192  # blocks solved at once, beside their halo; some 10 kB each
 STEPS, LOWEST = 6, 0.015  # Chebyshev steps a round, and eigenvalue of M⁻¹A from which on they damp evenly
@@ -34,6 +36,7 @@ SIDES = np.array([sign * step for step in _KEY_STEP for sign in (-1, 1)], np.int
 
 
 Round = tuple[float, float, int]  # ε in quanta, ∞: ω = 1; least eigenvalue to damp; steps
+_PART = 1 << 14  # blocks read at a time: they may have to come from a file
 
 
 @dataclass(frozen=True)
@@ -262,3 +265,38 @@ def index_of(keys: NDArray[np.int64], queries: NDArray[np.int64]) -> NDArray[np.
         return np.full(queries.shape, -1, np.int32)
     at = np.minimum(np.searchsorted(keys, queries), len(keys) - 1)
     return np.where(keys[at] == queries, at, -1).astype(np.int32)
+
+
+class SurfaceView(Protocol):
+    """Function that reads signed distances from the map: `values_of`, or one of `field_regularizer`."""
+
+    def __call__(
+        self,
+        keys: NDArray[np.int64],
+        store: BlockStore,
+        min_weight: float,
+        out: NDArray[np.float32] | None = None,
+    ) -> NDArray[np.float32]:
+        """(n, 512) values of blocks in quanta, NaN where unseen: below `min_weight` full samples.
+
+        Args:
+            keys: sorted packed keys; a block that the map does not hold is unseen.
+            out: rows to write to, at least n.
+        """
+
+
+def values_of(
+    keys: NDArray[np.int64], store: BlockStore, min_weight: float, out: NDArray[np.float32] | None = None
+) -> NDArray[np.float32]:
+    """Signed distances as they were fused: the `SurfaceView` of the surface `raw`."""
+    if out is None:
+        out = np.empty((len(keys), CUBE), np.float32)
+    least = max(1, int(np.ceil(min_weight * WEIGHT_ONE)))
+    for first in range(0, len(keys), _PART):
+        part = keys[first : first + _PART]
+        surface_cells.read_values(
+            len(part), part, store.hash_keys, store.hash_slots, store.sums, store.correction,
+            int(store.corrected), least, out[first : first + len(part)],
+        )  # fmt: skip
+        store.rest()
+    return out[: len(keys)]

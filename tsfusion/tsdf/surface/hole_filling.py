@@ -6,7 +6,7 @@
    weight elsewhere, so that second differences are least; a ramp goes on as it is. Seen voxels keep theirs.
 3. Marching cubes meshes seen and guessed voxels together. A triangle is guessed if its cell has a voxel that
    nobody saw; all others are those of the mesh without guesses.
-4. A guessed patch stays if it closes (`geometry/guessed_patches.py`).
+4. A guessed patch stays if it closes, and its colours come from its rim.
 """
 
 import math
@@ -15,17 +15,17 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core.distinct_integers import distinct
 from tsfusion.core.errors import InvalidConfig
-from tsfusion.geometry import guessed_patches
+from tsfusion.core.number_ranges import distinct
+from tsfusion.geometry import mesh_islands
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.kernels.integration.integrate import CUBE
 from tsfusion.kernels.surface import field_smoothing, marching_tables
 from tsfusion.kernels.surface import hole_kernels as kernels
 from tsfusion.tsdf.store.block_store import BlockStore
 from tsfusion.tsdf.surface import field_regularizer
+from tsfusion.tsdf.surface.field_regularizer import SurfaceView
 from tsfusion.tsdf.surface.mesh_extraction import MeshBuffers, extract_rows
-from tsfusion.tsdf.surface.surface_values import SurfaceView
 
 MOST_VOXELS = 64
 BATCH = 4096  # blocks solved at once, beside their halo
@@ -33,6 +33,7 @@ _STIFFEST = 48.0  # most that the operator of the preconditioner's units has: 4 
 _SOFTEST = 500.0  # least eigenvalue of D2ᵀD2 between two held ends, times the distance⁴: (4.73)⁴
 _SLAB, _SLOPE = 2.5, 0.5  # voxels from the plane of a rim that are solved, and how that grows with distance
 _TOLERANCE = 1e-2  # of the first guess's error
+_SWEEPS = 256  # of colours, at most: across the widest hole
 
 
 def checked(voxels: int) -> int:
@@ -76,7 +77,7 @@ def extract_filled(store: BlockStore, min_weight: float, view: SurfaceView, voxe
     seen_vertices = np.unique(mesh.faces[guessed == 0])
     mesh.normals[seen_vertices] = plain.normals  # not bent by what was guessed beside them
     guess = replace(mesh, guessed=guessed.astype(bool))
-    return guessed_patches.with_rim_colors(guessed_patches.closing(guess))
+    return with_rim_colors(closing(guess))
 
 
 def _fill(
@@ -182,3 +183,81 @@ def _spread(keys: NDArray[np.int64], rings: int) -> NDArray[np.int64]:
 
 def _rows(keys: NDArray[np.int64], queries: NDArray[np.int64]) -> NDArray[np.int32]:
     return field_regularizer.index_of(keys, queries)
+
+
+def closing(mesh: Mesh) -> Mesh:
+    """The mesh without the guessed patches that close nothing.
+
+    None of a patch's edges may be free: at the border of a scan and in a hole that is too wide they are. And
+    it may not have more triangles than the seen pieces that it hangs on: a crumb would grow to a bubble.
+    """
+    assert mesh.guessed is not None
+    guess = np.flatnonzero(mesh.guessed)
+    edges = _edges(mesh.faces[guess])
+    owner = np.tile(np.arange(len(guess), dtype=np.int32), 3)
+    key = _keys(edges)
+    order = np.argsort(key, kind="stable")
+    same = key[order][1:] == key[order][:-1]
+    patch = mesh_islands.linked(owner[order][1:][same], owner[order][:-1][same], len(guess))
+    alone = np.ones(len(key), bool)
+    alone[1:] &= ~same
+    alone[:-1] &= ~same
+    rim = order[alone]  # edges that one guessed triangle has
+    of, at = patch[owner[rim]], edges[rim]
+    seen = mesh.faces[~mesh.guessed]
+    touched = np.zeros(len(mesh.vertices), bool)
+    touched[at] = True
+    is_attached = np.isin(key[rim], _keys(_edges(seen[touched[seen].any(axis=1)])))
+    size = np.bincount(patch, minlength=len(guess))
+    keeps = _size_around(seen, of[is_attached], at[is_attached, 0], mesh) >= np.maximum(size, 1)
+    keeps[of[~is_attached]] = False
+    kept = ~mesh.guessed
+    kept[guess] = keeps[patch]
+    closed = mesh.of_faces(kept)
+    return closed if keeps[patch].any() else replace(closed, guessed=None)
+
+
+def _size_around(
+    seen: NDArray[np.int32], patch: NDArray[np.int32], vertex: NDArray[np.int32], mesh: Mesh
+) -> NDArray[np.int64]:
+    """Number of triangles of the seen pieces that each patch hangs on, by the vertices where it does."""
+    assert mesh.guessed is not None
+    label = mesh_islands.pieces(seen, len(mesh.vertices))
+    faces = np.bincount(label[seen[:, 0]], minlength=len(label))
+    pairs = np.unique(np.stack((patch, label[vertex]), axis=1), axis=0)
+    total = np.bincount(pairs[:, 0], faces[pairs[:, 1]], minlength=int(mesh.guessed.sum()))
+    return total.astype(np.int64)
+
+
+def _edges(faces: NDArray[np.int32]) -> NDArray[np.int32]:
+    return np.concatenate((faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]))
+
+
+def _keys(edges: NDArray[np.int32]) -> NDArray[np.int64]:
+    keys: NDArray[np.int64] = edges.min(axis=1).astype(np.int64) << 32 | edges.max(axis=1)
+    return keys
+
+
+def with_rim_colors(mesh: Mesh) -> Mesh:
+    """Colours of the guessed surface: those of its rim, diffused inward."""
+    if mesh.guessed is None or mesh.colors is None:
+        return mesh
+    known = np.zeros(len(mesh.vertices), bool)
+    known[mesh.faces[~mesh.guessed]] = True
+    faces = mesh.faces[mesh.guessed]
+    edges = np.concatenate((faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]))
+    a, b = np.unique(np.concatenate((edges, edges[:, ::-1])), axis=0).T
+    a, b = a[~known[a]], b[~known[a]]
+    colors = mesh.colors.astype(np.float64)
+    has = known.copy()
+    for _ in range(_SWEEPS):
+        use = has[b]
+        count = np.bincount(a[use], minlength=len(known))
+        sums = [np.bincount(a[use], colors[b[use], channel], len(known)) for channel in range(3)]
+        reached = count > 0
+        change = np.stack(sums, axis=1)[reached] / count[reached, None] - colors[reached]
+        colors[reached] += change
+        if (reached <= has).all() and (not len(change) or np.abs(change).max() < 0.5):
+            break
+        has |= reached
+    return replace(mesh, colors=np.round(colors).astype(np.uint8))

@@ -12,11 +12,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core.distinct_integers import distinct
+from tsfusion.core.number_ranges import distinct
 from tsfusion.geometry.mesh_parts import MeshPart
 from tsfusion.tsdf.store.block_store import CELL_STEPS, BlockStore
 from tsfusion.tsdf.surface import field_regularizer, mesh_extraction
-from tsfusion.tsdf.surface.surface_values import SurfaceView
+from tsfusion.tsdf.surface.field_regularizer import SurfaceView
 
 _FARTHEST = int(CELL_STEPS.max())  # what the keys of blocks that share a cell differ by at most
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""True place and brightness of each colour image: so that images agree on a surface.
+"""Images as textures take them, and the true place and brightness of each: so that they agree on a surface.
 
 Poses are never exact, and colour and depth are often taken some milliseconds apart: on a wall two metres away
 half a degree is four pixels. Each image is moved until it agrees with the mean of all others on points of the
@@ -7,7 +7,8 @@ surface (Zhou and Koltun 2014, with one pose an image), from coarse to fine. The
 channel makes the exposures equal, by least squares over all points seen twice.
 """
 
-from typing import NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple, Protocol
 
 import cv2
 import numpy as np
@@ -15,8 +16,8 @@ from numpy.typing import NDArray
 
 from tsfusion.core.readable_numbers import OnProgress
 from tsfusion.geometry import se3
+from tsfusion.geometry.keyframe import Keyframe, depth_metres
 from tsfusion.kernels.answers import texture_baking
-from tsfusion.tsdf.texture.texture_images import PosedImages, TextureImage, images
 
 # Levels: blur in pixels of the halved image, and rounds.
 LEVELS = ((3.0, 12), (1.5, 10), (0.75, 8))
@@ -31,6 +32,11 @@ _DARK, _BRIGHT = 8, 245  # grey levels between which brightness is measured
 _LOG_NOISE = 0.1  # of brightness, beyond which a point counts less
 _EXPOSURE_ROUNDS = 30
 _UNIT = 1e5  # pixels on a square metre that weigh 1
+_SMALLEST = 8  # pixels of an image's side
+_EDGE = 4.0  # pixels from an edge of the depth at which colour is trusted wholly: registration ends there
+_JUMP = 0.05  # of the depth: an edge
+_CLIPPED = 250  # grey levels from which a channel may have been any brightness
+_CLIPPED_TRUST = 0.05
 
 
 class ImageFit(NamedTuple):
@@ -77,6 +83,36 @@ class Fit(NamedTuple):
 
     images: dict[int, ImageFit]
     best: NDArray[np.float32]
+
+
+class TextureImage(NamedTuple):
+    """An image and what is known of its pixels; arrays of H × W.
+
+    Attributes:
+        number: of its keyframe.
+        color: (H, W, 3) uint8 RGB.
+        depth: float32 metres, 0 = none.
+        clearness: float32 from 0 (no depth, or at its edge) to 1.
+        trust: float32 from 0 to 1; low where the camera's range ended.
+        T_camera_world: (4, 4) float64.
+        camera: float32 fx, fy, cx, cy.
+    """
+
+    number: int
+    color: NDArray[np.uint8]
+    depth: NDArray[np.float32]
+    clearness: NDArray[np.float32]
+    trust: NDArray[np.float32]
+    T_camera_world: NDArray[np.float64]
+    camera: NDArray[np.float32]
+
+
+class PosedImages(Protocol):
+    """Keyframes that can be read again and again, in the same order; None stands for one of no use."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, index: int, /) -> Keyframe | None: ...
 
 
 def fit(
@@ -275,3 +311,46 @@ def sampled(
     above = (1 - s) * flat[at] + s * flat[at + 1]
     below = (1 - s) * flat[at + width] + s * flat[at + width + 1]
     return np.asarray((1 - t) * above + t * below)
+
+
+def images(keyframes: PosedImages, chosen: Sequence[int] | None = None) -> Iterator[TextureImage]:
+    """The keyframes with depth and colour images, one at a time.
+
+    Args:
+        chosen: their indices; None = all.
+    """
+    for index in range(len(keyframes)) if chosen is None else chosen:
+        found = image_of(keyframes[index], index)
+        if found is not None:
+            yield found
+
+
+def image_of(keyframe: Keyframe | None, index: int) -> TextureImage | None:
+    """The image of a keyframe; None where it has none, as that of a LiDAR, or one of a few pixels."""
+    if keyframe is None or keyframe.color is None or keyframe.intrinsics is None:
+        return None
+    if min(keyframe.shape) < _SMALLEST:
+        return None
+    depth = depth_metres(keyframe).astype(np.float32)
+    K = keyframe.intrinsics
+    color = np.ascontiguousarray(keyframe.color[..., ::-1])
+    clipped = color.max(axis=2) >= _CLIPPED
+    return TextureImage(
+        index,
+        color,
+        depth,
+        clearness_of(depth),
+        np.where(clipped, np.float32(_CLIPPED_TRUST), np.float32(1)),
+        se3.inverse(keyframe.T_world_camera),
+        np.array([K.fx, K.fy, K.cx, K.cy], np.float32),
+    )
+
+
+def clearness_of(depth: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(H, W) float32: 0 at an edge of the depth or where it has none, 1 some pixels away from it."""
+    square = np.ones((3, 3))
+    least = cv2.erode(np.where(depth > 0, depth, np.float32(1e9)), square)
+    most = cv2.dilate(depth, square)
+    inner = (depth > 0) & (most - least < _JUMP * most)
+    away = cv2.distanceTransform(inner.astype(np.uint8), cv2.DIST_L2, 3)
+    return np.asarray(np.minimum(away / _EDGE, 1), np.float32)

@@ -2,7 +2,7 @@
 """A texture for a mesh from the images that its map was made of: colour as sharp as the cameras saw it.
 
 1. Points are spread over the mesh, and the images are fitted to each other on them (`texture_fitting`).
-2. The mesh is cut into flat charts, which are laid out on pages (`texture_charts`, `texture_atlas`).
+2. The mesh is cut into flat charts, which are laid out on pages (`texture_charts`).
 3. Every texel is looked up in every image that sees it. Its coarse colour is the mean, by quality; its fine
    detail comes from the best views (two bands of Burt and Adelson's blending 1983). Weights change smoothly
    over the surface, so there are no seams between views.
@@ -18,14 +18,13 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import InvalidConfig, MapError
-from tsfusion.geometry import texture_atlas, texture_charts
+from tsfusion.geometry import texture_charts
 from tsfusion.geometry.mesh import Mesh
-from tsfusion.geometry.texture_atlas import GUARD, ChartPlacement
+from tsfusion.geometry.texture_charts import GUARD, ChartPlacement
 from tsfusion.geometry.textured_mesh import Texture, TexturedMesh, fields_of
 from tsfusion.kernels.answers import texture_baking
 from tsfusion.tsdf.texture import texture_fitting
-from tsfusion.tsdf.texture.texture_fitting import ImageFit, Visibility
-from tsfusion.tsdf.texture.texture_images import PosedImages, TextureImage, images
+from tsfusion.tsdf.texture.texture_fitting import ImageFit, PosedImages, TextureImage, Visibility, images
 
 _DENSITY = 2500.0  # points on a square metre on which images are fitted, at most; else one a voxel's face
 _FEWEST, _MOST = 20_000, 2_000_000  # such points
@@ -158,7 +157,7 @@ def _laid_out(mesh: Mesh, texel: float, size: int) -> tuple[ChartPlacement, list
     vertices, faces, normals = _arrays(mesh)
     charts = texture_charts.find(vertices, faces, normals)
     for attempt in range(_LAYOUTS):
-        layout = texture_atlas.pack(charts, faces, texel=texel, side=size)
+        layout = texture_charts.pack(charts, faces, texel=texel, side=size)
         covered = np.zeros(len(faces), np.uint8)
         owners = []
         for page, shape in enumerate(layout.sizes):

@@ -1,16 +1,26 @@
 # SPDX-License-Identifier: MIT
-"""Parts of a map's tiles that a plane and a box leave."""
+"""Parts of a map's tiles that a plane and a box leave, and the controls of both."""
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.geometry import mesh_cropping
+from tsfusion.geometry.color_scales import rounded_up
 from tsfusion.geometry.mesh import Mesh
+from tsfusion.viewer.page.page_server import calm
+
+if TYPE_CHECKING:
+    import viser
 
 ClipSide = Literal["whole", "part", "hidden"]
+_NONE, _HEIGHT = "none", "height"
+_AXES = ("x", "y", "z")
+_STEP = 0.01  # metres
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,3 +68,81 @@ class Clipping:
         if self.box is not None:
             shown &= ((points >= self.box[0]) & (points <= self.box[1])).all(axis=1)
         return shown
+
+
+class ClippingControls:
+    """Sliders as long as the map.
+
+    Args:
+        changed: called, on any thread, after somebody moved something.
+    """
+
+    def __init__(self, gui: "viser.GuiApi", changed: Callable[[], None]) -> None:
+        self.up = np.array((0.0, 0.0, 1.0))
+        self._low, self._high = np.zeros(3), np.ones(3)
+        self._plane: Any = gui.add_dropdown(
+            "Cut at", (_NONE, _HEIGHT, *_AXES), initial_value=_NONE, hint="Hide what is beyond a plane"
+        )
+        self._at: Any = gui.add_slider("Metres", 0.0, 1.0, _STEP, 1.0, disabled=True)
+        self._other: Any = gui.add_checkbox("Keep the other side", False, disabled=True)
+        self._box: Any = gui.add_checkbox("Only inside a box", False)
+        self._ranges: list[Any] = [
+            gui.add_multi_slider(axis, 0.0, 1.0, _STEP, (0.0, 1.0), visible=False) for axis in _AXES
+        ]
+
+        def update(event: object) -> None:
+            self._enable()
+            changed()
+
+        self._plane.on_update(calm(lambda event: self._move_to_end()))
+        for control in (self._plane, self._at, self._other, self._box, *self._ranges):
+            control.on_update(calm(update))
+
+    @property
+    def clipping(self) -> Clipping:
+        """State of the controls."""
+        normal, offset = None, 0.0
+        if self._plane.value != _NONE:
+            sign = -1.0 if self._other.value else 1.0
+            normal, offset = sign * self._normal, sign * float(self._at.value)
+        if not self._box.value:
+            return Clipping(normal, offset)
+        ends = np.array([(min(slider.value), max(slider.value)) for slider in self._ranges], np.float64).T
+        return Clipping(normal, offset, np.stack((ends[0], np.maximum(ends[1], ends[0] + _STEP))))
+
+    def fit(self, low: NDArray[np.float64], high: NDArray[np.float64], up: NDArray[np.float64]) -> None:
+        """Make the sliders as long as a map from (3,) `low` to (3,) `high`, metres."""
+        grain = rounded_up(float((high - low).max())) / 50
+        low, high = grain * np.floor(low / grain), grain * np.ceil(high / grain)
+        if (low == self._low).all() and (high == self._high).all() and (up == self.up).all():
+            return
+        self._low, self._high, self.up = low, high, up
+        for axis, slider in enumerate(self._ranges):
+            first, last = slider.value
+            first = low[axis] if first <= slider.min else max(first, low[axis])
+            last = high[axis] if last >= slider.max else min(last, high[axis])
+            slider.min, slider.max = float(low[axis]), float(high[axis])
+            slider.value = (float(first), float(max(first, last)))
+        self._fit_plane()
+
+    @property
+    def _normal(self) -> NDArray[np.float64]:
+        name = self._plane.value
+        return np.eye(3)[_AXES.index(name)] if name in _AXES else self.up
+
+    def _fit_plane(self, *, to_end: bool = False) -> None:
+        corners = np.array(np.meshgrid(*zip(self._low, self._high, strict=True))).reshape(3, -1).T
+        heights = corners @ self._normal
+        low, high = math.floor(heights.min() * 100) / 100, math.ceil(heights.max() * 100) / 100
+        value = high if to_end or self._at.value >= self._at.max else min(max(self._at.value, low), high)
+        self._at.min, self._at.max, self._at.value = low, high, value
+
+    def _move_to_end(self) -> None:
+        """Where a plane is chosen anew, it hides nothing at first."""
+        self._other.value = False
+        self._fit_plane(to_end=True)
+
+    def _enable(self) -> None:
+        self._at.disabled = self._other.disabled = self._plane.value == _NONE
+        for slider in self._ranges:
+            slider.visible = self._box.value

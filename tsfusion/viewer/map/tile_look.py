@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core.rates import Bucket
+from tsfusion.core.limits import Bucket
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.up_direction import Up
 from tsfusion.viewer.map import map_tiles

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsfusion.core.rates import Bucket
+from tsfusion.core.limits import Bucket
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.viewer.map import tile_glb
 from tsfusion.viewer.map.clipping import Clipping, ClipSide

@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.viewer.map import map_views
-from tsfusion.viewer.map.clipping_controls import ClippingControls
+from tsfusion.viewer.map.clipping import ClippingControls
 from tsfusion.viewer.map.map_views import PageCamera
 from tsfusion.viewer.map.tile_look import MOST_UNREAD, OwnLook, TileLook
-from tsfusion.viewer.page.calm_callbacks import calm
-from tsfusion.viewer.panels.state_tables import text
+from tsfusion.viewer.page.page_server import calm
+from tsfusion.viewer.panels.health_plots import text
 
 if TYPE_CHECKING:
     import viser

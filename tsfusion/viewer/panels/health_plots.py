@@ -1,18 +1,25 @@
 # SPDX-License-Identifier: MIT
-"""Delay, queue and memory of a server while keyframes come, over the time that a page has been open."""
+"""Delay, queue and memory of a server while keyframes come, over the time that a page has been open;
+the state of its maps and scanners as HTML, with every text escaped."""
 
+from collections.abc import Iterable, Sequence
+from html import escape
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tsfusion.core.readable_numbers import counted, grouped, size
 from tsfusion.geometry.color_scales import as_hex, of_number
-from tsfusion.wire.messages.health import Health
+from tsfusion.wire.messages.health import ClientHealth, Health
 
 if TYPE_CHECKING:
     import viser
 
 _MOST = 600  # moments that are kept
 _HEIGHT = 130  # pixels
+_TEXT = "font-size:.85em;line-height:1.5;padding:0 .9em .4em .6em;overflow-wrap:anywhere"
+_GOOD, _BAD = "#009e73", "#d55e00"
+_ADDRESS = 40  # characters of a name that are shown
 
 
 class HealthPlots:
@@ -76,3 +83,95 @@ def _plot(gui: "viser.GuiApi", title: str, names: tuple[str, str]) -> "viser.Gui
         scales={"x": uplot.Scale(time=False, auto=True), "y": uplot.Scale(auto=True)},
         visible=False,
     )
+
+
+def summary(title: str, map_name: str, problem: str, facts: Sequence[str], problems: Sequence[str]) -> str:
+    """The head of a panel: what is watched, whether it is there, and what is wrong.
+
+    Args:
+        problem: why what is watched is not there; empty = it is.
+        problems: of the server, a sentence each.
+    """
+    color, word = (_BAD, escape(problem)) if problem else (_GOOD, "connected")
+    dot = f'<span style="color:{color}">{"▲" if problem else "●"}</span>'
+    name = f" · {escape(map_name)}" if map_name and map_name not in title else ""
+    style = "font:inherit;font-weight:700;display:inline"
+    head = (
+        f'<h1 style="{style}" data-shown="{escape(map_name or title)}">{escape(title)}</h1>'  # page_head.html
+    )
+    lines = [head + name, f"{dot} {word}", " · ".join(map(escape, facts))]
+    text = "".join(f"<div>{line}</div>" for line in lines if line)
+    return f'<div style="{_TEXT}">{text}{"".join(map(_warning, problems))}</div>'
+
+
+def tables(health: Health, map_name: str, order: Sequence[str]) -> str:
+    """Every scanner and every map of a server.
+
+    Args:
+        order: the first 8 hexadecimal digits of the sessions that have a colour in the scene.
+    """
+    clients = sorted(
+        health.clients, key=lambda client: (client.map != map_name, client.client, client.session)
+    )
+    scanners = [_scanner(client, map_name, order) for client in clients]
+    maps = [
+        (
+            escape(_short(name)),
+            found.state,
+            grouped(found.keyframes_fused),
+            grouped(found.waiting),
+            size(found.map_bytes),
+        )
+        for name, found in sorted(health.maps.items())
+    ]
+    lost = counted(health.refused)
+    notes = [f"refused by the server: {lost}"] if lost else []
+    for name, found in sorted(health.maps.items()):
+        if counted(found.rejected):
+            notes.append(f"{name}: not fused: {counted(found.rejected)}")
+    return (
+        f'<div style="{_TEXT}">'
+        + _table(("scanner", "state", "in map", "of", "waiting"), scanners or [("none", "", "", "", "")])
+        + _table(("map", "state", "keyframes", "waiting", "size"), maps)
+        + "".join(f"<div>{escape(note)}</div>" for note in notes)
+        + "</div>"
+    )
+
+
+def text(content: str) -> str:
+    """A paragraph; `content` is HTML already."""
+    return f'<div style="{_TEXT}">{content}</div>'
+
+
+def _scanner(client: ClientHealth, map_name: str, order: Sequence[str]) -> tuple[str, ...]:
+    name = escape(_short(client.client or client.session))
+    if client.session in order and client.map == map_name:
+        name = f'<span style="color:{as_hex(of_number(order.index(client.session)))}">■</span> {name}'
+    elif client.map != map_name:
+        name += f" → {escape(_short(client.map))}"
+    state = f'<span style="color:{_BAD}">{escape(client.held)}</span>' if client.held else client.state
+    return name, state, grouped(client.fused), grouped(client.durable), grouped(client.waiting)
+
+
+def _table(head: Iterable[str], rows: Iterable[tuple[str, ...]]) -> str:
+    left, right = "text-align:left;padding:.1em .5em .1em 0", "text-align:right;padding:.1em 0 .1em .5em"
+
+    def row(cells: Iterable[str], tag: str) -> str:
+        weight = "600" if tag == "th" else "400"
+        styled = (
+            f'<{tag} style="{left if index < 2 else right};font-weight:{weight}">{cell}</{tag}>'
+            for index, cell in enumerate(cells)
+        )
+        return f"<tr>{''.join(styled)}</tr>"
+
+    body = "".join(row(cells, "td") for cells in rows)
+    return f'<table style="width:100%;border-collapse:collapse;margin:.3em 0">{row(head, "th")}{body}</table>'
+
+
+def _warning(sentence: str) -> str:
+    style = f"border-left:3px solid {_BAD};padding-left:.5em;margin-top:.3em"
+    return f'<div style="{style}">{escape(sentence)}</div>'
+
+
+def _short(name: str) -> str:
+    return name if len(name) <= _ADDRESS else name[: _ADDRESS - 1] + "…"

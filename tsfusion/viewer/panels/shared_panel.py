@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 from tsfusion.core.readable_numbers import grouped
 from tsfusion.viewer.map_feed import MapFeed, TimeLine
-from tsfusion.viewer.page.calm_callbacks import calm
-from tsfusion.viewer.panels import state_tables
+from tsfusion.viewer.page.page_server import calm
+from tsfusion.viewer.panels import health_plots
 from tsfusion.viewer.panels.health_plots import HealthPlots
 from tsfusion.wire.messages.health import Health
 
@@ -51,7 +51,7 @@ class SharedPanel:
         self._wanted_map: str | None = None  # until it is shown
         gui.set_panel_label("tsfusion")
         gui.main_panel.dock_right()
-        self._head = gui.add_html(state_tables.summary(feed.title, "", "", ["waiting for the map"], ()))
+        self._head = gui.add_html(health_plots.summary(feed.title, "", "", ["waiting for the map"], ()))
         tabs = gui.add_tab_group()
         with tabs.add_tab("View") as self.view:
             self._map: Any = self._choice_of_maps(gui)
@@ -61,7 +61,7 @@ class SharedPanel:
                 box.on_update(calm(partial(_show, show, what)))
         self.cut = tabs.add_tab("Cut")
         with tabs.add_tab("State"):
-            self._tables = gui.add_html(state_tables.text("No server is watched."))
+            self._tables = gui.add_html(health_plots.text("No server is watched."))
             self.plots = HealthPlots(gui)
 
     def take_orders(self, now: float, settled: float) -> Orders:
@@ -87,10 +87,10 @@ class SharedPanel:
             facts = [*facts, f"{grouped(found.keyframes_fused)} keyframes"]
             facts += [f"{grouped(found.waiting)} waiting"] if found.waiting else []
         problems = () if health is None else health.problems
-        self._head.content = state_tables.summary(self._feed.title, map_name, problem, facts, problems)
+        self._head.content = health_plots.summary(self._feed.title, map_name, problem, facts, problems)
         if health is not None:
             order = [session.hex()[:8] for session in sessions]
-            self._tables.content = state_tables.tables(health, map_name, order)
+            self._tables.content = health_plots.tables(health, map_name, order)
         self.plots.draw()
         names = tuple(self._feed.maps())
         if len(names) > 1:

@@ -1,15 +1,20 @@
 # SPDX-License-Identifier: MIT
-"""Products that a sum is made of, each rounded by itself, as on every CPU.
+"""Functions that kernels share: products rounded as on every CPU, and a check of devices.
 
 Taichi's CUDA backend and drivers of Vulkan may turn a·b + c into one instruction that rounds once (FMA): its
 last bit differs. There a product passes through `max` with a number below all that occur, which no
 compiler can leave out or fuse. On the CPU, where Taichi does not fuse (`fast_math=False`), it is the bare
-product.
+product. `is_exact` checks a device: atomics on int64, and float64 as on the CPU.
 """
 
-import taichi as ti
+import numpy as np
+
+from tsfusion.kernels import F64, I64
+from tsfusion.kernels import taichi as ti
 
 LOWEST = -3.0e38  # of float32, too
+_ADDED = 4096
+_STEP = -(1 << 27) - 3
 
 
 def _may_fuse() -> bool:
@@ -51,3 +56,28 @@ def cross(a, b):
     """a × b of two vectors of three."""
     left = product(ti.Vector([a[1], a[2], a[0]]), ti.Vector([b[2], b[0], b[1]]))
     return left - product(ti.Vector([a[2], a[0], a[1]]), ti.Vector([b[1], b[2], b[0]]))
+
+
+@ti.kernel
+def _sum_and_largest(sums: I64, count: ti.i32, step: ti.i64):
+    for i in range(count):
+        ti.atomic_add(sums[0], step * i)
+        ti.atomic_max(sums[1], ti.cast(i, ti.i64) << 42)
+
+
+@ti.kernel
+def _roots(values: F64):
+    for i in range(values.shape[0]):
+        values[i] = ti.floor(65536.0 / ti.sqrt(values[i]) + 0.5)
+
+
+def is_exact() -> bool:
+    """True if sums, the largest of numbers, and rounded quotients of roots come out as NumPy has them."""
+    sums = ti.ndarray(ti.i64, (2,))
+    sums.fill(0)
+    _sum_and_largest(sums, _ADDED, _STEP)
+    values = np.arange(1.0, _ADDED)
+    expected = np.floor(65536.0 / np.sqrt(values) + 0.5)
+    _roots(values)
+    total = _STEP * (_ADDED * (_ADDED - 1) // 2)
+    return sums.to_numpy().tolist() == [total, (_ADDED - 1) << 42] and bool((values == expected).all())
