@@ -42,7 +42,7 @@ from tsfusion.delivery.spool import Spool
 from tsfusion.geometry.keyframe import Keyframe, keyframe_of
 from tsfusion.geometry.sample_ranges import wrong_unit
 from tsfusion.geometry.sweeps import skewed
-from tsfusion.wire.messages.keyframe_times import KeyframeTimes
+from tsfusion.wire.messages.messages import KeyframeTimes
 from tsfusion.wire.records import corrections
 from tsfusion.wire.records.record_header import WORLD_NAME
 from tsfusion.wire.sockets import sockets

@@ -41,7 +41,7 @@ from tsfusion import Client, Keyframe, MapClient, TransportError, VolumeConfig
 from tsfusion.core.config import ClientConfig
 from tsfusion.wire.asking.map_client import Answered
 from tsfusion.wire.asking.queries import fetch_health
-from tsfusion.wire.messages.keyframe_times import spread
+from tsfusion.wire.messages.health import spread
 
 TURN = 25  # keyframes to one server before it is the other's turn
 FIRST = 30  # keyframes that are not counted: the map is new

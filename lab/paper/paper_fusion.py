@@ -21,7 +21,7 @@ from tsfusion.core.config import VolumeConfig
 from tsfusion.core.errors import MapError
 from tsfusion.delivery.outcomes import ClientStats
 from tsfusion.geometry.keyframe import Keyframe
-from tsfusion.wire.messages.keyframe_times import KeyframeTimes
+from tsfusion.wire.messages.messages import KeyframeTimes
 
 _START_S = 180.0  # a cold compilation
 

@@ -17,7 +17,7 @@ from tsfusion.core.errors import DatasetError
 from tsfusion.evaluation.trajectory_error import TrajectoryError, absolute_error
 from tsfusion.pipelines.report import latency_ledger
 from tsfusion.pipelines.runs.map_growth import GrowthRow
-from tsfusion.wire.messages.keyframe_times import Spread
+from tsfusion.wire.messages.health import Spread
 
 OUTCOME, POSES = "outcome.json", "poses.npz"
 DELAY, MEMORY = "delay.csv", "memory.csv"

@@ -23,8 +23,8 @@ from tsfusion.gateway.intake.keyframe_intake import Quotas
 from tsfusion.geometry import se3
 from tsfusion.tsdf.files import checkpoint
 from tsfusion.tsdf.store.growing_array import LAYER_DTYPES
-from tsfusion.wire.messages import keyframe_times, messages, questions
-from tsfusion.wire.messages.health import ClientHealth, Health, MapHealth, MeshLayout
+from tsfusion.wire.messages import messages, questions
+from tsfusion.wire.messages.health import ClientHealth, Health, MapHealth, MeshLayout, Spread
 from tsfusion.wire.records import codec, corrections
 from tsfusion.wire.records.codec import measurement
 from tsfusion.wire.records.record_header import CorrectionHeader, Refused, stamp, unpack
@@ -124,7 +124,7 @@ _POINT = np.zeros(3, "<f4").data.cast("B")  # that comes with a question
 
 def _control_seeds() -> list[bytes]:
     session = bytes(range(16))
-    spread = keyframe_times.Spread()
+    spread = Spread()
     health = Health(
         ready=True, problems=("x",), epoch="e", uptime_s=1.0, rss_bytes=1, refused={"gap": 1}, duplicates=0,
         maps={"default": MapHealth(
@@ -146,7 +146,7 @@ def _control_seeds() -> list[bytes]:
             for one in _questions()
         ),
         messages.Welcome("e", 1, 2, 1, 8, 1 << 24, 1 << 25),
-        messages.Ack(session, 2, 1, (keyframe_times.Stamps(2, 3, 4), keyframe_times.Stamps(1)), True),
+        messages.Ack(session, 2, 1, (messages.Stamps(2, 3, 4), messages.Stamps(1)), True),
         messages.Nack(session, 3, "door", "size", "too large"),
         messages.Hold(session, 1.5, "disk", "full"),
         messages.Denied(session, "map", "no"),

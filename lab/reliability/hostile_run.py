@@ -36,8 +36,9 @@ from tsfusion.core.config import ClientConfig, ServerConfig, override
 from tsfusion.pipelines.report import latency_ledger
 from tsfusion.wire.asking.queries import fetch_status
 from tsfusion.wire.keys import key_folder
-from tsfusion.wire.messages import keyframe_times
-from tsfusion.wire.messages.keyframe_times import KeyframeTimes, Spread
+from tsfusion.wire.messages import health
+from tsfusion.wire.messages.health import Spread
+from tsfusion.wire.messages.messages import KeyframeTimes
 from tsfusion.wire.records.record_header import unpack_keyframe
 from tsfusion.wire.sockets.curve import client_keys
 
@@ -279,8 +280,8 @@ def _phase(span: _Span, times: list[KeyframeTimes], bounds: Bounds) -> Phase:
         hostile=span.hostile,
         seconds=round(span.ended - span.started, 2),
         recovered_s=round(max(span.well, *late, 0.0) - span.ended, 2),
-        durable_ms=keyframe_times.spread(latency_ledger.durations_ms(sent, "captured_ns", "durable_ns")),
-        fused_ms=keyframe_times.spread(latency_ledger.durations_ms(sent, "captured_ns", "fused_ns")),
+        durable_ms=health.spread(latency_ledger.durations_ms(sent, "captured_ns", "durable_ns")),
+        fused_ms=health.spread(latency_ledger.durations_ms(sent, "captured_ns", "fused_ns")),
         seen=span.seen,
     )
 

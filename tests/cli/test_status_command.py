@@ -23,8 +23,7 @@ from tsfusion.cli.health_poll import READY, ServerWatcher
 from tsfusion.cli.health_poll import ServerSnapshot as Seen
 from tsfusion.cli.status_view import MAX_CLIENTS, render
 from tsfusion.core.errors import TransportError
-from tsfusion.wire.messages.health import Health
-from tsfusion.wire.messages.keyframe_times import Spread
+from tsfusion.wire.messages.health import Health, Spread
 from tsfusion.wire.messages.messages import Command, Reply
 
 NOBODY = "tcp://127.0.0.1:9"

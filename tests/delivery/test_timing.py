@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from tsfusion.delivery.outcomes import CAPACITY, ClockOffset, KeyframeTimesTable, TakingRate
-from tsfusion.wire.messages.keyframe_times import KeyframeTimes, Stamps
+from tsfusion.wire.messages.messages import KeyframeTimes, Stamps
 
 
 def test_a_row_fills_up_as_news_come() -> None:

@@ -8,8 +8,7 @@ import pytest
 from health_snapshots import client, health, map_health
 
 from tsfusion.gateway.clients.activity_log import ActivityLog
-from tsfusion.wire.messages.health import Health
-from tsfusion.wire.messages.keyframe_times import Spread
+from tsfusion.wire.messages.health import Health, Spread
 
 Told = Callable[[Health], list[str]]
 YARD = map_health(keyframes_durable=0, keyframes_fused=0, state="opening", delay_ms=Spread())

@@ -17,7 +17,7 @@ from tsfusion.gateway.records.journaled_records import FuserBacklog, FuserTime, 
 from tsfusion.geometry.sample_ranges import NO_SAMPLES
 from tsfusion.journal import Position, RecordEntry
 from tsfusion.journal.quarantine import Quarantine
-from tsfusion.wire.messages.keyframe_times import Stamps
+from tsfusion.wire.messages.messages import Stamps
 
 SESSION = bytes(range(16))
 

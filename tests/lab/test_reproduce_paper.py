@@ -34,7 +34,7 @@ from lab.paper.paper_worlds import PaperWorld
 from tsfusion.datasets import Synthetic
 from tsfusion.datasets.dataset import frame_of
 from tsfusion.evaluation.trajectory_error import TrajectoryError
-from tsfusion.wire.messages.keyframe_times import Spread
+from tsfusion.wire.messages.health import Spread
 
 pytestmark = pytest.mark.nightly
 

@@ -11,8 +11,8 @@ import pytest
 
 from tsfusion.pipelines.report import latency_ledger
 from tsfusion.pipelines.runs import run_files
-from tsfusion.wire.messages import keyframe_times
-from tsfusion.wire.messages.keyframe_times import KeyframeTimes
+from tsfusion.wire.messages import messages
+from tsfusion.wire.messages.messages import KeyframeTimes
 
 MS = 1_000_000
 
@@ -42,10 +42,10 @@ def test_stages_add_up_to_the_delay() -> None:
     records = [record(i, 90) for i in range(5)]
     parts = [
         latency_ledger.durations_ms(records, *ends)
-        for name, ends in keyframe_times.STAGES.items()
+        for name, ends in messages.STAGES.items()
         if name != "mesh"
     ]
-    assert np.sum(parts, axis=0) == pytest.approx(latency_ledger.durations_ms(records, *keyframe_times.DELAY))
+    assert np.sum(parts, axis=0) == pytest.approx(latency_ledger.durations_ms(records, *messages.DELAY))
 
 
 def test_unknown_stamps_are_left_out() -> None:

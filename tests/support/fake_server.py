@@ -9,8 +9,7 @@ from typing import Any
 import zmq
 
 from tsfusion.wire.messages import messages
-from tsfusion.wire.messages.health import Health, Status
-from tsfusion.wire.messages.keyframe_times import Spread
+from tsfusion.wire.messages.health import Health, Spread, Status
 from tsfusion.wire.messages.messages import Command, Reply
 from tsfusion.wire.sockets import sockets
 

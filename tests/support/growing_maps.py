@@ -20,8 +20,7 @@ from tsfusion.wire.asking.map_events import (
     ScannerSeen,
     SurfaceUpdate,
 )
-from tsfusion.wire.messages.health import ClientHealth, Health, MapHealth
-from tsfusion.wire.messages.keyframe_times import Spread
+from tsfusion.wire.messages.health import ClientHealth, Health, MapHealth, Spread
 
 SESSION = bytes(range(16))
 

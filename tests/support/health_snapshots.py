@@ -3,8 +3,7 @@
 
 from typing import Any
 
-from tsfusion.wire.messages.health import ClientHealth, Health, MapHealth
-from tsfusion.wire.messages.keyframe_times import Spread
+from tsfusion.wire.messages.health import ClientHealth, Health, MapHealth, Spread
 
 MIB = 1 << 20
 

@@ -21,7 +21,7 @@ from msgspec import Struct
 
 from tsfusion import Client, Intrinsics, Keyframe, journal
 from tsfusion.core.config import SERVER_SESSION, ClientConfig
-from tsfusion.wire.messages.keyframe_times import KeyframeTimes
+from tsfusion.wire.messages.messages import KeyframeTimes
 from tsfusion.wire.records.record_header import CorrectionHeader, unpack, unpack_keyframe
 
 LOST = 3  # exit status

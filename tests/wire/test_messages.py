@@ -6,8 +6,7 @@ import pytest
 
 from tsfusion.core.errors import DecodeError
 from tsfusion.wire.messages import messages
-from tsfusion.wire.messages.keyframe_times import Stamps
-from tsfusion.wire.messages.messages import Ack, Denied, Hello, Hold, Nack, Ping, Pong, Welcome
+from tsfusion.wire.messages.messages import Ack, Denied, Hello, Hold, Nack, Ping, Pong, Stamps, Welcome
 
 SESSION = bytes(range(16))
 

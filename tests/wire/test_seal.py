@@ -10,7 +10,7 @@ from keyframes_and_servers import wall
 
 from tsfusion.core.errors import DecodeError
 from tsfusion.wire.messages import messages
-from tsfusion.wire.messages.keyframe_times import Stamps
+from tsfusion.wire.messages.messages import Stamps
 from tsfusion.wire.records import codec, corrections
 from tsfusion.wire.records.record_header import is_damaged, seal, stamp, unpack
 

@@ -18,11 +18,11 @@ from tsfusion.wire.messages.health import (
     ClientHealth,
     Health,
     MapHealth,
+    Spread,
     headline,
     lost_of_client,
     lost_of_map,
 )
-from tsfusion.wire.messages.keyframe_times import Spread
 
 MAX_CLIENTS = 40  # rows: the clients with the newest messages
 WIDE = 110  # columns from which on all figures are shown

@@ -16,8 +16,7 @@ from tsfusion.delivery.spool import Waiting
 from tsfusion.geometry.sample_ranges import NO_SAMPLES
 from tsfusion.journal.quarantine import Quarantine
 from tsfusion.wire.messages import messages
-from tsfusion.wire.messages.keyframe_times import Stamps
-from tsfusion.wire.messages.messages import PROTOCOL_VERSION
+from tsfusion.wire.messages.messages import PROTOCOL_VERSION, Stamps
 
 REFUSED_FOLDER = "refused"  # inside the spool; opens like any journal
 REFUSED_BYTES = 64 << 20

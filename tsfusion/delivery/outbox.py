@@ -26,7 +26,7 @@ from tsfusion.delivery.outcomes import (
 )
 from tsfusion.delivery.spool import Spool, Waiting
 from tsfusion.geometry.keyframe import Keyframe
-from tsfusion.wire.messages.keyframe_times import KeyframeTimes, Stamps
+from tsfusion.wire.messages.messages import KeyframeTimes, Stamps
 
 LinkKind = Literal[
     "connecting", "connected", "held", "opening", "moved", "refused", "other_world", "locked_out", "silent"

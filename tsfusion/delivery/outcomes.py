@@ -9,7 +9,7 @@ from msgspec import Struct
 
 from tsfusion.core.readable_numbers import count_of
 from tsfusion.delivery.spool import Waiting
-from tsfusion.wire.messages.keyframe_times import KeyframeTimes, Stamps
+from tsfusion.wire.messages.messages import KeyframeTimes, Stamps
 
 _ANSWERED_RUNS = 4096  # of numbers without a gap, that are remembered: the server may say more of them
 

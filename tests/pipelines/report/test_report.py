@@ -22,7 +22,7 @@ from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.up_direction import parse
 from tsfusion.pipelines.report import latency_ledger, map_report, pictures, run_report, run_sections
 from tsfusion.pipelines.report.findings import RunFindings
-from tsfusion.wire.messages.keyframe_times import KeyframeTimes
+from tsfusion.wire.messages.messages import KeyframeTimes
 
 _EMPTY = frozenset(("meta", "img", "br", "input", "image", "path"))  # elements without an end
 HOSTILE = '<script>alert("1")</script>&\'"'

@@ -19,7 +19,7 @@ from tsfusion.core.process import version_of
 from tsfusion.gateway.health import metrics_families
 from tsfusion.gateway.health.metrics_http import HttpResponse, MetricsPage
 from tsfusion.wire.messages.health import Health
-from tsfusion.wire.messages.keyframe_times import STAGES as LEDGER_STAGES
+from tsfusion.wire.messages.messages import STAGES as LEDGER_STAGES
 
 STAGES = (*LEDGER_STAGES, "total")
 BUCKETS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)  # seconds

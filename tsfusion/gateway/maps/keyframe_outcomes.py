@@ -19,8 +19,8 @@ from tsfusion.gateway.maps.map_records import IncomingRecord, MapRecords
 from tsfusion.gateway.records.journaled_records import IndexEntry
 from tsfusion.geometry.sample_ranges import NO_SAMPLES
 from tsfusion.journal import read
-from tsfusion.wire.messages import keyframe_times, messages
-from tsfusion.wire.messages.keyframe_times import Spread
+from tsfusion.wire.messages import health, messages
+from tsfusion.wire.messages.health import Spread
 from tsfusion.wire.messages.mesh_updates import Meshed, MeshUpdate
 
 log = logging.getLogger(__name__)
@@ -58,7 +58,7 @@ class KeyframeOutcomes:
         self._meshed = 0  # keyframes that the present fuser answered and meshed
 
     def acknowledge(
-        self, key: bytes, stamps: Sequence[keyframe_times.Stamps] = (), *, resend: bool = False
+        self, key: bytes, stamps: Sequence[messages.Stamps] = (), *, resend: bool = False
     ) -> None:
         """Tell a client how far its session is."""
         self._routes.send(
@@ -70,7 +70,7 @@ class KeyframeOutcomes:
         header, received_ns = record.header, record.received_ns
         if not record.is_correction:
             self._metrics.observe(self._name, "journal", (durable_ns - received_ns) / 1e9)
-        self.acknowledge(header.session, [keyframe_times.Stamps(header.seq, received_ns, durable_ns)])
+        self.acknowledge(header.session, [messages.Stamps(header.seq, received_ns, durable_ns)])
 
     def on_ready(self, ready: fuser_messages.Ready) -> None:
         """Go back to the counts of the checkpoint that a new fuser began with."""
@@ -243,7 +243,7 @@ class DelayStatistics:
 
     def summary(self) -> Spread:
         """Mean, percentiles and maximum of the delays, milliseconds."""
-        return keyframe_times.spread(np.array([delay for delay, _ in self._recent_ms]))
+        return health.spread(np.array([delay for delay, _ in self._recent_ms]))
 
 
 # refused: not passed on to the fuser; late: their time was over; failed: the fuser could not
@@ -266,4 +266,4 @@ class QuestionCounts:
     @property
     def delay_ms(self) -> Spread:
         """From when the newest questions came to when their answers left, milliseconds."""
-        return keyframe_times.spread(np.array(self._delays_ms))
+        return health.spread(np.array(self._delays_ms))

@@ -16,7 +16,7 @@ from tsfusion.fuser.fuser_messages import Fuse, SessionProgress
 from tsfusion.gateway.clients.client_routes import Session, Sessions
 from tsfusion.gateway.fusers.fuser_supervisor import FuserSupervisor
 from tsfusion.journal import Position, RecordEntry
-from tsfusion.wire.messages.keyframe_times import Stamps
+from tsfusion.wire.messages.messages import Stamps
 
 
 class IndexEntry(Struct, frozen=True):

@@ -18,7 +18,7 @@ from tsfusion.geometry.se3 import Poses
 from tsfusion.geometry.up_direction import Up
 from tsfusion.pipelines.report import run_record
 from tsfusion.pipelines.report.run_record import MapResult, RunRecord
-from tsfusion.wire.messages.keyframe_times import KeyframeTimes
+from tsfusion.wire.messages.messages import KeyframeTimes
 
 Paths = dict[str, tuple[NDArray[np.int64] | None, Poses]]  # of a file's name, timestamps and poses
 PATHS = ("trajectory", "trajectory-corrected", "reference", "keyframes")

@@ -10,7 +10,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.wire.messages.keyframe_times import DELAY, STAGES, KeyframeTimes, Spread, spread
+from tsfusion.wire.messages.health import Spread, spread
+from tsfusion.wire.messages.messages import DELAY, STAGES, KeyframeTimes
 
 TARGET_MS = 500.0
 _STAMPS = (

@@ -23,7 +23,7 @@ from tsfusion.core.process import version_of
 from tsfusion.core.readable_numbers import count_of, counted
 from tsfusion.evaluation.trajectory_error import TrajectoryError
 from tsfusion.pipelines.report import shortfall
-from tsfusion.wire.messages.keyframe_times import Spread
+from tsfusion.wire.messages.health import Spread
 
 RunKind = Literal["replay", "scan"]
 _EARLIER = {"dataset": "source"}  # names that earlier versions wrote → names of today

@@ -16,8 +16,8 @@ from tsfusion.pipelines.report import charts, latency_ledger, page
 from tsfusion.pipelines.report.charts import Axis, Chart
 from tsfusion.pipelines.report.findings import MapFindings, RunFindings
 from tsfusion.pipelines.report.run_record import Circumstances, MapResult, RunRecord
-from tsfusion.wire.messages.keyframe_times import DELAY, STAGES, KeyframeTimes, Spread, spread
-from tsfusion.wire.messages.messages import SKIP_REASONS
+from tsfusion.wire.messages.health import Spread, spread
+from tsfusion.wire.messages.messages import DELAY, SKIP_REASONS, STAGES, KeyframeTimes
 
 _COLUMNS = 200  # of a chart by keyframe: more keyframes are drawn together
 _BINS = 50

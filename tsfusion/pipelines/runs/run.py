@@ -60,7 +60,7 @@ from tsfusion.scanner.localization import localizers
 from tsfusion.scanner.localization.localizer import Localizer, PoseCorrections
 from tsfusion.scanner.scanner import Scanner, Submap
 from tsfusion.scanner.sources.source import Source
-from tsfusion.wire.messages.keyframe_times import KeyframeTimes
+from tsfusion.wire.messages.messages import KeyframeTimes
 
 _OUTDOOR_SENSORS = ("stereo", "lidar")
 

@@ -24,7 +24,7 @@ from tsfusion.pipelines.report import latency_ledger, shortfall
 from tsfusion.pipelines.runs.target_server import Target
 from tsfusion.scanner.scanner import Submap
 from tsfusion.wire.messages.health import Status
-from tsfusion.wire.messages.keyframe_times import KeyframeTimes
+from tsfusion.wire.messages.messages import KeyframeTimes
 
 MAP = "map.tsf"
 REPORT = "report.html"

@@ -3,12 +3,35 @@
 
 from typing import Annotated, Any, Literal, NamedTuple
 
+import numpy as np
 from msgspec import Struct
+from numpy.typing import NDArray
 
 from tsfusion.core.headline import Headline
 from tsfusion.core.readable_numbers import count_of, span
 from tsfusion.geometry.up_direction import Up
-from tsfusion.wire.messages.keyframe_times import Spread
+
+
+class Spread(Struct, frozen=True, kw_only=True):
+    """Statistics of a duration over `count` keyframes, milliseconds; all 0 where there is none."""
+
+    count: int = 0
+    mean: float = 0.0
+    p50: float = 0.0
+    p95: float = 0.0
+    p99: float = 0.0
+    max: float = 0.0
+
+
+def spread(values_ms: NDArray[np.float64]) -> Spread:
+    """Count, mean, p50, p95, p99 and maximum of the values that are not NaN."""
+    known = values_ms[~np.isnan(values_ms)]
+    if not len(known):
+        return Spread()
+    mean, p50, p95, p99, most = (
+        round(float(x), 3) for x in (known.mean(), *np.percentile(known, (50, 95, 99)), known.max())
+    )
+    return Spread(count=len(known), mean=mean, p50=p50, p95=p95, p99=p99, max=most)
 
 
 class MeshLayout(Struct, frozen=True, kw_only=True):

@@ -14,7 +14,6 @@ from tsfusion.core.errors import DecodeError
 from tsfusion.core.readable_numbers import counted
 from tsfusion.wire.messages.forget_messages import Forgotten, Selection
 from tsfusion.wire.messages.health import Health, MeshLayout, Status
-from tsfusion.wire.messages.keyframe_times import Seq, Stamps
 from tsfusion.wire.messages.migration_messages import Address, HandOver, Moved, Parcel
 from tsfusion.wire.messages.questions import Answer, Question
 from tsfusion.wire.records.record_header import SessionId, WorldName, is_damaged, seal
@@ -44,6 +43,50 @@ def explained(counts: dict[str, int]) -> str:
     """{"thinned": 2} → 2 × thinned (the map was too far behind)."""
     named = {reason: f"{reason} ({SKIP_REASONS[reason]})" for reason in counts if reason in SKIP_REASONS}
     return counted({named.get(reason, reason): count for reason, count in counts.items()})
+
+
+Seq = Annotated[int, Meta(ge=0, le=(1 << 63) - 1)]
+
+
+class Stamps(Struct, frozen=True, array_like=True):
+    """Server times of one keyframe, monotonic nanoseconds; 0 = not yet."""
+
+    seq: Seq
+    received_ns: int = 0
+    durable_ns: int = 0
+    fuse_start_ns: int = 0
+    fused_ns: int = 0
+    meshed_ns: int = 0
+
+
+class KeyframeTimes(Struct, kw_only=True):
+    """The latency ledger's row: one keyframe, every stamp on the client's monotonic clock; 0 = unknown.
+
+    `clock_bound_ns`: the server's stamps are right to within ± this (half the best round trip).
+    """
+
+    seq: int
+    timestamp_ns: int = 0  # the sensor's own clock
+    captured_ns: int = 0
+    sent_ns: int = 0
+    received_ns: int = 0
+    durable_ns: int = 0
+    fuse_start_ns: int = 0
+    fused_ns: int = 0
+    meshed_ns: int = 0
+    clock_bound_ns: int = 0
+
+
+# A stage lasts from one stamp to the next; together they are a keyframe's way from capture to mesh.
+STAGES: dict[str, tuple[str, str]] = {
+    "encode": ("captured_ns", "sent_ns"),
+    "wire": ("sent_ns", "received_ns"),
+    "journal": ("received_ns", "durable_ns"),
+    "queue": ("durable_ns", "fuse_start_ns"),
+    "fuse": ("fuse_start_ns", "fused_ns"),
+    "mesh": ("fused_ns", "meshed_ns"),
+}
+DELAY = ("captured_ns", "fused_ns")
 
 
 class Hello(Struct, frozen=True, tag="hello", omit_defaults=True):
