@@ -191,10 +191,8 @@ def room_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def quick_servers(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Have servers of runs in this process start quick fusers (`quick_fusers.LAZY`)."""
-    from tsfusion.pipelines.runs import target_server
-
-    monkeypatch.setattr(target_server, "subprocess", quick_fusers.with_quick_servers(quick_fusers.LAZY))
+    """Have runs in this process start quick fusers (`quick_fusers.LAZY`), and draw little."""
+    quick_fusers.quicken_runs(quick_fusers.LAZY, monkeypatch.setattr)
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ import cv2
 import pytest
 import trimesh
 from clients_and_spools import deliver
-from command_processes import COMMAND, QUICK, Here, descendants, end, read_until, server, started, tsfusion
+from command_processes import COMMAND, QUICK, Here, descendants, end, read_until, server, started
 from small_recordings import first_views
 
 from tsfusion import Client, FlushTimeout, Volume, VolumeConfig, journal
@@ -26,7 +26,8 @@ from tsfusion.wire.records.codec import decode_keyframe
 VOXEL = 0.08
 
 
-def test_serve_answers_and_ends_well(tmp_path: Path) -> None:
+@pytest.mark.usefixtures("quick_servers")
+def test_serve_answers_and_ends_well(here: Here, tmp_path: Path) -> None:
     (tmp_path / "cache").mkdir()
     may_wait = sys.platform == "linux" and not durable_files.is_in_memory(tmp_path)
     flags = ("--memory", "0.3GB", "--cache", tmp_path / "cache") if may_wait else ()
@@ -48,17 +49,17 @@ def test_serve_answers_and_ends_well(tmp_path: Path) -> None:
         assert re.match(
             r"tsfusion: INFO: a client left: 2 keyframes received, 2 of them in the map \(map", left
         )
-        answer = json.loads(tsfusion("status", "--connect", address, "--json").stdout)
+        answer = json.loads(here("status", "--connect", address, "--json").stdout)
         status, (scanner,) = answer["maps"]["default"], answer["health"]["clients"]
         assert (scanner["keyframes_durable"], scanner["keyframes_fused"], scanner["state"]) == (2, 2, "gone")
         assert (status["keyframes_durable"], status["keyframes_fused"]) == (2, 2)
         assert status["blocks"] > 10
         assert len(status["map_hash"]) == 32
-        assert " 2/2 " in tsfusion("status", address).stdout
-        done = tsfusion("mesh", address, tmp_path / "live.obj", "--min-weight", 0.5)
+        assert " 2/2 " in here("status", address).stdout
+        done = here("mesh", address, tmp_path / "live.obj", "--min-weight", 0.5)
         assert done.returncode == 0, done.stderr
         assert "up +z (floor: " in done.stdout
-        done = tsfusion(
+        done = here(
             "replay", "synthetic:room", "--start", 2, "--max-frames", 1, "--connect", address,
             "--out", tmp_path / "more", "--json",
         )  # fmt: skip

@@ -34,6 +34,7 @@ from tsfusion.journal import Journal, segment_path
 from tsfusion.wire.records import codec, corrections
 
 SESSION, COUNT = b"\xab" * 16, 12
+pytestmark = pytest.mark.usefixtures("quick_servers")
 
 
 class InThisProcess:

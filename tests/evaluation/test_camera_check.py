@@ -117,6 +117,7 @@ def room_in(folder: Path, unit: float, *, posed: bool = True) -> Path:
     return folder
 
 
+@pytest.mark.usefixtures("quick_servers")
 def test_a_room_of_half_a_metre_is_doubted_where_nothing_states_its_unit(tmp_path: Path) -> None:
     root = room_in(tmp_path / "mine", 0.001, posed=False)
     words = r"all depth is within 0\.\d+ m, which no room is.*0\.2 mm \(5000 a metre\).*depth_scale=0\.001"

@@ -300,6 +300,7 @@ def test_replay_stops_before_it_fuses_what_is_wrong(
     assert capsys.readouterr().err == ""
 
 
+@pytest.mark.usefixtures("quick_servers")
 def test_a_scan_says_what_is_wrong_with_frames_without_poses(data: Data, tmp_path: Path) -> None:
     """Colour that does not lie on the depth costs a scan its place: half of the frames are not localised."""
     whole = data(FOLDERS["7scenes"])

@@ -7,6 +7,7 @@ others when it has nothing else to do. Tests of everything around the map need n
 
 import subprocess
 import sys
+from collections.abc import Callable
 from itertools import islice
 from pathlib import Path
 from types import SimpleNamespace
@@ -41,11 +42,24 @@ def run_command(fuser: tuple[str, ...]) -> list[str]:
     return [sys.executable, "-c", f"{program}from tsfusion.__main__ import main\nmain()"]
 
 
-def quicken_runs(fuser: tuple[str, ...]) -> None:
-    """Have runs of this process start servers with such fusers."""
+def quicken_runs(fuser: tuple[str, ...], put: Callable[[Any, str, Any], None] = setattr) -> None:
+    """Have runs of this process start servers with such fusers, and draw little: most of a short run.
+
+    Args:
+        put: sets attributes of modules.
+    """
+    from tsfusion.pipelines.maps import mesh_preview
+    from tsfusion.pipelines.report import latency_ledger
     from tsfusion.pipelines.runs import target_server
 
-    target_server.subprocess = with_quick_servers(fuser)  # type: ignore[attr-defined]
+    whole = mesh_preview.picture
+
+    def small(mesh: Any, camera: Any, width: int, height: int, **more: Any) -> Any:
+        return whole(mesh, camera, width // 8, height // 8, **more)
+
+    put(target_server, "subprocess", with_quick_servers(fuser))
+    put(mesh_preview, "picture", small)
+    put(latency_ledger, "plot", lambda _, path: path.touch())
 
 
 def with_quick_servers(fuser: tuple[str, ...]) -> SimpleNamespace:
