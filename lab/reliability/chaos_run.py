@@ -16,11 +16,11 @@ from typing import Any
 from bad_network import Proxy
 from keyframes_and_servers import NUMBERED_NS, UNSECURED, Secured, secured, until, wall
 from msgspec import Struct
-from scanner_process import Plan, journals, plan_in
-from supervisors import PATIENCE, Daemon, Scanner
 
 from lab.reliability.chaos_plan import KINDS, Attack, Forgetting, Kind, fault, on_map, on_scanners, on_server
 from lab.reliability.delivery_verdict import client_problems, server_problems, verify
+from lab.reliability.scanner_process import Plan, journals, plan_in
+from lab.reliability.supervisors import PATIENCE, Daemon, Scanner
 from tsfusion import journal
 from tsfusion.core.config import ClientConfig, override
 from tsfusion.core.errors import TransportError, TsfusionError

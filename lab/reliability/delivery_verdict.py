@@ -5,9 +5,9 @@ import functools
 from pathlib import Path
 
 from keyframes_and_servers import NUMBERED_NS, wall
-from scanner_process import Report, correction_number, journals
 from sum_map import SumMap, hash_of
 
+from lab.reliability.scanner_process import Report, correction_number, journals
 from tsfusion import journal
 from tsfusion.core.config import SERVER_SESSION
 from tsfusion.wire.messages.health import Status

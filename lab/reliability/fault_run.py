@@ -22,17 +22,16 @@ from typing import Any
 
 import msgspec
 import sum_map
-import syscall_faults
 from clients_and_spools import NOBODY
-from forked_processes import Forked, answer
 from keyframes_and_servers import VOLUME, lasting_address, map_hash
 from msgspec import Struct
-from repository import SUPPORT
-from scanner_process import numbers
-from syscall_faults import SHORT, Call, Watcher
+from repository import ROOT
 
-from lab.reliability import faulty_client
+from lab.reliability import faulty_client, syscall_faults
 from lab.reliability.faulty_client import REFUSED, REJECTED, Orders
+from lab.reliability.forked_processes import Forked, answer
+from lab.reliability.scanner_process import numbers
+from lab.reliability.syscall_faults import SHORT, Call, Watcher
 from tsfusion import server
 from tsfusion.core import logs
 from tsfusion.core.config import ServerConfig
@@ -314,7 +313,7 @@ class Run:
     def _serve(self) -> None:
         logs.configure("text", "warning")
         if self._real:
-            own = f"sys.path.append({str(SUPPORT)!r}); import syscall_faults"
+            own = f"sys.path.append({str(ROOT)!r}); from lab.reliability import syscall_faults"
             install = f"syscall_faults.install({self._watcher.address!r}, 'fuser')"
             lines = ["import sys, tsfusion.tsdf.volume", "from tsfusion.fuser.__main__ import main"]
             lines += [own, install] * (self._watched == "fuser")

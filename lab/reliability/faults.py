@@ -27,8 +27,7 @@ import msgspec
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "support"))
 sys.path.append(str(Path(__file__).parents[2]))  # lab is not installed
-import syscall_faults
-
+from lab.reliability import syscall_faults
 from lab.reliability.fault_run import PROCESSES, Case, Outcome, Run, cases
 
 

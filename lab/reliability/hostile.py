@@ -24,9 +24,8 @@ import msgspec
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "support"))
 sys.path.append(str(Path(__file__).parents[2]))  # lab is not installed
-from attack_target import ACCESS
-from attacks import ATTACKS, ATTACKS_OF
-
+from lab.reliability.attack_target import ACCESS
+from lab.reliability.attacks import ATTACKS, ATTACKS_OF
 from lab.reliability.hostile_run import HEADING, MEMORY_BYTES, Bounds, Outcome, markdown_row, row, run
 
 _MB = 1 << 20

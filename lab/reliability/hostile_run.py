@@ -12,8 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-from attack_target import Access, Target
-from attacks import ATTACKS
 from keyframes_and_servers import (
     NUMBERED_NS,
     UNSECURED,
@@ -26,11 +24,12 @@ from keyframes_and_servers import (
     wall,
 )
 from msgspec import Struct
-from repository import SUPPORT
-from scanner_process import Plan, Report, journals, plan_in
-from supervisors import PATIENCE, SCANNER
 
+from lab.reliability.attack_target import Access, Target
+from lab.reliability.attacks import ATTACKS
 from lab.reliability.hostile_watch import Seen, Watch
+from lab.reliability.scanner_process import Plan, Report, journals, plan_in
+from lab.reliability.supervisors import PATIENCE, SCANNER
 from tsfusion import journal
 from tsfusion.core.config import ClientConfig, ServerConfig, override
 from tsfusion.pipelines.report import latency_ledger
@@ -46,7 +45,7 @@ RATE = 8.0  # keyframes a second of the well-behaved one
 MEMORY_BYTES = ServerConfig().memory_bytes  # the bound on the gateway
 FUSER_MEMORY_BYTES = 2 << 30
 _LOGS = 'from tsfusion.core import logs\nlogs.configure("text", "warning")\n'  # cut short, as `serve` does
-_ATTACKS = SUPPORT / "attacks.py"
+_ATTACKS = Path(__file__).with_name("attacks.py")
 _FILES = 8192
 _MORE_FILES = 30  # of maps that were opened meanwhile
 _PEACE_S = 2.0

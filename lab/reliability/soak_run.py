@@ -13,10 +13,10 @@ import numpy as np
 import small_disks
 from keyframes_and_servers import connected, lasting_address, map_hash, until
 from msgspec import Struct
-from scanner_process import plan_in, save_room, source
-from supervisors import Daemon, Scanner
 
 from lab.reliability.hostile_watch import rss_bytes
+from lab.reliability.scanner_process import plan_in, save_room, source
+from lab.reliability.supervisors import Daemon, Scanner
 from tsfusion import VolumeConfig
 from tsfusion.core.config import ClientConfig
 from tsfusion.core.errors import TsfusionError

@@ -6,8 +6,9 @@ import subprocess
 import sys
 
 import pytest
-import syscall_faults
 from repository import ROOT
+
+from lab.reliability import syscall_faults
 
 KINDS = [
     "server fdatasync state/maps/default/journal/N.mcap 8 EIO for a while",

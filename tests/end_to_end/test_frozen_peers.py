@@ -19,11 +19,11 @@ from bad_network import Proxy
 from clients_and_spools import NOBODY, send_all
 from keyframes_and_servers import DEADLINE, Server, connected, serving, until, wall
 from quick_fusers import SUMS
-from scanner_process import Plan, Report, journals, numbers
 from sum_map import hash_of
-from supervisors import SCANNER
 
 from lab.reliability.delivery_verdict import verify
+from lab.reliability.scanner_process import Plan, Report, journals, numbers
+from lab.reliability.supervisors import SCANNER
 from tsfusion import Client, journal
 from tsfusion.core.config import ClientConfig
 from tsfusion.core.errors import FlushTimeout, ServerUnreachable, TransportError

@@ -4,9 +4,9 @@
 from pathlib import Path
 
 import pytest
-from attack_target import Access
-from attacks import ATTACKS_OF
 
+from lab.reliability.attack_target import Access
+from lab.reliability.attacks import ATTACKS_OF
 from lab.reliability.hostile_run import Bounds, run, table
 from tsfusion.core import process
 from tsfusion.gateway.ports.connection_limits import MemoryGuard

@@ -6,10 +6,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from attacks import raw
 from keyframes_and_servers import connected
 from served_gateway import Served, record, serving_here
 
+from lab.reliability.attacks import raw
 from tsfusion.core import logs
 from tsfusion.gateway.health.metrics_http import HttpResponse, MetricsPage
 from tsfusion.wire.sockets import sockets

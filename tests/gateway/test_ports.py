@@ -11,10 +11,10 @@ from typing import Any
 
 import pytest
 import zmq
-from attacks import part, raw
 from keyframes_and_servers import connected, secured, wall
 from served_gateway import Served, record, serving_here
 
+from lab.reliability.attacks import part, raw
 from tsfusion import Client
 from tsfusion.gateway.ports import access_control, connections, ports
 from tsfusion.gateway.ports.connections import Connections, OpenConnection

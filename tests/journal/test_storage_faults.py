@@ -7,8 +7,9 @@ import sys
 import tempfile
 
 import pytest
-import syscall_faults
 from repository import TESTS
+
+from lab.reliability import syscall_faults
 
 
 @pytest.mark.skipif(not syscall_faults.is_possible(), reason="needs seccomp's user notification")

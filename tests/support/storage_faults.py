@@ -19,10 +19,10 @@ from contextlib import suppress
 from pathlib import Path
 
 import sum_map
-from forked_processes import Forked
 from keyframes_and_servers import VOLUME
-from syscall_faults import SHORT, Call, Watcher, install
 
+from lab.reliability.forked_processes import Forked
+from lab.reliability.syscall_faults import SHORT, Call, Watcher, install
 from tsfusion.core.errors import JournalError, TsfusionError
 from tsfusion.delivery.spool import Spool, Waiting
 from tsfusion.fuser.fuser_messages import SessionProgress

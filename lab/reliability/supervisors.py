@@ -13,7 +13,8 @@ from typing import Any
 import msgspec
 from bad_network import Proxy
 from keyframes_and_servers import Server, until
-from scanner_process import LOST, Plan, Report
+
+from lab.reliability.scanner_process import LOST, Plan, Report
 
 SCANNER = Path(__file__).with_name("scanner_process.py")
 PATIENCE = 180.0  # seconds; for everything to be fused after all
@@ -129,6 +130,7 @@ class Scanner:
     @property
     def taken(self) -> int:
         """Number of keyframes that all its processes logged as taken."""
+        assert self.plan.log is not None
         log = Path(self.plan.log)
         return len(log.read_bytes().split()) if log.exists() else 0
 
@@ -149,6 +151,7 @@ class Scanner:
 
     def report(self) -> Report:
         """Report of the process that saw everything fused."""
+        assert self.plan.report is not None
         return msgspec.json.decode(Path(self.plan.report).read_bytes(), type=Report)
 
     def close(self) -> None:

@@ -7,10 +7,10 @@ import zlib
 from functools import cache
 
 import numpy as np
-from attack_target import Target
 from hostile_messages import Frames, with_depth, with_header
 from keyframes_and_servers import pose
 
+from lab.reliability.attack_target import Target
 from tsfusion import Keyframe
 from tsfusion.wire.records import codec
 

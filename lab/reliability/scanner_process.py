@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """A scanner as a process of its own, that may be killed at any moment and started again.
 
-    python tests/support/scanner_process.py '{"address": …, "spool": …}'
+    python lab/reliability/scanner_process.py '{"address": …, "spool": …}'
 
 Keyframe number i carries i in its `timestamp_ns`. A scanner that comes back decides by looking which ones
 were taken: what is in the spool or in the server's journal was, whatever its predecessor lived to say of it.
@@ -16,6 +16,9 @@ from typing import Any
 
 import msgspec
 import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "support"))
+sys.path.append(str(Path(__file__).parents[2]))  # lab is not installed
 from keyframes_and_servers import NUMBERED_NS, pose, wall
 from msgspec import Struct
 
@@ -107,6 +110,7 @@ def correction_number(record: journal.Record) -> int:
     """The number that `scan` gave a correction."""
     header = unpack(record.frames[0])
     assert isinstance(header, CorrectionHeader)
+    assert header.T_map_odometry is not None
     return round(header.T_map_odometry[3])
 
 
@@ -125,17 +129,19 @@ def save_room(path: Path, count: int, width: int) -> None:
     from tsfusion.datasets.worlds.synthetic import Synthetic
 
     views = list(Synthetic("room", count=count, width=width, path="tour"))
+    camera = views[0].intrinsics
+    assert camera is not None
     np.savez(
         path,
-        depth=np.stack([view.depth for view in views]),
-        color=np.stack([view.color for view in views]),
+        depth=np.stack([np.asarray(view.depth) for view in views]),
+        color=np.stack([np.asarray(view.color) for view in views]),
         pose=np.stack([view.T_world_camera for view in views]),
-        camera=np.array(msgspec.structs.astuple(views[0].intrinsics)),
+        camera=np.array(msgspec.structs.astuple(camera)),
         scale=np.array(views[0].depth_scale),
     )
 
 
-def source(room: str | None) -> Callable[[int], Keyframe]:
+def source(room: str | None) -> Callable[..., Keyframe]:
     """Keyframes by number."""
     if room is None:
         return wall

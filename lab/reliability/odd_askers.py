@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 import odd_questions
 import zmq
-from attack_target import Target
-from costly_keyframes import following, rays
 from hostile_messages import Frames
 from keyframes_and_servers import CAMERA, pose
-from odd_clients import drain, send, small_buffer
 
+from lab.reliability.attack_target import Target
+from lab.reliability.costly_keyframes import following, rays
+from lab.reliability.odd_clients import drain, send, small_buffer
 from tsfusion import Keyframe
 from tsfusion.wire.messages import messages, questions
 from tsfusion.wire.messages.forget_messages import Selection

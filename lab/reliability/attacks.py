@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Attacks of strangers on a server, each some seconds long, in one process; bounded, loopback only.
 
-python tests/support/attacks.py TARGET
+python lab/reliability/attacks.py TARGET
 
 It reads lines of seconds and the name of an attack, and answers each with `begun`, and in the end how many
 messages, connections or bytes it came to.
@@ -17,18 +17,20 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from pathlib import Path
 from typing import Any
 
-import costly_keyframes
 import msgspec
 import numpy as np
-import odd_askers
-import odd_clients
 import zmq
-from attack_target import Access, Target
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "support"))
+sys.path.append(str(Path(__file__).parents[2]))  # lab is not installed
 from hostile_messages import Frames, bad_values, bombs, hostile_corrections, lies
 from keyframes_and_servers import connected, wall
 
+from lab.reliability import costly_keyframes, odd_askers, odd_clients
+from lab.reliability.attack_target import Access, Target
 from tsfusion.wire.messages import messages
 from tsfusion.wire.messages.messages import PROTOCOL_VERSION, Command
 from tsfusion.wire.records import codec, corrections

@@ -15,15 +15,16 @@ from typing import Any
 import msgspec
 import numpy as np
 import zmq
-from attack_target import Target
-from costly_keyframes import following, fresh
 from hostile_messages import Frames, good, with_depth, with_header
 from keyframes_and_servers import CAMERA, connected, pose, wall
 
+from lab.reliability.attack_target import Target
+from lab.reliability.costly_keyframes import following, fresh
 from tsfusion import Intrinsics, Keyframe
 from tsfusion.wire.messages import messages
 from tsfusion.wire.messages.messages import PROTOCOL_VERSION, Command, Hello, Ping
 from tsfusion.wire.records import codec
+from tsfusion.wire.records.record_header import unpack_keyframe
 from tsfusion.wire.sockets import sockets
 from tsfusion.wire.sockets.curve import ClientKeys
 
@@ -238,7 +239,7 @@ def sizes(target: Target) -> int:
         one = Keyframe(depth=depth, T_world_camera=pose(), intrinsics=CAMERA)
         made.append(codec.encode(one, session=bytes(16), seq=1, jpeg_quality=90))
     frames = good()
-    header = codec.check(frames)
+    header = unpack_keyframe(frames[0])
     first = msgspec.structs.replace(header.buffers[0], shape=(0, 0), bytes=0, crc32=zlib.crc32(b""))
     made.append(with_header([frames[0], b""], buffers=(first,)))
     made.append(codec.encode(wall(), session=bytes(16), seq=1, jpeg_quality=1))
