@@ -26,7 +26,6 @@ from command_processes import (
     read_until,
     server,
     started,
-    tsfusion,
 )
 from small_recordings import seven_scenes
 
@@ -89,15 +88,12 @@ def figures(done: "subprocess.CompletedProcess[str]") -> dict[str, Any]:
     return found
 
 
-def scan(*arguments: object) -> "subprocess.CompletedProcess[str]":
-    return tsfusion("scan", *COARSE, *arguments)
-
-
 @pytest.mark.usefixtures("quick_servers")
 def test_a_scan_leaves_mesh_trajectory_and_figures(walk: Path, here: Here, tmp_path: Path) -> None:
     out = tmp_path / "out"
     state = tmp_path / "state"
-    run = figures(scan(walk, "--localizer", "rgbd", "--out", out, "--state", state, "--json"))
+    given = ("--localizer", "rgbd", "--out", out, "--state", state, "--json")
+    run = figures(here("scan", walk, *COARSE, *given))
     assert {path.name for path in out.iterdir()} == {
         "mesh.ply", "mesh.glb", "preview.png", "delay.csv", "delay.png", "run.json", "trajectory.txt",
         "keyframes.txt", "map.tsf", "reference.txt", "growth.csv", "report.html",
