@@ -346,6 +346,15 @@ def test_a_replay_without_a_surface_says_so(here: Here, tmp_path: Path) -> None:
     assert "no surface" in json.loads((tmp_path / "out" / "run.json").read_text())["missed"]
 
 
+@pytest.mark.parametrize("verb", ["replay", "check"])
+def test_a_live_source_is_for_scans(here: Here, verb: str) -> None:
+    done = here(verb, "camera:0")
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1].endswith(
+        "camera:0 is live and gives no poses: `tsfusion scan camera:0` finds them"
+    )
+
+
 @pytest.mark.slow
 def test_demo(tmp_path: Path) -> None:
     done = tsfusion("demo", "--out", tmp_path / "out")

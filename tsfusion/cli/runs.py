@@ -332,11 +332,14 @@ def open_recording(path: Path, /, *, unpack: bool = False, **given: Any) -> "Dat
         unpack: whether to unpack an archive beside itself.
         given: settings of the dataset; None = not given.
     """
+    from tsfusion.core.errors import DatasetError
     from tsfusion.journal.state_folder import is_journal
+    from tsfusion.scanner.sources.named_sources import is_live
 
+    if is_live(str(path)) and not path.exists():
+        raise DatasetError(f"{path} is live and gives no poses: `tsfusion scan {path}` finds them")
     if is_journal(path):
         from tsfusion.cluster import keyframe_sources
-        from tsfusion.core.errors import DatasetError
         from tsfusion.journal.journaled_keyframes import JournalRecording
 
         for name, value in given.items():

@@ -38,27 +38,26 @@ from tsfusion.core.output_folder import results
 from tsfusion.core.readable_numbers import count_of
 from tsfusion.datasets.cameras import described
 from tsfusion.datasets.dataset import UNREADABLE
-from tsfusion.evaluation.trajectory_error import TrajectoryError, absolute_error
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.origin import Origin, world_of
 from tsfusion.geometry.sample_ranges import wrong_unit
 from tsfusion.geometry.stereo_matching import EXCHANGED, exchanged
-from tsfusion.geometry.up_direction import HeldSensor, Up
+from tsfusion.geometry.up_direction import Up
 from tsfusion.journal.journaled_keyframes import LOST
 from tsfusion.pipelines.maps import scan_alignment
 from tsfusion.pipelines.maps.scan_alignment import ExistingMap
 from tsfusion.pipelines.report import latency_ledger, run_record, shortfall
-from tsfusion.pipelines.report.run_record import Accuracy, MapResult, RunKind, RunRecord
+from tsfusion.pipelines.report.run_record import Accuracy, RunKind, RunRecord
 from tsfusion.pipelines.runs import engine, map_growth, run_files, target_server
 from tsfusion.pipelines.runs.engine import AHEAD, Engine, Progress
 from tsfusion.pipelines.runs.leftovers import ANSWER_SECONDS, Leftovers
-from tsfusion.pipelines.runs.run_files import WrittenMap
+from tsfusion.pipelines.runs.run_files import WrittenMap, WrittenSubmap
 from tsfusion.pipelines.runs.target_server import Target
 from tsfusion.pipelines.runs.viewer_child import ViewerChild, showing
 from tsfusion.scanner.keyframe_selection import EveryFrame, KeyframeSelector
 from tsfusion.scanner.localization import localizers
-from tsfusion.scanner.localization.localizer import Localizer, PoseCorrections
-from tsfusion.scanner.scanner import Scanner, Submap
+from tsfusion.scanner.localization.localizer import Localizer
+from tsfusion.scanner.scanner import Scanner
 from tsfusion.scanner.sources.source import Source
 from tsfusion.wire.messages.messages import KeyframeTimes
 
@@ -192,9 +191,8 @@ def run(
         accuracy = None if error_mm is None else Accuracy.of(error_mm)
         record = active.record(folder, written, accuracy)  # when its own server has ended
         run_record.write(work, record)
-        run_files.write_report(
-            work, {f"mesh{suffix}.ply": there.mesh for _, there, suffix in written if there}
-        )
+        meshes = {f"mesh{one.suffix}.ply": one.in_map.mesh for one in written if one.in_map and one.has_mesh}
+        run_files.write_report(work, meshes)
     active.raise_failure(folder)
     return record
 
@@ -316,18 +314,6 @@ def _other_map(target: Target, why: str) -> str:
     return name
 
 
-class _WrittenSubmap(NamedTuple):
-    """A submap whose files were written. `in_map` is its map; None = its server was not asked."""
-
-    figures: MapResult
-    in_map: WrittenMap | None
-    suffix: str
-
-    @property
-    def has_mesh(self) -> bool:
-        return self.in_map is not None and len(self.in_map.mesh.faces) > 0
-
-
 class _ActiveRun:
     """A run whose server is there: it sends, waits, writes what came of it, and says what it missed.
 
@@ -366,10 +352,19 @@ class _ActiveRun:
         if not self._is_complete:
             self._say_what_stays()
 
-    def write(self, work: Path) -> list[_WrittenSubmap]:
+    def write(self, work: Path) -> list[WrittenSubmap]:
         """Write trajectories, meshes and the latency ledger."""
-        written = [self._write(work, one, number) for number, one in enumerate(self._scanner.submaps, 1)]
-        if self._plan.waits_for_map and not any(one.has_mesh for one in written):
+        plan, submaps = self._plan, self._scanner.submaps
+        more = {"up": plan.up, "min_weight": plan.min_weight, "keep_islands": plan.keep_islands}
+        asked = self._target if plan.waits_for_map else None
+        written = [
+            run_files.write_submap(
+                work, one, asked, "" if number == 1 else f"-{number}",
+                sensor=plan.source.sensor, is_given=plan.is_replay, **more,
+            )
+            for number, one in enumerate(submaps, 1)
+        ]  # fmt: skip
+        if plan.waits_for_map and not any(one.has_mesh for one in written):
             stats, why = self._scanner.state().stats, self._scanner.first_rejection
             self._failures.append(OutputError(run_files.no_surface(stats, why)))
         run_files.write_ledger(work, self._times)
@@ -508,29 +503,12 @@ class _ActiveRun:
 
     # --- results ---
 
-    def _write(self, work: Path, submap: Submap, number: int) -> _WrittenSubmap:
-        """Write the files of one submap."""
-        plan, suffix, in_map = self._plan, f"-{number}" if number > 1 else "", None
-        if submap.located:
-            run_files.write_trajectory(work, submap, suffix, is_given=plan.is_replay)
-        if submap.located and plan.waits_for_map:
-            self._target.keep_map(submap.name, work / f"map{suffix}.tsf")
-            held = HeldSensor()
-            poses = submap.located.poses(submap.corrections)
-            for T, force in zip(poses, submap.located.forces(), strict=True):
-                held.add(T, plan.source.sensor, force)
-            in_map = run_files.write_map(
-                work, self._target, submap.name, held, suffix=suffix, world=submap.client.world,
-                up=plan.up, min_weight=plan.min_weight, keep_islands=plan.keep_islands,
-            )  # fmt: skip
-        return _WrittenSubmap(_describe(submap, in_map), in_map, suffix)
-
     @property
     def _times(self) -> list[KeyframeTimes]:
         """Stamps of all submaps' keyframes, one submap after the other."""
         return [record for submap in self._scanner.submaps for record in submap.client.records]
 
-    def record(self, folder: Path, written: list[_WrittenSubmap], accuracy: Accuracy | None) -> RunRecord:
+    def record(self, folder: Path, written: list[WrittenSubmap], accuracy: Accuracy | None) -> RunRecord:
         """The run in figures."""
         plan, scanner, source, first = self._plan, self._scanner, self._plan.source, written[0]
         state, delays = scanner.state(), latency_ledger.summarise(self._times)
@@ -619,32 +597,6 @@ def _refused_worlds(clients: list[Client]) -> list[Exception]:
             kept = f"{waiting} in {client.spool_folder} (`tsfusion spool list`)"
             return [WorldRefused(f"{error}; {kept}")]
     return []
-
-
-def _describe(submap: Submap, in_map: WrittenMap | None) -> MapResult:
-    """A submap in figures."""
-    figures: dict[str, Any] = {}
-    if in_map is not None:
-        names = ("map_hash", "keyframes_moved", "moving_s", "corrections_unavailable", "blocks")
-        figures = {**{name: getattr(in_map.status, name) for name in names}, "mesh": in_map.figures}
-    corrections = submap.corrections
-    return MapResult(
-        name=submap.name,
-        frames=len(submap.located),
-        keyframes=int((submap.located.seqs >= 0).sum()),
-        loops=corrections.loops if corrections else 0,
-        trajectory_error=_error(submap, None),
-        corrected_error=_error(submap, corrections) if corrections else None,
-        **figures,
-    )
-
-
-def _error(submap: Submap, corrections: PoseCorrections | None) -> TrajectoryError | None:
-    """Error against the source's own poses, over the frames that have one; None = fewer than two have."""
-    which, references = submap.located.with_reference()
-    if len(which) < 2:
-        return None
-    return absolute_error(submap.located.poses(corrections)[which], references)
 
 
 def _server_rss(in_map: WrittenMap | None) -> dict[str, int]:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from tsfusion.client import ClientStats
 from tsfusion.datasets.dataset import NOMINAL_NS
 from tsfusion.datasets.trajectory_files import write_tum
+from tsfusion.evaluation.trajectory_error import TrajectoryError, absolute_error
 from tsfusion.geometry import up_direction
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.mesh_arrays import Provenance
@@ -21,7 +22,9 @@ from tsfusion.geometry.up_direction import HeldSensor, Up
 from tsfusion.journal.state_folder import check_no_map_of_a_server
 from tsfusion.pipelines.maps import mesh_finishing
 from tsfusion.pipelines.report import latency_ledger, shortfall
+from tsfusion.pipelines.report.run_record import MapResult
 from tsfusion.pipelines.runs.target_server import Target
+from tsfusion.scanner.localization.localizer import PoseCorrections
 from tsfusion.scanner.scanner import Submap
 from tsfusion.wire.messages.health import Status
 from tsfusion.wire.messages.messages import KeyframeTimes
@@ -49,6 +52,77 @@ class WrittenMap(NamedTuple):
     status: Status
     mesh: Mesh  # with its `up`
     figures: dict[str, Any]  # of the mesh, and what was `left_out` of some files
+
+
+class WrittenSubmap(NamedTuple):
+    """A submap whose files were written. `in_map` is its map; None = its server was not asked."""
+
+    figures: MapResult
+    in_map: WrittenMap | None
+    suffix: str
+
+    @property
+    def has_mesh(self) -> bool:
+        return self.in_map is not None and len(self.in_map.mesh.faces) > 0
+
+
+def write_submap(
+    work: Path,
+    submap: Submap,
+    target: Target | None,
+    suffix: str,
+    *,
+    sensor: str,
+    is_given: bool,
+    **more: Any,
+) -> WrittenSubmap:
+    """Write the trajectories of a submap, and its mesh; keep its map.
+
+    Args:
+        target: has its map; None = that is not asked.
+        suffix: stands before the endings.
+        sensor: of its frames.
+        is_given: see `write_trajectory`.
+        more: of `write_map`.
+    """
+    if not submap.located:
+        return WrittenSubmap(_describe(submap, None), None, suffix)
+    write_trajectory(work, submap, suffix, is_given=is_given)
+    if target is None:
+        return WrittenSubmap(_describe(submap, None), None, suffix)
+    target.keep_map(submap.name, work / f"map{suffix}.tsf")
+    held = HeldSensor()
+    poses = submap.located.poses(submap.corrections)
+    for T, force in zip(poses, submap.located.forces(), strict=True):
+        held.add(T, sensor, force)
+    in_map = write_map(work, target, submap.name, held, suffix=suffix, world=submap.client.world, **more)
+    return WrittenSubmap(_describe(submap, in_map), in_map, suffix)
+
+
+def _describe(submap: Submap, in_map: WrittenMap | None) -> MapResult:
+    """A submap in figures."""
+    figures: dict[str, Any] = {}
+    if in_map is not None:
+        names = ("map_hash", "keyframes_moved", "moving_s", "corrections_unavailable", "blocks")
+        figures = {**{name: getattr(in_map.status, name) for name in names}, "mesh": in_map.figures}
+    corrections = submap.corrections
+    return MapResult(
+        name=submap.name,
+        frames=len(submap.located),
+        keyframes=int((submap.located.seqs >= 0).sum()),
+        loops=corrections.loops if corrections else 0,
+        trajectory_error=_error(submap, None),
+        corrected_error=_error(submap, corrections) if corrections else None,
+        **figures,
+    )
+
+
+def _error(submap: Submap, corrections: PoseCorrections | None) -> TrajectoryError | None:
+    """Error against the source's own poses, over the frames that have one; None = fewer than two have."""
+    which, references = submap.located.with_reference()
+    if len(which) < 2:
+        return None
+    return absolute_error(submap.located.poses(corrections)[which], references)
 
 
 def write_map(
