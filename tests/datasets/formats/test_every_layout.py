@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import pytest
-from small_recordings import one_line
+from small_recordings import CAMERA, one_line
 
 from lab.reliability.fuzz_folders import WRITERS
 from tsfusion.datasets import describe, find, open_dataset
@@ -225,12 +225,30 @@ def test_a_watched_folder_gives_the_same_frames(
 ) -> None:
     whole, frames = unharmed(harmed.row)
     root = Path(shutil.copytree(whole, tmp_path / whole.name))
+    recorded = open_dataset(root, posed=False)
     (root / "DONE").touch()
     with WatchedFolder(root) as source:
-        assert [measured(frame) for frame in source] == list(frames)
+        watched = list(source)
+    assert [measured(frame) for frame in watched] == list(frames)
+    for index, frame in enumerate(watched):
+        expected = frame_of(recorded, index)
+        assert frame.depth_scale == expected.depth_scale
+        assert (frame.intrinsics, frame.baseline_fx) == (expected.intrinsics, expected.baseline_fx)
     harmed.harm(root)
     with WatchedFolder(root) as source:
         found = [measured(frame) for frame in source]
     is_last = harmed.change == "first renamed" and not harmed.row.second  # any name will do
     assert len(found) == len(frames) - (not is_last)
     assert set(found) <= set(frames)
+
+
+def test_units_are_the_layouts_own_where_no_file_states_them(
+    unharmed: Callable[[Row], tuple[Path, Found]], tmp_path: Path
+) -> None:
+    root = Path(shutil.copytree(unharmed(ROWS[2])[0], tmp_path / "replica"))
+    (root / "cam_params.json").unlink()
+    (root / "K.txt").write_text(CAMERA)
+    (root / "DONE").touch()
+    with WatchedFolder(root) as source:
+        scales = {frame.depth_scale for frame in source}
+    assert scales == {frame_of(open_dataset(root), 0).depth_scale} == {1 / 6553.5}
