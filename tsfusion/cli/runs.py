@@ -304,7 +304,7 @@ def _open(context: typer.Context, spec: str, flags: dict[str, Any]) -> "tuple[So
         live = open_source(spec, **options.dataset_options(flags["option"], **camera))
         return live if flags["max_frames"] is None else LimitedSource(live, flags["max_frames"]), []
     from tsfusion.core.errors import DatasetError
-    from tsfusion.datasets.given_trajectory import WithTrajectory, pairs_by_time
+    from tsfusion.datasets.folder_frames import WithTrajectory, pairs_by_time
 
     path, flag, origin = Path(spec), flags["trajectory"], flags["origin"]
     if not _is_synthetic(path) and not path.expanduser().exists():

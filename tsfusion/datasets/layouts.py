@@ -18,7 +18,7 @@ from tsfusion.core import plugins
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.dataset import Dataset, Frames
 from tsfusion.datasets.download import archives
-from tsfusion.datasets.folder_frames import FolderFrames
+from tsfusion.datasets.folder_frames import FolderFrames, WithTrajectory
 from tsfusion.datasets.formats import kitti
 from tsfusion.datasets.formats.euroc import EuRoC
 from tsfusion.datasets.formats.folder_table import (
@@ -33,7 +33,6 @@ from tsfusion.datasets.formats.nerfstudio import Nerfstudio
 from tsfusion.datasets.formats.scan_folders import LidarDump, ScanFolder
 from tsfusion.datasets.formats.stereo_folders import StereoFolder
 from tsfusion.datasets.formats.tum import TUM
-from tsfusion.datasets.given_trajectory import WithTrajectory
 from tsfusion.datasets.rosbag import bag as rosbag_dataset
 from tsfusion.datasets.rosbag.reader import ENDINGS
 from tsfusion.geometry.frame import Frame

@@ -19,7 +19,7 @@ from written_recordings import fits_together
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets import KITTI, KITTIRaw, open_dataset, select
 from tsfusion.datasets.dataset import NO_HALF
-from tsfusion.datasets.given_trajectory import WithTrajectory
+from tsfusion.datasets.folder_frames import WithTrajectory
 from tsfusion.geometry.keyframe import depth_metres, points_camera, points_world
 from tsfusion.geometry.se3 import inverse
 from tsfusion.geometry.stereo_matching import Matcher

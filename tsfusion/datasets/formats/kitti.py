@@ -11,7 +11,7 @@ from functools import cache, partial
 from importlib.machinery import PathFinder
 from importlib.util import find_spec, module_from_spec
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +41,7 @@ EXPECTED = "sequences/NN/{calib.txt,times.txt,image_0,image_1,velodyne} and pose
 RAW_EXPECTED = "DATE/DATE_drive_NNNN_sync/{image_00..03,velodyne_points,oxts}/data and DATE/calib_*.txt"
 _PAIRS = {"grey": ("00", "01"), "color": ("02", "03")}
 _PACKET = 30  # numbers of an oxts line
+_T = TypeVar("_T")
 _ALONG = 0.9  # cosine of the angle between axes that point forward
 
 
@@ -240,14 +241,17 @@ def _read_times(path: Path, frames: list[int]) -> NDArray[np.int64] | None:
     """Nanoseconds of each frame, by line number; None where the file is absent."""
     if not path.exists():
         return None
-    stamps = [
-        nanoseconds(line, path, number) for number, line in read_lines(path, "seconds, one frame a line")
-    ]
-    if frames[-1] >= len(stamps):
-        raise DatasetError(
-            f"{path} has {len(stamps)} lines, but there is a frame {frames[-1]}; expected a line a frame"
-        )
-    return np.array([stamps[number] for number in frames], dtype=np.int64)
+    lines = read_lines(path, "seconds, one frame a line")
+    return np.array(_of_frames(path, [nanoseconds(line, path, number) for number, line in lines], frames))
+
+
+def _of_frames(path: Path, lines: list[_T], frames: list[int]) -> list[_T]:
+    """The entries of frames in a file with a line a frame."""
+    if frames[-1] < len(lines):
+        return [lines[number] for number in frames]
+    raise DatasetError(
+        f"{path} has {len(lines)} lines, but there is a frame {frames[-1]}; expected a line a frame"
+    )
 
 
 def recognises_raw(path: Path) -> bool:
@@ -402,14 +406,10 @@ def _read_dates(path: Path, frames: list[int]) -> NDArray[np.int64] | None:
     if not path.exists():
         return None
     try:
-        lines = path.read_text(encoding="ascii").splitlines()
-        stamps = np.array([lines[number].strip().replace(" ", "T") for number in frames], "datetime64[ns]")
+        lines = _of_frames(path, path.read_text(encoding="ascii").splitlines(), frames)
+        stamps = np.array([line.strip().replace(" ", "T") for line in lines], "datetime64[ns]")
     except (OSError, ValueError) as error:
         raise DatasetError(f"{path}: {error}; expected `year-month-day hour:minute:second` a line") from error
-    except IndexError as error:
-        raise DatasetError(
-            f"{path} has {len(lines)} lines, but there is a frame {frames[-1]}; expected a line a frame"
-        ) from error
     if np.isnat(stamps).any():
         empty = frames[int(np.isnat(stamps).argmax())]
         raise DatasetError(f"{path}:{empty + 1} is empty, but there is a frame {empty}")

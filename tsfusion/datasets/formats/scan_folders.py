@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.dataset import SCAN, FramePoses, NoPoses, Times
 from tsfusion.datasets.file_names import in_order, in_time, series_of
-from tsfusion.datasets.folder_frames import FolderFrames
-from tsfusion.datasets.given_trajectory import poses_between
+from tsfusion.datasets.folder_frames import FolderFrames, poses_between
 from tsfusion.datasets.readers import numbers, read_lines
 from tsfusion.datasets.scan_files import SUFFIXES, USUAL_FIELDS, Scan, read_scan, times_on
 from tsfusion.datasets.trajectory_files import check_quaternion, has_times, read_poses, read_tum, usable
