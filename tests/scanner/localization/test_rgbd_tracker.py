@@ -307,7 +307,7 @@ from pathlib import Path
 import cv2
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
-from tsfusion.scanner.localization.localizer import Pose
+from tsfusion.scanner.localization.localizer import TrackedPose
 from tsfusion.scanner.localization.rgbd.rgbd_tracker import RGBDLocalizer
 
 def megabytes(name):
@@ -318,7 +318,7 @@ names = [f"{sys.argv[1]}/{index:03}" for index in range(125)]
 for name in names + names[::-1]:
     depth, color = cv2.imread(name + ".png", cv2.IMREAD_UNCHANGED), cv2.imread(name + ".jpg")
     answer = localizer.track(Frame(sensor="kinect", depth=depth, color=color, intrinsics=K))
-    assert isinstance(answer, Pose), answer
+    assert isinstance(answer, TrackedPose), answer
     sizes.append(megabytes("VmRSS"))
 assert answer.anchor > 50
 kept = localizer._kept
