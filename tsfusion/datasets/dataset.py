@@ -107,7 +107,7 @@ class SeveralRecordings(DatasetError):
 class Dataset(Protocol):
     """Keyframes by index: all that `replay` needs.
 
-    One that a localizer can follow has `frame(index)` too, as `Frames` gives it.
+    A dataset that a localizer can follow has `frame(index)` too, as `Frames` gives it.
 
     Attributes:
         name: for reports.
@@ -295,9 +295,9 @@ class Frames(ShownRecording):
 
 
 class Wrapped(Frames):
-    """Some frames of another dataset.
+    """Chosen frames of another dataset.
 
-    Has the other's `distance` where it has one: the measure of a world whose surface is known.
+    `distance` is the other's, if it has one: the measure of a world whose surface is known.
     """
 
     distance: Callable[[NDArray[np.floating]], NDArray[np.float64]]
@@ -347,7 +347,7 @@ def frame_of(dataset: Dataset, index: int) -> Frame:
 
 
 def readable(read: Callable[[int], _T], indices: Iterable[int]) -> Iterator[tuple[int, _T]]:
-    """Each index with what `read` makes of it, without those whose frame alone cannot be read."""
+    """Yield each index with the result of `read`; an index whose frame alone cannot be read is left out."""
     for index in indices:
         try:
             found = read(index)

@@ -52,7 +52,7 @@ class Layout(NamedTuple):
         name: for reports.
         description: the expected files, in one line.
         recognises: True if a folder or file is in this layout; quick, reads no images, raises nothing. Of a
-            layout that is a world's, True of `Path("synthetic:WORLD")`.
+            layout that is a world's, True for `Path("synthetic:WORLD")`.
         open: `open(path, **options)` → a dataset; takes `posed` where frames may lack a pose. A world's takes
             `world` and `sensor` by name.
 

@@ -179,7 +179,7 @@ def read_kitti(path: Path) -> list[Transform | None]:
 
 
 def read_matrix(path: Path) -> Transform:
-    """One 4×4 camera-to-world matrix in a file (7-Scenes)."""
+    """Read the 4×4 camera-to-world matrix of a file (7-Scenes)."""
     table = read_numbers(path, "a 4×4 camera-to-world matrix", columns=4)
     if table.shape != (4, 4):
         raise DatasetError(f"{path} must hold 4 rows of 4 numbers, got {len(table)} rows")

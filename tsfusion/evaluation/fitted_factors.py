@@ -126,7 +126,7 @@ def _fitted(fits_at: FitsAt, widest: float, steps: int, given: Fits, *, least: f
 
 
 def _peak_and_error(logs: Logs, curves: NDArray[np.float64]) -> tuple[float, float]:
-    """Where the sum of the pairs' curves is highest, and its standard error by leaving out each pair once."""
+    """Peak of the sum of the pairs' curves, and its standard error by leaving out each pair once."""
     total, count = curves.sum(axis=1), curves.shape[1]
     left_out = np.array([_peak(logs, total - curve) for curve in curves.T])
     error = np.sqrt((count - 1) / count * ((left_out - left_out.mean()) ** 2).sum())
@@ -134,7 +134,7 @@ def _peak_and_error(logs: Logs, curves: NDArray[np.float64]) -> tuple[float, flo
 
 
 def _peak(at: Logs, values: NDArray[np.float64]) -> float:
-    """Where a curve is highest, between its samples by a parabola."""
+    """Place of a curve's peak, between its samples by a parabola."""
     top = int(np.argmax(values))
     if not 0 < top < len(at) - 1:
         return float(at[top])

@@ -21,8 +21,8 @@ Triangles = NDArray[np.float64]  # (n, 3, 3)
 class MeshDistance:
     """Unsigned distance from a mesh: exact nearby, elsewhere at most `SLACK` of itself too long.
 
-    Where more than `MOST_CANDIDATES` balls may be the nearest, as from the centre of a sphere, at most a
-    `radius` too long.
+    Distances to more than `MOST_CANDIDATES` balls, as from the centre of a sphere, are at most a `radius`
+    too long.
 
     Args:
         vertices: (n, 3) metres.

@@ -124,11 +124,11 @@ def _constraint(points: NDArray[np.float64], normals: NDArray[np.float64]) -> fl
 
 
 def parts_spread(a: SampledSurface, b: SampledSurface, T_a_b: Transform, reach: float) -> float:
-    """How far the parts of the common surface want surface `b` in different places, metres.
+    """Distance between the places at which parts of the common surface want surface `b`, metres.
 
     Along each of three directions, parts whose normals lie along it say by the median of their offsets where
-    `b` should be. Where a map has drifted they disagree, though what is left after the fit is small: a robust
-    fit leaves out what does not fit.
+    `b` should be. Parts of a map that has drifted disagree, though the fit's residual is small: a robust fit
+    leaves out what does not fit.
 
     Args:
         reach: metres within which the other surface is looked for.
@@ -152,7 +152,7 @@ def parts_spread(a: SampledSurface, b: SampledSurface, T_a_b: Transform, reach: 
 
 
 def _split(points: NDArray[np.float64], part: NDArray[np.intp], halvings: int) -> list[NDArray[np.intp]]:
-    """Some points in parts of equal size, each cut across its longest side; none of fewer than 50."""
+    """Split points into parts of equal size, each cut across its longest side; none of fewer than 50."""
     if len(part) < _LEAST_PART:
         return []
     if not halvings or len(part) < 2 * _LEAST_PART:

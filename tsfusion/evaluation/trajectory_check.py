@@ -121,7 +121,7 @@ def _jump(track: _Track, compare: Callable[[int, int], FramePair | None], range_
 def _jumped(
     pair: FramePair | None, usual: Transform, range_m: float, *, moved: float, force: float, is_timed: bool
 ) -> float:
-    """How far a step surely jumps, metres; 0 = nobody can tell, or it does not.
+    """Distance by which a step surely jumps, metres; 0 = none, or nobody can tell.
 
     Args:
         usual: motion that the steps around let expect; it is `moved` metres off, and needs a `force` in m/s².

@@ -57,7 +57,7 @@ def unpack(path: Path) -> Path:
 
 
 def extract(path: Path, into: Path, *, nested: bool = False) -> None:
-    """Unpack into an empty folder. What was unpacked stays there when the rest fails.
+    """Unpack into an empty folder. Unpacked files stay there when the rest fails.
 
     Args:
         nested: unpack zip files inside too, and remove them.

@@ -159,7 +159,7 @@ class DepthImages(DepthReader, FolderFrames):
     """Frames of one depth image each, with colour and a pose where they are recorded.
 
     A layout is a row of attributes: `depth_at`, `color_at`, `poses_at`, `camera_at` (files of the camera by
-    preference) and `published`. What these cannot say is a method: `_registered` says how colour fits.
+    preference) and `published`. Methods say the rest: `_registered` how colour fits.
 
     Args:
         intrinsics, calibration: of the depth images, instead of a file of the camera in the folder
@@ -214,7 +214,7 @@ class DepthImages(DepthReader, FolderFrames):
         return find_camera(root, size, **given, **self._known_camera(root))
 
     def _known_camera(self, root: Path) -> dict[str, Any]:
-        """Where the camera is: `places`, `files` and `published` of `find_camera`."""
+        """Place of the camera: `places`, `files` and `published` of `find_camera`."""
         places = (Path(os.path.normpath(root / file)) for file in self.camera_at)
         return {"files": [path for path in places if path.is_file()][:1], "published": self.published}
 

@@ -270,6 +270,6 @@ def _closeness(color: ImageTopic, depth: ImageTopic) -> tuple[object, ...]:
 
 
 def _shared(one: str, other: str) -> int:
-    """How many names two topics have in common from the left."""
+    """Number of names that two topics have in common from the left."""
     pairs = zip(one.split("/"), other.split("/"), strict=False)
     return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))

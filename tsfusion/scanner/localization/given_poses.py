@@ -20,9 +20,9 @@ from tsfusion.scanner.localization.localizer import Localizer, Lost, TrackedPose
 class TrajectoryFilePoses(Localizer):
     """`Localizer` that interpolates the poses of a file at each frame's timestamp.
 
-    A file in KITTI's format has no times. They are read from `times.txt` (seconds, a line a pose), beside the
-    file or, for `poses/NN.txt`, in `sequences/NN` as in the benchmark. Counting frames instead would move
-    all poses after a dropped frame.
+    Times of a file in KITTI's format are read from `times.txt` (seconds, a line a pose), beside the file or,
+    for `poses/NN.txt`, in `sequences/NN` as in the benchmark. Counting frames instead would move all poses
+    after a dropped frame.
 
     Args:
         path: `timestamp tx ty tz qx qy qz qw` or 12 numbers a line, poses of the sensor whose frames are

@@ -45,8 +45,7 @@ _POINT = 16  # bytes: x, y, z and intensity in float32
 class FolderLayout(NamedTuple):
     """Files of a frame: the first, and of images the second, which shares a part of its name.
 
-    `files` are they in words, with {} for the folder of the second; `of` is the layout of a recording whose
-    usual unit of depth counts.
+    `files` names both in words, with {} for the folder of the second. The unit of depth is usual in `of`.
     """
 
     kind: Literal["depth", "pair", "points"]
@@ -112,8 +111,8 @@ class WatchedFolder(LiveSource):
     before it, which is left out after `deadline` without a change. Colour must be registered to depth.
     Timestamps are those in the names (decimal seconds, or nanoseconds), or the times of the files.
 
-    It ends when a file `DONE` or `.end` appears, or after `idle` seconds without a new frame. The name of
-    every frame is remembered (100 bytes each).
+    A file `DONE` or `.end` ends the source, or `idle` seconds without a new frame. The name of every frame is
+    remembered (100 bytes each).
 
     Args:
         path: an existing folder; its layout and its camera may be written later.

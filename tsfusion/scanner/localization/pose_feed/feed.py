@@ -87,7 +87,7 @@ class PoseFeed:
     def track(self, frame: Frame) -> TrackedPose | Lost:
         """Interpolate the feed's poses at the frame's timestamp; wait up to `wait_s` for the next one.
 
-        Of a frame with point times the one after its last point is waited for.
+        A frame with point times waits for the pose after its last point.
         """
         if not frame.timestamp_ns:
             return Lost(reason="the frame has no time, so that no pose can be looked up", timestamp_ns=0)

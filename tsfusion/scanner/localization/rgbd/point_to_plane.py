@@ -199,7 +199,7 @@ def match(
 def correlated_blocks(found: Match, columns: int) -> float:
     """Number of blocks that share one error: 1 for white noise, dozens where a sensor's errors are smooth.
 
-    It is the variance of the distances' means over cells of blocks, in units of what white noise would give.
+    Variance of the distances' means over cells of blocks, in units of what white noise would give.
     """
     near = np.abs(found.distance) < 4 * found.sigma
     whitened = (found.distance[near] / found.sigma[near]).astype(np.float64)
