@@ -20,7 +20,7 @@ from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.textured_mesh import TexturedMesh
 from tsfusion.journal import Journal, state_folder
 from tsfusion.journal.journaled_keyframes import JournaledKeyframes
-from tsfusion.pipelines.maps import journal_fusion, mesh_finishing
+from tsfusion.pipelines.maps import journal_fusion
 from tsfusion.wire.records import codec, corrections
 
 pytest.importorskip("xatlas")
@@ -72,7 +72,7 @@ def recorded(tmp_path: Path) -> Callable[..., Path]:
 def textured(folder: Path) -> TexturedMesh:
     keyframes = JournaledKeyframes(state_folder.find_journal(folder))
     volume = volume_of([keyframes[i].keyframe for i in range(len(keyframes))], voxel_size=VOXEL)
-    return mesh_finishing.textured(volume.extract_mesh(), folder, VOXEL)
+    return journal_fusion.textured(volume.extract_mesh(), folder, VOXEL)
 
 
 def centre_of(mesh: TexturedMesh, is_painted: Callable[[np.ndarray], np.ndarray]) -> np.ndarray | None:
@@ -108,7 +108,7 @@ def test_a_forgotten_keyframe_paints_nothing(recorded: Callable[..., Path]) -> N
 def test_a_journal_without_keyframes_says_so(recorded: Callable[..., Path]) -> None:
     mesh = volume_of([square_at(at(0.0))] * 2, voxel_size=VOXEL).extract_mesh()
     with pytest.raises(JournalError, match="no keyframes"):
-        mesh_finishing.textured(mesh, recorded([], {}, []), VOXEL)
+        journal_fusion.textured(mesh, recorded([], {}, []), VOXEL)
 
 
 def test_the_command_writes_a_textured_file(

@@ -54,6 +54,7 @@ MAY_REACH_TAICHI = (
         "pipelines",
         "cluster",
         "cli",
+        "pipelines.runs.run",
         "__main__",
     ),
 )

@@ -281,14 +281,14 @@ def _textured(
     """The mesh with a texture from the journal's images."""
     from tsfusion.cli import opened_maps, progress
     from tsfusion.journal import state_folder
-    from tsfusion.pipelines.maps import mesh_finishing
+    from tsfusion.pipelines.maps import journal_fusion
     from tsfusion.tsdf.texture.texturing import TextureSettings
 
     settings = TextureSettings() if size is None else TextureSettings(size=size)
     place, chosen = state_folder.resolve_map(source, name), {key: view[key] for key in ("until", "only")}
     with progress.shown(quiet=quiet) as display:
         display.stage(f"texture of {source}")
-        return mesh_finishing.textured(
+        return journal_fusion.textured(
             made, place, found.volume.config.voxel_size, settings, **chosen,
             reading=partial(display.show_bytes, opened_maps.JOURNAL), watch=display.show_steps,
         )  # fmt: skip

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Maps made of a journal: all of it, up to a time, as one scanner saw it, elsewhere, or painted by origin."""
+"""Maps made of a journal: all, until a time, of one scanner, elsewhere, painted by origin; and textures."""
 
 from collections import Counter
 from collections.abc import Callable, Collection
@@ -16,10 +16,14 @@ from tsfusion.core.errors import DecodeError, InvalidKeyframe, JournalError, Map
 from tsfusion.core.readable_numbers import OnProgress
 from tsfusion.geometry import color_scales
 from tsfusion.geometry.keyframe import Keyframe
+from tsfusion.geometry.mesh import Mesh
+from tsfusion.geometry.textured_mesh import TexturedMesh
 from tsfusion.journal import journaled_keyframes, state_folder
 from tsfusion.journal.journaled_keyframes import LOST, FinalKeyframe, JournaledKeyframes, JournaledSession
 from tsfusion.pipelines.maps import saved_maps
 from tsfusion.tsdf.files import checkpoint
+from tsfusion.tsdf.texture import texturing
+from tsfusion.tsdf.texture.texturing import TextureSettings
 from tsfusion.tsdf.volume import Volume
 
 ColorBy = Literal["client", "session"]
@@ -203,3 +207,51 @@ def _is_of_server(saved: Path) -> bool:
     """True if a map says how far it is with the journal beside it; one that was put there does not."""
     with checkpoint.reading(saved) as (header, _):
         return "done" in header.meta
+
+
+class JournalImages:
+    """The keyframes of a journal as a texture takes them; None where one is of no use."""
+
+    def __init__(self, keyframes: JournaledKeyframes) -> None:
+        self._keyframes = keyframes
+
+    def __len__(self) -> int:
+        return len(self._keyframes)
+
+    def __getitem__(self, index: int) -> Keyframe | None:
+        """Read a keyframe.
+
+        Raises:
+            JournalError: when it cannot be read any more.
+        """
+        try:
+            return self._keyframes[index].keyframe
+        except (DecodeError, InvalidKeyframe):  # the map could not take it either, and whoever made it told
+            return None
+
+
+def textured(
+    mesh: Mesh,
+    source: Path,
+    voxel_size: float,
+    settings: TextureSettings | None = None,
+    *,
+    until: str | None = None,
+    only: Collection[str] = (),
+    reading: OnProgress = lambda _done, _all: None,
+    watch: texturing.StageProgress = lambda _stage, _done, _all: None,
+) -> TexturedMesh:
+    """Give the mesh of a map a texture from the images in its journal.
+
+    Args:
+        source: what `state_folder.find_journal` takes.
+        voxel_size: metres, of the map.
+        until, only: the keyframes, as `choose` has them.
+
+    Raises:
+        JournalError: when there is no journal, or it has no keyframes; others as `texturing.textured`.
+    """
+    keyframes = choose(source, until=until, only=only, watch=reading)
+    if not len(keyframes):
+        raise JournalError(f"a texture needs the images in the journal, but {source} has no keyframes")
+    return texturing.textured(mesh, JournalImages(keyframes), voxel_size, settings, watch=watch)

@@ -1,21 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""Last steps before a mesh is shared: cut to a box, freed of small pieces, thinned, textured, written."""
+"""Last steps before a mesh is shared: cut to a box, freed of small pieces, thinned, and written."""
 
 import dataclasses
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tsfusion.core.errors import DecodeError, InvalidConfig, InvalidKeyframe, JournalError, OutputError
-from tsfusion.core.readable_numbers import OnProgress
+from tsfusion.core.errors import InvalidConfig, OutputError
 from tsfusion.geometry import mesh_cropping, mesh_islands, mesh_simplification, point_files
-from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.geometry.mesh import FORMATS, GUESS_COLOR, Mesh
-from tsfusion.geometry.textured_mesh import TexturedMesh
-from tsfusion.journal.journaled_keyframes import JournaledKeyframes
-from tsfusion.pipelines.maps import journal_fusion, mesh_preview
-from tsfusion.tsdf.texture import texturing
-from tsfusion.tsdf.texture.texturing import TextureSettings
+from tsfusion.pipelines.maps import mesh_preview
 
 if TYPE_CHECKING:
     from tsfusion.tsdf.volume import Volume
@@ -230,51 +224,3 @@ def write(mesh: Mesh, files: Sequence[Path], *, keep_islands: bool | None = None
         return {"islands": 0, "triangles": 0, "files": []}
     figures = mesh.figures
     return {"islands": figures["islands"], "triangles": figures["island_triangles"], "files": without}
-
-
-class JournalImages:
-    """The keyframes of a journal as a texture takes them; None where one is of no use."""
-
-    def __init__(self, keyframes: JournaledKeyframes) -> None:
-        self._keyframes = keyframes
-
-    def __len__(self) -> int:
-        return len(self._keyframes)
-
-    def __getitem__(self, index: int) -> Keyframe | None:
-        """Read a keyframe.
-
-        Raises:
-            JournalError: when it cannot be read any more.
-        """
-        try:
-            return self._keyframes[index].keyframe
-        except (DecodeError, InvalidKeyframe):  # the map could not take it either, and whoever made it told
-            return None
-
-
-def textured(
-    mesh: Mesh,
-    source: Path,
-    voxel_size: float,
-    settings: TextureSettings | None = None,
-    *,
-    until: str | None = None,
-    only: Collection[str] = (),
-    reading: OnProgress = lambda _done, _all: None,
-    watch: texturing.StageProgress = lambda _stage, _done, _all: None,
-) -> TexturedMesh:
-    """Give the mesh of a map a texture from the images in its journal.
-
-    Args:
-        source: what `state_folder.find_journal` takes.
-        voxel_size: metres, of the map.
-        until, only: the keyframes, as `journal_fusion.choose` has them.
-
-    Raises:
-        JournalError: when there is no journal, or it has no keyframes; others as `texturing.textured`.
-    """
-    keyframes = journal_fusion.choose(source, until=until, only=only, watch=reading)
-    if not len(keyframes):
-        raise JournalError(f"a texture needs the images in the journal, but {source} has no keyframes")
-    return texturing.textured(mesh, JournalImages(keyframes), voxel_size, settings, watch=watch)

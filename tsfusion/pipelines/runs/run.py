@@ -58,7 +58,7 @@ from tsfusion.scanner.keyframe_selection import EveryFrame, KeyframeSelector
 from tsfusion.scanner.localization import localizers
 from tsfusion.scanner.localization.localizer import Localizer
 from tsfusion.scanner.scanner import Scanner
-from tsfusion.scanner.sources.source import Source
+from tsfusion.scanner.sources.source import RecordedSource, Source
 from tsfusion.wire.messages.messages import KeyframeTimes
 
 _OUTDOOR_SENSORS = ("stereo", "lidar")
@@ -336,6 +336,8 @@ class _ActiveRun:
         self._leftovers.begin()
         self._scanner = self._open_scanner()
         self._engine = Engine(target, self._observe, lambda: self._scanner.state().link)
+        if isinstance(plan.source, RecordedSource):
+            plan.source.attend = self._engine.check
         self._begun, self._seconds, self._peak_rss = time.monotonic(), 0.0, 0
 
     def carry_out(self) -> None:

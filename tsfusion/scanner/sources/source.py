@@ -6,7 +6,7 @@ import math
 import queue
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from itertools import islice
 from types import TracebackType
@@ -128,6 +128,7 @@ def monotonic_of(wall_ns: int, *, oldest_s: float) -> int:
     return now - age if 0 <= age <= oldest_s * SECOND else now
 
 
+_POLL_S = 0.1  # between looks at what else there is to do while a time is waited for
 _READ_AHEAD = 3  # times as long as the last frame took to be read: disks and images differ
 
 
@@ -137,9 +138,13 @@ class RecordedSource(LiveSource):
     Args:
         dataset: opened with poses or without.
         rate: frames a second; None = as fast as they are taken.
+
+    Attributes:
+        attend: called again and again while a frame's time is waited for.
     """
 
     live = False
+    attend: Callable[[], object] = staticmethod(lambda: None)
 
     def __init__(self, dataset: Dataset, *, rate: float | None = None) -> None:
         super().__init__(dataset.name, dataset.sensor)
@@ -180,8 +185,9 @@ class RecordedSource(LiveSource):
         return -math.inf if self._rate is None else due + 1 / self._rate
 
     def _wait_until(self, due: float) -> None:
-        if due > time.monotonic():
-            self._closed.wait(due - time.monotonic())
+        while (left := due - time.monotonic()) > 0 and not self._closed.is_set():
+            self.attend()
+            self._closed.wait(min(left, _POLL_S))
 
 
 class LimitedSource(LiveSource):
