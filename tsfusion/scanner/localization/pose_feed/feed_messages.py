@@ -5,7 +5,7 @@ A message is one frame, JSON or MessagePack, a map of:
 
 - `stamp_ns`: integer, of the clock that stamps the frames.
 - `pose`: `[tx, ty, tz, qx, qy, qz, qw]`, or the 16 numbers of T_world_camera row by row; of the sensor whose
-  frames are followed, OpenCV axes (a LiDAR: its own). Poses of odometry never jump when a loop is closed.
+  frames are followed, OpenCV axes (a LiDAR: its own). Poses are odometry: none may jump at a closed loop.
 - `lost`: true instead of a pose: the sender does not know the pose.
 - `corrections`: result of loop closure, alone or beside a pose. A map of `stamps_ns`, of poses sent before;
   `poses`, their corrected ones, each as above; `loops`, closed so far (optional); and `T_corrected_world`, as
