@@ -17,6 +17,14 @@ PACKAGE, HERE = ROOT / "tsfusion", Path(__file__).parent
 HOUSE: dict[str, Any] = msgspec.toml.decode((HERE / "house.toml").read_bytes())
 SPINE = (HERE / "spine.txt").read_text(encoding="utf-8").split()
 MOST_ATTRIBUTES, MOST_ARGUMENTS = 12, 8
+MOST_ENTRIES = 95  # of docs/glossary.md
+# Words of class names that mean what any dictionary says: no entry of the glossary would tell more.
+PLAIN = {
+    "addresses", "begin", "by", "copied", "current", "done", "end", "entry", "failed", "file",
+    "find", "finish", "found", "free", "growing", "handler", "incoming", "load", "open", "reader",
+    "recent", "save", "saved", "space", "started", "statistics", "table", "taking", "time", "times",
+    "unwritten", "waiting",
+}  # fmt: skip
 FILES = sorted(PACKAGE.rglob("*.py"))
 
 
@@ -147,9 +155,9 @@ def test_each_room_has_a_sentence_in_its_wing() -> None:
 
 
 def test_the_spine_speaks_words_of_the_glossary() -> None:
-    """Words of its classes are entries of docs/glossary.md; house.toml has those that are not yet."""
+    """Words of its classes are in a heading of docs/glossary.md, or plain."""
     entries = re.findall(r"^### (.+)$", text(ROOT / "docs" / "glossary.md"), re.MULTILINE)
-    assert len(entries) <= 95
+    assert len(entries) <= MOST_ENTRIES
     known = {word.lower() for entry in entries for word in re.findall(r"\w+", entry)}
     used = {
         word.lower()
@@ -158,5 +166,5 @@ def test_the_spine_speaks_words_of_the_glossary() -> None:
         if isinstance(node, ast.ClassDef) and not node.name.startswith("_")
         for word in re.findall(r"[A-Z][a-z0-9]+|[A-Z]+(?![a-z])", node.name)
     }
-    missing = sorted(used - known)
-    assert missing == HOUSE["words"], "write an entry of docs/glossary.md, or take the word out of house.toml"
+    assert not used - known - PLAIN, "write an entry of docs/glossary.md, or use a word of it"
+    assert not PLAIN - used | PLAIN & known, "take these words out of PLAIN"
