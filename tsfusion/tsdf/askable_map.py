@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Questions to a map: distances at points, views, free space, distance fields, its points and voxels."""
+"""Questions to a map: distances at points, views, free space, distance fields, points and voxels."""
 
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
@@ -39,7 +39,7 @@ MOST_NEW_CUBES = 2  # of a surface that is not kept, in an answer about cells
 
 
 class AskableMap(ReadableMap):
-    """A map that answers questions, and keeps what it solved and meshed for the next one."""
+    """Map that answers questions, and keeps solved values and meshes for the next question."""
 
     def __init__(self, config: VolumeConfig, store: BlockStore) -> None:
         super().__init__(config, store)
@@ -48,7 +48,7 @@ class AskableMap(ReadableMap):
     def sample(
         self, points: ArrayLike, *, min_weight: float | None = None, surface: Surface | None = None
     ) -> Samples:
-        """The signed distance, its weight and its gradient at points, between voxel centres interpolated.
+        """Signed distance, its weight and its gradient at points, interpolated between voxel centres.
 
         NaN beyond the band around surfaces (`reach`) does not mean free: planners ask `distance_field`.
 
@@ -63,20 +63,20 @@ class AskableMap(ReadableMap):
 
     @property
     def reach(self) -> float:
-        """How far before a surface `sample` knows distances, metres: the least half-width of a band."""
+        """Distance before a surface up to which `sample` knows values, metres: least half-width of a band."""
         return self.model.min_support * self.config.voxel_size
 
     def signed_distance(
         self, points: NDArray[np.floating], min_weight: float | None = None
     ) -> NDArray[np.float32]:
-        """Signed distances that the map holds at points of the world: positive in the free space it saw.
+        """Signed distances in the map at points, without interpolation: positive in the free space it saw.
 
         Args:
             points: (n, 3) metres; each takes the value of the voxel that it lies in.
             min_weight: as for `extract_mesh`.
 
         Returns:
-            (n,) metres; NaN where the map saw nothing, which is all but a band around its surfaces.
+            (n,) metres; NaN where the map saw nothing, which is everywhere but a band around its surfaces.
         """
         centres = np.floor(checked_points(points) / self.config.voxel_size) + 0.5
         return self.sample(centres * self.config.voxel_size, min_weight=min_weight, surface="raw").distance
@@ -94,21 +94,21 @@ class AskableMap(ReadableMap):
     ) -> View:
         """View of the surface by a pinhole camera: depth, normals, and colours if the map has them.
 
-        A surface is seen from its front alone, which is where the sensors were.
+        A surface is seen from its front alone, where the sensors were.
 
         Args:
             intrinsics: `Intrinsics`, a (3, 3) camera matrix, or fx, fy, cx, cy; pixels.
             T_world_camera: (4, 4) pose, camera axes x right, y down, z forward.
             shape: (height, width), pixels.
             min_weight, surface: as for `extract_mesh`.
-            normals, colors: whether with them; depth alone is quicker.
+            normals, colors: images beside depth; depth alone is quicker.
         """
         camera = checked_camera(intrinsics, T_world_camera, shape)
         tiles = self._tiles_of(surface, self._checked_min_weight(min_weight))
         return camera_views.cast(tiles, *camera, normals=normals, colors=colors)
 
     def settled_stamp(self, min_weight: float | None = None, surface: Surface | None = None) -> int | None:
-        """The `stamp` of the state that `raycast` or `settle` made whole last; None = it is not kept."""
+        """`stamp` of the last state that `raycast` or `settle` meshed as a whole; None = no longer kept."""
         return self._tiles_of(surface, self._checked_min_weight(min_weight)).settled
 
     def raycast_settled(
@@ -122,23 +122,23 @@ class AskableMap(ReadableMap):
         normals: bool = True,
         colors: bool = True,
     ) -> View | None:
-        """As `raycast`, of the state of `settled_stamp`; None where some of it is not kept any more."""
+        """As `raycast`, of the state of `settled_stamp`. Returns None where some of it is no longer kept."""
         camera = checked_camera(intrinsics, T_world_camera, shape)
         least = self._checked_min_weight(min_weight)
         tiles = self._tiles_of(surface, least)
         return camera_views.cast_settled(tiles, *camera, normals=normals, colors=colors)
 
     def settle(self, most: int, *, min_weight: float | None = None, surface: Surface | None = None) -> bool:
-        """Mesh again what the last `raycast` showed and has changed since, at most so many cubes of it.
+        """Mesh again the changed part of the last `raycast`, at most `most` cubes.
 
         Returns:
-            Whether `raycast_settled` is of the map as it is now.
+            True if `raycast_settled` now shows the current map.
         """
         tiles = self._tiles_of(surface, self._checked_min_weight(min_weight))
         return tiles.settled is not None and tiles.settle_some(most)
 
     def point_cloud(self, *, min_weight: float | None = None, surface: Surface | None = None) -> PointCloud:
-        """Points of the surface, a vertex of its mesh each: at most three a voxel.
+        """Points of the surface, the vertices of its mesh: at most three a voxel.
 
         Args:
             min_weight, surface: as for `extract_mesh`.
@@ -148,16 +148,15 @@ class AskableMap(ReadableMap):
         return PointCloud(mesh.vertices, mesh.normals, weights, mesh.colors)
 
     def blocks(self) -> Blocks:
-        """The blocks of voxels as NumPy arrays: the stored sums without copying, and decoded on request."""
+        """Blocks of voxels as NumPy arrays: the stored sums without copying, decoded values on request."""
         return Blocks(self._store)
 
     def to_open3d(self) -> Any:
         """Make an `open3d.t.geometry.VoxelBlockGrid` of the map as it was fused.
 
-        Open3D's meshes and points of it lie half a voxel too low along x, y and z, since Open3D takes a
-        voxel's value for that of its lowest corner: `translate` them. A distance of 8 voxels is 1 there
-        (`trunc_voxel_multiplier=8`, the default). `extract_mesh().to_open3d()` and
-        `point_cloud().to_open3d()` need no such care.
+        Open3D takes a voxel's value for that of its lowest corner: `translate` its meshes and points by half
+        a voxel along x, y and z. A distance of 8 voxels is 1 there (`trunc_voxel_multiplier=8`, the default).
+        `extract_mesh().to_open3d()` and `point_cloud().to_open3d()` need no such care.
 
         Raises:
             MissingDependency: without Open3D.
@@ -173,17 +172,17 @@ class AskableMap(ReadableMap):
         min_weight: float | None = None,
         unseen_is_free: bool = False,
     ) -> DistanceField:
-        """Euclidean distance to the nearest surface, of every voxel in a box.
+        """Euclidean distance to the nearest surface, for every voxel in a box.
 
-        Surfaces around the box count, too: a voxel has the same distance in whatever box.
+        Surfaces around the box count, too: a voxel has the same distance in any box.
 
         Args:
             box: x0, y0, z0, x1, y1, z1 in metres, one voxel thick for a plane; None = around the whole map.
-            max_distance: metres; what is farther has this distance.
-            subvoxel: distances to the surface where it lies in the voxels; else between voxels' centres, as
-                SciPy's `distance_transform_edt`.
+            max_distance: metres; farther voxels have this distance.
+            subvoxel: distances to the surface within its voxel; else between voxel centres, as SciPy's
+                `distance_transform_edt`.
             min_weight: as for `extract_mesh`.
-            unseen_is_free: where nothing was seen the distance is that to what was; else 0.
+            unseen_is_free: an unseen voxel has the distance to the nearest seen surface; else 0.
 
         Raises:
             InvalidConfig: for another box, or one of too many voxels; MapError: no box, and an empty map.
@@ -196,9 +195,9 @@ class AskableMap(ReadableMap):
     def distance_blocks(
         self, *, max_distance: float = 0.5, min_weight: float | None = None
     ) -> Iterator[FieldBlocks]:
-        """The distance field of the whole map, blocks of 8³ voxels nearer than `max_distance` to a surface.
+        """Distance field of the whole map: blocks of 8³ voxels nearer than `max_distance` to a surface.
 
-        Memory holds one tile of 16³ blocks and what lies around it, however large the map is. The values are
+        Memory holds one tile of 16³ blocks and its surroundings, for a map of any size. The values equal
         those of `distance_field`.
 
         Args:
@@ -258,7 +257,7 @@ class AskableMap(ReadableMap):
 
     @property
     def knows_free_space(self) -> bool:
-        """True if the map knows free space that is not near surfaces: all but maps of earlier versions do."""
+        """True if the map knows free space away from surfaces; maps of earlier versions may not."""
         return self.config.space_carving or len(self._store.clear) > 0
 
     def occupancy_slice(
@@ -312,11 +311,11 @@ class AskableMap(ReadableMap):
         *,
         values: SurfaceView | None = None,
     ) -> CellMeshes:
-        """The mesh of `extract_mesh(blocks=cells)`, and which of its faces are each cell's.
+        """Mesh of `extract_mesh(blocks=cells)`, and the faces of each cell.
 
         Args:
-            cells: (n, 3) int32 block coordinates; of a block that the map does not have there are none.
-            values: of `whole_values`, for the very triangles of the whole map's mesh, or of `surface_tiles`.
+            cells: (n, 3) int32 block coordinates; a block that the map does not have adds no faces.
+            values: `whole_values`, for exactly the triangles of the whole map's mesh, or `surface_tiles`.
         """
         keys = distinct(pack_keys(cells))
         return self._mesh_keys(keys, self._checked_min_weight(None), values or self._view(surface))
@@ -337,16 +336,16 @@ class AskableMap(ReadableMap):
         surface: Surface | None = None,
         most: int = 256,
     ) -> tuple[CellMeshes, NDArray[np.int32] | None]:
-        """Some of the map's cells in the order of their keys, and where the others begin; None = nowhere.
+        """Some of the map's cells in key order, and the first of the remaining ones; None = no more.
 
-        What they show depends on the map alone, of whatever surface; `extract_mesh` of some blocks may be
-        a hundredth of a voxel from it.
+        Their meshes depend on the map alone, for every surface; `extract_mesh` of some blocks may differ by a
+        hundredth of a voxel.
 
         Args:
-            first: block coordinates of where to begin; None = with the first cell.
-            since: only cells that changes after this `stamp` reach; cells of blocks that have gone since
-                are not among them: `drops` says whether there are any.
-            most: cells at once.
+            first: block coordinates of the first cell; None = the map's first cell.
+            since: only cells that changes after this `stamp` reach. Cells of blocks removed since are
+                missing: `drops` tells that there are some.
+            most: cells in one answer.
         """
         store, surface = self._store, surface or self.model.surface
         start = 0 if first is None else int(pack_keys(np.array([first], np.int32))[0])
@@ -370,7 +369,7 @@ class AskableMap(ReadableMap):
         return found, None if rest is None else unpack_keys(np.array([rest]))[0]
 
     def cell_stamps(self, cells: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """The stamps of the last changes to (n, 3) cells as fused, and to their own blocks: (n,) each."""
+        """Stamps of the last changes to (n, 3) cells as fused, and to their own blocks: (n,) each."""
         return mesh_extraction.stamps_of(self._store, pack_keys(cells))
 
     @property
@@ -380,7 +379,7 @@ class AskableMap(ReadableMap):
 
     @property
     def drops(self) -> int:
-        """How often blocks have gone: cells that read them have changed, too, and no stamp says so."""
+        """Number of times that blocks were removed; cells that read them have changed without a new stamp."""
         return self._store.drops
 
     def _level(
@@ -407,11 +406,11 @@ class AskableMap(ReadableMap):
 
     @property
     def _reading_bytes(self) -> int:
-        """Memory for meshes, and of what is kept of answers."""
+        """Memory of meshes and of kept answers."""
         return self._mesh_buffers.nbytes + sum(kept.nbytes for kept in self._tiles.values())
 
     def _tiles_of(self, surface: Surface | None, min_weight: float) -> SurfaceTiles:
-        """Values kept of a surface for the next question, without those changed since the last one."""
+        """Kept values of a surface, without those that have changed since the last question."""
         view, which = self._view(surface), (surface or self.model.surface, min_weight)
         try:
             changed = np.sort(self._store.keys[self._store.take_dirty(ASKED)])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Readings of a map: surfaces, hashes, files of voxels. Nothing here changes it."""
+"""Readings of a map that never change it: surfaces, hashes, files of voxels."""
 
 import hashlib
 import math
@@ -43,17 +43,17 @@ _MOST_SHOWN = 50_000  # blocks of a map that has a picture: it is meshed for tha
 
 
 def begin_hash(voxel_size: float) -> "hashlib.blake2b":
-    """A digest that is to take the keys and then the sums of a map's used blocks, 1024 at a time."""
+    """Digest for the keys and then the sums of a map's used blocks, 1024 at a time."""
     digest = hashlib.blake2b(digest_size=16)
     digest.update(struct.pack("<di", voxel_size, integrate.QUANTA_PER_VOXEL))
     return digest
 
 
 class ReadableMap(object_cards.Shown):
-    """A map as one reads it: `Volume` without the ways to change it.
+    """`Volume` without the methods that change it.
 
     Attributes:
-        config: its settings; `model`: those of its sensor.
+        config, model: settings of the map, and of its sensor.
         keyframes: number of those in it with a usable sample.
         held: their sensors.
         meta: anything JSON-like that is saved with it.
@@ -83,7 +83,7 @@ class ReadableMap(object_cards.Shown):
 
     @property
     def _store(self) -> BlockStore:
-        """The blocks, for the thread that they belong to. Raises MapError in another one."""
+        """Blocks, for the thread that they belong to. Raises MapError in another one."""
         runtime.check_thread()
         return self._blocks
 
@@ -96,17 +96,17 @@ class ReadableMap(object_cards.Shown):
         fill_holes: int | None = None,
         texture: PosedImages | None = None,
     ) -> Mesh:
-        """The surface, by marching cubes over the whole map or over the cells of some blocks.
+        """Surface by marching cubes over the whole map, or over the cells of some blocks.
 
         Args:
             min_weight: full-confidence samples a voxel needs to count as seen; default the sensor's.
-            blocks: (n, 3) int32 block coordinates. A mesh of `cells_to_mesh(take_dirty())` replaces what
-                changed.
-            surface: what to mesh instead of what the settings say; for `raw`, `cells_of(take_dirty())` do.
+            blocks: (n, 3) int32 block coordinates. A mesh of `cells_to_mesh(take_dirty())` replaces the
+                changed parts.
+            surface: surface to mesh, instead of that of the settings; for `raw`, `cells_of(take_dirty())` do.
             fill_holes: close holes and gaps up to so many voxels wide with a guess that continues the field
-                (`surface/hole_filling.py`); the mesh's `guessed` says which triangles these are. Of a whole
-                map only, and all of its field has to fit into memory.
-            texture: the map's keyframes at their poses, a list or anything that can be read again and again:
+                (`surface/hole_filling.py`); the mesh's `guessed` marks these triangles. Of a whole map only,
+                and all of its field has to fit into memory.
+            texture: the map's keyframes at their poses, a list or anything that can be read several times:
                 the mesh is a `TexturedMesh` with colours as sharp as their images (`texturing.textured`).
 
         Raises:
@@ -142,7 +142,7 @@ class ReadableMap(object_cards.Shown):
 
     @contextmanager
     def _own_buffers(self) -> Iterator[MeshBuffers]:
-        """Working memory for a mesh; who asks in a pause has others."""
+        """Working memory for a mesh; a mesh made within a pause has its own."""
         buffers, self._mesh_buffers = self._mesh_buffers, MeshBuffers()
         try:
             yield buffers
@@ -150,7 +150,9 @@ class ReadableMap(object_cards.Shown):
             self._mesh_buffers = buffers
 
     def whole_values(self, surface: Surface | None = None) -> WholeMapValues:
-        """Values that `extract_mesh` of the whole map meshes, for `mesh_cells`, while the map stays."""
+        """Values that `extract_mesh` of the whole map meshes, for `mesh_cells`; valid until the map
+        changes.
+        """
         return WholeMapValues(np.sort(self._store.keys), self._view(surface), field_regularizer.BATCH)
 
     def kept_values(self) -> KeptValues:
@@ -160,10 +162,10 @@ class ReadableMap(object_cards.Shown):
     def mesh_parts(
         self, folder: str | os.PathLike[str], min_weight: float | None = None, *, up: Up | None = None
     ) -> MeshParts:
-        """The mesh of the whole map, made tile by tile in bounded memory, to be saved: `extract_mesh`'s.
+        """Mesh of `extract_mesh` of the whole map, made tile by tile in bounded memory, to be saved.
 
         Args:
-            folder: where it waits in files without names.
+            folder: for unnamed files in which it waits.
             min_weight: as for `extract_mesh`.
             up: away from the ground; None = it is found.
 
@@ -175,44 +177,45 @@ class ReadableMap(object_cards.Shown):
         return MeshParts(parts, Path(folder), held=self.held, known_up=up)
 
     def mesh_run(self, keys: NDArray[np.int64], which: range) -> mesh_tiles.MeshRun:
-        """Some tiles of a larger map's mesh, of which this one holds `mesh_tiles.blocks_of_run` and around.
+        """Some tiles of a larger map's mesh. This map holds `mesh_tiles.blocks_of_run` of them, and their
+        surroundings.
 
         Args:
-            keys: of all of its blocks, sorted.
+            keys: of all blocks of the larger map, sorted.
             which: of its `mesh_tiles.tile_count` tiles.
         """
         least = self._checked_min_weight(None)
         return mesh_tiles.run(keys, which, self._store, least, self._view(None))
 
     def provenance(self, source: str | None = None) -> Provenance:
-        """Notes about the map for a file of its surface; its hash is taken anew.
+        """Notes about the map for a file of its surface, with a newly computed hash.
 
         Args:
-            source: file or folder that the map came from; its name is told, not where it lies.
+            source: file or folder that the map came from; the notes have its name, not its path.
         """
         return _provenance(self.meta, self.keyframes, self.map_hash(), self.config, source)
 
     def cells_to_mesh(self, dirty: NDArray[np.int32]) -> NDArray[np.int32]:
-        """The blocks whose mesh the changes to these blocks reach: (m, 3) int32.
+        """Blocks whose mesh depends on the changed blocks: (m, 3) int32.
 
-        They and their neighbours towards −x, −y, −z; the field carries a change into the blocks around first.
-        Of what is meshed raw, normals at the rim may be a keyframe behind.
+        These are the changed blocks, those into which the field carries the change, and their neighbours
+        towards −x, −y, −z. In a raw mesh, normals at the rim may be a keyframe behind.
         """
         return self._cells_reached(dirty, self.model.surface)
 
     def _cells_reached(self, dirty: NDArray[np.int32], surface: Surface) -> NDArray[np.int32]:
-        """Cells to mesh again, as `cells_to_mesh`, of a surface."""
+        """Cells to mesh again, as `cells_to_mesh`, for a surface."""
         return cells_of(unpack_keys(self.values_reached(dirty, surface)))
 
     def values_reached(self, dirty: NDArray[np.int32], surface: Surface | None = None) -> NDArray[np.int64]:
-        """Keys of the blocks whose values changes to these blocks (n, 3) reach: `KeptValues.forget` them."""
+        """Keys of the blocks whose values depend on the changed blocks (n, 3), for `KeptValues.forget`."""
         keys, surface = pack_keys(dirty), surface or self.model.surface
         if surface == "normal":
             return field_regularizer.around(keys, self._store, 1)
         return field_regularizer.spread(keys, self._store, self._field) if surface == "field" else keys
 
     def diff(self, later: "ReadableMap", *, tolerance: float | None = None) -> MapDifference:
-        """Differences in a later map of the same frame, in numbers and as a coloured mesh.
+        """Differences to a later map of the same frame, in numbers and as a coloured mesh.
 
         Args:
             later: the other map.
@@ -249,11 +252,11 @@ class ReadableMap(object_cards.Shown):
 
         Args:
             path: the file; `.npz`, `.zarr` or `.vdb`.
-            dense: one array around the whole map, instead of its blocks; not of OpenVDB.
+            dense: one array around the whole map, instead of its blocks; not for OpenVDB.
             field: `tsdf`, signed distances as fused with weights and colours, or `distance`, the Euclidean
                 distance field.
             max_distance, min_weight: of the distance field, as for `distance_blocks`.
-            watch: told the bytes of the arrays that are written, and all of them (not of OpenVDB).
+            watch: called with the bytes written so far and in all (not for OpenVDB).
 
         Raises:
             InvalidConfig: for another suffix or field; OutputError: for an empty map, a box that is too
@@ -268,7 +271,7 @@ class ReadableMap(object_cards.Shown):
     def map_hash(self) -> str:
         """Hex digest of the exact sums: equal for the same keyframes in any order, on any number of threads.
 
-        Colour and smoothed values are not part of it (colour may travel lossily; smoothing has an order).
+        It leaves out colour, which may travel lossily, and smoothed values, which depend on order.
         """
         digest = begin_hash(self.config.voxel_size)
         for keys, sums in self._store.in_order("sums"):
@@ -292,7 +295,6 @@ class ReadableMap(object_cards.Shown):
             raise MapError(f"the maps have voxels of {ours:g} m and {theirs:g} m: fuse one of them again")
 
     def _checked_min_weight(self, min_weight: float | None) -> float:
-        """Least weight as given, or the sensor's."""
         if min_weight is None:
             min_weight = self.model.min_weight
         most = integrate.WEIGHT_LIMIT / WEIGHT_ONE
@@ -313,7 +315,7 @@ class ReadableMap(object_cards.Shown):
         )
 
     def _view(self, surface: Surface | None) -> SurfaceView:
-        """The function that reads a surface's signed distances from the map."""
+        """Function that reads a surface's signed distances from the map."""
         surface = surface or self.model.surface
         if surface not in get_args(Surface):
             raise InvalidConfig(f"surface must be one of {', '.join(get_args(Surface))}, got {surface!r}")
@@ -325,7 +327,7 @@ class ReadableMap(object_cards.Shown):
 
 
 def map_provenance(header: CheckpointHeader) -> Provenance:
-    """Provenance of a saved map's surface, as `ReadableMap.provenance`, by its header."""
+    """Provenance of a saved map's surface from its header, as `ReadableMap.provenance`."""
     return _provenance(header.meta, header.keyframes, header.map_hash, header.config, None)
 
 

@@ -80,7 +80,7 @@ class IntegrateStats(msgspec.Struct, frozen=True):
 
 
 class VolumeStats(msgspec.Struct, frozen=True):
-    """Size of the map. `bytes` is that of the blocks and their hash, without `scratch_bytes`."""
+    """Size of the map. `bytes` counts the blocks and their hash, without `scratch_bytes`."""
 
     keyframes: int
     blocks: int
@@ -179,7 +179,7 @@ class Volume(AskableMap):
     if not TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Any:
-            """Say what stands for a name of other libraries."""
+            """Answer a name of another library with its counterpart."""
             hint = instead(name, OTHER_NAMES_OF_VOLUME, dir(type(self)))
             raise AttributeError(f"Volume has no {name}{hint}")
 
@@ -188,7 +188,7 @@ class Volume(AskableMap):
     ) -> IntegrateStats:
         """Add a keyframe. On an error the map is as it was.
 
-        One without a usable sample changes nothing and is not counted; the first of them is a warning.
+        A keyframe without a usable sample changes nothing and is not counted; the first of them is a warning.
 
         Args:
             keyframe: also a dict of a keyframe's fields, or an object with such attributes.
@@ -196,7 +196,7 @@ class Volume(AskableMap):
             fields: a keyframe's fields instead: `integrate(points=…, T_world_camera=…)`.
 
         Raises:
-            InvalidKeyframe: what is given is no keyframe.
+            InvalidKeyframe: the arguments are no keyframe.
             MapFull: the keyframe or the map would exceed its limit of blocks, or the keyframe its `quota`.
             WeightOverflow: a voxel has taken as many votes as its integers hold.
         """
@@ -208,7 +208,7 @@ class Volume(AskableMap):
         return stats
 
     def why_no_samples(self, keyframe: Keyframe) -> str:
-        """Reason why `integrate` found no usable sample in a keyframe, and what to do, for a person."""
+        """Reason why a `keyframe` has no usable sample, and its cure, for a person."""
         model = self.config.model(keyframe.sensor)
         reach = VOXEL_LIMIT * self.config.voxel_size
         return why_no_samples(keyframe, model.min_range, model.max_range, reach)
@@ -263,7 +263,7 @@ class Volume(AskableMap):
         self.meta = map_history.added(self.meta, other.meta)
 
     def copy(self) -> "Volume":
-        """Another map of the same keyframes, settings and counts: what happens to one does not to the other.
+        """Copy of the map, its keyframes, settings and counts; later changes to one do not affect the other.
 
         Raises:
             MemoryError, MapFull: when there is no room for both.
@@ -286,14 +286,16 @@ class Volume(AskableMap):
         raise MapError("a Volume cannot be pickled: use save, and Volume.load where it is needed")
 
     def _parts_with(self, other: "Volume") -> tuple[Part, Part] | None:
-        """The places of both in one map of which they are parts that share no voxel; None = they are none."""
+        """Places of both in one map of which they are parts that share no voxel; None = they are no such
+        parts.
+        """
         if map_crop.PART_OF not in self.meta or map_crop.PART_OF not in other.meta:
             return None
         one, two = (map_crop.part_of(each.meta, each.map_hash()) for each in (self, other))
         return (one, two) if one is not None and two is not None and one.is_beside(two) else None
 
     def _join(self, other: "Volume", one: Part, two: Part) -> None:
-        """Add another part of the same map, of whose keyframes each is in both."""
+        """Add another part of the same map, with the same keyframes in both."""
         map_addition.add(self._store, other._store, self.config.max_blocks, are_parts=True)
         self.keyframes = max(self.keyframes, other.keyframes)
         own = self.map_hash()
@@ -333,7 +335,7 @@ class Volume(AskableMap):
         return cropped
 
     def _has_content_of(self, other: "Volume") -> bool:
-        """True if the other map has the same sums; hashed only where the counts do not tell."""
+        """True if the other map has the same sums; hashed only if the counts do not tell."""
         counts = [(one.keyframes, one._store.count) for one in (self, other)]
         return counts[0] == counts[1] and all(
             hash_of(self) == hash_of(other) for hash_of in (Volume.map_hash, Volume.color_hash)
@@ -356,13 +358,13 @@ class Volume(AskableMap):
         return blocks
 
     def changed_blocks(self) -> NDArray[np.int32]:
-        """The blocks that `take_dirty` would take, which still will."""
+        """Blocks that the next `take_dirty` returns; they stay marked."""
         store = self._store
         changed = np.flatnonzero(store.dirty[: store.count] & MESHED)
         return unpack_keys(np.concatenate([store.keys[changed], *self._released]))
 
     def release_empty(self) -> int:
-        """Give up the blocks that `retract` has left without votes; returns how many.
+        """Remove the blocks that `retract` has left without votes. Returns their number.
 
         The map stays the same, as if it were saved and loaded. Blocks that come later take their room.
         """
@@ -521,29 +523,27 @@ class Volume(AskableMap):
         return blocks[((blocks >= np.array(low)) & (blocks < np.array(high))).all(axis=1)]
 
     def limit_memory(self, nbytes: int) -> None:
-        """Let a keyframe fail with MemoryError from now on if the map, with it, would take more bytes.
+        """Let a keyframe fail with MemoryError from now on if the map would take more than `nbytes` with it.
 
-        The map stays as it is, also where it takes more already. Working memory is not counted. In a map with
+        The map stays as it is, even if it takes more already. Working memory is not counted. In a map with
         `memory_bytes` no keyframe fails: its coldest blocks leave memory instead.
         """
         self._store.limit(nbytes)
 
     def set_pause(self, pause: Callable[[], None]) -> None:
-        """Let a function be called between steps that leave the map alone: of meshes, hashes, saving, and
-        before a keyframe's rays are added.
-
-        It may ask the map anything, and must not change it.
+        """Call a function, `pause`, between steps that leave the map alone: of meshes, hashes, saving, and
+        before a keyframe's rays are added. It may ask the map anything, and must not change it.
         """
         self._store.pause = pause
 
     @property
     def arch(self) -> Arch:
-        """Device that fuses keyframes: as the settings say, or `cpu` where that device is missing."""
+        """Device that fuses keyframes: that of the settings, or `cpu` if it is missing."""
         return "cpu" if self._device is None else self._device.arch
 
     @property
     def most_blocks(self) -> int:
-        """Number of blocks that the map may have, by its settings and by `limit_memory`."""
+        """Greatest number of blocks, by the settings and by `limit_memory`."""
         return min(self.config.max_blocks, self._store.most_blocks)
 
     def _apply(self, keyframe: Keyframe, sign: int) -> IntegrateStats:
@@ -578,7 +578,7 @@ class Volume(AskableMap):
 def _writers(
     store: BlockStore, device: DeviceBlocks | None, config: VolumeConfig
 ) -> tuple[RayBuffers, Integrator]:
-    """Maker of rays of keyframes, which adds them to a map."""
+    """Maker of rays of keyframes, and the integrator that adds them to a map."""
     if device is None:
         buffers = RayBuffers(color=config.color, regularised=store.corrected)
         return buffers, Integrator(store, buffers, config)
@@ -587,12 +587,12 @@ def _writers(
 
 
 def _number(value: Any) -> Any:
-    """A number of NumPy's as Python's: 0.05 in float32 is 0.05."""
+    """Python number of a NumPy one: 0.05 in float32 is 0.05."""
     return float(str(value)) if isinstance(value, np.floating) else value
 
 
 def _keyframe(keyframe: Any, others: tuple[object, ...], fields: Mapping[str, Any]) -> Keyframe:
-    """The keyframe of a call; other values by position are those of another library."""
+    """Keyframe of a call; further values by position are those of another library."""
     if others:
         return keyframe_of((keyframe, *others))
     return keyframe_of(fields if keyframe is None and fields else keyframe)

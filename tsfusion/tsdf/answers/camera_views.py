@@ -19,8 +19,6 @@ MOST_TRIANGLES = 1 << 21  # that are drawn at a time
 
 
 class _Wanted(NamedTuple):
-    """Images of a view beside depth."""
-
     normals: bool
     colors: bool
 
@@ -38,7 +36,7 @@ def cast(
     normals: bool = True,
     colors: bool = True,
 ) -> View:
-    """The view, (H, W), of a surface: of the tiles before the camera; `normals`, `colors`: if with them."""
+    """View, (H, W), of the tiles before the camera; `normals` and `colors` add these images."""
     camera = intrinsics, T_world_camera, shape
     with np.errstate(over="ignore", invalid="ignore"):  # a focal length may be next to none
         numbers = _in_view(tiles, *camera).tolist()
@@ -57,7 +55,7 @@ def cast_settled(
     normals: bool = True,
     colors: bool = True,
 ) -> View | None:
-    """As `cast`, of the map as it was when it was settled; None where that is not kept any more."""
+    """As `cast`, of the map's settled state. Returns None where that is no longer kept."""
     camera = intrinsics, T_world_camera, shape
     with np.errstate(over="ignore", invalid="ignore"):
         meshes = tiles.settled_meshes(_in_view(tiles, *camera).tolist())
@@ -73,7 +71,6 @@ def _of_meshes(
     shape: tuple[int, int],
     wanted: _Wanted,
 ) -> View:
-    """The view of all of some meshes."""
     camera = intrinsics, T_world_camera, shape
     parts = _parts(meshes, wanted)
     seen = look_at(next(parts, _NOTHING), *camera, wanted)
@@ -91,7 +88,7 @@ def look_at(
     shape: tuple[int, int],
     wanted: _Wanted = _ALL,
 ) -> View:
-    """The view of a mesh, (H, W): depth, and normals and colours that are wanted, of the first front side."""
+    """View of a mesh, (H, W): depth, and the wanted normals and colours, of the first front side."""
     focal = intrinsics.fx
     seen, vertices, faces = rasterised(mesh, intrinsics, T_world_camera, shape)
     of_normals = mesh.normals if wanted.normals else _NOTHING.normals
@@ -108,10 +105,10 @@ def look_at(
 def rasterised(
     mesh: Mesh, intrinsics: Intrinsics, T_world_camera: NDArray[np.float64], shape: tuple[int, int]
 ) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.int32]]:
-    """View of each pixel, as `rasterizer.rasterise` writes it, and the vertices and faces that it drew.
+    """Hits of each pixel, as `rasterizer.rasterise` writes them, with the drawn vertices and faces.
 
-    The rasteriser knows one focal length and a centred image. A shear of space that keeps z makes any
-    pinhole camera such a one.
+    The rasteriser knows one focal length and a centred image. A shear of space that keeps z turns any pinhole
+    camera into such a one.
     """
     height, width = shape
     K, focal = intrinsics, intrinsics.fx
@@ -128,7 +125,7 @@ def rasterised(
 def _in_view(
     tiles: SurfaceTiles, intrinsics: Intrinsics, T_world_camera: NDArray[np.float64], shape: tuple[int, int]
 ) -> NDArray[np.int64]:
-    """Numbers of the tiles that may be seen, the nearest first."""
+    """Numbers of the tiles that may be seen, nearest first."""
     numbers, side = tiles.numbers(), tiles.side_m
     centres = (unpack_keys(numbers) + 0.5) * side - T_world_camera[:3, 3]
     centres = centres @ T_world_camera[:3, :3]
@@ -146,7 +143,7 @@ def _in_view(
 
 
 def _parts(meshes: Iterator[Mesh], wanted: _Wanted) -> Iterator[Mesh]:
-    """Meshes with what is wanted of them, joined up to `MOST_TRIANGLES`."""
+    """Meshes joined up to `MOST_TRIANGLES`."""
     part: list[Mesh] = []
     triangles = 0
     for mesh in meshes:
@@ -172,7 +169,6 @@ def _joined(meshes: list[Mesh], wanted: _Wanted) -> Mesh:
 
 
 def _nearer(one: View, other: View) -> View:
-    """Nearer of two views of a camera, pixel by pixel."""
     is_other = (other.depth > 0) & ((one.depth == 0) | (other.depth < one.depth))
     for ours, theirs in ((one.depth, other.depth), (one.normals, other.normals), (one.colors, other.colors)):
         if ours is not None and theirs is not None:

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Euclidean distances to the map's surface, in a box or block by block.
 
-A site is a voxel within half a voxel of the surface, or the nearer one of two neighbours that lie on its two
-sides: as they were fused, not smoothed, so that a distance depends on no more than the map's sums around it.
-The exact transform finds each voxel's nearest site; its distance is that to the surface at this site, which
-the signed distances there place within the voxel.
+A site is a voxel within half a voxel of the surface, or the nearer one of two neighbours on its two sides.
+Sites come from the fused values, not from smoothed ones: a distance depends only on the map's sums around it.
+The exact transform finds each voxel's nearest site. The signed distances there place the surface within that
+voxel.
 """
 
 import math
@@ -87,7 +87,7 @@ def in_box(
 
 
 def in_blocks(store: BlockStore, max_distance: float, min_weight: float) -> Iterator[FieldBlocks]:
-    """Distances of the whole map in memory for one tile: see `AskableMap.distance_blocks`."""
+    """Distances of the whole map, with memory for one tile: see `AskableMap.distance_blocks`."""
     reach = Reach(max_distance, store.voxel_size)
     _checked_shape(np.full(3, 8 * _TILE + 2 * (reach.margin + 8)), whole=True)
     blocks = unpack_keys(store.keys)
@@ -108,7 +108,7 @@ def in_blocks(store: BlockStore, max_distance: float, min_weight: float) -> Iter
 def _near(
     store: BlockStore, first: NDArray[np.int32], end: NDArray[np.int32], reach: Reach, min_weight: float
 ) -> Iterator[FieldBlocks]:
-    """The blocks in a box of blocks in which a distance is less than the largest."""
+    """Blocks in a box of blocks in which a distance is less than the largest."""
     edges = 8 * store.voxel_size * np.concatenate([first, end])
     field = in_box(store, edges.tolist(), reach.metres, min_weight, subvoxel=True)
     sides = (end - first).tolist()
@@ -129,7 +129,7 @@ def occupancy_of(values: NDArray[np.float32]) -> NDArray[np.int8]:
 
 
 def _bounds(store: BlockStore) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The box around the blocks that hold votes, in voxels."""
+    """Box around the blocks that hold votes, voxels."""
     used = store.used()
     if not len(used):
         raise MapError("the map is empty: there is no box around it; give one")
@@ -158,7 +158,7 @@ def _checked_shape(shape: NDArray[np.int64], *, whole: bool) -> Shape:
 def _read(
     store: BlockStore, first: NDArray[np.int64], shape: Shape, min_weight: float
 ) -> NDArray[np.float32]:
-    """Signed distances in voxels of a box of whole blocks, flat; NaN where unseen."""
+    """Signed distances, voxels, of a box of whole blocks, flat; NaN where unseen."""
     coordinates = unpack_keys(store.keys).astype(np.int64) - first
     count = np.array(shape) // 8
     inside = ((coordinates >= 0) & (coordinates < count)).all(axis=1)
@@ -175,7 +175,7 @@ def _read(
 
 
 def _clear(store: BlockStore, first: NDArray[np.int64], shape: Shape) -> NDArray[np.bool_]:
-    """Mask of the voxels of a box of whole blocks that lie in blocks that are free as a whole."""
+    """Mask of the voxels that lie in wholly free blocks, for a box of whole blocks."""
     keys, counts = store.clear.counts()
     found, places = np.zeros([side // 8 for side in shape], bool), unpack_keys(keys) - first
     inside = ((places >= 0) & (places < found.shape)).all(axis=1) & (counts > 0)
@@ -188,11 +188,10 @@ def _clear(store: BlockStore, first: NDArray[np.int64], shape: Shape) -> NDArray
 def _nearest_sites(
     values: NDArray[np.float32], shape: Shape, low: Shape, extent: Shape, reach: Reach
 ) -> Nearest:
-    """The nearest sites of the voxels of a box in the grid."""
     found = np.empty(values.size, np.int32), np.empty(values.size, np.int32)
     kernels.mark_sites(values, *shape, 0, shape[0], 0, *found)
     sides = list(shape)
-    # First along the axis that leaves the least for the others: for a slice, across it
+    # First along the axis that leaves the fewest lines: for a slice, across it
     for axis in sorted(range(3), key=lambda a: extent[a] / shape[a]):
         length, inner = sides[axis], math.prod(sides[axis + 1 :])
         sides[axis] = extent[axis]
@@ -213,10 +212,8 @@ def spread(
     places: tuple[int, int],
     reach: Reach,
 ) -> Nearest:
-    """Carry distances along some lines of a grid (…, length, inner), from all places to some; returns `into`.
-
-    Args:
-        line: length and inner.
+    """Carry distances along grid lines (…, length, inner) to the given places; `line` = (length, inner).
+    Returns `into`.
     """
     stack = np.empty((kernels.BANDS, line[0], 2), np.int32)
     kernels.spread_along_lines(*found, *line, *lines, *places, reach.most_squared, stack, *into)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Slices of the map between two heights, kept current as keyframes come: occupancy and horizontal distances.
+"""Slices of the map between two heights, updated as keyframes come: occupancy and horizontal distances.
 
-A cell is a column of samples between the heights. What it holds is a function of the sums at these samples:
-that is read again for the cells above changed blocks, and distances are counted again as far as these reach.
+A cell is a column of samples between the heights; its value depends only on the sums at these samples. Cells
+above changed blocks are read again, and distances are computed again as far as the changed cells reach.
 """
 
 import math
@@ -38,7 +38,7 @@ Rectangle = tuple[int, int, int, int]  # first row, first column, end row, end c
 
 
 def axes_of(up: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(3, 3) rows: the map's x axis as seen from above (y, where x is up), what is left of it, and up."""
+    """(3, 3) rows: the map's x axis (y, where x is up) as seen from above, the axis to its left, and up."""
     up = up / np.linalg.norm(up)
     ahead = np.eye(3)[0] if abs(up[0]) < 0.9 else np.eye(3)[1]
     ahead = ahead - (ahead @ up) * up
@@ -48,9 +48,9 @@ def axes_of(up: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 class CurrentSlice:
-    """A slice that follows the map: `update` it with the blocks that have changed.
+    """Slice that follows the map; `AskableMap.current_slice` makes it.
 
-    Made by `AskableMap.current_slice`. After `update` it holds what a new one would.
+    After `update` with the changed blocks it equals a new slice.
     """
 
     def __init__(
@@ -109,10 +109,8 @@ class CurrentSlice:
         return float(centres.min(initial=np.inf)) - half, float(centres.max(initial=-np.inf)) + half
 
     def update(self, blocks: NDArray[np.int32]) -> bool:
-        """Follow the map after a change; returns whether the slice has changed.
-
-        Args:
-            blocks: (n, 3) int32, those of `Volume.take_dirty`.
+        """Follow the changed blocks, (n, 3) int32, of `Volume.take_dirty`. Returns True if the slice has
+        changed.
         """
         cells = self._changed_cells(np.asarray(blocks, np.float64).reshape(-1, 3))
         if not len(cells):
@@ -127,7 +125,7 @@ class CurrentSlice:
         return bool(len(moved)) or bool((self._seen[cells] != before[1]).any())
 
     def _changed_cells(self, blocks: NDArray[np.float64]) -> NDArray[np.int32]:
-        """Cells above changed blocks, and above those that are looked through since, or not any more."""
+        """Cells above changed blocks, and above blocks that have become free, or are free no longer."""
         others = self._store.clear.changed_since(self._noted)
         self._noted = self._store.clear.noted
         if others is None:
@@ -135,11 +133,10 @@ class CurrentSlice:
         return self._cells_above(np.concatenate([blocks, unpack_keys(others)]))
 
     def occupancy(self) -> OccupancySlice:
-        """The slice's occupancy."""
         return OccupancySlice(self.grid, self._cells(), self._carved or len(self._store.clear) > 0)
 
     def distances(self, *, unseen_is_free: bool = False) -> DistanceSlice:
-        """The slice's distances; 0 where nothing was seen, unless that is to count as free."""
+        """Distances; 0 where nothing was seen, unless unseen counts as free."""
         cells, distance = self._cells(), self._inside(self._distance).copy()
         distance = blocked(distance, cells, unseen_is_free=unseen_is_free)
         return DistanceSlice(self.grid, distance, cells, self._reach.metres)
@@ -156,7 +153,6 @@ class CurrentSlice:
         return flat.reshape(self._shape)[m:-m, m:-m]
 
     def _read(self, cells: NDArray[np.int32]) -> None:
-        """Read the samples of some cells."""
         store, grid, n = self._store, self.grid, self._across
         size = store.voxel_size
         along_column, along_row = (axis * (grid.resolution / n / size) for axis in grid.axes[:2])
@@ -175,7 +171,7 @@ class CurrentSlice:
             self._values[part] *= np.float32(size / grid.resolution)
 
     def _cells_above(self, blocks: NDArray[np.float64]) -> NDArray[np.int32]:
-        """Numbers of the cells with a sample in one of some blocks; a few beside them."""
+        """Numbers of the cells with a sample in one of the blocks, and of a few beside them."""
         grid, block = self.grid, 8 * self._store.voxel_size
         centres = (blocks + 0.5) * block @ grid.axes.T
         half = block / 2 * np.abs(grid.axes).sum(axis=1) + 1e-6 * block  # as samples are rounded
@@ -194,10 +190,10 @@ class CurrentSlice:
         return np.flatnonzero(reached).astype(np.int32)
 
     def _count(self, changed: Rectangle) -> None:
-        """Count distances again, as far as changed cells reach."""
+        """Compute distances again, as far as changed cells reach."""
         rows, columns = self._shape
         top, left, bottom, right = changed
-        # cells beside them may become sites, or have their surface elsewhere
+        # Cells beside them may become sites, or their surface may move
         top, bottom = max(top - 1, 0), min(bottom + 1, rows)
         left, right = max(left - 1, 0), min(right + 1, columns)
         reach = self._reach.margin
@@ -268,7 +264,7 @@ def _cell_range(box: Sequence[float], edge: float) -> tuple[NDArray[np.int64], N
 
 
 def _box_around(store: BlockStore, axes: NDArray[np.float64]) -> list[float]:
-    """The rectangle around all blocks that hold votes, in the slice's frame."""
+    """Rectangle around all blocks that hold votes, in the slice's frame."""
     used = store.used()
     if not len(used):
         raise MapError("the map is empty: there is no box around it; give one")

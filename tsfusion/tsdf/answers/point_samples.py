@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The map's signed distance at points: which blocks are read, for `kernels/answers/point_sampling.py`."""
+"""Signed distances at points: the choice of blocks for `kernels/answers/point_sampling.py`."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ _MOST_SOLVED = 1 << 14  # blocks whose values are gathered at a time: 32 MB
 def sample(
     points: NDArray[np.floating], store: BlockStore, min_weight: float, view: SurfaceView = values_of
 ) -> Samples:
-    """Samples of a surface's distances at points (n, 3), metres."""
+    """Samples of a surface's signed distances at points (n, 3), metres."""
     count = len(points)
     whole = Samples(
         np.empty(count, np.float32), np.empty(count, np.float32), np.empty((count, 3), np.float32)
@@ -69,10 +69,7 @@ def _fill(
 def _table(
     keys: NDArray[np.int64], most: int
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]] | None:
-    """Table of blocks by their place: `rows`, `begin` and `size` of `interpolate_within`.
-
-    None where these blocks lie so far apart that the table would have more than `most` numbers.
-    """
+    """Table by place: `rows`, `begin`, `size` of `interpolate_within`; None = more than `most` numbers."""
     blocks = unpack_keys(keys)
     begin = blocks.min(axis=0) - 2
     size = blocks.max(axis=0) + 2 - begin
@@ -84,7 +81,7 @@ def _table(
 
 
 def _needed(points: NDArray[np.floating], store: BlockStore) -> NDArray[np.intp]:
-    """Slots of the blocks that the points need, in the order of their keys."""
+    """Slots of the blocks that the points need, in key order."""
     is_needed = np.zeros(store.count, np.uint8)
     point_sampling.list_blocks(points, 1 / store.voxel_size, store.hash_keys, store.hash_slots, is_needed)
     slots = np.flatnonzero(is_needed)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The blocks of a map on a device, and which of them differ from the rows that its `BlockStore` has."""
+"""Blocks of a map on a device, and the rows that differ from those of its `BlockStore`."""
 
 import weakref
 from typing import Any, Literal
@@ -18,8 +18,9 @@ _CHUNK = 4096  # blocks copied at a time: 42 MB with colour
 
 
 class DeviceBlocks(DeviceRows):
-    """Keyframes are added on the device. The store's rows follow when somebody reads them (`fetch`), and the
-    device's when somebody has written to the store's (`send`)."""
+    """Rows on the device, to which keyframes are added. `fetch` brings the store's rows up to date before a
+    read; `send` brings the device's up to date after a write to the store.
+    """
 
     first_blocks = FIRST_BLOCKS
     is_none = False

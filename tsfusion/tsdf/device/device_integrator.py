@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Rays and integration where the map's blocks are on a device: the transaction is `Integrator`'s."""
+"""Rays and integration of a map whose blocks are on a device: the transaction is `Integrator`'s."""
 
 from collections.abc import Sequence
 from typing import Any, Literal
@@ -26,7 +26,7 @@ from tsfusion.tsdf.store.block_store import BlockStore
 
 
 class DeviceRayBuffers(RayBuffers):
-    """The rays stay on the device; here are their bands, and what a launch says about blocks."""
+    """Bands of rays that stay on the device, and what a launch reports about blocks."""
 
     def __init__(self, *, color: bool) -> None:
         super().__init__(color=color, regularised=False)
@@ -35,8 +35,7 @@ class DeviceRayBuffers(RayBuffers):
         self.is_light = False  # whether no lane can overflow that has reserve for a part
 
     def note_told(self, told: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Take over what a launch tells of blocks; returns the slots of those that are touched for the first
-        time."""
+        """Take over a launch's report on blocks. Returns the slots of blocks touched for the first time."""
         new = told[FRESH_AT + 2 * told[NEW] :]
         self._touched.reserve(TOUCHED_HEADER)
         self.touched[:TOUCHED_HEADER] = told[:TOUCHED_HEADER]
@@ -53,7 +52,7 @@ class DeviceRayBuffers(RayBuffers):
         self.touched[TOUCHED_COUNT] += len(slots)
 
     def share_out(self, units: int) -> None:
-        """Nothing: each ray has a thread of its own."""
+        """No work: each ray has a thread of its own."""
 
     def note_missing(self, keys: NDArray[np.int64]) -> None:
         """Take over the keys of missing blocks, in order."""
@@ -84,14 +83,14 @@ class DeviceRayBuffers(RayBuffers):
         self._ask("image_rays", image, *rest)
 
     def _ask(self, kind: str, measured: NDArray[Any], *rest: Any) -> None:
-        """Note which rays are to be made: that and what is to be done with them is one call."""
+        """Note the rays to be made: making and adding them is one call."""
         self.asked = kind, measured, *rest
         samples = len(measured) if kind == "point_rays" else measured.size
         self.is_light = samples * WEIGHT_ONE < PART_WEIGHT
 
 
 class DeviceIntegrator(Integrator):
-    """The one writer of a map's sums on a device."""
+    """Only writer of a map's sums on a device."""
 
     _buffers: DeviceRayBuffers
 
@@ -100,12 +99,12 @@ class DeviceIntegrator(Integrator):
     ) -> None:
         super().__init__(store, buffers, config)
         self._device = device
-        # What the first launch told, and keys of missing blocks, when it was made
+        # Report of the first launch, and keys of missing blocks
         self._ahead: tuple[NDArray[np.int32], NDArray[np.int64]] | None = None
         self._has_inserted = False  # it has inserted the missing blocks, too
 
     def _begin(self, sign: int) -> None:
-        """Make the rays, and add them in the same call: nearly always all of them are one part."""
+        """Make the rays and add them in the same call: nearly always all of them are one part."""
         super()._begin(sign)
         store, buffers, config = self._store, self._buffers, self._config
         store.send()
@@ -181,12 +180,11 @@ class DeviceIntegrator(Integrator):
 
 
 def keys_told(told: NDArray[np.int32], found: Sequence[NDArray[Any]]) -> NDArray[np.int64]:
-    """Keys of the blocks that a launch has made blocks of the map, or of those that it found missing."""
+    """Keys of the blocks that a launch has inserted, or found missing."""
     if new := int(told[NEW]):
         return told[FRESH_AT : FRESH_AT + 2 * new].view(np.int64)
     return found[1].copy() if len(found) > 1 else np.empty(0, np.int64)
 
 
 def _bands(told: NDArray[np.int32]) -> NDArray[np.int32]:
-    """The bands in what a launch tells."""
     return told[BANDS_AT:FRESH_AT].reshape(-1, BAND_FIELDS)

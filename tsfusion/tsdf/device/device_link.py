@@ -39,11 +39,11 @@ _ANSWER_S = 0.002  # in which a GPU answers
 
 
 class DeviceLost(RuntimeError):
-    """The process with the device has ended, or a kernel failed on it: what it had added since the map was
-    last read is lost.
+    """Error of a device process that has ended, or on which a kernel failed: additions since the map was last
+    read are lost.
 
-    This is no TsfusionError on purpose: no keyframe is to blame, and nothing may go on with the map. A fuser
-    that ends with it is started again, and fuses what its journal has beyond the last checkpoint.
+    It is no TsfusionError: no keyframe is to blame, and nothing may continue with the map. A fuser that ends
+    with it is started again, and fuses the journal's records after the last checkpoint.
     """
 
 
@@ -51,11 +51,7 @@ class DeviceLink:
     """Calls to a device, one after the other, from the thread that uses maps."""
 
     def __init__(self, arch: Arch) -> None:
-        """Start the process.
-
-        Raises:
-            DeviceLost: when there is no such device; the message says why.
-        """
+        """Start the process. Raises DeviceLost, with the reason, without such a device."""
         self.arch = arch
         self.is_trusted = False  # whether it was tried
         self._has_ended = False
@@ -85,27 +81,23 @@ class DeviceLink:
         return self._has_ended
 
     def new_map(self, layers: tuple[str, ...]) -> int:
-        """Make an empty map on the device; returns its number.
-
-        Raises:
-            MemoryError, DeviceLost: as `call`.
-        """
+        """Make an empty map on the device. Returns its number. Raises as `call`."""
         self._maps += 1
         self.call(self._maps, "make", layers)
         return self._maps
 
     def forget_later(self, number: int) -> None:
-        """Let a map go before the next call: this may be called at any time, also during one."""
+        """Release a map before the next call; safe at any time, also during a call."""
         self._forgotten.append(number)
 
     def call(self, number: int, verb: str, *arguments: Any, first: Sequence[Step] = ()) -> Any:
-        """Call a method of a map (`DeviceMap`); arrays in the result are valid until the next call.
+        """Call a method of a map (`DeviceMap`). Arrays in the result are valid until the next call.
 
         Args:
             number: of the map.
             verb: name of the method.
             arguments: of the method; arrays are copied.
-            first: methods that are called before, and their arguments; if one fails, the others are not.
+            first: methods called before it, with their arguments; one that fails stops the rest.
 
         Raises:
             MemoryError: the device has no memory for more; the map is as it was.
@@ -129,8 +121,7 @@ class DeviceLink:
         return self._receive(None)
 
     def _packed(self, arguments: Sequence[Any]) -> tuple[list[Any], list[SentArray]]:
-        """Arguments as they are sent, and the arrays among them: of large ones the place in the memory that
-        both processes have."""
+        """Arguments as sent, and the arrays among them; a large one is sent as its place in shared memory."""
         values, arrays = list(arguments), list[SentArray]()
         for i, one in enumerate(arguments):
             if isinstance(one, np.ndarray):
@@ -161,7 +152,7 @@ class DeviceLink:
         return found
 
     def close(self) -> None:
-        """End the process, and with it its maps."""
+        """End the process and its maps."""
         if self._has_ended:
             return
         self._has_ended = True
@@ -181,8 +172,7 @@ _missing = set[Arch]()
 
 
 def link_to(arch: Arch) -> DeviceLink | None:
-    """The process with a device, which all maps of this process share; None = there is none, which is logged
-    once."""
+    """Process with a device, shared by all maps of this process; None = without one, which is logged once."""
     if arch == "cpu" or arch in _missing:
         return None
     link = _links.get(arch)
@@ -197,7 +187,7 @@ def link_to(arch: Arch) -> DeviceLink | None:
 
 
 def refuse(link: DeviceLink, why: str) -> None:
-    """Let all maps of this process be on the CPU, and say why."""
+    """Put all maps of this process on the CPU, and log the reason."""
     link.close()
     _missing.add(link.arch)
     log.warning("the device %s cannot be used: %s; keyframes are fused on the CPU", link.arch, why)

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""A map's blocks in the memory of a device: all that integration reads and writes (`ti.ndarray`).
+"""Blocks of a map in the memory of a device: all that integration reads and writes (`ti.ndarray`).
 
-`device_process` has one for each map of its parent's, whose `BlockStore` gives out slots and keeps what
-nobody adds to. A call brings in a keyframe, or takes out what it touched; nothing else is copied.
+`device_process` has one for each map of its parent process. The parent's `BlockStore` gives out slots and
+keeps the layers that integration does not change. A call copies in a keyframe and copies out the blocks it
+touched, no more.
 """
 
 from collections.abc import Iterator
@@ -51,8 +52,9 @@ class LaunchJob(NamedTuple):
 
 
 class Room(NamedTuple):
-    """Limits of a keyframe: new blocks for which all memory is there, blocks touched, and Σ of what its rays
-    and its new blocks cost (`integrator.KeyframeQuota`)."""
+    """Limits of a keyframe: new blocks for which all memory is there, touched blocks, and the cost of its
+    rays and new blocks (`integrator.KeyframeQuota`).
+    """
 
     new: int
     touched: int
@@ -61,7 +63,7 @@ class Room(NamedTuple):
 
 
 class DeviceMap:
-    """The blocks of one map, as numbered by its `BlockStore`, and the rays of its current keyframe."""
+    """Blocks of one map, as numbered by its `BlockStore`, and the rays of its current keyframe."""
 
     def __init__(self, layers: tuple[str, ...], copies: Copies) -> None:
         self._layer_names = layers
@@ -87,12 +89,11 @@ class DeviceMap:
     def fuse(
         self, kind: str, job: tuple[int, ...] | None, room: tuple[int, ...], *arguments: Any
     ) -> tuple[NDArray[Any], ...]:
-        """Make a keyframe's rays, as the function of this name in `device_rays` of these arguments,
-        and add them, if there is a `LaunchJob`. Missing blocks are then blocks of the map, if there is `Room`
-        for them, and `NEW` of what is told says so.
+        """Make a keyframe's rays with the function `kind` of `device_rays`, and add them, if there is a
+        `LaunchJob`.
 
-        Returns:
-            As `add`.
+        Missing blocks are then inserted, if there is `Room` for them; `NEW` of the report says so. Returns as
+        `add`.
         """
         is_image = kind == "image_rays"
         kernel = device_rays.fuse_image if is_image else device_rays.fuse_points
@@ -124,7 +125,7 @@ class DeviceMap:
         return self._news(told, missing)
 
     def _room_for_image(self, height: int, width: int) -> tuple[Any, Any]:
-        """Make room for an image's rays; returns the scratch arrays of its kernel."""
+        """Make room for an image's rays. Returns the scratch arrays of its kernel."""
         tiles = rays_from_images.tiles_of(height, width)
         self._share_places(tiles, rays_from_images.TILE_SAMPLES)
         self._depths = _at_least(self._depths, ti.i32, rays_from_images.most_rays(height, width))
@@ -132,13 +133,12 @@ class DeviceMap:
         return self._depths, self._tiles
 
     def _room_for_points(self, count: int) -> tuple[Any]:
-        """Likewise for points."""
         self._share_places(count, 1)
         self._depths = _at_least(self._depths, ti.i32, count)
         return (self._depths,)
 
     def _share_places(self, units: int, places: int) -> None:
-        """Share out units of work to the bands, each of so many places for rays."""
+        """Distribute units of work over the bands, each with so many places for rays."""
         if (units, places) == self._shared:
             return
         self._shared = units, places
@@ -153,8 +153,8 @@ class DeviceMap:
         """Add rays to the map's blocks.
 
         Returns:
-            What is told of the keyframe (`device_integration`), with the slots of blocks that it
-            touches for the first time; and, if any are missing, the keys of missing blocks, in order.
+            Report of the keyframe (`device_integration`), with the slots of blocks touched for the first
+            time; and, if any are missing, the keys of missing blocks, in order.
         """
         job = LaunchJob(*given)
         self._launch(job, job.first_band, job.end_band)
@@ -172,8 +172,9 @@ class DeviceMap:
         return self._news(told, missing if job.which == integrate.ALL else missing[:0])
 
     def _news(self, told: NDArray[np.int32], missing: NDArray[np.int64]) -> tuple[NDArray[Any], ...]:
-        """The answer to the host: what a launch told, without slots that an earlier one told of and places
-        without a key; and missing blocks, in order."""
+        """Answer to the host: a launch's report, without slots reported before and places without a key; and
+        missing blocks, in order.
+        """
         known, self._known = self._known, int(told[TOUCHED_COUNT])
         told = np.concatenate([told[: FRESH_AT + 2 * told[NEW]], told[TOUCHED_AT + known :]])
         return (told, distinct(missing)) if len(missing) else (told,)
@@ -187,7 +188,7 @@ class DeviceMap:
         )  # fmt: skip
 
     def _read_results(self) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
-        """`told` of the last launch, and the keys of missing blocks, of which some may be there twice."""
+        """`told` of the last launch, and the keys of missing blocks, with duplicates."""
         size = TOUCHED_AT + min(_FEW_TOUCHED, self._stamps.shape[0])
         for _ in range(2):  # the second time, if it was not all
             (told,) = self._copies.read((self._told, size))
@@ -203,8 +204,8 @@ class DeviceMap:
         return told, found.copy()
 
     def _runs(self, first: int, end: int) -> Iterator[tuple[int, int]]:
-        """Runs of the bands whose updates fit into the list; it grows for a band that does not."""
-        # what a ray costs is no less than the voxels that it crosses
+        """Runs of bands whose updates fit into the list, which grows for a larger band."""
+        # The cost of a ray is no less than the number of voxels that it crosses
         costs = np.concatenate([[0], np.cumsum(self._costs)])
         while first < end:
             fits = int(np.searchsorted(costs, costs[first] + _LISTED, side="right")) - 1
@@ -232,8 +233,9 @@ class DeviceMap:
         keys: NDArray[np.int64],
         slots: NDArray[np.int32],
     ) -> None:
-        """Have `count` blocks, new ones with voxels of zero; their keys and slots are at these places of the
-        hash, which has `size` of them. With another size than before it is empty first."""
+        """Insert `count` blocks with zero voxels, with keys and slots at these places of the hash of `size`
+        places. A change of `size` empties the hash first.
+        """
         self._reserve(count)
         self._count = count
         if self._hash_keys.shape[0] != size:
@@ -244,7 +246,7 @@ class DeviceMap:
             self._copies.finish()
 
     def drop(self, count: int) -> None:
-        """Have `count` blocks, and none of them in the hash; voxels of slots beyond become zero."""
+        """Keep `count` blocks, none of them in the hash. Voxels of slots beyond become zero."""
         gone = np.arange(count, self._count, dtype=np.int32)
         for name in self._layer_names:
             if len(gone):
@@ -254,7 +256,7 @@ class DeviceMap:
         self._hash_keys.fill(0)
 
     def largest_weights(self, slots: NDArray[np.int32]) -> NDArray[np.int32]:
-        """The largest weight in each of these blocks."""
+        """Largest weight in each block."""
         self._marks = _at_least(self._marks, ti.i32, len(slots))
         handed = self._copies.given(slots)
         device_rows.largest_weights(self._layers["sums"], *handed, len(slots), self._marks)
@@ -270,11 +272,7 @@ class DeviceMap:
         device_rows.write_rows(self._layers[name], slots, rows)
 
     def _reserve(self, count: int) -> None:
-        """Make room for so many blocks.
-
-        Raises:
-            RuntimeError: when the device has none; the map is as it was.
-        """
+        """Make room for so many blocks. Raises RuntimeError without memory; the map is as it was."""
         capacity = self._stamps.shape[0]
         if count > capacity:
             size = max(count, 2 * capacity)
@@ -289,12 +287,11 @@ class DeviceMap:
 
 
 def bands_of(told: NDArray[np.int32]) -> NDArray[np.int32]:
-    """The bands in what is told."""
     return told[BANDS_AT:FRESH_AT].reshape(BANDS, BAND_FIELDS)
 
 
 def last_layer(kind: int) -> str:
-    """The layer that votes of this kind need beside `color_rgn`."""
+    """Layer that votes of this kind need beside `color_rgn`."""
     return "hits" if kind == integrate.HIT_VOTE else "color_b"
 
 
@@ -305,5 +302,4 @@ def _zeros(dtype: Any, *shape: int) -> Any:
 
 
 def _at_least(array: Any, dtype: Any, *shape: int) -> Any:
-    """The array, or a larger one of zeros."""
     return array if array.shape[0] >= shape[0] else _zeros(dtype, *shape)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """`python -m tsfusion.tsdf.device.device_process`: the process in which Taichi runs on a device.
 
-Taichi has one device a process. Whoever reads maps (meshes, the field, questions) does that on the CPU;
-`device_link` starts this process for it, and is at the other end of its connection.
+Taichi has one device a process. Readers of maps (meshes, the field, questions) run on the CPU. `device_link`
+starts this process and is the other end of its connection.
 """
 
 import signal
@@ -31,7 +31,7 @@ GROWS = ("make", "insert")  # what may fail for lack of memory, and then changes
 
 
 class _Device:
-    """Main loop of the process: it answers calls of maps by their numbers."""
+    """Main loop: it answers calls of maps by their numbers."""
 
     def __init__(self, link: socket.socket, requests: SharedArrays, replies: SharedArrays) -> None:
         self._link, self._requests, self._replies = link, requests, replies
@@ -40,7 +40,7 @@ class _Device:
         self._maps: dict[int, DeviceMap] = {}
 
     def run(self) -> None:
-        """Answer until the other end is closed."""
+        """Answer until the other end closes."""
         with suppress(OSError):
             while True:
                 look_out(self._link.fileno(), NEXT_S)
@@ -88,7 +88,7 @@ class _Device:
         return self._replies.write(found) if isinstance(found, tuple) else found
 
     def _read(self, one: "DeviceMap", names: list[str], slots: Any) -> list[SharedSlot]:
-        """Rows of layers, copied from the device to where the other process reads them."""
+        """Rows of layers, copied from the device into shared memory."""
         places = []
         for name in names:
             rows, place = self._replies.empty((len(slots), CUBE), LAYER_DTYPES[name])
@@ -98,8 +98,9 @@ class _Device:
 
 
 def main() -> None:
-    """Serve a connection: its descriptor, those of the shared memory, the device, and whether to end at once
-    with the thread that started this process."""
+    """Serve a connection: its descriptor, that of the shared memory, the device, and `1` to end at once with
+    the thread that started this process.
+    """
     link, requests, replies = (int(argument) for argument in sys.argv[1:4])
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)  # who started it decides

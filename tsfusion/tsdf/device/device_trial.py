@@ -24,11 +24,10 @@ _LAYERS = ("sums", "color_rgn", "color_b", "hits")
 
 
 def device_for(arch: Arch, *, color: bool, hits: bool, smooths: bool) -> DeviceBlocks | None:
-    """The blocks of a new map on a device; None = it is on the CPU, by its settings or because there is no
-    such device, which a warning says.
+    """Blocks of a new map on a device; None = on the CPU, by its settings or for want of a device (a
+    warning).
 
-    Raises:
-        MemoryError: the device has no memory for another map.
+    Raises MemoryError if the device has no memory for another map.
     """
     if smooths and arch != "cpu":
         log.warning("smoothing along rays (regularizer) needs the CPU; keyframes are fused there")
@@ -63,7 +62,9 @@ def _store(device: DeviceBlocks | None) -> BlockStore:
 
 
 def _fused(store: BlockStore, buffers: RayBuffers, integrator: Integrator) -> list[NDArray[Any]]:
-    """The keys of a map of two keyframes and its layers, in order; the second one was there twice."""
+    """Keys, bounds and layers, in key order, of a map of two keyframes, the second of which was there
+    twice.
+    """
     for keyframe, sign in zip(_keyframes(), (1, 1, 1, -1), strict=True):
         buffers.make_rays(keyframe, _CONFIG)
         integrator.apply(sign)

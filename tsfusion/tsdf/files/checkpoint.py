@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""A saved map: one file, written whole or not at all, verified when read on the way into a map.
+r"""A saved map: one file, written whole or not at all, verified when read on the way into a map.
 
-    TSFMAP1\\n | header | chunk … | digest      each but the first: uint32 length, then its bytes
+    TSFMAP1\n | header | chunk … | digest      each but the first: uint32 length, then its bytes
 
-The header is msgpack; a chunk is one zstd frame with the keys and then each layer of up to 1024 blocks,
-blocks in key order (a sum of maps has shorter chunks among them); the digest is blake2b-128 of
-everything before it.
+The header is msgpack. A chunk is one zstd frame with the keys and then each layer of up to 1024 blocks, in
+key order (a sum of maps has shorter chunks among them). The digest is blake2b-128 of everything before it.
 """
 
 import hashlib
@@ -51,7 +50,7 @@ NamedArrays = Iterable[tuple[str, NDArray[Any]]]  # some rows of a chunk at a ti
 
 
 class CheckpointHeader(msgspec.Struct, kw_only=True):
-    """First part of a checkpoint: the settings and history of the map, and what follows."""
+    """First part of a checkpoint: the settings and history of the map, and the layout of what follows."""
 
     config: VolumeConfig
     keyframes: int
@@ -62,7 +61,7 @@ class CheckpointHeader(msgspec.Struct, kw_only=True):
     clear: bytes = b""  # blocks that keyframes look through (`clear_blocks.encoded`)
 
     def clear_blocks(self, path: Path) -> "clear_blocks.ClearCounts":
-        """The blocks that keyframes look through, and by how many. Raises DamagedCheckpoint."""
+        """Blocks that keyframes look through, with the number of keyframes. Raises DamagedCheckpoint."""
         try:
             return clear_blocks.decoded(self.clear, self.config.max_blocks)
         except ValueError as error:
@@ -70,16 +69,14 @@ class CheckpointHeader(msgspec.Struct, kw_only=True):
 
 
 class _SavedSettings(msgspec.Struct):
-    """The settings of a header as its writer named them."""
-
     config: dict[str, Any]
 
 
 class Chunk(NamedTuple):
     """Up to 1024 blocks of a checkpoint that is being read.
 
-    `fill` reads the next bytes into an array: first the keys (blocks,) int64, then for each layer of the
-    header, in its order, rows (blocks, 512) of the layer's dtype. `frame`: all of it as it is stored.
+    `fill` reads the next bytes into an array: first the keys (blocks,) int64, then, for each layer in the
+    header's order, rows (blocks, 512) of its dtype. `frame`: the whole chunk as stored.
     """
 
     first: int
@@ -91,8 +88,8 @@ class Chunk(NamedTuple):
 class Piece(NamedTuple):
     """Up to 1024 blocks of a checkpoint that is being written.
 
-    Either `rows`: the keys, then the layers of the header in its order; or all of that in one array,
-    `content`; or the `frame` of a `Chunk`.
+    Either `rows`: the keys, then the layers in the header's order; or all of that in one array, `content`; or
+    the `frame` of a `Chunk`.
     """
 
     blocks: int
@@ -113,12 +110,11 @@ def write(
 ) -> Path:
     """Write blocks `slots` of each layer (…, 512) under their keys.
 
-    What was at `path` stays as it was until the new file is whole and on the disk. A part that a killed
-    writer left is overwritten.
+    The old file at `path` stays until the new one is whole and on the disk. A part that a killed writer left
+    is overwritten.
 
     Args:
-        map_digest: takes the keys and sums, so that they are read once; what it comes to is the header's
-            `map_hash`.
+        map_digest: takes the keys and sums in the same pass; its result is the header's `map_hash`.
         between: called after each 1024 blocks are read.
 
     Raises:
@@ -156,12 +152,12 @@ def write_pieces(
     map_hash: Callable[[], str] | None = None,
     between: Callable[[], None] = lambda: None,
 ) -> Path:
-    """Write a map whose blocks come in pieces, as `write`, with no more than one of them in memory.
+    """Write a map in pieces, as `write`, with one piece in memory.
 
     Args:
         blocks: number of all of them.
-        pieces: in the order of their keys.
-        map_hash: what the header says, known when all pieces were taken; until then it has one as long.
+        pieces: in key order.
+        map_hash: called when all pieces are taken; until then the header has a placeholder of its length.
     """
     header.blocks = blocks
     try:
@@ -188,18 +184,13 @@ def _write_header(file: BinaryIO, header: CheckpointHeader) -> None:
 
 
 def _write_digest(file: BinaryIO) -> None:
-    """Append the digest of a file that is written."""
     file.flush()
     with open(file.name, "rb") as written:
         file.write(_digest(written, file.tell()))
 
 
 def copy(source: Path, target: Path, alter: Callable[[CheckpointHeader], None]) -> Path:
-    """Write a checkpoint whose header is another one; the blocks are copied as they are.
-
-    Raises:
-        DamagedCheckpoint, CheckpointError: as `reading` and `write`.
-    """
+    """Write a checkpoint with another header and the same blocks. Raises as `reading` and `write`."""
     try:
         with source.open("rb") as old, durable_files.replacing(target) as file:
             _check_magic(old, source)
@@ -218,10 +209,9 @@ def copy(source: Path, target: Path, alter: Callable[[CheckpointHeader], None]) 
 
 
 def split(content: NDArray[np.uint8], layers: Iterable[str]) -> tuple[NDArray[np.int64], dict[str, Any]]:
-    """The keys (n,) and the rows (n, 512) of each layer that lie in a chunk's bytes one after the other.
+    """Keys (n,) and rows (n, 512) of each layer in the bytes of a chunk.
 
-    Args:
-        content: as `array_for` makes it, or a whole chunk; the arrays are views of it.
+    `content` comes from `array_for`, or is a whole chunk; the arrays are views of it.
     """
     layers = list(layers)
     blocks = len(content) // _block_bytes(layers)
@@ -234,22 +224,22 @@ def split(content: NDArray[np.uint8], layers: Iterable[str]) -> tuple[NDArray[np
 
 
 def array_for(blocks: int, layers: Iterable[str]) -> NDArray[np.uint8]:
-    """Room for the bytes of a chunk of some blocks."""
     return np.empty(blocks * _block_bytes(layers), np.uint8)
 
 
 @contextmanager
 def reading(path: Path, *, is_checked: bool = False) -> Iterator[tuple[CheckpointHeader, Iterator[Chunk]]]:
-    """Header and chunks of a checkpoint, for the block to put straight into their place.
+    """Header and chunks of a checkpoint; the `with` block puts each chunk into its place.
 
-    No more than a chunk is held beside that place. A MemoryError of the block is one of the checkpoint.
+    Memory holds one chunk beside that place. A MemoryError of the `with` block becomes one about the
+    checkpoint.
 
     Args:
-        is_checked: the caller has read the file just now: its digest is not compared again.
+        is_checked: the caller has just read the file; its digest is not compared again.
 
     Raises:
-        DamagedCheckpoint: when a byte differs from what was written.
-        CheckpointError: when the file is missing, cannot be read now, or is of another version.
+        DamagedCheckpoint: when a byte differs from the one written.
+        CheckpointError: when the file is missing, unreadable, or of another version.
     """
     try:
         with path.open("rb") as file:
@@ -266,7 +256,7 @@ def reading(path: Path, *, is_checked: bool = False) -> Iterator[tuple[Checkpoin
 
 
 def keys_of(path: Path, *, is_checked: bool = False) -> tuple[CheckpointHeader, NDArray[np.int64]]:
-    """The header of a checkpoint and the keys of its blocks, sorted. Arguments and errors as of `reading`."""
+    """Header of a checkpoint and the sorted keys of its blocks. Arguments and errors as of `reading`."""
     with reading(path, is_checked=is_checked) as (header, chunks):
         keys = np.empty(header.blocks, np.int64)
         for chunk in chunks:
@@ -283,7 +273,7 @@ def verify(path: Path, header: CheckpointHeader, map_hash: str) -> None:
 def _payloads(
     header: CheckpointHeader, pieces: Iterable[Piece], between: Callable[[], None]
 ) -> Iterator[list[bytes]]:
-    """Each piece as it is written, in parts: the map may have left little memory."""
+    """Bytes of each piece, in parts: the map may have left little memory."""
     left = header.blocks
     for piece in pieces:
         left -= piece.blocks
@@ -304,7 +294,7 @@ def _payloads(
 def _rows(
     keys: NDArray[np.int64], slots: NDArray[np.int64], layers: dict[str, NDArray[Any]]
 ) -> Iterator[tuple[str, NDArray[Any]]]:
-    """The keys of a chunk, and its rows, some at a time."""
+    """Keys of a chunk, and its rows, some at a time."""
     yield "keys", keys
     for name, layer in layers.items():
         for j in range(0, len(slots), _ROWS):
@@ -329,7 +319,7 @@ def _read_header(file: BinaryIO, path: Path) -> CheckpointHeader:
     try:
         header = msgspec.msgpack.decode(encoded, type=CheckpointHeader)
         if "min_behind" not in msgspec.msgpack.decode(encoded, type=_SavedSettings).config:
-            # of a version whose rays reach as far behind their ends as before them: so do those to come
+            # Rays of a version without this setting reach as far behind their ends as before; so do new ones
             header.config = msgspec.structs.replace(header.config, min_behind=SYMMETRIC)
     except msgspec.ValidationError as error:  # the digest agrees: it is as its writer meant it
         raise CheckpointError(f"{path} is of another version: {error}") from error
@@ -348,7 +338,6 @@ def _read_header(file: BinaryIO, path: Path) -> CheckpointHeader:
 
 
 def _block_bytes(layers: Iterable[str]) -> int:
-    """Bytes of a block: its key and its row in each layer."""
     return 8 + sum(CUBE * np.dtype(LAYER_DTYPES[name]).itemsize for name in layers)
 
 
@@ -380,9 +369,9 @@ def _fill(stream: zstandard.ZstdDecompressionReader, path: Path, rows: NDArray[A
 
 
 def _check_digest(file: BinaryIO, path: Path) -> None:
-    """Compare the digest of the whole file; leaves the position in `file` as it was.
+    """Compare the digest of the whole file, before any allocation, and keep the position in `file`.
 
-    This comes before any allocation: a header with one flipped bit may ask for all memory there is.
+    A header with one flipped bit may ask for all memory there is.
     """
     here = file.tell()
     size = file.seek(0, os.SEEK_END) - _DIGEST_BYTES
@@ -392,7 +381,7 @@ def _check_digest(file: BinaryIO, path: Path) -> None:
 
 
 def _digest(file: BinaryIO, size: int) -> bytes:
-    """The digest of the first bytes of a file, whose position is behind them then."""
+    """Digest of the first bytes of a file; leaves the position behind them."""
     file.seek(0)
     digest = hashlib.blake2b(digest_size=_DIGEST_BYTES)
     for at in range(0, size, _PART):
@@ -401,7 +390,7 @@ def _digest(file: BinaryIO, size: int) -> bytes:
 
 
 def _read_exactly(file: BinaryIO, size: int, path: Path) -> bytes:
-    """Read `size` bytes, or raise DamagedCheckpoint where the file ends before."""
+    """Read `size` bytes. Raises DamagedCheckpoint if the file ends before."""
     if size > os.fstat(file.fileno()).st_size or len(content := file.read(size)) != size:
         raise DamagedCheckpoint(f"{path} is cut short")
     return content
@@ -416,8 +405,7 @@ def fill(
 ) -> None:
     """Put the blocks of a checkpoint into an empty store, and their keys and sums into a digest.
 
-    Raises:
-        CheckpointError: for other layers than the store has, or blocks that no map has.
+    Raises CheckpointError for other layers than the store's, or for impossible blocks.
     """
     layers = store.layers()
     if not layers.keys() - {"hits"} <= {*header.layers} <= layers.keys():  # earlier versions count none
@@ -432,7 +420,7 @@ def fill(
                 chunk.fill(layers[name][chunk.first : store.count])
             store.note_written(np.arange(chunk.first, store.count))
             store.keep_within_memory()
-            # the hash is that of runs of 1024, wherever the file's chunks end
+            # The hash covers runs of 1024, wherever the file's chunks end
             while store.count - checked >= CHUNK or checked < store.count == header.blocks:
                 end = min(checked + CHUNK, store.count)
                 side.do(partial(_check_in, path, store, slice(checked, end), digest))
@@ -449,7 +437,7 @@ def fill_box(
 ) -> None:
     """Put the blocks low ≤ (x, y, z) < high of a checkpoint into an empty store.
 
-    Of chunks without such a block no more than the keys are unpacked.
+    A chunk without such a block is unpacked only up to its keys.
     """
     for chunk in chunks:
         keys = np.empty(chunk.blocks, np.int64)
@@ -469,7 +457,7 @@ def fill_box(
 
 
 def _check_in(path: Path, store: BlockStore, blocks: slice, digest: "hashlib.blake2b") -> None:
-    """Hash blocks that were read, and measure their bounds."""
+    """Hash blocks just read, and measure their bounds."""
     keys, sums = store.keys[blocks], store.sums[blocks]
     store.bounds[blocks] = (sums & integrate.WEIGHT_MASK).max(axis=1)
     before = store.keys[max(blocks.start - 1, 0) : blocks.stop]
@@ -480,7 +468,7 @@ def _check_in(path: Path, store: BlockStore, blocks: slice, digest: "hashlib.bla
 
 
 def loaded_config(header: CheckpointHeader, threads: int | None, changed: Mapping[str, Any]) -> VolumeConfig:
-    """The settings of a saved map, with those that may be others."""
+    """Settings of a saved map, with the changed ones."""
     saved = header.config
     fixed = {name for name in changed if name not in (*VIEW_SETTINGS, *LIMIT_SETTINGS, *RUN_SETTINGS)}
     if saved.model().regularizer != "off" and changed.get("smoothness") not in (None, saved.smoothness):

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Keyframes that a map holds, by session, as the fuser writes them into a checkpoint.
+"""Keyframes in a map, by session, as the fuser writes them into a checkpoint.
 
-A session is one scanner's stream of numbered records. Its keyframes count once, so maps that hold the same
-ones must not be added. Its poses are in one coordinate frame, the session's world: maps of different worlds
-are not added either, unless somebody knows better.
+A session is one scanner's stream of numbered records. Its keyframes count once: maps that hold the same ones
+must not be added. Its poses are in one coordinate frame, the session's world: maps of different worlds are
+added only if the caller knows that they share a frame.
 """
 
 from collections import Counter
@@ -27,18 +27,18 @@ _PLACES = ("seqs", "segments", "offsets", "fused")  # columns of a session's key
 
 
 class SessionHistory(Struct, frozen=True, eq=False):
-    """The keyframes of one session in a map.
+    """Keyframes of one session in a map.
 
     Attributes:
         session: 32 hex digits.
         client: name of its key; empty = it came without keys.
         world: its coordinate frame; empty = that of poses given from elsewhere.
         last: up to this number, each keyframe is in the map or will never be.
-        unlisted: up to this number it is not known which: 0 = it is known of all.
+        unlisted: up to this number the list of keyframes is unknown; 0 = all are listed.
         seqs: (n,) int64 numbers of the others in the map, ascending.
         poses: (n, 12) float64: upper three rows of each one's `T_world_camera` in the map.
         positions: (n, 2) int64: segment of the journal and byte of each one's record.
-        taken_out: (k,) int64 numbers of those that corrections have taken out of it.
+        taken_out: (k,) int64 numbers of keyframes that corrections have taken out of the map.
         waiting: number of keyframes whose corrected pose is not fused yet.
     """
 
@@ -55,13 +55,13 @@ class SessionHistory(Struct, frozen=True, eq=False):
 
 
 def sessions(meta: Mapping[str, Any]) -> list[SessionHistory]:
-    """The sessions of a map; of one that no server saved none is known."""
+    """Sessions of a map; none of a map that no server saved."""
     saved = meta.get("poses") or {}
     listed = saved.get("sessions", {})
     waiting = [name for name, *_ in saved.get("waiting", ())]
     found = []
     for name, (last, client, *world) in meta.get("done", {}).items():
-        # Of one that is not listed nothing is in the map, or an earlier version fused it
+        # An unlisted keyframe is not in the map, or an earlier version fused it
         nothing = {**dict.fromkeys(_PLACES, b""), "unknown": 0 if saved else last}
         one: Mapping[str, Any] = listed.get(name, nothing)
         fused = np.frombuffer(one["fused"]).reshape(-1, _POSE)
@@ -84,31 +84,31 @@ def sessions(meta: Mapping[str, Any]) -> list[SessionHistory]:
 
 
 def check_readable(meta: Mapping[str, Any]) -> None:
-    """Raise an error of Python's where what a server writes down is not as it writes it."""
+    """Raise a Python error unless the history has the form that a server writes."""
     sessions(meta)
     msgspec.convert(meta.get("rejected", {}), dict[str, int])
     HeldSensor(meta.get(HELD))
 
 
 def of_clients(histories: Iterable[SessionHistory]) -> list[SessionHistory]:
-    """The sessions of scanners: all but the server's own, in which it forgets keyframes."""
+    """Sessions of scanners: all but the server's own, in which it forgets keyframes."""
     return [one for one in histories if one.session != SERVER_SESSION.hex()]
 
 
 def worlds(meta: Mapping[str, Any]) -> set[str]:
     """Coordinate frames of a map's keyframes; empty text = that of poses given from elsewhere.
 
-    A map that no server made says its own as `world`.
+    A map that no server made states its own as `world`.
     """
     return {one.world for one in of_clients(sessions(meta))} or {str(meta.get("world", ""))}
 
 
 def check_addable(here: Mapping[str, Any], there: Mapping[str, Any], *, same_frame: bool) -> None:
-    """Raise MapError where two maps hold the same keyframes, or are not known to be in one coordinate frame.
+    """Raise MapError if two maps hold the same keyframes, or may be in different coordinate frames.
 
     Args:
         here, there: `meta` of each map.
-        same_frame: they are in one, whatever their worlds.
+        same_frame: the maps are in one frame, whatever their worlds.
     """
     ours, theirs = ({one.session: one for one in of_clients(sessions(meta))} for meta in (here, there))
     for name in ours:
@@ -118,7 +118,7 @@ def check_addable(here: Mapping[str, Any], there: Mapping[str, Any], *, same_fra
 
 
 def check_worlds(here: Set[str], there: Set[str], *, same_frame: bool, name: str = "the other map") -> None:
-    """Raise MapError where two sets of worlds have none in common, and are not known to be in one frame."""
+    """Raise MapError if two sets of worlds are disjoint and not known to be in one frame."""
     if not here.isdisjoint(there):
         return
     origins = [one for each in (here, there) for world in sorted(each) if (one := Origin.of_world(world))]
@@ -133,7 +133,7 @@ def check_worlds(here: Set[str], there: Set[str], *, same_frame: bool, name: str
 
 
 def are_given(here: Mapping[str, Any], there: Mapping[str, Any]) -> bool:
-    """True if nothing but given poses says that two maps are in one frame: no world, no session."""
+    """True if only given poses say that two maps are in one frame: no world, no session."""
     ours, theirs = (of_clients(sessions(meta)) for meta in (here, there))
     worlds = [{one.world for one in each} or {""} for each in (ours, theirs)]
     names = [{one.session for one in each} for each in (ours, theirs)]
@@ -156,14 +156,15 @@ def _check_distinct(ours: SessionHistory, theirs: SessionHistory) -> None:
 
 
 def poses(meta: Mapping[str, Any]) -> set[bytes]:
-    """The poses of a map's keyframes, as far as they are listed: who has one of them is likely the same."""
+    """Listed poses of a map's keyframes; maps with a common pose likely share that keyframe."""
     return {row.tobytes() for one in sessions(meta) for row in one.poses}
 
 
 def without_journal(meta: Mapping[str, Any]) -> dict[str, Any]:
-    """The meta of a map that leaves its journal behind, or no longer is the sum of whole keyframes.
+    """Meta of a map that leaves its journal behind, or is no longer a sum of whole keyframes.
 
-    None of its keyframes can be moved or listed any more. Those whose corrections wait stay where they are.
+    None of its keyframes can be moved or listed any more. Keyframes with waiting corrections stay where they
+    are.
     """
     if "done" not in meta:
         return dict(meta)
@@ -182,7 +183,7 @@ def without_journal(meta: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def added(here: Mapping[str, Any], there: Mapping[str, Any]) -> dict[str, Any]:
-    """The meta of two maps' sum; each session goes on from where it was later."""
+    """Meta of two maps' sum; each session continues from the later of its two states."""
     one, other = without_journal(here), without_journal(there)
     together = {**other, **one}
     if "done" not in together:
@@ -205,7 +206,6 @@ def added(here: Mapping[str, Any], there: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _sums(*parts: Mapping[str, Any]) -> dict[str, int]:
-    """The counts of all parts, added by name."""
     counts = Counter[str]()
     for part in parts:
         counts.update({name: value for name, value in part.items() if isinstance(value, int)})
@@ -213,7 +213,7 @@ def _sums(*parts: Mapping[str, Any]) -> dict[str, int]:
 
 
 def _later(parts: list[dict[str, Any]]) -> dict[str, Any]:
-    """A session of one map, or of two as the one that is farther has it."""
+    """A session of one map, or the later state of a session of two."""
     if len(parts) == 1:
         return parts[0]
     latest = max(parts, key=lambda part: part["unknown"])

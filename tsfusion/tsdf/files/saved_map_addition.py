@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Saved maps added file to file: the sum of any number, with memory for one chunk of each.
+"""Addition of any number of saved maps, file to file, with memory for one chunk of each.
 
-Where a chunk's blocks lie between those of all other maps it goes to the sum as it is, compressed; only its
-keys and sums are read, for the hash.
+A chunk whose blocks lie between those of all other maps goes to the sum as it is, compressed; only its keys
+and sums are read, for the hash.
 """
 
 from collections.abc import Iterator, Sequence
@@ -36,7 +36,7 @@ def add_files(paths: Sequence[Path], target: Path) -> CheckpointHeader:
     """Write the sum of saved maps of one frame, voxel size and set of layers, as `Volume.merge` makes it.
 
     Args:
-        paths: one or more; whether they hold keyframes twice is the caller's to know.
+        paths: one or more; the caller makes sure that no keyframe is in two of them.
         target: the file; it may be one of them.
 
     Raises:
@@ -59,10 +59,9 @@ def add_files(paths: Sequence[Path], target: Path) -> CheckpointHeader:
 
 
 def checked_keys(path: Path) -> tuple[CheckpointHeader, NDArray[np.int64]]:
-    """The header of a checkpoint whose voxels have the hash that it tells, and the keys of its blocks.
+    """Header of a checkpoint, and the keys of its blocks, after a check of the voxels against the map's hash.
 
-    Raises:
-        CheckpointError: as `checkpoint.reading`; DamagedCheckpoint also for another hash.
+    Raises as `checkpoint.reading`, and DamagedCheckpoint for another hash.
     """
     with checkpoint.reading(path) as (header, chunks), MapDigest(header.config.voxel_size) as digest:
         keys = np.empty(header.blocks, np.int64)
@@ -77,7 +76,6 @@ def checked_keys(path: Path) -> tuple[CheckpointHeader, NDArray[np.int64]]:
 
 
 def _header(paths: Sequence[Path], headers: Sequence[CheckpointHeader], blocks: int) -> CheckpointHeader:
-    """Header of the sum."""
     first = headers[0]
     for other in headers[1:]:
         if (other.config.voxel_size, other.layers) != (first.config.voxel_size, first.layers):
@@ -105,7 +103,7 @@ def _header(paths: Sequence[Path], headers: Sequence[CheckpointHeader], blocks: 
 
 
 class MapDigest:
-    """The hash of a map whose blocks come in their order, in pieces of any length."""
+    """Hash of a map from its blocks in key order, in pieces of any length."""
 
     def __init__(self, voxel_size: float) -> None:
         self._digest, self._side = begin_hash(voxel_size), SideThread()
@@ -122,7 +120,7 @@ class MapDigest:
         self._side.__exit__(kind, error, where)
 
     def add(self, keys: NDArray[np.int64], sums: NDArray[np.int64]) -> None:
-        """Take blocks; the arrays stay as they are from here on."""
+        """Take blocks; the arrays must not change afterwards."""
         while len(keys):
             now = min(CHUNK - self._count, len(keys))
             self._waiting.append((keys[:now], sums[:now]))
@@ -138,15 +136,12 @@ class MapDigest:
         self._waiting, self._count = [], 0
 
     def hexdigest(self) -> str:
-        """Hash of all blocks that came."""
         self._take()
         self._side.wait()
         return self._digest.hexdigest()
 
 
 class _BlockStream:
-    """The blocks of a saved map in their order."""
-
     def __init__(self, keys: NDArray[np.int64], opened: tuple[CheckpointHeader, Iterator[Chunk]]) -> None:
         self._keys, self._layers, self._chunks = keys, opened[0].layers, opened[1]
         self._chunk: Chunk | None = None  # of which the next block is
@@ -159,18 +154,17 @@ class _BlockStream:
 
     @property
     def next_key(self) -> int:
-        """Key of the next block."""
         return int(self._keys[self._taken])
 
     @property
     def last_key(self) -> int:
-        """Last key of the chunk that the next block is in."""
+        """Last key of the next block's chunk."""
         chunk = self._current()
         return int(self._keys[chunk.first + chunk.blocks - 1])
 
     @property
     def is_at_chunk(self) -> bool:
-        """True if nothing of the current chunk was taken."""
+        """True if no block of the current chunk has been taken."""
         return self._current().first == self._taken
 
     def _current(self) -> Chunk:
@@ -179,7 +173,6 @@ class _BlockStream:
         return self._chunk
 
     def pass_on(self, digest: MapDigest) -> Piece:
-        """The chunk as it is."""
         chunk = self._current()
         keys, sums = np.empty(chunk.blocks, np.int64), np.empty((chunk.blocks, CUBE), np.int64)
         chunk.fill(keys)
@@ -189,12 +182,11 @@ class _BlockStream:
         return Piece(chunk.blocks, frame=chunk.frame)
 
     def keys_up_to(self, last: int) -> NDArray[np.int64]:
-        """Keys of the next blocks, up to `last`."""
         rest = self._keys[self._taken :]
         return rest[: np.searchsorted(rest, last, side="right")]
 
     def take(self, last: int) -> Iterator[tuple[NDArray[np.int64], BlockColumns]]:
-        """The blocks up to `last` that were not taken: keys and rows, a chunk's at a time."""
+        """Keys and rows of the next blocks up to `last`, a chunk's at a time."""
         left = len(self.keys_up_to(last))
         while left:
             chunk = self._current()
@@ -213,7 +205,7 @@ class _BlockStream:
 
 
 def _pieces(streams: Sequence[_BlockStream], layers: Sequence[str], digest: MapDigest) -> Iterator[Piece]:
-    """The sum's blocks in their order."""
+    """Blocks of the sum, in key order."""
     while left := sorted((one for one in streams if not one.is_over), key=lambda one: one.next_key):
         first, last = left[0], left[0].last_key
         if first.is_at_chunk and all(one.next_key > last for one in left[1:]):
@@ -227,7 +219,7 @@ def _pieces(streams: Sequence[_BlockStream], layers: Sequence[str], digest: MapD
 def _sum(
     keys: NDArray[np.int64], streams: Sequence[_BlockStream], layers: Sequence[str], digest: MapDigest
 ) -> Piece:
-    """The sums of some blocks, whose keys are all that the streams have next."""
+    """Sums of the blocks `keys`, which are next in the streams."""
     content = checkpoint.array_for(len(keys), layers)
     own, sums = checkpoint.split(content, layers)
     own[:] = keys
@@ -247,7 +239,7 @@ def _sum(
 
 
 def _put(sums: BlockColumns, rows: BlockColumns, at: NDArray[np.int64]) -> None:
-    """Write the rows `at` of blocks that nothing was written for."""
+    """Write the rows `at` of blocks that have none yet."""
     if not len(at):
         return
     run = slice(int(at[0]), int(at[-1]) + 1)  # mostly they lie side by side
@@ -257,7 +249,6 @@ def _put(sums: BlockColumns, rows: BlockColumns, at: NDArray[np.int64]) -> None:
 
 
 def _add(sums: BlockColumns, rows: BlockColumns, at: NDArray[np.int64]) -> None:
-    """Add to the rows `at`."""
     both = sums["sums"][at]
     both += rows["sums"]
     if (is_full := both & WEIGHT_LIMIT).any():  # the limit is a bit, and twice as much the lane's end

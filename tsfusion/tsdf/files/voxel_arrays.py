@@ -2,17 +2,17 @@
 """A map as arrays of voxels, in memory (NumPy, Open3D) or in a file: `.npz`, `.zarr`, `.vdb` (OpenVDB).
 
 Both kinds of arrays hold `voxel_size` (metres) and, for each voxel, `tsdf` float32 (signed distance to the
-surface in metres, positive in front of it, NaN where nothing was seen), `weight` float32 (votes, in
-full-confidence samples) and, where the map has colour, `color` uint8 RGB (0 where none was seen). Of the
-distance field they hold `distance` float32 (metres, at most `max_distance`) instead.
+surface in metres, positive in front of it, NaN where unseen), `weight` float32 (votes, in full-confidence
+samples) and, in a map with colour, `color` uint8 RGB (0 where unseen). A distance field holds `distance`
+float32 (metres, at most `max_distance`) instead.
 
 Blocks: `blocks` (n, 3) int32, and `tsdf`, `weight` (n, 8, 8, 8), `color` (n, 8, 8, 8, 3). The centre of voxel
 (i, j, k) of block b is at (8 · blocks[b] + (i, j, k) + 0.5) · voxel_size.
 
-Dense: `tsdf`, `weight` (X, Y, Z), `color` (X, Y, Z, 3), and `origin` (3,) float64: the centre of voxel
-(i, j, k) is at origin + ((i, j, k) + 0.5) · voxel_size.
+Dense: `tsdf`, `weight` (X, Y, Z), `color` (X, Y, Z, 3), and `origin` (3,) float64: the centre of voxel (i, j,
+k) is at origin + ((i, j, k) + 0.5) · voxel_size.
 
-OpenVDB: one grid, `tsdf` or `distance`; where nothing was seen, or nothing is near, it has its background.
+OpenVDB: one grid, `tsdf` or `distance`; its background stands where nothing was seen, or nothing is near.
 """
 
 import tempfile
@@ -48,8 +48,6 @@ OPEN3D_TRUNCATION = 8.0  # voxels that stand for 1 in Open3D: its `trunc_voxel_m
 
 
 class _GridField(NamedTuple):
-    """Values written of each voxel."""
-
     dtype: DTypeLike
     unseen: float
     units: str
@@ -72,7 +70,7 @@ FORMATS = (".npz", ".zarr", ".vdb")
 
 
 class _Voxels(NamedTuple):
-    """Arrays of voxels, of which no more than a part is in memory."""
+    """Arrays of voxels, only a part of which is in memory."""
 
     plain: dict[str, NDArray[Any]]  # what stands beside them
     names: list[str]  # of `_FIELDS`
@@ -98,8 +96,9 @@ def write(
         max_distance, min_weight: of the distance field, as for `AskableMap.distance_blocks`.
 
     Raises:
-        InvalidConfig: for another suffix or field; OutputError: when it cannot be written, a map is empty, or
-            the box has more than `MOST_DENSE` voxels; MissingDependency: zarr is not installed.
+        InvalidConfig: for another suffix or field.
+        OutputError: when it cannot be written, a map is empty, or the box has more than `MOST_DENSE` voxels.
+        MissingDependency: zarr is not installed.
     """
     suffix = path.suffix.lower()
     if suffix not in FORMATS or field not in get_args(FieldName) or (dense and suffix == ".vdb"):
@@ -129,7 +128,7 @@ def write(
 
 
 def _fused(store: BlockStore, used: NDArray[np.int64], *, dense: bool) -> _Voxels:
-    """The sums of a map as values."""
+    """Signed distances, weights and colours of a map."""
     blocks = unpack_keys(store.keys[used])
     low, high = blocks.min(axis=0), blocks.max(axis=0) + 1
     shape = tuple(int(length) for length in 8 * (high - low)) if dense else (len(used), 8, 8, 8)
@@ -147,7 +146,6 @@ def _fused(store: BlockStore, used: NDArray[np.int64], *, dense: bool) -> _Voxel
 
 
 def _dense_distances(store: BlockStore, max_distance: float, min_weight: float) -> _Voxels:
-    """The distance field around a map."""
     found = distance_fields.in_box(store, None, max_distance, min_weight, subvoxel=True)
     plain = {"voxel_size": np.float64(store.voxel_size), "origin": found.origin}
     plain["max_distance"] = np.float64(max_distance)
@@ -158,7 +156,7 @@ def _dense_distances(store: BlockStore, max_distance: float, min_weight: float) 
 def _spooled_distances(
     store: BlockStore, near: Iterator[distance_fields.FieldBlocks], max_distance: float, spool: IO[bytes]
 ) -> _Voxels:
-    """The distance field near a map's surfaces, which waits in a file until it is known how long it is."""
+    """Distance field near a map's surfaces, spooled to a file until its length is known."""
     blocks = []
     for one in near:
         spool.write(one.distance.data)
@@ -188,7 +186,7 @@ def _write_npz(path: Path, voxels: _Voxels, progress: "_Counted") -> None:
 
 
 def _write_zarr(path: Path, voxels: _Voxels, progress: "_Counted") -> None:
-    """A folder in which each array has chunks of `_CHUNK` blocks, or of 8 planes across x."""
+    """Write a folder in which each array has chunks of `_CHUNK` blocks, or of 8 planes across x."""
     try:
         import zarr
     except ImportError as error:
@@ -228,7 +226,6 @@ def _write_vdb(
     near: Iterator[distance_fields.FieldBlocks] | None,
     max_distance: float,
 ) -> None:
-    """One grid for OpenVDB."""
     size = store.voxel_size
     if near is not None:
         point_files.write(path, near, name="distance", voxel_size=size, background=max_distance)
@@ -243,7 +240,7 @@ def _write_vdb(
 
 
 class _Counted:
-    """Tells how many bytes have passed."""
+    """Counter of the bytes that have passed."""
 
     def __init__(self, watch: OnProgress, total: int) -> None:
         self._watch, self._total, self._done = watch, total, 0
@@ -257,7 +254,7 @@ class _Counted:
 def _write_array(
     archive: zipfile.ZipFile, name: str, shape: tuple[int, ...], parts: Iterator[NDArray[Any]]
 ) -> None:
-    """Write an array of this shape whose parts, in order, are those given."""
+    """Write an array of this shape from its parts, in order."""
     entry = zipfile.ZipInfo(f"{name}.npy", _EARLIEST)
     entry.compress_type = zipfile.ZIP_DEFLATED
     with archive.open(entry, "w", force_zip64=True) as file:
@@ -291,7 +288,7 @@ def _slabs(
 
 
 def decoded(store: BlockStore, slots: NDArray[np.int64], name: str) -> NDArray[Any]:
-    """(m, 8, 8, 8, …) of a field in blocks: `tsdf`, `weight` or `color`."""
+    """Field `tsdf`, `weight` or `color` of blocks, (m, 8, 8, 8, …)."""
     shape = (len(slots), 8, 8, 8, *_FIELDS[name].shape)
     if name == "tsdf":
         quanta = values_of(store.keys[slots], store, 0.0)
@@ -308,9 +305,9 @@ def decoded(store: BlockStore, slots: NDArray[np.int64], name: str) -> NDArray[A
 class Blocks:
     """The n blocks that a map has now, of 8³ voxels each: [block, x, y, z].
 
-    The centre of voxel (i, j, k) of block b is at (8 · coordinates[b] + (i, j, k) + 0.5) · voxel_size.
-    What is stored is shown without copying, read-only: (n, 8, 8, 8) arrays that stay valid whatever the map
-    does next. They show what keyframes change in these blocks until the map's memory grows.
+    The centre of voxel (i, j, k) of block b is at (8 · coordinates[b] + (i, j, k) + 0.5) · voxel_size. Stored
+    sums are shown without copying, read-only: (n, 8, 8, 8) arrays that stay valid after any change of the
+    map. They show what keyframes change in these blocks until the map's memory grows.
 
     Args:
         store: the blocks of a map; `Volume.blocks()` gives them.
@@ -321,7 +318,7 @@ class Blocks:
         sums: int64, (Σ w·m) · 2²⁷ + Σ w: m in sixtieths of a voxel, w in sixteenths of a full sample.
         color_rgn: int64, (Σ R) · 2⁴⁰ + (Σ G) · 2¹⁶ + n of n votes; None if the map holds no colour.
         color_b: int32, Σ B.
-        correction: float32, what smoothing along rays adds to Σ w·m; None if the map does not smooth so.
+        correction: float32, added to Σ w·m by smoothing along rays; None in a map without such smoothing.
 
     Examples:
         >>> volume = tsfusion.Volume(0.05)
@@ -366,10 +363,8 @@ class Blocks:
 
 
 def to_voxel_block_grid(store: BlockStore) -> Any:
-    """Make an `open3d.t.geometry.VoxelBlockGrid` of the raw values.
-
-    Raises:
-        MissingDependency: without Open3D.
+    """Make an `open3d.t.geometry.VoxelBlockGrid` of the raw values. Raises MissingDependency without
+    Open3D.
     """
     o3d = import_open3d()
     used = store.used()

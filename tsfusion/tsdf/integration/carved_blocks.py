@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""The space that the current keyframe looks through: found on the CPU, whatever adds to the map.
+"""Space that the current keyframe looks through, found on the CPU.
 
-Blocks and which of their voxels an image carves; or, where the map does not carve, the blocks that an image
+A map that carves gets the blocks and voxels that an image carves; another map gets the blocks that an image
 or points look through as a whole.
 """
 
@@ -46,15 +46,13 @@ _GAPS = 3  # patches: so far from a point, less one, others are closed
 _MOST_STANDS = 4  # parts of a sweep that are seen from one place each
 _STAND = 2.0  # voxels that a point's own start may be away from there
 
-# The image, whether it has disparities, scale, confidence or anything, whether there is confidence: as the
-# kernels take them.
+# Image, disparity flag, scale, confidence, confidence flag: arguments of the kernels
 Read = tuple[NDArray[np.float32], int, float, NDArray[Any], int]
 Optics = tuple[NDArray[np.float64], ...]
 
 
 class PointRays(NamedTuple):
-    """Points (n, 3) and the starts of their rays, (1, 3) or (n, 3), sensor frame; their confidence, and
-    whether there is any."""
+    """Points (n, 3), the starts of their rays, (1, 3) or (n, 3), sensor frame, and optional confidence."""
 
     points: NDArray[np.float32]
     starts: NDArray[np.float32]
@@ -63,18 +61,19 @@ class PointRays(NamedTuple):
 
 
 class _Sight(NamedTuple):
-    """A view as the kernels read it (`space_carving`), and rays of depth one through the corners of
-    its image, (3, 4)."""
+    """A view as the kernels read it (`space_carving`), and rays of depth one through its image's corners, (3,
+    4).
+    """
 
     numbers: NDArray[np.float64]
     rays: NDArray[np.float64]
 
 
 class CarvedBlocks:
-    """Keys of blocks, which of their voxels are clear, and what is added to each of these.
+    """Keys of blocks, their clear voxels, and what is added to each voxel.
 
     Attributes:
-        clear: distinct keys of the blocks that are clear as a whole, where the map does not carve.
+        clear: distinct keys of the blocks that are clear as a whole, of a map that does not carve.
     """
 
     def __init__(self) -> None:
@@ -93,7 +92,7 @@ class CarvedBlocks:
         return len(self.keys)
 
     def forget(self) -> None:
-        """Have no blocks: the keyframe carves nothing."""
+        """Remove all blocks: the keyframe carves nothing."""
         self.voxels = 0
         self.keys, self.amounts, self.masks = (array[:0] for array in self._room)
         self.clear = self.clear[:0]
@@ -103,9 +102,9 @@ class CarvedBlocks:
 
         Args:
             keyframe: one with an image.
-            read: its image, and how it is read.
+            read: its image as the kernels read it.
             model: the sensor model, as for `rays_from_images`.
-            most: blocks that a keyframe may touch; if there are more, one more than that is listed.
+            most: blocks that a keyframe may touch; beyond it, one more than that is listed.
         """
         assert keyframe.intrinsics is not None  # checked by Keyframe
         self.forget()
@@ -129,9 +128,8 @@ class CarvedBlocks:
         self.voxels = int(self._counts[VOXELS])
 
     def find_clear(self, keyframe: Keyframe, read: Read, model: NDArray[np.float64], most: int) -> None:
-        """Find the blocks that an image looks through as a whole; none where there are more than `most`.
-
-        Arguments as of `find`.
+        """Find the blocks that an image looks through as a whole; none if more than `most`. Arguments as of
+        `find`.
         """
         assert keyframe.intrinsics is not None
         self.forget()
@@ -145,7 +143,7 @@ class CarvedBlocks:
     def find_clear_of_points(
         self, points: PointRays, T_world_sensor: NDArray[np.float64], model: NDArray[np.float64], most: int
     ) -> None:
-        """Likewise of points, which are drawn into images around where they are seen from."""
+        """As `find_clear`, of points, which are drawn into images around the places they are seen from."""
         self.forget()
         found = [self.clear]
         for part, centre in _stands(points, model[VOXEL_SIZE]):
@@ -183,7 +181,7 @@ class CarvedBlocks:
     def _see(
         self, K: Intrinsics, T: NDArray[np.float64], read: Read, model: NDArray[np.float64]
     ) -> _Sight | None:
-        """Find how far the image's patches are clear; returns the view that it is, None = there is none."""
+        """Find how far the image's patches are clear. Returns its view; None = there is none."""
         self._image.make_room(*read[0].shape)
         camera = self._camera(K, read[0].shape, model)
         read = (np.ascontiguousarray(read[0], np.float32), *read[1:])
@@ -199,7 +197,7 @@ class CarvedBlocks:
     def _listed(
         self, views: Sequence[_Sight], images: "_PatchImages", voxel_size: float, most: int
     ) -> NDArray[np.int64]:
-        """Keys of the blocks that some images look through, in no order; none where there are too many."""
+        """Unordered keys of the blocks that the images look through; none if there are too many."""
         cubes, numbers = _cubes_in(views, images), np.concatenate([view.numbers for view in views])
         power = max(0, min(3, math.ceil(math.log2(_LEAST_CUBE / (8 * voxel_size)))))
         keys, count = np.empty(0, np.int64), _FEW
@@ -214,7 +212,7 @@ class CarvedBlocks:
         return keys[: count if count <= most else 0]
 
     def _camera(self, K: Intrinsics, shape: tuple[int, ...], model: NDArray[np.float64]) -> Optics:
-        """`_camera_of` images, nearly always that of the images before."""
+        """`_camera_of` images, cached from the images before."""
         kind = K, shape, model[MAX_RANGE], model[VOXEL_SIZE]
         if kind != self._kind:
             self._kind, self._found = kind, _camera_of(K, shape, model)
@@ -222,12 +220,11 @@ class CarvedBlocks:
 
     @property
     def nbytes(self) -> int:
-        """Memory, bytes."""
         return sum(array.nbytes for array in self._room) + self._image.nbytes + self._points.nbytes
 
 
 class _PatchImages:
-    """How far the patches of images are clear, and the least and the most in squares of them."""
+    """Clear depth of image patches, and its least and greatest values in squares of patches."""
 
     def __init__(self) -> None:
         self.pixels = 0, 0  # height, width of each
@@ -236,7 +233,7 @@ class _PatchImages:
         self.least = self.most = np.zeros(0, np.int32)
 
     def make_room(self, height: int, width: int) -> None:
-        """Have an image of (height, width) pixels."""
+        """Reserve an image of (height, width) pixels."""
         if self.pixels == (height, width):
             return
         rows, columns = -(-height // PATCH), -(-width // PATCH)
@@ -246,12 +243,12 @@ class _PatchImages:
             begin, high, wide, _ = levels[-1]
             levels.append((begin + high * wide, -(-high // 2), -(-wide // 2), rows))
         least, most = (np.zeros(levels[-1][0] + 1, np.int32) for _ in range(2))
-        # all of them, or none where there is no memory
+        # All of them, or none for want of memory
         self.pixels, self.clear, self.levels = (height, width), clear, np.array(levels, np.int32)
         self.least, self.most = least, most
 
     def use(self, clear: NDArray[np.int32]) -> None:
-        """Have the patches of some images, (n, rows, columns)."""
+        """Take the patches of images, (n, rows, columns)."""
         squares = int(self.levels[-1, 0]) + 1
         self.clear = clear.reshape(-1, clear.shape[2])
         self.least, self.most = (np.empty(len(clear) * squares, np.int32) for _ in range(2))
@@ -262,7 +259,7 @@ class _PatchImages:
         return sum(array.nbytes for array in (self.clear, self.levels, self.least, self.most))
 
 
-# Of images of points: where their columns, rows and depths go in the sensor's frame
+# Columns, rows and depths of images of points, as directions in the sensor's frame
 _AXES = np.array(
     [np.roll(np.eye(3), axis, axis=0)[:, [1, 2, 0]] * [1, 1, sign] for axis in range(3) for sign in (1, -1)]
 )
@@ -275,9 +272,9 @@ def _list_of(blocks: int) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray
 def _view(
     camera: Optics, centre: NDArray[np.float64], orientation: NDArray[np.float64], model: NDArray[np.float64]
 ) -> _Sight:
-    """The view of a camera at a centre, metres."""
+    """View of a camera at a centre, metres."""
     matrix, corners, rest = camera
-    # sums one after the other, as every processor makes them
+    # Sums in sequence, equal on every processor
     directions = matrix[:, :1] * orientation[:, 0] + matrix[:, 1:2] * orientation[:, 1]
     directions += matrix[:, 2:] * orientation[:, 2]
     numbers = np.concatenate([centre / model[VOXEL_SIZE], directions.ravel(), rest])
@@ -285,14 +282,15 @@ def _view(
 
 
 def _cubes_in(views: Sequence[_Sight], images: _PatchImages) -> NDArray[np.int32]:
-    """Cubes of 64 voxels that each view is to look at: where they begin in the list of all, the first of
-    them, and how many on each axis; (views + 1, 7)."""
+    """Cubes of 64 voxels for each view, (views + 1, 7): index of its first cube in the list of all, that
+    cube, and the number of cubes on each axis.
+    """
     found = np.zeros((len(views) + 1, 7), np.int32)
     deepest = images.most.reshape(len(views), -1)[:, -1]
     for n, (numbers, rays) in enumerate(views):
         centre = numbers[:3]
         ends = centre[:, None] + float(deepest[n]) / numbers[SCALE] * rays
-        # a voxel's centre is no cube's border
+        # No voxel centre lies on a cube's border
         low, high = np.minimum(centre, ends.min(axis=1)), np.maximum(centre, ends.max(axis=1))
         found[n, 1:] = np.clip(np.floor(np.concatenate([low, high]) / SIDE), -_MOST_CUBES, _MOST_CUBES)
         found[n, 4:] -= found[n, 1:4] - 1
@@ -301,7 +299,9 @@ def _cubes_in(views: Sequence[_Sight], images: _PatchImages) -> NDArray[np.int32
 
 
 def _thinned(K: Intrinsics, read: Read, model: NDArray[np.float64]) -> tuple[Intrinsics, Read]:
-    """A camera's image of fewer pixels, none of which is wide; what they miss has hits in the map."""
+    """A camera's image of fewer pixels, none of them wide; surfaces that fall between pixels have hits in the
+    map.
+    """
     image, is_disparity, scale, confidence, has_confidence = read
     widest = _THIN_VOXELS * model[VOXEL_SIZE] / model[MAX_RANGE]
     step = max(1, min(_THINNEST, int(min(K.fx, abs(K.fy), 1e6) * widest)))
@@ -317,7 +317,7 @@ def _thinned(K: Intrinsics, read: Read, model: NDArray[np.float64]) -> tuple[Int
 
 
 def _stands(points: PointRays, voxel_size: float) -> Iterator[tuple[PointRays, NDArray[np.float32]]]:
-    """Parts of a sweep, and where each is seen from; without those of a place that varies by too much."""
+    """Parts of a sweep, each with its viewpoint; parts whose viewpoint varies too much are left out."""
     count, reach = len(points.points), _STAND * voxel_size
     parts = min(1 if len(points.starts) == 1 else _MOST_STANDS, count)
     for part in range(parts):
@@ -330,10 +330,10 @@ def _stands(points: PointRays, voxel_size: float) -> Iterator[tuple[PointRays, N
 
 
 def _closed(ends: NDArray[np.int32], scale: float, far: float) -> NDArray[np.int32]:
-    """Depths up to which patches (n, rows, columns) are clear, from where points end in them, units.
+    """Depths up to which patches (n, rows, columns) are clear, in units, from the ends of their points.
 
-    A patch without a point is as clear as those around it. Points that lie far apart say nothing about what
-    is between them: the wider such a gap, the nearer it ends.
+    A patch without a point is as clear as those around it. Sparse points say nothing about the space between
+    them: the wider the gap, the nearer its clear depth.
     """
     near, clear = ends, np.zeros_like(ends)
     for gap in range(_GAPS):
@@ -348,8 +348,9 @@ def _closed(ends: NDArray[np.int32], scale: float, far: float) -> NDArray[np.int
 
 
 def _camera_of(K: Intrinsics, shape: tuple[int, ...], model: NDArray[np.float64]) -> Optics:
-    """A camera: what a step right, down and forward adds to column · depth, row · depth and depth, (3, 3);
-    rays of depth one through the image's corners, (3, 4); and the last six numbers of a view."""
+    """A camera: steps right, down and forward in column · depth, row · depth and depth, (3, 3); rays of depth
+    one through the image's corners, (3, 4); and the last six numbers of a view.
+    """
     height, width = shape[:2]
     middle = (K.cx + 0.5) / PATCH, (K.cy + 0.5) / PATCH
     matrix = np.array([(K.fx / PATCH, 0, middle[0]), (0, K.fy / PATCH, middle[1]), (0, 0, 1)])
@@ -357,7 +358,7 @@ def _camera_of(K: Intrinsics, shape: tuple[int, ...], model: NDArray[np.float64]
     y = [(v - 0.5 - K.cy) / K.fy for v in (0, height)]
     corners = np.array([(a, b, 1.0) for a in x for b in y])
     widest = max(math.hypot(*corner) for corner in corners)
-    # the most units of a place in the image, of one that lies a voxel away
+    # Greatest image coordinate, units, of a place that lies a voxel away
     most = _MOST_UNITS / math.sqrt(3) / max(math.hypot(*row) for row in matrix)
     far = min(MAX_CARVED / widest, model[MAX_RANGE] / model[VOXEL_SIZE], (most / _COARSEST - SIDE) / widest)
     if not far > NEAREST:  # as wide an image is no camera's; also where numbers are too large

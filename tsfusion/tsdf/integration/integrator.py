@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Adds the rays of one keyframe to the map, all or none of them, or takes them away again.
+"""Addition of one keyframe's rays to the map, all or none, and their removal.
 
-Rays go straight into the map's sums. Whether a keyframe is acceptable (there is room for its blocks, no
-lane overflows) shows during or after that; if it is not, the same rays are added with the opposite sign,
-which restores every byte, because the sums are integers.
+Rays go straight into the map's sums. A keyframe proves unacceptable (no room for its blocks, a lane
+overflows) during or after that. The same rays are then added with the opposite sign, which restores every
+byte, because the sums are integers.
 """
 
 from collections.abc import Iterator
@@ -42,12 +42,11 @@ RayShare = tuple[int, int]  # bands first … last - 1
 
 
 class KeyframeQuota(Struct, frozen=True):
-    """Bounds of a keyframe.
+    """Limits of a keyframe.
 
     Attributes:
-        cost: what its rays cost (`voxel_traversal.write_ray`), 100 for each block that it carves, and 1000
-            for each that it adds.
-        blocks: that it adds.
+        cost: of its rays (`voxel_traversal.write_ray`), 100 for each carved block, and 1000 for each new one.
+        blocks: new ones.
     """
 
     cost: int
@@ -55,7 +54,7 @@ class KeyframeQuota(Struct, frozen=True):
 
 
 class Integrator:
-    """The one writer of a map's sums."""
+    """Only writer of a map's sums."""
 
     def __init__(self, store: BlockStore, buffers: RayBuffers, config: VolumeConfig) -> None:
         self._store = store
@@ -71,14 +70,14 @@ class Integrator:
         self.units = min(runtime.threads(), BANDS)  # which add at the same time
 
     def apply(self, sign: int, quota: KeyframeQuota | None = None) -> int:
-        """Add (+1) or take away (-1) the rays in the buffers; returns the number of voxel updates.
+        """Add (+1) or take away (-1) the rays in the buffers. Returns the number of voxel updates.
 
         Args:
-            quota: of a keyframe that is added; None = none but the map's limits.
+            quota: of a keyframe that is added; None = only the map's limits.
 
         Raises:
-            MapFull, WeightOverflow: when adding; MapError: when taking away what is not there. The map is as
-                it was.
+            MapFull, WeightOverflow: when adding.
+            MapError: when taking away what is not there. After each error the map is as it was.
         """
         self._room = self._affordable = self._most_cost = NO_LIMIT
         if quota is not None and sign > 0:
@@ -113,7 +112,7 @@ class Integrator:
         return updates
 
     def _take_back(self, added: list[RayShare], sign: int, before: int) -> None:
-        """Bring back the map of `before` blocks, whatever failed."""
+        """Restore the map of `before` blocks after any failure."""
         if self._store.count > self._admitted:  # blocks that nothing was added to yet
             self._store.drop(self._admitted)
         if self._has_cleared:
@@ -128,13 +127,13 @@ class Integrator:
 
     @property
     def _vote(self) -> int:
-        """Vote of the keyframe's rays where they end."""
+        """Vote of the keyframe's rays at their ends."""
         if self._buffers.colored:
             return integrate.COLOR_VOTE
         return integrate.HIT_VOTE if self._store.counts_hits else integrate.NO_VOTE
 
     def _begin(self, sign: int) -> None:
-        """Empty the list of touched blocks; `sign` is that of what follows."""
+        """Empty the list of touched blocks; `sign` is that of the additions to come."""
         self._store.stamp += 1
         self._buffers.touched[:TOUCHED_HEADER] = 0
         self._buffers.reserve_touched(self._store.count)
@@ -151,7 +150,7 @@ class Integrator:
             first = max(end, first + 1)
 
     def _add(self, part: RayShare, sign: int) -> None:
-        """Add a part to the blocks the map has, and list the missing ones, until these are too many."""
+        """Add a part to the blocks of the map, and list missing blocks, until there are too many."""
         buffers = self._buffers
         most = self._most_missing()
         self._launch(part, sign, most_missing=min(most, buffers.most_missing))
@@ -161,13 +160,13 @@ class Integrator:
             self._launch(part, sign, most_missing=most)
 
     def _most_missing(self) -> int:
-        """Blocks that the map may lack for the rest of a keyframe."""
+        """Missing blocks allowed for the rest of a keyframe."""
         config, touched = self._config, int(self._buffers.touched[TOUCHED_COUNT])
         room = min(config.max_blocks - self._store.count, self._room, self._affordable)
         return max(min(room, config.max_blocks_per_keyframe - touched), 0)
 
     def _admit(self, part: RayShare, sign: int) -> None:
-        """Insert the missing blocks into the map, and add the deferred rays to them."""
+        """Insert the missing blocks, and add the deferred rays to them."""
         store, buffers = self._store, self._buffers
         if not buffers.bands[part[0] : part[1], DEFERRED].any():
             self._limit(int(buffers.touched[TOUCHED_COUNT]))
@@ -189,17 +188,15 @@ class Integrator:
         self._note_admitted(len(keys))
 
     def _note_admitted(self, blocks: int) -> None:
-        """Note that new blocks have been added to."""
         self._admitted = self._store.count
         self._room -= blocks
         self._affordable -= blocks
 
     def _insert(self, keys: NDArray[np.int64]) -> None:
-        """Have blocks of these keys before something is added to them."""
         self._store.insert(keys)
 
     def _check_cost(self, most: int) -> int:
-        """Cost of the rays; a keyframe that takes more time than one of any real sensor is refused."""
+        """Cost of the rays. Refuses a keyframe that takes longer than one of any real sensor."""
         cost = int(self._buffers.bands[:, COST].sum(dtype=np.int64))
         cost += CARVED_COST * len(self._buffers.carved)
         if cost > most:
@@ -211,7 +208,7 @@ class Integrator:
         return cost
 
     def _check_room(self, missing: int) -> None:
-        """Refuse a keyframe that needs more blocks than the map, or its sender, may still add."""
+        """Refuse a keyframe that needs more new blocks than the map's limit or its sender's quota allows."""
         count, most = self._store.count, self._config.max_blocks
         if count + missing > most:
             raise MapFull(
@@ -230,7 +227,6 @@ class Integrator:
             )
 
     def _limit(self, blocks: int) -> None:
-        """Refuse a keyframe that touches too many blocks."""
         if blocks > self._config.max_blocks_per_keyframe:
             raise KeyframeTooLarge(
                 f"a keyframe may touch at most max_blocks_per_keyframe = "
@@ -239,7 +235,7 @@ class Integrator:
             )
 
     def _carve(self, sign: int) -> int:
-        """Add to the voxels that the keyframe's image looks through; returns how many these are."""
+        """Add to the voxels that the keyframe's image looks through. Returns their number."""
         store, buffers = self._store, self._buffers
         carved, touched = buffers.carved, int(buffers.touched[TOUCHED_COUNT])
         self._limit(max(len(carved), touched))
@@ -270,7 +266,7 @@ class Integrator:
         self._has_cleared = True
 
     def _add_free(self, slots: NDArray[np.int32], sign: int) -> None:
-        """Add what is carved to the blocks in these slots."""
+        """Add the carved votes to the blocks in these slots."""
         store, buffers = self._store, self._buffers
         space_carving.add_free_blocks(
             slots, buffers.carved.amounts, buffers.carved.masks, sign, store.stamp, store.stamps,
@@ -278,10 +274,10 @@ class Integrator:
         )  # fmt: skip
 
     def _check(self, most: int, sign: int) -> None:
-        """Refuse a keyframe after which a lane has left its range, by no more than `most`.
+        """Refuse a keyframe after which a lane has left its range by no more than `most`.
 
-        The blocks' bounds grow by all that could be added; only where they reach the limit are the voxels
-        themselves read.
+        The blocks' bounds grow by the most that could be added. Voxels are read only in blocks whose bound
+        reaches the limit.
         """
         store, slots = self._store, self._buffers.touched_slots
         if sign > 0:
@@ -303,11 +299,10 @@ class Integrator:
             )
 
     def _measure_touched(self) -> None:
-        """Set the bounds of the touched blocks from their voxels."""
         integrate.largest_weights(self._store.sums, self._buffers.touched, self._store.bounds)
 
     def _smooth(self, sign: int) -> None:
-        """Bring the regularised layer up to date in the blocks just touched."""
+        """Update the regularised layer in the blocks just touched."""
         if sign < 0:
             self._forget_smoothed()
         else:

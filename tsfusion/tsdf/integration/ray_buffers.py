@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Memory for one keyframe at a time: its rays and the blocks they touch. Every keyframe uses it again."""
+"""Memory for one keyframe at a time, reused by the next: its rays and the blocks they touch."""
 
 from typing import Any
 
@@ -29,8 +29,9 @@ _NOTHING = {len(shape): np.zeros(shape, np.uint8) for shape in ((1,), (1, 3))}
 
 
 class RayBuffers:
-    """Rays of the current keyframe (`rays`, by `bands`), the slots of the blocks they touch (`touched`), the
-    keys of those that the map does not have (`missing`, a hash set), and what it looks through (`carved`)."""
+    """Rays of the current keyframe (`rays`, by `bands`), slots of the blocks they touch (`touched`), keys of
+    missing blocks (`missing`, a hash set), and the space it looks through (`carved`).
+    """
 
     def __init__(self, *, color: bool, regularised: bool) -> None:
         self._modelled: tuple[Any, ...] = ()  # what `_parameters` are of
@@ -68,7 +69,6 @@ class RayBuffers:
 
     @property
     def touched_slots(self) -> NDArray[np.int32]:
-        """Slots of the blocks that the current keyframe touches."""
         return self.touched[TOUCHED_HEADER : TOUCHED_HEADER + self.touched[TOUCHED_COUNT]]
 
     @property
@@ -82,7 +82,7 @@ class RayBuffers:
         self._owners.reserve(blocks)
 
     def share_out(self, units: int) -> None:
-        """Give each unit neighbouring bands, which cost about as much to add as those of any other."""
+        """Give each unit neighbouring bands of about equal cost."""
         if self.again.shape[1] < len(self.rays):
             self.again = np.zeros((2, len(self.rays)), np.int32)
         if len(self.scratch) < units * UNIT_SCRATCH:
@@ -127,7 +127,7 @@ class RayBuffers:
     def _model(
         self, config: VolumeConfig, sensor: str | None, baseline_fx: float | None
     ) -> NDArray[np.float64]:
-        """The sensor model, which is nearly always that of the keyframe before."""
+        """Sensor model, cached from the keyframe before."""
         modelled = config, sensor, baseline_fx
         if modelled != self._modelled:
             self._parameters = model_parameters(
@@ -139,33 +139,33 @@ class RayBuffers:
 
     @property
     def samples(self) -> int:
-        """Number of samples that went into the rays."""
         return int(self.bands[:, SAMPLES].sum())
 
     @staticmethod
     def as_read(image: NDArray[Any]) -> NDArray[Any]:
-        """An image as the kernel reads it, which for two types would be compiled twice, a second a start."""
+        """Image in the one type that the kernel reads: a second type would cost a second of compilation a
+        start.
+        """
         return image.astype(np.float32, copy=False)
 
     def _rays_of_points(self, points: Any, *rest: Any) -> None:
-        """Run `rays_from_points`, which takes these arguments and then the buffers."""
+        """Run `rays_from_points` with these arguments and the buffers."""
         self._reserve_rays(len(points))
         rays_from_points.rays_from_points(points, *rest, self.rays, self.bands)
 
     def _rays_of_image(self, image: NDArray[Any], *rest: Any) -> None:
-        """Likewise `rays_from_image`."""
         self._reserve_rays(rays_from_images.most_rays(*image.shape))
         rays_from_images.rays_from_image(image, *rest, self.rays, self.bands)
 
     @property
     def most_missing(self) -> int:
-        """Keys that `missing` takes: it is to stay half empty."""
+        """Keys that `missing` takes while it stays half empty."""
         return len(self.missing) // 2
 
     def take_missing(self) -> NDArray[np.int64]:
-        """Keys of the missing blocks, in an order that only they and the set's size decide.
+        """Keys of the missing blocks; their order depends only on them and the set's size.
 
-        Empties `missing`, which becomes small again when it was much too large.
+        `missing` is emptied, and shrinks if it was much too large.
         """
         keys: NDArray[np.int64] = self.missing[self.missing != 0]
         if len(self.missing) > max(_FEW_MISSING, 16 * len(keys)):
@@ -179,14 +179,14 @@ class RayBuffers:
         self.touched[[TOUCHED_OVERFLOW, TOUCHED_MISSING]] = 0
 
     def grow_missing(self, keys: int) -> None:
-        """Make room for so many keys in `missing`, and empty it."""
+        """Empty `missing` and make room for so many keys."""
         self.missing = np.zeros(1 << max(2 * keys - 1, 1).bit_length(), np.int64)
         self.touched[[TOUCHED_OVERFLOW, TOUCHED_MISSING]] = 0
 
     def reserve_votes(self) -> None:
         """Make room for the votes of all touched blocks."""
         self._votes.reserve(int(self.touched[TOUCHED_COUNT]))
-        # one for its length; each unit may leave a part of its last chunk empty
+        # One chunk for its length; each unit may leave a part of its last chunk empty
         self._voted.reserve(int(self.touched[TOUCHED_COUNT]) + 1 + BANDS * ray_smoothing.CHUNK // CUBE)
 
     @property
@@ -208,7 +208,7 @@ def model_parameters(
     outlier_filter: bool = True,
     space_carving: bool = False,
 ) -> NDArray[np.float64]:
-    """The sensor model as the kernels read it: (12,) float64, indices in kernels/base/sensor_noise.py."""
+    """Sensor model as the kernels read it: (12,) float64, indices in kernels/base/sensor_noise.py."""
     slope, z0 = model.sigma_slope, model.sigma_z0
     if baseline_fx is not None and model.disparity_sigma > 0:
         slope, z0 = model.disparity_sigma / baseline_fx, 0.0
@@ -249,12 +249,12 @@ def _camera(keyframe: Keyframe, voxel_size: float) -> NDArray[np.float64]:
 
 
 def _optional(array: NDArray[np.uint8] | None, dims: int) -> tuple[NDArray[Any], int]:
-    """An array that a kernel can be handed, and whether it holds anything."""
+    """Array that a kernel accepts, and 1 if it holds anything."""
     return (_NOTHING[dims], 0) if array is None else (array, 1)
 
 
 def keyframes_of_every_kind(model: SensorModel, voxel_size: float) -> list[Keyframe]:
-    """Keyframes of 16×16 samples within the sensor's range, one for each way through `make_rays`."""
+    """Keyframes of 16×16 samples within the sensor's range, one for each path through `make_rays`."""
     near = max(model.min_range * 1.5, 4 * voxel_size)
     pose, camera = np.eye(4), Intrinsics(20.0, 20.0, 8.0, 8.0)
     color = np.zeros((16, 16, 3), np.uint8)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The map's memory: blocks of 8³ voxels in slots, found by their packed coordinates."""
+"""Memory of the map: blocks of 8³ voxels in slots, found by their packed coordinates."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -22,21 +22,20 @@ from tsfusion.tsdf.store.clear_blocks import ClearBlocks
 from tsfusion.tsdf.store.growing_array import LAYER_DTYPES, MAX_ITEMS, FileArray, GrowingArray
 from tsfusion.tsdf.store.residency import Residency
 
-# Who follows the changes of blocks: `Volume.take_dirty`, what is kept of answers, `shows_surface`
+# Followers of the changes of blocks: `Volume.take_dirty`, kept answers, `shows_surface`
 MESHED, ASKED, SURFACES = 1, 2, 4
 _FIRST_CAPACITY = 1024
 _CHUNK = 1024  # blocks read at a time where a whole layer would be copied
 _HASH_BYTES = 4 * 12  # most that a block takes in the hash, which is a quarter full or fuller
-# What the keys of a block and of its neighbours towards −x, −y, −z are smaller by
+# Differences of the keys of a block and its neighbours towards −x, −y, −z from the key of the block
 CELL_STEPS = np.array([x << 42 | y << 21 | z for x in (0, 1) for y in (0, 1) for z in (0, 1)])
 
 
 class DeviceRows:
-    """Rows of a store on a device as well; these are on none, and `DeviceBlocks` on one.
+    """Copy of a store's rows on a device; this class has no device, `DeviceBlocks` has one.
 
     Attributes:
         first_blocks: number of blocks for which a store has room at first.
-        is_none: whether there is no device.
         sends_blocks: when `insert` tells the device; later = with the next call, never = it has them.
     """
 
@@ -51,7 +50,7 @@ class DeviceRows:
         """Bring the device's rows of `count` blocks up to date."""
 
     def note_written(self, slots: NDArray[Any]) -> None:
-        """Note that the store's rows have been written to."""
+        """Note a write to the store's rows."""
 
     def note_added(self, slots: NDArray[np.int32], count: int) -> None:
         """Note that the device has added to blocks, of `count` in all."""
@@ -63,16 +62,15 @@ class DeviceRows:
         hash_keys: NDArray[np.int64],
         hash_slots: NDArray[np.int32],
     ) -> None:
-        """Let the device have `count` blocks: new are those at these places of the hash, or all of another
-        size of it.
+        """Give the device `count` blocks: the new ones at these places of the hash, or, after a change of its
+        size, all.
 
-        Raises:
-            MemoryError: there is no room for them; the device has those that it had. Where they are sent
-                later, the next call raises it.
+        Raises MemoryError without room, with the next call if blocks are sent later; the device keeps its
+        former blocks.
         """
 
     def drop(self, count: int, hash_keys: NDArray[np.int64], hash_slots: NDArray[np.int32]) -> None:
-        """Let the device have `count` blocks, as the hash has them, and no others."""
+        """Keep `count` blocks on the device, as the hash has them, and no others."""
 
 
 class BlockStore:
@@ -80,16 +78,16 @@ class BlockStore:
 
     Layers, (slot, 512): `sums` int64; with colour `color_rgn` int64 and `color_b` int32; when smoothing
     `correction` float32; where hits are counted `hits` int32 (see kernels/integration/integrate.py and
-    kernels/integration/ray_smoothing.py). Beside them, one number a
-    block: `dirty` uint8 (a bit for each that follows the changes), and int32 `stamps` (the last keyframe that
-    touched it), `places` (where in that keyframe's list), `bounds` (no voxel has more weight than this).
-    A layer the map does not have is one row of zeros, so that kernels can be handed it.
+    kernels/integration/ray_smoothing.py). One number a block: `dirty` uint8 (a bit for each follower of the
+    changes), and int32 `stamps` (the last keyframe that touched it), `places` (where in that keyframe's
+    list), `bounds` (no voxel has more weight than this). A layer the map does not have is one row of zeros,
+    so that kernels can be handed it.
 
-    With a `cache` the layers lie in files, and blocks that no keyframe has changed for long leave memory:
-    whoever touches rows of many blocks calls `keep_within_memory` now and then.
+    With a `cache` the layers lie in files, and blocks unchanged for long leave memory: a caller that touches
+    rows of many blocks calls `keep_within_memory` now and then.
 
-    With a `device` keyframes are added there. Rows that are read here are brought up to date first; whoever
-    writes to rows says which (`note_written`).
+    With a `device` keyframes are added there. Rows are brought up to date before they are read here; after a
+    write to rows, the writer names them with `note_written`.
     """
 
     def __init__(
@@ -143,7 +141,7 @@ class BlockStore:
 
     @contextmanager
     def opening(self, blocks: int) -> Iterator[None]:
-        """Take so many blocks of a saved map in the block, whatever limits one that grows has."""
+        """Accept `blocks` blocks of a saved map within the context, whatever the limits of growth."""
         limits = self.most_blocks, [file.min_free_bytes for file in self._files]
         self.most_blocks = MAX_ITEMS
         for file in self._files:
@@ -157,19 +155,19 @@ class BlockStore:
                 file.min_free_bytes = least
 
     def shown(self, layer: str) -> NDArray[Any] | None:
-        """(count, 512) rows of a layer, not copied (`GrowingArray.shown`); None if there is none."""
+        """(count, 512) rows of a layer, not copied (`GrowingArray.shown`); None without this layer."""
         self._fetch()
         return self._layers[layer].shown(self.count) if layer in self._present else None
 
     @property
     def hash_keys(self) -> NDArray[np.int64]:
-        """The hash from block to slot (kernels/base/block_hash.py): keys."""
+        """Keys of the hash from block to slot (kernels/base/block_hash.py)."""
         self._hash()
         return self._hash_keys
 
     @property
     def hash_slots(self) -> NDArray[np.int32]:
-        """Likewise slots."""
+        """Slots of the same hash."""
         self._hash()
         return self._hash_slots
 
@@ -199,14 +197,16 @@ class BlockStore:
 
     @property
     def ray_ends(self) -> tuple[NDArray[np.int64], NDArray[np.int32], int]:
-        """Layers that count the rays which end in a voxel, and which of them the map has
-        (`surface_cells.held`)."""
+        """Layers that count the ray ends in a voxel, and a number for those that the map has
+        (`surface_cells.held`).
+        """
         return self.color_rgn, self.hits, self.color + 2 * self.counts_hits
 
     @property
     def clear_blocks(self) -> tuple[NDArray[Any], ...]:
-        """By slot, whether a block shows a surface or hits; and the blocks that keyframes look through
-        (`surface_cells.is_clear`)."""
+        """Flags by slot of blocks that show a surface or hits; and the blocks that keyframes look through
+        (`surface_cells.is_clear`).
+        """
         clear = self.clear
         if len(clear):
             with process.uninterrupted():
@@ -234,7 +234,7 @@ class BlockStore:
         return self._bounds.array
 
     def layers(self) -> dict[str, NDArray[Any]]:
-        """The layers the map has, by name."""
+        """Layers of the map, by name."""
         self._fetch()
         return {name: self._layers[name].array for name in self._present}
 
@@ -246,11 +246,11 @@ class BlockStore:
         self._device.fetch(self._layers)
 
     def send(self) -> None:
-        """Bring what was written to rows to the device."""
+        """Bring the device's rows up to date."""
         self._device.send(self._layers, self.count)
 
     def note_written(self, slots: NDArray[Any]) -> None:
-        """Note that rows have been written to, from outside."""
+        """Note a write to rows from outside."""
         self._device.note_written(slots)
 
     def note_touched(self, slots: NDArray[np.int32]) -> None:
@@ -259,7 +259,7 @@ class BlockStore:
         self.stamps[slots], self.dirty[slots] = self.stamp, CHANGED
 
     def limit(self, nbytes: int) -> None:
-        """Let the map take no more than so many bytes of memory from now on; a larger one stays as it is.
+        """Limit the map's memory, bytes, from now on; a larger map stays as it is.
 
         The number of blocks that this allows depends on the layers alone, never on how the map has grown.
         With a cache the map may grow on; its coldest blocks leave memory.
@@ -275,15 +275,15 @@ class BlockStore:
         return self._residency is not None
 
     def keep_within_memory(self) -> None:
-        """Let the coldest blocks leave memory if there are too many: call it after rows were touched."""
+        """Let the coldest blocks leave memory if there are too many; call it after a touch of rows."""
         if self._residency is not None:
             index = self.nbytes - self.count * self._residency.row_bytes
             self._residency.keep_within(max(self._memory_bytes - index, 0), self.stamps[: self.count])
 
     def rest(self) -> None:
-        """Let blocks leave memory, and others have their turn: call it between the steps of a long pass.
+        """Let blocks leave memory, and other work have its turn, between the steps of a long pass.
 
-        Only of one that reads, and can bear that others read meanwhile.
+        Only for a pass that reads, and that allows other readers meanwhile.
         """
         self.keep_within_memory()
         self.pause()
@@ -291,9 +291,7 @@ class BlockStore:
     def reserve(self, count: int) -> None:
         """Make room for `count` blocks in all.
 
-        Raises:
-            MemoryError: when there is not enough; the map is as it was.
-            MapFull: likewise on the disk of the cache.
+        Raises MemoryError, or MapFull for the disk of the cache, without room; the map is as it was.
         """
         if count > max(self.most_blocks, self.count) and self._residency is not None:
             raise MapFull(
@@ -347,7 +345,7 @@ class BlockStore:
             self._device.drop(count, self.hash_keys, self.hash_slots)
 
     def release(self, slots: NDArray[np.int64]) -> None:
-        """Give up blocks without votes: the last ones take their slots, and new ones the room."""
+        """Remove blocks without votes: the last blocks take their slots, and new ones the room."""
         self._fetch()
         left = self.count - len(slots)
         is_free = np.zeros(self.count, bool)
@@ -362,13 +360,13 @@ class BlockStore:
         self.note_written(to)
 
     def slots_of(self, keys: NDArray[np.int64]) -> NDArray[np.int32]:
-        """(n,) slots of (n,) keys, −1 where there is no such block."""
+        """(n,) slots of (n,) keys, −1 for an absent block."""
         slots = np.empty(len(keys), np.int32)
         block_hash.find_blocks(keys, self.hash_keys, self.hash_slots, slots)
         return slots
 
     def copy_from(self, other: "BlockStore") -> None:
-        """Become a copy of another store with the same layers, as long as this one is empty. As `reserve`."""
+        """Copy another store with the same layers into this empty one. Raises as `reserve`."""
         self.most_blocks, self._memory_bytes = other.most_blocks, other._memory_bytes
         with self.opening(other.count):
             self.insert(other.keys)
@@ -384,7 +382,6 @@ class BlockStore:
         self.note_written(np.arange(self.count))
 
     def measure_bounds(self) -> None:
-        """Set `bounds` from the sums."""
         for i in range(0, self.count, _CHUNK):
             chunk = slice(i, min(i + _CHUNK, self.count))
             self.bounds[chunk] = (self.sums[chunk] & WEIGHT_MASK).max(axis=1)
@@ -397,7 +394,7 @@ class BlockStore:
         return slots
 
     def used(self) -> NDArray[np.int64]:
-        """Slots with any vote left, in the order of their keys."""
+        """Slots with any vote left, in key order."""
         has_votes = np.empty(self.count, bool)
         for i in range(0, self.count, _CHUNK):
             chunk = slice(i, min(i + _CHUNK, self.count))
@@ -418,7 +415,7 @@ class BlockStore:
             self.rest()
 
     def _hash(self) -> None:
-        """Put the blocks into the hash that are not there yet. For the thread that kernels run in."""
+        """Put new blocks into the hash. For the thread that kernels run in."""
         runtime.check_thread()
         first, self._hashed = self._hashed, self.count
         if first < self.count:
@@ -443,7 +440,7 @@ class BlockStore:
 
     @property
     def resident_bytes(self) -> int:
-        """Memory that the blocks and their hash take, bytes: less than `nbytes` where some are in files."""
+        """Bytes of the blocks and their hash in memory: less than `nbytes` with some blocks in files."""
         if self._residency is None:
             return self.nbytes
         return self.nbytes - self.count * self._residency.row_bytes + self._residency.nbytes
@@ -462,10 +459,10 @@ def unpack_keys(keys: NDArray[np.int64]) -> NDArray[np.int32]:
 
 
 def distinct_blocks(coordinates: NDArray[np.int32]) -> NDArray[np.int32]:
-    """(n, 3) block coordinates, each once, in the order of their keys: (m, 3) int32."""
+    """Distinct block coordinates in key order: (n, 3) → (m, 3) int32."""
     return unpack_keys(distinct(pack_keys(coordinates)))
 
 
 def cells_of(coordinates: NDArray[np.int32]) -> NDArray[np.int32]:
-    """The blocks whose cells read these blocks: themselves and their neighbours towards −x, −y, −z."""
+    """Blocks whose cells read these blocks: themselves and their neighbours towards −x, −y, −z."""
     return unpack_keys(distinct(pack_keys(coordinates)[:, None] - CELL_STEPS))

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""How many keyframes look through each block as a whole: free space that no voxel holds.
+"""Number of keyframes that look through each block as a whole: free space that no voxel holds.
 
-What a keyframe looks through (`carved_blocks`) is a function of the keyframe alone: counts are sums as
-the voxels' are, and a keyframe that is taken away takes its own. A block is free where one keyframe or more
+The blocks that a keyframe looks through (`carved_blocks`) depend on the keyframe alone. Counts are sums, as
+voxels are, and a keyframe that is taken away takes its own counts. A block is free if one keyframe or more
 looks through it and its voxels show neither a hit nor a surface.
 """
 
@@ -24,9 +24,10 @@ ClearCounts = tuple[
 
 
 class ClearBlocks:
-    """Blocks by their keys in slots of their own, each with its count.
+    """Blocks by their keys, in slots of their own, each with its count.
 
-    A count below one is none: a map of an earlier version did not count the keyframe that was taken away.
+    A count below one stands for none: a map of an earlier version did not count the keyframe that was taken
+    away.
     """
 
     def __init__(self) -> None:
@@ -53,15 +54,14 @@ class ClearBlocks:
         return self._keys.array[slots], self._counts.array[slots]
 
     def add(self, keys: NDArray[np.int64], amount: int | NDArray[np.int32], most: int) -> None:
-        """Add to the counts of blocks, all or none; what is taken from blocks without a count is nothing.
+        """Add to the counts of blocks, all or none. Subtraction from blocks without a count has no effect.
 
         Args:
             keys: distinct.
-            amount: of all, or of each.
+            amount: one for all, or one for each.
             most: blocks with voxels that the map may have.
 
-        Raises:
-            MapFull: there would be too many; MemoryError: there is no room.
+        Raises MapFull for too many blocks, MemoryError without room.
         """
         slots = self._slots_of(keys)
         missing = keys[slots < 0]
@@ -74,7 +74,7 @@ class ClearBlocks:
         self._note(keys[(before > 0) != (after > 0)])
 
     def replace(self, counts: ClearCounts) -> None:
-        """Have these counts instead. Raises MemoryError."""
+        """Take these counts instead. Raises MemoryError."""
         self._keys.array[: self._count] = self._counts.array[: self._count] = 0
         for array in self._hash:
             array[:] = 0
@@ -83,8 +83,9 @@ class ClearBlocks:
         self._noted, self.noted = [], self.noted + _MOST_NOTED + 1  # more than anybody follows
 
     def changed_since(self, noted: int) -> NDArray[np.int64] | None:
-        """Keys of the blocks that are looked through, or not any more, since so many were `noted`; None = too
-        many."""
+        """Keys of blocks that have become free, or are free no longer, since `noted` changes; None = too
+        many.
+        """
         found, left = [np.empty(0, np.int64)], self.noted - noted
         for keys in reversed(self._noted):
             if left <= 0:
@@ -94,10 +95,9 @@ class ClearBlocks:
         return None if left > 0 else distinct(np.concatenate(found))
 
     def take_unknown(self, drops: int, blocks: int, changed: NDArray[np.int64]) -> NDArray[np.int32]:
-        """Slots of the map's blocks to look at again: those that have changed, and new ones.
+        """Slots of the map's blocks to look at again: changed and new ones.
 
-        Args:
-            drops, blocks: how often blocks have moved, and how many there are.
+        `drops` and `blocks`: how often blocks have moved, and how many there are.
         """
         first = self._known[1] if self._known[0] == drops else 0
         if blocks > len(self.shows_surface):
@@ -107,7 +107,6 @@ class ClearBlocks:
 
     @property
     def nbytes(self) -> int:
-        """Memory, bytes."""
         return len(self.shows_surface) + 12 * self._count + sum(array.nbytes for array in self._hash)
 
     def _slots_of(self, keys: NDArray[np.int64]) -> NDArray[np.int32]:
@@ -131,7 +130,7 @@ class ClearBlocks:
         self._count = count
 
     def _forget_empty(self) -> None:
-        """Make room: let go of blocks whose keyframes have all been taken away."""
+        """Make room: remove blocks whose keyframes have all been taken away."""
         counts = self.counts()
         if len(counts[0]) <= self._count // 2:
             noted = self._noted, self.noted
@@ -147,7 +146,7 @@ class ClearBlocks:
 
 
 def check_count(blocks: int, most: int) -> None:
-    """Raise MapFull where so many are too many for a map of `most` blocks."""
+    """Raise MapFull if `blocks` are too many for a map of `most` blocks."""
     if blocks > _A_BLOCK * most:
         raise MapFull(
             f"the map may hold at most {_A_BLOCK * most} blocks of free space, {_A_BLOCK} times max_blocks, "
@@ -156,7 +155,7 @@ def check_count(blocks: int, most: int) -> None:
 
 
 def summed(several: list[ClearCounts], add: "np.ufunc" = np.add) -> ClearCounts:
-    """The counts of several maps, added; of parts of one map, which share keyframes, their `np.maximum`."""
+    """Sum of the counts of several maps; for parts of one map, which share keyframes, their `np.maximum`."""
     keys = np.concatenate([one[0] for one in several])
     found = distinct(keys)
     counts = np.zeros(len(found), np.int32)
@@ -165,15 +164,13 @@ def summed(several: list[ClearCounts], add: "np.ufunc" = np.add) -> ClearCounts:
 
 
 def encoded(counts: ClearCounts) -> bytes:
-    """ClearCounts as they are saved: keys (int64), then counts (int32), little-endian."""
+    """ClearCounts as saved: keys (int64), then counts (int32), little-endian."""
     return counts[0].astype("<i8").tobytes() + counts[1].astype("<i4").tobytes()
 
 
 def decoded(saved: bytes, most: int) -> ClearCounts:
-    """ClearCounts that `encoded` made.
-
-    Raises:
-        ValueError: they are not what it makes, or too many for a map of `most` blocks.
+    """ClearCounts from `encoded`. Raises ValueError for other bytes, or too many for a map of `most`
+    blocks.
     """
     count = len(saved) // 12
     if len(saved) != 12 * count or count > _A_BLOCK * most:

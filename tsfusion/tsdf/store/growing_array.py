@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Arrays that grow without copying: anonymous memory whose pages the operating system adds on first touch, or
-a file whose pages can leave memory."""
+a file whose pages can leave memory.
+"""
 
 import ctypes
 import mmap
@@ -31,9 +32,9 @@ MAX_ITEMS = (1 << 22) - 1  # × 512 voxels stays below the 2³¹ elements that a
 class GrowingArray:
     """A zero-initialised array (capacity, *item) whose capacity can grow.
 
-    On Linux growing moves page-table entries, not bytes (`mremap`), and pages never touched take no
-    memory; elsewhere it copies. Take `array` anew after every `reserve`: an older one, or a view of it,
-    points to memory that is gone.
+    On Linux growing moves page-table entries, not bytes (`mremap`), and untouched pages take no memory;
+    elsewhere it copies. Take `array` anew after every `reserve`: an older one, or a view of it, points to
+    freed memory.
     """
 
     def __init__(self, item: tuple[int, ...], dtype: DTypeLike, capacity: int) -> None:
@@ -52,9 +53,9 @@ class GrowingArray:
         return int(np.prod(self._item, dtype=np.int64)) * self._dtype.itemsize
 
     def shown(self, count: int) -> NDArray[Any]:
-        """The first items, read-only, without copying: memory that stays, however the array grows.
+        """First items, read-only, without copying, in memory that stays valid however the array grows.
 
-        Once it has grown, what was shown before may be a copy of how it was.
+        After growth, an earlier result may be a copy of the old state.
         """
         items = self.array[:count]
         if self._map is not None:  # as a buffer of the map, which then is not resized
@@ -64,10 +65,8 @@ class GrowingArray:
         return items
 
     def reserve(self, capacity: int) -> None:
-        """Make room for `capacity` items; new items are zero.
-
-        Raises:
-            MemoryError: when there is not enough; the array stays as it was.
+        """Make room for `capacity` items; new items are zero. Raises MemoryError; the array stays as it
+        was.
         """
         if capacity <= self.capacity:
             return
@@ -78,7 +77,7 @@ class GrowingArray:
             self._grow(capacity)  # near the limit, no more than is needed
 
     def _whole_pages(self, capacity: int) -> int:
-        """So many items or a few more, that fill huge pages: only these are moved as they are."""
+        """Capacity rounded up to whole huge pages: only these are moved as they are."""
         size = capacity * self.item_bytes
         if size < _HUGE_PAGE or _HUGE_PAGE % self.item_bytes:
             return capacity
@@ -123,14 +122,14 @@ class GrowingArray:
 
 
 class FileArray(GrowingArray):
-    """A growing array in a file that has no name, in a folder on a disk (Linux).
+    """A growing array in an unnamed file, in a folder on a disk (Linux).
 
-    Address space for all items there can be is taken once: growing only asks the disk for room, and `array`
-    keeps its address. Its pages are the file's: the system counts them neither as this process's allocations
-    nor for ever as its resident memory (`let_go`).
+    Address space for the largest size is taken once: growing only asks the disk for room, and `array` keeps
+    its address. Its pages are the file's: the system counts them neither as this process's allocations nor
+    for ever as its resident memory (`let_go`).
 
     Args:
-        min_free_bytes: that growing beyond `capacity` leaves free on the disk; None = nothing.
+        min_free_bytes: disk space left free by growth beyond `capacity`; None = nothing.
 
     Raises:
         InvalidConfig: when the folder cannot hold such a file.
@@ -177,15 +176,15 @@ class FileArray(GrowingArray):
 
     @property
     def address(self) -> int:
-        """Address of the first item, for ever."""
+        """Permanent address of the first item."""
         return int(self.array.ctypes.data)
 
     def let_go(self, first: int, end: int) -> None:
         """Take items first … end-1, whole pages, out of this process's memory; touched, they come back.
 
-        They are the system's then: it writes them to the disk, and keeps a copy for as long as nothing else
-        needs the memory. (Told to drop them by posix_fadvise, it reads again what comes back: 1.6 times the
-        CPU in a room four times as large as its memory.)
+        The system then owns them: it writes them to the disk, and keeps a copy while nothing else needs the
+        memory. (Dropped with posix_fadvise, they are read again from disk: 1.6 times the CPU in a room four
+        times as large as its memory.)
         """
         size = self.item_bytes
         self._pages.madvise(mmap.MADV_DONTNEED, first * size, (end - first) * size)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Blocks of a map in files that are in memory, and those that leave it when they take too much."""
+"""Blocks of a map in files, of which memory holds a part; blocks leave it when they take too much."""
 
 import mmap
 import os
@@ -24,7 +24,7 @@ _PRESENT = np.uint64(63)  # bit of an entry: the page is in memory
 
 
 class Residency:
-    """Keeps the pages of some layers that are in this process's memory within a budget."""
+    """Limit of the pages of some layers in this process's memory."""
 
     def __init__(self, layers: Collection[FileArray], disk_bytes: int = 0) -> None:
         self._layers, self.disk_bytes = layers, disk_bytes
@@ -33,19 +33,17 @@ class Residency:
 
     @cached_property
     def row_bytes(self) -> int:
-        """Size of a block, bytes."""
         return sum(layer.item_bytes for layer in self._layers)
 
     @property
     def nbytes(self) -> int:
-        """Memory of the blocks that are here, bytes; a library that was loaded meanwhile counts, too."""
+        """Bytes of the blocks in memory; includes a library that was loaded meanwhile."""
         return max(0, self._measured + process.shared_rss_bytes() - self._shared)
 
     def keep_within(self, budget: int, stamps: NDArray[np.int32]) -> None:
-        """Let blocks go if they take more bytes than `budget`, those changed longest ago first.
+        """Let the blocks unchanged for longest leave memory if all take more bytes than `budget`.
 
-        Args:
-            stamps: (count,) the last keyframe that changed each block.
+        `stamps`: (count,) the last keyframe that changed each block.
         """
         if self.nbytes <= budget or not len(stamps):
             return
@@ -62,7 +60,7 @@ class Residency:
         self._measured, self._shared = total, process.shared_rss_bytes()
 
     def _held(self, groups: int) -> NDArray[np.int64]:
-        """Bytes of each of the first groups in memory; of whole groups where the system does not tell."""
+        """Bytes in memory of each of the first groups; of whole groups if the system does not tell."""
         held = np.zeros(groups, np.int64)
         for layer in self._layers:
             pages = GROUP * layer.item_bytes // mmap.PAGESIZE  # of a group
@@ -77,7 +75,7 @@ class Residency:
 
 
 def _pages_in_memory(first: int, count: int) -> NDArray[np.bool_]:
-    """Pages, of `count` from number `first` on, that are in this process's memory (Linux)."""
+    """Mask of the pages, `count` from number `first` on, in this process's memory (Linux)."""
     found = np.ones(count, bool)
     with suppress(OSError), open("/proc/self/pagemap", "rb", buffering=0) as table:
         for i in range(0, count, _PART):
@@ -88,14 +86,14 @@ def _pages_in_memory(first: int, count: int) -> NDArray[np.bool_]:
 
 
 def _runs(numbers: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
-    """First and end of each run of consecutive numbers, which are sorted."""
+    """First and end of each run of consecutive numbers; the numbers are sorted."""
     cuts = np.flatnonzero(np.diff(numbers) != 1) + 1
     for part in np.split(numbers, cuts):
         yield int(part[0]), int(part[-1]) + 1
 
 
 def checked_cache(memory_bytes: int, cache: str | os.PathLike[str] | CacheConfig | None) -> CacheConfig:
-    """Folder in which blocks may wait that are not in memory."""
+    """Folder for blocks that are not in memory."""
     if memory_bytes < 1:
         raise InvalidConfig(f"memory_bytes must be > 0, got {memory_bytes}")
     if sys.platform != "linux" or not process.shared_rss_bytes():

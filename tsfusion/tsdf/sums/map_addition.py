@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""The sums of one map added to those of another, all or none of them.
+"""Sums of one map added to those of another, all or none of them.
 
-Where a voxel's colour would have more votes than `COLOR_LIMIT` it is settled: both colours are averaged, each
-by its votes, to one of so many. Smoothed values are not sums. A block of both maps falls back to raw
-values, as where a keyframe is retracted; one of a single map keeps them.
+A voxel whose colour would have more votes than `COLOR_LIMIT` is settled: both colours are averaged by their
+votes, to one of so many. Smoothed values are not sums: a block of both maps falls back to raw values, as
+after a retraction; a block of one map keeps them.
 """
 
 import numpy as np
@@ -27,12 +27,12 @@ def add(store: BlockStore, other: BlockStore, max_blocks: int, *, are_parts: boo
 
     Args:
         max_blocks: that `store` may have.
-        are_parts: both are parts of one map, of whose keyframes each is in both.
+        are_parts: both are parts of one map, with the same keyframes in both.
 
     Raises:
         MapFull: when it would have more.
         WeightOverflow: when a voxel would have more votes than its integers hold.
-        MemoryError: when there is no room. After each of these the map is as it was.
+        MemoryError: without room. After each error the map is as it was.
     """
     theirs = other.used()
     keys = other.keys[theirs]
@@ -63,7 +63,9 @@ def add(store: BlockStore, other: BlockStore, max_blocks: int, *, are_parts: boo
 def _check_weights(
     store: BlockStore, other: BlockStore, slots: NDArray[np.int32], theirs: NDArray[np.int64]
 ) -> None:
-    """Refuse voxels whose votes would not fit; only blocks whose bounds are near that are read."""
+    """Raise WeightOverflow if a voxel's weights would overflow. Only blocks whose `bounds` make that possible
+    are read.
+    """
     bounds = store.bounds[slots].astype(np.int64) + other.bounds[theirs]
     full = 0
     near = np.flatnonzero(bounds >= WEIGHT_LIMIT)
@@ -111,7 +113,7 @@ Colors = tuple[NDArray[np.int64], NDArray[np.int32]]  # rows of `color_rgn` and 
 
 
 def added_colors(here: Colors, there: Colors) -> Colors:
-    """The colours of the same blocks in two maps, (n, 512) each, added; settled ones are averaged."""
+    """Sum of the colours of the same blocks in two maps, (n, 512) each; settled ones are averaged."""
     rgn, blue = here[0] + there[0], here[1] + there[1]
     if not ((here[0] | there[0] | rgn) & COLOR_LIMIT).any():  # fewer votes in both, and together
         return rgn, blue

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The part of a map in a box, voxel by voxel; and parts of one map, which may be put together again."""
+"""The part of a map in a box, voxel by voxel; and parts of one map, which may be joined again."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -19,11 +19,11 @@ _MOST = 1 << 24  # voxels from the origin: beyond any map
 
 
 class Part(Struct, frozen=True):
-    """A map's place in another one of which it is a part, for as long as its own hash stays.
+    """Place of a map in another one, the whole, of which it is a part; valid until its own hash changes.
 
     Attributes:
-        whole: hash of that map.
-        boxes: first x, y, z and last + 1 of the voxels that were taken over; those of several are disjoint.
+        whole: hash of the whole map.
+        boxes: first x, y, z and last + 1 of the copied voxels; several boxes are disjoint.
     """
 
     whole: str
@@ -31,17 +31,17 @@ class Part(Struct, frozen=True):
     boxes: list[list[int]]
 
     def within(self, first: NDArray[np.int64], end: NDArray[np.int64], own: str) -> "Part":
-        """The part of this part in another box, whose hash is `own`."""
+        """Part of this part in another box, with the hash `own`."""
         cut = [[*np.maximum(box[:3], first), *np.minimum(box[3:], end)] for box in self.boxes]
         return Part(self.whole, own, [list(map(int, box)) for box in cut if _overlap(box, box)])
 
     def is_beside(self, other: "Part") -> bool:
-        """True if both parts are of one map, and share no voxel."""
+        """True if both parts are of one map and share no voxel."""
         return self.whole == other.whole and not any(_overlap(a, b) for a in self.boxes for b in other.boxes)
 
 
 def part_of(meta: Mapping[str, Any], own: str) -> Part | None:
-    """The place of a map of this meta and hash in another one; None = it is no part, or has changed."""
+    """Place of a map of this meta and hash in another one; None = it is no part, or has changed."""
     found = msgspec.convert(meta[PART_OF], Part) if PART_OF in meta else None
     return found if found is not None and found.own == own else None
 
@@ -51,7 +51,7 @@ def _overlap(one: Sequence[int], other: Sequence[int]) -> bool:
 
 
 def voxel_range(box: Sequence[float], voxel_size: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The voxels whose centres lie in a box: first (3,), and last + 1 (3,). Boxes side by side share none.
+    """Voxels whose centres lie in a box: first (3,), and last + 1 (3,). Boxes side by side share none.
 
     Args:
         box: x0, y0, z0, x1, y1, z1 in metres; a centre on the upper side is outside.
@@ -69,8 +69,7 @@ def voxel_range(box: Sequence[float], voxel_size: float) -> tuple[NDArray[np.int
 def copy(store: BlockStore, into: BlockStore, first: NDArray[np.int64], end: NDArray[np.int64]) -> None:
     """Copy the voxels `first` ≤ (x, y, z) < `end` to a store without blocks; those around them stay zero.
 
-    Raises:
-        MemoryError: when there is no room.
+    Raises MemoryError without room.
     """
     used = store.used()
     corners = 8 * unpack_keys(store.keys[used]).astype(np.int64)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The difference between two maps of one frame: counts, and the surface that came or went."""
+"""Difference between two maps of one frame: counts, and the surface that came or went."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -37,17 +37,16 @@ class MapSide(NamedTuple):
 class MapDifference:
     """Difference between a map and a later one of the same place.
 
-    A voxel counts where it has votes. A piece of surface of the later map is `unchanged` where the earlier
-    one has its surface within the tolerance, `appeared` where that saw free space, and `new` where it saw
-    nothing. Surface of the earlier map is `gone` where the later one saw free space, and `not_seen_again`
-    where that saw nothing. Free space is known in the band around surfaces alone, unless a map was made with
-    `space_carving`: without it much of what came or went counts as `new` and `not_seen_again`.
+    A voxel counts if it has votes. Surface of the later map is `unchanged` where the earlier map has its
+    surface within the tolerance, `appeared` where that saw free space, and `new` where it saw nothing.
+    Surface of the earlier map is `gone` where the later one saw free space, and `not_seen_again` where that
+    saw nothing. Without `space_carving`, free space is known only in the band around surfaces: many changes
+    then count as `new` and `not_seen_again`.
 
     Attributes:
         blocks, voxels: number of those that are `same`, `changed`, `only_earlier` and `only_later`.
         area_m2: square metres of surface, by kind.
-        mesh: the later surface, and of the earlier one what is not there any more; each kind has a colour
-            (`COLORS`).
+        mesh: the later surface, and the lost parts of the earlier one; each kind has a colour (`COLORS`).
     """
 
     blocks: dict[str, int]
@@ -95,8 +94,7 @@ def count(earlier: BlockStore, later: BlockStore) -> tuple[dict[str, int], dict[
 def surfaces(earlier: MapSide, later: MapSide, tolerance: float) -> tuple[dict[str, float], Mesh]:
     """Square metres of each kind of surface, and the coloured mesh.
 
-    Args:
-        tolerance: metres between two surfaces that are the same.
+    `tolerance`: metres between two surfaces that are the same.
     """
     kinds = [
         _kinds(earlier.mesh, later, tolerance, (GONE, UNSEEN)),
@@ -114,8 +112,7 @@ def surfaces(earlier: MapSide, later: MapSide, tolerance: float) -> tuple[dict[s
 def _kinds(mesh: Mesh, other: MapSide, tolerance: float, names: tuple[str, str]) -> NDArray[np.uint8]:
     """(n,) index in `_KINDS` of a mesh's vertices, by the voxels of the other map that they lie in.
 
-    Args:
-        names: of those that the other map saw free, and did not see.
+    `names`: kinds for voxels that the other map saw free, and did not see.
     """
     free, unseen = map(_KINDS.index, names)
     store, least = other.store, max(1, int(np.ceil(other.min_weight * WEIGHT_ONE)))
@@ -135,7 +132,7 @@ def _kinds(mesh: Mesh, other: MapSide, tolerance: float, names: tuple[str, str])
 
 
 def _of_faces(faces: NDArray[np.int32], of_vertices: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """A triangle is of a kind when its three vertices are; others are unchanged."""
+    """Kind of each triangle: that of its three vertices if equal, else unchanged."""
     corners = of_vertices[faces]
     same = (corners[:, 0] == corners[:, 1]) & (corners[:, 0] == corners[:, 2])
     return np.where(same, corners[:, 0], np.uint8(_KINDS.index(UNCHANGED)))
@@ -147,7 +144,7 @@ def _areas(mesh: Mesh) -> NDArray[np.float64]:
 
 
 def _painted(earlier: Mesh, kinds: NDArray[np.uint8], later: Mesh, later_kinds: NDArray[np.uint8]) -> Mesh:
-    """The later mesh, and of the earlier one the faces that changed, coloured by kind."""
+    """The later mesh and the changed faces of the earlier one, coloured by kind."""
     faces = earlier.faces[_of_faces(earlier.faces, kinds) != _KINDS.index(UNCHANGED)]
     used, numbers = np.unique(faces, return_inverse=True)
     moved = numbers.reshape(-1, 3).astype(np.int32) + np.int32(len(later.vertices))

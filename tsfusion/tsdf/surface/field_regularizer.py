@@ -2,8 +2,9 @@
 """Signed distances of a surface, raw or of the regularised field: plan of blocks and iterations.
 `kernels/surface/field_smoothing.py` solves.
 
-A view of the map's sums: no order of keyframes or threads can show. Blocks are solved with a halo of their
-neighbours, so that some blocks' values are nearly those of the whole map (docs/method.md says how nearly).
+The result is a function of the map's sums: the order of keyframes and threads has no effect. Blocks are
+solved with a halo of neighbours, so that some blocks' values are nearly those of the whole map
+(docs/method.md says how nearly).
 """
 
 import math
@@ -41,8 +42,9 @@ _PART = 1 << 14  # blocks read at a time: they may have to come from a file
 
 @dataclass(frozen=True)
 class FieldSettings:
-    """`smoothness` λ against data weights in full-confidence samples, `edge` ε in voxels: D2 beyond it
-    counts as an edge, `reweightings`: rounds of steps, each with ω from the x of the last."""
+    """`smoothness` λ against data weights in full-confidence samples, `edge` ε in voxels: a larger D2 counts
+    as an edge, `reweightings`: rounds of steps, each with ω from the x of the last.
+    """
 
     smoothness: float
     edge: float
@@ -50,7 +52,7 @@ class FieldSettings:
 
     @property
     def reach(self) -> float:
-        """Voxels: the length over which the penalty smooths; what lies deeper does not move the surface."""
+        """Length over which the penalty smooths, voxels; what lies deeper does not move the surface."""
         return max(LEAST_REACH, float(self.smoothness**0.25))
 
     @property
@@ -71,7 +73,7 @@ class FieldSettings:
 
     @property
     def halo(self) -> int:
-        """Blocks around those that are solved, on each side, that are solved with them."""
+        """Blocks around the wanted ones, on each side, that are solved with them."""
         return 1 + 2 * self.coarser
 
 
@@ -121,7 +123,7 @@ def along_normals(
 
 
 def spread(keys: NDArray[np.int64], store: BlockStore, settings: FieldSettings) -> NDArray[np.int64]:
-    """The blocks whose field may move by more than a hundredth of a voxel with the sums of these."""
+    """Blocks whose field may move by more than a hundredth of a voxel with the sums of these."""
     return around(keys, store, 1 + settings.coarser)
 
 
@@ -129,7 +131,7 @@ def spread(keys: NDArray[np.int64], store: BlockStore, settings: FieldSettings) 
 class GridLevel:
     """Listed cells of one resolution: `bits` = log2 of the cells a side of a block.
 
-    `planes`, `places`: which cells, and where in the list (`kernels/surface/field_smoothing.py`).
+    `planes`, `places`: marked cells, and their places in the list (`kernels/surface/field_smoothing.py`).
     """
 
     bits: int
@@ -142,7 +144,7 @@ class GridLevel:
 
     @classmethod
     def make(cls, bits: int, planes: NDArray[np.uint64], counts: NDArray[np.int32]) -> "GridLevel":
-        """An empty list of the marked cells; `counts` has those of each word."""
+        """Empty list of the marked cells; `counts` has the number in each word."""
         places = np.append(0, np.cumsum(counts)).astype(np.int32)
         total = -(-int(places[-1]) // kernels.ABREAST) * kernels.ABREAST
         y, weight, x = (np.zeros(total + 1, np.float32) for _ in range(3))  # the last stands for "none"
@@ -153,10 +155,9 @@ class GridLevel:
     def relax(
         self, smoothness: float, rounds: Sequence[Round], pause: Callable[[], None] = lambda: None
     ) -> None:
-        """Go down the gradient in rounds, each with ω from the solution of the one before.
+        """Descend the gradient in rounds, each with ω from the solution of the one before.
 
-        Args:
-            pause: called after each launch.
+        `pause` is called after each launch.
         """
         total = len(self.x)
         omega, bent = np.zeros((3, total), np.float32), np.zeros((3, total), np.float32)
@@ -194,7 +195,7 @@ def _solve_batch(
                 level.bits, coarse.links, coarse.planes, coarse.places, coarse.x,
                 level.planes, level.places, level.x,
             )  # fmt: skip
-        # between cells of twice the size a bend is 4 times as large, and there are 8 times fewer
+        # Between cells of twice the size a bend is 4 times as large, and there are 8 times fewer
         level.relax(settings.smoothness / 2**depth, settings.rounds(depth), store.pause)
     kernels.write_values(levels[0].planes, levels[0].places, levels[0].x, values)
     if not is_all:
@@ -206,7 +207,7 @@ def _solve_batch(
 def _list(
     keys: NDArray[np.int64], values: NDArray[np.float32], store: BlockStore, settings: FieldSettings
 ) -> list[GridLevel]:
-    """The voxels near the surface, and their coarser cells."""
+    """Voxels near the surface, and their coarser cells."""
     sides = index_of(keys, keys[:, None] + SIDES)
     planes, counts = marks_of(len(keys), CUBE)
     kernels.mark_voxels(values, settings.reach * QUANTA_PER_VOXEL, planes, counts)
@@ -231,7 +232,7 @@ def _list(
 
 
 def marks_of(blocks: int, cells: int) -> tuple[NDArray[np.uint64], NDArray[np.int32]]:
-    """Room for the marks of so many cells a block, a bit each, and for how many each word has."""
+    """Room for the marks of so many cells a block, a bit each, and for the number in each word."""
     shape = blocks, -(-cells // WORD)
     return np.empty(shape, np.uint64), np.empty(shape, np.int32)
 
@@ -247,7 +248,7 @@ def chebyshev(lowest: float, steps: int) -> Iterator[tuple[float, float]]:
 
 
 def around(keys: NDArray[np.int64], store: BlockStore, rings: int = 1) -> NDArray[np.int64]:
-    """The blocks of the map up to so many blocks away, these among them; sorted."""
+    """Blocks of the map up to `rings` blocks away, with these themselves; sorted."""
     for _ in range(rings):
         most = min(len(AROUND) * len(keys), store.count)
         table = np.zeros(1 << max(4, (2 * most).bit_length()), np.int64)

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Holes closed by the field: a guess of the surface where nothing was seen, and which triangles are guessed.
+"""Holes closed by the field: a guess of the surface where nothing was seen, with its triangles marked.
 
 1. A rim is where a surface breaks off: a seen voxel that it passes, beside an unseen one.
 2. The unseen voxels within half a hole of a rim get values: paper eq. 3 with seen voxels as data and no
-   weight elsewhere, so that second differences are least; a ramp goes on as it is. Seen voxels keep theirs.
-3. Marching cubes meshes seen and guessed voxels together. A triangle is guessed if its cell has a voxel that
-   nobody saw; all others are those of the mesh without guesses.
+   weight elsewhere, so that second differences are least; a ramp continues as it is. Seen voxels keep theirs.
+3. Marching cubes meshes seen and guessed voxels together. A triangle is guessed if its cell has an unseen
+   voxel; all others are those of the mesh without guesses.
 4. A guessed patch stays if it closes, and its colours come from its rim.
 """
 
@@ -37,14 +37,14 @@ _SWEEPS = 256  # of colours, at most: across the widest hole
 
 
 def checked(voxels: int) -> int:
-    """The width of holes to close; raises InvalidConfig for one that is none."""
+    """Width of holes to close; raises InvalidConfig for an impossible one."""
     if not 1 <= voxels <= MOST_VOXELS:
         raise InvalidConfig(f"holes are filled up to 1 to {MOST_VOXELS} voxels, got {voxels}")
     return voxels
 
 
 def extract_filled(store: BlockStore, min_weight: float, view: SurfaceView, voxels: int) -> Mesh:
-    """The mesh of the whole map with its holes up to so many voxels closed; `guessed` says where."""
+    """Mesh of the whole map with its holes up to `voxels` wide closed; `guessed` marks the new triangles."""
     own, buffers = np.sort(store.keys), MeshBuffers()
     seen = view(own, store, min_weight)
     more, filled = _fill(own, seen, voxels)
@@ -83,7 +83,7 @@ def extract_filled(store: BlockStore, min_weight: float, view: SurfaceView, voxe
 def _fill(
     keys: NDArray[np.int64], seen: NDArray[np.float32], voxels: int
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Sorted keys of blocks with guessed values, and their (n, 512) values; NaN where nothing is guessed."""
+    """Sorted keys of blocks with guessed values, and their (n, 512) values; NaN without a guess."""
     rims = np.zeros((len(keys), CUBE), np.uint8)
     kernels.find_rims(_rows(keys, keys[:, None] + field_regularizer.AROUND), seen, rims)
     rings = math.ceil(_reach(voxels) / 8)
@@ -103,7 +103,7 @@ def _fill(
 def _taken(
     local: NDArray[np.int64], keys: NDArray[np.int64], seen: NDArray[np.float32], rims: NDArray[np.uint8]
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Values and rims of some blocks; nothing was seen in those that the map does not have."""
+    """Values and rims of some blocks; a block that the map does not have is unseen."""
     at = _rows(keys, local)
     values, marks = np.full((len(local), CUBE), np.nan, np.float32), np.zeros((len(local), CUBE), np.uint8)
     values[at >= 0], marks[at >= 0] = seen[at[at >= 0]], rims[at[at >= 0]]
@@ -137,7 +137,7 @@ def _list(
     values: NDArray[np.float32],
     marks: NDArray[np.uint8],
 ) -> tuple[field_regularizer.GridLevel, NDArray[np.int32]]:
-    """The marked voxels with first values and the seen ones beside them; the layer of each, 0 where seen."""
+    """Marked voxels with first values and the seen ones beside them; the layer of each, 0 where seen."""
     planes, counts = field_regularizer.marks_of(len(local), CUBE)
     kernels.take_marked(around, values, marks, planes, counts)
     level = field_regularizer.GridLevel.make(3, planes, counts)
@@ -153,7 +153,7 @@ def _list(
 
 
 def _relax(level: field_regularizer.GridLevel, voxels: int) -> None:
-    """Least second differences between the seen values: as many steps as a hole of this width needs."""
+    """Minimise second differences between the seen values, in as many steps as a hole of this width needs."""
     lowest = _SOFTEST / _STIFFEST / (voxels + 2) ** 4
     steps = math.ceil(0.5 * math.log(2 / _TOLERANCE) / math.sqrt(lowest))
     level.relax(1.0, [(math.inf, lowest, steps)])
@@ -165,7 +165,7 @@ def _reach(voxels: int) -> float:
 
 
 def _ball(voxels: int) -> NDArray[np.int32]:
-    """(n, 3) columns of the ball that is marked around a rim: x, y, and how far it reaches up and down."""
+    """(n, 3) columns of the ball that is marked around a rim: x, y, and the reach up and down."""
     radius = _reach(voxels)
     n = int(radius)
     x, y = np.mgrid[-n : n + 1, -n : n + 1].reshape(2, -1)
@@ -175,7 +175,7 @@ def _ball(voxels: int) -> NDArray[np.int32]:
 
 
 def _spread(keys: NDArray[np.int64], rings: int) -> NDArray[np.int64]:
-    """Keys of the blocks up to so many blocks away, whether the map has them or not; sorted."""
+    """Sorted keys of blocks up to `rings` blocks away, also of those that the map does not have."""
     for _ in range(rings):
         keys = distinct(keys[:, None] + field_regularizer.AROUND)
     return keys
@@ -186,10 +186,10 @@ def _rows(keys: NDArray[np.int64], queries: NDArray[np.int64]) -> NDArray[np.int
 
 
 def closing(mesh: Mesh) -> Mesh:
-    """The mesh without the guessed patches that close nothing.
+    """Mesh without the guessed patches that close nothing.
 
-    None of a patch's edges may be free: at the border of a scan and in a hole that is too wide they are. And
-    it may not have more triangles than the seen pieces that it hangs on: a crumb would grow to a bubble.
+    A patch with a free edge goes: it lies at the border of a scan, or in a hole that is too wide. So does a
+    patch with more triangles than the seen pieces that it hangs on: a crumb would grow to a bubble.
     """
     assert mesh.guessed is not None
     guess = np.flatnonzero(mesh.guessed)
@@ -220,7 +220,7 @@ def closing(mesh: Mesh) -> Mesh:
 def _size_around(
     seen: NDArray[np.int32], patch: NDArray[np.int32], vertex: NDArray[np.int32], mesh: Mesh
 ) -> NDArray[np.int64]:
-    """Number of triangles of the seen pieces that each patch hangs on, by the vertices where it does."""
+    """Number of triangles of the seen pieces that each patch hangs on, by their shared vertices."""
     assert mesh.guessed is not None
     label = mesh_islands.pieces(seen, len(mesh.vertices))
     faces = np.bincount(label[seen[:, 0]], minlength=len(label))
@@ -239,7 +239,7 @@ def _keys(edges: NDArray[np.int32]) -> NDArray[np.int64]:
 
 
 def with_rim_colors(mesh: Mesh) -> Mesh:
-    """Colours of the guessed surface: those of its rim, diffused inward."""
+    """Colours of the guessed surface, diffused inward from its rim."""
     if mesh.guessed is None or mesh.colors is None:
         return mesh
     known = np.zeros(len(mesh.vertices), bool)

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Mesh extraction: which blocks are read, and working memory; the work is in
-`kernels/surface/surface_cells.py` and `kernels/surface/marching_cubes.py`. For those who follow the map: its
-cells in the order of their keys, with the triangles of each."""
+"""Mesh extraction: choice of blocks, and working memory, for `kernels/surface/surface_cells.py` and
+`kernels/surface/marching_cubes.py`. Followers of the map get its cells in key order, with the triangles of
+each.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -25,9 +26,9 @@ _X = 42  # bits of a key below x: keys of one x are a layer
 
 
 class MeshBuffers:
-    """Working memory of one extraction: a row a block, and one row for the blocks that are not there.
+    """Working memory of one extraction: a row a block, and one row for absent blocks.
 
-    `kernels/surface/surface_cells.py` explains what the arrays hold.
+    `kernels/surface/surface_cells.py` explains the arrays.
     """
 
     def __init__(self) -> None:
@@ -60,7 +61,6 @@ class MeshBuffers:
             self._forget()
 
     def table(self, keys: int) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-        """An empty hash with room for some keys."""
         size = 1 << max(4, (2 * keys).bit_length())
         if len(self._table) < size:
             self._table, self._table_rows = np.zeros(size, np.int64), np.zeros(size, np.int32)
@@ -81,12 +81,12 @@ class MeshBuffers:
 
 
 def back_limits(config: VolumeConfig) -> tuple[float, float]:
-    """From where on voxels are far behind a surface, and clear: quanta. A voxel that all looked through has
-    the least support or more. No voxel is either where bands vary, or nothing is carved.
+    """Distances, quanta, from which voxels are far behind a surface, and clear. A voxel that all looked
+    through has the least support or more. No voxel is either in a map with varying bands, or without carving.
 
-    Seen at a grazing angle, a street far ahead has voxels with quite different distances side by side: where
-    noise widens the bands, as of stereo pairs, and where no planes are known, as of points, whose noise does
-    not grow with their distance.
+    At a grazing angle, voxels of a street far ahead lie side by side with quite different distances: in maps
+    where noise widens the bands (stereo pairs), and where no planes are known (points, whose noise does not
+    grow with distance).
     """
     model = config.model()
     away = model.max_range / 2 - model.sigma_z0
@@ -115,7 +115,7 @@ def extract_cells(
     buffers: MeshBuffers | None = None,
     view: SurfaceView = values_of,
 ) -> tuple[Mesh, NDArray[np.int32]]:
-    """The mesh as of `extract`, and (n + 1,) where the faces of each block's cells begin."""
+    """Mesh as of `extract`, and (n + 1,) first faces of each block's cells."""
     buffers = buffers or MeshBuffers()
     try:
         mesh, keys = extract_rows(wanted, store, min_weight, buffers, view)
@@ -134,10 +134,9 @@ def extract_rows(
     *,
     keys: NDArray[np.int64] | None = None,
 ) -> tuple[Mesh, NDArray[np.int64]]:
-    """The mesh as of `extract`, and the (n,) keys of the blocks that rows of `buffers` are about.
+    """Mesh as of `extract`, and the (n,) keys of the blocks in the rows of `buffers`.
 
-    Args:
-        keys: the wanted blocks and those around them, of which `view` knows more than the map has.
+    `keys`: the wanted blocks and those around them, of which `view` knows more than the map has.
     """
     keys = buffers.keys_around(wanted, store) if keys is None else keys
     count = len(keys)
@@ -173,10 +172,10 @@ def extract_rows(
 
 @dataclass(frozen=True, eq=False)
 class CellMeshes:
-    """The triangles of some cells.
+    """Triangles of some cells.
 
     Attributes:
-        cells: (n, 3) int32 block coordinates, in the order of their keys.
+        cells: (n, 3) int32 block coordinates, in key order.
         first_face: (n + 1,) int32: the cell in row i has the faces `first_face[i]` to `first_face[i + 1]`.
         mesh: of these cells.
     """
@@ -187,7 +186,9 @@ class CellMeshes:
 
 
 def listed(store: BlockStore, first: int, most: int) -> tuple[NDArray[np.int64], int | None]:
-    """The sorted keys of the map's blocks from `first` on, at most so many; where the others begin."""
+    """Sorted keys of the map's blocks from `first` on, at most `most`; and the first of the remaining
+    ones.
+    """
     keys = store.keys[store.keys >= first]
     if len(keys) <= most:
         return np.sort(keys), None
@@ -204,13 +205,13 @@ def listed_since(
     to_cells: Callable[[NDArray[np.int64]], NDArray[np.int64]],
     reach: int,
 ) -> tuple[NDArray[np.int64], int | None]:
-    """List cells as `listed`, only those that changes after the stamp `since` reach.
+    """Cells as of `listed`, restricted to those that changes after the stamp `since` reach.
 
-    Looked through layer by layer, so that an answer costs what lies in a few layers, not in the map.
+    The search goes layer by layer: an answer costs the size of a few layers, not of the map.
 
     Args:
         to_cells: gives the keys of the cells that changes of blocks reach.
-        reach: that they lie away from these, blocks; towards −x one more.
+        reach: greatest distance of these cells from the blocks, blocks; towards −x one more.
     """
     changed = store.keys[store.stamps[: store.count] > since]
     layer, low = changed >> _X, first >> _X
@@ -229,9 +230,9 @@ def listed_since(
 
 
 def stamps_of(store: BlockStore, keys: NDArray[np.int64]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """The stamps of the last changes to cells: of all blocks that a cell reads, and of its own block.
+    """Stamps of the last changes to cells, (n,) each: of all blocks that a cell reads, and of its own block.
 
-    Two (n,) arrays; 0 = none since the map was opened.
+    0 = no change since the map was opened.
     """
     slots = store.slots_of((keys[:, None] + CELL_STEPS).ravel())
     stamps = np.where(slots >= 0, store.stamps[slots], 0).reshape(-1, len(CELL_STEPS))

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""The mesh of a whole map in tiles, with memory for one tile: together the same vertices and triangles.
+"""Mesh of a whole map in tiles, with memory for one tile: together the same vertices and triangles.
 
-A tile is a run of blocks in the order of their keys: it has the vertices on its blocks' voxel edges and the
-triangles of their cells. Tiles come last first: a cell's other vertices lie towards +x, +y, +z, in tiles that
-are known by then. Vertices are counted from the end of the whole mesh, whose length shows with the last tile.
+A tile is a run of blocks in key order: it has the vertices on its blocks' voxel edges and the triangles of
+their cells. Tiles come last first: a cell's other vertices lie towards +x, +y, +z, in tiles that are known by
+then. Vertices are counted from the end of the whole mesh, whose length is known after the last tile.
 """
 
 from collections.abc import Iterable, Iterator
@@ -23,7 +23,8 @@ _FARTHEST = int(CELL_STEPS.max())  # what the keys of blocks that share a cell d
 
 class Numbered(NamedTuple):
     """Blocks whose vertices have numbers: (n,) sorted keys, (n, 24) edges with a vertex, and (n,) the number
-    of the first vertex, from the end."""
+    of the first vertex, from the end.
+    """
 
     keys: NDArray[np.int64]
     edges: NDArray[np.uint64]
@@ -47,7 +48,7 @@ class Numbered(NamedTuple):
 
 
 class _Vertices(NamedTuple):
-    """Vertices of other tiles, (n,) each: the key of the block, and which of its edges they are on."""
+    """Vertices of other tiles, (n,) each: the key of the block, and the edge of it."""
 
     keys: NDArray[np.int64]
     edges: NDArray[np.int64]
@@ -60,13 +61,13 @@ _NOBODY = Numbered(np.zeros(0, np.int64), np.zeros((0, 24), np.uint64), np.zeros
 
 
 class MeshRun(NamedTuple):
-    """The mesh of some tiles, one after the other, that is made without the others.
+    """Mesh of consecutive tiles, made without the others.
 
     Attributes:
         part: its numbers are from the end of these tiles; 0 stands for vertices behind them.
-        open_at: (n,) where these zeros are, in the corners of all faces.
+        open_at: (n,) places of these zeros in the corners of all faces.
         open_keys, open_edges: (n,) which vertices they are: the key of the block, and the edge of it.
-        border: the first blocks, whose vertices those before may need.
+        border: the first blocks, whose vertices earlier tiles may need.
         first: key of the first block.
     """
 
@@ -89,17 +90,14 @@ def tiles(store: BlockStore, min_weight: float, view: SurfaceView) -> Iterator[M
 
 
 def tile_count(blocks: int) -> int:
-    """Number of tiles of a map."""
     return -(-blocks // field_regularizer.BATCH)
 
 
 def run(
     keys: NDArray[np.int64], which: range, store: BlockStore, min_weight: float, view: SurfaceView
 ) -> MeshRun:
-    """Some tiles of a map, of which the store holds what they depend on: `blocks_of_run`, and around them.
-
-    Args:
-        keys: of all of its blocks, sorted.
+    """Some tiles of a map whose blocks have these sorted keys; the store holds `blocks_of_run` and their
+    surroundings.
     """
     made = list(_tiles(keys, which, store, min_weight, view))[::-1]
     corners = np.array([one.part.faces.size for one in made])
@@ -128,7 +126,7 @@ def blocks_of_run(keys: NDArray[np.int64], which: range) -> NDArray[np.int64]:
 
 
 def together(runs: Iterable[MeshRun]) -> Iterator[MeshPart]:
-    """The parts of the whole mesh, as of `tiles`, of its runs, the last first."""
+    """Parts of the whole mesh, as of `tiles`, from its runs, the last first."""
     done, known = 0, _NOBODY
     for one in runs:
         faces = one.part.faces.astype(np.int64) + done
@@ -182,7 +180,7 @@ def _tiles(
 def _vertices(
     local: NDArray[np.int64], rows: NDArray[np.int64], first: NDArray[np.int32], edges: NDArray[np.uint64]
 ) -> _Vertices:
-    """Vertices on other tiles' edges, of which a tile knows but its own numbers.
+    """Vertices on other tiles' edges, for which a tile has only its own numbers.
 
     Args:
         local: (n,) the tile's numbers.
@@ -205,9 +203,9 @@ def _bits(planes: NDArray[np.uint64]) -> NDArray[np.uint8]:
 
 
 class WholeMapValues:
-    """A `SurfaceView` whose values are those of the whole map: its blocks are solved in the same batches.
+    """A `SurfaceView` with the values of the whole map, whose blocks are solved in the same batches.
 
-    Of use as long as the map stays as it is.
+    Valid until the map changes.
 
     Args:
         keys: sorted, of all blocks of the map.
@@ -226,7 +224,6 @@ class WholeMapValues:
         min_weight: float,
         out: NDArray[np.float32] | None = None,
     ) -> NDArray[np.float32]:
-        """See `SurfaceView`."""
         assert out is not None  # `mesh_extraction` has rows for them
         at = np.searchsorted(self._keys, keys)
         for number in np.unique(at // self._size).tolist():
@@ -238,12 +235,12 @@ class WholeMapValues:
         return out[: len(keys)]
 
     def forget_beyond(self, key: int) -> None:
-        """Let go of batches in which every key is larger."""
+        """Release batches in which every key is larger."""
         for number in [one for one in self._solved if self._keys[one * self._size] > key]:
             del self._solved[number]
 
     def forget_before(self, key: int) -> None:
-        """Let go of batches that no cell from this key on reads."""
+        """Release batches that no cell from this key on reads."""
         for number in [one for one in self._solved if self._last(one) < key - _FARTHEST]:
             del self._solved[number]
 

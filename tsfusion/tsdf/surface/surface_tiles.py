@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""A surface's values and meshes in cubes of 8³ blocks, kept while the map stays as it is; values
-kept block by block while it grows.
+"""Values and meshes of a surface in cubes of 8³ blocks, kept until the map changes; and values kept block by
+block while it grows.
 
-What a cube holds depends on the map alone: not on what was asked before, nor on how the map came about.
+The content of a cube depends on the map alone: neither on earlier questions nor on how the map came about.
 
-The last state of which a view was made whole stays while the map goes on, as long as a newer one is not
-whole: meshes of cubes that change are kept beside the new ones. A view of it is of that state in every cube,
-for a cube that has not changed since is the same now.
+The last state of a complete view stays available while the map changes, until a newer view is complete: the
+old meshes of changed cubes are kept beside the new ones. A cube without changes is the same in both states.
 """
 
 from collections import OrderedDict
@@ -37,7 +36,7 @@ class SurfaceTiles:
 
     Args:
         view: reads its values.
-        reach: blocks whose sums a block's values depend on lie so many blocks away at the most.
+        reach: distance, blocks, within which sums influence a block's values.
     """
 
     def __init__(self, store: BlockStore, view: SurfaceView, min_weight: float, reach: int) -> None:
@@ -56,7 +55,6 @@ class SurfaceTiles:
 
     @property
     def values(self) -> SurfaceView:
-        """The function that reads these values."""
         return values_of if self._view is values_of else self._read
 
     @property
@@ -65,17 +63,15 @@ class SurfaceTiles:
 
     @property
     def side_m(self) -> float:
-        """Side of a cube, metres."""
         return 8 * SIDE * self._store.voxel_size
 
     @property
     def nbytes(self) -> int:
-        """Memory of what is kept."""
         before = sum(piece.nbytes for piece in self._before.values())
         return self._values.nbytes + self._meshes.nbytes + before + self._buffers.nbytes
 
     def forget(self, changed: NDArray[np.int64]) -> None:
-        """Let go of what depends on blocks that have changed: sorted keys."""
+        """Release all that depends on the changed blocks: sorted keys."""
         if self._drops != self._store.drops:  # blocks have gone
             self._drops = self._store.drops
             self._values.clear()
@@ -91,7 +87,7 @@ class SurfaceTiles:
             self._lacking = None
 
     def _keep_before(self, numbers: NDArray[np.int64]) -> None:
-        """Keep the meshes that cubes had when the map was settled."""
+        """Keep the settled meshes of these cubes."""
         if self.settled is None:
             return
         for number in set(numbers.tolist()) - self._changed:
@@ -106,13 +102,13 @@ class SurfaceTiles:
         self._changed, self._before, self._lacking = set(), {}, None
 
     def settle(self, numbers: Sequence[int]) -> None:
-        """Note that a view of these cubes has been made of the map as it is."""
+        """Note that a view of these cubes shows the current map."""
         self.settled, self._shown = self._store.stamp, list(numbers)
         self._settled_numbers = self.numbers()
         self._changed, self._before, self._lacking = set(), {}, None
 
     def settle_some(self, most: int) -> bool:
-        """Mesh again a few cubes of the last view; whether the map is settled then."""
+        """Mesh again a few cubes of the last view. Returns True if the map is then settled."""
         if self._lacking is None:  # what does not fit into what is kept is made once
             self._lacking = [number for number in self._shown if self._meshes.get(number) is None]
         for _ in self.meshes(self._lacking[:most]):
@@ -123,7 +119,7 @@ class SurfaceTiles:
         return is_done
 
     def settled_meshes(self, numbers: Sequence[int]) -> list[Mesh] | None:
-        """The meshes of some cubes as the map was when it was settled; None where one is not kept."""
+        """Meshes of some cubes of the settled map; None if one is not kept."""
         if self.settled is None:
             return None
         there = set(self._settled_numbers.tolist()).intersection(numbers)
@@ -142,7 +138,7 @@ class SurfaceTiles:
         return self._numbers
 
     def affordable(self, keys: NDArray[np.int64], most: int) -> int:
-        """Number of the first blocks that lie in cubes that are kept, and in so many that are not."""
+        """Number of the first blocks that lie in kept cubes and in at most `most` others."""
         if self._view is values_of:
             return len(keys)
         numbers, first = np.unique(_tile_of(keys), return_index=True)
@@ -154,7 +150,7 @@ class SurfaceTiles:
         return new[most] if len(new) > most else len(keys)
 
     def meshes(self, numbers: Sequence[int]) -> Iterator[Mesh]:
-        """The meshes of the cells of some cubes; what is not kept is made several at a time."""
+        """Meshes of the cells of some cubes; missing ones are made several at a time."""
         for i in range(0, len(numbers), AT_ONCE):
             some = numbers[i : i + AT_ONCE]
             pieces = {number: self._meshes.get(number) for number in some}
@@ -163,7 +159,7 @@ class SurfaceTiles:
                 yield (pieces[number] or made[number]).mesh
 
     def _made(self, numbers: list[int]) -> dict[int, "_CubeMesh"]:
-        """Meshes of cubes, each as it would be without the others: a launch costs as much as a small one."""
+        """Meshes of cubes, each as it would be alone: one launch for all costs as much as a small one."""
         if not numbers:
             return {}
         keys, cube_of = self._keys(numbers)
@@ -186,7 +182,7 @@ class SurfaceTiles:
         min_weight: float,
         out: NDArray[np.float32] | None = None,
     ) -> NDArray[np.float32]:
-        """See `SurfaceView`; `store` and `min_weight` are those that it was made with."""
+        """A `SurfaceView`; `store` and `min_weight` are those of this object."""
         if out is None:
             out = np.empty((len(keys), CUBE), np.float32)
         order = np.argsort(tiles := _tile_of(keys), kind="stable")
@@ -201,7 +197,7 @@ class SurfaceTiles:
         return out[: len(keys)]
 
     def _keys(self, numbers: Sequence[int]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Keys of the map's blocks in some cubes, sorted in each, and which cube each lies in."""
+        """Keys of the map's blocks in some cubes, sorted in each, and the cube of each."""
         corners = SIDE * unpack_keys(np.array(numbers))
         keys = pack_keys((corners[:, None] + _INSIDE).reshape(-1, 3))
         held = np.flatnonzero(self._store.slots_of(keys) >= 0)
@@ -213,14 +209,12 @@ class _Sized(Protocol):
 
 
 class _Values:
-    """Sorted keys of blocks, and a row of values of each."""
-
     def __init__(self, keys: NDArray[np.int64], values: NDArray[np.float32]) -> None:
         self.keys, self.values = keys, values
         self.nbytes = keys.nbytes + values.nbytes
 
     def of(self, keys: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Rows of some blocks; NaN for one that is not there."""
+        """Rows of some blocks; NaN for an absent one."""
         if not len(self.keys):
             return np.full((len(keys), CUBE), np.nan, np.float32)
         at = np.minimum(np.searchsorted(self.keys, keys), len(self.keys) - 1)
@@ -240,7 +234,7 @@ Item = TypeVar("Item", bound=_Sized)
 
 
 class _Kept(Generic[Item]):
-    """Things by number; those asked for longest ago go when they are too many."""
+    """Items by number; the least recently used go when they are too many."""
 
     def __init__(self) -> None:
         self._items: OrderedDict[int, Item] = OrderedDict()
@@ -268,7 +262,6 @@ class _Kept(Generic[Item]):
 
 
 def _tile_of(keys: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Number of the cube that each block lies in."""
     return pack_keys(unpack_keys(keys) >> 3)
 
 
@@ -277,13 +270,10 @@ def _tiles_of(keys: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 class KeptValues:
-    """A `SurfaceView` that solves a block once, until it is told that its values are others.
+    """A `SurfaceView` that solves a block once, until `forget` names it.
 
-    A block beside a changed one keeps what it had where that is to a hundredth of a voxel what it would be
-    now: `ReadableMap.cells_to_mesh` names the others.
-
-    Args:
-        view: reads the surface.
+    A neighbour of a changed block keeps its old values if they are right to 0.01 voxel;
+    `ReadableMap.cells_to_mesh` lists the neighbours that are not. `view` reads the surface.
     """
 
     def __init__(self, store: BlockStore, view: SurfaceView) -> None:
@@ -292,14 +282,13 @@ class KeptValues:
         self.clear()
 
     def clear(self) -> None:
-        """Forget every block."""
         self._drops = self._store.drops
         self._rows = np.zeros(0, np.int32)  # of each slot of the map
         self._free = np.arange(MOST_BLOCKS, dtype=np.int32)[::-1]
         self._values = GrowingArray((CUBE,), np.float32, 0)
 
     def forget(self, keys: NDArray[np.int64]) -> None:
-        """Solve these blocks anew when they are asked for."""
+        """Solve these blocks anew at the next question."""
         if self._drops != self._store.drops:  # blocks have other slots now
             self.clear()
         slots = self._store.slots_of(keys)
@@ -315,7 +304,6 @@ class KeptValues:
         min_weight: float,
         out: NDArray[np.float32] | None = None,
     ) -> NDArray[np.float32]:
-        """See `SurfaceView`; `store` is the map that this follows."""
         out = np.empty((len(keys), CUBE), np.float32) if out is None else out[: len(keys)]
         self.forget(keys[:0])
         slots = store.slots_of(keys)
@@ -332,7 +320,7 @@ class KeptValues:
         return out
 
     def _keep(self, slots: NDArray[np.int32], solved: NDArray[np.float32]) -> None:
-        """Note what blocks have; when there is no room left, these are the first of a new start."""
+        """Keep values of blocks; without room, all earlier ones go."""
         count = len(slots)
         if (slots < 0).any() or count > MOST_BLOCKS:
             return

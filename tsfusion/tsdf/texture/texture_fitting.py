@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Images as textures take them, and the true place and brightness of each: so that they agree on a surface.
+"""Images for textures, and the true place and brightness of each, fitted so that they agree on a surface.
 
 Poses are never exact, and colour and depth are often taken some milliseconds apart: on a wall two metres away
 half a degree is four pixels. Each image is moved until it agrees with the mean of all others on points of the
@@ -47,7 +47,7 @@ class ImageFit(NamedTuple):
 
 
 class Visibility(NamedTuple):
-    """When a point counts as seen: metres and share of the depth that it may be off, cosine of the slant."""
+    """Limits for a seen point: depth error in metres and as a share of the depth, cosine of the slant."""
 
     tolerance: float
     relative: float = 0.01
@@ -108,7 +108,7 @@ class TextureImage(NamedTuple):
 
 
 class PosedImages(Protocol):
-    """Keyframes that can be read again and again, in the same order; None stands for one of no use."""
+    """Keyframes that can be read several times, in the same order; None stands for an unusable one."""
 
     def __len__(self) -> int: ...
 
@@ -128,9 +128,9 @@ def fit(
     """Fit the images of keyframes to each other on points of the surface, (n, 3) float32 with unit normals.
 
     Args:
-        align: move them; otherwise they stay where their keyframes are.
+        align: move them; otherwise they stay at their keyframes' poses.
         even: make their exposures equal.
-        watch: told the steps done, and all of them.
+        watch: called with the steps done and in all.
     """
     rounds = sum(rounds for _, rounds in LEVELS) if align else 0
     best = np.zeros(len(points), np.float32)
@@ -163,7 +163,7 @@ def sighting(
     visibility: Visibility,
     best: NDArray[np.float32],
 ) -> Sighting:
-    """View of an image; `best` is raised where it sees a point better than others."""
+    """View of an image; `best` is raised for points that it sees better than others."""
     found = np.empty((len(points), 3), np.float32)
     T = image.T_camera_world
     texture_baking.look(points, normals, T, T, image.camera, image.depth, image.clearness, *visibility, found)
@@ -187,7 +187,7 @@ def _aligned(
     blurred: list[NDArray[np.float32]],
     poses: list[NDArray[np.float64]],
 ) -> list[NDArray[np.float64]]:
-    """The poses after a step of each image towards the mean of the others."""
+    """Poses after a step of each image towards the mean of the others."""
     total, weight = np.zeros(len(points)), np.zeros(len(points))
     looks = []
     for one, image, T in zip(sightings, blurred, poses, strict=True):
@@ -242,7 +242,7 @@ def stepped(
 def _in_place(
     poses: list[NDArray[np.float64]], start: list[NDArray[np.float64]]
 ) -> list[NDArray[np.float64]]:
-    """The poses without what they have in common: moving all at once changes nothing that images show."""
+    """Poses without their common motion: a motion of all at once changes nothing that images show."""
     starts, moved = np.stack(start), np.stack(poses)
     about = se3.transform(np.eye(3), se3.inverse(starts)[:, :3, 3].mean(axis=0))
     moves = se3.log(se3.inverse(about) @ se3.inverse(moved) @ starts @ about)
@@ -251,7 +251,7 @@ def _in_place(
 
 
 def _plausible(T: NDArray[np.float64], T0: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The new pose, or the old one where the new one is too far from it to be true."""
+    """New pose, or the old one if the new one is implausibly far from it."""
     twist = se3.log(T @ se3.inverse(T0))
     far = np.linalg.norm(twist[:3]) > _MAX_SHIFT or np.linalg.norm(twist[3:]) > _MAX_TURN
     return T0 if far or not np.isfinite(twist).all() else T
@@ -260,7 +260,7 @@ def _plausible(T: NDArray[np.float64], T0: NDArray[np.float64]) -> NDArray[np.fl
 def _gains(
     points: NDArray[np.float32], sightings: list[Sighting], poses: list[NDArray[np.float64]]
 ) -> NDArray[np.float32]:
-    """(n, 3) float32: factors on RGB that make the images equally bright where they see the same points.
+    """(n, 3) float32: factors on RGB that make the images equally bright on the same points.
 
     Logarithms of brightness are the sum of the image's and the point's; both are found in turn, robustly.
     """
@@ -294,7 +294,6 @@ def _camera_points(points: NDArray[np.float32], one: Sighting, T: NDArray[np.flo
 
 
 def pixels(one: Sighting, p: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Columns and rows of camera points."""
     fx, fy, cx, cy = one.camera
     return fx * p[:, 0] / p[:, 2] + cx, fy * p[:, 1] / p[:, 2] + cy
 
@@ -302,7 +301,7 @@ def pixels(one: Sighting, p: NDArray[np.float64]) -> tuple[NDArray[np.float64], 
 def sampled(
     image: NDArray[np.generic], u: NDArray[np.float64], v: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """(k,) float64 values between the pixels of an image, beyond its border those of the border."""
+    """(k,) float64 values interpolated in an image; beyond its border, those of the border."""
     height, width = image.shape
     u, v = np.clip(u, 0, width - 1.001), np.clip(v, 0, height - 1.001)
     i, j = u.astype(np.intp), v.astype(np.intp)
@@ -314,11 +313,7 @@ def sampled(
 
 
 def images(keyframes: PosedImages, chosen: Sequence[int] | None = None) -> Iterator[TextureImage]:
-    """The keyframes with depth and colour images, one at a time.
-
-    Args:
-        chosen: their indices; None = all.
-    """
+    """Keyframes with depth and colour images, one at a time; `chosen`: their indices, None = all."""
     for index in range(len(keyframes)) if chosen is None else chosen:
         found = image_of(keyframes[index], index)
         if found is not None:
@@ -326,7 +321,7 @@ def images(keyframes: PosedImages, chosen: Sequence[int] | None = None) -> Itera
 
 
 def image_of(keyframe: Keyframe | None, index: int) -> TextureImage | None:
-    """The image of a keyframe; None where it has none, as that of a LiDAR, or one of a few pixels."""
+    """Image of a keyframe; None without one, as for a LiDAR, or for one of a few pixels."""
     if keyframe is None or keyframe.color is None or keyframe.intrinsics is None:
         return None
     if min(keyframe.shape) < _SMALLEST:
@@ -347,7 +342,7 @@ def image_of(keyframe: Keyframe | None, index: int) -> TextureImage | None:
 
 
 def clearness_of(depth: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(H, W) float32: 0 at an edge of the depth or where it has none, 1 some pixels away from it."""
+    """(H, W) float32: 0 without depth or at its edge, 1 some pixels away from it."""
     square = np.ones((3, 3))
     least = cv2.erode(np.where(depth > 0, depth, np.float32(1e9)), square)
     most = cv2.dilate(depth, square)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A texture for a mesh from the images that its map was made of: colour as sharp as the cameras saw it.
+"""Texture for a mesh from the images that its map was made of: colour as sharp as the cameras saw it.
 
 1. Points are spread over the mesh, and the images are fitted to each other on them (`texture_fitting`).
 2. The mesh is cut into flat charts, which are laid out on pages (`texture_charts`).
@@ -43,8 +43,8 @@ class TextureSettings(Struct, frozen=True):
     """Settings of a texture.
 
     Attributes:
-        size: texels of a page's side, at most; where they do not suffice there are several pages.
-        texel: metres; None = a pixel of the view that sees a place best, in the middle of all places.
+        size: greatest side of a page, texels; a texture that needs more has several pages.
+        texel: metres; None = a pixel of the view that sees a place best, as the median over all places.
         align: fit the poses of the colours to each other.
         even: make the exposures equal.
         sharpness: power of a view's quality by which the best views prevail in fine detail.
@@ -65,14 +65,14 @@ def textured(
     *,
     watch: StageProgress = lambda _stage, _done, _all: None,
 ) -> TexturedMesh:
-    """Give a mesh a texture from keyframes at their poses; places that no image shows keep its own colours.
+    """Give a mesh a texture from keyframes at their poses; places without an image keep their own colours.
 
     The same mesh and keyframes give the same bytes.
 
     Args:
         keyframes: of the map; read several times. Those without depth and colour images are left out.
         voxel_size: metres, of the map.
-        watch: told the stage, the steps done, and all of them.
+        watch: called with the stage, the steps done, and all steps.
 
     Raises:
         InvalidConfig: for settings out of range.
@@ -128,7 +128,7 @@ def _arrays(mesh: Mesh) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray
 def spread(
     vertices: NDArray[np.float32], faces: NDArray[np.int32], normals: NDArray[np.float32], density: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Points on a surface and its normals there, both (n, 3) float32: so many a square metre, evenly.
+    """Points on a surface and its normals there, both (n, 3) float32, `density` a square metre, evenly.
 
     The same surface has the same points.
     """
@@ -148,12 +148,12 @@ def spread(
 
 
 def _texel(best: NDArray[np.float32]) -> float:
-    """Metres of a pixel in the best view of a place, in the middle of all places."""
+    """Size of a pixel, metres, in the best view of a place, as the median over all places."""
     return max(float(1 / np.sqrt(np.median(best[best > 0]))), _FINEST)
 
 
 def _laid_out(mesh: Mesh, texel: float, size: int) -> tuple[ChartPlacement, list[NDArray[np.int64]]]:
-    """Places of the faces, and whose each texel is; no face covers another."""
+    """Places of the faces, and the face of each texel; no face covers another."""
     vertices, faces, normals = _arrays(mesh)
     charts = texture_charts.find(vertices, faces, normals)
     for attempt in range(_LAYOUTS):
@@ -173,7 +173,7 @@ def _laid_out(mesh: Mesh, texel: float, size: int) -> tuple[ChartPlacement, list
 
 
 class _Baker:
-    """Looks surface points up in the images."""
+    """Colours of surface points from the images."""
 
     def __init__(
         self,
@@ -188,13 +188,15 @@ class _Baker:
         self._watch, self._done, self._all = watch, 0, 0
 
     def begin(self, calls: int) -> None:
-        """Say how often `colors` will be called."""
+        """Announce the number of calls of `colors`."""
         self._all = calls * len(self._fits)
 
     def colors(
         self, points: NDArray[np.float32], normals: NDArray[np.float32]
     ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-        """(n, 3) uint8 RGB of points of the surface, and which of them an image shows; others are grey."""
+        """(n, 3) uint8 RGB of points of the surface, and a mask of those that an image shows; others are
+        grey.
+        """
         sums = np.zeros((len(points), 8), np.float32)
         found = np.empty((len(points), 3), np.float32)
         for image in images(self._keyframes, sorted(self._fits)):
@@ -222,7 +224,7 @@ def _bands(image: TextureImage, fit: ImageFit) -> NDArray[np.float32]:
 def _pages(
     mesh: Mesh, layout: ChartPlacement, owners: list[NDArray[np.int64]], baker: _Baker
 ) -> tuple[list[NDArray[np.uint8]], float]:
-    """The painted pages, and the share of their surface that an image shows."""
+    """Painted pages, and the share of their surface that an image shows."""
     pages, shown, all_inside = [np.full((*shape, 3), _GREY, np.uint8) for shape in layout.sizes], 0, 0
     batches = list(_batches(owners))
     baker.begin(len(batches) + 1)
