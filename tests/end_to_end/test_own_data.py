@@ -113,7 +113,8 @@ def test_a_scan_of_images_without_times_takes_one_pose_a_frame(
 
     root = own_recordings.images(tmp_path / "mine", kitchen, poses=False)
     slam = str(poses_file(tmp_path / "slam.txt", poses, kitchen))
-    flags = dict.fromkeys([*RUN_OPTIONS, "localizer"]) | {"trajectory": slam, "start": 2, "stride": 2}
+    given = {"trajectory": slam, "start": 2, "stride": 2, "unpack": False}
+    flags = dict.fromkeys([*RUN_OPTIONS, "localizer"]) | given
     source, _ = _open(None, str(root), flags)
     with source:
         found = [frame.T_world_camera for frame in source]

@@ -163,11 +163,11 @@ def report(
     from tsfusion.cli import opened_maps, output, progress
     from tsfusion.core.errors import InvalidConfig
     from tsfusion.core.output_folder import check_writable
-    from tsfusion.pipelines.report import findings, run_report
+    from tsfusion.pipelines.report import run_record, run_report
     from tsfusion.pipelines.report.page import ENDINGS
     from tsfusion.pipelines.runs.run_files import REPORT
 
-    is_run = findings.is_run(source)
+    is_run = run_record.is_run(source)
     if is_run and map_ is not None:
         raise InvalidConfig(f"--map has no effect on {source}: a run's report has all its maps")
     page = out or (source / REPORT if is_run else Path(REPORT))

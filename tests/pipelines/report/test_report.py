@@ -21,7 +21,7 @@ from tsfusion.datasets.trajectory_files import read_poses, write_tum
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.up_direction import parse
 from tsfusion.pipelines.report import latency_ledger, map_report, pictures, run_report, run_sections
-from tsfusion.pipelines.report.findings import RunFindings
+from tsfusion.pipelines.report.run_record import RunFindings
 from tsfusion.wire.messages.messages import KeyframeTimes
 
 _EMPTY = frozenset(("meta", "img", "br", "input", "image", "path"))  # elements without an end

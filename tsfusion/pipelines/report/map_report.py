@@ -15,10 +15,9 @@ from tsfusion.journal.journaled_keyframes import JournaledKeyframes
 from tsfusion.pipelines.maps import saved_maps
 from tsfusion.pipelines.maps.saved_maps import MapSummary
 from tsfusion.pipelines.report import page, run_record, run_sections
-from tsfusion.pipelines.report.findings import MapFindings
 from tsfusion.pipelines.report.map_sections import ShownMap
 from tsfusion.pipelines.report.page import Page
-from tsfusion.pipelines.report.run_record import MapResult, RunRecord
+from tsfusion.pipelines.report.run_record import MapFindings, MapResult, RunRecord
 from tsfusion.tsdf.volume import Volume
 
 _NO_DELAY = "A saved map does not hold when its keyframes were fused: a run's report has that."

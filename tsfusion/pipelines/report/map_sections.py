@@ -13,8 +13,8 @@ from tsfusion.geometry.mesh import Mesh
 from tsfusion.pipelines.maps import mesh_preview
 from tsfusion.pipelines.report import charts, page, pictures
 from tsfusion.pipelines.report.charts import Axis, Chart
-from tsfusion.pipelines.report.findings import MapFindings, Paths
 from tsfusion.pipelines.report.pictures import ErrorScale, Sides
+from tsfusion.pipelines.report.run_record import MapFindings, Paths
 
 _MOST_PATH = 2000  # points of the trajectory in the 3-D view
 _BINS = 60  # of a histogram

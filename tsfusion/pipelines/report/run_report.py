@@ -5,11 +5,10 @@ from pathlib import Path
 
 from tsfusion.core.readable_numbers import count_of, counted, figure, grouped, size
 from tsfusion.geometry.mesh import Mesh
-from tsfusion.pipelines.report import findings, map_sections, page, run_record, run_sections
-from tsfusion.pipelines.report.findings import MapFindings, RunFindings
+from tsfusion.pipelines.report import map_sections, page, run_record, run_sections
 from tsfusion.pipelines.report.map_sections import ShownMap
 from tsfusion.pipelines.report.page import Page, Pictures
-from tsfusion.pipelines.report.run_record import Accuracy, MapResult
+from tsfusion.pipelines.report.run_record import Accuracy, MapFindings, MapResult, RunFindings
 
 _MOST_MAPS = 4  # that are shown in pictures
 _ELSEWHERE = "The map is on its server, so there is no mesh here: `tsfusion mesh` fetches it."
@@ -29,8 +28,8 @@ def write(folder: Path, out: Path, *, meshes: dict[str, Mesh] | None = None) -> 
     Raises:
         OutputError: when the results cannot be read, or `out` cannot be written.
     """
-    found = findings.read(folder, meshes)
-    made, drawn = _page(found, findings.date_of(found.record, folder))
+    found = run_record.read_findings(folder, meshes)
+    made, drawn = _page(found, run_record.date_of(found.record, folder))
     return page.write(made.html(), drawn, out)
 
 

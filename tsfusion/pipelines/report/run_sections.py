@@ -14,8 +14,7 @@ from tsfusion.evaluation import trajectory_error
 from tsfusion.evaluation.trajectory_error import TrajectoryError
 from tsfusion.pipelines.report import charts, latency_ledger, page
 from tsfusion.pipelines.report.charts import Axis, Chart
-from tsfusion.pipelines.report.findings import MapFindings, RunFindings
-from tsfusion.pipelines.report.run_record import Circumstances, MapResult, RunRecord
+from tsfusion.pipelines.report.run_record import Circumstances, MapFindings, MapResult, RunFindings, RunRecord
 from tsfusion.wire.messages.health import Spread, spread
 from tsfusion.wire.messages.messages import DELAY, SKIP_REASONS, STAGES, KeyframeTimes
 
