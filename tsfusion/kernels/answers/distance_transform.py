@@ -2,9 +2,9 @@
 """Exact Euclidean distance transform of a box of voxels, one axis at a time.
 
 Felzenszwalb and Huttenlocher, "Distance transforms of sampled functions" (2012), in integers: along each line
-of voxels the lower envelope of one parabola a site. With the smallest squared distance goes the number of
-the site that it leads to; of sites equally far, the one of the smallest number counts. So neither the order
-of the axes nor what lies around a box shows in the result.
+of voxels the lower envelope of one parabola a site. The number of the nearest site goes with the smallest
+squared distance; of sites equally far, the smallest number counts. So the result depends neither on the order
+of the axes nor on the surroundings of a box.
 
 Grids are flat arrays of (X, Y, Z), z fastest. A site is a voxel at the surface.
 """
@@ -57,7 +57,7 @@ def is_site(values: ti.template(), shape, at, own):
 def is_rim(values: ti.template(), shape, at, own):
     """True if a body ends at a voxel with nothing seen beside it, and no neighbour leads to a surface.
 
-    So it is at the edge of a table in a slice through its top: its surface is above, not beside.
+    Example: the edge of a table in a slice through its top; its surface is above, not beside.
     """
     beside, lead = 0, 0.0
     if own < -0.5:
@@ -78,8 +78,8 @@ def is_rim(values: ti.template(), shape, at, own):
 
 @ti.func
 def slope(values: ti.template(), shape, at, own):
-    """Gain of the distance with a voxel along each axis: towards the surface where it lies between the
-    voxel and its neighbour, else from both neighbours that were seen."""
+    """Gain of the distance with a voxel along each axis: towards a surface between the voxel and its
+    neighbour, else from both seen neighbours."""
     gradient = vec3f(0.0)
     for a in ti.static(range(3)):
         step = vec3i(0)
@@ -101,7 +101,7 @@ def slope(values: ti.template(), shape, at, own):
 
 @ti.func
 def surface_offset(values: ti.template(), shape, at):
-    """From a site's centre to the surface in voxels: one Newton step, held within a voxel."""
+    """Vector from a site's centre to the surface, voxels: one Newton step, held within a voxel."""
     own = value_at(values, shape, at)
     gradient = slope(values, shape, at, own)
     offset = gradient * (-own / ti.max(gradient.norm_sqr(), 1e-6))
@@ -116,7 +116,7 @@ def mark_sites(
 ):  # fmt: skip
     """Begin a transform in the rows `first` ≤ x < `end`: sites are 0 from themselves, all else is far.
 
-    `rims`: whether the rims of bodies are sites, too.
+    With `rims`, the rims of bodies are sites, too.
     """
     for row in range((end - first) * Y):
         x, y = first + row // Y, row % Y
@@ -130,7 +130,7 @@ def mark_sites(
 
 @ti.func
 def last_place(p, g_p, site_p, q, g_q, site_q):
-    """The last place on a line where the parabola at `p` counts, before that at `q` > `p` does."""
+    """Last place on a line where the parabola at `p` counts, before that at `q` > `p` does."""
     num = (g_q + q * q) - (g_p + p * p)
     den = 2 * (q - p)
     last = ti.floor(num / ti.cast(den, ti.f64), ti.i32)
@@ -147,9 +147,9 @@ def spread_along_lines(
 ):  # fmt: skip
     """Smallest squared distance along each line, at its places `begin` … `end` − 1.
 
-    The grid is (…, `length`, `inner`); in the output a line has `end` − `begin` places. What is farther than
-    `most`, squared, is far.
-    `stack` (bands, length, 2): of each parabola on the envelope its place, and where it begins to count.
+    The grid is (…, `length`, `inner`); in the output a line has `end` − `begin` places. Squared distances
+    above `most` are far. `stack` (bands, length, 2): for each parabola on the envelope, its place and where
+    it begins to count.
     """
     for run in range(runs(BANDS)):  # run loop: kernels/base/quick_launch.py
         band = unit_of(run, BANDS)
@@ -192,9 +192,8 @@ def spread_along_lines(
 
 @ti.kernel
 def place_sites(values: F32, shape: vec3i, squared: I32, rows: vec2i, columns: vec2i, offsets: F32x2):
-    """`offsets`: the way to the surface of the sites (`squared` is 0) in some `rows`, x, and `columns`, y;
-    0 of a rim.
-    """
+    """Write `offsets`, the vectors from the sites (`squared` is 0) to the surface, for `rows` of x and
+    `columns` of y; 0 at a rim."""
     width = columns[1] - columns[0]
     for n in range((rows[1] - rows[0]) * width):
         x, y = rows[0] + n // width, columns[0] + n % width
@@ -215,12 +214,12 @@ def measure(
     columns: vec2i, subvoxel: ti.i32, placed: ti.i32, offsets: F32x2, edge: ti.f32, most: ti.f32,
     distances: F32,
 ):  # fmt: skip
-    """Distances in metres, at most `most`, of the voxels in some `rows`, x, and `columns`, y (first,
-    end), of the box `begin`, `extent`:
-    to the surface at the nearest site, or to the site's centre. Negative where a voxel lies behind it.
+    """Distances, metres, at most `most`, of the voxels in `rows` of x and `columns` of y (first, end) of the
+    box `begin`, `extent`: to the surface at the nearest site, or to the site's centre. Negative behind the
+    surface.
 
-    `edge` is a voxel's, metres. With `placed` the surface lies at the sites' `offsets`, of `place_sites`:
-    many voxels have one site.
+    `edge` is a voxel's, metres. With `placed` the surface lies at the `offsets` of `place_sites`: many voxels
+    share one site.
     """
     width = columns[1] - columns[0]
     for n in range((rows[1] - rows[0]) * width):

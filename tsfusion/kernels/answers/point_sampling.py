@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The map's signed distance between voxel centres: trilinear interpolation, and its gradient.
+"""Signed distance of the map between voxel centres: trilinear interpolation, and its gradient.
 
-A point is rounded to 2⁻¹⁶ voxel. It lies between eight voxel centres, of which those count that have a share
-in it: at a voxel's centre that voxel alone.
+A point is rounded to 2⁻¹⁶ voxel. It lies between eight voxel centres, of which those with a share in it
+count: at a voxel's centre that voxel alone.
 
 The map holds distances along rays. Where these were oblique, the gradient is steeper than 1: divided by it,
 the distance is, to first order, that to the surface.
@@ -23,7 +23,8 @@ BANDS = 64  # of blocks: units of parallel work
 BAND = 512  # points that one thread takes at a time
 BATCH = 64  # points of a band that wait for memory together
 
-# What values are: Σ w·m / Σ w; that, with what `correction` adds to Σ w·m; or what `pair` put beside Σ w
+# Kinds of values: Σ w·m / Σ w; that, with `correction` added to Σ w·m; or the number that `pair` put beside Σ
+# w
 FUSED, CORRECTED, SOLVED = 0, 1, 2
 
 vec3f = ti.types.vector(3, ti.f32)
@@ -36,7 +37,7 @@ corners_f = ti.types.vector(8, ti.f32)
 
 @ti.func
 def place_of(points: ti.template(), n, per_metre):
-    """Point n in 2⁻¹⁶ voxel from the centre of voxel (0, 0, 0), and whether a map can reach so far."""
+    """Point n in 2⁻¹⁶ voxel from the centre of voxel (0, 0, 0), and a flag: within the reach of a map."""
     place = vec3l(0)
     inside = True
     for a in ti.static(range(3)):
@@ -48,7 +49,7 @@ def place_of(points: ti.template(), n, per_metre):
 
 @ti.func
 def find_near(near: ti.template(), voxel, k, map_keys: ti.template(), map_slots: ti.template()):
-    """Slot of the block k away (bits: one on along x, y, z) from that of a voxel; kept in `near`."""
+    """Slot of the block k away (bits: one on along x, y, z) from that of a voxel; cached in `near`."""
     if near[k] == UNKNOWN:
         key = pack((voxel[0] >> 3) + (k & 1), (voxel[1] >> 3) + (k >> 1 & 1), (voxel[2] >> 3) + (k >> 2))
         near[k] = map_find(map_keys, map_slots, map_keys.shape[0] - 1, key)
@@ -57,7 +58,7 @@ def find_near(near: ti.template(), voxel, k, map_keys: ti.template(), map_slots:
 
 @ti.func
 def crossing(voxel):
-    """Along which axes (bits) the voxels one on lie in the next block."""
+    """Axes (bits) along which the next voxel lies in the next block."""
     return (
         ti.cast((voxel[0] & 7) == 7, ti.i32)
         | ti.cast((voxel[1] & 7) == 7, ti.i32) << 1
@@ -77,7 +78,7 @@ def corner_offset(voxel, c: ti.template()):
 
 @ti.func
 def read_voxel(row, o, sums: ti.template(), kind, correction: ti.template()):
-    """The sums of a voxel, and what `correction` holds of it."""
+    """Sums of a voxel, and its entry in `correction`."""
     held = ti.f32(0.0)
     if kind == CORRECTED:
         held = correction[row, o]
@@ -127,7 +128,7 @@ def write_sample(
     n, packed, held, f, kind, min_weight, metres, distance: ti.template(), weight: ti.template(),
     gradient: ti.template(),
 ):  # fmt: skip
-    """Sample n: of the sums of its eight corners, at the place f in their cell."""
+    """Write sample n from the sums of its eight corners, at the place f in their cell."""
     v = corners_f(0.0)
     w = corners_f(0.0)
     for c in ti.static(range(8)):
@@ -136,7 +137,7 @@ def write_sample(
     if not (total == total):  # Taichi's != is false of NaN
         total = blend_shares(v, f)
     slope *= ti.static(1.0 / QUANTA_PER_VOXEL)
-    # along oblique rays the distance grows faster than that to the surface
+    # Along oblique rays the distance grows faster than that to the surface
     steep = slope.norm()
     shorter = 1.0 / ti.select(steep > 1.0, steep, 1.0)
     distance[n] = total * metres * shorter
@@ -176,7 +177,7 @@ def list_blocks(points: ANYx2, per_metre: ti.f64, map_keys: I64, map_slots: I32,
 def pair(slots: I32, sums: I64x2, values: F32x2, pairs: I64x2):
     """Row n of `pairs`: row n of `values`, bits, in the upper halves; in the lower ones Σ w of `slots[n]`.
 
-    What `interpolate` reads of a point lies together then: at points in random order it waits for memory.
+    All that `interpolate` reads of a point then lies together: at points in random order it waits for memory.
     """
     for run in range(runs(BANDS)):  # run loop: kernels/base/quick_launch.py
         band = unit_of(run, BANDS)
@@ -246,11 +247,11 @@ def interpolate_within(
     """As `interpolate`, to the bit, at many points: by a table instead of the hash, and many at once.
 
     `rows` has the rows in `sums` of the blocks in a box, which begins at block `begin` and has `size` of them
-    along x, y and z: -1 where there is none, as in the first two layers along each axis and in the last.
+    along x, y and z: -1 for an absent block, as in the first two layers along each axis and in the last.
 
-    Points in random order wait for memory; here, those of a batch together: all are placed, then all sums are
-    touched that they need, then these are blended. Meanwhile a point's row of the answer has its block
-    (`weight`, bits), its voxel (`distance`, bits) and its place in the cell (`gradient`).
+    Points in random order wait for memory; those of a batch wait together: all are placed, then all their
+    sums are touched, then these are blended. Meanwhile a point's row of the answer has its block (`weight`,
+    bits), its voxel (`distance`, bits) and its place in the cell (`gradient`).
     """
     count = points.shape[0]
     metres = ti.cast(1.0 / (per_metre * QUANTA_PER_VOXEL), ti.f32)

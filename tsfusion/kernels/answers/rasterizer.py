@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""A z-buffer rasteriser: which triangle each pixel sees.
+"""A z-buffer rasteriser: the triangle that each pixel sees.
 
-Vertices come in camera coordinates (x right, y down, z forward). A pixel keeps the smallest
-`depth bits << 32 | triangle`, by an atomic minimum: the picture does not depend on thread order.
-Triangles whose back is turned are not drawn, so a room opens like a doll's house.
+Vertices come in camera coordinates (x right, y down, z forward). A pixel keeps the smallest `depth bits << 32
+| triangle`, by an atomic minimum: the picture does not depend on thread order. Back faces are not drawn, so a
+room opens like a doll's house.
 """
 
 import taichi as ti
@@ -72,8 +72,8 @@ def fill(seen: ti.types.ndarray(), a, b, c, triangle, focal, width, height):
                     last = -1.0
             near = tm.dot(row, inverse)
             nearer = tm.dot(right, inverse)
-            # Held first as floats, as an int cannot hold what an edge that is nearly level gives, and then as
-            # ints, as a float may be none.
+            # Floats first, since an int cannot hold the result of a nearly level edge; then ints, since NaN
+            # is possible.
             wide = high.x - low.x
             start = ti.max(ti.cast(ti.ceil(ti.min(first, wide + 1.0)), ti.i32), 0)
             stop = ti.min(ti.cast(ti.floor(ti.max(last, -1.0)), ti.i32), ti.cast(wide, ti.i32))
@@ -142,7 +142,7 @@ def look_up(
     colors: U8x2,  # likewise
     focal: ti.f32, empty: ti.i64, depth: F32x2, normal: F32x3, color: U8x3,
 ):  # fmt: skip
-    """Depth, unit normal and colour of every pixel that is not EMPTY, as the corners of its triangle say."""
+    """Depth, unit normal and colour of every pixel that is not EMPTY, from its triangle's corners."""
     height, width = seen.shape[0], seen.shape[1]
     per_pixel = 1.0 / focal
     is_more = normals.shape[0] + colors.shape[0] > 0
@@ -211,7 +211,7 @@ def shade(
 
 @ti.func
 def point_at(image: ti.types.ndarray(), v, u, focal):
-    """Point that a pixel sees, camera coordinates; z = 0 where it sees nothing."""
+    """Point that a pixel sees, camera coordinates; z = 0 if it sees nothing."""
     x = (u - 0.5 * (image.shape[1] - 1)) / focal
     y = (v - 0.5 * (image.shape[0] - 1)) / focal
     return image[v, u, 3] * tm.vec3(x, y, 1.0)
@@ -219,7 +219,7 @@ def point_at(image: ti.types.ndarray(), v, u, focal):
 
 @ti.func
 def step_between(image: ti.types.ndarray(), v, u, dv, du, focal):
-    """Vector along the surface from pixel (v, u) towards (v + dv, u + du), by the side that is less steep."""
+    """Vector along the surface from pixel (v, u) towards (v + dv, u + du), by the less steep side."""
     height, width = image.shape[0], image.shape[1]
     here = point_at(image, v, u, focal)
     ahead = point_at(image, ti.min(v + dv, height - 1), ti.min(u + du, width - 1), focal) - here

@@ -20,12 +20,10 @@ def read_columns(
     correction: F32x2, corrected: ti.i32, color_rgn: I64x2, hits: I32x2, layers: ti.i32, shows_surface: U8,
     clear_keys: I64, clear_slots: I32, clear_counts: I32, min_weight: ti.i32, values: F32, seen: I32,
 ):  # fmt: skip
-    """`values`: the smallest signed distance in voxels (`held`) among the samples of each of the `cells`
-    that were seen, NaN where none was; `seen`: how many were, or lie in a block that is free as a whole.
-
-    Cell n is (`row` + n // `width`, `column` + n % `width`). It has `across`² columns of `heights` samples;
-    these are `along_row`, `along_column`, `along_height` apart, in voxels, from `corner` on.
-    """
+    """Write `values`: the smallest signed distance in voxels (`held`) among the seen samples of each of the
+    `cells`, NaN if none was seen; and `seen`: the number of samples that were seen, or lie in a block that is
+    free as a whole. Cell n is (`row` + n // `width`, `column` + n % `width`). It has `across`² columns of
+    `heights` samples, `along_row`, `along_column`, `along_height` apart, in voxels, from `corner` on."""
     mask = map_keys.shape[0] - 1
     for run in range(runs(BANDS)):  # run loop: kernels/base/quick_launch.py
         band = unit_of(run, BANDS)

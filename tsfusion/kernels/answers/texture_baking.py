@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Textures: which triangle each texel shows, where it lies in the world, and what the cameras saw there.
+"""Textures: the triangle of each texel, its place in the world, and its colour in the cameras' images.
 
-Texel (column i, row j) has its centre at (i + 0.5, j + 0.5). A texel keeps the smallest
-`distance from the triangle << 32 | triangle`, by an atomic minimum; every other loop writes to its own texel
-alone. So nothing depends on the order of the threads.
+Texel (column i, row j) has its centre at (i + 0.5, j + 0.5). A texel keeps the smallest `distance from the
+triangle << 32 | triangle`, by an atomic minimum; every other loop writes to its own texel alone. So nothing
+depends on the order of the threads.
 """
 
 import taichi as ti
@@ -102,7 +102,7 @@ def place_texels(
     texels: I32x2, owner: I64x2, corners: F32x3, vertices: F32x2, normals: F32x2, faces: I32x2, points: F32x2,
     directions: F32x2,
 ):  # fmt: skip
-    """Write where the texels `texels` (n, 2), row and column, lie on the mesh, and the normals there."""
+    """Write the points of the mesh at the texels `texels` (n, 2), row and column, and the normals there."""
     for r in range(texels.shape[0]):
         j, i = texels[r, 0], texels[r, 1]
         f = ti.cast(owner[j, i], ti.i32)
@@ -131,7 +131,7 @@ def bilinear(image: ti.template(), u, v, k):
 
 @ti.func
 def moved(T: ti.template(), p):
-    """A point in the frame that T (4, 4) leads to."""
+    """Point p in the target frame of T (4, 4)."""
     q = tm.vec3(0.0)
     for k in ti.static(range(3)):
         q[k] = ti.cast(T[k, 0] * p.x + T[k, 1] * p.y + T[k, 2] * p.z + T[k, 3], ti.f32)
@@ -146,7 +146,7 @@ def pixel(K: ti.template(), p):
 
 @ti.func
 def is_inside(at, height, width):
-    """True if a pixel can be read between its neighbours."""
+    """True if a pixel can be interpolated between its neighbours."""
     return at.x >= 1.0 and at.y >= 1.0 and at.x < width - 2.0 and at.y < height - 2.0
 
 
@@ -157,10 +157,10 @@ def look(
 ):  # fmt: skip
     """Write column, row and quality of each point in an image to `found` (n, 3); quality 0 = not seen.
 
-    A point is seen where the image's own depth lies within `tolerance + relative · z` of the point's: nothing
-    stands in front of it, and what it belongs to was there. The quality is the number of pixels on a square
-    metre there, times the pixel's clearness. `T` (4, 4) is T_camera_world, `T_color` the same of the colours
-    alone, which may have been taken at another moment than the depth; `K` fx, fy, cx, cy.
+    A point is seen if the image's depth lies within `tolerance + relative · z` of the point's: nothing stands
+    in front of it, and its surface was there. The quality is the number of pixels on a square metre there,
+    times the pixel's clearness. `T` (4, 4) is T_camera_world, `T_color` the same of the colours alone, which
+    may have been taken at another moment than the depth; `K` fx, fy, cx, cy.
     """
     height, width = depth.shape[0], depth.shape[1]
     for r in range(points.shape[0]):
@@ -193,8 +193,8 @@ def blend(found: F32x2, bands: F32x3, unit: ti.f32, power: ti.f32, sums: F32x2):
     """Add an image to `sums` (n, 8): Σ of weight and coarse colour, Σ of weight and fine colour.
 
     `bands` (H, W, 7): the image's coarse part, its fine part, and its trust. Coarse colours are mixed by
-    quality, in which no seam is seen; of the fine ones the best views prevail, by the quality to a power.
-    `unit` is the quality that counts 1.
+    quality, which hides seams; for fine ones the weight is a power of the quality, so that the best views
+    prevail. `unit` is the quality that counts 1.
     """
     for r in range(found.shape[0]):
         u, v = found[r, 0], found[r, 1]

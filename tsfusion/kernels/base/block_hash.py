@@ -17,7 +17,7 @@ MAX_PROBES = 256
 
 @ti.func
 def set_insert(table: ti.template(), mask, key):
-    """Insert `key` (> 0) into the set; returns how much larger it is now, and whether it is too full.
+    """Insert `key` (> 0) into the set. Returns the growth of the set, and a flag: the set is too full.
 
     Of threads that insert one key at the same time, one counts it.
     """

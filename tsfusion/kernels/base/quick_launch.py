@@ -2,14 +2,13 @@
 """Launches of a kernel in a tenth of the time that Taichi takes, and loops shared out among threads.
 
 Taichi 1.7 looks at the type of every argument anew at each launch: 8 µs an argument, 0.14 ms for the sixteen
-of `integrate.add_rays`. That is as long as a small keyframe's rays take, and one thread's work whatever the
-number of threads.
+of `integrate.add_rays`. A small keyframe's rays take no longer, and the look-up is always one thread's work.
 
 A run loop is a parallel loop over heavy units of work (a band of rays, a block). Taichi 1.7's CPU backend
-gives each thread one piece of a loop, next to each other and of the same length, at least 512 iterations
-(`make_cpu_multithreaded_range_for.cpp`). Neighbouring units cost alike, and those of one piece more than
-those of another: at 1 cm the rays of an image's lower half cost 1.7 times those of its upper half, and one
-thread waited for the other. So thread t of T takes units t, t + T, t + 2T, …:
+gives each thread one contiguous piece of a loop, of the same length, at least 512 iterations
+(`make_cpu_multithreaded_range_for.cpp`). Neighbouring units cost alike, and pieces differ: at 1 cm the rays
+of an image's lower half cost 1.7 times those of its upper half, and one thread waited for the other. So
+thread t of T takes units t, t + T, t + 2T, …:
 
     for run in range(runs(count)):  # run loop: kernels/base/quick_launch.py
         unit = unit_of(run, count)
@@ -33,7 +32,7 @@ _WHAT: dict[type, int] = {}  # of the types of arguments that were seen: to ask 
 
 
 class Copied(NamedTuple):
-    """A NumPy array that a device has at an address: a kernel that only reads it is handed the copy there.
+    """A NumPy array with a copy on a device: a kernel that only reads it is handed the copy.
 
     Its first launch, which is Taichi's own, copies the array itself.
     """
@@ -46,8 +45,8 @@ class QuickLaunch:
     """A kernel over arrays of NumPy (contiguous) and of Taichi and numbers, launched as Taichi does once it
     knows their types.
 
-    The first launch for each choice of dtypes and dimensions is Taichi's own, and so is every launch with
-    other arguments, and with another version of Taichi.
+    Taichi itself makes the first launch for each choice of dtypes and dimensions, every launch with other
+    arguments, and all launches in another version of Taichi.
     """
 
     def __init__(self, kernel: Callable[..., None]) -> None:
@@ -85,7 +84,7 @@ class QuickLaunch:
         self._program.launch_kernel(code, context)
 
     def _begin(self, arguments: tuple[Any, ...], kind: tuple[int, ...] | None) -> None:
-        """Launch the kernel as Taichi does, and keep what it has found out."""
+        """Launch the kernel as Taichi does, and keep its compiled form."""
         arguments = tuple(one.array if isinstance(one, Copied) else one for one in arguments)
         self._kernel(*arguments)
         if kind is None:
@@ -115,7 +114,7 @@ def _is_known(argument: Any) -> bool:
 
 
 def _kind(arguments: tuple[Any, ...]) -> tuple[int, ...] | None:
-    """Types that a launch depends on, as numbers; None where Taichi is to look for itself."""
+    """Types that a launch depends on, as numbers; None = Taichi has to look."""
     kind = []
     for argument in arguments:
         what = _WHAT.get(type(argument))
@@ -137,7 +136,7 @@ def _kind(arguments: tuple[Any, ...]) -> tuple[int, ...] | None:
 
 
 def _what(argument: Any) -> int | None:
-    """The class of an argument, also of a type derived from a usual one; None = Taichi is to look."""
+    """Class of an argument, also for a subclass of a usual type; None = Taichi has to look."""
     for kind, what in (
         (ti.Ndarray, _OF_TAICHI), (np.ndarray, _OF_NUMPY), (Copied, _COPIED), (_INTEGERS, _INTEGER),
         (_FLOATS, _FLOAT),
@@ -149,7 +148,6 @@ def _what(argument: Any) -> int | None:
 
 @ti.func
 def _piece(count):
-    """Iterations of one thread."""
     threads = ti.static(runtime.threads())
     return ti.max((count + threads - 1) // threads, _LEAST)
 
@@ -162,6 +160,6 @@ def runs(count):
 
 @ti.func
 def unit_of(run, count):
-    """The unit of an iteration; `count` or more where it has none."""
+    """Unit of an iteration; `count` or more = none."""
     piece = _piece(count)
     return run % piece * ti.static(runtime.threads()) + run // piece

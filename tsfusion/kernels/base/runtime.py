@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Taichi is started once, here, on the thread that will launch kernels."""
+"""Start of Taichi, once, on the thread that will launch kernels."""
 
 import ctypes
 import os
@@ -25,8 +25,8 @@ _thread: int | None = None  # the one that kernels run in; None = no one yet
 def check_thread() -> None:
     """Raise MapError in another thread than the one that started Taichi, and in a process forked from it.
 
-    Taichi asks at a kernel's first launch at most. Two threads would write to one map at the same time; in a
-    forked process the threads of kernels are missing, and a launch waits for them for ever.
+    Taichi itself checks only a kernel's first launch. Two threads would write to one map at the same time; in
+    a forked process the threads of kernels are missing, and a launch waits for them for ever.
     """
     if get_ident() == _thread or _thread is None:
         return
@@ -90,9 +90,8 @@ def start(threads: int | None = None) -> None:
 def start_device(arch: str) -> None:
     """Start Taichi on a device instead, once a process: `cuda`, `vulkan` or `metal`.
 
-    Raises:
-        MissingDependency: where this machine, or Taichi's build for it, has no such device, or the device
-            lacks what the map is made of.
+    Raises MissingDependency if this machine, or Taichi's build for it, has no such device, or the device
+    lacks a feature that the map needs.
     """
     from tsfusion.kernels import taichi as ti
 
@@ -117,9 +116,9 @@ def start_device(arch: str) -> None:
 
 @cache
 def kept_in() -> tuple[str, str]:
-    """The folder of compiled kernels, and why it is not the usual one; empty = it is.
+    """Folder of compiled kernels, and the reason for an unusual one; empty = it is the usual one.
 
-    Taichi makes the folder when a process ends, and where it cannot, that end is a segmentation fault.
+    Taichi makes the folder when a process ends; if it cannot, that end is a segmentation fault.
     """
     from taichi.lang import impl
 
@@ -139,7 +138,7 @@ def kept_in() -> tuple[str, str]:
 
 
 def first_line(error: BaseException) -> str:
-    """First line of an error of Taichi; the rest is where in Taichi it arose."""
+    """First line of an error of Taichi; the others are its place in Taichi."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return lines[0] if lines else type(error).__name__
 

@@ -62,15 +62,15 @@ def support_width(model: ti.template(), sigma):
 @ti.func
 def behind_width(model: ti.template(), sigma, support):
     """Half-width of a ray's band, 2⁻⁸ voxel: three sigma, at least the preset's, at most the support. A wider
-    one hides the other face of a thin thing; one that ends within the noise moves the surface."""
+    band hides the other face of a thin thing; a band that ends within the noise moves the surface."""
     width = ti.max(sigma * model[SUPPORT_PER_SIGMA], model[LEAST_BEHIND] * 256.0)
     return ti.cast(ti.min(width, ti.cast(support, ti.f64)), ti.i32)
 
 
 @ti.func
 def before_width(model: ti.template(), support, length):
-    """How far before its end the ray of a point, of `length` voxels, begins, 2⁻⁸ voxel: its support, or with
-    space carving all but what is next to the sensor."""
+    """Distance before its end at which the ray of a point, of `length` voxels, begins, 2⁻⁸ voxel: its
+    support, or with space carving its whole length but the part next to the sensor."""
     before = support
     if model[CARVES_SPACE] > 0.0:
         carved = ti.min(length, MAX_CARVED) - NEVER_CARVED
@@ -80,7 +80,7 @@ def before_width(model: ti.template(), support, length):
 
 @ti.func
 def layer_depth(model: ti.template(), z):
-    """How far apart in depth samples of one surface may be, metres."""
+    """Greatest depth step between samples of one surface, metres."""
     return model[VOXEL_SIZE] + LAYER_SIGMAS * noise_sigma(model, z)
 
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Integer geometry shared by all kernels: voxel keys, and the traversal of the voxels a ray crosses.
 
-A ray is `RAY_FIELDS` int32, made once per keyframe: where its band begins and how it goes on. Everything
-after that is integer arithmetic, so every kernel visits the same voxels.
+A ray is `RAY_FIELDS` int32, made once per keyframe: the start of its band and its steps. All later arithmetic
+is in integers, so every kernel visits the same voxels.
 
 Units: position 2⁻¹⁰ voxel, direction 2⁻¹⁶, distance along the ray 2⁻¹⁶ voxel.
 """
@@ -11,11 +11,11 @@ import taichi as ti
 
 from tsfusion.kernels.base.kernel_functions import dot, norm, product
 
-# First voxel of the band (3), next crossing an axis (3), crossing interval an axis (3), what the distance
-# loses with a step an axis (3), signed distance of the first voxel's centre to the surface along the ray
-# (positive before it), length of the ray, where in it the end point lies, weight << 24 | 0xRRGGBB. The band
-# is as wide before the end point as behind it. The low 3 bits of `END` are the axes that go down; the next 5,
-# above the low 8 of `LENGTH`, are the support, 2⁻⁸ voxel.
+# First voxel of the band (3), next crossing an axis (3), crossing interval an axis (3), loss of the distance
+# with a step an axis (3), signed distance of the first voxel's centre to the surface along the ray (positive
+# before it), length of the ray, place of the end point in it, weight << 24 | 0xRRGGBB. The band is as wide
+# before the end point as behind it. The low 3 bits of `END` are the axes that go down; the next 5, above the
+# low 8 of `LENGTH`, are the support, 2⁻⁸ voxel.
 RAY_FIELDS = 16
 VOXEL, CROSSING, INTERVAL, LOSS = 0, 3, 6, 9
 DISTANCE, LENGTH, END, WEIGHT_COLOR = 12, 13, 14, 15
@@ -48,7 +48,7 @@ def pack(x, y, z):
 
 @ti.func
 def unpack(key):
-    """The three coordinates of a key: the inverse of `pack`."""
+    """Three coordinates of a key: the inverse of `pack`."""
     return vec3i(
         ti.cast((key >> 42) & 2097151, ti.i32) - 1048576,
         ti.cast((key >> 21) & 2097151, ti.i32) - 1048576,
@@ -69,16 +69,16 @@ def hash_key(key):
 def write_ray(
     rays: ti.template(), r, first, end, direction, gradient, before, support, behind, weight, color
 ):
-    """Write ray `r` of a band that begins with ray `first`; returns what it costs to add it.
+    """Write ray `r` of a band that begins with ray `first`. Returns the cost of its addition.
 
-    That is the most voxels it can cross, `FAR_COST` times if it begins away from the ray before it: then no
-    block that it crosses is in the processor's cache.
+    The cost is the most voxels it can cross, times `FAR_COST` if it begins away from the ray before it: then
+    no block that it crosses is in the processor's cache.
 
-    `end` int32 2⁻¹⁰ voxel; `direction` float64 of any length; the ray reaches `before` and `behind` the
-    end point, int32 2⁻⁸ voxel. A ray without a direction gets no weight. `support`, likewise: the distance
-    that is told before the band.
-    `gradient`, float64, is what the distance along the ray to the surface loses with a voxel along each axis:
-    n / (n·u) for a plane of normal n; zero stands for the plane across the ray, whose gradient is u.
+    `end` int32 2⁻¹⁰ voxel; `direction` float64 of any length; the ray reaches `before` and `behind` the end
+    point, int32 2⁻⁸ voxel. A ray without a direction gets no weight. `support`, in the same unit: the
+    distance written before the band. `gradient`, float64, is the loss of the distance along the ray with a
+    voxel along each axis: n / (n·u) for a plane of normal n; zero stands for the plane across the ray, whose
+    gradient is u.
     """
     length = norm(direction)
     usable = weight
@@ -128,15 +128,15 @@ def write_ray(
 
 @ti.func
 def is_apart(rays: ti.template(), r, other):
-    """True if two rays begin neither in one block nor in blocks side by side."""
+    """True if two rays begin neither in one block nor in adjacent blocks."""
     step = abs((ray_vector(rays, r, VOXEL) >> 3) - (ray_vector(rays, other, VOXEL) >> 3))
     return ti.max(step[0], step[1], step[2]) > 1
 
 
 @ti.func
 def write_band(bands: ti.template(), band, first, end, samples, weight, cost):
-    """Write what a band holds: rays `first` … `end` − 1 of so many samples and of `weight` in all, which cost
-    so much to add (int64; held to what fits)."""
+    """Write a band: rays `first` … `end` − 1, their samples, their total `weight`, and the cost of their
+    addition (int64; clamped)."""
     bands[band, START] = first
     bands[band, COUNT] = end - first
     bands[band, SAMPLES] = samples
@@ -152,7 +152,7 @@ def ray_weight(rays: ti.template(), r):
 
 @ti.func
 def parts_of(rays: ti.template(), r):
-    """Length of ray `r`, where its end point lies, and its support, 2⁻¹⁶ voxel."""
+    """Length of ray `r`, place of its end point, and its support, 2⁻¹⁶ voxel."""
     length, end = rays[r, LENGTH], rays[r, END]
     return length & ~255, end & ~255, (end & 248) << 13 | (length & 255) << 8
 
@@ -165,8 +165,8 @@ def ray_vector(rays: ti.template(), r, first: ti.template()):
 
 @ti.func
 def next_step(crossing):
-    """Mask: all bits in the axis that is crossed next (the first of equals), none in the others. No branch:
-    which axis comes next is what a processor predicts worst."""
+    """Mask: all bits in the axis that is crossed next (the first of equals), none in the others. It has no
+    branch: a processor predicts the next axis worst of all."""
     nearest = ti.min(crossing[0], crossing[1], crossing[2])
     x = -ti.cast(crossing[0] == nearest, ti.i32)
     y = -ti.cast(crossing[1] == nearest, ti.i32) & ~x
@@ -179,8 +179,8 @@ def steps(end):
     return vec3i(1 - 2 * (end & 1), 1 - (end & 2), 1 - ((end & 4) >> 1))
 
 
-# Where a ray is: the voxel, the distance of its centre to the surface, where along the band the ray crosses
-# each axis next; and what a step along each axis adds to the three.
+# State of a walk: the voxel, the distance of its centre to the surface, the next crossing of each axis along
+# the band; and the changes of these three with a step along each axis.
 Walk = ti.types.struct(
     voxel=vec3i, distance=ti.i32, crossing=vec3i, towards=vec3i, loss=vec3i, interval=vec3i
 )
@@ -197,7 +197,7 @@ def begin_walk(rays: ti.template(), r):
 
 @ti.func
 def advance(walk: ti.template(), step):
-    """Go on to the next voxel, along the axis that `next_step` found."""
+    """Step to the next voxel, along the axis that `next_step` found."""
     walk.crossing += walk.interval & step
     walk.voxel += walk.towards & step
     walk.distance -= (walk.loss & step).sum()
@@ -211,7 +211,7 @@ def offset_in_block(voxel):
 
 @ti.func
 def voxel_of(o):
-    """Place of the voxel of this number in its block."""
+    """Place in its block of the voxel of this number."""
     return vec3i(o >> 6, (o >> 3) & 7, o & 7)
 
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Copies between a process's memory and a device's.
 
-Taichi 1.7 copies an array of NumPy that a kernel is handed into new memory of the device, and back, whoever
-writes to it: 0.15 ms for four numbers on a GPU of 2024. On CUDA the driver is asked instead.
+Taichi 1.7 copies a NumPy argument of a kernel into new memory of the device, and back, even if nothing writes
+to it: 0.15 ms for four numbers on a GPU of 2024. On CUDA the driver copies instead.
 """
 
 import ctypes
@@ -38,17 +38,16 @@ def _read_rows(source: I32x2, out: I32x2):
 
 
 class Copies:
-    """By kernels of Taichi, on any device."""
+    """Copies by kernels of Taichi, on any device."""
 
     def given(self, *arrays: NDArray[Any]) -> Sequence[Any]:
         """Arguments for a kernel (`QuickLaunch`) that reads these arrays; valid until the next call."""
         return arrays
 
     def read(self, *wanted: tuple[Any, int]) -> list[NDArray[Any]]:
-        """The first items of Taichi's arrays of int32 or int64, valid until the next call.
+        """First items of Taichi's arrays of int32 or int64, valid until the next call.
 
-        Args:
-            wanted: arrays of one dimension or two, and how many numbers or rows of each.
+        `wanted`: arrays of one dimension or two, and how many numbers or rows of each.
         """
         found = []
         for source, count in wanted:
@@ -59,17 +58,16 @@ class Copies:
         return found
 
     def finish(self) -> None:
-        """Wait until what was given is copied: from then on it may change. `read` waits, too."""
+        """Wait until the `given` arrays are copied and may change. `read` waits, too."""
 
     def pin(self, memory: NDArray[np.uint8]) -> None:
-        """Let this memory, instead of any before, be copied from faster, where the device can."""
+        """Make copies from this memory faster, instead of any before, where the device can."""
 
 
 class CudaCopies(Copies):
-    """By CUDA's driver, in the order of Taichi's launches: both use the default stream.
+    """Copies by CUDA's driver, in the order of Taichi's launches: both use the default stream.
 
-    Raises:
-        OSError: where there is no driver.
+    Raises OSError without a driver.
     """
 
     def __init__(self) -> None:
@@ -133,17 +131,13 @@ class CudaCopies(Copies):
         return ti.ndarray(ti.u8, (nbytes,))
 
     def _pinned(self, nbytes: int) -> NDArray[np.uint8]:
-        """Memory that is copied to faster; it is kept until the process ends."""
+        """Memory for faster copies; it is kept until the process ends."""
         address = ctypes.c_void_p()
         self._call("cuMemAllocHost_v2", ctypes.byref(address), _U64(nbytes))
         return np.ctypeslib.as_array((ctypes.c_uint8 * nbytes).from_address(address.value or 0))
 
     def _call(self, name: str, *arguments: Any) -> None:
-        """Call the driver.
-
-        Raises:
-            RuntimeError: it failed.
-        """
+        """Call the driver. Raises RuntimeError if it fails."""
         error = getattr(self._cuda, name)(*arguments)
         if error:
             raise RuntimeError(f"{name} of CUDA's driver failed with error {error}")
@@ -157,7 +151,6 @@ def _aligned(nbytes: int) -> int:
 
 
 def _memory(array: NDArray[Any]) -> tuple[Any, Any]:
-    """Address and size of an array."""
     return ctypes.c_void_p(array.ctypes.data), _U64(array.nbytes)
 
 

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Additive integration on a device of many threads: a thread a ray, additions by atomics.
 
-Every voxel gets what `integrate.add_rays` gives it: the additions are the same integers, and their order
-shows nowhere. Arrays are a device's (`ti.ndarray`); those of the map have a row of 512 voxels a slot.
+Every voxel gets the same sum as from `integrate.add_rays`: the additions are the same integers, and their
+order has no effect. Arrays are a device's (`ti.ndarray`); those of the map have a row of 512 voxels a slot.
 
-What is counted is counted in many places first: a device makes one addition to a place after the other.
+Counters are split over many places first: a device makes one addition to a place after the other.
 """
 
 import taichi as ti
@@ -60,13 +60,13 @@ from tsfusion.kernels.integration.integrate import (
 from tsfusion.kernels.integration.rays_from_images import TILE_SAMPLES
 
 # A listed update: place of the voxel in the layers, w·m << WEIGHT_FIELD | w, and the key of a missing block,
-# of which the place is −1 − number of the voxel in it.
+# whose place is −1 − the number of the voxel in it.
 LISTED_FIELDS = 4
 PLACE, AMOUNT, KEY = 0, 1, 2
 WEIGHT_FIELD = 8  # bits
 SKIPPED = -1 - CUBE  # instead of a place
 
-# Rays in groups, by their places: voxels that they cross, and where their updates begin in the list.
+# Groups of rays, by their places: voxels that they cross, and the start of their updates in the list.
 GROUP, GROUP_FIELDS = TILE_SAMPLES, 2
 CROSSED, BASE = 0, 1
 LISTED, COSTS = 0, 1  # in `totals`: updates that are listed, and what the rays cost
@@ -80,7 +80,7 @@ ROOM_NEW, ROOM_TOUCHED, ROOM_COST, BLOCK_COST = 0, 1, 2, 3
 
 @ti.func
 def begin_groups(i, groups: ti.template(), totals: ti.template()):
-    """The i-th thread empties what is counted of a launch, if there are as many groups."""
+    """Clear a launch's counters in the i-th thread, if there are as many groups."""
     if i == 0:
         totals[LISTED], totals[COSTS] = 0, 0
     if i < groups.shape[0]:
@@ -117,7 +117,7 @@ def winner_place(key, table: ti.template()):
 
 @ti.func
 def is_winner(i, listed: ti.template(), winners: ti.template()):
-    """True if a block is to be listed among the missing ones from place i: nearly always from one place."""
+    """True if the missing block at place i is to be listed from here: nearly always one place only."""
     key = missing_key(listed, i)
     first, second = winners[winner_place(key, 0)], winners[winner_place(key, 1)]
     found = 1
@@ -150,8 +150,8 @@ def list_updates(
     listed: ti.template(),
 ):  # fmt: skip
     """List the update of every voxel that ray `r` crosses in blocks of slot ≥ `oldest` and in missing blocks,
-    from place `base` on, `most` in all; returns the numbers of updates and of those in missing blocks, and
-    where the update is whose voxel takes the colour, or −1."""
+    from place `base` on, `most` in all. Returns the numbers of updates and of those in missing blocks, and
+    the place of the update whose voxel takes the colour, or −1."""
     walk, weight = begin_walk(rays, r), ray_weight(rays, r)
     length, end, support = parts_of(rays, r)
     half = length - end
@@ -190,7 +190,7 @@ def list_updates(
 @ti.func
 def add_update(listed: ti.template(), i, at, sign_, sums: ti.template()):
     """Make the update that is listed at place i, of the voxel at place `at` of the layers."""
-    # both sums in one addition; their quotient minimises Σ w (x − m)²: paper eq. 2
+    # Both sums in one addition; their quotient minimises Σ w (x − m)²: paper eq. 2
     packed = listed[i, AMOUNT]
     product, w = ti.cast(packed >> WEIGHT_FIELD, ti.i64), packed & ((1 << WEIGHT_FIELD) - 1)
     ti.atomic_add(sums[at // CUBE, at % CUBE], sign_ * ((product << WEIGHT_BITS) + w))
@@ -218,7 +218,7 @@ def vote_color(
 
 @ti.func
 def listed_end(count, totals: ti.template(), listed: ti.template()):
-    """How many updates of `count` rays are listed; none where they are more than there is room for."""
+    """Number of listed updates of `count` rays; 0 if there are more than the room for them."""
     is_listed = (count > 0) & (totals[LISTED] <= listed.shape[0])
     return ti.cast(ti.select(is_listed, totals[LISTED], 0), ti.i32)
 
@@ -231,8 +231,8 @@ def whole_groups(count):
 
 @ti.func
 def place_of(j):
-    """Place of the ray that the j-th thread looks at. Of a cell of four pixels only the first place has one:
-    neighbours look at every fourth place, where all of them have a ray, or none."""
+    """Place of the ray that the j-th thread looks at. Of a cell of four pixels only the first place has a
+    ray: neighbouring threads look at every fourth place, where all of them have a ray, or none."""
     return j // GROUP * GROUP + j % GROUP % (GROUP // 4) * 4 + j % GROUP // (GROUP // 4)
 
 
@@ -242,10 +242,9 @@ def list_rays(
     listed: ti.template(), marks: ti.template(), hash_keys: ti.template(), hash_slots: ti.template(),
     told: ti.template(),
 ):  # fmt: skip
-    """List the updates of `count` rays, which are in `places_end` places of whole groups. `marks`: of each,
-    where in its group's part of the list it begins, and then where the update is that takes its colour.
-
-    Each loop is a task of a device, in this function and the next ones; so is the first of each end.
+    """List the updates of `count` rays, which are in `places_end` places of whole groups. `marks`: for each
+    ray, the start of its updates in its group's part of the list, then the place of the update that takes its
+    colour. Each loop is a task of a device, in this function and the next ones; so is the first of each end.
     """
     for j in range(places_end):
         i = place_of(j)
@@ -272,8 +271,8 @@ def add_listed(
     places: ti.template(), claims: ti.template(), hash_keys: ti.template(), stamps: ti.template(),
     told: ti.template(), sums: ti.template(),
 ):  # fmt: skip
-    """Make the first `end` updates of the list, a thread each: so those of one ray do not wait for each
-    other. Nothing is added inside a loop within a thread: after that, Mesa's software device (22.3) forgets
+    """Make the first `end` updates of the list, a thread each, so that those of one ray do not wait for each
+    other. No addition is inside a loop within a thread: after that, Mesa's software device (22.3) forgets
     which threads run. Keys of missing blocks go to `missing`, hardly any of them twice (`is_winner`)."""
     for i in range(end):
         at = listed[i, PLACE]
@@ -306,8 +305,8 @@ def vote_colors(
     told: ti.template(), hash_keys: ti.template(), hash_slots: ti.template(), oldest,
     color_rgn: ti.template(), color_b: ti.template(),
 ):  # fmt: skip
-    """Cast the votes for colours of `votes_end` − 1 rays, if their updates were made; and enter the blocks
-    into the hash that may share a place, of new ones from slot `oldest` on: one after the other."""
+    """Cast the colour votes of `votes_end` − 1 rays, if their updates were made. New blocks from slot
+    `oldest` on that may share a place enter the hash, one after the other."""
     for k in range(votes_end):
         i = k - 1
         if i < 0:
@@ -348,7 +347,7 @@ def order_new(missing: ti.template(), places: ti.template(), claims: ti.template
 
 @ti.func
 def new_blocks(room: ti.template(), totals: ti.template(), told: ti.template()):
-    """How many missing blocks there is room for: all of them, or none."""
+    """Number of missing blocks with room: all of them, or none."""
     new = told[TOUCHED_MISSING]
     cost = totals[COSTS] + new * room[BLOCK_COST]
     if (
@@ -367,11 +366,9 @@ def add_new(
     missing: ti.template(), places: ti.template(), claims: ti.template(), hash_keys: ti.template(),
     hash_slots: ti.template(), stamps: ti.template(), told: ti.template(), sums: ti.template(),
 ):  # fmt: skip
-    """Have the new blocks from slot `oldest` on, if there is room, and make the updates of the list in them.
-
-    The hash becomes the one that `block_hash.insert_blocks` makes of them in the order of their slots. Those
-    that share no place with others enter it here, the others at last (`vote_colors`).
-    """
+    """Insert the new blocks from slot `oldest` on, if there is room, and make the updates of the list in
+    them. The hash equals that of `block_hash.insert_blocks` with the blocks in the order of their slots.
+    Blocks that share no place with others enter it here, the others at last (`vote_colors`)."""
     for i in range(end):
         new = new_blocks(room, totals, told)
         if i == 0:
@@ -397,8 +394,8 @@ def add_and_admit(
     groups: ti.template(), totals: ti.template(), listed: ti.template(), marks: ti.template(),
     sums: ti.template(), color_rgn: ti.template(), color_b: ti.template(),
 ):  # fmt: skip
-    """Add a keyframe's first `count` rays and their colours (`vote_colors`); missing blocks become the map's,
-    from `first_slot` on, if they are few and there is `room` for them."""
+    """Add a keyframe's first `count` rays and their colours (`vote_colors`). Missing blocks are inserted from
+    `first_slot` on, if they are few and there is `room` for them."""
     list_rays(rays, 0, count, places_end, 0, groups, totals, listed, marks, hash_keys, hash_slots, told)
     end = listed_end(count, totals, listed)
     add_listed(end, sign_, stamp, listed, winners, missing, places, claims, hash_keys, stamps, told, sums)
@@ -423,8 +420,8 @@ def add_rays(
     color_b: I32x2,
 ):  # fmt: skip
     """Add rays of places `first_ray` … `end_ray` − 1 as `integrate.add_rays` does, to blocks of slot ≥
-    `oldest`; missing blocks are told of. Where the updates are more than `listed` has room for, none is made,
-    and `told` says so."""
+    `oldest`. Missing blocks are reported. If `listed` has no room for all updates, none is made, and `told`
+    says so."""
     count = end_ray - first_ray
     for i in range(groups.shape[0] + BANDS):
         if i >= BANDS:

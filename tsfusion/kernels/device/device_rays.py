@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Rays of images and points on a device of many threads: those that `rays_from_images` and `rays_from_points`
-make, to the bit, a thread a pixel or point.
+"""Rays of images and points on a device of many threads, a thread a pixel or point: equal to the bit to those
+of `rays_from_images` and `rays_from_points`.
 
-Rays have fixed places, so a band's rays do not follow each other: a place without a ray has weight 0.
-The kernels add the rays, too (`device_integration`): one launch takes half of the time of two.
+Rays have fixed places, so a band's rays do not follow each other: a place without a ray has weight 0. The
+kernels add the rays, too (`device_integration`): one launch takes half of the time of two.
 """
 
 import taichi as ti
@@ -56,8 +56,8 @@ from tsfusion.kernels.integration.rays_from_points import (
     write_bundle_ray,
 )
 
-# A tile: width and height of its cells, whether it is flat, the slopes of its plane (float32's bits), and
-# what is counted of its rays: fields of a band.
+# A tile: width and height of its cells, flag for a flat one, slopes of its plane (float32's bits), and
+# counters of its rays: fields of a band.
 TILE_FIELDS = 16
 WIDE, HIGH, FLAT, SLOPE_X, SLOPE_Y, COUNTED = 0, 1, 2, 3, 4, 8
 COUNTS = (COUNT, SAMPLES, WEIGHT, COST)

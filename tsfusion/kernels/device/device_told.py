@@ -6,10 +6,10 @@ import taichi as ti
 from tsfusion.kernels.base.voxel_traversal import BAND_FIELDS, DEFERRED
 from tsfusion.kernels.integration.integrate import TOUCHED_HEADER, TOUCHED_MISSING
 
-# `told` begins with the header of the touched blocks (`integrate`). It goes on with: how many new
-# blocks are blocks of the map now; how many missing ones have a place in the hash that no other one wants;
-# whether two of them are the same; the bands, of which the k-th also counts updates of every 64th ray; keys
-# of new blocks, in the order of their slots, two numbers each; slots of touched blocks.
+# `told` begins with the header of the touched blocks (`integrate`). Then: number of new blocks; number of
+# missing blocks with a place in the hash that no other one wants; flag, two of these are the same; the bands,
+# the k-th of which also counts updates of every 64th ray; keys of new blocks, in the order of their slots,
+# two numbers each; slots of touched blocks.
 NEW, APART, ARE_SAME = (TOUCHED_HEADER + i for i in range(3))
 HEADER = 16
 BANDS = 64  # those of a map on the CPU: at their ends bundles of points end
@@ -33,7 +33,7 @@ def band_field(band, field: ti.template()):
 
 @ti.func
 def begin_keyframe(i, told: ti.template(), claims: ti.template()):
-    """The i-th of `BEGINNERS` threads empties what is told of the keyframe before."""
+    """Clear the report of the keyframe before, in the i-th of `BEGINNERS` threads."""
     if i < TOUCHED_AT:
         told[i] = 0
     if i < CLAIMS:
@@ -42,7 +42,7 @@ def begin_keyframe(i, told: ti.template(), claims: ti.template()):
 
 @ti.func
 def joined(low, high):
-    """A key of its two numbers."""
+    """A key from its two numbers."""
     return (ti.cast(high, ti.i64) << 32) | (ti.cast(low, ti.i64) & ti.i64(4294967295))
 
 
@@ -54,7 +54,7 @@ def fresh_key(told: ti.template(), rank):
 
 @ti.func
 def rank_of(told: ti.template(), key):
-    """The rank of a new block: those that share no place in the hash come first, each lot by its keys."""
+    """Rank of a new block: those that share no place in the hash come first, each group by its keys."""
     rank = rank_within(told, key, 0, told[APART])
     if rank < 0:
         rank = rank_within(told, key, told[APART], told[TOUCHED_MISSING])
@@ -63,7 +63,7 @@ def rank_of(told: ti.template(), key):
 
 @ti.func
 def rank_within(told: ti.template(), key, first, end):
-    """The rank of a new block that is among those of a run of ranks; else −1."""
+    """Rank of a new block within a run of ranks; else −1."""
     low, high = first, end
     while high - low > 1:
         middle = (low + high) >> 1

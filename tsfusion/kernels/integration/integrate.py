@@ -69,17 +69,17 @@ COLOR_LIMIT = 1 << 15  # votes after which a voxel's colour is settled and takes
 CUBE = 512
 CHANGED = 255  # a block is dirty for all that follow its changes: a bit each
 
-# `touched`: how many blocks, whether more are missing than may be, whether a colour was taken away that was
-# not there, how many blocks are missing, and then the slots of the touched ones
+# `touched`: number of blocks, flag for too many missing ones, flag for a removed colour that was not there,
+# number of missing blocks, and then the slots of the touched ones
 TOUCHED_COUNT, TOUCHED_OVERFLOW, TOUCHED_MISMATCH, TOUCHED_MISSING, TOUCHED_HEADER = 0, 1, 2, 3, 4
 
-# Which rays of a band are added: all of them, those that cross blocks which were missing, or those that were
-# added before it showed that too many blocks are missing (to take them away again).
+# Added rays of a band: all of them, those that cross blocks which were missing, or those that were added
+# before too many missing blocks were found (to take them away again).
 ALL, ONLY_DEFERRED, ONLY_ADDED = 0, 1, 2
 LATER, OTHERS = 0, 1  # rays that are added `again`: to blocks that are missing, to blocks of other units
 
-# Why nothing is added to a block: the map lacks it, another unit adds to it, its turn is in another call; or
-# it is not known yet. All are negative, and have a bit each among those that are zero in places of blocks.
+# Reasons why nothing is added to a block: the map lacks it, another unit adds to it, its turn is in another
+# call; or not known yet. All are negative, and have a bit each among those that are zero in places of blocks.
 ABSENT, OF_ANOTHER, LEFT_OUT = (bit - (1 << 31) for bit in (1, 2, 4))
 BITS = 15
 
@@ -88,8 +88,8 @@ LISTED_COLORS = 512  # votes, one int64: the voxel's place above the colour
 LISTED_UPDATES = 2 * STRETCH  # in an array of the function: one of 512 numbers takes 0.2 s to compile
 UNIT_SCRATCH = COLORS_AT + LISTED_COLORS  # int64 of a unit: its windows, votes for colours
 
-# What a launch does, `job`: which rays of which bands, on how many units, sign, slots from which on, how many
-# blocks may be missing, number of the keyframe, what a ray leaves in the voxel where it ends (`NO_VOTE` …)
+# A launch, `job`: which rays of which bands, on how many units, sign, slots from which on, how many
+# blocks may be missing, number of the keyframe, vote of a ray in the voxel of its end (`NO_VOTE` …)
 WHICH, FIRST_BAND, LAST_BAND, UNITS, SIGN, OLDEST, MOST_MISSING, STAMP, VOTE = range(9)
 NO_VOTE, COLOR_VOTE, HIT_VOTE = 0, 1, 2  # a hit is counted in the layer that is handed in place of Σ B
 
@@ -114,8 +114,8 @@ def quantize(distance):
 
 @ti.func
 def free_bounds(half, support):
-    """Least and greatest distance that is told to a voxel before the band of this half-width, quanta: its
-    own, up to the support; where the band is as wide as that, no other."""
+    """Least and greatest distance written to a voxel before the band of this half-width, quanta: its own, up
+    to the support; in a band as wide as the support, only this."""
     most = quantize(support)
     return ti.select(half < support, 0, most), most
 
@@ -125,10 +125,8 @@ def claim(
     slot, mark, stamp, owners: ti.template(), stamps: ti.template(), places: ti.template(),
     dirty: ti.template(), touched: ti.template(),
 ):  # fmt: skip
-    """Whether a block is the unit's whose `mark` this is: the one that comes to it first, and lists it.
-
-    A unit asks for its own mark alone, which nobody else writes.
-    """
+    """True if a block belongs to the unit of this `mark`: the first unit to reach a block has it, and lists
+    it. A unit asks for its own mark alone, which nobody else writes."""
     is_own = ti.cast(owners[slot] == mark, ti.i32)
     if is_own == 0 and stamps[slot] != stamp:
         if ti.atomic_max(stamps[slot], stamp) != stamp:
@@ -158,7 +156,7 @@ def enter_block(
     missing: ti.template(), owners: ti.template(), stamps: ti.template(), places: ti.template(),
     dirty: ti.template(), touched: ti.template(), of_others: ti.template(),
 ):  # fmt: skip
-    """Place of a block's first voxel in the layers; or why nothing is added to it."""
+    """Place of a block's first voxel in the layers; or the reason why nothing is added to it."""
     slot = map_find(hash_keys, hash_slots, hash_keys.shape[0] - 1, key)
     first = ABSENT
     if slot < 0:
@@ -177,7 +175,7 @@ def enter_block(
 
 @ti.func
 def add(lanes: ti.template(), at, amount, atomically: ti.template()):
-    """Add to a lane; returns what it was."""
+    """Add to a lane. Returns its former value."""
     before = lanes[at]
     if ti.static(atomically):
         before = ti.atomic_add(lanes[at], amount)
@@ -191,11 +189,9 @@ def vote_color(
     listed, kind, sign_, color_rgn: ti.template(), color_b: ti.template(), touched: ti.template(),
     atomically: ti.template(),
 ):  # fmt: skip
-    """Add a listed vote for a colour, or a hit.
-
-    A count just below 2¹⁶ has gone below none. A settled colour stays, whatever is added or taken away: it is
-    no longer a sum. Hits may go below none: a map of an earlier version has not counted those that it took.
-    """
+    """Add a listed vote for a colour, or a hit. A count just below 2¹⁶ has gone below zero. A settled colour
+    stays through every addition and removal: it is no longer a sum. Hits may go below zero: a map of an
+    earlier version has not counted those that it took."""
     at, packed = ti.cast(listed >> 32, ti.i32), ti.cast(listed, ti.i32)
     votes = COLOR_LIMIT
     if kind == HIT_VOTE:
@@ -230,7 +226,7 @@ def list_updates(
     owners: ti.template(), stamps: ti.template(), places: ti.template(), dirty: ti.template(),
     touched: ti.template(), of_others: ti.template(),
 ):  # fmt: skip
-    """List the voxels of the ray at place `k` in its stretch, after `count` others, and what each is given.
+    """List the voxels of the ray at place `k` in its stretch, after `count` others, and the addition to each.
 
     The ray's vote for a colour is listed, too. Returns the bits of what the ray crosses (`ABSENT` …).
     """
@@ -267,7 +263,7 @@ def list_updates(
             m, w = place >> DISTANCE_AT, vote
             if i < before:
                 m, w = ti.min(ti.max(m, least), most), free_vote
-            # both sums in one addition; their quotient minimises Σ w (x − m)²: paper eq. 2
+            # Both sums in one addition; their quotient minimises Σ w (x − m)²: paper eq. 2
             voxels[count], amounts[count] = at, (ti.cast(m * w, ti.i64) << WEIGHT_BITS) + w
             count += 1
             if i == uncolored:
@@ -282,10 +278,10 @@ def add_updates(
     voxels: ti.template(), amounts: ti.template(), count: ti.template(), sums: ti.template(),
     atomically: ti.template(),
 ):  # fmt: skip
-    """Add what is listed, and empty the list.
+    """Add the listed updates, and empty the list.
 
-    A loop so short that a processor waits for dozens of voxels' memory at once, not for ten: of a LiDAR's
-    rays, whose voxels are in no cache, it takes a third of the time.
+    In so short a loop a processor waits for dozens of voxels' memory at once, not for ten: a LiDAR's rays,
+    whose voxels are in no cache, take a third of the time.
     """
     for i in range(count):
         add(sums, voxels[i], amounts[i], atomically)
@@ -300,8 +296,8 @@ def add_bands(
     touched: ti.template(), sums: ti.template(), color_rgn: ti.template(), color_b: ti.template(),
     of_others: ti.template(),
 ):  # fmt: skip
-    """Add the rays of a unit's bands to its own blocks; or a share of those that cross blocks `of_others` to
-    these: whoever came first to a block that two units share has it, so that one unit may have them all."""
+    """Add the rays of one unit. A block belongs to the unit that reached it first. With `of_others`, add
+    instead an equal share of the rays that cross other units' blocks."""
     which, stamp = job[WHICH], job[STAMP]
     sign_, oldest, most_missing, kind = job[SIGN], job[OLDEST], job[MOST_MISSING], job[VOTE]
     has_color = ti.min(kind, COLOR_VOTE)
@@ -394,10 +390,10 @@ def add_rays(
 
     Rays that cross blocks the map does not have are listed in `again`, the keys in `missing`; when those
     blocks exist, a second call with `ONLY_DEFERRED` and `OLDEST` = the first new slot adds the rest. With
-    more than `MOST_MISSING` of them every band ends after the ray that it is at: `ONLY_ADDED` are those.
+    more than `MOST_MISSING` of them every band ends after its current ray: `ONLY_ADDED` are the rays so far.
 
-    Units run at the same time, each through its own bands. A block is of the unit that comes to it first and
-    adds to it alone, without atomics. Rays that cross blocks of other units are listed, too, for
+    Units run at the same time, each through its own bands. A block belongs to the unit that reaches it first,
+    which adds to it alone, without atomics. Rays that cross blocks of other units are listed, too, for
     `add_shared_rays`. The layers are flat: slot · 512 + offset.
     """
     for run in range(runs(job[UNITS])):  # run loop: kernels/base/quick_launch.py
@@ -418,7 +414,7 @@ def add_shared_rays(
 ):  # fmt: skip
     """Add the rays that cross blocks of other units to these, with atomics: after `add_rays`, same arguments.
 
-    A kernel of its own, because one thread need not wait until it is compiled.
+    A kernel of its own, because one thread need not wait for its compilation.
     """
     for run in range(runs(job[UNITS])):  # run loop: kernels/base/quick_launch.py
         unit = unit_of(run, job[UNITS])

@@ -81,8 +81,8 @@ def factorise(
     """Solve L D z = A (y − t) of A + λ D2ᵀD2 = L D Lᵀ, with natural ends, for signals of n elements a lane
     with weights that sum to `total`; z is y − t where n < 3.
 
-    What is read and written goes through arrays of the function, which no store to an argument may change:
-    so the lanes become vectors.
+    Reads and writes go through arrays of the function, which no store to an argument may change: so the lanes
+    become vectors.
     """
     d1, d2 = ti.Vector([1.0] * LANES), ti.Vector([1.0] * LANES)
     l1_1, l2_1, l2_2 = ti.Vector([0.0] * LANES), ti.Vector([0.0] * LANES), ti.Vector([0.0] * LANES)
@@ -123,7 +123,7 @@ def substitute_back(
 ):
     """Solve Lᵀ (x̂ − t) = z, a lane each, and put ⌊16 x̂ + ½⌋ in the place of t.
 
-    What stands behind a lane's end counts for nothing.
+    Elements behind a lane's end are ignored.
     """
     x1, x2, votes = ti.Vector([0.0] * LANES), ti.Vector([0.0] * LANES), ti.Vector([0] * LANES)
     for back in range(longest):
@@ -183,9 +183,9 @@ def gather(
     voxels: ti.template(), counts: ti.template(), totals: ti.template(), feedback, sums: ti.template(),
     correction: ti.template(), signal: ti.template(), at_signal,
 ):  # fmt: skip
-    """Put what the map holds in the voxels that each ray crosses into its signal.
+    """Put the map's values in the voxels that each ray crosses into its signal.
 
-    Apart from listing them: so a processor waits for more of them at once (`integrate.add_updates`).
+    A pass of its own lets a processor wait for more of them at once (`integrate.add_updates`).
     """
     for k in range(LANES):
         total = 0.0
@@ -288,7 +288,7 @@ def smooth_rays(
 @QuickLaunch
 @ti.kernel
 def commit_votes(touched: I32, sums: I64, votes: I64, voted: I32, correction: F32):
-    """A voxel's value (Σ w·m + correction) / Σ w becomes the mean that its rays propose; clears `votes`."""
+    """Set a voxel's value (Σ w·m + correction) / Σ w to the mean that its rays propose; clears `votes`."""
     for i in range(voted[0]):
         place = voted[1 + i]
         if place != NO_VOXEL:

@@ -2,12 +2,12 @@
 """Eight rays that walk side by side, so that a step of all of them is a few vector instructions.
 
 A stretch is up to 64 voxels of each. Its first pass walks and lists voxels: arithmetic without a branch, on
-arrays of the function, which no store to an argument may change: so the rays become lanes of vectors. Whoever
-uses the stretch goes through the list, ray by ray.
+arrays of the function, which no store to an argument may change: so the rays become lanes of vectors. The
+user of a stretch goes through the list, ray by ray.
 
-A ray crosses about ten voxels and two or three blocks. To look a block up wherever a ray enters one would
-cost more than the voxels: a jump that no processor predicts, and the hash. So a ray walks in a window of 8³
-blocks: each voxel reads the place of its block from a small table.
+A ray crosses about ten voxels and two or three blocks. A look-up of each new block would cost more than the
+voxels: a jump that no processor predicts, and the hash. So a ray walks in a window of 8³ blocks: each voxel
+reads the place of its block from a small table.
 """
 
 import taichi as ti
@@ -42,9 +42,9 @@ ALL_BITS = tuple(
 )  # of an axis
 MOST_LISTED = 1023  # quanta
 
-# Numbers of the rays that walk, `walks`: field + place. Three fields an axis: where along the band the ray
-# crosses it next, the interval, what a step adds to `AT` and to `OFF`, number of the window. `AT`: where in
-# the window; `OFF`: distance to the surface, 2⁻¹⁶ quantum; `ODD`: bits of the window in `WINDOW`.
+# Numbers of the walking rays, `walks`: field + place. Three fields an axis: next crossing along the band, the
+# interval, changes of `AT` and `OFF` with a step, number of the window. `AT`: place in the window; `OFF`:
+# distance to the surface, 2⁻¹⁶ quantum; `ODD`: bits of the window in `WINDOW`.
 NEXT, EVERY, STEP, TURN, WINDOW = (axis * ABREAST for axis in (0, 3, 6, 9, 12))
 AT, OFF, ODD, RAY_LENGTH, BAND, COLORED, RAY, MET, VOXELS, FREE, UNCOLORED = (
     field * ABREAST for field in range(15, 26)
@@ -60,7 +60,7 @@ UNKNOWN = 8 - (1 << 31)  # instead of a place
 
 @ti.func
 def begin(rays: ti.template(), r, per_voxel: ti.template(), colors, walks: ti.template(), k):
-    """Let ray `r` begin at place `k`; `per_voxel`: units of `OFF` for one of the ray's distance."""
+    """Begin ray `r` at place `k`; `per_voxel`: units of `OFF` for one of the ray's distance."""
     length, end, _ = parts_of(rays, r)
     voxel, towards = ray_vector(rays, r, VOXEL), steps(rays[r, END])
     at = 0
@@ -83,11 +83,11 @@ def begin(rays: ti.template(), r, per_voxel: ti.template(), colors, walks: ti.te
 
 @ti.func
 def crossed_before(walks: ti.template(), k, until):
-    """How many voxels the ray at place `k` leaves before it is `until` along its band."""
+    """Number of voxels that the ray at place `k` leaves before it is `until` along its band."""
     n = 0
     for a in ti.static(range(3)):
         gap = until - 1 - walks[NEXT + a * ABREAST + k]
-        # exact: a quotient of such integers is an integer, or further from one than float64 rounds
+        # Exact: a quotient of such integers is an integer, or further from one than float64 rounds
         times = ti.cast(ti.cast(gap, ti.f64) / ti.cast(walks[EVERY + a * ABREAST + k], ti.f64), ti.i32) + 1
         n += ti.select(gap >= 0, times, 0)
     return n
@@ -95,8 +95,8 @@ def crossed_before(walks: ti.template(), k, until):
 
 @ti.func
 def measure(walks: ti.template(), carves, colors):
-    """Count the voxels that each ray has before it: all, those in free space, those before the one
-    that takes the colour. Returns the largest number of all."""
+    """Count the remaining voxels of each ray: all, those in free space, those before the one that takes the
+    colour. Returns the largest number of all."""
     for k in range(ABREAST):
         n = crossed_before(walks, k, walks[RAY_LENGTH + k]) + 1
         walks[VOXELS + k] = ti.select(walks[RAY + k] != NOBODY, n, 0)
@@ -118,14 +118,14 @@ def measure(walks: ti.template(), carves, colors):
 
 @ti.func
 def beyond(walks: ti.template(), k, here, a: ti.template()):
-    """By how much the number of the window `here` (its odd bits) differs on an axis from that in `walks`."""
+    """Difference on an axis between the number of the window `here` (its odd bits) and that in `walks`."""
     changed = ((here ^ walks[ODD + k]) >> (2 - a)) & 1
     return ti.select(walks[STEP + a * ABREAST + k] == ALL_BITS[a], -changed, changed)
 
 
 @ti.func
 def window_of(walks: ti.template(), k, here):
-    """The window whose odd bits are `here`, of those that the ray at place `k` comes to in the stretch."""
+    """The window with the odd bits `here` that the ray at place `k` reaches in the stretch."""
     window = vec3i(walks[WINDOW + k], walks[WINDOW + ABREAST + k], walks[WINDOW + 2 * ABREAST + k])
     for a in ti.static(range(3)):
         window[a] += beyond(walks, k, here, a)
@@ -136,13 +136,13 @@ def window_of(walks: ti.template(), k, here):
 def walk(
     walks: ti.template(), count, listed: ti.template(), distances: ti.template(), exactly: ti.template()
 ):
-    """List `count` voxels of each ray, the first of all rays, then the second. Behind a ray's end stands
-    anything. `exactly`: put the distances as `OFF` has them into `distances`, too."""
+    """List `count` voxels of each ray, the first of all rays, then the second. Entries behind a ray's end are
+    undefined. With `exactly`, distances as `OFF` has them go to `distances`, too."""
     for i in range(count):
         for k in range(ABREAST):
             at, off = walks[AT + k], walks[OFF + k]
             x, y, z = walks[NEXT + k], walks[NEXT + ABREAST + k], walks[NEXT + 2 * ABREAST + k]
-            # the axis that is crossed next, the first of equals
+            # The axis that is crossed next, the first of equals
             is_x, is_y = (x <= y) & (x <= z), y <= z
             walks[NEXT + k] = x + ti.select(is_x, walks[EVERY + k], 0)
             walks[NEXT + ABREAST + k] = y + ti.select(is_x, 0, ti.select(is_y, walks[EVERY + ABREAST + k], 0))
@@ -150,7 +150,7 @@ def walk(
             step = ti.select(is_y, walks[STEP + ABREAST + k], walks[STEP + 2 * ABREAST + k])
             turn = ti.select(is_y, walks[TURN + ABREAST + k], walks[TURN + 2 * ABREAST + k])
             bits = ti.select(is_x, ALL_BITS[0], ti.select(is_y, ALL_BITS[1], ALL_BITS[2]))
-            # ones between the axis' bits carry from one to the next
+            # Ones between the axis' bits carry from one to the next
             stepped = (at | ~bits) + ti.select(is_x, walks[STEP + k], step)
             walks[AT + k] = (stepped & bits) | (at & ~bits)
             walks[OFF + k] = off + ti.select(is_x, walks[TURN + k], turn)
@@ -162,9 +162,9 @@ def walk(
 
 @ti.func
 def open_window(window, scratch: ti.template(), base):
-    """Where the places of a window's blocks are in the unit's scratch, which begins at `base`.
+    """Place of a window's table of blocks in the unit's scratch, which begins at `base`.
 
-    They are unknown if it did not have this window.
+    A window that is new to the unit starts with unknown blocks.
     """
     number = (window[0] & 3) << 4 | (window[1] & 3) << 2 | (window[2] & 3)
     blocks = base + WINDOWS + number * WINDOW_BLOCKS

@@ -46,11 +46,12 @@ PLANE_SIGMA = 1.0  # voxels: with more noise than that a plane says nothing abou
 LEAST_FACING = 0.15  # cosine between plane normal and ray: what is seen more edge-on has no plane
 
 
-# How an image's numbers become depths. `per_metre`: 2⁻¹⁰ voxels a metre.
+# Conversion of an image's numbers to depths. `per_metre`: 2⁻¹⁰ voxels a metre.
 DepthReading = ti.types.struct(
     is_disparity=ti.i32, scale=ti.f32, has_confidence=ti.i32, near=ti.f32, far=ti.f32, per_metre=ti.f32
 )
-# Voxels: what a step right, a step down and pixel (0, 0) add to the direction of a pixel's ray; its start.
+# Voxels: changes of the direction of a pixel's ray with a step right and a step down, that of pixel (0, 0);
+# its start.
 CameraArgs = ti.types.struct(du=vec3, dv=vec3, corner=vec3, origin=vec3)
 # Pixels of a tile: from (x, y), counted from the tile's corner (left, top); its depths begin at `base`.
 Cell = ti.types.struct(left=ti.i32, top=ti.i32, x=ti.i32, y=ti.i32, wide=ti.i32, high=ti.i32, base=ti.i32)
@@ -73,7 +74,7 @@ def most_rays(height: int, width: int) -> int:
 
 
 def are_given(sums: object) -> bool:
-    """True if a kernel has made sums of columns (`column_sums`, `color_sums`) for a function to use."""
+    """True if a kernel passes sums of columns (`column_sums`, `color_sums`) to a function."""
     return sums is not None
 
 
@@ -87,7 +88,7 @@ def camera_of(rows: ti.template()):
 
 @ti.func
 def reading_of(model: ti.template(), is_disparity, scale, has_confidence):
-    """How an image is read: its numbers' scale, float64, is metres a number or, of disparities, metres times
+    """Reading of an image: its numbers' scale, float64, is metres a number or, of disparities, metres times
     numbers."""
     near, far = ti.cast(model[MIN_RANGE], ti.f32), ti.cast(model[MAX_RANGE], ti.f32)
     per_metre = ti.cast(1.0 / (model[VOXEL_SIZE] / 1024.0), ti.f32)
@@ -96,15 +97,15 @@ def reading_of(model: ti.template(), is_disparity, scale, has_confidence):
 
 @ti.func
 def few(count):
-    """A number of rows or columns of a tile, known to be small: LLVM else adds to a loop one for 32 at once,
-    which never runs and takes long to compile."""
+    """A small number of rows or columns of a tile. Without this hint LLVM adds a loop for 32 at once, which
+    never runs and takes long to compile."""
     return count & FEW
 
 
 @ti.func
 def depth_of(raw, reading, divides: ti.template()):
     """Depth of a pixel's number in 2⁻¹⁰ voxel; 0 = no usable return. All float32, and no branch: a row of a
-    tile is read in vectors. `divides`: whether it can be a disparity."""
+    tile is read in vectors. `divides`: the number may be a disparity."""
     z = raw * reading.scale
     if ti.static(divides):
         if reading.is_disparity == 1:
@@ -204,7 +205,7 @@ def fit_plane(depths: ti.template(), base, anchor, sigma):
 
 @ti.func
 def tile_plane(model: ti.template(), unit, mean, depths: ti.template(), base):
-    """The plane of a tile of `mean` depth (metres), if it is flat and noise does not hide it."""
+    """Plane of a tile of `mean` depth (metres), if it is flat and noise does not hide it."""
     plane = Plane(0, 0.0, 0.0)
     sigma = noise_sigma(model, mean)
     if sigma < PLANE_SIGMA * model[VOXEL_SIZE]:
@@ -242,7 +243,7 @@ def cell_shape(pixel):
 
 @ti.func
 def layer_sums(depths: ti.template(), cell, low, up_to):
-    """The cell's samples with depths in [`low`, `up_to`], and the least depth beyond (1 << 30: none)."""
+    """Samples of the cell with depths in [`low`, `up_to`], and the least depth beyond (1 << 30: none)."""
     least, deepest, beyond, n, sum_q, sum_x, sum_y = 1 << 30, 0, 1 << 30, 0, ti.i64(0), 0, 0
     for row in range(few(cell.high)):
         y = cell.y + row
@@ -301,7 +302,7 @@ def samples_of(depths: ti.template(), columns: ti.template(), cell):
 
 @ti.func
 def take_nearest(model: ti.template(), unit, depths: ti.template(), cell, rest: ti.template()):
-    """The nearest of the `rest` of a cell's samples that may belong to one surface; they leave it."""
+    """Nearest of the `rest` of a cell's samples that may belong to one surface; they leave it."""
     layer = rest
     tolerance = ti.cast(ti.min(layer_depth(model, rest.low * unit) / unit, 1e9), ti.i32)
     layer.up_to = rest.low + tolerance
@@ -348,8 +349,7 @@ def layer_color(
     color: ti.template(), has_color, confidence: ti.template(), has_confidence, depths: ti.template(),
     colors: ti.template(), cell, layer,
 ):  # fmt: skip
-    """Mean colour 0xRRGGBB and summed confidence of a layer's samples; `colors`: of
-    `color_sums`, or None."""
+    """Mean colour 0xRRGGBB and summed confidence of a layer's samples; `colors`: of `color_sums`, or None."""
     n, bgr, trust = layer.n, vec3i(0), 0
     is_summed = 0
     if ti.static(are_given(colors)):
@@ -381,8 +381,8 @@ def write_layer_ray(
     rays: ti.template(), r, first, model: ti.template(), camera, plane, unit, color: ti.template(), has_color,
     confidence: ti.template(), has_confidence, depths: ti.template(), colors: ti.template(), cell, layer,
 ):  # fmt: skip
-    """Write ray `r` through the mean of a layer's samples; returns its weight, 0 if it is out of reach, and
-    what it costs to add it.
+    """Write ray `r` through the mean of a layer's samples. Returns its weight, 0 out of reach, and the cost
+    of its addition.
 
     paper eq. 1 (u = column, v = row), in voxels: point = origin + z (u·du + v·dv + corner).
     """

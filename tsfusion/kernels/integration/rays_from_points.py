@@ -50,7 +50,7 @@ Bundle = ti.types.struct(
 
 @ti.func
 def confidence_at(q, o, nearest, farthest, confidence: ti.template(), has_confidence, i):
-    """Confidence in point i at q, seen from o; 0 if it is out of range. Ranges are squared metres."""
+    """Confidence in point i at q, seen from o; 0 out of range. Ranges are squared metres."""
     found = 0
     span = dot(q - o, q - o)
     # False for NaN as well
@@ -76,8 +76,8 @@ def add_point(bundle: ti.template(), q, o, confident, color: ti.template(), has_
 
 @ti.func
 def write_bundle_ray(rays: ti.template(), r, first, model: ti.template(), pose: ti.template(), bundle, start):
-    """Write ray `r` from `start` through the mean of a bundle; returns its weight, 0 if out of reach, and
-    what it costs to add it."""
+    """Write ray `r` from `start` through the mean of a bundle. Returns its weight, 0 out of reach, and the
+    cost of its addition."""
     n = bundle.n
     mean = bundle.sum_q * (1.0 / n)
     origin, end = transform(pose, start), transform(pose, mean)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Space carving by images: which voxels a depth image looks through, and their votes for free space.
+"""Space carving by images: the voxels that a depth image looks through, and their votes for free space.
 
 A ray for each cell of the image would come to a voxel four times, and more often near the camera, where rays
-meet. Here each block is projected into the image instead, once. What is looked up there are the depths up to
+meet. Here each block is projected into the image instead, once. The look-up tables hold the depths up to
 which patches of 3×3 pixels are clear, and the least and the greatest of these in squares of patches, level by
 level, so that most blocks, and cubes of blocks, are known to be hidden or clear as a whole.
 
@@ -51,16 +51,16 @@ NO_SAMPLE = 1 << 30
 HIDDEN, PARTLY, CLEAR = 0, 1, 2
 BLOCKS, VOXELS = 0, 1  # in `counts`
 
-# `view`, float64: the camera's centre (voxels); what a place relative to it (voxels) is multiplied by to
-# become column · depth, row · depth (patches, voxels) and depth (voxels), three numbers each; the depth up to
-# which it carves (voxels); how many units these have, a power of two; fx, fy, cx, cy.
+# `view`, float64: the camera's centre (voxels); factors from a relative place (voxels) to column · depth, row
+# · depth (patches, voxels) and depth (voxels), three numbers each; the depth up to which it carves (voxels);
+# number of units in these, a power of two; fx, fy, cx, cy.
 CENTRE, COLUMN, ROW, DEPTH, FAR, SCALE, FX, FY, CX, CY = 0, 3, 6, 9, 12, 13, 14, 15, 16, 17
 VIEW_FIELDS = 18
 FINEST = 1 << 14  # units a voxel
 VIEWS = 6  # of points: both ways along x, y and z
 VIEW_TANGENT = 1.25  # of half of such a view's angle: views overlap, so that no cube lies in none as a whole
 
-# Column · depth, row · depth and depth of a voxel, in units; what a step along each axis adds to these.
+# Column · depth, row · depth and depth of a voxel, in units; changes of these with a step along each axis.
 PixelPlace = ti.types.struct(column=ti.i32, row=ti.i32, depth=ti.i32)
 Steps = ti.types.struct(column=vec3i, row=vec3i, depth=vec3i)
 # What is carved: depths from `near` to `far`, units, in an image of so many rows and columns of patches. The
@@ -82,8 +82,8 @@ def whole(number):
 
 @ti.func
 def begin_cube(first, view: ti.template(), v, height, width, rows, columns):
-    """Place, steps and reach of a cube's first voxel in view v of images of (height, width) pixels and
-    (rows, columns) patches."""
+    """Place, steps and reach of a cube's first voxel in view v of images of (height, width) pixels and (rows,
+    columns) patches."""
     at = VIEW_FIELDS * v
     scale, away = view[at + SCALE], ti.cast(first * SIDE, ti.f64) + 0.5 - view_row(view, at + CENTRE)
     column, row = view_row(view, at + COLUMN), view_row(view, at + ROW)
@@ -108,7 +108,7 @@ def note_sample(depth, x, nearest: ti.template(), second: ti.template()):
 @ti.func
 def clear_up_to(model: ti.template(), nearest, second, cosine, far, scale):
     """Depth up to which a patch is clear, units: a band's half-width before the `second` nearest of its
-    samples, because a single one may be wrong. Of its only one it is 0 with `outlier_filter`, as without a
+    samples, because a single one may be wrong. For one sample it is 0 with `outlier_filter`, as without a
     sample.
 
     The samples are in 2⁻¹⁰ voxel, `cosine` is of the angle between the patch and the camera's axis. All
@@ -165,10 +165,10 @@ def find_clear_depths(
     confidence: U8x2, has_confidence: ti.i32, view: F64, model: F64, levels: I32x2, clear: I32x2, least: I32,
     most: I32,
 ):  # fmt: skip
-    """Fill `clear`, (rows, columns) of patches, with the depths up to which these are clear, and `least` and
-    `most` with those of squares of 2×2 patches, of 4×4, and so on.
+    """Fill `clear`, (rows, columns) of patches, with their clear depths, and `least` and `most` with those of
+    squares of 2×2 patches, of 4×4, and so on.
 
-    `levels`, (n, 4): where the numbers of a level begin, its rows and columns, and the rows of patches.
+    `levels`, (n, 4): start of a level's numbers, its rows and columns, and the rows of patches.
     """
     for run in range(runs(clear.shape[0])):  # run loop: kernels/base/quick_launch.py
         r = unit_of(run, clear.shape[0])
@@ -225,11 +225,11 @@ def moved(place, steps, x, y, z):
 
 @ti.func
 def look(place, steps, side, reach, levels: ti.template(), base, least: ti.template(), most: ti.template()):
-    """State of a cube of `side` voxels, the first of them at a place: hidden, clear, or maybe clear in
-    part. Numbers of squares begin at `base`."""
+    """State of a cube of `side` voxels, the first of them at a place: hidden, clear, or maybe clear in part.
+    Numbers of squares begin at `base`."""
     nearest, farthest = NO_SAMPLE, -NO_SAMPLE
     left, right, top, bottom = 1e9, -1e9, 1e9, -1e9
-    # by how much the cube is on the inner side of each of the image's edges, if at all
+    # Distance of the cube from each of the image's edges on the inner side, if it is there
     inner_left, inner_top, inner_right, inner_bottom = -1.0, -1.0, -1.0, -1.0
     for k in ti.static(range(8)):
         n = side - 1
@@ -277,8 +277,8 @@ def look(place, steps, side, reach, levels: ti.template(), base, least: ti.templ
 
 @ti.func
 def look_at_middle(place, steps, side, reach, clear: ti.template(), top):
-    """State, as of `look`, of the one patch in which the middle of a cube lies: what is clear there is hidden
-    or clear as a whole, or partly; what is partly clear there is so. The image's rows begin at `top`."""
+    """State, as of `look`, of the one patch at the middle of a cube. A clear patch leaves the cube hidden,
+    clear or partly clear; a partly clear patch leaves it partly clear. The image's rows begin at `top`."""
     middle = moved(place, steps, side // 2, side // 2, side // 2)
     inverse = 1.0 / ti.cast(ti.max(middle.depth, 1), ti.f32)
     x, y = ti.cast(middle.column * inverse, ti.i32), ti.cast(middle.row * inverse, ti.i32)
@@ -317,8 +317,8 @@ def mark_clear(
     place, steps, reach, clear: ti.template(), columns_by: ti.template(), rows_by: ti.template(),
     depths_by: ti.template(), depths: ti.template(), patches: ti.template(), words: ti.template(),
 ):  # fmt: skip
-    """Set the mask `words` of the block whose first voxel is at `place`; returns how many of its voxels are
-    clear. The first loop has no branch, so that it becomes vectors."""
+    """Set the mask `words` of the block whose first voxel is at `place`. Returns the number of its clear
+    voxels. The first loop has no branch, so that it becomes vectors."""
     count = 0
     for x in range(WORDS):
         base = moved(place, steps, x, 0, 0)
@@ -348,9 +348,8 @@ def list_free_blocks(
     cubes: I32,  # the first of them, and how many on each axis
     keys: I64, amounts: I64, masks: I64x2, counts: I32,
 ):  # fmt: skip
-    """List the blocks with voxels that an image looks through: their keys, which of their voxels these are,
-    and what is added to each of them. `counts`: how many blocks and voxels; if there are more blocks than the
-    list takes, it ends there."""
+    """List the blocks with voxels that an image looks through: their keys, masks of these voxels, and the
+    addition to each. `counts`: number of blocks and voxels; a full list ends early."""
     for run in range(runs(cubes[3] * cubes[4] * cubes[5])):  # run loop: kernels/base/quick_launch.py
         n = unit_of(run, cubes[3] * cubes[4] * cubes[5])
         if n < cubes[3] * cubes[4] * cubes[5]:
@@ -407,13 +406,11 @@ def list_clear_blocks(
     clear: I32x2, height: ti.i32, width: ti.i32, levels: I32x2, least: I32, most: I32, views: F64,
     cubes: I32x2, least_power: ti.i32, keys: I64, counts: I32,
 ):  # fmt: skip
-    """List the keys of the blocks that some images look through as a whole, once for each image, and how many
-    they are: those of clear cubes of 8 · 2^`least_power` voxels a side or more.
-
-    `clear` has the images' rows one below the other, `least` and `most` their squares one after the other.
-    `cubes`: of each image where those of 64 voxels begin in the list of all, the first of them, and how many
-    on each axis. At its end is where the list ends.
-    """
+    """List the keys of the blocks that some images look through as a whole, once for each image, and their
+    number. These lie in clear cubes of 8 · 2^`least_power` voxels a side or more. `clear` has the images'
+    rows one below the other, `least` and `most` their squares one after the other. `cubes`: for each image,
+    the index of its first cube of 64 voxels in the list of all, that cube, and the number on each axis. At
+    its end is the end of the list."""
     images = cubes.shape[0] - 1
     units, rows, squares = cubes[images, 0], clear.shape[0] // images, least.shape[0] // images
     for run in range(runs(units)):  # run loop: kernels/base/quick_launch.py
@@ -456,11 +453,11 @@ def see_points(
     points: F32x2, starts: F32x2, confidence: U8, has_confidence: ti.i32, step: ti.i32, centre: F32,
     model: F64, units: ti.f64, ends: I32x2, seen: I32,
 ):  # fmt: skip
-    """Draw every `step`-th of some points into six square images around `centre`, towards both sides along x,
-    y and z: the depth up to which the nearest one of a patch leaves it clear, of so many `units` a voxel.
+    """Draw every `step`-th point into six square images around `centre`, towards both sides along x, y and z:
+    the clear depth before the nearest point of a patch, in `units` a voxel.
 
-    `ends` has the images' rows one below the other, `NO_SAMPLE` where no point is; `seen` says which images
-    have any. A point too near to be one of the map ends its patch at once.
+    `ends` has the images' rows one below the other, `NO_SAMPLE` without a point; `seen` marks the images with
+    any. A point too near for the map ends its patch at once.
     """
     near, far = ti.cast(model[MIN_RANGE] ** 2, ti.f32), ti.cast(model[MAX_RANGE] ** 2, ti.f32)
     own_starts = ti.select(starts.shape[0] == 1, 0, 1)
@@ -497,8 +494,8 @@ def add_free_blocks(
     slots: I32, amounts: I64, masks: I64x2, sign_: ti.i32, stamp: ti.i32, stamps: I32, places: I32, dirty: U8,
     touched: I32, sums: I64x2,
 ):  # fmt: skip
-    """Add to the clear voxels of blocks, whose slots these are, each of them once; list those that keyframe
-    `stamp` has not touched yet."""
+    """Add to the clear voxels of blocks with these distinct slots. Blocks that keyframe `stamp` has not
+    touched yet are listed."""
     for run in range(runs(slots.shape[0])):  # run loop: kernels/base/quick_launch.py
         n = unit_of(run, slots.shape[0])
         if n < slots.shape[0]:

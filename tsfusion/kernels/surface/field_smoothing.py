@@ -62,7 +62,7 @@ def mark_voxels(values: F32x2, reach: ti.f32, planes: U64x2, counts: I32x2):
 
 @ti.func
 def number_of(planes: ti.template(), places: ti.template(), b, o):
-    """Number in the list of a cell that is listed; of another, the next one's."""
+    """Number of a listed cell in the list; for another cell, the next one's."""
     below = (ti.u64(1) << ti.cast(o & 63, ti.u64)) - ti.u64(1)
     return places[b, o >> 6] + count_bits(planes[b, o >> 6] & below)
 
@@ -71,7 +71,7 @@ def number_of(planes: ti.template(), places: ti.template(), b, o):
 def neighbour(
     planes: ti.template(), places: ti.template(), around: ti.template(), bits, b, o, axis, side, none
 ):
-    """Number in the list of the cell before or after cell o along an axis, `none` if it is not in it."""
+    """Number in the list of the cell before or after cell o along an axis, `none` if it is not listed."""
     shift = (2 - axis) * bits
     mask = (1 << bits) - 1
     at = ((o >> shift) & mask) + 2 * side - 1
@@ -86,7 +86,7 @@ def neighbour(
 def link(
     planes: ti.template(), places: ti.template(), around: ti.template(), bits, b, o, i, links: ti.template()
 ):
-    """Column i of `links`: the numbers of the cells beside cell o, how many columns where there is none."""
+    """Column i of `links`: numbers of the cells beside cell o; the number of columns for a missing one."""
     for side in ti.static(range(6)):
         links[side, i] = neighbour(planes, places, around, bits, b, o, side // 2, side % 2, links.shape[1])
 
@@ -117,7 +117,7 @@ def list_voxels(
 
 @ti.func
 def parent_of(o, bits):
-    """The cell of half the resolution that holds cell o of a block with 2^bits cells a side."""
+    """Cell of half the resolution that holds cell o of a block with 2^bits cells a side."""
     mask = (1 << bits) - 1
     x = o >> (2 * bits)
     y = (o >> bits) & mask
@@ -167,7 +167,7 @@ def slope(links: ti.template(), x: ti.template(), i, axis):
 
 @ti.func
 def off_center(o, bits, axis):
-    """From its parent's centre to cell o, in cells of its size: ±½."""
+    """Offset of cell o from its parent's centre, in cells of its size: ±½."""
     return ti.cast((o >> ((2 - axis) * bits)) & 1, ti.f32) - 0.5
 
 
@@ -178,7 +178,7 @@ def list_parents(
     around: I32x2, planes: U64x2, places: I32x2, links: I32x2, y: F32, weight: F32, coarse_planes: U64x2,
     coarse_places: I32x2, coarse_links: I32x2, coarse_y: F32, coarse_weight: F32, coarse_x: F32,
 ):  # fmt: skip
-    """Each coarse cell: the weighted mean of its finer cells, the sum of their weights, its neighbours.
+    """List the coarse cells: weighted mean of the finer cells, sum of their weights, neighbours.
 
     Each value is moved to the cell's centre along its own slope: ramps stay ramps where cells are missing.
     """
@@ -299,7 +299,7 @@ def relax(
     bent: ti.i32,  # whether q is of this x
     q_x: F32, q_y: F32, q_z: F32, step: F32, x: F32,
 ):  # fmt: skip
-    """Some steps of the Chebyshev iteration, each after q = ω D2 x along each axis."""
+    """Steps of the Chebyshev iteration, each after q = ω D2 x along each axis."""
     for k in ti.static(range(AT_ONCE)):
         for group in range(x_before.shape[0] // ABREAST * (1 - bent if ti.static(k == 0) else 1)):
             along_x, along_y, along_z = abreast(0.0), abreast(0.0), abreast(0.0)
@@ -329,7 +329,7 @@ def relax(
 @QuickLaunch
 @ti.kernel
 def write_values(planes: U64x2, places: I32x2, x: F32, values: F32x2):
-    """The field where it was solved; other values stay."""
+    """Write the field where it was solved; other values stay."""
     for run in range(runs(planes.shape[0])):  # run loop: kernels/base/quick_launch.py
         b = unit_of(run, planes.shape[0])
         if b < planes.shape[0]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The field carried into voxels that nobody saw, near where a surface breaks off (`hole_filling.py`).
+"""The field carried into unseen voxels, near where a surface breaks off (`hole_filling.py`).
 
 Unseen voxels near a rim and the seen ones beside them are numbered into one list, as for the field
 regulariser, whose `weigh` and `relax` then solve it: paper eq. 3 with no weight where nothing was seen.
@@ -29,7 +29,7 @@ def find_rims(
     around: I32x2,  # (blocks, 27): rows of the blocks around, −1 = none
     values: F32x2, rims: U8x2,
 ):  # fmt: skip
-    """1 for each seen voxel that the surface passes and that has an unseen one among the 26 around."""
+    """Set 1 for each seen voxel that the surface passes and that has an unseen one among the 26 around."""
     for run in range(runs(values.shape[0])):  # run loop: kernels/base/quick_launch.py
         b = unit_of(run, values.shape[0])
         if b < values.shape[0]:
@@ -74,7 +74,7 @@ def row_of(keys: ti.template(), count, key):
 
 @ti.func
 def normal_at(values: ti.template(), around: ti.template(), b, p):
-    """Unit gradient at a seen voxel, from the seen ones beside it; 0 where there are none."""
+    """Unit gradient at a seen voxel, from the seen ones beside it; 0 without any."""
     here = value_at(values, around, b, p)
     normal = vec3f(0.0)
     for a in ti.static(range(3)):
@@ -100,7 +100,7 @@ def mark_unseen(
     slab: ti.f32,  # voxels from the plane of the rim, and how that grows with the distance from it
     slope: ti.f32, marks: U8x2,
 ):  # fmt: skip
-    """Mark the unseen voxels in a ball around each rim voxel that are near the surface as it would go on.
+    """Mark the unseen voxels in a ball around each rim voxel that are near the continued surface.
 
     Threads that meet write the same.
     """
@@ -162,7 +162,7 @@ def list_marked(
     values: F32x2, marks: U8x2, planes: U64x2, places: I32x2, links: I32x2, y: F32, weight: F32, x: F32,
     layer: I32,
 ):  # fmt: skip
-    """Fill the list: the value and weight of each seen voxel, none of the others, and the neighbours."""
+    """Fill the list: values and weights of seen voxels, neighbours of all."""
     for run in range(runs(values.shape[0])):  # run loop: kernels/base/quick_launch.py
         b = unit_of(run, values.shape[0])
         if b < values.shape[0]:
@@ -188,10 +188,8 @@ def extend(
     layer: I32,  # the last of it, as of `x`, stands for none
     x: F32,
 ) -> ti.i32:  # fmt: skip
-    """Give a first value to voxels beside those that have one: the mean of what ramps and neighbours say.
-
-    Returns how many got one.
-    """
+    """Give a first value to voxels beside those that have one: the mean of the predictions of ramps and
+    neighbours. Returns their number."""
     given = 0
     for i in range(links.shape[1]):
         if layer[i] == EARLY:
@@ -219,7 +217,7 @@ def mark_guessed_faces(
     unseen: U64x2,  # (row, 8): planes, as in `surface_cells`
     inside: U64x2, active: U64x2, first: I32x2, triangle_count: I32, guessed: U8,
 ):  # fmt: skip
-    """1 for each triangle, in the order of `emit_faces`, of a cell with a corner that nobody saw."""
+    """Set 1 for each triangle, in the order of `emit_faces`, of a cell with an unseen corner."""
     for run in range(runs(BANDS)):  # run loop: kernels/base/quick_launch.py
         band = unit_of(run, BANDS)
         if band < BANDS:

@@ -55,7 +55,7 @@ def gather(r, count, first, last, around: ti.template(), values: ti.template(), 
 
 @ti.func
 def slope(padded: ti.template(), band, i, step):
-    """Central difference, one-sided at the edge of what was seen."""
+    """Central difference, one-sided at the edge of the seen voxels."""
     before = padded[band, i - step]
     here = padded[band, i]
     after = padded[band, i + step]
@@ -95,7 +95,7 @@ def normal_at(padded: ti.template(), band, i, axis, t):
 
 @ti.func
 def axis_step(axis):
-    """How far apart neighbours along an axis are in `padded`."""
+    """Distance of neighbours along an axis in `padded`."""
     return ti.select(axis == 0, PAD * PAD, ti.select(axis == 1, PAD, 1))
 
 
@@ -175,7 +175,7 @@ def emit_vertices(
                             i = ((p[0] + 1) * PAD + p[1] + 1) * PAD + p[2] + 1
                             here = padded[band, i]
                             there = padded[band, i + axis_step(axis)]
-                            # kept off the voxel centres, where several edges' vertices would fall together
+                            # Off the voxel centres, where several edges' vertices would fall together
                             t = ti.min(ti.max(here / (here - there), 0.001), 0.999)
                             normal = normal_at(padded, band, i, axis, t)
                             for a in ti.static(range(3)):

@@ -23,7 +23,6 @@ MAX_TRIANGLES = 5
 
 
 def _faces() -> list[list[int]]:
-    """The corners of each cube face, counter-clockwise seen from outside."""
     faces = []
     for axis in range(3):
         b, c = (axis + 1) % 3, (axis + 2) % 3
@@ -44,8 +43,8 @@ def _segments(case: int) -> dict[int, int]:
         inside = [case >> corner & 1 for corner in face]
         for i in range(4):
             if inside[i] and not inside[i - 1]:
-                # the run of inside corners that starts at i is cut off by one segment; on an ambiguous
-                # face both runs have length one
+                # One segment cuts off the run of inside corners that starts at i; on an ambiguous face both
+                # runs have length one
                 j = i
                 while inside[(j + 1) % 4]:
                     j += 1
@@ -98,7 +97,7 @@ def _table() -> tuple[np.ndarray, np.ndarray]:
     for case in range(256):
         triangles = []
         for loop in _loops(case):
-            # a rotation of the loop is the same polygon, but another root for the recursion
+            # A rotation of the loop is the same polygon, but another root for the recursion
             options = (_triangulate(loop[s:] + loop[:s]) for s in range(len(loop)))
             chosen = next((t for t in options if t is not None), None)
             if chosen is None:
@@ -110,5 +109,5 @@ def _table() -> tuple[np.ndarray, np.ndarray]:
 
 
 TRIANGLE_COUNT, TRIANGLE_EDGES = _table()
-# the same, each edge as 8·axis + the corner it starts from
+# The same, each edge as 8·axis + the corner it starts from
 TRIANGLE_STARTS = np.where(TRIANGLE_EDGES < 0, 0, 8 * EDGE_AXIS[TRIANGLE_EDGES] + EDGE_CORNER[TRIANGLE_EDGES])

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Smoothing along normals: the 1-D solve of paper eq. 3 on the field sampled along its gradient.
 
-Nothing is kept a keyframe: each voxel near the surface samples the values before and behind it and takes
-the centre row of (I + λ D2ᵀD2)⁻¹, as many samples a side as were seen.
+No state is kept between keyframes: each voxel near the surface samples the values before and behind it and
+takes the centre row of (I + λ D2ᵀD2)⁻¹, as many samples a side as were seen.
 """
 
 import taichi as ti
@@ -17,7 +17,7 @@ vec3f = ti.types.vector(3, ti.f32)
 
 @ti.func
 def block_at(around: ti.template(), b, p):
-    """Row of the block that holds a voxel, −1 where there is none; p is relative to block b."""
+    """Row of the block that holds a voxel, −1 for an absent block; p is relative to block b."""
     return around[b, ((p[0] >> 3) + 1) * 9 + ((p[1] >> 3) + 1) * 3 + (p[2] >> 3) + 1]
 
 

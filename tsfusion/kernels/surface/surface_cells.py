@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""The map's sums as values; masks of the cells that the surface crosses and of voxel edges with a vertex.
+"""Values from the map's sums; masks of the cells that the surface crosses and of voxel edges with a vertex.
 
-A block's voxels are eight planes of bits, one an x; bit 8·y + z of a plane is voxel (x, y, z). Whether
-cells are crossed is then a matter of shifting and combining planes of the block and of its neighbours.
-A cell takes part when its eight corners are seen, and a surface was measured there (`is_between`); an edge
-carries a vertex when its ends differ in sign and a cell that takes part has it: as that cell then has both
-signs, `active` cells say all.
+A block's voxels are eight planes of bits, one an x; bit 8·y + z of a plane is voxel (x, y, z). Shifts and
+combinations of planes of the block and of its neighbours then find the crossed cells. A cell takes part when
+its eight corners are seen, and a surface was measured there (`is_between`); an edge carries a vertex when its
+ends differ in sign and a cell that takes part has it: as that cell then has both signs, `active` cells say
+all.
 
-Blocks are rows of arrays. Row `count` stands for every block that is not there: nothing is seen in it.
+Blocks are rows of arrays. Row `count` stands for every absent block: nothing is seen in it.
 """
 
 import taichi as ti
@@ -28,33 +28,33 @@ Z06 = 0x7F7F7F7F7F7F7F7F
 
 planes4 = ti.types.vector(4, ti.u64)
 BANDS = 64  # units of parallel work; fixed, so that nothing depends on the thread count
-# A loop that stores to an array does not become vector code (LLVM cannot know that the array's address is
-# not what is stored to); one that stores to a small local vector does: 0.5 µs a block instead of 1.4.
+# A loop that stores to an array does not become vector code (LLVM cannot exclude that the store changes the
+# array's address); one that stores to a small local vector does: 0.5 µs a block instead of 1.4.
 STRIDE = 32
 SEVERAL = 3  # rays that end in a voxel: a surface is there, however many others look through it
 
 
 @ti.func
 def next_z(plane, block_z):
-    """The plane of each voxel's neighbour at z + 1; `block_z` is the same plane of the next block."""
+    """Plane of each voxel's neighbour at z + 1; `block_z` is the same plane of the next block."""
     return ((plane >> ti.u64(1)) & ti.u64(Z06)) | ((block_z & ti.u64(Z0)) << ti.u64(7))
 
 
 @ti.func
 def next_y(plane, block_y):
-    """The plane of each voxel's neighbour at y + 1; `block_y` is the same plane of the next block."""
+    """Plane of each voxel's neighbour at y + 1; `block_y` is the same plane of the next block."""
     return (plane >> ti.u64(8)) | (block_y << ti.u64(56))
 
 
 @ti.func
 def previous_z(plane, block_z):
-    """The plane of each voxel's neighbour at z − 1; `block_z` is the same plane of the block before."""
+    """Plane of each voxel's neighbour at z − 1; `block_z` is the same plane of the block before."""
     return ((plane & ti.u64(Z06)) << ti.u64(1)) | ((block_z >> ti.u64(7)) & ti.u64(Z0))
 
 
 @ti.func
 def previous_y(plane, block_y):
-    """The plane of each voxel's neighbour at y − 1; `block_y` is the same plane of the block before."""
+    """Plane of each voxel's neighbour at y − 1; `block_y` is the same plane of the block before."""
     return (plane << ti.u64(8)) | (block_y >> ti.u64(56))
 
 
@@ -98,7 +98,7 @@ def collect_around(
     table: I64,  # empty; never more than half full
     keys: I64,
 ) -> ti.i32:  # fmt: skip
-    """List the blocks of the map that are, or touch, one of the `wanted` (sorted). Returns how many."""
+    """List the blocks of the map that are, or touch, one of the `wanted` (sorted). Returns their number."""
     found = 0
     mask = table.shape[0] - 1
     map_mask = map_keys.shape[0] - 1
@@ -171,8 +171,8 @@ def find_around(
 def is_between(r, x, j, around: ti.template(), values: ti.template(), behind, clear):
     """True if cell j of a plane lies between a voxel that is `clear` and one far `behind` a surface (quanta).
 
-    Sensors looked through the one, and it is known what hides the other: no surface was measured in between,
-    or its voxels would be near it.
+    Sensors looked through the one, and the other lies behind a known surface: no surface was measured in
+    between, or its voxels would be near it.
     """
     least, most = 0.0, 0.0
     for c in range(8):
@@ -188,7 +188,7 @@ def find_active(
     r, around: ti.template(), seen: ti.template(), inside: ti.template(), active: ti.template(),
     triangle_count: ti.template(), values: ti.template(), behind, clear,
 ):  # fmt: skip
-    """Fill a row's `active`; returns how many triangles it has."""
+    """Fill a row's `active`. Returns the number of its triangles."""
     total = 0
     seen_low = corner_planes(seen, around, r, 0)
     low = corner_planes(inside, around, r, 0)
@@ -222,13 +222,13 @@ def find_edges(
     r, around: ti.template(), inside: ti.template(), active: ti.template(), edges: ti.template(),
     starts: ti.template(),
 ):  # fmt: skip
-    """Fill `edges` and `starts` of a row; returns how many vertices it has."""
+    """Fill `edges` and `starts` of a row. Returns the number of its vertices."""
     total = 0
     here = around[r, HERE]
     below = around[r, HERE - 1]
     beside = around[r, HERE - 3]
     diagonal = around[r, HERE - 4]
-    # active cells at x − 1 whose (y, z) is a voxel's own, less (1, 0), (0, 1)
+    # Active cells at x − 1 whose (y, z) is a voxel's own, less (1, 0), (0, 1)
     last = active[around[r, HERE - 9], 7]
     last_y = previous_y(last, active[around[r, HERE - 12], 7])
     last_z = previous_z(last, active[around[r, HERE - 10], 7])
@@ -354,10 +354,10 @@ def distance_as_float(packed):
 
 @ti.func
 def held(value, slot, o, color_rgn: ti.template(), hits: ti.template(), layers):
-    """The signed distance of a voxel for who may not run into something, in voxels.
+    """Signed distance of a voxel, voxels, for a reader that must not run into something.
 
-    A mean of rays that end in the voxel and of others that pass a thin thing there is that of free space; so
-    a voxel in which `SEVERAL` rays have ended is at the surface. `layers`: 1 = the map counts votes for
+    The mean of rays that end in the voxel and of others that pass a thin thing there is that of free space;
+    so a voxel in which `SEVERAL` rays have ended is at the surface. `layers`: 1 = the map counts votes for
     colours, 2 = hits.
     """
     ended = 0
@@ -385,7 +385,7 @@ def is_clear(
 @QuickLaunch
 @ti.kernel
 def find_surfaces(slots: I32, sums: I64x2, color_rgn: I64x2, hits: I32x2, layers: ti.i32, shows_surface: U8):
-    """Note of blocks whether a ray has ended in a voxel of theirs, or one is at a surface or behind it."""
+    """Mark blocks in which a ray has ended in a voxel, or a voxel is at a surface or behind it."""
     for run in range(runs(BANDS)):  # run loop: kernels/base/quick_launch.py
         band = unit_of(run, BANDS)
         if band < BANDS:
@@ -407,7 +407,7 @@ def find_surfaces(slots: I32, sums: I64x2, color_rgn: I64x2, hits: I32x2, layers
 
 @ti.kernel
 def hold_hits(slots: I32, color_rgn: I64x2, hits: I32x2, layers: ti.i32, values: F32x2):
-    """Row r of `values`, those of the block in `slots[r]` in voxels, becomes what is `held` there."""
+    """Replace row r of `values`, that of the block in `slots[r]` in voxels, by its `held` distances."""
     for run in range(runs(BANDS)):  # run loop: kernels/base/quick_launch.py
         band = unit_of(run, BANDS)
         if band < BANDS:

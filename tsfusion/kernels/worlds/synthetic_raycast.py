@@ -234,9 +234,9 @@ def cast(
         directions: (n, 3) float64, sensor frame; with z = 1 the distance is a depth.
         solids: (m, 12) float64.
         tile_of: (n,) int32, number of each ray's tile.
-        starts, listed: int32; the solids of tile t are `listed[starts[t] : starts[t + 1]]`, all that its rays
-            may meet, and those next to them, which dim the light.
-        distance: (n,) float64, out: in units of the direction's length; 0 = nothing met.
+        starts, listed: int32; the solids of tile t are `listed[starts[t] : starts[t + 1]]`: all that its rays
+            may meet, and the adjacent ones, which dim the light.
+        distance: (n,) float64, out: in units of the direction's length; 0 = no solid met.
         incidence: (n,) float64, out: |cosine| between ray and surface normal.
         color: (n, 3) uint8 BGR, out; of no rows = no colour wanted.
     """
