@@ -45,7 +45,7 @@ MAP_NAME = rf"[a-z0-9][a-z0-9_-]{{0,{MAP_NAME_LENGTH - 1}}}"
 MapName = Annotated[str, Meta(pattern=rf"\A{MAP_NAME}\Z")]
 # Of a key in the allow-list: a map, or all whose names begin so
 MapPattern = Annotated[str, Meta(pattern=rf"\A({MAP_NAME}|({MAP_NAME})?\*)\Z")]
-# A voxel nearly as large as the sensor's range shows nothing: as many must fit into it.
+# A voxel nearly as large as the sensor's range shows nothing: so many must fit into it.
 LEAST_VOXELS = 10
 MOST_SAMPLES = 1 << 22  # full-confidence ones that a voxel can count
 LEAST_VOXEL_SIZE = 0.00001  # metres: finer than any sensor
@@ -193,12 +193,12 @@ class VolumeConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
     @property
     def counts_hits(self) -> bool:
-        """Whether the map counts rays without a colour in the voxels where they end: where many others may
-        pass a thin thing in its voxel, which then has the mean of free space."""
+        """True if the map counts rays without a colour in the voxels of their ends: there, many rays past a
+        thin thing would give its voxel the mean of free space."""
         return self.space_carving or self.sensor == "lidar"
 
     def model(self, sensor: str | None = None) -> SensorModel:
-        """The sensor model of a keyframe, changed by what this config sets.
+        """Sensor model of a keyframe, changed by the settings of this config.
 
         Args:
             sensor: name of the keyframe's sensor preset; None = the map's.
@@ -217,7 +217,7 @@ class VolumeConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
         return msgspec.structs.replace(SENSORS[name], **chosen)
 
     def checked_model(self) -> SensorModel:
-        """The map's own sensor model, once the settings are found to fit each other.
+        """Sensor model of the map, after a check that the settings fit each other.
 
         Raises:
             InvalidConfig: for ranges out of order, or voxels so large that the sensor sees next to none.
@@ -423,11 +423,8 @@ AnyStruct = TypeVar("AnyStruct", bound=Struct)
 
 
 def make_settings(struct: type[AnyStruct], settings: dict[str, Any]) -> AnyStruct:
-    """Build a config struct, checking names, types and bounds.
-
-    Raises:
-        InvalidConfig: naming the key and what was expected.
-    """
+    """Build a config struct, checking names, types and bounds. Raises InvalidConfig, naming key and
+    expectation."""
     plain = {key: v.item() if isinstance(v, np.generic) else v for key, v in settings.items()}
     try:
         return msgspec.convert(plain, struct)
@@ -436,7 +433,7 @@ def make_settings(struct: type[AnyStruct], settings: dict[str, Any]) -> AnyStruc
 
 
 def override(config: AnyStruct, **changes: Any) -> AnyStruct:
-    """Change the settings whose new value is not None; the result is checked as `make_settings` does."""
+    """Change the settings whose new value is not None; the result is checked as in `make_settings`."""
     settings = msgspec.structs.asdict(config)
     settings.update({key: value for key, value in changes.items() if value is not None})
     return make_settings(type(config), settings)
@@ -484,13 +481,10 @@ def _message(struct: type[Struct], settings: dict[str, Any], problem: str) -> st
 
 
 def load(path: str | Path | None, **volume: Any) -> Config:
-    """Read a TOML file; None gives the defaults.
+    """Read a TOML file; None gives the defaults. `volume`: settings of the map for those that the file does
+    not name.
 
-    Args:
-        volume: settings of the map that apply where the file does not name them.
-
-    Raises:
-        InvalidConfig: when the file is missing, not TOML, or holds an unknown key or a bad value.
+    Raises InvalidConfig for a missing file, bad TOML, an unknown key or a bad value.
     """
     if path is None:
         return Config(volume=make_settings(VolumeConfig, volume))
@@ -545,7 +539,7 @@ def _toml_value(value: Any) -> str:
 
 
 def _bounds(kind: msgspec.inspect.Type) -> str:
-    """Describe the bounds of a number, or list the words that are allowed."""
+    """Bounds of a number, or the allowed words."""
     if isinstance(kind, msgspec.inspect.UnionType):
         return "; ".join(note for note in map(_bounds, kind.types) if note)
     if isinstance(kind, msgspec.inspect.LiteralType):
@@ -565,7 +559,7 @@ _FIELD = re.compile(r"^    (\w+): .*?(?:  # (?P<comment>.+))?$")
 
 
 def _field_comments(struct: type[Struct]) -> dict[str, str]:
-    """Read the comments beside the fields in this file, so that no setting is explained twice."""
+    """Comments beside the fields in this file, so that no setting is explained twice."""
     try:
         source = inspect.getsource(struct)
     except OSError:  # installed without sources
@@ -575,7 +569,7 @@ def _field_comments(struct: type[Struct]) -> dict[str, str]:
 
 
 def instead(name: str, others: dict[str, str], known: Iterable[str]) -> str:
-    """End of a message about an unknown name: `: write …` where it is known what was meant, else empty."""
+    """End of a message about an unknown name: `: write …` with the likely name, else empty."""
     if name in others:
         return f": write {others[name].format(name=name)}"
     close = get_close_matches(name, known, n=1)

@@ -19,7 +19,7 @@ _OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder and those above it, so that they are still there after a power cut; raises OSError."""
+    """Make a folder and those above it, durable through a power cut. Raises OSError."""
     missing = [folder, *folder.parents]
     missing = missing[: next((i for i, one in enumerate(missing) if one.exists()), None)]
     folder.mkdir(parents=True, exist_ok=True)
@@ -28,7 +28,7 @@ def make_folder(folder: Path) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Make what was created, renamed or deleted in a folder durable (POSIX; elsewhere there is no way)."""
+    """Make created, renamed and deleted names in a folder durable (POSIX; elsewhere there is no way)."""
     if os.name != "posix":
         return
     handle = os.open(folder, os.O_RDONLY)
@@ -40,16 +40,10 @@ def sync_folder(folder: Path) -> None:
 
 @contextmanager
 def replacing(path: Path, *, private: bool = False) -> Iterator[BinaryIO]:
-    """A new file for the block to write, which takes the place of `path` at the end of the block.
+    """A new file that the block writes, durable and in the place of `path` at the end of the block.
 
-    It is on the disk by then. Until then, and after an error, the file before it stays as it was; what a
-    killed process left of its new file is overwritten.
-
-    Args:
-        private: only the owner may read the file (0600), from its first byte.
-
-    Raises:
-        OSError: when the disk refuses.
+    Until then, and after an error, the old file stays as it was; a killed process's remains are overwritten.
+    With `private`, only the owner may read the file (0600), from its first byte. Raises OSError.
     """
     partial = path.with_name(f".{path.name}.partial")
     mode = 0o600 if private else 0o666
@@ -69,12 +63,9 @@ def replacing(path: Path, *, private: bool = False) -> Iterator[BinaryIO]:
 
 @contextmanager
 def replacing_folder(path: Path) -> Iterator[Path]:
-    """A new folder for the block to fill, which takes the place of `path` at the end of the block.
+    """A new folder that the block fills, in the place of `path` at the end of the block.
 
-    After an error the folder before it stays as it was. A file of this name is not replaced.
-
-    Raises:
-        OSError: when the disk refuses, or `path` is a file.
+    After an error the old folder stays as it was. A file of this name is not replaced. Raises OSError.
     """
     partial, before = (path.with_name(f".{path.name}.{kind}") for kind in ("partial", "before"))
     if path.exists() and not path.is_dir():
@@ -94,7 +85,7 @@ def replacing_folder(path: Path) -> Iterator[Path]:
 
 
 def sweep(folder: Path, pattern: str) -> None:
-    """Delete the files whose whole name matches: parts that a killed writer left. What cannot go stays."""
+    """Delete the files whose whole name matches: parts that a killed writer left. Undeletable ones stay."""
     with suppress(OSError):
         for name in os.listdir(folder):
             if re.fullmatch(pattern, name):
@@ -103,7 +94,7 @@ def sweep(folder: Path, pattern: str) -> None:
 
 
 def free_bytes(folder: Path) -> int:
-    """Room that is left on a folder's disk for this user; raises OSError."""
+    """Free room for this user on a folder's disk. Raises OSError."""
     disk = os.statvfs(folder)
     return disk.f_bavail * disk.f_frsize
 
@@ -128,11 +119,9 @@ def is_in_memory(folder: Path) -> bool:
 
 
 def make_private_folder(folder: Path) -> None:
-    """Make a folder that only its owner can open (0700), unless it is there.
+    """Make a folder that only its owner can open (0700), unless it exists.
 
-    Raises:
-        InvalidConfig: when others can change the folder that is there.
-        OutputError: when it cannot be made.
+    Raises InvalidConfig if others can change the existing folder, OutputError if it cannot be made.
     """
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -142,7 +131,7 @@ def make_private_folder(folder: Path) -> None:
 
 
 def check_private_folder(folder: Path) -> None:
-    """Raise InvalidConfig when a folder is not there, or when others could put other files into it."""
+    """Raise InvalidConfig if a folder is missing, or others could put files into it."""
     try:
         mode = folder.stat().st_mode
     except OSError as error:
@@ -157,7 +146,7 @@ def check_private_folder(folder: Path) -> None:
 
 
 def size_of(path: Path) -> int:
-    """Size of a file, bytes; 0 where there is none that can be looked at."""
+    """Size of a file, bytes; 0 for one that is missing or unreadable."""
     try:
         return path.stat().st_size
     except OSError:

@@ -28,12 +28,10 @@ def hold(folder: Path, name: str | None = None, *, wait: float = 0.0) -> ExitSta
     """Keep other processes that call this out of a folder, until `close` or the end of this process.
 
     Args:
-        name: of the file in the folder that is locked, made when absent; None = the folder itself.
+        name: of the locked file in the folder, made when absent; None = the folder itself.
         wait: seconds to wait for a process that has the lock.
 
-    Raises:
-        BlockingIOError: when another process has the lock.
-        OSError: when the file or folder cannot be opened.
+    Raises BlockingIOError if another process has the lock, OSError if it cannot be opened.
     """
     if name is None:
         descriptor = os.open(folder, os.O_RDONLY)
@@ -58,7 +56,7 @@ def _lock(descriptor: int, deadline: float) -> None:
 
 
 def owner_of(folder: Path, *, name: str = "lock") -> str | None:
-    """The pid of the process that holds a folder, "?" where it is not known; None = nobody does."""
+    """Pid of the process that holds a folder, "?" if unknown; None = no process."""
     is_named = (folder / name).exists()
     try:
         hold(folder, name if is_named else None).close()
@@ -92,9 +90,9 @@ def lock_folder(
     error_type: type[TsfusionError] = JournalError,
     make: bool = True,
 ) -> ExitStack:
-    """Make a folder and hold it for this process; the lock file `name` says which process that is.
+    """Make a folder and hold it for this process; the lock file `name` has the process's pid.
 
-    The folder itself is locked, too: somebody may delete the file.
+    The folder itself is locked, too, for the file may be deleted.
 
     Args:
         kind: the folder, in the words of an error: `spool`, `state`, `map`.
@@ -102,8 +100,7 @@ def lock_folder(
         wait: seconds to wait for another owner.
         make: make the folder when it is absent.
 
-    Raises:
-        TsfusionError: of `error_type`, when the folder cannot be written, or another process holds it.
+    Raises `error_type` if the folder cannot be written, or another process holds it.
     """
     path = folder / name
     try:

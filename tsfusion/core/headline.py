@@ -17,8 +17,8 @@ class Headline(Struct, frozen=True, kw_only=True):
     """State of a run, a map or a server in words; the mark before them and their colours only support.
 
     Attributes:
-        doing: what goes on, in a word or two.
-        trouble: why it does not work, in a few words; empty = it does.
+        doing: current activity, in a word or two.
+        trouble: reason why it does not work, in a few words; empty = it works.
         waiting: keyframes that are taken, but not fused yet.
         rate: keyframes fused a second; 0 = not known.
         lost: keyframes that are not in the map and will not come into it.
@@ -37,14 +37,14 @@ class Headline(Struct, frozen=True, kw_only=True):
 
     @property
     def parts(self) -> list[tuple[str, Severity]]:
-        """The three answers, each with how bad it is."""
+        """The three answers, each with its severity."""
         works: tuple[str, Severity] = (self.trouble, "bad") if self.trouble else (self.doing, "good")
         pace: tuple[str, Severity] = (self.pace, "notice" if self.is_behind else "good")
         return [works, pace, (f"lost {count_of(self.lost, 'keyframe')}", "bad" if self.lost else "good")]
 
     @property
     def pace(self) -> str:
-        """Words for the pace: keeping up, or how much waits, and for how long where that is known."""
+        """Words for the pace: keeping up, or the number and, if known, the time of waiting keyframes."""
         if not self.is_behind:
             return "keeping up"
         seconds = f", about {span(self.waiting / self.rate)}" if self.rate else ""
@@ -52,7 +52,7 @@ class Headline(Struct, frozen=True, kw_only=True):
 
     @property
     def mark(self) -> tuple[str, Severity]:
-        """The sign of the worst of the three answers."""
+        """Sign of the worst of the three answers."""
         level = max((level for _, level in self.parts), key=list(MARKS).index)
         return MARKS[level], level
 

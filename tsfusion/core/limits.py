@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Bounds: on the memory that somebody else's file may take, checked before it is spent, and on rates.
+"""Bounds on the memory that a foreign file may take, checked before it is spent, and on rates.
 
-A container of a few kilobytes can unpack to gigabytes, and a file with a hole has any size: whoever reads a
+A container of a few kilobytes can unpack to gigabytes, and a file with a hole has any size: code that reads a
 file whole, or unpacks a part of one, asks here.
 """
 
@@ -24,7 +24,7 @@ _SHORTEST = 1.0  # seconds until there is a rate
 
 
 def check(source: object, nbytes: float) -> None:
-    """Raise DatasetError where something that is read whole needs more than `MAX_FILE_BYTES`."""
+    """Raise DatasetError if a `source` that is read whole needs more than `MAX_FILE_BYTES`."""
     if nbytes > MAX_FILE_BYTES:
         raise DatasetError(
             f"{source} needs {size(nbytes)} of memory; expected at most {size(MAX_FILE_BYTES)}"
@@ -32,7 +32,7 @@ def check(source: object, nbytes: float) -> None:
 
 
 def unpack(opener: Callable[[Any, str], Any], packed: bytes, *_: Any) -> bytes:
-    """Unpack a chunk or a message by `bz2.open` or its likes; raises ValueError beyond `MAX_PIECE_BYTES`."""
+    """Unpack a chunk or a message by `bz2.open` or the like. Raises ValueError beyond `MAX_PIECE_BYTES`."""
     with opener(io.BytesIO(packed), "rb") as file:
         found: bytes = file.read(MAX_PIECE_BYTES + 1)
     if len(found) > MAX_PIECE_BYTES:
@@ -48,7 +48,7 @@ class BoundedFile(io.BufferedReader):
         self._left = max(_FEW_BYTES, _WORST_RATIO * packed)
 
     def read(self, nbytes: int | None = -1, /) -> bytes:
-        """Read as from any file; raises ValueError beyond the bounds."""
+        """Read as from any file. Raises ValueError beyond the bounds."""
         if nbytes is not None and nbytes > MAX_PIECE_BYTES:
             raise ValueError(f"a part of {size(nbytes)} is larger than {size(MAX_PIECE_BYTES)}")
         found = super().read(nbytes)
@@ -62,7 +62,6 @@ class BoundedPath(type(Path())):  # type: ignore[misc]  # which class it is depe
     """A path whose binary file is a `BoundedFile`."""
 
     def open(self, mode: str = "r", *args: Any, **kwargs: Any) -> IO[Any]:
-        """Open the file."""
         opened: IO[Any] = (
             BoundedFile(io.FileIO(self)) if mode == "rb" else super().open(mode, *args, **kwargs)
         )
@@ -72,14 +71,14 @@ class BoundedPath(type(Path())):  # type: ignore[misc]  # which class it is depe
 class Rates:
     """Growth of two counts a second, over the last seconds; None = too short a time to tell.
 
-    Counts that fall are those of something new, and begin anew.
+    Falling counts are those of a new object, and begin anew.
     """
 
     def __init__(self) -> None:
         self._samples: deque[tuple[float, int, int]] = deque()
 
     def __call__(self, first: int, second: int) -> tuple[float | None, float | None]:
-        """Take the counts of now, and return how much each grows a second."""
+        """Take the present counts. Returns the growth of each a second."""
         now = time.monotonic()
         if self._samples and (first < self._samples[-1][1] or second < self._samples[-1][2]):
             self._samples.clear()
@@ -102,7 +101,7 @@ class Bucket:
         self._then = now
 
     def wait(self, amount: float, now: float) -> float:
-        """Seconds until an amount may pass; one that is larger than the bucket passes when that is full."""
+        """Seconds until an amount may pass; one larger than the bucket passes when that is full."""
         self._level = min(self._level + (now - self._then) * self._rate, self._most)
         self._then = now
         return max(min(amount, self._most) - self._level, 0.0) / self._rate

@@ -30,10 +30,8 @@ log = logging.getLogger(__name__)
 def configure(format: LogFormat, level: LogLevel, process: str = "server", *, map: str | None = None) -> None:
     """Log to stderr from now on; `process` (server or fuser) stands in every line.
 
-    Args:
-        map: the subject of every line that names no other map.
-
-    Only tsfusion's own loggers are set to `level`; other packages log warnings and errors.
+    `map`: the subject of every line that names no other map. Only tsfusion's own loggers are set to `level`;
+    other packages log warnings and errors.
     """
     formatter = (JsonFormatter if format == "json" else TextFormatter)(process, map)
     for handler in logging.root.handlers[:]:
@@ -64,7 +62,7 @@ def about(
 ) -> dict[str, Any]:
     """Name the subject of a line: `log.warning("…", extra=logs.about(session=key, seq=7))`.
 
-    A session is shown by its first 8 hexadecimal digits; whatever is None or empty is left out.
+    A session is shown by its first 8 hexadecimal digits; None and empty values are left out.
     """
     shown = session.hex() if isinstance(session, bytes) else session
     given = {"map": map, "session": shown and shown[:8], "seq": seq, "client": client, "reason": reason}
@@ -72,7 +70,7 @@ def about(
 
 
 def log_left_out() -> None:
-    """Log how many lines were left out, once their period is over. Call it about once a second."""
+    """Log the number of suppressed lines, once their period is over. Call it about once a second."""
     for handler in logging.root.handlers:
         if isinstance(handler, Stderr):
             handler.log_left_out()
@@ -138,7 +136,7 @@ def _trace(record: logging.LogRecord) -> str:
 
 
 class Stderr(_Handler):
-    """Handler that writes to standard error what its limiter lets through."""
+    """Handler that writes to standard error, within its limiter."""
 
     def __init__(self, limiter: "Limiter") -> None:
         super().__init__(sys.stderr)
@@ -151,7 +149,7 @@ class Stderr(_Handler):
             super().emit(record)
 
     def format(self, record: logging.LogRecord) -> str:
-        """The record's line; text is broken between words where a terminal is narrower."""
+        """Line of the record; text is broken between words for a narrower terminal."""
         line: str = super().format(record)
         return fitted(line, self.stream) if isinstance(self.formatter, TextFormatter) else line
 
@@ -161,7 +159,7 @@ class Stderr(_Handler):
             self._write(self._limiter.finished_periods())
 
     def close(self) -> None:
-        """Say what was left out, however young."""
+        """Log the number of suppressed lines, also of a period that is not over."""
         self._write(self._limiter.finished_periods(everything=True))
         super().close()
 
@@ -173,7 +171,7 @@ class Stderr(_Handler):
 class Limiter:
     """Limit of `most` lines in each period from each place in the code; further lines are counted.
 
-    Errors too: a peer can bring them about, or a disk. What ends the process always passes.
+    Errors too, since a peer or a disk can cause them. The reason for the end of the process always passes.
     """
 
     def __init__(
@@ -195,7 +193,7 @@ class Limiter:
         return False
 
     def finished_periods(self, *, everything: bool = False) -> Iterator[logging.LogRecord]:
-        """End the periods that are over; a summary for each place that left lines out."""
+        """End the periods that are over. Yields a summary for each place with suppressed lines."""
         before = self._clock() - self._period
         for key, place in list(self._places.items()):
             if everything or place.began <= before:
@@ -219,5 +217,5 @@ def _summary(last: logging.LogRecord, count: int, period: float) -> logging.LogR
 
 
 def _log_unexpected(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-    """Log an error that nobody handled, as one JSON object like every other line."""
+    """Log an unhandled error as one JSON object, like every other line."""
     log.critical("unexpected: %s", error or kind.__name__, exc_info=(kind, error, trace))

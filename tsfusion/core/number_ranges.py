@@ -16,11 +16,7 @@ Integer = TypeVar("Integer", bound=np.integer)
 
 
 class NumberRanges:
-    """A set of whole numbers, 16 bytes a range.
-
-    Args:
-        ranges: first and last number of each.
-    """
+    """A set of whole numbers, 16 bytes a range. `ranges`: first and last number of each."""
 
     def __init__(self, ranges: Iterable[tuple[int, int]] = ()) -> None:
         self._ranges: NDArray[np.int64] = _merged(np.array(list(ranges), dtype=np.int64).reshape(-1, 2))
@@ -40,7 +36,7 @@ class NumberRanges:
         return ", ".join(f"{first}-{last}" if last > first else f"{first}" for first, last in self)
 
     def mask(self, numbers: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """(n,) which of these numbers are in the set."""
+        """(n,) mask of the numbers in the set."""
         if not len(self._ranges):
             return np.zeros(len(numbers), np.bool_)
         at = np.searchsorted(self._ranges[:, 0], numbers, side="right") - 1
@@ -48,12 +44,11 @@ class NumberRanges:
         return found
 
     def add(self, numbers: NDArray[np.int64]) -> None:
-        """Add numbers, in any order."""
         self._ranges = _merged(np.concatenate([self._ranges, np.repeat(numbers[:, None], 2, axis=1)]))
 
 
 def _merged(ranges: NDArray[np.int64]) -> NDArray[np.int64]:
-    """(n, 2) ranges in order, with those joined that overlap or touch."""
+    """(n, 2) ranges in order; overlapping and touching ones are joined."""
     if not len(ranges):
         return ranges
     ranges = ranges[np.argsort(ranges[:, 0], kind="stable")]
@@ -63,11 +58,7 @@ def _merged(ranges: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def parse(text: str) -> tuple[tuple[int, int], ...]:
-    """The ranges in a text such as `3-17,20`.
-
-    Raises:
-        InvalidConfig: for anything else.
-    """
+    """Ranges in a text such as `3-17,20`. Raises InvalidConfig for anything else."""
     found = []
     for word in text.split(","):
         match = _WORD.fullmatch(word)
@@ -79,9 +70,9 @@ def parse(text: str) -> tuple[tuple[int, int], ...]:
 
 
 def distinct(values: NDArray[Integer]) -> NDArray[Integer]:
-    """The integers of an array of any shape, each once, ascending: (n,).
+    """Distinct integers of an array of any shape, ascending: (n,).
 
-    As `np.unique`, which hashes integers since NumPy 2.3: of many keys that takes twenty times as long.
+    `np.unique` hashes integers since NumPy 2.3: with many keys that takes twenty times as long.
     """
     ascending = np.sort(values, axis=None)
     is_first = np.ones(len(ascending), bool)

@@ -24,14 +24,13 @@ _IDLE_S = 60.0  # a work folder may be younger than its lock
 
 @contextmanager
 def building(out: str | os.PathLike[str]) -> Iterator[Path]:
-    """A temporary folder whose files move to the folder `out` when the block ends without an error.
+    """Temporary folder whose files move to the folder `out` when the block ends without an error.
 
     A new `out` appears in one rename. In an existing one each file replaces its namesake and everything else
     stays; its old `run.json` is deleted first and the new one comes last, so that it always describes its
     neighbours. An error leaves nothing, no parent folder either; the next run clears up after a killed one.
 
-    Raises:
-        OutputError: at once, when `out` cannot be written.
+    Raises OutputError at once if `out` cannot be written.
     """
     out = Path(out).expanduser().absolute()
     _check_folder(out)
@@ -47,14 +46,13 @@ def building(out: str | os.PathLike[str]) -> Iterator[Path]:
 
 @contextmanager
 def results(out: str | os.PathLike[str] | None, *, overwrite: bool = False) -> Iterator[tuple[Path, Path]]:
-    """The folder of a run: its temporary one, as `building` has it, and the one that this becomes.
+    """Folder of a run: the temporary one of `building`, and the one that it becomes.
 
     Args:
         out: None = a new folder `out/DATE_TIME`; the link `out/latest` names it afterwards.
-        overwrite: whether `out` may hold files, of which those of the same name are replaced.
+        overwrite: `out` may hold files, of which those of the same name are replaced.
 
-    Raises:
-        OutputError: at once, when `out` cannot be written, or holds files that may not be replaced.
+    Raises OutputError at once if `out` cannot be written, or holds files that may not be replaced.
     """
     if out is None:
         root = Path(DEFAULT).absolute()
@@ -82,7 +80,7 @@ def _check_folder(out: Path) -> None:
 
 
 def _visible(folder: Path) -> list[str]:
-    """Names in a folder, without what a killed run left."""
+    """Names in a folder, without a killed run's remains."""
     with suppress(OSError):
         return sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
     return []
@@ -123,17 +121,17 @@ def _workplace(work: Path, out: Path) -> Iterator[Path]:
 
 
 def _sweep(place: Path, prefix: str, *, idle_s: float = 0.0) -> None:
-    """Remove the work folders whose owner is dead, and that nobody changed for so long."""
+    """Remove work folders of dead owners that have not changed for `idle_s`."""
     with suppress(OSError):
         for path in [path for path in place.iterdir() if path.name.startswith(prefix)]:
-            # another run is at work there, or the folder is not ours to remove
+            # Another run is at work there, or the folder is not ours to remove
             with suppress(OSError), folder_lock.hold(path):
                 if time.time() - path.stat().st_mtime >= idle_s:
                     shutil.rmtree(path, ignore_errors=True)
 
 
 def _claim(root: Path, stamp: str) -> tuple[Path, Path]:
-    """Make the work folder of the first free name: it, and the folder that it becomes."""
+    """Make the work folder of the first free name. Returns it, and the folder that it becomes."""
     for count in itertools.count(1):
         out = root / (stamp if count == 1 else f"{stamp}-{count}")
         work = root / f"{_PARTIAL}{out.name}"
@@ -149,7 +147,7 @@ def _claim(root: Path, stamp: str) -> tuple[Path, Path]:
 
 
 def _point(link: Path, name: str) -> None:
-    """Let a link name the newest folder; where links are not possible, there is none."""
+    """Point a link at the newest folder; without support for links there is none."""
     new = link.with_name(f".{link.name}-{secrets.token_hex(4)}")
     try:
         new.symlink_to(name)
@@ -171,7 +169,7 @@ def _move(work: Path, out: Path) -> None:
         raise OutputError(f"cannot write to {out}: {error.strerror}; choose another folder") from error
 
 
-# First bytes of files by the ending of their names; of others nobody can tell
+# First bytes of files by the ending of their names; other endings have no known ones
 _BEGINNINGS = {
     ".tsf": b"TSFMAP1\n", ".ply": b"ply", ".glb": b"glTF", ".png": b"\x89PNG", ".npz": b"PK", ".pdf": b"%PDF",
     ".las": b"LASF", ".laz": b"LASF", ".pcd": b"# .PCD", ".pgm": b"P5", ".mcap": b"\x89MCAP", ".vdb": b" BDV",
@@ -184,9 +182,8 @@ def check_writable(
 ) -> None:
     """Raise OutputError unless a file could be made at `path` and it ends so; leaves nothing there.
 
-    Args:
-        overwrite: a map may be replaced that is there. What can be made again, such as a mesh, is replaced in
-            any case, a file that is of another kind than its name never.
+    With `overwrite` an existing map may be replaced. A reproducible file, such as a mesh, is replaced in any
+    case, a file of another kind than its name never.
     """
     path = Path(path)
     if path.suffix.lower() not in endings:

@@ -17,7 +17,7 @@ _T = TypeVar("_T")
 
 
 def load(point: EntryPoint, error: type[TsfusionError]) -> Any:
-    """The object that an entry point names; whatever its import raises becomes one `error`."""
+    """Object that an entry point names; any error of its import becomes one `error`."""
     try:
         return point.load()
     except Exception as problem:
@@ -35,14 +35,13 @@ def takes(function: Callable[..., Any], option: str) -> bool:
 def call(
     function: Callable[..., _T], options: dict[str, Any], *, name: str, error: type[TsfusionError]
 ) -> _T:
-    """Call a function with options by name; those that are None are left out.
+    """Call a function with options by name, without those that are None.
 
-    A number is taken where text is expected, an integer where a float is, and a list for a struct such as
-    `Intrinsics`. A parameter of another type than these takes anything.
+    A number is accepted for text, an integer for a float, and a list for a struct such as `Intrinsics`. A
+    parameter of another type than these takes anything.
 
-    Args:
-        name: of what is called, for the message.
-        error: class of the error for an unknown option or a value of the wrong type.
+    `name`: of the function, for the message. `error`: its class, for an unknown option or a value of the
+    wrong type.
     """
     parameters = inspect.signature(function).parameters
     given = {key: value for key, value in options.items() if value is not None}

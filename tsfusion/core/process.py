@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: MIT
-"""Memory, limits, signals and the end of this process, as the operating system offers them; versions;
-work in C that a second thread does meanwhile."""
+"""Memory, limits, signals and the end of this process, as the operating system offers them; versions; work in
+C on a second thread."""
 
 import _signal  # type: ignore[import-not-found]  # `signal` makes enumerations of numbers: 5 µs a call
 import ctypes
@@ -44,14 +44,14 @@ def peak_rss_bytes() -> int:
 
 
 def rss_bytes() -> int:
-    """Resident memory of this process now, bytes; 0 where the system does not tell."""
+    """Resident memory of this process now, bytes; 0 = unknown."""
     with suppress(OSError), open("/proc/self/statm", "rb") as file:  # by far quicker than a Path
         return int(file.read().split()[1]) * resource.getpagesize()
     return 0
 
 
 def tree_rss_bytes(pid: int) -> int:
-    """Resident memory of a process and its children now, bytes; 0 where the system does not tell (Linux)."""
+    """Resident memory of a process and its children now, bytes; 0 = unknown (Linux)."""
     total = 0
     with suppress(OSError, ValueError, IndexError):
         total = (
@@ -64,7 +64,7 @@ def tree_rss_bytes(pid: int) -> int:
 
 
 def shared_rss_bytes() -> int:
-    """The part of the resident memory that belongs to files, bytes; 0 where the system does not tell."""
+    """Part of the resident memory that belongs to files, bytes; 0 = unknown."""
     with suppress(OSError), open("/proc/self/statm", "rb") as file:
         return int(file.read().split()[2]) * resource.getpagesize()
     return 0
@@ -77,7 +77,7 @@ def give_back_memory() -> None:
 
 
 def keep_freed_memory() -> None:
-    """Have the allocator keep up to 32 MB of what is freed, for arrays of up to 8 MB (glibc).
+    """Let the allocator keep up to 32 MB of freed memory, for arrays of up to 8 MB (glibc).
 
     Else a keyframe's arrays go back to the system, and come again page by page: 1.5 ms of 7 in a fuser.
     """
@@ -88,7 +88,7 @@ def keep_freed_memory() -> None:
 
 
 def data_bytes() -> int:
-    """Memory that this process has reserved, used or not, bytes; 0 where the system does not tell."""
+    """Memory that this process has reserved, used or not, bytes; 0 = unknown."""
     with suppress(OSError):
         for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
             if line.startswith("VmData:"):
@@ -104,7 +104,7 @@ def limit_memory(most: int) -> None:
 
 
 def lift_memory_limit() -> None:
-    """Take back what `limit_memory` has set in the process that started this one."""
+    """Remove the `limit_memory` of the process that started this one."""
     _, hard = resource.getrlimit(resource.RLIMIT_DATA)
     with suppress(OSError, ValueError):
         resource.setrlimit(resource.RLIMIT_DATA, (hard, hard))
@@ -153,8 +153,8 @@ def cores() -> list[int]:
 def cores_of_their_own(count: int) -> Iterator[None]:
     """Give each of the last `count` threads that start in the block a core of its own (Linux).
 
-    Only where they are as many as the cores. Threads that one call wakes together for a millisecond's work
-    else often share a core for all of it: that of the caller seems taken until the caller waits.
+    Only if they are as many as the cores. Threads that one call wakes together for a millisecond's work else
+    often share a core for all of it: that of the caller seems taken until the caller waits.
     """
     ours, before = cores(), _threads()
     yield
@@ -166,7 +166,7 @@ def cores_of_their_own(count: int) -> Iterator[None]:
 
 
 def _threads() -> list[int]:
-    """Numbers of this process's threads, ascending; empty where the system does not tell."""
+    """Numbers of this process's threads, ascending; empty = unknown."""
     with suppress(OSError):
         return sorted(map(int, os.listdir("/proc/self/task")))
     return []
@@ -186,7 +186,7 @@ def physical_memory_bytes() -> int:
 
 
 def oom_kills() -> int:
-    """Number of processes that the system has ended for lack of memory; 0 where it does not tell."""
+    """Number of processes that the system has ended for lack of memory; 0 = unknown."""
     with suppress(OSError):
         for line in Path("/proc/vmstat").read_text(encoding="ascii").splitlines():
             if line.startswith("oom_kill "):
@@ -201,7 +201,7 @@ _holds_back = False  # the main thread is within `uninterrupted`
 def uninterrupted() -> Iterator[None]:
     """Hold Ctrl-C and SIGTERM back until the end of the block.
 
-    The block runs to its end, and code in it that swallows exceptions cannot swallow these signals.
+    Code in the block that swallows exceptions cannot swallow these signals.
     """
     global _holds_back  # noqa: PLW0603  as the handlers are the process's
     if _holds_back or threading.current_thread() is not threading.main_thread():
@@ -232,7 +232,7 @@ def uninterrupted() -> Iterator[None]:
 
 
 def version_of(package: str) -> str:
-    """Version of a package, or `missing`. tsfusion also runs where it is not installed, from its sources."""
+    """Version of a package, or `missing`: tsfusion also runs from its sources, without an installation."""
     if package == "tsfusion":
         return tsfusion.__version__
     from importlib import metadata
@@ -244,10 +244,7 @@ def version_of(package: str) -> str:
 
 
 class SideThread:
-    """Does calls one after the other, in their order, beside the thread that uses it as a context.
-
-    Where no thread can be had the calls are done at once.
-    """
+    """Thread for calls in their order, used as a context; without a free thread the calls run at once."""
 
     def __init__(self) -> None:
         self._pool: ThreadPoolExecutor | None = ThreadPoolExecutor(1)
@@ -263,7 +260,7 @@ class SideThread:
             self._pool.shutdown(cancel_futures=True)
 
     def do(self, call: Callable[[], None]) -> None:
-        """Do a call soon; waits while too many others are to be done. Raises what one of them raised."""
+        """Queue a call; waits while the queue is full. Raises an error of an earlier call."""
         if self._pool is not None:
             try:
                 self._waiting.append(self._pool.submit(call))
@@ -275,6 +272,6 @@ class SideThread:
             self._waiting.popleft().result()
 
     def wait(self) -> None:
-        """Wait until every call is done; raises what one of them raised."""
+        """Wait until every call is done. Raises an error of one of them."""
         while self._waiting:
             self._waiting.popleft().result()

@@ -48,10 +48,9 @@ def count_of(number: int, one: str, many: str = "") -> str:
 
 
 def fitted(text: str, stream: TextIO, *, indent: int = 2) -> str:
-    """Break lines between words where they are too long for the terminal at `stream`; elsewhere never.
+    """Break lines between words if they are too long for the terminal at `stream`; elsewhere never.
 
-    Args:
-        indent: columns before what follows the first part of a line.
+    `indent`: columns before each further part of a line.
     """
     try:
         columns = os.get_terminal_size(stream.fileno()).columns if stream.isatty() else 0

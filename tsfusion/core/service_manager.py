@@ -40,7 +40,7 @@ class Watchdog:
         self._next_pet = clock()
 
     def starting(self, status: str) -> None:
-        """Report how far a start is that takes long; it may take longer than TimeoutStartSec, then."""
+        """Report the progress of a long start, which may then take longer than TimeoutStartSec."""
         self._status = status
         self._send(f"EXTEND_TIMEOUT_USEC={_START_EXTENSION_US}", _line(status))
 
@@ -52,7 +52,7 @@ class Watchdog:
     def pet(self, status: str = "") -> None:
         """Report that the loop is alive; call it as often as you like.
 
-        A message is sent once in each half of the interval, and at once when the status is new.
+        A message is sent once in each half of the interval, and at once for a new status.
         """
         if status and status != self._status:
             self._status = status
@@ -82,7 +82,7 @@ class Watchdog:
 
 
 def _interval(environment: Mapping[str, str]) -> float | None:
-    """Watchdog interval in seconds; None when it is not this process that is watched."""
+    """Watchdog interval in seconds; None = another process is watched."""
     if environment.get("WATCHDOG_PID", str(os.getpid())) != str(os.getpid()):
         return None
     microseconds = environment.get("WATCHDOG_USEC", "")

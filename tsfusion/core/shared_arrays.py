@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: MIT
-"""Arrays that one process writes and another reads, in memory that both have mapped; and waiting for a word
-of the other one."""
+"""Arrays that one process writes and another reads, in memory that both have mapped; and a quick wait for a
+message."""
 
 import math
 import mmap
@@ -34,7 +34,7 @@ class SharedSlot(NamedTuple):
 
 
 def make_file() -> int:
-    """A descriptor of a file without a name, in memory where the system has such files (Linux)."""
+    """Descriptor of an unnamed file, in memory where the system has such files (Linux)."""
     with suppress(AttributeError):
         return os.memfd_create("tsfusion")
     with tempfile.TemporaryFile() as file:
@@ -42,8 +42,7 @@ def make_file() -> int:
 
 
 def look_out(descriptor: int, seconds: float) -> None:
-    """Wait for something to read, so long at most, without sleeping: to be woken takes longer than what is
-    waited for."""
+    """Wait for input, at most `seconds`, without sleeping: a wake-up takes longer than the wait."""
     poll = select.poll()
     poll.register(descriptor, select.POLLIN)
     end = time.monotonic() + seconds
@@ -52,11 +51,10 @@ def look_out(descriptor: int, seconds: float) -> None:
 
 
 def talking_sockets() -> tuple[socket.socket, socket.socket]:
-    """Two ends of a connection between processes that keeps messages apart; reading an end says nothing (b"")
-    once the other one is closed.
+    """Two ends of a connection between processes that keeps messages apart; an end whose other end is closed
+    reads b"".
 
-    Raises:
-        OSError: the system has no such connections (macOS).
+    Raises OSError without such connections (macOS).
     """
     return socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
 
@@ -64,8 +62,7 @@ def talking_sockets() -> tuple[socket.socket, socket.socket]:
 class SharedArrays:
     """One process's side of the memory. Arrays stay valid; their content until the writer begins anew.
 
-    Args:
-        descriptor: of the file; it is closed with this object.
+    `descriptor`: of the file; it is closed with this object.
     """
 
     def __init__(self, descriptor: int) -> None:
@@ -75,11 +72,11 @@ class SharedArrays:
         self._end = 0
 
     def begin(self) -> None:
-        """Write over what was written before."""
+        """Overwrite the earlier arrays from now on."""
         self._end = 0
 
     def empty(self, shape: tuple[int, ...], dtype: DTypeLike) -> tuple[NDArray[Any], SharedSlot]:
-        """An array to be filled, and where it is."""
+        """Array to be filled, and its place."""
         place = SharedSlot(-(-self._end // _ALIGNMENT) * _ALIGNMENT, shape, np.dtype(dtype).str)
         self._end = end = place.end
         if end > self._size:
@@ -96,7 +93,7 @@ class SharedArrays:
         return places
 
     def read(self, place: SharedSlot) -> NDArray[Any]:
-        """The array at a place, not copied."""
+        """Array at a place, not copied."""
         if self._map is None or place.end > self._size:
             # Arrays of the earlier mapping keep it.
             self._size = os.fstat(self._descriptor).st_size
@@ -108,11 +105,11 @@ class SharedArrays:
 
     @property
     def memory(self) -> NDArray[np.uint8]:
-        """All of the memory that is mapped."""
+        """All mapped memory."""
         return np.empty(0, np.uint8) if self._map is None else np.frombuffer(self._map, np.uint8)
 
     def close(self) -> None:
-        """Close the descriptor; arrays that were read stay."""
+        """Close the descriptor; arrays read before stay."""
         if self._descriptor >= 0:
             os.close(self._descriptor)
             self._descriptor = -1

@@ -43,11 +43,7 @@ _MAX_RESIDUAL = 1e-10  # on the unit plane
 
 @dataclass(frozen=True)
 class Camera:
-    """Calibrated camera with a lens model.
-
-    Raises:
-        InvalidConfig: naming what is wrong.
-    """
+    """Calibrated camera with a lens model. Raises InvalidConfig, naming the wrong value."""
 
     intrinsics: Intrinsics  # pixels
     size: Size  # (height, width) of its images
@@ -80,11 +76,10 @@ class Camera:
 
     @property
     def is_pinhole(self) -> bool:
-        """True if the images need no undistortion."""
         return self.model == "pinhole" and not self.skew
 
     def resized(self, size: Size) -> "Camera":
-        """The camera of the same images in another size of the same shape."""
+        """Camera of the same images in another size of the same shape."""
         factor = size[1] / self.size[1]
         return replace(self, intrinsics=self.intrinsics.scaled(factor), size=size, skew=self.skew * factor)
 
@@ -198,11 +193,8 @@ class Undistorter:
 
 @dataclass(frozen=True, eq=False)
 class StereoRig:
-    """Two cameras side by side; `p_right = T_right_left @ p_left`.
-
-    Raises:
-        InvalidConfig: naming what is wrong.
-    """
+    """Two cameras side by side; `p_right = T_right_left @ p_left`. Raises InvalidConfig, naming the wrong
+    value."""
 
     left: Camera
     right: Camera
@@ -227,11 +219,7 @@ class Rectifier:
         baseline_m, baseline_fx: metres; metre · pixels.
         T_left_rectified: (4, 4), a rotation: `T_world_rectified = T_world_left @ T_left_rectified`.
 
-    Args:
-        keep: as for `Undistorter`.
-
-    Raises:
-        InvalidConfig: one camera is above the other, or they are swapped.
+    `keep` as for `Undistorter`. Raises InvalidConfig if one camera is above the other, or they are swapped.
     """
 
     def __init__(self, rig: StereoRig, *, keep: float = 0.0) -> None:
@@ -293,7 +281,7 @@ class _Maps:
 
 
 def _flat(cameras: list[tuple[Camera, NDArray[np.float64]]], size: Size, keep: float) -> Intrinsics:
-    """Intrinsics of the pinhole camera that shows what all cameras, turned by their rotations, see."""
+    """Intrinsics of the pinhole camera that shows the view of all cameras, turned by their rotations."""
     if not 0 <= keep <= 1:
         raise InvalidConfig(f"keep must be between 0 and 1, got {keep}")
     inner, outer = np.array([_seen(camera, R) for camera, R in cameras]).swapaxes(0, 1)
@@ -311,10 +299,8 @@ def _flat(cameras: list[tuple[Camera, NDArray[np.float64]]], size: Size, keep: f
 
 
 def _seen(camera: Camera, R: NDArray[np.float64]) -> tuple[list[float], list[float]]:
-    """Largest rectangle inside a turned camera's image on the unit plane, and the smallest around it.
-
-    Each is left, top, right, bottom.
-    """
+    """Largest rectangle inside a turned camera's image on the unit plane, and the smallest around it; each is
+    left, top, right, bottom."""
     last_row, last_column = (side - 1 - _INSET for side in camera.size)
     along = np.linspace(0, 1, _EDGE_POINTS)
     u, v = _INSET + along * (last_column - _INSET), _INSET + along * (last_row - _INSET)

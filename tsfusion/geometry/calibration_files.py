@@ -30,7 +30,7 @@ EXPECTED_CAMERA = (
     "Kalibr's, EuRoC's, ROS's, OpenCV's, Open3D's or RealSense's file of a camera; or in a .txt its 3×3 "
     "matrix, or fx fy cx cy"
 )
-# Where files with more have the camera
+# Place of the camera in files with more
 _PARTS = ("cam0", "cam", "camera", "camera_params", "intrinsic", "intrinsics", "depth")
 _MATRICES = ("camera_matrix", "cameraMatrix", "intrinsic_matrix", "camera_intrinsics", "K", "k", "mtx")
 _COEFFICIENTS = (
@@ -41,7 +41,7 @@ _NAMED_COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _SIZES = (("image_width", "image_height"), ("width", "height"), ("w", "h"), ("W", "H"), ("cols", "rows"))
 _ORB_SLAM = ("Camera.", "Camera1.")  # in front of its names
 _MAX_TEXT, _MAX_DEPTH, _MAX_INDENTATION = 1 << 20, 64, 256  # characters, brackets or tags, spaces
-# Of a unit of depth, in small letters: depth_scale, png_depth_scale, DepthMapFactor, depth.units, …
+# Names of a unit of depth, in small letters: depth_scale, png_depth_scale, DepthMapFactor, depth.units, …
 _DEPTH_UNIT = re.compile(
     r"depth.*(scal(e|ing)|factor(?!y)|unit)|unitsper(meter|metre|m)$|(^|cam|camera)scale$"
 )
@@ -53,11 +53,8 @@ Tree = dict[str, Any]
 def read_camera(path: str | Path, *, size: Size | None = None) -> Camera:
     """Read the camera of a file (of a Kalibr chain: `cam0`); `.txt` is a matrix, or `fx fy cx cy` and more.
 
-    Args:
-        size: (height, width) for a file without one.
-
-    Raises:
-        DatasetError: no such file, an unknown format, a missing or wrong value.
+    `size`: (height, width) for a file without one. Raises DatasetError for a missing file, an unknown format,
+    a missing or wrong value.
     """
     path = Path(path)
     try:
@@ -69,12 +66,11 @@ def read_camera(path: str | Path, *, size: Size | None = None) -> Camera:
 
 
 def read_depth_unit(path: str | Path) -> float | None:
-    """Metres a unit of integer depth as a camera's file states it; None = it does not, or cannot be read.
+    """Metres a unit of integer depth as a camera's file states it; None = unstated or unreadable.
 
     A number above 1 is of units a metre, whatever its name: Open3D's `depth_scale` is 1000, others' 0.001.
 
-    Raises:
-        DatasetError: no unit of depth, or several.
+    Raises DatasetError for no unit of depth, or several.
     """
     path, tree = Path(path), {}
     with suppress(DatasetError):
@@ -120,8 +116,7 @@ def _metres(value: Any) -> float | None:
 def read_rig(*paths: str | Path, size: Size | None = None) -> StereoRig:
     """Read a stereo rig from one file, the left and the right camera's, or intrinsics and extrinsics.
 
-    Raises:
-        DatasetError: as `read_camera`; also when the transform between the cameras is missing.
+    Raises DatasetError as `read_camera`, and for a missing transform between the cameras.
     """
     files = [Path(path) for path in paths]
     trees = [read_tree(path) for path in files]
@@ -155,8 +150,7 @@ def read_text(path: Path, content: str) -> str:
 def read_tree(path: Path) -> Tree:
     """Read a YAML, JSON or XML file as nested dictionaries and lists; numbers become floats.
 
-    Raises:
-        DatasetError: the file cannot be read or parsed.
+    Raises DatasetError if the file cannot be read or parsed.
     """
     text = read_text(path, EXPECTED)
     if _is_too_large(text):
@@ -177,7 +171,7 @@ def read_tree(path: Path) -> Tree:
 
 
 def _json(text: str) -> Any:
-    """The values of a JSON file; None for one that is none (OpenCV's YAML may look like it)."""
+    """Values of a JSON file; None for another file (OpenCV's YAML may look like it)."""
     try:
         return json.loads(text)
     except (ValueError, RecursionError):
@@ -215,7 +209,7 @@ def _plain(node: Any) -> Any:
 
 
 def _camera(tree: Tree, size: Size | None) -> tuple[Camera, Tree]:
-    """Read the camera; also return its part of the file."""
+    """Read the camera. Returns also its part of the file."""
     while (part := next((name for name in _PARTS if isinstance(tree.get(name), dict)), None)) is not None:
         if "data" in tree[part] or "fx" in tree:  # a matrix of OpenCV's, or other things beside the camera
             break
@@ -245,7 +239,6 @@ def _camera(tree: Tree, size: Size | None) -> tuple[Camera, Tree]:
 
 
 def _stated_size(tree: Tree) -> Size | None:
-    """(height, width) as a camera's file states it."""
     named = next((tree[name] for name in ("resolution", "imageSize", "image_size") if name in tree), None)
     if named is not None:
         return int(named[1]), int(named[0])
@@ -257,10 +250,9 @@ def _stated_size(tree: Tree) -> Size | None:
 
 
 def _matrix(value: Any, *, by_column: bool) -> NDArray[np.float64]:
-    """A camera matrix of 3×3, 3×4 or 4×4 numbers, or a list of them (`by_column`: column by column).
+    """Camera matrix of 3×3, 3×4 or 4×4 numbers, or a list of them (`by_column`: column by column).
 
-    Raises:
-        InvalidConfig: of another shape or form.
+    Raises InvalidConfig for another shape or form.
     """
     numbers = _numbers(value)
     if numbers.size in (12, 16):
@@ -278,7 +270,7 @@ def _matrix(value: Any, *, by_column: bool) -> NDArray[np.float64]:
 
 
 def _distortion(tree: Tree) -> tuple[float, ...]:
-    """The coefficients of a lens; none where the file has none."""
+    """Coefficients of a lens; none if the file has none."""
     named = next((tree[name] for name in _COEFFICIENTS if name in tree), None)
     if named is None:
         model = str(tree.get("distortion_model", ""))
@@ -365,7 +357,6 @@ def _opencv_rig(tree: Tree, size: Size | None) -> StereoRig:
 
 
 def _numbers(value: Any) -> NDArray[np.float64]:
-    """Flatten a list, or the `data` of a matrix."""
     return np.asarray(value["data"] if isinstance(value, dict) else value, dtype=np.float64).ravel()
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Colours for numbers and for names, that everybody's eyes tell apart, and round ends for scales."""
+"""Colours for numbers and for names, also for colour-blind people, and round ends for scales."""
 
 import colorsys
 import math

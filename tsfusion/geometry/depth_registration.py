@@ -23,8 +23,7 @@ class Registration:
         size, color_size: (height, width) of their images; `color_size` None = the same.
         T_color_depth: (4, 4), `p_color = T_color_depth @ p_depth`, metres.
 
-    Raises:
-        InvalidKeyframe: `T_color_depth` is not rigid.
+    Raises InvalidKeyframe if `T_color_depth` is not rigid.
     """
 
     def __init__(
@@ -50,7 +49,7 @@ class Registration:
         """Colour of every depth pixel: (H, W, 3) uint8 of the depth's size.
 
         A pixel without depth (0) gets the colour far away there; one outside of the colour image, the colour
-        of its border; one hidden from the colour camera, the colour of what hides it.
+        of its border; one hidden from the colour camera, the colour of the surface that hides it.
         """
         expected = (*self.color_size, 3)
         if color.shape != expected or color.dtype != np.uint8:
@@ -62,7 +61,7 @@ class Registration:
         return seen
 
     def _strips(self, depth_m: NDArray[np.float32]) -> Iterator[tuple[slice, NDArray[np.float32]]]:
-        """A depth image a few rows at a time, so that what is made of them stays in the cache."""
+        """Depth image a few rows at a time, so that intermediate arrays stay in the cache."""
         if depth_m.shape != self.size:
             raise InvalidConfig(f"depth must be of size {self.size}, got {depth_m.shape}")
         for top in range(0, len(depth_m), _STRIP):

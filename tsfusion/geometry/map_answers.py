@@ -115,8 +115,7 @@ class PointCloud:
     def to_open3d(self) -> Any:
         """Make an `open3d.t.geometry.PointCloud` with `normals`, `weights` and `colors` (float32, 0 to 1).
 
-        Raises:
-            MissingDependency: without Open3D.
+        Raises MissingDependency without Open3D.
         """
         o3d = import_open3d()
         cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor(self.points))
@@ -128,11 +127,7 @@ class PointCloud:
 
 
 def import_open3d() -> Any:
-    """The module `open3d`.
-
-    Raises:
-        MissingDependency: without it.
-    """
+    """Module `open3d`. Raises MissingDependency without it."""
     try:
         return import_module("open3d")
     except ImportError as error:
@@ -140,11 +135,7 @@ def import_open3d() -> Any:
 
 
 def checked_points(points: Any) -> NDArray[np.floating]:
-    """Points as a contiguous (n, 3) array of float32 or float64.
-
-    Raises:
-        InvalidConfig: for another shape, or something that is no number.
-    """
+    """Points as a contiguous (n, 3) array of float32 or float64. Raises InvalidConfig for anything else."""
     array = np.asarray(points)
     if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in "fiu":
         raise InvalidConfig(
@@ -156,11 +147,8 @@ def checked_points(points: Any) -> NDArray[np.floating]:
 def checked_camera(
     intrinsics: Any, T_world_camera: Any, shape: Any
 ) -> tuple[Intrinsics, NDArray[np.float64], tuple[int, int]]:
-    """Intrinsics, pose and (height, width) of a view that is asked for.
-
-    Raises:
-        InvalidConfig: naming what is wrong.
-    """
+    """Intrinsics, pose and (height, width) of a requested view. Raises InvalidConfig, naming the wrong
+    value."""
     found = intrinsics_of(intrinsics)
     if found is None:
         raise InvalidConfig(

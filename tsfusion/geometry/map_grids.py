@@ -19,7 +19,7 @@ from tsfusion.geometry.up_direction import Up
 
 FREE, OCCUPIED, UNSEEN = 0, 100, -1  # as in ROS's nav_msgs/OccupancyGrid
 SLICE_FORMATS = (".pgm", ".yaml", ".png", ".npz")
-# What map_server and nav2 make of a pixel p: occupied if (255 − p) / 255 > OCCUPIED_THRESH, free if it is
+# Reading of a pixel p by map_server and nav2: occupied if (255 − p) / 255 > OCCUPIED_THRESH, free if it is
 # < FREE_THRESH, else unknown. 205 is 0.19608: at 0.25, which some tools write, all that is unknown is free.
 OCCUPIED_THRESH, FREE_THRESH = 0.65, 0.196
 _PIXELS = {FREE: 254, OCCUPIED: 0, UNSEEN: 205}
@@ -82,7 +82,6 @@ class SliceGrid:
 
     @property
     def figures(self) -> dict[str, Any]:
-        """Values beside the cells in a file."""
         return {
             "origin": np.array(self.origin), "resolution": np.float64(self.resolution),
             "heights": np.array([self.low, self.high]), "axes": self.axes,
@@ -91,7 +90,7 @@ class SliceGrid:
 
     @property
     def heights_in_words(self) -> str:
-        """Between which heights it is, and from where they count."""
+        """Heights of the slice, and where they count from."""
         if self.floor is None:
             return f"{self.low:g} and {self.high:g} m"
         low, high = self.low - self.floor, self.high - self.floor
@@ -99,7 +98,6 @@ class SliceGrid:
 
     @property
     def floor_in_words(self) -> str:
-        """Where the floor is, once it was found."""
         floor = self.floor or 0.0
         return f"which is {abs(floor):.3f} m {'below' if floor < 0 else 'above'} the map's origin"
 
@@ -294,7 +292,7 @@ class DistanceField:
 
 
 class SliceSettings(TypedDict, total=False):
-    """Names and types of what `Volume.distance_slice` says of a slice, for type checkers."""
+    """Names and types of the settings of `Volume.distance_slice`, for type checkers."""
 
     box: Sequence[float] | None
     resolution: float | None
@@ -313,7 +311,7 @@ class OwnSliceSettings(SliceSettings, total=False):
 def blocked(
     distance: NDArray[np.float32], states: NDArray[np.int8], *, unseen_is_free: bool
 ) -> NDArray[np.float32]:
-    """Distances as a planner may compare them: 0 where nothing was seen, unless that is to count as free."""
+    """Distances as a planner may compare them: 0 where unseen, unless unseen counts as free."""
     return distance if unseen_is_free else np.where(states == UNSEEN, np.float32(0), distance)
 
 

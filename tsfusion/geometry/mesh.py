@@ -222,7 +222,6 @@ class Mesh(MeshArrays, object_cards.Shown):
 
     @property
     def summary(self) -> str:
-        """One line: vertices, triangles, extent in metres, islands, and up."""
         return summarise(self.figures)
 
     @cached_property

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The arrays of a triangle mesh and where it comes from, for functions that make files and other meshes."""
+"""Arrays of a triangle mesh and its origin, for functions that make files and other meshes."""
 
 import dataclasses
 from dataclasses import dataclass, field
@@ -20,10 +20,10 @@ AnyMesh = TypeVar("AnyMesh", bound="MeshArrays")
 
 @dataclass(frozen=True, kw_only=True)
 class Provenance:
-    """Origin of a surface; None = it is not known.
+    """Origin of a surface; None = unknown.
 
     Attributes:
-        source: name of the map, or of its file or folder: not where that lies, as files are sent around.
+        source: name of the map, or of its file or folder, without the path, as files are sent around.
         keyframes: number that the map was made from.
         map_hash: `map_hash()` of the map.
         world: coordinate frames of its scans; empty = poses were given from elsewhere.
@@ -38,7 +38,7 @@ class Provenance:
 
     @property
     def origins(self) -> list[Origin]:
-        """Origins of its worlds, in the frame of the poses that their scans came with."""
+        """Origins of its worlds, in the frame of their scans' given poses."""
         return [one for world in (self.world or "").split() if (one := Origin.of_world(world))]
 
     @property
@@ -56,7 +56,6 @@ class Provenance:
 
 
 def generator() -> str:
-    """Name and version of this program."""
     from tsfusion import __version__
 
     return f"{GENERATOR} {__version__}"
@@ -64,7 +63,7 @@ def generator() -> str:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MeshArrays:
-    """Arrays of a `Mesh`, which says what they are."""
+    """Arrays of a `Mesh`, which documents them."""
 
     vertices: NDArray[np.float32]
     faces: NDArray[np.int32]
@@ -83,10 +82,9 @@ class MeshArrays:
         return up_direction.find(self, self.held)
 
     def of_faces(self: AnyMesh, kept: NDArray[np.bool_] | NDArray[np.integer]) -> AnyMesh:
-        """A mesh of some of the faces and the vertices that they use, in the same order.
+        """Mesh of some of the faces and the vertices that they use, in the same order.
 
-        Args:
-            kept: (m,) bool for each face, or the numbers of faces.
+        `kept`: (m,) bool for each face, or the numbers of faces.
         """
         chosen = np.flatnonzero(kept) if kept.dtype == np.bool_ else kept
         faces = np.take(self.faces, chosen, axis=0)

@@ -36,8 +36,7 @@ def cut(mesh: AnyMesh, normal: NDArray[np.float64], offset: float) -> AnyMesh:
 def _cut(mesh: AnyMesh, height: NDArray[np.float32], plane: tuple[int, np.float32] | None = None) -> AnyMesh:
     """Part of a mesh above a plane, where vertices have a height ≥ 0.
 
-    Args:
-        plane: the axis that it is across, and where: cut vertices are there to the last bit.
+    `plane`: its axis, and its place on it: cut vertices are there to the last bit.
     """
     kept = height >= 0
     count = kept[mesh.faces].sum(axis=1)
@@ -70,10 +69,8 @@ def _with_cuts(
     height: NDArray[np.float32],
     plane: tuple[int, np.float32] | None,
 ) -> tuple[AnyMesh, NDArray[np.int64]]:
-    """The mesh with a vertex where each edge meets the plane, and their numbers; an edge has one.
-
-    Where an edge ends on the plane this is its end.
-    """
+    """Mesh with one vertex where each edge meets the plane, and their numbers; an edge that ends on the plane
+    has this end."""
     edges, which = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True)
     p, q = edges.T
     share = (height[p] / (height[p] - height[q]))[:, None]

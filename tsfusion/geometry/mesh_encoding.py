@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""A mesh as the content of a PLY, GLB, OBJ or STL file, and what the file says about itself.
+"""Content of a PLY, GLB, OBJ or STL file of a mesh, with the file's notes about it.
 
-Vertices are in the map's frame; the nodes of a GLB turn them so that up is +Y, as glTF 2.0 asks for.
-Guessed triangles are the last ones in PLY, an object of their own in GLB and OBJ, and have 1 as their
-attribute in STL.
+Vertices are in the map's frame; the nodes of a GLB turn them so that up is +Y, as glTF 2.0 asks for. Guessed
+triangles are the last ones in PLY, an object of their own in GLB and OBJ, and have 1 as their attribute in
+STL.
 """
 
 import dataclasses
@@ -69,7 +69,7 @@ def _glb(mesh: MeshArrays) -> bytes:
 
 
 def glb_of(scene: Any, mesh: MeshArrays) -> bytes:
-    """The content of a GLB with a mesh's objects, which are in the map's frame.
+    """Content of a GLB with a mesh's objects, which are in the map's frame.
 
     Each node turns its object so that up is +Y. Objects without a picture get a material that is no metal.
     """
@@ -96,7 +96,7 @@ def glb_of(scene: Any, mesh: MeshArrays) -> bytes:
 
 
 def _scene(mesh: MeshArrays) -> Any:
-    """Seen and guessed triangles as objects of these names; one, `mesh`, where none is guessed."""
+    """Seen and guessed triangles as objects of these names; one, `mesh`, without guesses."""
     import trimesh
 
     scene = trimesh.Scene()
@@ -130,7 +130,7 @@ def facts_of(mesh: MeshArrays) -> dict[str, str]:
 
 
 def comments(mesh: MeshArrays, comment: bytes) -> bytes:
-    """Comments with what the file says about itself."""
+    """Comments with the file's notes about its mesh."""
     lines = [f"{name} {value}".encode() for name, value in facts_of(mesh).items()]
     return b"".join(comment + line + b"\n" for line in lines)
 
@@ -141,7 +141,7 @@ def described(up: Up | None) -> str:
 
 
 def _srgb_to_linear() -> NDArray[np.uint16]:
-    """Linear light of each level of sRGB, 0 to 65535: in 8 bits most dark levels would be one."""
+    """Linear light of each level of sRGB, 0 to 65535: in 8 bits most dark levels would coincide."""
     s = np.arange(256) / 255
     linear = np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
     return np.round(linear * _OPAQUE).astype(np.uint16)

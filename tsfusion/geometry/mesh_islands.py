@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Islands: small pieces of a mesh that hang together with nothing else, mostly noise.
+"""Islands: small pieces of a mesh that are connected with nothing else, mostly noise.
 
-Of a mesh that is too large for memory, islands are found part by part: a number for each vertex waits in a
-file; memory holds a part, and a box for each piece of one. A part's triangles may name vertices of parts that
-came before: there pieces of both are one.
+Islands of a mesh that is too large for memory are found part by part: a number for each vertex waits in a
+file; memory holds a part, and a box for each piece of one. A part's triangles may name vertices of earlier
+parts: pieces that meet there are one.
 """
 
 from collections.abc import Iterable, Iterator
@@ -19,10 +19,10 @@ ISLAND = 50  # vertices that a piece needs to be none: marching cubes makes abou
 
 
 def find(faces: NDArray[np.int32], vertices: int) -> NDArray[np.bool_]:
-    """Vertices, of `vertices`, that belong to pieces of fewer than `ISLAND` vertices: (n,) bool.
+    """(n,) bool of `vertices` vertices: those in pieces of fewer than `ISLAND` vertices.
 
-    That is as much surface as 7 × 7 voxels, 14 cm across at 2 cm. None where most triangles would be on
-    islands: then they are the scene.
+    That is as much surface as 7 × 7 voxels, 14 cm across at 2 cm. None if most triangles would be on islands:
+    then they are the scene.
     """
     label = pieces(faces, vertices)
     small = (np.bincount(label, minlength=1) < ISLAND)[label]
@@ -46,7 +46,7 @@ def find_smaller(
 
 
 def checked_extent(min_extent: float) -> float:
-    """A least extent of pieces; raises InvalidConfig for one that is none."""
+    """Least extent of pieces; raises InvalidConfig for an impossible one."""
     if not 0 <= min_extent < np.inf:
         raise InvalidConfig(f"the least extent of a piece must be 0 metres or more, got {min_extent}")
     return min_extent
@@ -59,15 +59,15 @@ def count(faces: NDArray[np.int32], islands: NDArray[np.bool_]) -> int:
 
 
 def pieces(faces: NDArray[np.int32], vertices: int) -> NDArray[np.int32]:
-    """For each of `vertices` vertices the lowest number of a vertex that triangles connect it with: (n,)."""
+    """For each of `vertices` vertices, the lowest number of a vertex that triangles connect it with: (n,)."""
     a, b = np.concatenate((faces[:, :2], faces[:, 1:])).T
     return linked(a, b, vertices)
 
 
 def linked(a: NDArray[np.int32], b: NDArray[np.int32], count: int) -> NDArray[np.int32]:
-    """For each of `count` things the lowest number of one that links a[i]–b[i] connect it with: (n,).
+    """For each of `count` items, the lowest number of an item that links a[i]–b[i] connect it with: (n,).
 
-    Labels go down along every link, and each thing jumps to its label's label, until nothing changes.
+    Labels go down along every link, and each item jumps to its label's label, until nothing changes.
     """
     label = np.arange(count, dtype=np.int32)
     while len(a):
@@ -130,7 +130,7 @@ def find_in_parts(parts: Iterable[Any], number: NDArray[np.int32], min_extent: f
 
 
 def _boxes(vertices: NDArray[np.float32], piece: NDArray[np.int32], total: int) -> NDArray[np.float32]:
-    """(total, 6): lowest and highest corner of each piece's vertices; turned inside out without any."""
+    """(total, 6): lowest and highest corner of each piece's vertices; inverted for a piece without any."""
     boxes = np.tile(np.repeat(np.array((np.inf, -np.inf), np.float32), 3), (total, 1))
     order = np.argsort(piece, kind="stable")
     found, first = np.unique(piece[order], return_index=True)
@@ -141,7 +141,7 @@ def _boxes(vertices: NDArray[np.float32], piece: NDArray[np.int32], total: int) 
 
 
 def without(parts: Iterable[Any], number: NDArray[np.int32], islands: Islands) -> Iterator[Any]:
-    """The parts without the islands; `number` becomes the new numbers of the vertices, 0 where left out."""
+    """Parts without the islands; `number` becomes the new numbers of the vertices, 0 for a removed one."""
     done = kept_before = 0
     for part in parts:
         count = len(part.vertices)

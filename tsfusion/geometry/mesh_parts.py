@@ -24,8 +24,8 @@ _FACE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
 
 
 class MeshPart(NamedTuple):
-    """A part of a mesh: as of a `Mesh`, but `faces` (m, 3) int32 count vertices from the end of the whole: 1
-    is the last one. They may name vertices of the parts that come behind this one in the mesh."""
+    """Part of a mesh, as a `Mesh`, but `faces` (m, 3) int32 count vertices from the end of the whole: 1 is
+    the last one. They may name vertices of the parts that come behind this one in the mesh."""
 
     vertices: NDArray[np.float32]
     faces: NDArray[np.int32]
@@ -117,10 +117,9 @@ class MeshParts:
         return up_direction.find(Mesh(rows["position"], faces, rows["normal"]), self._held)
 
     def without_islands(self, min_extent: float) -> "MeshParts":
-        """The mesh without pieces smaller than `min_extent` metres, as of a `Mesh`; on the disk, too.
+        """Mesh on the disk without pieces smaller than `min_extent` metres, as of a `Mesh`.
 
-        Raises:
-            OutputError: when the folder's disk has no room.
+        Raises OutputError without room on the folder's disk.
         """
         file = self._file(self._folder)
         try:
@@ -136,7 +135,6 @@ class MeshParts:
         return parts
 
     def _arrived(self) -> Iterator[MeshPart]:
-        """The parts as they came."""
         vertex_at = face_at = 0
         for vertices, faces in self._counts:
             size = vertices * self._vertex.itemsize
@@ -148,7 +146,7 @@ class MeshParts:
 
     @property
     def figures(self) -> dict[str, Any]:
-        """Figures as of a `Mesh`; islands are not looked for."""
+        """Figures as of a `Mesh`, without a search for islands."""
         extent = self._high - self._low if self.vertices else np.zeros(3)
         return {
             "vertices": self.vertices,
@@ -160,13 +158,10 @@ class MeshParts:
         }
 
     def save(self, path: Path) -> list[Path]:
-        """Write one PLY, the same as `Mesh.save` does, or GLB files of a part each: `NAME-0001.glb` and on.
+        """Write one PLY, the same as `Mesh.save`, or GLB files of a part each: `NAME-0001.glb` and on.
+        Returns the files.
 
-        Returns:
-            The files.
-
-        Raises:
-            OutputError: for another suffix, an empty mesh, or a path that cannot be written.
+        Raises OutputError for another suffix, an empty mesh, or a path that cannot be written.
         """
         check(path)
         if not self.faces:
@@ -258,7 +253,6 @@ def check(path: Path) -> None:
 
 
 def _vertex_type(has_color: bool) -> np.dtype[Any]:
-    """A vertex as it stands in a PLY file."""
     fields: list[Any] = [("position", "<f4", 3), ("normal", "<f4", 3)]
     return np.dtype(fields + [("color", "u1", 4)] * has_color)
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Fewer triangles by collapsing edges in the order of their quadric error (Garland and Heckbert, 1997), by
 the library `fast-simplification`. Borders stay as they are; each vertex gets the mean colour and normal of
-those that became one with it. No edge has more than two triangles afterwards."""
+the vertices merged into it. No edge has more than two triangles afterwards."""
 
 import dataclasses
 from typing import Any
@@ -74,7 +74,7 @@ def _reduced(mesh: AnyMesh, ratio: float | None, max_error: float | None) -> Any
 def _with_means(
     full: AnyMesh, vertices: NDArray[np.float32], faces: NDArray[np.int32], became: NDArray[np.int64]
 ) -> AnyMesh:
-    """The simplified mesh; each vertex with the mean of the vertices that became it."""
+    """Simplified mesh; each vertex with the mean of the vertices that became it."""
     used = became >= 0
     count = np.bincount(became[used], minlength=len(vertices))
 
@@ -119,11 +119,9 @@ def _joined(parts: list[AnyMesh], like: AnyMesh) -> AnyMesh:
 
 
 def _unfolded(mesh: AnyMesh) -> AnyMesh:
-    """The mesh with at most two triangles at each edge, and none twice.
-
-    Collapsed edges can fold a surface onto itself. Two triangles with the same corners that face each other
-    both go; where more than two meet at an edge, each sheet gets vertices of its own (Guéziec et al., 2001).
-    """
+    """Mesh with at most two triangles at each edge, and none twice. Collapsed edges can fold a surface onto
+    itself. Two triangles with the same corners that face each other both go; at an edge of more than two
+    triangles, each sheet gets vertices of its own (Guéziec et al., 2001)."""
     rising = (mesh.faces < np.roll(mesh.faces, -1, axis=1)).sum(axis=1)
     facing = np.where(rising == 2, 1, -1)  # whether the corners' order is an even one
     _, group = np.unique(np.sort(mesh.faces, axis=1), axis=0, return_inverse=True)
@@ -162,7 +160,7 @@ def _unfolded(mesh: AnyMesh) -> AnyMesh:
 
 
 def border_edges(faces: NDArray[np.int32]) -> NDArray[np.int32]:
-    """(n, 2) edges that one triangle has alone."""
+    """(n, 2) edges of only one triangle."""
     edges = np.concatenate((faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]))
     key = edges.min(axis=1).astype(np.int64) << 32 | edges.max(axis=1)
     _, first, count = np.unique(key, return_index=True, return_counts=True)

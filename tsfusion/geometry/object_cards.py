@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Maps, meshes, keyframes and recordings as a prompt and a notebook show them: figures and a picture."""
+"""Figures and a picture of maps, meshes, keyframes and recordings, for a prompt and a notebook."""
 
 import base64
 from abc import ABC, abstractmethod
@@ -20,7 +20,7 @@ _CELL = "text-align:left;padding:2px 12px 2px 0"
 
 
 class Shown(ABC):
-    """Base of what says in a line, and in a notebook with pictures, what it is."""
+    """Base of objects that describe themselves in a line, and in a notebook with pictures."""
 
     @abstractmethod
     def _facts(self) -> dict[str, str]:
@@ -98,7 +98,7 @@ def surface(
     colors: NDArray[np.uint8] | None,
     up: Iterable[float] = (0.0, 0.0, 1.0),
 ) -> Picture | None:
-    """Points of a surface from obliquely above, those that face the viewer; None where there are none.
+    """Points of a surface from obliquely above, those that face the viewer; None = no such points.
 
     Args:
         points, normals: (n, 3); None = all face the viewer.
@@ -134,7 +134,7 @@ def _small(image: NDArray[Any]) -> NDArray[Any]:
 
 
 def _grey(image: NDArray[Any], *, inverse: bool) -> Picture:
-    """An image as grey values; what is 0 or no number is black."""
+    """Image as grey values; 0 and NaN are black."""
     values = np.nan_to_num(np.asarray(image, np.float64), nan=0.0, posinf=0.0, neginf=0.0)
     there = values > 0
     grey = np.zeros(values.shape)
@@ -144,7 +144,7 @@ def _grey(image: NDArray[Any], *, inverse: bool) -> Picture:
 
 
 def _share(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Values from 0 to 1, between the 2nd and the 98th of a hundred."""
+    """Values scaled to 0 … 1, between the 2nd and the 98th percentile."""
     if not len(values):
         return values
     low, high = np.percentile(values, (2, 98))

@@ -2,9 +2,9 @@
 """Origins of maps whose poses are in a national grid or UTM.
 
 Voxels and float32 vertices reach some kilometres around zero; eastings and northings are hundreds of
-kilometres away. So whole metres are taken off all positions of a recording, once, where it is read. The name
-of the map's world says which: it goes with each record into the journal, the map and the meshes, and maps of
-two origins are of two worlds.
+kilometres away. So the reader of a recording subtracts whole metres from all positions. The name of the map's
+world has them: it goes with each record into the journal, the map and the meshes, and maps of two origins are
+of two worlds.
 """
 
 import re
@@ -27,8 +27,6 @@ _WORLD = re.compile(r"(?:EPSG([0-9]{4,6})|origin)((?:_-?[0-9]{1,9}){3})")
 
 
 class System(NamedTuple):
-    """A coordinate reference system of positions."""
-
     crs: str = ""  # its code, such as `EPSG:25832`; empty = nobody said, or it has none
     metres: tuple[float, float, float] = (1.0, 1.0, 1.0)  # of a unit along x, y and z
     projection: Any = None  # a `pyproj.CRS`
@@ -36,7 +34,7 @@ class System(NamedTuple):
 
 @lru_cache(maxsize=64)
 def system(text: str) -> System:
-    """System of a code or WKT; raises InvalidConfig for none or degrees, MissingDependency without pyproj."""
+    """System of a code or WKT. Raises InvalidConfig for none or degrees, MissingDependency without pyproj."""
     if not _CRS.fullmatch(text):
         raise InvalidConfig(f"crs must be EPSG: and a number, such as EPSG:25832, got {text!r}")
     try:
@@ -74,12 +72,12 @@ class Origin:
 
     @property
     def world(self) -> str:
-        """Name of the world of keyframes whose positions count from here."""
+        """World name of keyframes whose positions count from here."""
         return "_".join([self.crs.replace(":", "") or "origin", *map(str, self.position)])
 
     @staticmethod
     def of_world(world: str) -> "Origin | None":
-        """The origin in the name of a world; None = the world has none."""
+        """Origin in the name of a world; None = the world has none."""
         found = _WORLD.fullmatch(world)
         if found is None:
             return None
@@ -91,16 +89,15 @@ class Origin:
 
 
 def found(positions: Sequence[NDArray[np.float64]], wanted: object = None, crs: str = "") -> Origin | None:
-    """The origin of a recording; None = its positions stay as they are.
+    """Origin of a recording; None = its positions stay as they are.
 
     Args:
         positions: (3,) metres each, in the recording's order.
-        wanted: `auto` or None = near the first position where that is farther than `FAR` from zero; `X,Y,Z`
-            or three numbers = that place in whole metres.
+        wanted: `auto` or None = near the first position, if that is farther than `FAR` from zero; `X,Y,Z` or
+            three numbers = that place in whole metres.
         crs: code of their coordinate reference system.
 
-    Raises:
-        InvalidConfig: for anything else.
+    Raises InvalidConfig for anything else.
     """
     if wanted is not None and not (isinstance(wanted, str) and wanted == AUTO):
         return Origin(_parsed(wanted), crs)

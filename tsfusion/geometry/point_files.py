@@ -135,7 +135,6 @@ def _write_pcd(file: BinaryIO, rows: NDArray[Any], facts: dict[str, str]) -> Non
 def _write_las(
     file: BinaryIO, rows: NDArray[Any], facts: dict[str, str], origin: Origin, *, compressed: bool
 ) -> None:
-    """LAS 1.4."""
     try:
         import laspy
     except ImportError as error:
@@ -205,7 +204,7 @@ def write(path: Path, parts: Parts, *, name: str, voxel_size: float, background:
 
 
 def _write_leaves(file: BinaryIO, values: NDArray[np.float32], background: float) -> NDArray[np.uint8]:
-    """Write the values of leaves; returns their masks (n, 64) of active voxels."""
+    """Write the values of leaves. Returns their masks (n, 64) of active voxels."""
     flat = np.ascontiguousarray(values.reshape(len(values), 512), "<f4")
     active = flat != np.float32(background)
     masks = np.packbits(active, axis=1, bitorder="little")
@@ -217,7 +216,7 @@ def _write_leaves(file: BinaryIO, values: NDArray[np.float32], background: float
 
 
 def _write_file(file: BinaryIO, name: str, grid: bytes, buffers: BinaryIO) -> None:
-    """Write a file of one grid, given all that stands before its leaves' values, and these."""
+    """Write a file of one grid from `grid`, all before its leaves' values, and these."""
     file.write(struct.pack("<qIII?", _MAGIC, _FORMAT, *_LIBRARY, True) + _NO_UUID)
     file.write(_metadata({"creator": "tsfusion"}) + struct.pack("<I", 1))
     file.write(_text(name) + _text(_GRID) + _text(""))
@@ -263,7 +262,7 @@ def _topology(blocks: NDArray[np.int32], masks: NDArray[np.uint8]) -> bytes:
 
 
 def _node(children: NDArray[np.int32], side: int) -> bytes:
-    """A node with these (n, 3) children: their mask, that of its own active values, and these: none."""
+    """Node with these (n, 3) children: their mask, and an empty mask of its own active values."""
     has_child = np.zeros(side**3, bool)
     has_child[np.ravel_multi_index(tuple(children.T), (side,) * 3)] = True
     return (

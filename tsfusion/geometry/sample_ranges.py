@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Ranges of a keyframe's samples, and what is wrong with them when a sensor could not have measured them."""
+"""Ranges of a keyframe's samples, and advice about ranges that a sensor could not have measured."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,8 @@ NEAREST_M, FARTHEST_M = 0.01, 100.0
 
 
 def sample_ranges(keyframe: Keyframe) -> NDArray[np.float64]:
-    """(n,) metres of the samples with a return: depth along the optical axis, of points the ray's length."""
+    """(n,) metres of the samples with a return: depth along the optical axis; for points, the ray's
+    length."""
     measured = keyframe.measurement
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         if keyframe.points is not None:
@@ -32,7 +33,7 @@ def sample_ranges(keyframe: Keyframe) -> NDArray[np.float64]:
 def wrong_unit(keyframe: Keyframe) -> str:
     """Advice about depth in a wrong unit, for a person; empty = it may be in metres.
 
-    Judged by the median: metres where no sensor measures any.
+    The median decides: in metres, no sensor would measure so near or so far.
     """
     ranges = sample_ranges(keyframe)
     if not len(ranges):
@@ -53,7 +54,7 @@ def wrong_unit(keyframe: Keyframe) -> str:
 
 
 def why_no_samples(keyframe: Keyframe, min_range: float, max_range: float, reach: float) -> str:
-    """Reason why a map can use none of a keyframe's samples, and what to do, for a person.
+    """Reason why a map can use none of a keyframe's samples, and its cure, for a person.
 
     Args:
         min_range, max_range: of the sensor's model, metres.

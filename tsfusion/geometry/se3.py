@@ -22,13 +22,13 @@ _SERIES = 0.02  # radians below which the Jacobian's series are better than its 
 
 
 def hat(v: NDArray[np.floating]) -> NDArray[np.float64]:
-    """The matrix of the cross product with `v`: (…, 3) → (…, 3, 3)."""
+    """Matrix of the cross product with `v`: (…, 3) → (…, 3, 3)."""
     W: NDArray[np.float64] = v @ _HAT
     return W.reshape(*v.shape, 3)
 
 
 def exp(twist: NDArray[np.floating]) -> Transform:
-    """The transform of a twist: (…, 6) → (…, 4, 4) (eq. 7.33)."""
+    """Transform of a twist: (…, 6) → (…, 4, 4) (eq. 7.33)."""
     phi = twist[..., 3:]
     angle = _length(phi)[..., None, None]
     a, b = np.sin(angle) / angle, 2 * (np.sin(angle / 2) / angle) ** 2
@@ -42,7 +42,7 @@ def exp(twist: NDArray[np.floating]) -> Transform:
 
 
 def log(T: Transform) -> Twist:
-    """The twist of a transform, with a rotation of at most π: (…, 4, 4) → (…, 6)."""
+    """Twist of a transform, with a rotation of at most π: (…, 4, 4) → (…, 6)."""
     phi = rotation_vector(T[..., :3, :3])
     rho = (_left_jacobian_inverse(phi) @ T[..., :3, 3, None])[..., 0]
     return np.concatenate([rho, phi], axis=-1)
@@ -73,7 +73,7 @@ def transform(R: ArrayLike, t: ArrayLike) -> Transform:
 
 
 def inverse(T: Transform) -> Transform:
-    """The inverse of a rigid transform: (…, 4, 4)."""
+    """Inverse of a rigid transform: (…, 4, 4)."""
     result = _identity(T.shape[:-2])
     R = T[..., :3, :3].swapaxes(-1, -2)
     result[..., :3, :3] = R

@@ -24,8 +24,8 @@ class Matcher:
 
     OpenCV's 3-way mode ignores `disp12MaxDiff`, so the pair is matched the other way round, too, and compared
     here: on KITTI 06 this takes disagreements of more than 2 px between frames from 6.0 % to 2.4 %. Half the
-    resolution is enough for that. It takes an eighth of the time, and as its mistakes are others, more of
-    them show. Images are widened by the search range before, which keeps the left edge.
+    resolution is enough for that: it takes an eighth of the time, and its errors differ, so that more of them
+    show. Images are widened by the search range before, which keeps the left edge.
     """
 
     # Range of disparities, pixels, a multiple of 16; None = a twelfth of the width, at least 32
@@ -75,7 +75,7 @@ def exchanged(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> bool:
 
 
 def _semi_global(search: int, *, block: int = 5, uniqueness: int = 10, **more: int) -> Any:
-    """OpenCV's matcher; four bands of the image are matched each by itself, so threads change nothing."""
+    """OpenCV's matcher on four independent bands of the image: threads change nothing."""
     return cv2.StereoSGBM.create(
         minDisparity=0,
         numDisparities=search,
@@ -101,7 +101,6 @@ def _usual_search(image: NDArray[np.uint8]) -> int:
 
 
 def _multiple_of_16(pixels: float) -> int:
-    """The smallest multiple of 16 that is not smaller."""
     return -int(-pixels // 16) * 16
 
 
@@ -112,7 +111,7 @@ def _match(matcher: Any, left: NDArray[np.uint8], right: NDArray[np.uint8], sear
 
 
 def _agree(left: NDArray[np.int16], right: NDArray[np.int16], tolerance: float) -> NDArray[np.bool_]:
-    """True where the right image's disparity, at the pixel the left one points to, is the same: (H, W)."""
+    """Mask (H, W) of pixels whose partner in the right image has the same disparity."""
     height, width = left.shape
     pixel = np.empty((height, width, 2), np.int16)
     pixel[..., 0] = np.arange(width) - (left + UNITS // 2) // UNITS

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Sweeps: points that a moving sensor measures one after the other, and where they are at one time."""
+"""Sweeps: points that a moving sensor measures one after the other, moved to one time."""
 
 from typing import NamedTuple
 
@@ -29,14 +29,13 @@ class Motion(NamedTuple):
 
 
 def motion_about(at: PoseAt, stamp_ns: int, times_s: NDArray[np.float32] | None) -> Motion | None:
-    """Motion during a sweep by the poses of a trajectory; where it ends within the sweep, that goes on.
+    """Motion during a sweep by the poses of a trajectory; beyond their end it is extrapolated.
 
     Args:
         at: T_world_sensor.
         times_s: (N,) seconds of the points after the stamp; None = they have none.
 
-    Returns:
-        None where there is no pose at the stamp, or about it none for half of the time of a sweep.
+    Returns None without a pose at the stamp, or with poses around it for less than half of the sweep.
     """
     if times_s is None:
         return None
@@ -67,7 +66,7 @@ def steady(twist: NDArray[np.float64], times_s: NDArray[np.floating]) -> Motion:
 
 
 def skewed(why: str) -> str:
-    """Say that the motion within sweeps is left in the points, and why."""
+    """Notice that the motion within sweeps is left in the points, with the reason."""
     return f"motion within sweeps is not taken out: {why}"
 
 
@@ -80,8 +79,7 @@ def at_stamp(
         points: each in the sensor's axes at its own time.
         times_s: (N,) seconds after the timestamp.
 
-    Raises:
-        InvalidKeyframe: the motion does not cover these times, or is none at the timestamp.
+    Raises InvalidKeyframe if the motion does not cover these times, or lacks the timestamp.
     """
     rises = len(motion.times_s) > 1 and (np.diff(motion.times_s) > 0).all()
     if not rises or not np.isfinite(motion.times_s).all() or not np.isfinite(motion.poses).all():

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Charts: pieces of a mesh that lie flat without folding, laid on the pages of a texture by xatlas.
 
-Every triangle is seen along the one of six directions that it faces most: the two ways along three right
-angles that most of the surface follows, as walls and floors do. Neighbours that are seen along the same
-direction are one chart. Tens of thousands of small triangles take a second, where a general unwrapper fits a
-plane to each piece for a minute, and leaves thousands of pieces.
+Every triangle is projected along the one of six directions that it faces most: both ways along the three
+perpendicular axes that most of the surface follows, as walls and floors do. Neighbours of one direction are
+one chart. Tens of thousands of small triangles take a second; a general unwrapper fits a plane to each piece
+for a minute, and leaves thousands of pieces.
 """
 
 from importlib.util import find_spec
@@ -40,7 +40,7 @@ class Charts(NamedTuple):
 
 
 def find(vertices: NDArray[np.float32], faces: NDArray[np.int32], normals: NDArray[np.float32]) -> Charts:
-    """The charts of a mesh, as few as smoothing makes them; the same mesh has the same ones."""
+    """Charts of a mesh, as few as smoothing makes them; the same mesh has the same ones."""
     corners = vertices.astype(np.float64)[faces]
     flat = _unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     smooth = _unit(normals.astype(np.float64)[faces].sum(axis=1))
@@ -52,17 +52,13 @@ def find(vertices: NDArray[np.float32], faces: NDArray[np.int32], normals: NDArr
 
 
 def split(charts: Charts, faces: NDArray[np.int32], vertices: int, covered: NDArray[np.bool_]) -> Charts:
-    """The charts where some faces, which lie below others of their chart, are charts of their own."""
+    """Charts in which `faces`, which lie below others of their chart, are charts of their own."""
     label = 2 * charts.number.astype(np.int64) + covered
     return charts._replace(number=connected(label, _neighbours(faces, vertices)))
 
 
 def connected(label: NDArray[np.integer], pairs: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Number the pieces of neighbouring faces with equal labels: (m,) int32.
-
-    Args:
-        pairs: (k, 2) neighbours.
-    """
+    """Number the pieces of neighbouring faces with equal labels: (m,) int32. `pairs`: (k, 2) neighbours."""
     a, b = pairs[label[pairs[:, 0]] == label[pairs[:, 1]]].T
     lowest = mesh_islands.pieces(np.stack([a, b, b], axis=1), len(label))
     return np.unique(lowest, return_inverse=True)[1].astype(np.int32)
@@ -100,12 +96,12 @@ def _main_axes(normals: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _followed(normals: NDArray[np.float64], directions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """How much of the normals lies near each direction or its opposite."""
+    """Share of the normals near each direction or its opposite."""
     return np.asarray(np.maximum(np.abs(normals @ directions.T) - 0.9, 0).sum(axis=0))
 
 
 def _plane(axis: NDArray[np.float64], hint: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(2, 3): right and up of what is seen by one who looks against an axis."""
+    """(2, 3): right and up in a view against an axis."""
     first = _unit(hint - axis * (axis @ hint))
     return np.stack([first, np.cross(axis, first)])
 
@@ -113,7 +109,7 @@ def _plane(axis: NDArray[np.float64], hint: NDArray[np.float64]) -> NDArray[np.f
 def _labels(
     flat: NDArray[np.float64], smooth: NDArray[np.float64], pairs: NDArray[np.int32]
 ) -> NDArray[np.intp]:
-    """The direction of each face: (m,), by the cosines (m, 6) with its plane and with its normals.
+    """Direction of each face: (m,), by the cosines (m, 6) with its plane and with its normals.
 
     Iterated conditional modes (Besag 1986), half of the faces at a time.
     """
@@ -158,19 +154,14 @@ def check_installed() -> None:
 
 
 def pack(charts: Charts, faces: NDArray[np.int32], *, texel: float, side: int) -> ChartPlacement:
-    """Lay charts out.
+    """Lay charts out on pages of at most `side` texels of `texel` metres a side; larger charts shrink.
 
-    Args:
-        texel: edge of a texel, metres.
-        side: texels of a page's side, at most; a chart that is larger is made smaller.
-
-    Raises:
-        MissingDependency: without xatlas.
+    Raises MissingDependency without xatlas.
     """
     check_installed()
     import xatlas
 
-    # A vertex of each chart that it belongs to.
+    # One vertex for each chart that has it.
     key = charts.number[:, None].astype(np.int64) * (int(faces.max()) + 1) + faces
     _, first, place = np.unique(key.ravel(), return_index=True, return_inverse=True)
     flat = charts.corners.reshape(-1, 2)[first]
@@ -196,7 +187,7 @@ def pack(charts: Charts, faces: NDArray[np.int32], *, texel: float, side: int) -
 
 
 def _cropped(corners: NDArray[np.float32], page: NDArray[np.int32], side: int) -> ChartPlacement:
-    """Pages as large as what is on them, up to a side."""
+    """Pages cropped to their charts, up to a side."""
     sizes = []
     for number in range(int(page.max()) + 1):
         of_page = corners[page == number].reshape(-1, 2)

@@ -35,16 +35,16 @@ class Texture:
     pages: list[NDArray[np.uint8]]
 
     def of_faces(self, kept: NDArray[np.bool_] | NDArray[np.integer]) -> "Texture":
-        """The texture of some faces, a (m,) bool or numbers, on the same pages."""
+        """Texture of some faces, a (m,) bool or numbers, on the same pages."""
         return dataclasses.replace(self, corners=self.corners[kept], page=self.page[kept])
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class TexturedMesh(Mesh):
-    """A mesh whose surface shows what the cameras saw.
+    """A mesh whose surface shows the images of the cameras.
 
     Attributes:
-        texture: its pictures. `colors` are theirs at the vertices: what a PLY file holds.
+        texture: its pictures. `colors` are theirs at the vertices: the colours in a PLY file.
         seen: share of the surface that an image shows; the rest has the map's colours.
     """
 
@@ -55,10 +55,7 @@ class TexturedMesh(Mesh):
         """Write as `Mesh.save` does, GLB and OBJ with the texture.
 
         A GLB holds its pictures; beside an OBJ lie `NAME.mtl` and `NAME-0.png`. Other files have the colours
-        at the vertices.
-
-        Raises:
-            OutputError: as `Mesh.save`.
+        at the vertices. Raises as `Mesh.save`.
         """
         path = Path(path)
         if path.suffix.lower() not in TEXTURED or not len(self.faces):
@@ -80,11 +77,8 @@ class TexturedMesh(Mesh):
         return mesh_encoding.glb_of(self._scene("page"), self)
 
     def sample(self, face: NDArray[np.integer], weight: NDArray[np.floating]) -> NDArray[np.float32]:
-        """(n, 3) float32 RGB, 0 to 255, of the texture at points of the surface.
-
-        Args:
-            face: (n,) the face of each point; `weight`: (n, 3) its barycentric weights there.
-        """
+        """(n, 3) float32 RGB, 0 to 255, of the texture at points on `face` (n,) with barycentric `weight` (n,
+        3)."""
         found = np.empty((len(face), 3), np.float32)
         at = (np.asarray(weight, np.float32)[..., None] * self.texture.corners[face]).sum(axis=1)
         for number, page in enumerate(self.texture.pages):
@@ -101,7 +95,7 @@ class TexturedMesh(Mesh):
 
     @property
     def figures(self) -> dict[str, Any]:
-        """Figures as of a mesh, and of the texture: its pages, and how much of the surface an image shows."""
+        """Figures as of a mesh, with the texture's pages and the share of the surface that an image shows."""
         texture = {
             "pages": [list(page.shape[1::-1]) for page in self.texture.pages],
             "seen": round(self.seen, 4),
@@ -113,10 +107,9 @@ class TexturedMesh(Mesh):
         return dataclasses.replace(self, **fields_of(part), texture=self.texture.of_faces(kept))
 
     def page_mesh(self, page: int, *, name: str = "page") -> Any:
-        """The faces of a page as a `trimesh.Trimesh` with texture; vertices on a seam are doubled.
+        """Faces of a page as a `trimesh.Trimesh` with texture; vertices on a seam are doubled.
 
-        Args:
-            name: of its material, before the page's number.
+        `name`: of its material, before the page's number.
         """
         with process.uninterrupted():  # trimesh ignores exceptions while it is imported
             import trimesh
@@ -151,7 +144,6 @@ class TexturedMesh(Mesh):
         return trimesh.Scene({f"{name}-{page}": self.page_mesh(page, name=name) for page in pages})
 
     def _as_obj(self, path: Path) -> dict[Path, bytes]:
-        """Contents of the files of an OBJ, the OBJ itself last."""
         from trimesh.exchange.obj import export_obj
 
         library = path.with_suffix(".mtl").name
@@ -169,10 +161,8 @@ class TexturedMesh(Mesh):
 def barycentric(
     ray: NDArray[np.float64], a: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """(n, 3) weights of corners (n, 3) where rays from the origin meet their triangles' planes.
-
-    They are kept inside the triangles (Möller and Trumbore 1997).
-    """
+    """(n, 3) weights of corners (n, 3) where rays from the origin meet their triangles' planes, kept inside
+    the triangles (Möller and Trumbore 1997)."""
     across = (np.cross(b, c), np.cross(c, a), np.cross(a, b))
     weight = np.stack([(ray * normal).sum(axis=1) for normal in across], axis=1)
     total = weight.sum(axis=1, keepdims=True)

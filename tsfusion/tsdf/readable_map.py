@@ -151,8 +151,7 @@ class ReadableMap(object_cards.Shown):
 
     def whole_values(self, surface: Surface | None = None) -> WholeMapValues:
         """Values that `extract_mesh` of the whole map meshes, for `mesh_cells`; valid until the map
-        changes.
-        """
+        changes."""
         return WholeMapValues(np.sort(self._store.keys), self._view(surface), field_regularizer.BATCH)
 
     def kept_values(self) -> KeptValues:

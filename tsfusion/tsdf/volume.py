@@ -287,8 +287,7 @@ class Volume(AskableMap):
 
     def _parts_with(self, other: "Volume") -> tuple[Part, Part] | None:
         """Places of both in one map of which they are parts that share no voxel; None = they are no such
-        parts.
-        """
+        parts."""
         if map_crop.PART_OF not in self.meta or map_crop.PART_OF not in other.meta:
             return None
         one, two = (map_crop.part_of(each.meta, each.map_hash()) for each in (self, other))
@@ -532,8 +531,7 @@ class Volume(AskableMap):
 
     def set_pause(self, pause: Callable[[], None]) -> None:
         """Call a function, `pause`, between steps that leave the map alone: of meshes, hashes, saving, and
-        before a keyframe's rays are added. It may ask the map anything, and must not change it.
-        """
+        before a keyframe's rays are added. It may ask the map anything, and must not change it."""
         self._store.pause = pause
 
     @property

@@ -213,8 +213,7 @@ def spread(
     reach: Reach,
 ) -> Nearest:
     """Carry distances along grid lines (…, length, inner) to the given places; `line` = (length, inner).
-    Returns `into`.
-    """
+    Returns `into`."""
     stack = np.empty((kernels.BANDS, line[0], 2), np.int32)
     kernels.spread_along_lines(*found, *line, *lines, *places, reach.most_squared, stack, *into)
     return into

@@ -110,8 +110,7 @@ class CurrentSlice:
 
     def update(self, blocks: NDArray[np.int32]) -> bool:
         """Follow the changed blocks, (n, 3) int32, of `Volume.take_dirty`. Returns True if the slice has
-        changed.
-        """
+        changed."""
         cells = self._changed_cells(np.asarray(blocks, np.float64).reshape(-1, 3))
         if not len(cells):
             return False

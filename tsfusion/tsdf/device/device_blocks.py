@@ -19,8 +19,7 @@ _CHUNK = 4096  # blocks copied at a time: 42 MB with colour
 
 class DeviceBlocks(DeviceRows):
     """Rows on the device, to which keyframes are added. `fetch` brings the store's rows up to date before a
-    read; `send` brings the device's up to date after a write to the store.
-    """
+    read; `send` brings the device's up to date after a write to the store."""
 
     first_blocks = FIRST_BLOCKS
     is_none = False

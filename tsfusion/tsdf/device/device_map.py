@@ -53,8 +53,7 @@ class LaunchJob(NamedTuple):
 
 class Room(NamedTuple):
     """Limits of a keyframe: new blocks for which all memory is there, touched blocks, and the cost of its
-    rays and new blocks (`integrator.KeyframeQuota`).
-    """
+    rays and new blocks (`integrator.KeyframeQuota`)."""
 
     new: int
     touched: int
@@ -173,8 +172,7 @@ class DeviceMap:
 
     def _news(self, told: NDArray[np.int32], missing: NDArray[np.int64]) -> tuple[NDArray[Any], ...]:
         """Answer to the host: a launch's report, without slots reported before and places without a key; and
-        missing blocks, in order.
-        """
+        missing blocks, in order."""
         known, self._known = self._known, int(told[TOUCHED_COUNT])
         told = np.concatenate([told[: FRESH_AT + 2 * told[NEW]], told[TOUCHED_AT + known :]])
         return (told, distinct(missing)) if len(missing) else (told,)
@@ -234,8 +232,7 @@ class DeviceMap:
         slots: NDArray[np.int32],
     ) -> None:
         """Insert `count` blocks with zero voxels, with keys and slots at these places of the hash of `size`
-        places. A change of `size` empties the hash first.
-        """
+        places. A change of `size` empties the hash first."""
         self._reserve(count)
         self._count = count
         if self._hash_keys.shape[0] != size:

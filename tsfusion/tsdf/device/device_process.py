@@ -99,8 +99,7 @@ class _Device:
 
 def main() -> None:
     """Serve a connection: its descriptor, that of the shared memory, the device, and `1` to end at once with
-    the thread that started this process.
-    """
+    the thread that started this process."""
     link, requests, replies = (int(argument) for argument in sys.argv[1:4])
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)  # who started it decides

@@ -63,8 +63,7 @@ def _store(device: DeviceBlocks | None) -> BlockStore:
 
 def _fused(store: BlockStore, buffers: RayBuffers, integrator: Integrator) -> list[NDArray[Any]]:
     """Keys, bounds and layers, in key order, of a map of two keyframes, the second of which was there
-    twice.
-    """
+    twice."""
     for keyframe, sign in zip(_keyframes(), (1, 1, 1, -1), strict=True):
         buffers.make_rays(keyframe, _CONFIG)
         integrator.apply(sign)

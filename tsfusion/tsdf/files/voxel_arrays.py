@@ -364,8 +364,7 @@ class Blocks:
 
 def to_voxel_block_grid(store: BlockStore) -> Any:
     """Make an `open3d.t.geometry.VoxelBlockGrid` of the raw values. Raises MissingDependency without
-    Open3D.
-    """
+    Open3D."""
     o3d = import_open3d()
     used = store.used()
     names = ["tsdf", "weight", *(["color"] if store.color else [])]

@@ -62,8 +62,7 @@ class PointRays(NamedTuple):
 
 class _Sight(NamedTuple):
     """A view as the kernels read it (`space_carving`), and rays of depth one through its image's corners, (3,
-    4).
-    """
+    4)."""
 
     numbers: NDArray[np.float64]
     rays: NDArray[np.float64]
@@ -129,8 +128,7 @@ class CarvedBlocks:
 
     def find_clear(self, keyframe: Keyframe, read: Read, model: NDArray[np.float64], most: int) -> None:
         """Find the blocks that an image looks through as a whole; none if more than `most`. Arguments as of
-        `find`.
-        """
+        `find`."""
         assert keyframe.intrinsics is not None
         self.forget()
         K, read = _thinned(keyframe.intrinsics, read, model)
@@ -283,8 +281,7 @@ def _view(
 
 def _cubes_in(views: Sequence[_Sight], images: _PatchImages) -> NDArray[np.int32]:
     """Cubes of 64 voxels for each view, (views + 1, 7): index of its first cube in the list of all, that
-    cube, and the number of cubes on each axis.
-    """
+    cube, and the number of cubes on each axis."""
     found = np.zeros((len(views) + 1, 7), np.int32)
     deepest = images.most.reshape(len(views), -1)[:, -1]
     for n, (numbers, rays) in enumerate(views):
@@ -300,8 +297,7 @@ def _cubes_in(views: Sequence[_Sight], images: _PatchImages) -> NDArray[np.int32
 
 def _thinned(K: Intrinsics, read: Read, model: NDArray[np.float64]) -> tuple[Intrinsics, Read]:
     """A camera's image of fewer pixels, none of them wide; surfaces that fall between pixels have hits in the
-    map.
-    """
+    map."""
     image, is_disparity, scale, confidence, has_confidence = read
     widest = _THIN_VOXELS * model[VOXEL_SIZE] / model[MAX_RANGE]
     step = max(1, min(_THINNEST, int(min(K.fx, abs(K.fy), 1e6) * widest)))
@@ -349,8 +345,7 @@ def _closed(ends: NDArray[np.int32], scale: float, far: float) -> NDArray[np.int
 
 def _camera_of(K: Intrinsics, shape: tuple[int, ...], model: NDArray[np.float64]) -> Optics:
     """A camera: steps right, down and forward in column · depth, row · depth and depth, (3, 3); rays of depth
-    one through the image's corners, (3, 4); and the last six numbers of a view.
-    """
+    one through the image's corners, (3, 4); and the last six numbers of a view."""
     height, width = shape[:2]
     middle = (K.cx + 0.5) / PATCH, (K.cy + 0.5) / PATCH
     matrix = np.array([(K.fx / PATCH, 0, middle[0]), (0, K.fy / PATCH, middle[1]), (0, 0, 1)])

@@ -30,8 +30,7 @@ _NOTHING = {len(shape): np.zeros(shape, np.uint8) for shape in ((1,), (1, 3))}
 
 class RayBuffers:
     """Rays of the current keyframe (`rays`, by `bands`), slots of the blocks they touch (`touched`), keys of
-    missing blocks (`missing`, a hash set), and the space it looks through (`carved`).
-    """
+    missing blocks (`missing`, a hash set), and the space it looks through (`carved`)."""
 
     def __init__(self, *, color: bool, regularised: bool) -> None:
         self._modelled: tuple[Any, ...] = ()  # what `_parameters` are of
@@ -144,8 +143,7 @@ class RayBuffers:
     @staticmethod
     def as_read(image: NDArray[Any]) -> NDArray[Any]:
         """Image in the one type that the kernel reads: a second type would cost a second of compilation a
-        start.
-        """
+        start."""
         return image.astype(np.float32, copy=False)
 
     def _rays_of_points(self, points: Any, *rest: Any) -> None:

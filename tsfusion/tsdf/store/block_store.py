@@ -198,15 +198,13 @@ class BlockStore:
     @property
     def ray_ends(self) -> tuple[NDArray[np.int64], NDArray[np.int32], int]:
         """Layers that count the ray ends in a voxel, and a number for those that the map has
-        (`surface_cells.held`).
-        """
+        (`surface_cells.held`)."""
         return self.color_rgn, self.hits, self.color + 2 * self.counts_hits
 
     @property
     def clear_blocks(self) -> tuple[NDArray[Any], ...]:
         """Flags by slot of blocks that show a surface or hits; and the blocks that keyframes look through
-        (`surface_cells.is_clear`).
-        """
+        (`surface_cells.is_clear`)."""
         clear = self.clear
         if len(clear):
             with process.uninterrupted():

@@ -84,8 +84,7 @@ class ClearBlocks:
 
     def changed_since(self, noted: int) -> NDArray[np.int64] | None:
         """Keys of blocks that have become free, or are free no longer, since `noted` changes; None = too
-        many.
-        """
+        many."""
         found, left = [np.empty(0, np.int64)], self.noted - noted
         for keys in reversed(self._noted):
             if left <= 0:
@@ -170,8 +169,7 @@ def encoded(counts: ClearCounts) -> bytes:
 
 def decoded(saved: bytes, most: int) -> ClearCounts:
     """ClearCounts from `encoded`. Raises ValueError for other bytes, or too many for a map of `most`
-    blocks.
-    """
+    blocks."""
     count = len(saved) // 12
     if len(saved) != 12 * count or count > _A_BLOCK * most:
         raise ValueError("its blocks of free space are not of the size expected")

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: MIT
 """Arrays that grow without copying: anonymous memory whose pages the operating system adds on first touch, or
-a file whose pages can leave memory.
-"""
+a file whose pages can leave memory."""
 
 import ctypes
 import mmap
@@ -66,8 +65,7 @@ class GrowingArray:
 
     def reserve(self, capacity: int) -> None:
         """Make room for `capacity` items; new items are zero. Raises MemoryError; the array stays as it
-        was.
-        """
+        was."""
         if capacity <= self.capacity:
             return
         ahead = min(2 * self.capacity, self.capacity + _STEP if _MOVES_PAGES else MAX_ITEMS, MAX_ITEMS)

@@ -64,8 +64,7 @@ def _check_weights(
     store: BlockStore, other: BlockStore, slots: NDArray[np.int32], theirs: NDArray[np.int64]
 ) -> None:
     """Raise WeightOverflow if a voxel's weights would overflow. Only blocks whose `bounds` make that possible
-    are read.
-    """
+    are read."""
     bounds = store.bounds[slots].astype(np.int64) + other.bounds[theirs]
     full = 0
     near = np.flatnonzero(bounds >= WEIGHT_LIMIT)

@@ -43,8 +43,7 @@ _PART = 1 << 14  # blocks read at a time: they may have to come from a file
 @dataclass(frozen=True)
 class FieldSettings:
     """`smoothness` λ against data weights in full-confidence samples, `edge` ε in voxels: a larger D2 counts
-    as an edge, `reweightings`: rounds of steps, each with ω from the x of the last.
-    """
+    as an edge, `reweightings`: rounds of steps, each with ω from the x of the last."""
 
     smoothness: float
     edge: float

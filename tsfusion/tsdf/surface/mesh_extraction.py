@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Mesh extraction: choice of blocks, and working memory, for `kernels/surface/surface_cells.py` and
 `kernels/surface/marching_cubes.py`. Followers of the map get its cells in key order, with the triangles of
-each.
-"""
+each."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -187,8 +186,7 @@ class CellMeshes:
 
 def listed(store: BlockStore, first: int, most: int) -> tuple[NDArray[np.int64], int | None]:
     """Sorted keys of the map's blocks from `first` on, at most `most`; and the first of the remaining
-    ones.
-    """
+    ones."""
     keys = store.keys[store.keys >= first]
     if len(keys) <= most:
         return np.sort(keys), None

@@ -23,8 +23,7 @@ _FARTHEST = int(CELL_STEPS.max())  # what the keys of blocks that share a cell d
 
 class Numbered(NamedTuple):
     """Blocks whose vertices have numbers: (n,) sorted keys, (n, 24) edges with a vertex, and (n,) the number
-    of the first vertex, from the end.
-    """
+    of the first vertex, from the end."""
 
     keys: NDArray[np.int64]
     edges: NDArray[np.uint64]
@@ -97,8 +96,7 @@ def run(
     keys: NDArray[np.int64], which: range, store: BlockStore, min_weight: float, view: SurfaceView
 ) -> MeshRun:
     """Some tiles of a map whose blocks have these sorted keys; the store holds `blocks_of_run` and their
-    surroundings.
-    """
+    surroundings."""
     made = list(_tiles(keys, which, store, min_weight, view))[::-1]
     corners = np.array([one.part.faces.size for one in made])
     begin = np.cumsum(corners) - corners

@@ -195,8 +195,7 @@ class _Baker:
         self, points: NDArray[np.float32], normals: NDArray[np.float32]
     ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
         """(n, 3) uint8 RGB of points of the surface, and a mask of those that an image shows; others are
-        grey.
-        """
+        grey."""
         sums = np.zeros((len(points), 8), np.float32)
         found = np.empty((len(points), 3), np.float32)
         for image in images(self._keyframes, sorted(self._fits)):
