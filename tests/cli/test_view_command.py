@@ -25,7 +25,7 @@ from tsfusion.core.errors import InvalidConfig
 from tsfusion.pipelines.runs import viewer_child
 from tsfusion.pipelines.runs.viewer_child import ViewerChild
 from tsfusion.viewer.live_page import LivePage
-from tsfusion.viewer.page.page_server import listen
+from tsfusion.viewer.page.page_guard import listen
 from tsfusion.wire.asking.queries import fetch_health
 from tsfusion.wire.keys import key_folder
 

@@ -79,7 +79,8 @@ def view(
     """
     from tsfusion.core import logs, process
     from tsfusion.viewer.live_page import LivePage
-    from tsfusion.viewer.page.page_server import PageServer, check_installed, parse_place
+    from tsfusion.viewer.page.page_guard import check_installed, parse_place
+    from tsfusion.viewer.page.page_server import PageServer
     from tsfusion.wire.sockets.curve import client_keys
 
     logs.configure("text", "warning", "view")

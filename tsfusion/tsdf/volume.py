@@ -42,7 +42,7 @@ from tsfusion.tsdf.askable_map import AskableMap
 from tsfusion.tsdf.device.device_blocks import DeviceBlocks
 from tsfusion.tsdf.device.device_integrator import DeviceIntegrator, DeviceRayBuffers
 from tsfusion.tsdf.device.device_trial import device_for
-from tsfusion.tsdf.files import checkpoint, map_history, voxel_arrays
+from tsfusion.tsdf.files import checkpoint, map_history, saved_map, voxel_arrays
 from tsfusion.tsdf.files.map_history import HELD
 from tsfusion.tsdf.integration.integrator import Integrator, KeyframeQuota
 from tsfusion.tsdf.integration.ray_buffers import RayBuffers, keyframes_of_every_kind
@@ -469,12 +469,12 @@ class Volume(AskableMap):
         """
         with ExitStack() as opening, checkpoint.reading(Path(path)) as (header, chunks):
             volume = cls(
-                checkpoint.loaded_config(header, threads, changed), memory_bytes=memory_bytes, cache=cache
+                saved_map.loaded_config(header, threads, changed), memory_bytes=memory_bytes, cache=cache
             )
             store = volume._store
             opening.enter_context(store.opening(header.blocks))
             digest = begin_hash(header.config.voxel_size)
-            checkpoint.fill(store, Path(path), header, chunks, digest)
+            saved_map.fill(store, Path(path), header, chunks, digest)
             store.clear.replace(header.clear_blocks(Path(path)))
             volume.keyframes = header.keyframes
             volume.held = HeldSensor(header.meta.pop(HELD, None))
@@ -506,9 +506,9 @@ class Volume(AskableMap):
             InvalidConfig, CheckpointError: as `load`; the map's own hash is not compared.
         """
         with checkpoint.reading(Path(path), is_checked=is_checked) as (header, chunks):
-            volume = cls(checkpoint.loaded_config(header, None, changed))
+            volume = cls(saved_map.loaded_config(header, None, changed))
             halo = 1 + volume._halo
-            checkpoint.fill_box(volume._store, header, chunks, np.array(low) - halo, np.array(high) + halo)
+            saved_map.fill_box(volume._store, header, chunks, np.array(low) - halo, np.array(high) + halo)
             volume.held = HeldSensor(header.meta.get(HELD))
         return volume
 

@@ -15,7 +15,7 @@ import msgspec
 from tsfusion.core import process
 from tsfusion.core.config import DEFAULT_MAP
 from tsfusion.pipelines.runs.target_server import Target
-from tsfusion.viewer.page.page_server import check_installed, listen, parse_place
+from tsfusion.viewer.page.page_guard import check_installed, listen, parse_place
 from tsfusion.wire.sockets import sockets
 from tsfusion.wire.sockets.curve import ClientKeys
 

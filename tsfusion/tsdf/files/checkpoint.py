@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-r"""A saved map: one file, written whole or not at all, verified when read on the way into a map.
+r"""A saved map: one file, written whole or not at all, verified when read.
 
     TSFMAP1\n | header | chunk … | digest      each but the first: uint32 length, then its bytes
 
@@ -10,11 +10,11 @@ key order (a sum of maps has shorter chunks among them). The digest is blake2b-1
 import hashlib
 import os
 import struct
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 
 import msgspec
 import numpy as np
@@ -22,21 +22,14 @@ import zstandard
 from numpy.typing import NDArray
 
 from tsfusion.core import durable_files
-from tsfusion.core.config import (
-    LIMIT_SETTINGS,
-    RUN_SETTINGS,
-    SYMMETRIC,
-    VIEW_SETTINGS,
-    VolumeConfig,
-    override,
-)
-from tsfusion.core.errors import CheckpointError, DamagedCheckpoint, InvalidConfig
+from tsfusion.core.config import SYMMETRIC, VolumeConfig
+from tsfusion.core.errors import CheckpointError, DamagedCheckpoint
 from tsfusion.core.process import SideThread
-from tsfusion.kernels.integration import integrate
 from tsfusion.tsdf.files import map_history
-from tsfusion.tsdf.store import clear_blocks
-from tsfusion.tsdf.store.block_store import BlockStore, unpack_keys
 from tsfusion.tsdf.store.growing_array import LAYER_DTYPES
+
+if TYPE_CHECKING:
+    from tsfusion.tsdf.store.clear_blocks import ClearCounts
 
 MAGIC = b"TSFMAP1\n"
 CHUNK = 1024  # blocks
@@ -60,8 +53,10 @@ class CheckpointHeader(msgspec.Struct, kw_only=True):
     blocks: int = 0
     clear: bytes = b""  # blocks that keyframes look through (`clear_blocks.encoded`)
 
-    def clear_blocks(self, path: Path) -> "clear_blocks.ClearCounts":
+    def clear_blocks(self, path: Path) -> "ClearCounts":
         """Blocks that keyframes look through, with the number of keyframes. Raises DamagedCheckpoint."""
+        from tsfusion.tsdf.store import clear_blocks  # with Taichi
+
         try:
             return clear_blocks.decoded(self.clear, self.config.max_blocks)
         except ValueError as error:
@@ -394,86 +389,3 @@ def _read_exactly(file: BinaryIO, size: int, path: Path) -> bytes:
     if size > os.fstat(file.fileno()).st_size or len(content := file.read(size)) != size:
         raise DamagedCheckpoint(f"{path} is cut short")
     return content
-
-
-def fill(
-    store: BlockStore,
-    path: Path,
-    header: CheckpointHeader,
-    chunks: Iterable[Chunk],
-    digest: "hashlib.blake2b",
-) -> None:
-    """Put the blocks of a checkpoint into an empty store, and their keys and sums into a digest.
-
-    Raises CheckpointError for other layers than the store's, or for impossible blocks.
-    """
-    layers = store.layers()
-    if not layers.keys() - {"hits"} <= {*header.layers} <= layers.keys():  # earlier versions count none
-        raise CheckpointError(f"{path} is of another version: it has layers {header.layers}")
-    checked = 0
-    with SideThread() as side:
-        for chunk in chunks:
-            keys = np.empty(chunk.blocks, np.int64)
-            chunk.fill(keys)
-            store.insert(keys)
-            for name in header.layers:
-                chunk.fill(layers[name][chunk.first : store.count])
-            store.note_written(np.arange(chunk.first, store.count))
-            store.keep_within_memory()
-            # The hash covers runs of 1024, wherever the file's chunks end
-            while store.count - checked >= CHUNK or checked < store.count == header.blocks:
-                end = min(checked + CHUNK, store.count)
-                side.do(partial(_check_in, path, store, slice(checked, end), digest))
-                checked = end
-        side.wait()
-
-
-def fill_box(
-    store: BlockStore,
-    header: CheckpointHeader,
-    chunks: Iterable[Chunk],
-    low: NDArray[np.int64],
-    high: NDArray[np.int64],
-) -> None:
-    """Put the blocks low ≤ (x, y, z) < high of a checkpoint into an empty store.
-
-    A chunk without such a block is unpacked only up to its keys.
-    """
-    for chunk in chunks:
-        keys = np.empty(chunk.blocks, np.int64)
-        chunk.fill(keys)
-        blocks = unpack_keys(keys)
-        inside = ((blocks >= low) & (blocks < high)).all(axis=1)
-        if not inside.any():
-            continue
-        first = store.count
-        store.insert(keys[inside])
-        for name in header.layers:
-            rows = np.empty((chunk.blocks, CUBE), LAYER_DTYPES[name])
-            chunk.fill(rows)
-            store.layers()[name][first : store.count] = rows[inside]
-        store.note_written(np.arange(first, store.count))
-    store.measure_bounds()
-
-
-def _check_in(path: Path, store: BlockStore, blocks: slice, digest: "hashlib.blake2b") -> None:
-    """Hash blocks just read, and measure their bounds."""
-    keys, sums = store.keys[blocks], store.sums[blocks]
-    store.bounds[blocks] = (sums & integrate.WEIGHT_MASK).max(axis=1)
-    before = store.keys[max(blocks.start - 1, 0) : blocks.stop]
-    if (np.diff(before) <= 0).any() or not store.bounds[blocks].all():
-        raise DamagedCheckpoint(f"{path} is malformed: its blocks are empty or out of order")
-    digest.update(keys.data)
-    digest.update(sums.data)
-
-
-def loaded_config(header: CheckpointHeader, threads: int | None, changed: Mapping[str, Any]) -> VolumeConfig:
-    """Settings of a saved map, with the changed ones."""
-    saved = header.config
-    fixed = {name for name in changed if name not in (*VIEW_SETTINGS, *LIMIT_SETTINGS, *RUN_SETTINGS)}
-    if saved.model().regularizer != "off" and changed.get("smoothness") not in (None, saved.smoothness):
-        fixed.add("smoothness")  # it has smoothed along rays already
-    if fixed:
-        raise InvalidConfig(f"a saved map cannot change {', '.join(sorted(fixed))}; fuse it anew")
-    config = override(msgspec.structs.replace(saved, threads=threads, arch="cpu"), **changed)
-    return override(config, max_blocks=max(config.max_blocks, header.blocks))

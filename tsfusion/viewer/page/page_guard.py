@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Guard of a page: requests are judged by their Host, Origin and token.
+"""Guard of a page: requests are judged by their Host, Origin and token. The place where it is served.
 
 A foreign page can make a browser send requests to this machine, and a foreign name can be made to lead to it:
 so Host must name this server, and the Origin of a WebSocket must be that Host. Beyond loopback, a token must
@@ -13,17 +13,21 @@ import secrets
 import socket
 from http import HTTPStatus
 from http.cookies import CookieError, SimpleCookie
+from importlib.util import find_spec
 from ipaddress import ip_address
 from typing import NamedTuple, Protocol
 from urllib.parse import parse_qs
 
-from tsfusion.core.errors import InvalidConfig
+from tsfusion.core.errors import InvalidConfig, MissingDependency, TransportError
+from tsfusion.viewer import LISTEN
+from tsfusion.wire.sockets import sockets
 from tsfusion.wire.sockets.sockets import is_loopback
 
 _TOKEN = re.compile(r"[\w.~-]{8,128}", re.ASCII)  # as it stands in an address
 _HOST = re.compile(r"(?:\[(?P<host6>[0-9A-Fa-f:.]+)\]|(?P<host>[\w.-]+))(?::[0-9]{1,5})?", re.ASCII)
 _ANY = ("0.0.0.0", "::")
 _FARAWAY = "192.0.2.1"  # of no machine (RFC 5737)
+_INSTALL = "the live page needs viser; install it with: pip install '.[viewer]' in your clone of tsfusion"
 
 
 class Headers(Protocol):
@@ -169,3 +173,44 @@ def _own_address(host: str) -> str:
             return str(probe.getsockname()[0])
     except OSError:  # no network
         return "127.0.0.1" if family == socket.AF_INET else "::1"
+
+
+def check_installed() -> None:
+    """Raise MissingDependency where viser is not installed, without loading it."""
+    if find_spec("viser") is None:
+        raise MissingDependency(_INSTALL)
+
+
+def parse_place(text: str) -> tuple[str, int]:
+    """Host and port of `HOST:PORT`; an IPv6 address stands in brackets.
+
+    Raises:
+        InvalidConfig: for anything else.
+    """
+    try:
+        host, port = sockets.parse_address(f"tcp://{text}")
+    except InvalidConfig:
+        raise InvalidConfig(
+            f"a page listens at HOST:PORT, such as {LISTEN}, of IPv6 [::1]:5558, port 0 = a free one; "
+            f"got {text!r}"
+        ) from None
+    return host.replace("*", "0.0.0.0"), port
+
+
+def listen(host: str, port: int) -> socket.socket:
+    """A socket that listens there; port 0 = a free one.
+
+    Raises:
+        TransportError: when the port is taken, or there is no such address here.
+    """
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    both = host == "::" and socket.has_dualstack_ipv6()
+    try:
+        return socket.create_server((host, port), family=family, dualstack_ipv6=both)
+    except OSError as error:
+        place = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+        why = (error.strerror or str(error)).partition(" (while")[0]
+        raise TransportError(
+            f"cannot show a page at {place}: {why}; choose another place, such as "
+            "127.0.0.1:0 (a free port), or end what has it"
+        ) from error

@@ -16,17 +16,14 @@ from contextlib import AsyncExitStack, ExitStack, asynccontextmanager
 from functools import lru_cache, partial
 from http import HTTPStatus
 from importlib import resources
-from importlib.util import find_spec
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from msgspec import MsgspecError
 
-from tsfusion.core.errors import InvalidConfig, MissingDependency, TransportError
-from tsfusion.viewer import LISTEN
+from tsfusion.core.errors import TransportError
 from tsfusion.viewer.page import page_messages
-from tsfusion.viewer.page.page_guard import PageGuard, Refusal, is_websocket
-from tsfusion.wire.sockets import sockets
+from tsfusion.viewer.page.page_guard import PageGuard, Refusal, check_installed, is_websocket, listen
 
 if TYPE_CHECKING:
     import viser
@@ -44,7 +41,6 @@ _FULL = f"{BROWSERS} browsers show this page already: close one"
 _MISFITS = (TypeError, ValueError, LookupError, AttributeError, OSError, RuntimeError)
 
 log = logging.getLogger(__name__)
-_INSTALL = "the live page needs viser; install it with: pip install '.[viewer]' in your clone of tsfusion"
 
 
 class PageServer:
@@ -249,44 +245,3 @@ def calm(callback: Callable[..., object]) -> Callable[..., None]:
             log.warning("a request of a browser failed: %s: %s", type(error).__name__, error)
 
     return call
-
-
-def check_installed() -> None:
-    """Raise MissingDependency where viser is not installed, without loading it."""
-    if find_spec("viser") is None:
-        raise MissingDependency(_INSTALL)
-
-
-def parse_place(text: str) -> tuple[str, int]:
-    """Host and port of `HOST:PORT`; an IPv6 address stands in brackets.
-
-    Raises:
-        InvalidConfig: for anything else.
-    """
-    try:
-        host, port = sockets.parse_address(f"tcp://{text}")
-    except InvalidConfig:
-        raise InvalidConfig(
-            f"a page listens at HOST:PORT, such as {LISTEN}, of IPv6 [::1]:5558, port 0 = a free one; "
-            f"got {text!r}"
-        ) from None
-    return host.replace("*", "0.0.0.0"), port
-
-
-def listen(host: str, port: int) -> socket.socket:
-    """A socket that listens there; port 0 = a free one.
-
-    Raises:
-        TransportError: when the port is taken, or there is no such address here.
-    """
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    both = host == "::" and socket.has_dualstack_ipv6()
-    try:
-        return socket.create_server((host, port), family=family, dualstack_ipv6=both)
-    except OSError as error:
-        place = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
-        why = (error.strerror or str(error)).partition(" (while")[0]
-        raise TransportError(
-            f"cannot show a page at {place}: {why}; choose another place, such as "
-            "127.0.0.1:0 (a free port), or end what has it"
-        ) from error
