@@ -173,7 +173,7 @@ def _serve(gateway: Gateway, signals: list[int], watchdog: Watchdog) -> int:
     log.info("ending: what is in the journals is fused and saved first")
     watchdog.stopping()
     gateway.stop_accepting()
-    while not gateway.maps.settled and len(signals) == 1:
+    while not gateway.maps.ended and len(signals) == 1:
         gateway.step()
         watchdog.pet()
     drained = gateway.maps.drained

@@ -780,7 +780,7 @@ def test_a_fusers_own_lines_obey_log_level(level: str, shown: list[str]) -> None
 
 
 def held(fuser: Fuser, link: Link) -> bool:
-    return isinstance(link.last(), fuser_messages.Held) and fuser.is_held
+    return isinstance(link.last(), fuser_messages.Held) and fuser.is_stuck
 
 
 def test_a_journal_that_is_away_is_waited_for_and_the_order_kept(
@@ -801,7 +801,7 @@ def test_a_journal_that_is_away_is_waited_for_and_the_order_kept(
     fuser.go_on()
     done = [message for message, _ in link.sent if isinstance(message, fuser_messages.Done)]
     assert [(one.index, one.reason) for one in done] == [(0, None), (1, None)]
-    assert (fuser.is_held, fuser.exit_status) == (False, None)
+    assert (fuser.is_stuck, fuser.exit_status) == (False, None)
 
 
 def test_a_keyframe_whose_segment_alone_is_gone_is_rejected_after_a_while(

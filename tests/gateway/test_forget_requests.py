@@ -57,7 +57,7 @@ class Asked:
         self.step()
 
     def step(self, *, settled: bool = False, unavailable: int = 0) -> None:
-        self.map.step(settled=settled, in_map=lambda _: self.in_map, unavailable=unavailable)
+        self.map.step(is_server_answered=settled, in_map=lambda _: self.in_map, unavailable=unavailable)
 
     def find(self, *seqs: int, forgotten: tuple[int, ...] = ()) -> None:
         """Answer what was asked last."""

@@ -402,7 +402,7 @@ def test_a_journal_that_is_away_is_said_although_no_keyframe_comes_until_it_is_b
         gateway.step()
     assert default(gateway).fuser_restarts == 0  # it would begin with an empty map
     assert not journal_folder(tmp_path).exists()
-    assert hosted.settled  # a server that is to end does not wait for it
+    assert hosted.ended  # a server that is to end does not wait for it
     (tmp_path / "aside").rename(journal_folder(tmp_path))
     stepped(gateway, lambda: not default(gateway).problem)
     assert default(drained(gateway)).keyframes_fused == 4

@@ -74,7 +74,7 @@ def test_maps_of_the_state_folder_begin_when_they_are_asked_for_or_one_by_one(tm
         for _ in range(3):
             served.step()
         assert begun() == ["default"]
-        assert (maps.warm, maps.drained, maps.settled) == (True, True, True)
+        assert (maps.warm, maps.drained, maps.ended) == (True, True, True)
         assert served.gateway.health().maps["shed"].state == "opening"
         served.until(lambda: isinstance(served.greet(link, "house"), Welcome))
         assert begun() == ["default", "house"]

@@ -12,12 +12,12 @@ from tsfusion.core import durable_files
 from tsfusion.core.errors import JournalError, TsfusionError
 
 _POLL_S = 0.05
-_held: WeakSet[ExitStack] = WeakSet()
+_locks: WeakSet[ExitStack] = WeakSet()
 
 
 def _let_go() -> None:
     """Close the locks in a forked process: they are its parent's, and end with that."""
-    for lock in list(_held):
+    for lock in list(_locks):
         lock.close()
 
 
@@ -40,7 +40,7 @@ def hold(folder: Path, name: str | None = None, *, wait: float = 0.0) -> ExitSta
     with ExitStack() as lock:
         lock.callback(os.close, descriptor)
         _lock(descriptor, time.monotonic() + wait)
-        _held.add(made := lock.pop_all())
+        _locks.add(made := lock.pop_all())
         return made
 
 

@@ -213,9 +213,9 @@ def uninterrupted() -> Iterator[None]:
     def later(number: int, frame: FrameType | None) -> None:
         came.append((number, frame))
 
-    for held in (signal.SIGINT, signal.SIGTERM):
-        if _signal.getsignal(held) is not None:  # one that Python did not set cannot be put back
-            usual[held] = _signal.signal(held, later)
+    for caught in (signal.SIGINT, signal.SIGTERM):
+        if _signal.getsignal(caught) is not None:  # one that Python did not set cannot be put back
+            usual[caught] = _signal.signal(caught, later)
     _holds_back = True
     try:
         yield

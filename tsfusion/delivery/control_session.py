@@ -157,8 +157,8 @@ class ControlSession:
             self.rewind()
 
     def _ping(self, now: float) -> None:
-        settled = self.welcome is None or self.clock.count >= SAMPLES
-        self._ping_due = now + (_PING_INTERVAL if settled else _FIRST_PINGS_INTERVAL)
+        is_clock_known = self.welcome is None or self.clock.count >= SAMPLES
+        self._ping_due = now + (_PING_INTERVAL if is_clock_known else _FIRST_PINGS_INTERVAL)
         self._say_how_it_is()
 
     def take_leave(self) -> None:

@@ -95,8 +95,8 @@ class Fuser:
         self._folder = Path(begin.folder)
         self._since_checkpoint = 0
         self._orders: deque[fuser_messages.Fuse] = deque()  # not answered; the first cannot be read for now
-        self._held_since: float | None = None  # time.monotonic(); None = nothing is held
-        self._retry_at = 0.0  # time.monotonic(), of what is held
+        self._stuck_since: float | None = None  # time.monotonic(); None = nothing is stuck
+        self._retry_at = 0.0  # time.monotonic(), of what is stuck
         self._answered = 0  # records of this process
         self._more_waits = False  # at the gateway
         self._epoch = f"{time.monotonic_ns():x}"  # of the answers of this process
@@ -161,7 +161,7 @@ class Fuser:
             "warm": Chore(lambda _: None if self._warming is None else mesh.quiet_wait, self._warm),
             "refine": Chore(lambda _: mesh.refine_wait(), mesh.refine),
             "retry": Chore(
-                lambda _: max(self._retry_at - time.monotonic(), 0.0) if self.is_held else None, self.go_on
+                lambda _: max(self._retry_at - time.monotonic(), 0.0) if self.is_stuck else None, self.go_on
             ),
         }
 
@@ -217,7 +217,7 @@ class Fuser:
             self.exit_status = 0 if self._checkpoint() else 1
 
     @property
-    def is_held(self) -> bool:
+    def is_stuck(self) -> bool:
         """True if records wait for one that cannot be read for now."""
         return bool(self._orders)
 
@@ -225,7 +225,7 @@ class Fuser:
         """Take the records that were ordered, in order, up to one that cannot be read now."""
         while self._orders and self.exit_status is None and self._fuse(self._orders[0]):
             self._orders.popleft()
-            self._held_since = None
+            self._stuck_since = None
 
     @property
     def idle_after_ms(self) -> int:
@@ -336,10 +336,10 @@ class Fuser:
         now = time.monotonic()
         if not error.temporary:
             return False
-        if self._held_since is None:
+        if self._stuck_since is None:
             log.warning("%s; it is tried again", error)
-            self._held_since = now
-        is_over = now - self._held_since >= _PATIENCE_S
+            self._stuck_since = now
+        is_over = now - self._stuck_since >= _PATIENCE_S
         is_away = self._journal_is_away()
         if is_over and not is_away and error.errno == errno.ENOENT:
             return False

@@ -60,7 +60,7 @@ class PoseMover:
         self._expects, self._rest_factor = expects, rest_factor
         self._seconds = 0.0
         self._next = 0.0  # time.monotonic()
-        self._held_since: float | None = None
+        self._stuck_since: float | None = None
         self._said = 0.0
         self._given_up: Counter[str] = Counter()  # by reason
 
@@ -73,7 +73,7 @@ class PoseMover:
         """Seconds until there is a move to do: at once when idle, otherwise after a pause; None = never."""
         if not self.waiting:
             return None
-        return 0.0 if idle and self._held_since is None else max(self._next - time.monotonic(), 0.0)
+        return 0.0 if idle and self._stuck_since is None else max(self._next - time.monotonic(), 0.0)
 
     def progress(self) -> CorrectionProgress:
         """Progress of the map with corrected poses."""
@@ -109,7 +109,7 @@ class PoseMover:
         else:
             self._poses.moved()
             self.moved += 1
-        self._held_since = None
+        self._stuck_since = None
         now = time.monotonic()
         self._seconds += now - began
         self._next = now + self._rest_factor * (now - began)
@@ -149,14 +149,14 @@ class PoseMover:
             return False
         now = time.monotonic()
         if self._is_away():
-            self._held_since = self._held_since or now
+            self._stuck_since = self._stuck_since or now
             return True
         if error.errno == errno.ENOENT and self._is_deleted(move.position.segment):
             return False
-        if self._held_since is None:
+        if self._stuck_since is None:
             log.warning("%s; it is tried again", error)
-            self._held_since = now
-        return now - self._held_since < _PATIENCE_S
+            self._stuck_since = now
+        return now - self._stuck_since < _PATIENCE_S
 
     def _is_deleted(self, segment: int) -> bool:
         """True if a segment was deleted to keep the journal to its limit: then a later one is the first."""

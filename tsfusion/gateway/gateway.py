@@ -49,8 +49,8 @@ _REPLIES_SHARE = 4  # one fourth of the memory is for meshes and answers that wa
 _PLACE_KEPT = 0.5  # seconds for which it is known at which server a map is
 _MOST_PLACES = 64
 _OF_AN_OPEN_MAP = frozenset({"forget", "ask", "status", "mesh"})
-_MOST_HELD = 32  # commands that wait for their map to open
-_HELD_SHARE = 0.9  # of a command's time: the answer is to come within it
+_MOST_DEFERRED = 32  # commands that wait for their map to open
+_WAIT_SHARE = 0.9  # of a command's time: the answer is to come within it
 Handlers = dict[sockets.AnySocket, Callable[[list[zmq.Frame]], None]]
 
 
@@ -96,7 +96,7 @@ class Gateway:
             ports, metrics, self._refused, unread=unread, max_bytes=most_unread, rate=server.quota_questions
         )
         self._places: dict[str, tuple[tuple[str, str] | None, float]] = {}  # map → where it is, until when
-        self._held: list[tuple[str, float, Callable[[], None]]] = []  # map, until when, what is done then
+        self._deferred: list[tuple[str, float, Callable[[], None]]] = []  # map, until when, what is done then
         self._publishing: dict[str, bool] = {}  # map → whether its fuser was told to send triangles
         self._limits = ConnectionLimits(ports, access, self._refused, server.memory_bytes)
         self._condition = ServerCondition(
@@ -142,8 +142,8 @@ class Gateway:
         self.moves.step()
         self._questions.step()
         now = time.monotonic()
-        for one in [one for one in self._held if now > one[1] or not self._opens(one[0])]:
-            self._held.remove(one)
+        for one in [one for one in self._deferred if now > one[1] or not self._opens(one[0])]:
+            self._deferred.remove(one)
             one[2]()
         self._scans.step()
         self._update_fusers()
@@ -240,7 +240,7 @@ class Gateway:
         points: list[zmq.Frame],
         client: str,
         *,
-        was_held: bool = False,
+        has_waited: bool = False,
     ) -> None:
         maps = self._admission.maps_of(client)
         if command.name == "ping":
@@ -265,13 +265,13 @@ class Gateway:
             self.ports.reply(identity, reply)
         elif (
             command.name in _OF_AN_OPEN_MAP
-            and not was_held
-            and len(self._held) < _MOST_HELD
+            and not has_waited
+            and len(self._deferred) < _MOST_DEFERRED
             and self._opens(command.map)
         ):
-            until = time.monotonic() + _HELD_SHARE * min(questions.LONGEST_S, command.timeout_s)
-            again = partial(self._on_command, identity, command, points, client, was_held=True)
-            self._held.append((command.map, until, again))
+            until = time.monotonic() + _WAIT_SHARE * min(questions.LONGEST_S, command.timeout_s)
+            again = partial(self._on_command, identity, command, points, client, has_waited=True)
+            self._deferred.append((command.map, until, again))
         elif command.name == "forget":
             self._on_forget(identity, command, client)
         elif command.name in ("move", "hand_over"):

@@ -119,7 +119,7 @@ class _Exporter:
         self._final = final
         self._names: dict[bytes, str] = {}
         self._has_clock: dict[bytes, bool] = {}  # by session
-        self._held: dict[bytes, tuple[Path, Record]] = {}
+        self._first: dict[bytes, tuple[Path, Record]] = {}
         self._seen: set[tuple[bytes, int]] = set()
         self._stamps: set[tuple[bytes, int]] = set()
         self._problems: list[JournalFault] = []
@@ -137,7 +137,7 @@ class _Exporter:
             elif not step.is_correction and (step.session, step.seq) not in self._seen:
                 self._seen.add((step.session, step.seq))
                 self._add(path, step)
-        for path, record in self._held.values():
+        for path, record in self._first.values():
             self._write(path, record)
         if not self._keyframes:
             raise JournalError(f"no keyframes in {place.path}; `tsfusion journal info` says what it holds")
@@ -153,14 +153,14 @@ class _Exporter:
         except (DecodeError, IndexError) as error:
             self._refuse(path, record, error)
             return
-        held = self._held.pop(record.session, None)
+        first = self._first.pop(record.session, None)
         if record.session not in self._has_clock:
-            if not has_stamp and held is None:
-                self._held[record.session] = path, record
+            if not has_stamp and first is None:
+                self._first[record.session] = path, record
                 return
             self._has_clock[record.session] = has_stamp
-        if held is not None:
-            self._write(*held)
+        if first is not None:
+            self._write(*first)
         self._write(path, record)
 
     def _write(self, path: Path, record: Record) -> None:

@@ -47,7 +47,7 @@ _SHARE = 0.008  # of a core, for putting updates into tiles: many at once cost l
 _TOGETHER = (0.25, 1.5)  # seconds of updates that are taken at once, at least and at most
 _MOST_UPDATES = 64  # that wait for that
 _BEHIND = 50  # voxels that a following camera is behind a scanner
-_SETTLED = 0.25  # seconds that a time slider rests before the map is rewound
+_SLIDER_REST_S = 0.25  # seconds that a time slider rests before the map is rewound
 _DRAW_SHARE = 0.01  # of a core, for sending tiles and marks: what changes meanwhile is sent once
 _DRAW = (0.25, 1.0)  # seconds between two sendings to browsers, at least and at most
 _OFTEN, _SELDOM = 0.3, 1.0  # seconds between two looks at cameras, and at scales and states
@@ -213,7 +213,7 @@ class LivePage:
 
     def _obey(self, now: float) -> None:
         """Do what browsers have asked for."""
-        orders = self._panel.take_orders(now, _SETTLED)
+        orders = self._panel.take_orders(now, _SLIDER_REST_S)
         if orders.map_name is not None and orders.map_name != self.map_name:
             self._feed.choose(orders.map_name)
         if orders.place is not None:

@@ -298,7 +298,7 @@ def settle(path: Path) -> None:
 
 
 def test_scans(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(watched_folder, "_SETTLED_S", 60.0)  # a loaded machine is not to reach it
+    monkeypatch.setattr(watched_folder, "_AT_REST_S", 60.0)  # a loaded machine is not to reach it
     points = np.abs(np.random.default_rng(0).normal(size=(100, 4))).astype(np.float32)
     write(tmp_path, "velodyne/000000.bin", points.tobytes())
     settle(tmp_path / "velodyne" / "000000.bin")
@@ -384,8 +384,8 @@ def test_files_that_go_away_while_they_are_read(tmp_path: Path, monkeypatch: pyt
         rgbd(tmp_path, number)
     is_whole = watched_folder.is_whole
 
-    def then_gone(path: Path, *, settled: bool) -> bool:
-        found = is_whole(path, settled=settled)
+    def then_gone(path: Path, *, is_at_rest: bool) -> bool:
+        found = is_whole(path, is_at_rest=is_at_rest)
         if path.stem.endswith("0"):
             path.unlink()
         return found

@@ -124,7 +124,7 @@ class FuserSupervisor:
         self.finishing = self._finish_sent = False
         self.restarts = 0
         self.failed = ""  # why no process stays alive; empty = one does; tried again, ever more rarely
-        self.held = ""  # why its next record cannot be read for now; empty = it can
+        self.stuck = ""  # why its next record cannot be read for now; empty = it can
         self._was_ready = False
         try:
             self._start()
@@ -135,7 +135,7 @@ class FuserSupervisor:
         self._process = self._spares.take(self._map, self._begin.volume, waits=self.waits)
         self.is_prepared = False
         self.ready = False  # it has opened the map and compiled the kernels
-        self.held = ""
+        self.stuck = ""
         self._restart_at = 0.0
         self._silence = FuserSilence(self._process.pid)
         self._last_message = self._ready_since = time.monotonic()
@@ -205,8 +205,8 @@ class FuserSupervisor:
         """Reason why no keyframe is fused now, and what to do; empty = they are."""
         if self.failed or self._restart_at:
             return self.failed
-        if self.held:
-            return self.held
+        if self.stuck:
+            return self.stuck
         silence, timeout = self._silence, self._server.fuser_timeout
         process_ = f"its fuser (process {self.pid})"
         if silence.stopped >= min(STANDS_STILL_AFTER, timeout / 2):
@@ -289,11 +289,11 @@ class FuserSupervisor:
             self.in_flight.popleft()
             if self._blame.get(message.index, 0) < GIVE_UP_AT:  # one that is given up stays so
                 self._blame.pop(message.index, None)
-            self.failed = self.held = ""
+            self.failed = self.stuck = ""
             if self._last_message - self._ready_since > _STEADY_AFTER:
                 self._early_deaths = 0
         elif isinstance(message, fuser_messages.Held):
-            self.held = message.message
+            self.stuck = message.message
         elif isinstance(message, fuser_messages.Saved) and message.written:
             self._early_deaths = 0
             self._blame.pop(fuser_messages.MOVING, None)

@@ -38,7 +38,7 @@ _LEFT_FILES = ("*.damaged*", "journal/*.replaced", "journal/*.damaged*")
 Send = Callable[[fuser_messages.ToFuser], bool]
 Append = Callable[[bytes, NDArray[np.int64]], None]
 OnAnswer = Callable[[Forgotten | str], None]
-_Stage = Literal["ask", "find", "settle", "save", "erase"]
+_Stage = Literal["ask", "find", "leave", "save", "erase"]
 
 
 class ForgetRequest:
@@ -100,13 +100,13 @@ class Forgetting:
         """Begin again with a new fuser: it knows nothing of what the one before was asked."""
         if self._requests:
             request = self._requests[0]
-            request.stage = {"find": "ask", "save": "settle"}.get(request.stage, request.stage)  # type: ignore[assignment]
+            request.stage = {"find": "ask", "save": "leave"}.get(request.stage, request.stage)  # type: ignore[assignment]
 
-    def step(self, *, settled: bool, in_map: Callable[[bytes], int], unavailable: int) -> None:
+    def step(self, *, is_server_answered: bool, in_map: Callable[[bytes], int], unavailable: int) -> None:
         """Do the next piece of work of the first request.
 
         Args:
-            settled: whether the map has done all that the server's own records ask.
+            is_server_answered: whether the map has done all that the server's own records ask.
             in_map: the highest number of a session that the fuser has answered. What it has not cannot be
                 erased: after a crash nobody would hand it out, and it would count as lost.
             unavailable: keyframes that stay where they were fused though they should not.
@@ -119,7 +119,7 @@ class Forgetting:
             request.unavailable = unavailable
             if self._send(Find(self._number, request.selection)):
                 request.stage = "find"
-        elif request.stage == "settle" and settled and request.is_answered(in_map):
+        elif request.stage == "leave" and is_server_answered and request.is_answered(in_map):
             if unavailable > request.unavailable:
                 count = count_of(unavailable - request.unavailable, "keyframe")
                 stay = f"{count} cannot be taken out of the map: the log says why"
@@ -151,7 +151,7 @@ class Forgetting:
             return
         self._log(request)
         if request.erase:
-            request.stage = "settle"
+            request.stage = "leave"
         else:
             self._answer(self._result(request))
 

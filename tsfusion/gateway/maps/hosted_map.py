@@ -121,9 +121,9 @@ class HostedMap:
         return self.outcomes.moves.waiting + sum(self.backlog.leaving.values())
 
     @property
-    def settled(self) -> bool:
+    def ended(self) -> bool:
         """True if the map is drained, or will not be soon: its fuser cannot be kept alive, or read."""
-        return self.drained or bool(self.fuser.failed or self.fuser.held) or self.records.disk.is_away
+        return self.drained or bool(self.fuser.failed or self.fuser.stuck) or self.records.disk.is_away
 
     def idle_since(self, since: float) -> bool:
         """True if no keyframe waits, nor came after `since` (`time.monotonic()`)."""
@@ -251,7 +251,7 @@ class HostedMap:
             own = sessions.get(SERVER_SESSION)
             is_answered = own is None or own.in_map >= own.durable
             self.forgetting.step(
-                settled=is_answered and not moves.waiting,
+                is_server_answered=is_answered and not moves.waiting,
                 in_map=lambda key: session.in_map if (session := sessions.get(key)) else 0,
                 unavailable=moves.unavailable,
             )

@@ -387,9 +387,9 @@ class MapRegistry:
         return all(hosted.drained for hosted in self._begun)
 
     @property
-    def settled(self) -> bool:
+    def ended(self) -> bool:
         """True if every map that has begun is drained, or never will be."""
-        return all(hosted.settled for hosted in self._begun)
+        return all(hosted.ended for hosted in self._begun)
 
     def finish(self) -> bool:
         """Have every fuser write its checkpoint and end. Call it until all have ended, which it returns."""

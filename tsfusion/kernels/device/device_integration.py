@@ -200,7 +200,7 @@ def add_update(listed: ti.template(), i, at, sign_, sums: ti.template()):
 def vote_color(
     at, packed, kind, sign_, told: ti.template(), color_rgn: ti.template(), color_b: ti.template()
 ):
-    """Add a vote 0xRRGGBB for a voxel's colour, or a hit. A settled colour stays, as in
+    """Add a vote 0xRRGGBB for a voxel's colour, or a hit. A full colour stays, as in
     `integrate.vote_color`."""
     slot, o = at // CUBE, at % CUBE
     taken = COLOR_LIMIT

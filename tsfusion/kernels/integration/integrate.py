@@ -65,7 +65,7 @@ WEIGHT_LIMIT = 1 << 26  # half of what the lane holds: going over, or below none
 QUANTA_PER_VOXEL = 60
 MAX_DISTANCE = 1023  # quanta: the widest half-width, 16 voxels, and one to spare
 FREE_SHIFT = 1  # a vote for free space before the band is half of one for a surface
-COLOR_LIMIT = 1 << 15  # votes after which a voxel's colour is settled and takes no more
+COLOR_LIMIT = 1 << 15  # votes after which a voxel's colour is full and takes no more
 CUBE = 512
 CHANGED = 255  # a block is dirty for all that follow its changes: a bit each
 
@@ -189,7 +189,7 @@ def vote_color(
     listed, kind, sign_, color_rgn: ti.template(), color_b: ti.template(), touched: ti.template(),
     atomically: ti.template(),
 ):  # fmt: skip
-    """Add a listed vote for a colour, or a hit. A count just below 2¹⁶ has gone below zero. A settled colour
+    """Add a listed vote for a colour, or a hit. A count just below 2¹⁶ has gone below zero. A full colour
     stays through every addition and removal: it is no longer a sum. Hits may go below zero: a map of an
     earlier version has not counted those that it took."""
     at, packed = ti.cast(listed >> 32, ti.i32), ti.cast(listed, ti.i32)

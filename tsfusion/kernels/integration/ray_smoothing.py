@@ -6,7 +6,7 @@
 y: the stored values after fusing the measurement, along the voxels the ray crosses; t: those voxels'
 own distances to the end point. With evenly spaced voxels D2 t = 0 and this is eq. 3; with every crossed
 voxel in the signal, spacing is uneven, and without t the penalty would bend a perfect ramp.
-A = I is the paper's; A = diag(W), scaled to mean 1, keeps settled voxels settled.
+A = I is the paper's; A = diag(W), scaled to mean 1, moves voxels of much weight little.
 
 Two passes, never in place: each ray solves against the frozen state and adds x̂ as integers; afterwards
 each voxel that was voted for becomes the mean of its x̂.

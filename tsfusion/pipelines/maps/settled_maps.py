@@ -166,7 +166,7 @@ def _catch_up(fuser: Fuser, records: list[journal.RecordEntry], watch: OnProgres
     for index, record in enumerate(records):
         place = (record.position, record.session, record.seq, record.client, record.world)
         fuser.handle(fuser_messages.Fuse(index, *place, is_correction=record.is_correction))
-        while fuser.is_held and fuser.exit_status is None:
+        while fuser.is_stuck and fuser.exit_status is None:
             time.sleep(_POLL_S)
             fuser.go_on()
         if fuser.exit_status is not None:

@@ -30,7 +30,7 @@ END_MARKERS = ("DONE", ".end")  # a file of this name ends the source
 SENSORS = {"depth": "kinect", "pair": "stereo", "points": "lidar"}
 
 _PAUSE_FACTOR = 10  # pause between two listings, at least, in times a listing took
-_SETTLED_S = 0.5  # seconds without a change after which a file without an end mark counts as complete
+_AT_REST_S = 0.5  # seconds without a change after which a file without an end mark counts as complete
 _OLDEST_S = 600.0  # file times before this are of another clock
 _FIRST_TRIES = 5  # frames that cannot be read and none before them that can: so it is with all
 _ENOUGH = 10  # names that tell what their fractions are
@@ -284,8 +284,8 @@ class WatchedFolder(LiveSource):
             self._colored = False  # no frame has colour
         files = [first] if second is None else [first, second]
         try:
-            settled = final or max(waited, time.time() - first.stat().st_mtime) > _SETTLED_S
-            if not all(is_whole(file, settled=settled) for file in files):
+            is_at_rest = final or max(waited, time.time() - first.stat().st_mtime) > _AT_REST_S
+            if not all(is_whole(file, is_at_rest=is_at_rest) for file in files):
                 return self._unreadable(first, f"{first} is not complete") if final else _WAIT
             if kind != "points" and self._camera is None and not self._find_camera(kind, first, final=final):
                 return _WAIT
@@ -381,11 +381,11 @@ def _layout_of(root: Path) -> FolderLayout | None:
     return next((one for one in LAYOUTS if one.is_in(root)), None)
 
 
-def is_whole(path: Path, *, settled: bool) -> bool:
-    """True if a file is complete, by the mark at its end; by its `settled` state where it has none."""
+def is_whole(path: Path, *, is_at_rest: bool) -> bool:
+    """True if a file is complete: by the mark at its end or, where it has none, once it is at rest."""
     if path.suffix.lower() in _ENDS:
         with path.open("rb") as file:
             file.seek(max(0, path.stat().st_size - len(_PNG_END)))
             return file.read().endswith(_ENDS[path.suffix.lower()])
     nbytes = path.stat().st_size
-    return settled and nbytes > 0 and not (path.suffix == ".bin" and nbytes % _POINT)
+    return is_at_rest and nbytes > 0 and not (path.suffix == ".bin" and nbytes % _POINT)

@@ -47,26 +47,26 @@ class Residency:
         """
         if self.nbytes <= budget or not len(stamps):
             return
-        held = self._held(-(-len(stamps) // GROUP))
-        total = int(held.sum())
+        in_memory = self._in_memory(-(-len(stamps) // GROUP))
+        total = int(in_memory.sum())
         if total > budget:
             newest = np.maximum.reduceat(stamps, np.arange(0, len(stamps), GROUP))
-            here = np.flatnonzero(held)
+            here = np.flatnonzero(in_memory)
             here = here[np.argsort(newest[here], kind="stable")]
-            freed = np.cumsum(held[here])
+            freed = np.cumsum(in_memory[here])
             leaving = here[: int(np.searchsorted(freed, total - _LOW * budget)) + 1]
             self._let_go(np.sort(leaving))
-            total -= int(held[leaving].sum())
+            total -= int(in_memory[leaving].sum())
         self._measured, self._shared = total, process.shared_rss_bytes()
 
-    def _held(self, groups: int) -> NDArray[np.int64]:
+    def _in_memory(self, groups: int) -> NDArray[np.int64]:
         """Bytes in memory of each of the first groups; of whole groups if the system does not tell."""
-        held = np.zeros(groups, np.int64)
+        in_memory = np.zeros(groups, np.int64)
         for layer in self._layers:
             pages = GROUP * layer.item_bytes // mmap.PAGESIZE  # of a group
             is_here = _pages_in_memory(layer.address // mmap.PAGESIZE, groups * pages)
-            held += is_here.reshape(groups, pages).sum(axis=1) * mmap.PAGESIZE
-        return held
+            in_memory += is_here.reshape(groups, pages).sum(axis=1) * mmap.PAGESIZE
+        return in_memory
 
     def _let_go(self, groups: NDArray[np.int64]) -> None:
         for first, end in _runs(groups):

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Sums of one map added to those of another, all or none of them.
 
-A voxel whose colour would have more votes than `COLOR_LIMIT` is settled: both colours are averaged by their
+A voxel whose colour would have more votes than `COLOR_LIMIT` is full: both colours are averaged by their
 votes, to one of so many. Smoothed values are not sums: a block of both maps falls back to raw values, as
 after a retraction; a block of one map keeps them.
 """
@@ -112,7 +112,7 @@ Colors = tuple[NDArray[np.int64], NDArray[np.int32]]  # rows of `color_rgn` and 
 
 
 def added_colors(here: Colors, there: Colors) -> Colors:
-    """Sum of the colours of the same blocks in two maps, (n, 512) each; settled ones are averaged."""
+    """Sum of the colours of the same blocks in two maps, (n, 512) each; full ones are averaged."""
     rgn, blue = here[0] + there[0], here[1] + there[1]
     if not ((here[0] | there[0] | rgn) & COLOR_LIMIT).any():  # fewer votes in both, and together
         return rgn, blue

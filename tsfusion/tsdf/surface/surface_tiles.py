@@ -200,8 +200,8 @@ class SurfaceTiles:
         """Keys of the map's blocks in some cubes, sorted in each, and the cube of each."""
         corners = SIDE * unpack_keys(np.array(numbers))
         keys = pack_keys((corners[:, None] + _INSIDE).reshape(-1, 3))
-        held = np.flatnonzero(self._store.slots_of(keys) >= 0)
-        return keys[held], held // len(_INSIDE)
+        there = np.flatnonzero(self._store.slots_of(keys) >= 0)
+        return keys[there], there // len(_INSIDE)
 
 
 class _Sized(Protocol):

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from tsfusion.geometry.mesh import Mesh
 
 WHOLE, BY_HAND, _FOLLOW = "Whole map", "By hand", "Follow "
-_SETTLED = 10.0  # seconds after a move of ours, in which a slow browser may still tell older places
+_SLOWEST_S = 10.0  # seconds after a move of ours, in which a slow browser may still tell older places
 _AGAIN = 1.0  # seconds after which a camera is moved once more that a new up direction has turned
 _MOVED = 0.02  # of the distance to the target: further away, somebody moved the camera
 _RENDER = 30.0  # seconds that a browser may take for a picture
@@ -192,7 +192,7 @@ class BrowserPanel:
         distance = float(np.linalg.norm(view.position - view.target))
         if float(np.linalg.norm(self._client.camera.position - view.position)) <= _MOVED * distance:
             self._has_arrived, self._is_elsewhere = True, False
-        elif self._has_arrived or time.monotonic() >= self._moved_at + _SETTLED:
+        elif self._has_arrived or time.monotonic() >= self._moved_at + _SLOWEST_S:
             self._camera.value, self._is_elsewhere = BY_HAND, False
         else:
             self._is_elsewhere = True

@@ -64,11 +64,11 @@ class SharedPanel:
             self._tables = gui.add_html(health_plots.text("No server is watched."))
             self.plots = HealthPlots(gui)
 
-    def take_orders(self, now: float, settled: float) -> Orders:
-        """Requests of browsers; a time slider counts once it has rested for `settled` seconds."""
+    def take_orders(self, now: float, rest_s: float) -> Orders:
+        """Requests of browsers; a time slider counts once it has rested for `rest_s` seconds."""
         with self._lock:
             orders, self._orders = self._orders, Orders()
-            if orders.place is not None and now < self._slid_at + settled:
+            if orders.place is not None and now < self._slid_at + rest_s:
                 self._orders.place, orders.place = orders.place, None
         return orders
 

@@ -104,7 +104,7 @@ def optimise(
             if np.isin(weights, (0.0, 1.0)).all():
                 break
         weights = np.where(robust & (chi2 > trusted), 0.0, 1.0)
-    if used >= _FIRST_ITERATIONS:  # not settled yet
+    if used >= _FIRST_ITERATIONS:  # too early to stop
         T, more = problem.descend(T, weights, max(iterations - used, 1))
         used, chi2 = used + more, problem.chi2(T)
     return PoseGraphSolution(

@@ -28,7 +28,7 @@ MAX_EXTRAPOLATION = 3.0  # times the last interval between frames, over which th
 MAX_OLDER = 2  # keyframes that take part beside the last one
 MAX_OLDER_ANGLE = np.radians(60)
 MIN_OLDER_OVERLAP, MIN_OLDER_AGREEING = 0.5, 0.75  # shares
-COARSE_AGREEMENT = 0.03  # metres, beside three deviations: depth that agrees before the pose is settled
+COARSE_AGREEMENT = 0.03  # metres, beside three deviations: depth that agrees before the pose is exact
 # Corners lie on something that moves where they raise the misfit by more than this factor and offset.
 MISFIT_FACTOR, MISFIT_OFFSET = 1.2, 0.3  # the offset in deviations
 
