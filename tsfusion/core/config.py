@@ -200,11 +200,8 @@ class VolumeConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     def model(self, sensor: str | None = None) -> SensorModel:
         """Sensor model of a keyframe, changed by the settings of this config.
 
-        Args:
-            sensor: name of the keyframe's sensor preset; None = the map's.
-
-        Raises:
-            InvalidConfig: for an unknown name.
+        `sensor`: name of the keyframe's sensor preset; None = the map's. Raises InvalidConfig for an unknown
+        name.
         """
         name = sensor or self.sensor
         if name not in SENSORS:
@@ -219,8 +216,7 @@ class VolumeConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     def checked_model(self) -> SensorModel:
         """Sensor model of the map, after a check that the settings fit each other.
 
-        Raises:
-            InvalidConfig: for ranges out of order, or voxels so large that the sensor sees next to none.
+        Raises InvalidConfig for ranges out of order, or voxels so large that the sensor sees next to none.
         """
         model = self.model()
         if model.min_range >= model.max_range:
@@ -403,11 +399,8 @@ class Config(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
     maps: dict[MapName, dict[str, Any]] = {}  # [maps.NAME]: what differs there from [volume]
 
     def volumes(self) -> dict[str, VolumeConfig]:
-        """The settings of each map that has a `[maps.NAME]` table.
-
-        Raises:
-            InvalidConfig: for an unknown key or a bad value.
-        """
+        """Settings of each map that has a `[maps.NAME]` table. Raises InvalidConfig for an unknown key or a
+        bad value."""
         found = {}
         for name, settings in self.maps.items():
             try:
@@ -539,7 +532,6 @@ def _toml_value(value: Any) -> str:
 
 
 def _bounds(kind: msgspec.inspect.Type) -> str:
-    """Bounds of a number, or the allowed words."""
     if isinstance(kind, msgspec.inspect.UnionType):
         return "; ".join(note for note in map(_bounds, kind.types) if note)
     if isinstance(kind, msgspec.inspect.LiteralType):

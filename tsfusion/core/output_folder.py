@@ -105,7 +105,6 @@ def _parents(out: Path) -> Iterator[None]:
 
 @contextmanager
 def _workplace(work: Path, out: Path) -> Iterator[Path]:
-    """The folder `work`, locked while the block runs and removed afterwards."""
     try:
         work.mkdir(exist_ok=True)
         lock = folder_lock.hold(work)

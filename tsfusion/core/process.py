@@ -22,9 +22,9 @@ import tsfusion
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # malloc.h
 
-# Arguments of Popen: the terminal's Ctrl-C does not reach the process. It stays in this session where Python
-# can do that: Linux shares the cores among sessions (autogroup), and a process in one of its own that mostly
-# sleeps then waits seconds for a busy core.
+# Arguments of Popen: the terminal's Ctrl-C does not reach the process. The process stays in this session if
+# Python can do that: Linux shares the cores among sessions (autogroup), and a process in one of its own that
+# mostly sleeps then waits seconds for a busy core.
 OWN_GROUP: dict[str, Any] = (
     {"process_group": 0} if sys.version_info >= (3, 11) else {"start_new_session": True}
 )

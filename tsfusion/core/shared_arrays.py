@@ -105,7 +105,6 @@ class SharedArrays:
 
     @property
     def memory(self) -> NDArray[np.uint8]:
-        """All mapped memory."""
         return np.empty(0, np.uint8) if self._map is None else np.frombuffer(self._map, np.uint8)
 
     def close(self) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Frames: what a sensor measured at one moment, before its pose is known."""
+"""Frames: measurements of a sensor at one moment, before its pose is known."""
 
 import dataclasses
 from dataclasses import dataclass, field
@@ -93,11 +93,8 @@ class Frame:
         return cls(**{**fields, "sensor": keyframe.sensor or sensor})
 
     def along_axis(self) -> "Frame":
-        """The frame with depth along the optical axis, where it was measured along each pixel's ray.
-
-        Raises:
-            InvalidKeyframe: it has no depth image.
-        """
+        """Convert depth along each pixel's ray to depth along the optical axis. Raises InvalidKeyframe
+        without depth."""
         if self.depth is None or self.intrinsics is None:
             raise InvalidKeyframe(f"depth_along_ray is for depth images, and this is one of {self.kind}")
         z = self.depth / self.intrinsics.ray_lengths(self.depth.shape)
@@ -107,8 +104,7 @@ class Frame:
     def keyframe(self, T_world_camera: NDArray[np.float64], motion: Motion | None = None) -> Keyframe:
         """Make a keyframe of the frame; a stereo pair is matched for it.
 
-        Args:
-            motion: of the sensor, by which points that have times are put right; None = not known.
+        `motion` of the sensor corrects points with times; None = not known.
         """
         if self.kind != "pair":
             return self._at(T_world_camera, motion=motion)
@@ -125,7 +121,7 @@ class Frame:
     def tracking_disparity(self) -> NDArray[np.float32] | None:
         """Disparity of a stereo pair, (H, W) float32 pixels, 0 = none; None without a pair.
 
-        That of `matched` where the pair was matched before, else of half the resolution, which tracks as
+        From `matched` if the pair was matched before, else of half the resolution, which tracks as
         well: rendered KITTI 06 drifts by 0.11 % with both, KITTI 06 itself by 0.9 %.
         """
         if self.left is None or self.right is None:

@@ -64,7 +64,7 @@ class Intrinsics(msgspec.Struct, frozen=True, array_like=True):
 
 
 def _explains_names(cls: type[_T]) -> type[_T]:
-    """Let the error of a wrong field say what it is called here."""
+    """Add the right name of a field to the error about a wrong one."""
     made = cls.__init__
 
     @functools.wraps(made)
@@ -194,7 +194,7 @@ class Keyframe(object_cards.Shown):
 
     @property
     def measurement(self) -> NDArray[Any]:
-        """The array that was given: depth, disparity or points."""
+        """The given array: depth, disparity or points."""
         for array in (self.depth, self.disparity, self.points):
             if array is not None:
                 return array
@@ -313,11 +313,8 @@ class KeyframeFields(TypedDict, total=False):
 
 
 def keyframe_of(value: Any) -> Keyframe:
-    """A keyframe as it is, or made of a mapping of its fields or of an object with such attributes.
-
-    Raises:
-        InvalidKeyframe: when it is none of these, or a field is not what it must be.
-    """
+    """Keyframe of a keyframe, a mapping of its fields or an object with such attributes. Raises
+    InvalidKeyframe."""
     if isinstance(value, Keyframe):
         return value
     if isinstance(value, Mapping):
@@ -334,7 +331,7 @@ def keyframe_of(value: Any) -> Keyframe:
 
 
 def intrinsics_of(value: Any) -> Intrinsics | None:
-    """Intrinsics as they are, of a camera matrix, or of four numbers; None = neither."""
+    """Intrinsics of intrinsics, a camera matrix, or four numbers; None = another value."""
     if isinstance(value, Intrinsics) or value is None:
         return value
     try:
@@ -360,7 +357,7 @@ def check_intrinsics(intrinsics: Intrinsics) -> Intrinsics:
 
 
 def check_pose(pose: Any, *, farthest: float = MAX_TRANSLATION) -> NDArray[np.float64]:
-    """Check a rigid transform and return it as (4, 4) float64; a rotation within 1e-3 is made exact.
+    """Check a rigid transform. Returns it as (4, 4) float64, with a rotation within 1e-3 made exact.
 
     Idempotent to the bit, so that a keyframe checked at both ends of a wire keeps its map.
     """
@@ -433,7 +430,7 @@ def _array(name: str, value: Any, dtypes: tuple[type, ...], shape: tuple[int | N
 
 
 def _single(name: str, value: Any, shape: tuple[int | None, ...]) -> NDArray[np.float32]:
-    """Convert float32 or float64 to float32; what is too large becomes infinite, which is no return."""
+    """Convert float32 or float64 to float32; a larger number becomes infinite, which is no return."""
     with np.errstate(over="ignore"):
         return _array(name, value, (np.float32, np.float64), shape).astype(np.float32, copy=False)
 

@@ -59,11 +59,8 @@ class SliceGrid:
     floor: float | None = None  # height of the floor, metres from the map's origin; None = not looked for
 
     def cells_of(self, points: NDArray[np.floating]) -> NDArray[np.int64]:
-        """Cells of points: (n, 2) int64 row and column, which may lie outside of the slice.
-
-        Args:
-            points: (n, 3) metres in the map's frame.
-        """
+        """Cells of `points`, (n, 3) metres in the map's frame: (n, 2) int64 row and column, maybe outside of
+        the slice."""
         flat = np.asarray(points, np.float64) @ self.axes[:2].T
         cells: NDArray[np.int64] = np.floor((flat - self.origin) / self.resolution).astype(np.int64)
         return cells[:, ::-1]
@@ -71,8 +68,7 @@ class SliceGrid:
     def centres(self, height: float | None = None) -> NDArray[np.float64]:
         """Centres of the cells: (rows, columns, 3) float64 metres in the map's frame.
 
-        Args:
-            height: metres along up; None = half-way between `low` and `high`.
+        `height`: metres along up; None = half-way between `low` and `high`.
         """
         rows, columns = (np.arange(count) + 0.5 for count in self.shape)
         u, v = np.meshgrid(columns * self.resolution, rows * self.resolution)
@@ -131,8 +127,7 @@ class OccupancySlice:
         Args:
             path: `.yaml` or `.pgm` writes the pair that map_server reads, `.png` a picture, `.npz` arrays.
 
-        Raises:
-            OutputError: when a file cannot be written; InvalidConfig: for another suffix.
+        Raises OutputError for a file that cannot be written, InvalidConfig for another suffix.
         """
         path = Path(path)
         suffix = _checked_suffix(path)
@@ -171,7 +166,7 @@ class DistanceSlice:
     """Horizontal distances to what stands between two heights.
 
     `distance` (rows, columns) float32 metres, at most `max_distance`: to the nearest surface, negative where
-    the map knows that a cell lies behind one. Where too little was seen it is 0, so that a robot does not go
+    the map knows that a cell lies behind one. After too few samples it is 0, so that a robot does not go
     there; with `unseen_is_free` the distance to the nearest surface that was. `cells` tells which these are,
     as in an `OccupancySlice`.
 
@@ -198,13 +193,9 @@ class DistanceSlice:
         return self.max_distance
 
     def save(self, path: str | Path) -> list[Path]:
-        """Write a picture (.png) or arrays (.npz). Returns the files.
+        """Write a picture (.png) or arrays (.npz) to `path`, by its suffix. Returns the files.
 
-        Args:
-            path: the file; its suffix decides.
-
-        Raises:
-            OutputError: when a file cannot be written; InvalidConfig: for another suffix.
+        Raises OutputError for a file that cannot be written, InvalidConfig for another suffix.
         """
         path = Path(path)
         if _checked_suffix(path, (".png", ".npz")) == ".png":
@@ -226,7 +217,7 @@ class DistanceField:
     """Distances to the nearest surface in a box of voxels.
 
     `distance` (X, Y, Z) float32 metres, at most `max_distance`, negative where the map knows that a voxel
-    lies behind the surface. Where nothing was seen it is 0, so that a robot does not go there; with
+    lies behind the surface. In unseen voxels it is 0, so that a robot does not go there; with
     `unseen_is_free` the distance to the nearest surface that was seen. `occupancy` (X, Y, Z) int8 tells which
     these are: 0 free, 100 occupied, −1 unseen. The centre of voxel (i, j, k) is at
     origin + ((i, j, k) + 0.5) · voxel_size.
@@ -258,13 +249,9 @@ class DistanceField:
         return self.max_distance
 
     def at(self, points: ArrayLike) -> NDArray[np.float32]:
-        """Distances that points keep at least, from what their voxels say: (n,) metres; 0 outside the box.
+        """Lower bounds of the distances at points, from their voxels: (n,) metres; 0 outside the box.
 
-        Args:
-            points: (n, 3) metres in the map's frame.
-
-        Raises:
-            InvalidConfig: for an array that holds no points.
+        `points`: (n, 3) metres in the map's frame. Raises InvalidConfig for an array of anything else.
         """
         places = (checked_points(points) - self.origin) / self.voxel_size
         voxels = np.floor(places)
@@ -276,13 +263,9 @@ class DistanceField:
         return found
 
     def save(self, path: str | Path) -> list[Path]:
-        """Write the arrays (.npz). Returns the files.
+        """Write the arrays to `path` (.npz). Returns the files.
 
-        Args:
-            path: the file; its suffix decides.
-
-        Raises:
-            OutputError: when it cannot be written; InvalidConfig: for another suffix.
+        Raises OutputError for a file that cannot be written, InvalidConfig for another suffix.
         """
         _checked_suffix(path := Path(path), (".npz",))
         return _save_arrays(path, {

@@ -108,20 +108,13 @@ class Mesh(MeshArrays, object_cards.Shown):
         )  # fmt: skip
 
     def encode(self, suffix: str) -> bytes:
-        """Encode the mesh as the content of a file.
-
-        Args:
-            suffix: `.ply`, `.glb`, `.obj` or `.stl`.
-        """
+        """Encode the mesh as the content of a file with `suffix`: `.ply`, `.glb`, `.obj` or `.stl`."""
         return mesh_encoding.encode(self, suffix)
 
     def to_open3d(self) -> Any:
         """Make an `open3d.t.geometry.TriangleMesh` in the map's frame, with `normals` and `colors` (0 to 1).
 
-        Its `to_legacy()` is an `open3d.geometry.TriangleMesh`.
-
-        Raises:
-            MissingDependency: without Open3D.
+        Its `to_legacy()` is an `open3d.geometry.TriangleMesh`. Raises MissingDependency without Open3D.
         """
         o3d = import_open3d()
         mesh = o3d.t.geometry.TriangleMesh(o3d.core.Tensor(self.vertices), o3d.core.Tensor(self.faces))
@@ -131,11 +124,10 @@ class Mesh(MeshArrays, object_cards.Shown):
         return mesh
 
     def without_islands(self, min_extent: float | None = None) -> "Mesh":
-        """The mesh without its islands; itself where it has none.
+        """Mesh without its islands; the same object if it has none.
 
-        Args:
-            min_extent: metres from corner to corner of the box around a piece, below which it is an island;
-                None = pieces of few vertices (`mesh_islands.find`).
+        `min_extent`: least diagonal of the box around a piece that stays, metres; None = small pieces by
+        their number of vertices (`mesh_islands.find`).
         """
         islands = self.islands(min_extent)
         if not islands.any():
@@ -145,8 +137,7 @@ class Mesh(MeshArrays, object_cards.Shown):
     def islands(self, min_extent: float | None = None) -> NDArray[np.bool_]:
         """Vertices of islands, as `without_islands` leaves them out: (n,) bool.
 
-        Args:
-            min_extent: metres; None = the bound of `without_islands`.
+        `min_extent`: metres; None = the bound of `without_islands`.
         """
         if min_extent is None:
             return self._islands
@@ -158,13 +149,9 @@ class Mesh(MeshArrays, object_cards.Shown):
         return {"islands": mesh_islands.count(self.faces, islands), "triangles": triangles}
 
     def cropped(self, box: Sequence[float]) -> "Mesh":
-        """The part of the mesh inside a box; triangles across a side are cut there.
+        """Part of the mesh inside a `box`: x0, y0, z0, x1, y1, z1 in metres, in the mesh's frame.
 
-        Args:
-            box: x0, y0, z0, x1, y1, z1 in metres, in the mesh's frame.
-
-        Raises:
-            InvalidConfig: for another box.
+        Triangles across a side are cut there. Raises InvalidConfig for another box.
         """
         return dataclasses.replace(mesh_cropping.cropped(self, box), known_up=self.up)
 

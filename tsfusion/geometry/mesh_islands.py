@@ -21,8 +21,8 @@ ISLAND = 50  # vertices that a piece needs to be none: marching cubes makes abou
 def find(faces: NDArray[np.int32], vertices: int) -> NDArray[np.bool_]:
     """(n,) bool of `vertices` vertices: those in pieces of fewer than `ISLAND` vertices.
 
-    That is as much surface as 7 × 7 voxels, 14 cm across at 2 cm. None if most triangles would be on islands:
-    then they are the scene.
+    Such a piece has as much surface as 7 × 7 voxels, 14 cm across at 2 cm. None if most triangles would be on
+    islands: then they are the scene.
     """
     label = pieces(faces, vertices)
     small = (np.bincount(label, minlength=1) < ISLAND)[label]

@@ -25,7 +25,7 @@ _FACE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
 
 class MeshPart(NamedTuple):
     """Part of a mesh, as a `Mesh`, but `faces` (m, 3) int32 count vertices from the end of the whole: 1 is
-    the last one. They may name vertices of the parts that come behind this one in the mesh."""
+    the last one. Faces may name vertices of the parts that come behind this one in the mesh."""
 
     vertices: NDArray[np.float32]
     faces: NDArray[np.int32]
@@ -217,7 +217,6 @@ class MeshParts:
             yield np.asarray(self.vertices - from_end, np.int32)
 
     def _mesh(self, faces: NDArray[np.int32]) -> Mesh:
-        """Some faces with their vertices alone."""
         used, corners = np.unique(faces, return_inverse=True)
         rows = self._rows(used)
         colors = rows["color"][:, :3].copy() if self._has_color else None

@@ -244,7 +244,6 @@ def _transform(voxel_size: float) -> bytes:
 
 
 def _topology(blocks: NDArray[np.int32], masks: NDArray[np.uint8]) -> bytes:
-    """Topology of the tree: the nodes and leaves that exist."""
     node, root = blocks // _LEAVES, blocks // (_LEAVES * _NODES)
     starts = [0, *(np.flatnonzero((np.diff(node, axis=0) != 0).any(axis=1)) + 1).tolist(), len(blocks)]
     roots = [

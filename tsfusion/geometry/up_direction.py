@@ -67,11 +67,7 @@ class Up(msgspec.Struct, frozen=True):
 
 
 def parse(text: str) -> Up:
-    """Read `x`, `-y` or three numbers such as `0,-0.9,0.1`.
-
-    Raises:
-        InvalidConfig: for anything else.
-    """
+    """Read `x`, `-y` or three numbers such as `0,-0.9,0.1`. Raises InvalidConfig for anything else."""
     sign, name = (-1.0, text[1:]) if text[:1] == "-" else (1.0, text.removeprefix("+"))
     if name in _AXES:
         return _up(sign * np.eye(3)[_AXES.index(name)], "given")
@@ -86,10 +82,9 @@ def parse(text: str) -> Up:
 
 
 class HeldSensor:
-    """How the sensors of a map were held: sums over their poses, and over what accelerometers measured.
+    """Attitudes of the sensors of a map: sums over their poses, and over their accelerometers' values.
 
-    Args:
-        numbers: those of another, to go on from; None = nothing yet.
+    `numbers`: those of another, to continue from; None = nothing yet.
     """
 
     def __init__(self, numbers: Sequence[float] | None = None) -> None:
@@ -115,8 +110,8 @@ class HeldSensor:
             T_world_sensor: (4, 4). A LiDAR's own axes are x forward, y left, z up; a camera's are x right, y
                 down, z forward.
             sensor: name of the sensor model.
-            force: (3,) what an accelerometer measured, in the sensor's axes; None = nothing.
-            times: -1 takes it out again.
+            force: (3,) specific force, in the sensor's axes; None = nothing.
+            times: -1 removes the keyframe again.
         """
         up = T_world_sensor[:3, 2] if sensor == "lidar" else -T_world_sensor[:3, 1]
         rows = np.ones((2 if force is None else 3, 4))
@@ -132,7 +127,6 @@ class HeldSensor:
 
     @property
     def is_known(self) -> bool:
-        """True if any pose was added."""
         return bool(self._sums[1, 3])
 
     @property
@@ -156,19 +150,14 @@ class HeldSensor:
 
 
 def find(mesh: SurfaceArrays, held: HeldSensor, *, given: Up | None = None) -> Up | None:
-    """Find up from a mesh and from how the sensors that saw it were held.
+    """Find up from a mesh and from the attitudes of the sensors that saw it; None = unknown.
 
-    An accelerometer decides, where its mean over the scan is as long as gravity. Otherwise the plane with the
-    largest surface does, among those seen from above by sensors that were held upright within 45°; without
-    such a plane the mean of how they were held. Where that is not known a direction counts only if three
-    times as much surface faces there as any other way, and it is −y, +y or +z within 45°: walls look like a
-    floor.
+    An accelerometer decides, if its mean over the scan is as long as gravity. Else the plane with the largest
+    surface does, among those seen from above by sensors that were held upright within 45°; without such a
+    plane, the mean attitude. Without known attitudes, a direction counts only if three times as much surface
+    faces there as any other way, and it is −y, +y or +z within 45°: walls look like a floor.
 
-    Args:
-        given: by a person: the answer.
-
-    Returns:
-        None where it cannot be told.
+    `given`: by a person: the answer.
     """
     if given is not None:
         return given
@@ -185,13 +174,10 @@ def find(mesh: SurfaceArrays, held: HeldSensor, *, given: Up | None = None) -> U
 
 
 def floor_height(mesh: SurfaceArrays, up: Up, held: HeldSensor) -> float | None:
-    """Height of the floor along `up` from the map's origin, metres.
+    """Height of the floor along `up` from the map's origin, metres; None = no such surface is large enough.
 
-    The floor is the lowest of the large level surfaces that face up, below the mean place of the sensors:
-    at least a fifth as large as the largest one. Where the scan shows a table and no floor, it is the table.
-
-    Returns:
-        None where no such surface is large enough.
+    The floor is the lowest of the large level surfaces that face up, below the mean place of the sensors: at
+    least a fifth as large as the largest one. In a scan with a table and no floor, it is the table.
     """
     direction = np.array(up.direction)
     below = float(held.position @ direction) if held.is_known else np.inf
@@ -224,7 +210,7 @@ class _FacingSurface:
         return normal if share >= _LEAST else None
 
     def most_faced(self) -> Up | None:
-        """The direction that far more surface faces than any other, if maps are likely to have up there."""
+        """Direction that far more surface faces than any other, if maps are likely to have up there."""
         directions = _sphere()
         shares = self._facing(directions, np.ones(len(self.area), bool))
         best = directions[shares.argmax()]
@@ -235,7 +221,7 @@ class _FacingSurface:
         return _up(normal, "floor") if share >= _LEAST else None
 
     def lowest_level(self, up: NDArray[np.float64], below: float) -> float | None:
-        """Height of the lowest of the large planes that face up, under a height; None = there is none."""
+        """Height of the lowest of the large planes that face up, below a height; None = there is none."""
         heights = self.points @ up
         facing = np.flatnonzero((self.normals @ up > _LEVEL) & (heights < below))
         if not len(facing):

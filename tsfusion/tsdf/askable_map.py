@@ -129,10 +129,10 @@ class AskableMap(ReadableMap):
         return camera_views.cast_settled(tiles, *camera, normals=normals, colors=colors)
 
     def settle(self, most: int, *, min_weight: float | None = None, surface: Surface | None = None) -> bool:
-        """Mesh again the changed part of the last `raycast`, at most `most` cubes.
+        """Mesh again the changed part of the last `raycast`, at most `most` cubes, as of `min_weight` and
+        `surface`.
 
-        Returns:
-            True if `raycast_settled` now shows the current map.
+        Returns True if `raycast_settled` now shows the current map.
         """
         tiles = self._tiles_of(surface, self._checked_min_weight(min_weight))
         return tiles.settled is not None and tiles.settle_some(most)
@@ -406,7 +406,6 @@ class AskableMap(ReadableMap):
 
     @property
     def _reading_bytes(self) -> int:
-        """Memory of meshes and of kept answers."""
         return self._mesh_buffers.nbytes + sum(kept.nbytes for kept in self._tiles.values())
 
     def _tiles_of(self, surface: Surface | None, min_weight: float) -> SurfaceTiles:

@@ -176,8 +176,8 @@ class ReadableMap(object_cards.Shown):
         return MeshParts(parts, Path(folder), held=self.held, known_up=up)
 
     def mesh_run(self, keys: NDArray[np.int64], which: range) -> mesh_tiles.MeshRun:
-        """Some tiles of a larger map's mesh. This map holds `mesh_tiles.blocks_of_run` of them, and their
-        surroundings.
+        """Some tiles of a larger map's mesh. The present map holds `mesh_tiles.blocks_of_run` of them, and
+        their surroundings.
 
         Args:
             keys: of all blocks of the larger map, sorted.
@@ -189,15 +189,14 @@ class ReadableMap(object_cards.Shown):
     def provenance(self, source: str | None = None) -> Provenance:
         """Notes about the map for a file of its surface, with a newly computed hash.
 
-        Args:
-            source: file or folder that the map came from; the notes have its name, not its path.
+        `source`: file or folder that the map came from; the notes have its name, not its path.
         """
         return _provenance(self.meta, self.keyframes, self.map_hash(), self.config, source)
 
     def cells_to_mesh(self, dirty: NDArray[np.int32]) -> NDArray[np.int32]:
         """Blocks whose mesh depends on the changed blocks: (m, 3) int32.
 
-        These are the changed blocks, those into which the field carries the change, and their neighbours
+        Namely the changed blocks, those into which the field carries the change, and their neighbours
         towards −x, −y, −z. In a raw mesh, normals at the rim may be a keyframe behind.
         """
         return self._cells_reached(dirty, self.model.surface)
@@ -270,7 +269,7 @@ class ReadableMap(object_cards.Shown):
     def map_hash(self) -> str:
         """Hex digest of the exact sums: equal for the same keyframes in any order, on any number of threads.
 
-        It leaves out colour, which may travel lossily, and smoothed values, which depend on order.
+        Colour, which may travel lossily, and smoothed values, which depend on order, are left out.
         """
         digest = begin_hash(self.config.voxel_size)
         for keys, sums in self._store.in_order("sums"):

@@ -101,12 +101,12 @@ class Volume(AskableMap):
         merge, crop, copy, diff                   put maps together, take them apart, compare them
         map_hash, stats                           know what is in it
 
-    Give a `VolumeConfig`, or the edge of a voxel in metres and other fields by name:
-    `Volume(0.02, sensor="kinect", regularizer="ray")`.
-    It belongs to the first thread of a process that makes one, in which Taichi runs: calls from another, and
-    in a process forked from it, are MapErrors. `threads` counts for the first volume of a process.
-    With `arch="cuda"` or another device, keyframes are fused there, in a process that all volumes of this one
-    share; where the device is missing, a warning says why, and they are fused on the CPU.
+    Give a `VolumeConfig`, or the edge of a voxel in metres and other fields by name: `Volume(0.02,
+    sensor="kinect", regularizer="ray")`. A volume belongs to the first thread of a process that makes one, in
+    which Taichi runs: calls from another, and in a process forked from it, are MapErrors. `threads` counts
+    for the first volume of a process. With `arch="cuda"` or another device, keyframes are fused there, in a
+    process that all volumes of this one share; where the device is missing, a warning says why, and they are
+    fused on the CPU.
 
     Args:
         config: a `VolumeConfig`, or the edge of a voxel in metres.
@@ -265,8 +265,7 @@ class Volume(AskableMap):
     def copy(self) -> "Volume":
         """Copy of the map, its keyframes, settings and counts; later changes to one do not affect the other.
 
-        Raises:
-            MemoryError, MapFull: when there is no room for both.
+        Raises MemoryError or MapFull without room for both.
         """
         memory_bytes, cache = self._cache
         made = Volume(self.config, memory_bytes=memory_bytes, cache=cache)
@@ -306,8 +305,8 @@ class Volume(AskableMap):
     def crop(self, box: Sequence[float], *, most_bytes: int | None = None) -> "Volume":
         """A new map of the voxels whose centres lie in a box, with their sums, colours and smoothed values.
 
-        It can be merged, meshed and saved, and takes keyframes, anywhere. A keyframe that was cut can no
-        longer be retracted; `keyframes` counts all that the map was made from.
+        The part can be merged, meshed and saved, and takes keyframes, anywhere. A keyframe that was cut can
+        no longer be retracted; `keyframes` counts all that the map was made from.
 
         Args:
             box: x0, y0, z0, x1, y1, z1 in metres; a centre on the upper side is outside, so that maps of
@@ -513,11 +512,8 @@ class Volume(AskableMap):
         return volume
 
     def blocks_within(self, low: Sequence[int], high: Sequence[int]) -> NDArray[np.int32]:
-        """Blocks of the map in a box: (n, 3) int32 coordinates, low ≤ (x, y, z) < high.
-
-        Args:
-            low, high: (3,) block coordinates, first and last + 1.
-        """
+        """Blocks of the map in a box: (n, 3) int32 coordinates, `low` ≤ (x, y, z) < `high`, (3,) block
+        coordinates."""
         blocks = unpack_keys(self._store.keys)
         return blocks[((blocks >= np.array(low)) & (blocks < np.array(high))).all(axis=1)]
 
@@ -531,7 +527,7 @@ class Volume(AskableMap):
 
     def set_pause(self, pause: Callable[[], None]) -> None:
         """Call a function, `pause`, between steps that leave the map alone: of meshes, hashes, saving, and
-        before a keyframe's rays are added. It may ask the map anything, and must not change it."""
+        before a keyframe's rays are added. The function may ask the map anything, and must not change it."""
         self._store.pause = pause
 
     @property

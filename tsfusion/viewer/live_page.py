@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The live page: what a feed tells of a map, in a browser."""
+"""The live page: the events of a map's feed, shown in a browser."""
 
 import logging
 import sys
@@ -57,11 +57,11 @@ log = logging.getLogger(__name__)
 
 
 class LivePage:
-    """A page that shows what a feed tells, shared by its browsers but for what `BrowserPanel` has.
+    """A page that shows a feed of a map. Its browsers share it, except for their `BrowserPanel`.
 
     Args:
-        server: to fill; whoever made it ends it.
-        feed: of the map; whoever made it closes it.
+        server: to fill; its maker ends it.
+        feed: of the map; its maker closes it.
         measures: further quantities to colour by. Each has a name that may end with its unit, `error [m]`,
             and gives (n,) values at (n, 3) points in metres; NaN = none there. Called on another thread.
         max_bytes_per_second: of triangles to each browser, on average.
@@ -99,14 +99,9 @@ class LivePage:
         server.on_client_disconnect(calm(self._part))
 
     def run(self, stop: threading.Event, *, memory_bytes: int = sys.maxsize) -> None:
-        """Show what happens until `stop` is set.
+        """Show the feed until `stop` is set.
 
-        Args:
-            memory_bytes: that this process may take.
-
-        Raises:
-            MemoryError: when it takes more.
-            TsfusionError: of the feed.
+        Raises MemoryError if this process takes more than `memory_bytes`, or a TsfusionError of the feed.
         """
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")  # a browser that left
         try:
@@ -121,7 +116,7 @@ class LivePage:
                 look.colors.values.close()
 
     def tell_end(self, sentence: str) -> None:
-        """Say in every browser why nothing changes any more, and wait until that is on its way."""
+        """Show in every browser why the page no longer changes, and wait until that is on its way."""
         self._problem, self._health = sentence, None
         self._reckon()
         self._server.flush()
@@ -150,7 +145,6 @@ class LivePage:
                 self._problem = event.problem
 
     def _apply(self, now: float) -> None:
-        """Put the updates that have come into the tiles."""
         began = time.thread_time()
         keys = self._tiles.apply_all(self._updates, now - self._began)
         rest = _rest(began, _SHARE, _TOGETHER) if self._browsers else _TOGETHER[1]
@@ -173,7 +167,6 @@ class LivePage:
         self._marks.voxel_size = event.voxel_size
 
     def _looks(self) -> list[TileLook]:
-        """Shared look of the map, and those of browsers that have chosen another."""
         return [self.shared, *(one.own for one in self._panels() if one.own is not None)]
 
     def _panels(self) -> list[BrowserPanel]:
@@ -186,7 +179,6 @@ class LivePage:
         return colors
 
     def _step(self, now: float) -> None:
-        """Work between two looks at the feed."""
         if self._updates and now >= self._next_apply:
             self._apply(now)
         self._obey(now)
@@ -262,14 +254,14 @@ class LivePage:
         if panel is not None and panel.own is not None:
             panel.own.colors.values.close()
 
-    # What the panels of browsers ask
+    # Questions of the browsers' panels
 
     def whole_view(self, aspect: float, covered: float) -> PageCamera | None:
-        """All of the map; see `map_views.whole`."""
+        """View of all of the map; see `map_views.whole`."""
         return self._whole_views.of(aspect, covered)
 
     def scanner_view(self, session: bytes) -> PageCamera | None:
-        """From behind a scanner."""
+        """View from behind a scanner."""
         pose, up = self._marks.pose(session), self._up.direction
         return None if pose is None else map_views.behind(pose, up, distance=50 * self.voxel_size)
 
@@ -278,7 +270,6 @@ class LivePage:
         return [(session, self._marks.name(session)) for session in self._marks.sessions]
 
     def new_look(self, client: "viser.ClientHandle") -> OwnLook:
-        """Look of a browser alone."""
         look = OwnLook(client, self._tiles, self._new_colors(), self._own_bucket)
         look.nodes.voxel_size, look.colors.up = self.voxel_size, self._up.direction
         return look
@@ -290,7 +281,7 @@ class LivePage:
         return map_views.first_hit(self._tiles, look.nodes.clipping, origin, direction)
 
     def shown_mesh(self, look: TileLook) -> Mesh:
-        """Mesh of what is shown, in the map's frame."""
+        """Shown surface as a mesh, in the map's frame."""
         return look.mesh(self._up.up)
 
 

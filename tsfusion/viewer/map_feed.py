@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Source of what a page shows: a running server, a saved map or a recording of one."""
+"""Source of a page's map: a running server, a saved map or a recording of one."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -12,11 +12,11 @@ from tsfusion.wire.asking.map_events import MapEvent
 
 @dataclass(frozen=True)
 class TimeLine:
-    """The times that a feed can show.
+    """Times that a feed can show.
 
     Attributes:
-        keyframes: how many there are: places 0 (nothing) to `keyframes` (all).
-        seconds: when the last came after the first; None = not known.
+        keyframes: their number: places 0 (nothing) to `keyframes` (all).
+        seconds: from the first to the last; None = not known.
     """
 
     keyframes: int
@@ -24,16 +24,16 @@ class TimeLine:
 
 
 class MapFeed(Protocol):
-    """Source of what a page shows, event by event. For one thread, but for `weights`."""
+    """Source of a page's events. For one thread, except for `weights`."""
 
     @property
     def title(self) -> str:
-        """Name of what is watched, for a person."""
+        """Name of the watched map, for a person."""
         ...
 
     @property
     def time_line(self) -> TimeLine | None:
-        """The times that `seek` takes; None = only now can be shown."""
+        """Times that `seek` takes; None = only the present can be shown."""
         ...
 
     def maps(self) -> list[str]:
@@ -45,7 +45,7 @@ class MapFeed(Protocol):
         ...
 
     def seek(self, keyframes: int) -> None:
-        """Show the map as it was after so many keyframes; what is different comes as events."""
+        """Show the map as it was after so many keyframes; the differences come as events."""
         ...
 
     def events(self, timeout: float) -> list[MapEvent]:
@@ -53,9 +53,9 @@ class MapFeed(Protocol):
         ...
 
     def weights(self, points: NDArray[np.float32]) -> NDArray[np.float32] | None:
-        """(n,) weight of the map at (n, 3) points; None = nobody knows now."""
+        """(n,) weight of the map at (n, 3) points; None = unknown now."""
         ...
 
     def close(self) -> None:
-        """Let go of everything."""
+        """Release all resources."""
         ...

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Signed distance of the map between voxel centres: trilinear interpolation, and its gradient.
 
-A point is rounded to 2⁻¹⁶ voxel. It lies between eight voxel centres, of which those with a share in it
+A point is rounded to 2⁻¹⁶ voxel. A point lies between eight voxel centres, of which those with a share in it
 count: at a voxel's centre that voxel alone.
 
-The map holds distances along rays. Where these were oblique, the gradient is steeper than 1: divided by it,
+The map holds distances along rays. Along oblique rays, the gradient is steeper than 1: divided by it,
 the distance is, to first order, that to the surface.
 """
 

@@ -19,7 +19,7 @@ MAX_PROBES = 256
 def set_insert(table: ti.template(), mask, key):
     """Insert `key` (> 0) into the set. Returns the growth of the set, and a flag: the set is too full.
 
-    Of threads that insert one key at the same time, one counts it.
+    If threads insert one key at the same time, one counts it.
     """
     full, grown = 0, 0
     carried = key

@@ -165,8 +165,8 @@ def ray_vector(rays: ti.template(), r, first: ti.template()):
 
 @ti.func
 def next_step(crossing):
-    """Mask: all bits in the axis that is crossed next (the first of equals), none in the others. It has no
-    branch: a processor predicts the next axis worst of all."""
+    """Mask: all bits in the axis that is crossed next (the first of equals), none in the others. No branch: a
+    processor predicts the next axis worst of all."""
     nearest = ti.min(crossing[0], crossing[1], crossing[2])
     x = -ti.cast(crossing[0] == nearest, ti.i32)
     y = -ti.cast(crossing[1] == nearest, ti.i32) & ~x

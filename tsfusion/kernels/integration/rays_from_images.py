@@ -2,7 +2,7 @@
 """Rays from depth or disparity images.
 
 An image is read in tiles of 12×12 pixels. In a tile, the pixels of a cell about as wide as a voxel are
-bundled into one ray through their mean, a layer of depth at a time. Where the whole tile is flat, its plane
+bundled into one ray through their mean, a layer of depth at a time. In a flat tile, its plane
 gives the distance that the ray's voxels have to the surface; elsewhere it is the distance to the ray's end.
 Sums are integers, so nothing depends on threads. With `bundle = 0` every pixel is a ray.
 

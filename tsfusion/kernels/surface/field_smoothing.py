@@ -8,7 +8,7 @@ y = Σ w·m / Σ w and W = Σ w are read from the map, x near a flat surface is 
 counts (Geman and McClure; the gentler 1 / √(1 + …) rounds edges by a quarter more, docs/accuracy.md).
 
 The voxels near the surface are numbered into one dense list with the numbers of their neighbours; a missing
-one has the number past the end, where all is 0. Which cells of a block are listed is a bit each: `planes`, 64
+one has the number past the end, where all is 0. Each cell of a block has a bit, 1 = listed: `planes`, 64
 cells a word, and `places`, where the first cell of each word stands in the list. A cell's number is a count
 of bits, so what looks for numbers reads a hundred bytes a block.
 

@@ -42,8 +42,8 @@ class DeviceLost(RuntimeError):
     """Error of a device process that has ended, or on which a kernel failed: additions since the map was last
     read are lost.
 
-    It is no TsfusionError: no keyframe is to blame, and nothing may continue with the map. A fuser that ends
-    with it is started again, and fuses the journal's records after the last checkpoint.
+    The error is no TsfusionError: no keyframe is to blame, and nothing may continue with the map. A fuser
+    that ends with it is started again, and fuses the journal's records after the last checkpoint.
     """
 
 

@@ -40,7 +40,6 @@ class _Device:
         self._maps: dict[int, DeviceMap] = {}
 
     def run(self) -> None:
-        """Answer until the other end closes."""
         with suppress(OSError):
             while True:
                 look_out(self._link.fileno(), NEXT_S)

@@ -385,7 +385,6 @@ def _digest(file: BinaryIO, size: int) -> bytes:
 
 
 def _read_exactly(file: BinaryIO, size: int, path: Path) -> bytes:
-    """Read `size` bytes. Raises DamagedCheckpoint if the file ends before."""
     if size > os.fstat(file.fileno()).st_size or len(content := file.read(size)) != size:
         raise DamagedCheckpoint(f"{path} is cut short")
     return content

@@ -205,7 +205,6 @@ class _BlockStream:
 
 
 def _pieces(streams: Sequence[_BlockStream], layers: Sequence[str], digest: MapDigest) -> Iterator[Piece]:
-    """Blocks of the sum, in key order."""
     while left := sorted((one for one in streams if not one.is_over), key=lambda one: one.next_key):
         first, last = left[0], left[0].last_key
         if first.is_at_chunk and all(one.next_key > last for one in left[1:]):

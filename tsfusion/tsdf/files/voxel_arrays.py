@@ -128,7 +128,6 @@ def write(
 
 
 def _fused(store: BlockStore, used: NDArray[np.int64], *, dense: bool) -> _Voxels:
-    """Signed distances, weights and colours of a map."""
     blocks = unpack_keys(store.keys[used])
     low, high = blocks.min(axis=0), blocks.max(axis=0) + 1
     shape = tuple(int(length) for length in 8 * (high - low)) if dense else (len(used), 8, 8, 8)
@@ -240,8 +239,6 @@ def _write_vdb(
 
 
 class _Counted:
-    """Counter of the bytes that have passed."""
-
     def __init__(self, watch: OnProgress, total: int) -> None:
         self._watch, self._total, self._done = watch, total, 0
 
@@ -254,7 +251,6 @@ class _Counted:
 def _write_array(
     archive: zipfile.ZipFile, name: str, shape: tuple[int, ...], parts: Iterator[NDArray[Any]]
 ) -> None:
-    """Write an array of this shape from its parts, in order."""
     entry = zipfile.ZipInfo(f"{name}.npy", _EARLIEST)
     entry.compress_type = zipfile.ZIP_DEFLATED
     with archive.open(entry, "w", force_zip64=True) as file:
@@ -307,7 +303,7 @@ class Blocks:
 
     The centre of voxel (i, j, k) of block b is at (8 · coordinates[b] + (i, j, k) + 0.5) · voxel_size. Stored
     sums are shown without copying, read-only: (n, 8, 8, 8) arrays that stay valid after any change of the
-    map. They show what keyframes change in these blocks until the map's memory grows.
+    map. The arrays show later changes in these blocks until the map's memory grows.
 
     Args:
         store: the blocks of a map; `Volume.blocks()` gives them.

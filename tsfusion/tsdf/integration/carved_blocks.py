@@ -231,7 +231,6 @@ class _PatchImages:
         self.least = self.most = np.zeros(0, np.int32)
 
     def make_room(self, height: int, width: int) -> None:
-        """Reserve an image of (height, width) pixels."""
         if self.pixels == (height, width):
             return
         rows, columns = -(-height // PATCH), -(-width // PATCH)

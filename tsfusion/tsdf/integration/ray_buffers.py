@@ -147,7 +147,6 @@ class RayBuffers:
         return image.astype(np.float32, copy=False)
 
     def _rays_of_points(self, points: Any, *rest: Any) -> None:
-        """Run `rays_from_points` with these arguments and the buffers."""
         self._reserve_rays(len(points))
         rays_from_points.rays_from_points(points, *rest, self.rays, self.bands)
 

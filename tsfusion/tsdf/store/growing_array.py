@@ -126,11 +126,8 @@ class FileArray(GrowingArray):
     its address. Its pages are the file's: the system counts them neither as this process's allocations nor
     for ever as its resident memory (`let_go`).
 
-    Args:
-        min_free_bytes: disk space left free by growth beyond `capacity`; None = nothing.
-
-    Raises:
-        InvalidConfig: when the folder cannot hold such a file.
+    `min_free_bytes`: disk space left free by growth beyond `capacity`; None = nothing. Raises InvalidConfig
+    if the folder cannot hold such a file.
     """
 
     def __init__(

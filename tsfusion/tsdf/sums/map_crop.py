@@ -53,11 +53,8 @@ def _overlap(one: Sequence[int], other: Sequence[int]) -> bool:
 def voxel_range(box: Sequence[float], voxel_size: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Voxels whose centres lie in a box: first (3,), and last + 1 (3,). Boxes side by side share none.
 
-    Args:
-        box: x0, y0, z0, x1, y1, z1 in metres; a centre on the upper side is outside.
-
-    Raises:
-        InvalidConfig: for anything else.
+    `box`: x0, y0, z0, x1, y1, z1 in metres; a centre on the upper side is outside. Raises InvalidConfig for
+    anything else.
     """
     corners = np.asarray(box, np.float64)
     if corners.shape != (6,) or not np.isfinite(corners).all() or (corners[:3] >= corners[3:]).any():

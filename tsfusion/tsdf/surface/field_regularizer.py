@@ -206,7 +206,6 @@ def _solve_batch(
 def _list(
     keys: NDArray[np.int64], values: NDArray[np.float32], store: BlockStore, settings: FieldSettings
 ) -> list[GridLevel]:
-    """Voxels near the surface, and their coarser cells."""
     sides = index_of(keys, keys[:, None] + SIDES)
     planes, counts = marks_of(len(keys), CUBE)
     kernels.mark_voxels(values, settings.reach * QUANTA_PER_VOXEL, planes, counts)

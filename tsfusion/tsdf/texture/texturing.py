@@ -70,7 +70,7 @@ def textured(
     The same mesh and keyframes give the same bytes.
 
     Args:
-        keyframes: of the map; read several times. Those without depth and colour images are left out.
+        keyframes: of the map; read several times. Keyframes without depth and colour images are left out.
         voxel_size: metres, of the map.
         watch: called with the stage, the steps done, and all steps.
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Parts of a map's tiles that a plane and a box leave, and the controls of both."""
+"""Parts of a map's tiles left by a plane and a box, and the controls of both."""
 
 import math
 from collections.abc import Callable
@@ -28,9 +28,9 @@ class Clipping:
     """A plane, a box, both or none.
 
     Attributes:
-        normal: (3,) what lies where `normal · p > offset` is not shown; None = no plane.
+        normal: (3,) points with `normal · p > offset` are hidden; None = no plane.
         offset: metres.
-        box: (2, 3) lowest and highest coordinates of what is shown, metres; None = no box.
+        box: (2, 3) lowest and highest shown coordinates, metres; None = no box.
     """
 
     normal: NDArray[np.float64] | None = None
@@ -38,7 +38,7 @@ class Clipping:
     box: NDArray[np.float64] | None = None
 
     def side(self, bounds: NDArray[np.float32]) -> ClipSide:
-        """How much is shown of what lies within (2, 3) bounds."""
+        """Shown share of a region with (2, 3) bounds."""
         whole = True
         if self.normal is not None:
             middle = bounds.mean(axis=0) @ self.normal
@@ -61,7 +61,7 @@ class Clipping:
         return mesh
 
     def shows(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """(n,) whether each of (n, 3) points is where something is shown."""
+        """(n,) mask of shown (n, 3) points."""
         shown = np.ones(len(points), bool)
         if self.normal is not None:
             shown &= points @ self.normal <= self.offset
@@ -71,11 +71,7 @@ class Clipping:
 
 
 class ClippingControls:
-    """Sliders as long as the map.
-
-    Args:
-        changed: called, on any thread, after somebody moved something.
-    """
+    """Sliders as long as the map. `changed` is called, on any thread, after a move."""
 
     def __init__(self, gui: "viser.GuiApi", changed: Callable[[], None]) -> None:
         self.up = np.array((0.0, 0.0, 1.0))
@@ -100,7 +96,6 @@ class ClippingControls:
 
     @property
     def clipping(self) -> Clipping:
-        """State of the controls."""
         normal, offset = None, 0.0
         if self._plane.value != _NONE:
             sign = -1.0 if self._other.value else 1.0
@@ -111,7 +106,7 @@ class ClippingControls:
         return Clipping(normal, offset, np.stack((ends[0], np.maximum(ends[1], ends[0] + _STEP))))
 
     def fit(self, low: NDArray[np.float64], high: NDArray[np.float64], up: NDArray[np.float64]) -> None:
-        """Make the sliders as long as a map from (3,) `low` to (3,) `high`, metres."""
+        """Fit the sliders to a map from (3,) `low` to (3,) `high`, metres."""
         grain = rounded_up(float((high - low).max())) / 50
         low, high = grain * np.floor(low / grain), grain * np.ceil(high / grain)
         if (low == self._low).all() and (high == self._high).all() and (up == self.up).all():
@@ -138,7 +133,7 @@ class ClippingControls:
         self._at.min, self._at.max, self._at.value = low, high, value
 
     def _move_to_end(self) -> None:
-        """Where a plane is chosen anew, it hides nothing at first."""
+        """Move a newly chosen plane to where it hides nothing."""
         self._other.value = False
         self._fit_plane(to_end=True)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The surface of a map in cubes of some blocks: what came last for each cell, ready to be shown or saved."""
+"""Surface of a map in cubes of some blocks: the newest triangles of each cell, ready to be shown or saved."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ class Tile:
         mesh: without guesses; has colours.
         cell: (m,) int16 number of each face's cell in the tile.
         changed_s: (EDGE³,) float32 time of each cell's last change.
-        client: (EDGE³,) int32 who saw each cell last, a number of `MapTiles.clients`; −1 = not known.
+        client: (EDGE³,) int32 last client that saw each cell, a number of `MapTiles.clients`; −1 = not known.
     """
 
     mesh: Mesh
@@ -56,9 +56,8 @@ class MapTiles:
     """All tiles of a map, by their place.
 
     Attributes:
-        clients: sessions that saw cells, in the order of their first.
-        has_colors: whether any surface had colours.
-        version: how often something changed.
+        clients: sessions that saw cells, in order of appearance.
+        version: number of changes.
     """
 
     def __init__(self, edge: int = EDGE) -> None:
@@ -70,19 +69,17 @@ class MapTiles:
 
     @property
     def triangles(self) -> int:
-        """Number of all triangles."""
         return sum(len(tile.mesh.faces) for tile in list(self.tiles.values()))
 
     def clear(self) -> None:
-        """Forget everything."""
         self.__init__(self.edge)  # type: ignore[misc]
 
     def apply(self, update: SurfaceUpdate, now_s: float) -> set[CellKey]:
-        """Put an update's cells in place of all earlier ones there; the tiles that it changed."""
+        """Replace cells by those of an update. Returns the changed tiles."""
         return self.apply_all([update], now_s)
 
     def apply_all(self, updates: Sequence[SurfaceUpdate], now_s: float) -> set[CellKey]:
-        """Apply several updates at once, of which the last has the newest cells.
+        """Apply several updates at once, oldest first.
 
         A scanner that stands still changes the same cells with each keyframe: only the newest are looked at.
         """
@@ -130,7 +127,7 @@ class MapTiles:
             del self.tiles[key]
 
     def _numbered(self, update: SurfaceUpdate) -> NDArray[np.int32]:
-        """(n,) who saw each cell last, as a number of `clients`."""
+        """(n,) last client of each cell, as a number of `clients`."""
         if update.client is None:
             return np.full(len(update.cells), -1, np.int32)
         for session in update.clients:
@@ -142,7 +139,7 @@ class MapTiles:
 
 @dataclass(frozen=True, eq=False)
 class _TileUpdate:
-    """Part of an update for one tile: cells, who saw them, each face's cell, and which faces of a mesh."""
+    """Part of an update for one tile: cells, their clients, each face's cell, and the faces in a mesh."""
 
     cells: NDArray[np.int16]
     client: NDArray[np.int32]
@@ -151,12 +148,11 @@ class _TileUpdate:
     faces: NDArray[np.int64]
 
     def mesh(self) -> Mesh:
-        """The faces alone, with the vertices that they use."""
         return self.whole.of_faces(self.faces)
 
 
 def _newest_rows(updates: Sequence[SurfaceUpdate]) -> list[NDArray[np.int64]]:
-    """The rows of each update's cells that no later update has again."""
+    """Rows of each update's cells that no later update replaces."""
     keys = np.concatenate([keys_of(update.cells) for update in updates])
     if len(updates) == 1:
         return [np.arange(len(keys))]
@@ -170,10 +166,9 @@ def _newest_rows(updates: Sequence[SurfaceUpdate]) -> list[NDArray[np.int64]]:
 def _as_one(
     updates: Sequence[SurfaceUpdate], rows_of: Sequence[NDArray[np.int64]]
 ) -> tuple[Mesh, NDArray[np.int64], NDArray[np.int64]]:
-    """The mesh of some cells of several updates; of each cell its first face there, and the number of faces.
+    """Mesh of some cells of several updates; for each cell its first face there, and the number of faces.
 
-    Args:
-        rows_of: the rows of those cells, ascending, of each update.
+    `rows_of`: the rows of those cells, ascending, of each update.
     """
     meshes, counts = [], []
     for update, rows in zip(updates, rows_of, strict=True):
@@ -194,7 +189,6 @@ def _colored(mesh: Mesh) -> Mesh:
 
 
 def _joined(meshes: Sequence[Mesh]) -> Mesh:
-    """Meshes with colours as one."""
     if len(meshes) == 1:
         return meshes[0]
     offsets = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)], dtype=np.int32).tolist()
@@ -207,7 +201,7 @@ def _joined(meshes: Sequence[Mesh]) -> Mesh:
 
 
 def whole(meshes: list[Mesh], up: Up | None) -> Mesh:
-    """Meshes as one, on whose seams vertices at the same place with the same colour are one."""
+    """Meshes joined to one; at the seams, vertices of the same place and colour are merged."""
     if not meshes:
         return Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
     offsets = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
@@ -223,7 +217,7 @@ def whole(meshes: list[Mesh], up: Up | None) -> Mesh:
 
 
 def _ranges(starts: NDArray[np.integer], counts: NDArray[np.integer]) -> NDArray[np.int64]:
-    """The numbers from each start on, so many of each."""
+    """Consecutive numbers from each start, `counts` of each."""
     before = np.cumsum(counts) - counts
     found: NDArray[np.int64] = np.arange(int(counts.sum())) + np.repeat(starts - before, counts)
     return found

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""From where a map is looked at, the point of it that a ray of the pointer meets, and which way is up."""
+"""Views of a map, the point of it that the pointer's ray meets, and its up direction."""
 
 import math
 from typing import NamedTuple
@@ -26,7 +26,7 @@ _LESS = 0.985  # cosine of 10°: a new direction counts that is further from the
 
 
 class PageCamera(NamedTuple):
-    """A camera: where it is, what it looks at, both (3,) metres, and its up direction."""
+    """A camera: its position and its target, both (3,) metres, and its up direction."""
 
     position: NDArray[np.float64]
     target: NDArray[np.float64]
@@ -34,14 +34,12 @@ class PageCamera(NamedTuple):
 
 
 class ShownPoint(NamedTuple):
-    """(n, 3) points of a surface and its normals there."""
-
     points: NDArray[np.float64]
     normals: NDArray[np.float64]
 
 
 def sample(tiles: MapTiles) -> ShownPoint:
-    """A few points of each tile, as many as its triangles are its share of the map."""
+    """A few points of each tile, in proportion to its triangles."""
     meshes = [tile.mesh for tile in list(tiles.tiles.values())]
     total = sum(len(mesh.vertices) for mesh in meshes)
     step = max(1, total // (_SAMPLE * max(len(meshes), 50)))
@@ -54,11 +52,11 @@ def sample(tiles: MapTiles) -> ShownPoint:
 def whole(
     surface: ShownPoint, up: NDArray[np.float64], aspect: float, *, covered: float = 0.0
 ) -> PageCamera | None:
-    """From above, from the side that shows most of the surface; None = there is nothing to see.
+    """View from above, from the side that shows most of the surface; None = an empty map.
 
     Args:
         aspect: width / height of the picture.
-        covered: share of the picture's height, at its lower end, that is not to be seen.
+        covered: share of the picture's height, at its lower end, that is hidden.
     """
     if len(surface.points) < 3:
         return None
@@ -73,7 +71,7 @@ def whole(
 
 
 class WholeViews:
-    """Views of all of a map, each found once until `refresh` notes that the map has changed."""
+    """Views of all of a map, cached until `refresh` notes a change."""
 
     def __init__(self, tiles: MapTiles) -> None:
         self._tiles = tiles
@@ -83,18 +81,17 @@ class WholeViews:
         self._views: dict[tuple[float, float], PageCamera] = {}
 
     def forget(self) -> None:
-        """Find every view anew."""
         self._sample = None
         self._views.clear()
 
     def refresh(self, up: NDArray[np.float64]) -> None:
-        """Find views anew where the tiles, or the direction up, are others than before."""
+        """Clear the cache if the tiles, or the direction up, have changed."""
         if self._version != self._tiles.version or not np.array_equal(up, self._up):
             self._up, self._version = up, self._tiles.version
             self.forget()
 
     def of(self, aspect: float, covered: float) -> PageCamera | None:
-        """See `whole`; None is not kept: what comes first is seen at once."""
+        """View as of `whole`; None is not cached, so that the first surface is seen at once."""
         view = self._views.get((aspect, covered))
         if view is None:
             if self._sample is None or not len(self._sample.points):
@@ -113,7 +110,7 @@ def _fitted(
     aspect: float,
     covered: float,
 ) -> PageCamera:
-    """The nearest camera in a direction from which nearly all points are in the picture."""
+    """Nearest camera in a direction with nearly all points in the picture."""
     toward, up = directions
     right = np.cross(up, toward)
     right /= np.linalg.norm(right)
@@ -134,7 +131,7 @@ def _fitted(
 
 
 def behind(T_world_camera: NDArray[np.float64], up: NDArray[np.float64], *, distance: float) -> PageCamera:
-    """From behind and above a scanner, looking where it looks.
+    """View from behind and above a scanner, in its direction.
 
     Args:
         T_world_camera: (4, 4), OpenCV axes.
@@ -150,10 +147,9 @@ def behind(T_world_camera: NDArray[np.float64], up: NDArray[np.float64], *, dist
 def first_hit(
     tiles: MapTiles, clipping: Clipping, origin: NDArray[np.float64], direction: NDArray[np.float64]
 ) -> NDArray[np.float64] | None:
-    """(3,) the nearest point of what is shown of the front of a surface; None = the ray meets none.
+    """(3,) nearest shown point of a surface's front; None = the ray meets none.
 
-    Args:
-        origin, direction: (3,) of the ray, in the map's frame.
+    `origin` and `direction`: (3,) of the ray, in the map's frame.
     """
     direction = direction / np.linalg.norm(direction)
     nearest, found = np.inf, None
@@ -170,7 +166,7 @@ def first_hit(
 
 
 def _entry(bounds: NDArray[np.float32], origin: NDArray[np.float64], direction: NDArray[np.float64]) -> float:
-    """Where a ray comes into a box; infinity where it does not."""
+    """Distance at which a ray enters a box; infinity = never."""
     with np.errstate(divide="ignore", invalid="ignore"):
         ends = (bounds - origin) / direction
     ends = np.where(np.isnan(ends), np.array((-np.inf, np.inf))[:, None], ends)
@@ -198,8 +194,6 @@ def _hits(tile: Tile, origin: NDArray[np.float64], direction: NDArray[np.float64
 
 
 class MapUp:
-    """The up direction of a map."""
-
     def __init__(self) -> None:
         self.up: Up | None = None
         self._is_given = False
@@ -208,28 +202,28 @@ class MapUp:
 
     @property
     def direction(self) -> NDArray[np.float64]:
-        """(3,) unit length; +z where nobody knows."""
+        """(3,) unit length; +z = unknown."""
         return np.array((0.0, 0.0, 1.0) if self.up is None else self.up.direction)
 
     def note_scanner(self, event: ScannerSeen) -> None:
-        """Take into account how a sensor was held."""
+        """Take a sensor's attitude into account."""
         if not self._held.is_known:
             self._looked_at = 0  # what was found before was found without
         self._held.add(event.T_world_camera, "lidar" if event.intrinsics is None else "camera")
 
     def note_paths(self, event: PathsFound) -> None:
-        """Take into account how the sensors of the whole map were held."""
+        """Take the attitudes of the sensors of the whole map into account."""
         if event.held is not None and event.held.is_known:
             self._held = HeldSensor(event.held.numbers)
             self._looked_at = 0  # what was found before was found without
 
     def note_given(self, up: Up | None) -> None:
-        """Take a direction that comes with the map."""
+        """Take the direction stored with the map."""
         if up is not None:
             self.up, self._is_given = up, True
 
     def look(self, tiles: MapTiles) -> None:
-        """Look for it again, each time that there is twice as much of the map."""
+        """Estimate it again, each time that the map has doubled."""
         if self._is_given or (count := tiles.triangles) < max(_FIRST, 2 * self._looked_at):
             return
         self._looked_at = count
@@ -239,7 +233,7 @@ class MapUp:
 
 
 def _some_triangles(tiles: MapTiles, count: int) -> Mesh:
-    """A mesh of some triangles from everywhere, each with corners of its own."""
+    """Mesh of some triangles from everywhere, each with corners of its own."""
     step = max(1, count // up_direction.SAMPLE)
     corners, normals = [], []
     for tile in tiles.tiles.values():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Scanners in the scene: where each is, what it saw last, and the ways of its keyframes."""
+"""Scanners in the scene: their poses, last pictures, and the paths of their keyframes."""
 
 import math
 from dataclasses import dataclass, field
@@ -30,8 +30,6 @@ _MOST_PIXELS = 1 << 26
 
 @dataclass
 class _ScannerMark:
-    """A session: its newest keyframe, and where its keyframes are and were."""
-
     number: int
     newest: ScannerSeen | None = None
     pose: NDArray[np.float64] | None = None
@@ -56,7 +54,6 @@ class ScannerMarks:
         self.shows = {"scanners": True, "paths": True, "first paths": True}
 
     def clear(self) -> None:
-        """Take everything out of the scene."""
         for scanner in self._scanners.values():
             for node in scanner.nodes.values():
                 node.remove()
@@ -64,7 +61,7 @@ class ScannerMarks:
 
     @property
     def sessions(self) -> list[bytes]:
-        """Sessions of all scanners, in the order in which they came."""
+        """Sessions of all scanners, in order of appearance."""
         return list(self._scanners)
 
     def name(self, session: bytes) -> str:
@@ -79,7 +76,7 @@ class ScannerMarks:
         return None if scanner is None else scanner.pose
 
     def positions(self) -> NDArray[np.float64]:
-        """(n, 3) where keyframes are, of all scanners."""
+        """(n, 3) places of the keyframes of all scanners."""
         found = [list(scanner.now.values()) for scanner in self._scanners.values() if scanner.now]
         return np.concatenate(found) if found else np.zeros((0, 3))
 
@@ -94,7 +91,7 @@ class ScannerMarks:
         scanner.is_placed = scanner.is_drawn = False
 
     def note_paths(self, event: PathsFound) -> None:
-        """Take the places of all keyframes into account; what came after them stays."""
+        """Take the places of all keyframes; newer ones stay."""
         for session, scanner in self._scanners.items():
             if session not in event.paths and scanner.is_found:
                 scanner.now, scanner.newest, scanner.pose = {}, None, None
@@ -121,7 +118,7 @@ class ScannerMarks:
         )
 
     def draw(self, now: float) -> None:
-        """Bring what has changed into the scene."""
+        """Bring changes into the scene."""
         for session, scanner in self._scanners.items():
             if not scanner.is_placed:
                 scanner.is_placed = True
@@ -156,7 +153,7 @@ class ScannerMarks:
         node.wxyz, node.position = wxyz, position
 
     def _hang_picture(self, scanner: _ScannerMark, now: float) -> None:
-        """Show what it saw last, if that is new."""
+        """Show the scanner's last picture, if it is new."""
         node = scanner.nodes.get("scanners")
         is_due = scanner.picture is not None and now >= scanner.picture_at + _PICTURE_PAUSE
         if is_due and scanner.picture is not None and node is not None and _is_frustum(node):
@@ -223,7 +220,7 @@ class ScannerMarks:
 
 
 def _segments(points: NDArray[np.float64], most: float) -> NDArray[np.float32]:
-    """(n, 2, 3) from point to point, but for jumps of more than `most` metres."""
+    """(n, 2, 3) from point to point, without jumps of more than `most` metres."""
     points = points[:: max(1, math.ceil(len(points) / _MOST_POINTS))]
     pairs = np.stack((points[:-1], points[1:]), axis=1)
     steps = np.linalg.norm(pairs[:, 1] - pairs[:, 0], axis=1)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Coloured triangles as GLB for viser's scene: few bytes, and on the screen just the colours asked for.
+"""Coloured triangles as GLB for viser's scene: few bytes, and exactly the wanted colours on the screen.
 
 Positions are 16 bit on a grid that all tiles share, so that neighbours meet without a crack; colours are 16
-bit, too. The material is unlit: a map's colours were lit where they were seen. three.js then bends what it
-draws by a film's curve (ACES); the colours are sent bent the other way.
+bit, too. The material is unlit: a map's colours were lit at capture. three.js then applies a film curve
+(ACES) to its picture; the colours are sent through the inverse curve.
 """
 
 import json
@@ -33,15 +33,15 @@ def encode(
     corner: NDArray[np.float64],
     voxel_size: float,
 ) -> bytes:
-    """The content of a GLB file.
+    """Content of a GLB file.
 
     Args:
         vertices: (n, 3), metres.
         faces: (m, 3), at least one.
         colors: (n, 3) RGB (sRGB), as they are to be seen.
         corner: (3,) a point of the grid, below all vertices.
-        voxel_size: metres; positions are rounded to 1/256 of it, or of its double and so on where they do
-            not fit.
+        voxel_size: metres; positions are rounded to 1/256 of it, or of its double and so on where they do not
+            fit.
     """
     step = voxel_size / SHARES
     steps = (vertices - corner) / step
@@ -57,9 +57,9 @@ def encode(
 
 
 def before_curve(colors: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """(n, 3) linear values that three.js turns into these sRGB colours; the nearest it can, where it cannot.
+    """(n, 3) linear values that three.js turns into these sRGB colours, or the nearest possible ones.
 
-    It cannot show the most glaring colours: 1 % of light is taken from white, pure yellow becomes paler.
+    The most glaring colours are impossible: 1 % of light is taken from white, pure yellow becomes paler.
     """
     y = np.clip(_LINEAR[colors] @ _AFTER, 0.0, 0.999)
     # The curve is (v² + 0.0245786 v − 0.000090537) / (0.983729 v² + 0.432951 v + 0.238081): solved for v

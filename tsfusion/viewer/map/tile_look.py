@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Look of a map's tiles, colours and cut: one that browsers share, or one that a browser has chosen."""
+"""Look of a map's tiles, colours and cut: shared by browsers, or chosen by one."""
 
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
@@ -28,7 +28,7 @@ class TileLook:
         self._tiles, self.colors, self.nodes = tiles, colors, nodes
 
     def changed(self, keys: Iterable[CellKey]) -> None:
-        """Note tiles with other triangles; values are asked for first, but where nothing is shown yet."""
+        """Note tiles with other triangles. Tiles that are not shown yet do not wait for their values."""
         keys = set(keys)
         if self.colors.is_asked_for:
             found = {key: self._tiles.tiles[key] for key in keys if key in self._tiles.tiles}
@@ -37,30 +37,28 @@ class TileLook:
         self.nodes.changed(keys)
 
     def choose(self, mode: str) -> None:
-        """Colour by something else."""
         self.colors.choose(mode)
         self.colors.fit_scale()
         self.changed(self._tiles.tiles)
 
     def refresh(self, up: NDArray[np.float64]) -> None:
-        """Take the values that have come, and fit the scale to what is there."""
+        """Take new values, and fit the scale to the shown tiles."""
         self.colors.up = up
         if self.colors.fit_scale():
             self.nodes.changed(self._tiles.tiles)
 
     def clear(self) -> None:
-        """Forget the map."""
         self.nodes.clear()
         self.colors.choose(self.colors.mode)
 
     def mesh(self, up: Up | None) -> Mesh:
-        """Mesh of what is shown, in the map's frame."""
+        """Shown surface as a mesh, in the map's frame."""
         parts = [self.nodes.shown_mesh(key, tile) for key, tile in list(self._tiles.tiles.items())]
         return map_tiles.whole(parts, up)
 
 
 class OwnLook(TileLook):
-    """Look of one browser, which takes the place of the shared one as soon as all of it is there."""
+    """Look of one browser, which replaces the shared one once it is complete."""
 
     def __init__(
         self, client: "viser.ClientHandle", tiles: MapTiles, colors: VertexColors, bucket: Bucket
@@ -72,7 +70,7 @@ class OwnLook(TileLook):
         self._cover: viser.FrameHandle | None = None  # stands before the shared look and hides it
 
     def send(self, now: float) -> None:
-        """Send what is due, where the browser reads."""
+        """Send due tiles, if the browser reads."""
         unread = self._client._websock_connection.get_message_buffer().message_from_id
         if len(unread) > MOST_UNREAD:
             return
@@ -82,7 +80,6 @@ class OwnLook(TileLook):
             self._cover = self._client.scene.add_frame(ROOT, show_axes=False, visible=False)
 
     def close(self) -> None:
-        """Show the shared look again."""
         self.colors.values.close()
         if self._cover is not None:
             self._cover.remove()

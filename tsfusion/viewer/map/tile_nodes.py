@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The tiles of a map in the scene of all browsers: the newest wins, and bytes a second are bounded."""
+"""Tiles of a map in the scene of all browsers: the newest wins, and bytes a second are bounded."""
 
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
@@ -16,9 +16,9 @@ from tsfusion.viewer.map.vertex_colors import VertexColors
 if TYPE_CHECKING:
     import viser
 
-# Seconds between two versions of a tile, at least. A browser drops a model as soon as it is given another
-# one, and shows that only once it is read: so a tile has two nodes in turn, and the last one stays meanwhile.
-# A node costs viser ten times as much to make as to change: the other is kept, empty, while it may be needed.
+# Seconds between two versions of a tile, at least. A browser drops a model as soon as it gets another, and
+# shows that only after reading it: so a tile has two nodes in turn, and the last one stays meanwhile. A node
+# costs viser ten times as much to make as to change: an emptied one is kept while it may be needed.
 PAUSE = 1.0
 STEADY_PAUSE = 2.0  # of a tile that changes all the time: half of the work for everybody, and nobody sees it
 _SPARED = 5.0  # seconds that an empty node is kept after its last version
@@ -29,12 +29,12 @@ _MARGIN = 1.0  # of a tile's edge that its triangles may reach beyond it
 
 
 class TileNodes:
-    """Sends tiles that have changed, whoever waits longest first.
+    """Sender of changed tiles, the longest waiting first.
 
     Args:
         bucket: of bytes a second, of all tiles together.
         root: of the names of nodes.
-        keeps: whether browsers that come later get what has been sent.
+        keeps: browsers that come later get the tiles sent before.
     """
 
     def __init__(
@@ -71,7 +71,6 @@ class TileNodes:
         return key in self._nodes
 
     def clear(self) -> None:
-        """Take everything out of the scene."""
         older = (node for nodes in (self._last, self._spare) for node, _ in nodes.values())
         for node in (*self._nodes.values(), *older):
             node.remove()
@@ -89,12 +88,11 @@ class TileNodes:
             kept.clear()
 
     def changed(self, keys: Iterable[CellKey]) -> None:
-        """Note tiles that look different now."""
         for key in keys:
             self.waiting.setdefault(key)
 
     def clip(self, clipping: Clipping) -> None:
-        """Hide what lies beyond, at once; tiles that are cut follow."""
+        """Hide tiles beyond at once; cut tiles follow."""
         self.clipping = clipping
         for key, tile in list(self._tiles.tiles.items()):
             side, shown = clipping.side(tile.bounds), self._sides.get(key)
@@ -110,7 +108,7 @@ class TileNodes:
                 node.visible = True
 
     def send(self, now: float) -> int:
-        """Send what is due; the number of tiles that were."""
+        """Send due tiles. Returns their number."""
         count = 0
         for key, (_, end) in list(self._last.items()):
             if now >= end:
@@ -137,7 +135,6 @@ class TileNodes:
         return count
 
     def _due(self, key: CellKey) -> float:
-        """When a tile may be sent."""
         pause = _CUT_PAUSE if key in self._cut else self._pauses.get(key, PAUSE)
         return self._sent_at.get(key, -np.inf) + pause
 
@@ -147,7 +144,7 @@ class TileNodes:
         return mesh if self.clipping.side(tile.bounds) == "whole" else self.clipping.cut(mesh)
 
     def _send(self, key: CellKey, now: float) -> int:
-        """Bring a tile into the scene as it is now; the bytes that takes."""
+        """Update a tile in the scene. Returns the bytes that this takes."""
         tile, node = self._tiles.tiles.get(key), self._nodes.get(key)
         if tile is None:
             if node is not None:
@@ -195,14 +192,14 @@ class TileNodes:
         return len(content)
 
     def _add(self, key: CellKey, node: "viser.GlbHandle | None") -> "viser.GlbHandle":
-        """An empty node beside another one: what it is made with stays in viser's memory as long as it."""
+        """An empty node beside another one: viser keeps its first content in memory as long as the node."""
         names = [f"{self._root}/" + "_".join(map(str, key)) + version for version in ("", "b")]
         if node is not None:
             names.remove(node.name)
         return self._scene.add_glb(names[0], tile_glb.EMPTY, cast_shadow=False, receive_shadow=False)
 
     def _empty_last(self, key: CellKey, now: float) -> None:
-        """Take the version before out of the scene, and keep its node."""
+        """Empty the former version of a tile, and keep its node."""
         node, _ = self._last.pop(key)
         node.glb_data = tile_glb.EMPTY
         self._spare[key] = (node, now + _SPARED)

@@ -25,13 +25,13 @@ _STOPS = 9  # of a legend's bar
 
 @dataclass(frozen=True)
 class Scale:
-    """The values of the first and the last colour."""
+    """Values of the first and the last colour."""
 
     low: float
     high: float
 
     def colors(self, values: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:
-        """(n, 3) RGB of (n,) values; grey where there is none (NaN)."""
+        """(n, 3) RGB of (n,) values; grey for NaN."""
         share = np.nan_to_num((values - self.low) / (self.high - self.low))
         colors: NDArray[np.uint8] = ramp()[np.rint(255 * np.clip(share, 0, 1)).astype(np.uint8)]
         colors[np.isnan(values)] = _UNKNOWN
@@ -39,7 +39,7 @@ class Scale:
 
 
 class VertexColors:
-    """Present meaning of colours.
+    """Current meaning of colours.
 
     Args:
         tiles: that get colours.
@@ -57,12 +57,11 @@ class VertexColors:
         self._of_client: Callable[[bytes], str] = lambda session: session.hex()[:8]
 
     def choose(self, mode: str) -> None:
-        """Colour by something else."""
         self.mode, self.scale = mode, None
         self.values.choose(mode)
 
     def name_clients(self, name: Callable[[bytes], str]) -> None:
-        """Take a session's name from a function."""
+        """Take sessions' names from a function."""
         self._of_client = name
 
     @property
@@ -88,14 +87,13 @@ class VertexColors:
         return self._shaded(self.scale.colors(values), mesh.normals)
 
     def fit_scale(self) -> bool:
-        """Fit the scale's ends to what is there; whether they are others now, so that all colours are."""
+        """Fit the scale to the present values. Returns True if its ends, and so all colours, have changed."""
         before = self.scale
         if self.mode in {HEIGHT, AGE} or self.is_asked_for:
             self.scale = self._fitted()
         return self.scale != before
 
     def legend(self) -> str:
-        """Legend of the colours, as HTML."""
         if self.mode == CLIENT:
             names = [html.escape(self._of_client(session)) for session in self._tiles.clients]
             return " ".join(_swatch(of_number(i)) + name for i, name in enumerate(names)) or "not known"
@@ -142,7 +140,7 @@ class VertexColors:
         return Scale(-rounded_up(-low) if low < 0 else 0.0, rounded_up(high))
 
     def _shaded(self, colors: NDArray[np.uint8], normals: NDArray[np.float32]) -> NDArray[np.uint8]:
-        """Colours under a light from above and aside, so that shape reads where no picture shows it."""
+        """Colours under a light from above and aside, which shows shape without a picture."""
         side = np.roll(self.up, 1)
         light = self.up + 0.6 * (side - (side @ self.up) * self.up)
         light /= np.linalg.norm(light)
@@ -161,7 +159,6 @@ def _swatch(rgb: tuple[int, int, int]) -> str:
 
 
 def _bar(name: str, scale: Scale, unit: str) -> str:
-    """A bar of the colours with the numbers of its ends and middle."""
     colors = [as_hex(tuple(color)) for color in ramp()[np.linspace(0, 255, _STOPS).astype(int)].tolist()]
     unit = f"&nbsp;{unit}" if unit else ""
     numbers = [f"{number:.4g}" for number in (scale.low, (scale.low + scale.high) / 2, scale.high)]

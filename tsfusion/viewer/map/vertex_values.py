@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Numbers at the vertices of tiles that somebody else knows, asked for on a thread of their own."""
+"""Foreign values at the vertices of tiles, requested on a thread of their own."""
 
 import logging
 import threading
@@ -21,8 +21,7 @@ log = logging.getLogger(__name__)
 class VertexValues:
     """Values of one quantity at a time.
 
-    Args:
-        functions: by name: (n, 3) float32 points in metres → (n,) values, NaN = none there; None = not now.
+    `functions`, by name: (n, 3) float32 points in metres → (n,) values, NaN = none there; None = not now.
     """
 
     def __init__(self, functions: Mapping[str, Function]) -> None:
@@ -38,11 +37,10 @@ class VertexValues:
 
     @property
     def names(self) -> list[str]:
-        """Names of the quantities that can be chosen."""
         return list(self._functions)
 
     def choose(self, name: str) -> None:
-        """Ask for another quantity from now on; an unknown name for none."""
+        """Request another quantity from now on; an unknown name for none."""
         with self._change:
             self._name = name if name in self._functions else ""
             self._wanted.clear()
@@ -51,7 +49,7 @@ class VertexValues:
             self.is_unknown = False
 
     def ask(self, tiles: Mapping[CellKey, Tile]) -> None:
-        """Ask for the values of tiles; of each the newest counts."""
+        """Request the values of tiles; only the newest version of each counts."""
         with self._change:
             if not self._name:
                 return
@@ -69,17 +67,17 @@ class VertexValues:
         return known[1] if known is not None and known[0] is tile else None
 
     def known(self) -> list[NDArray[np.float32]]:
-        """The values of all tiles."""
+        """Values of all tiles."""
         return [values for _, values in list(self._known.values())]
 
     def take_ready(self) -> set[CellKey]:
-        """The tiles whose values came since the last call."""
+        """Tiles whose values came since the last call."""
         with self._change:
             ready, self._ready = self._ready, set()
         return ready
 
     def close(self) -> None:
-        """End the thread; a question that is under way ends by itself."""
+        """End the thread; a running request ends by itself."""
         with self._change:
             self._ended = True
             self._change.notify()

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Guard of a page: requests are judged by their Host, Origin and token. The place where it is served.
 
-A foreign page can make a browser send requests to this machine, and a foreign name can be made to lead to it:
-so Host must name this server, and the Origin of a WebSocket must be that Host. Beyond loopback, a token must
-be in the address of the first visit; a cookie stands for it from then on.
+A foreign page can make a browser send requests to this machine, and a foreign name can resolve to it: so Host
+must name this server, and the Origin of a WebSocket must be that Host. Beyond loopback, a token must be in
+the address of the first visit; a cookie stands for it from then on.
 """
 
 import hashlib
@@ -31,15 +31,11 @@ _INSTALL = "the live page needs viser; install it with: pip install '.[viewer]' 
 
 
 class Headers(Protocol):
-    """Headers of a request."""
-
-    def get_all(self, key: str) -> list[str]:
-        """Every value of the header of that name."""
-        ...
+    def get_all(self, key: str) -> list[str]: ...
 
 
 class Refusal(NamedTuple):
-    """The answer to a request that is refused, and a word for the reason."""
+    """Answer to a refused request, and a word for the reason."""
 
     reason: str
     status: HTTPStatus
@@ -47,20 +43,19 @@ class Refusal(NamedTuple):
 
 
 class PageGuard:
-    """Judges the requests to one page.
+    """Judge of the requests to one page.
 
     Args:
-        host: where the page listens: a name or number.
+        host: the page's address: a name or number.
         port: its real port.
-        token: 8 to 128 letters, digits and . _ ~ -; None = a random one where others than this machine can
-            reach the page, else none is needed.
+        token: 8 to 128 letters, digits and . _ ~ -; None = a random one if other machines can reach the page,
+            else none is needed.
 
     Attributes:
-        token: the one that is needed; None = none is.
+        token: the required one; None = none is.
         url: address to open the page with, token included.
 
-    Raises:
-        InvalidConfig: for a bad token.
+    Raises InvalidConfig for a bad token.
     """
 
     def __init__(self, host: str, port: int, token: str | None = None) -> None:
@@ -79,7 +74,7 @@ class PageGuard:
         self.url = f"http://{place}" + (f"/?token={token}" if token is not None else "")
 
     def refusal(self, path: str, headers: Headers) -> Refusal | None:
-        """Reason why a request is refused; None = it is not."""
+        """Reason why a request is refused; None = it is accepted."""
         hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
         if len(hosts) != 1 or not self._is_own(hosts[0]):
             return Refusal(
@@ -98,14 +93,14 @@ class PageGuard:
         return None
 
     def is_given(self, path: str) -> bool:
-        """True if a token is needed, and stands in the address that is asked for."""
+        """True if a required token stands in the requested address."""
         if self.token is None:
             return False
         given = parse_qs(path.partition("?")[2]).get("token", [""])[0]
         return hmac.compare_digest(given.encode(errors="surrogateescape"), self.token.encode())
 
     def answer_headers(self, path: str, headers: Headers) -> dict[str, str]:
-        """Headers of the answer to a request that is not refused: nothing is loaded from elsewhere."""
+        """Headers of the answer to an accepted request: nothing is loaded from elsewhere."""
         (host,) = headers.get_all("Host")
         policy = (
             "default-src 'self' data: blob: 'unsafe-inline' 'unsafe-eval'",
@@ -151,7 +146,7 @@ def is_websocket(headers: Headers) -> bool:
 
 
 def _is_from(origins: list[str], host: str) -> bool:
-    """True if a browser says that a page of `host` sends the request."""
+    """True if the browser says that a page of `host` sends the request."""
     if len(origins) != 1:
         return False
     scheme, _, place = origins[0].lower().partition("://")
@@ -159,13 +154,12 @@ def _is_from(origins: list[str], host: str) -> bool:
 
 
 def _own_names() -> set[str]:
-    """Names under which others may know this machine."""
     name = socket.gethostname().lower()
     return {name, f"{name.partition('.')[0]}.local"} if name else set()
 
 
 def _own_address(host: str) -> str:
-    """The address of this machine that others see; nothing is sent to find it out."""
+    """Address of this machine that others see; nothing is sent to find it out."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:

@@ -63,13 +63,10 @@ _decoder = msgpack.Decoder(_CameraMoved | _Click | _PictureTaken | _NewValue)
 
 
 def checked(message: str | bytes, control: Callable[[str], Any]) -> bytes | None:
-    """A browser's message as viser may have it; None = it is not to have it.
+    """Safe form of a browser's message for viser; None = viser must not have it.
 
-    Args:
-        control: the control of a name, as it is now, or None.
-
-    Raises:
-        msgspec.MsgspecError, RecursionError, TypeError: for what no page of ours sends.
+    `control`: present control of a name, or None. Raises msgspec.MsgspecError, RecursionError or TypeError
+    for a message that no page of ours sends.
     """
     read = _decoder.decode(message)  # type: ignore[arg-type]  # TypeError for text
     if len(message) > _MOST_BYTES and not isinstance(read, _PictureTaken):
@@ -96,7 +93,7 @@ def checked(message: str | bytes, control: Callable[[str], Any]) -> bytes | None
 
 
 def _fitted(value: Any, control: Any) -> Any:
-    """The value that a control gets when a browser sends `value`: within its bounds; None = none."""
+    """Value of a control within its bounds when a browser sends `value`; None = none."""
     before = getattr(control, "value", None)
     if isinstance(before, bool) or isinstance(value, bool):  # a box, or a button
         return value if isinstance(before, bool) and isinstance(value, bool) else None

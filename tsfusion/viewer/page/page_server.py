@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The web server of a page: viser's, behind a door that says who may come in.
+"""Web server of a page: viser's, behind a door that admits or refuses each connection.
 
 viser's own listens for every Origin, takes another port when one is in use, and prints. So it is given a
-`websockets.asyncio.server.serve` of ours while it starts; where it does not use that, nothing is served.
+`websockets.asyncio.server.serve` of ours while it starts; without using that, it serves nothing.
 """
 
 import asyncio
@@ -47,15 +47,15 @@ class PageServer:
     """A running web server with an empty page.
 
     Args:
-        host: where it listens; by default only this machine reaches it.
+        host: its address; by default only this machine reaches it.
         port: 0 = a free one.
         token: needed to open the page; None = none on this machine, else a random one.
 
     Attributes:
         server: to fill the page with.
         url: to open it with.
-        port, token: the real ones; the token is None where none is needed.
-        refused: requests that were turned away, by reason: host, origin, token, full, message.
+        port, token: the real ones; the token is None if none is needed.
+        refused: number of refused requests, by reason: host, origin, token, full, message.
 
     Raises:
         MissingDependency: without viser.
@@ -79,7 +79,6 @@ class PageServer:
         self.server.gui.configure_theme(show_logo=False, show_share_button=False)
 
     def close(self) -> None:
-        """End it, and every connection to it."""
         if not self._is_closing:
             self._is_closing = True
             self.server.get_event_loop().call_soon_threadsafe(self._end_connections)
@@ -122,20 +121,16 @@ class PageServer:
             yield running
 
     def _guarded(self, answer: "Callable[[ServerConnection, Request], Response | None]") -> dict[str, Any]:
-        """Options of a server that lets in whom the guard lets in.
-
-        Args:
-            answer: what viser answers to a request.
-        """
+        """Options of a server behind the guard. `answer`: viser's answer to a request."""
         from websockets.asyncio.server import ServerConnection
         from websockets.frames import CloseCode
 
         page = self
 
         class Knocking(ServerConnection):
-            """A connection that gives viser what our page sends, and makes room for others.
+            """A connection that gives viser the messages of our page, and makes room for others.
 
-            Of those that are no browser yet, the oldest is ended.
+            The oldest connection that is not a browser yet is closed.
             """
 
             def connection_made(self, transport: asyncio.BaseTransport) -> None:
@@ -190,7 +185,7 @@ class PageServer:
         log.warning("a browser at %s is turned away (%s): %s", peer[0], reason, text)
 
     def _control(self, name: str) -> Any:
-        """The control of that name, of all browsers or of one; None = there is none."""
+        """Control of that name, of all browsers or of one; None = there is none."""
         panels = [self.server.gui, *(client.gui for client in self.server.get_clients().values())]
         found = [
             one._gui_input_handle_from_uuid[name] for one in panels if name in one._gui_input_handle_from_uuid
@@ -223,7 +218,7 @@ def _with_our_head(html: bytes) -> bytes:
 
 
 def _quiet_logger() -> logging.Logger:
-    """A logger for connections, of which browsers and others may break as many as they like."""
+    """Logger for connections; any number of broken ones is normal."""
     made = logging.Logger(f"{__name__}.connections")
     made.addHandler(logging.NullHandler())
     made.addFilter(lambda record: record.getMessage() == "connection handler failed")
@@ -231,7 +226,6 @@ def _quiet_logger() -> logging.Logger:
 
 
 def _note_failure(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-    """Log in a line what viser did not expect of a browser."""
     log.warning("the page had an error: %s", context.get("exception") or context.get("message"))
 
 

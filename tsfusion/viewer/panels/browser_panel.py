@@ -35,7 +35,7 @@ _MARK = (213, 94, 0)
 
 
 class ShownPage(Protocol):
-    """The page that a browser shows, as its panel needs it (`LivePage`)."""
+    """Page of a browser, as its panel needs it (`LivePage`)."""
 
     map_name: str
     shared: TileLook
@@ -51,7 +51,7 @@ class ShownPage(Protocol):
 
 
 class BrowserPanel:
-    """The controls of one browser.
+    """Controls of one browser.
 
     Args:
         view, cut: make the containers of the controls current.
@@ -59,7 +59,7 @@ class BrowserPanel:
 
     Attributes:
         own: look that the browser has chosen; None = the shared one.
-        is_changed: whether another look has been chosen since `change_look`.
+        is_changed: True if another look has been chosen since `change_look`.
     """
 
     def __init__(
@@ -110,7 +110,7 @@ class BrowserPanel:
         self.is_changed = True
 
     def change_look(self) -> None:
-        """Look as the controls say: a look of its own where that is not the shared one."""
+        """Take the controls' look: a look of its own if it differs from the shared one."""
         self.is_changed = False
         mode, clipping, shared = self._mode.value, self._clipping.clipping, self._shown.shared
         if mode == shared.colors.mode and clipping.normal is None and clipping.box is None:
@@ -132,7 +132,7 @@ class BrowserPanel:
         self._tell_legend()
 
     def send(self, now: float) -> None:
-        """Send what is due of the browser's own look."""
+        """Send due tiles of the browser's own look."""
         if self.own is not None:
             with self._client.atomic():
                 self.own.send(now)
@@ -142,7 +142,7 @@ class BrowserPanel:
         self._legend.content, self._legend.visible = text(legend), bool(legend)
 
     def update(self) -> None:
-        """Move the camera with what it follows, and name the scanners that there are."""
+        """Move the camera with its scanner, and list the present scanners."""
         names = (WHOLE, BY_HAND, *dict.fromkeys(_FOLLOW + name for _, name in self._shown.scanners()))
         if tuple(self._camera.options) != names:
             self._camera.options = names
@@ -185,7 +185,7 @@ class BrowserPanel:
         self._commanded = None
 
     def _note_move(self) -> None:
-        """Leave the camera to whoever has moved it."""
+        """Stop following after a person has moved the camera."""
         view = self._commanded
         if view is None or self._camera.value == BY_HAND:
             return
@@ -252,7 +252,7 @@ class BrowserPanel:
         self._answer.content, self._answer.visible = text(content), True
 
     def _save_one(self, save: Callable[[], None]) -> None:
-        """Save one file at a time, when the browser has taken the last one."""
+        """Save one file at a time, after the browser has taken the last one."""
         waiting = self._client._websock_connection.get_message_buffer().message_from_id
         if len(waiting) > MOST_UNREAD or not self._saving.acquire(blocking=False):
             return
@@ -283,5 +283,5 @@ class BrowserPanel:
 
 
 def set_theme(gui: "viser.GuiApi", *, dark: bool) -> None:
-    """Light or dark, without the framework's own signs."""
+    """Choose light or dark, without the framework's own signs."""
     gui.configure_theme(dark_mode=dark, show_logo=False, show_share_button=False, control_width="medium")

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: MIT
-"""Delay, queue and memory of a server while keyframes come, over the time that a page has been open;
-the state of its maps and scanners as HTML, with every text escaped."""
+"""Delay, queue and memory of a server while keyframes come, over the time that a page has been open; the
+state of its maps and scanners as HTML, with every text escaped."""
 
 from collections.abc import Iterable, Sequence
 from html import escape
@@ -23,7 +23,7 @@ _ADDRESS = 40  # characters of a name that are shown
 
 
 class HealthPlots:
-    """Three plots, hidden until something is known; what has ended stays. Of a long time half is dropped."""
+    """Three plots, hidden without data; ended ones stay. After a long time half is dropped."""
 
     def __init__(self, gui: "viser.GuiApi") -> None:
         self._rows: list[tuple[float, ...]] = []
@@ -35,12 +35,11 @@ class HealthPlots:
         ]
 
     def clear(self) -> None:
-        """Begin anew."""
         self._rows.clear()
         self._stride, self._count, self._fused = 1, 0, -1
 
     def note(self, health: Health, map_name: str, now_s: float) -> None:
-        """Take the health of a moment into account."""
+        """Add the health of a moment."""
         found = health.maps.get(map_name)
         if found is None:
             return
@@ -58,7 +57,7 @@ class HealthPlots:
             self._rows, self._stride = self._rows[::2], 2 * self._stride
 
     def draw(self) -> None:
-        """Show what has been noted."""
+        """Show the noted health."""
         if len(self._rows) < 2:
             return
         columns = np.array(self._rows, np.float64).T
@@ -86,10 +85,10 @@ def _plot(gui: "viser.GuiApi", title: str, names: tuple[str, str]) -> "viser.Gui
 
 
 def summary(title: str, map_name: str, problem: str, facts: Sequence[str], problems: Sequence[str]) -> str:
-    """The head of a panel: what is watched, whether it is there, and what is wrong.
+    """Head of a panel: the watched map, its state, and its problems.
 
     Args:
-        problem: why what is watched is not there; empty = it is.
+        problem: reason why the watched map is not there; empty = it is.
         problems: of the server, a sentence each.
     """
     color, word = (_BAD, escape(problem)) if problem else (_GOOD, "connected")
@@ -107,8 +106,7 @@ def summary(title: str, map_name: str, problem: str, facts: Sequence[str], probl
 def tables(health: Health, map_name: str, order: Sequence[str]) -> str:
     """Every scanner and every map of a server.
 
-    Args:
-        order: the first 8 hexadecimal digits of the sessions that have a colour in the scene.
+    `order`: the first 8 hexadecimal digits of the sessions that have a colour in the scene.
     """
     clients = sorted(
         health.clients, key=lambda client: (client.map != map_name, client.client, client.session)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The panel that all browsers of a page share: what is shown, and how the server is."""
+"""Panel that all browsers of a page share: the shown map, and the state of the server."""
 
 import threading
 import time
@@ -38,11 +38,8 @@ class Orders:
 class SharedPanel:
     """Controls and figures in three tabs.
 
-    Args:
-        show: told what is to be shown or hidden in the scene.
-
-    Attributes:
-        view, cut: where a browser puts controls of its own.
+    `show` is told what to show or hide in the scene. Attributes `view`, `cut`: containers for a browser's own
+    controls.
     """
 
     def __init__(self, gui: "viser.GuiApi", feed: MapFeed, show: Callable[[str, bool], None]) -> None:
@@ -81,7 +78,7 @@ class SharedPanel:
         health: Health | None,
         sessions: Sequence[bytes],
     ) -> None:
-        """Show how things are."""
+        """Show the state of the map and the server."""
         found = None if health is None else health.maps.get(map_name)
         if found is not None:
             facts = [*facts, f"{grouped(found.keyframes_fused)} keyframes"]
