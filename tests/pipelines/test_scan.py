@@ -158,7 +158,7 @@ def test_poses_may_be_given_by_time_and_in_order(
 def test_a_terminal_that_goes_away_ends_a_scan_with_its_results(walk: Path, tmp_path: Path) -> None:
     """The shell and the kernel may both send SIGHUP."""
     process = started("scan", walk, "--rate", 2, *COARSE, "--out", tmp_path / "out", command=QUICK_RUN)
-    read_until(process, "frames ")
+    read_until(process, "; frames ")
     process.send_signal(signal.SIGHUP)
     time.sleep(0.3)
     process.send_signal(signal.SIGHUP)
