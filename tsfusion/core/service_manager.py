@@ -82,7 +82,7 @@ class Watchdog:
 
 
 def _interval(environment: Mapping[str, str]) -> float | None:
-    """Watchdog interval in seconds; None = another process is watched."""
+    """Watchdog interval in seconds; None = no watchdog, or one of another process."""
     if environment.get("WATCHDOG_PID", str(os.getpid())) != str(os.getpid()):
         return None
     microseconds = environment.get("WATCHDOG_USEC", "")

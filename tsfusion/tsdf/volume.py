@@ -179,7 +179,7 @@ class Volume(AskableMap):
     if not TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Any:
-            """Answer a name of another library with its counterpart."""
+            """Raise AttributeError, with the counterpart of another library's name."""
             hint = instead(name, OTHER_NAMES_OF_VOLUME, dir(type(self)))
             raise AttributeError(f"Volume has no {name}{hint}")
 

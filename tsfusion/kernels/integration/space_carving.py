@@ -277,8 +277,8 @@ def look(place, steps, side, reach, levels: ti.template(), base, least: ti.templ
 
 @ti.func
 def look_at_middle(place, steps, side, reach, clear: ti.template(), top):
-    """State, as of `look`, of the one patch at the middle of a cube. A clear patch leaves the cube hidden,
-    clear or partly clear; a partly clear patch leaves it partly clear. The image's rows begin at `top`."""
+    """State of a cube by the one patch at its middle: hidden or clear if all of its depths lie beyond or
+    before the patch's, else partly clear; clear outside the image. The image's rows begin at `top`."""
     middle = moved(place, steps, side // 2, side // 2, side // 2)
     inverse = 1.0 / ti.cast(ti.max(middle.depth, 1), ti.f32)
     x, y = ti.cast(middle.column * inverse, ti.i32), ti.cast(middle.row * inverse, ti.i32)

@@ -124,7 +124,7 @@ class CurrentSlice:
         return bool(len(moved)) or bool((self._seen[cells] != before[1]).any())
 
     def _changed_cells(self, blocks: NDArray[np.float64]) -> NDArray[np.int32]:
-        """Cells above changed blocks, and above blocks that have become free, or are free no longer."""
+        """Cells above changed blocks, and above blocks newly looked through, or no longer."""
         others = self._store.clear.changed_since(self._noted)
         self._noted = self._store.clear.noted
         if others is None:

@@ -147,12 +147,9 @@ def write_pieces(
     map_hash: Callable[[], str] | None = None,
     between: Callable[[], None] = lambda: None,
 ) -> Path:
-    """Write a map in pieces, as `write`, with one piece in memory.
+    """Write a map of `blocks` blocks in `pieces` in key order, as `write`, with one piece in memory.
 
-    Args:
-        blocks: number of all of them.
-        pieces: in key order.
-        map_hash: called when all pieces are taken; until then the header has a placeholder of its length.
+    `map_hash` is called when all pieces are taken; until then the header has a placeholder of its length.
     """
     header.blocks = blocks
     try:

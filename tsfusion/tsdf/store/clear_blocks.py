@@ -83,8 +83,7 @@ class ClearBlocks:
         self._noted, self.noted = [], self.noted + _MOST_NOTED + 1  # more than anybody follows
 
     def changed_since(self, noted: int) -> NDArray[np.int64] | None:
-        """Keys of blocks that have become free, or are free no longer, since `noted` changes; None = too
-        many."""
+        """Keys of blocks newly looked through, or no longer, since `noted` changes; None = too many."""
         found, left = [np.empty(0, np.int64)], self.noted - noted
         for keys in reversed(self._noted):
             if left <= 0:

@@ -201,14 +201,10 @@ def _bits(planes: NDArray[np.uint64]) -> NDArray[np.uint8]:
 
 
 class WholeMapValues:
-    """A `SurfaceView` with the values of the whole map, whose blocks are solved in the same batches.
+    """A `SurfaceView` with the values of the whole map, whose blocks are solved in the same batches, of
+    `size` blocks.
 
-    Valid until the map changes.
-
-    Args:
-        keys: sorted, of all blocks of the map.
-        view: reads the surface.
-        size: blocks a batch.
+    Valid until the map changes. `keys`: sorted, of all blocks of the map. `view` reads the surface.
     """
 
     def __init__(self, keys: NDArray[np.int64], view: SurfaceView, size: int) -> None:

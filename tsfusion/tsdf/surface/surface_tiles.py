@@ -32,11 +32,9 @@ MOST_BLOCKS = 1 << 14  # 32 MB
 
 
 class SurfaceTiles:
-    """Values and meshes of one surface.
+    """Values and meshes of one surface; `view` reads its values.
 
-    Args:
-        view: reads its values.
-        reach: distance, blocks, within which sums influence a block's values.
+    `reach`: distance, blocks, within which sums influence a block's values.
     """
 
     def __init__(self, store: BlockStore, view: SurfaceView, min_weight: float, reach: int) -> None:
