@@ -27,7 +27,7 @@ from tsfusion.wire.messages import messages, questions
 from tsfusion.wire.messages.health import ClientHealth, Health, MapHealth, MeshLayout, Spread
 from tsfusion.wire.records import codec, corrections
 from tsfusion.wire.records.codec import measurement
-from tsfusion.wire.records.record_header import CorrectionHeader, Refused, stamp, unpack
+from tsfusion.wire.records.record_header import CorrectionHeader, Refused, unpack, with_fields
 
 MAX_BYTES = 1 << 16  # of a case
 
@@ -111,7 +111,7 @@ def run_message(content: bytes) -> str:
         return f"{type(error).__name__} {error}"
     if keyframe.kind != measurement(header):
         raise Broken(f"a {measurement(header)} came out as {keyframe.kind}")
-    again = unpack(stamp(frames[0], previous=1, sent_ns=2))
+    again = unpack(with_fields(frames[0], previous=1, sent_ns=2))
     if (again.previous, again.sent_ns, again.seq) != (1, 2, header.seq):
         raise Broken("the header did not survive its stamp")
     return f"good {keyframe.kind}"

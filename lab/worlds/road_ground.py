@@ -28,7 +28,7 @@ class RoadGround:
         apart: (c, d) float32 metres from the course; bilinear between nodes.
         nearest: (c, d) int32, the nearest node of the course.
         shade: (e, f) uint8, light on the ground: `cast_shadow` takes it away.
-        layout: (8,) as `kernels.street_raycast.cast_view` wants it.
+        layout: (8,) as `street_raycast.cast_view` wants it.
     """
 
     course: Floats

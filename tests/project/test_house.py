@@ -168,3 +168,29 @@ def test_the_spine_speaks_words_of_the_glossary() -> None:
     }
     assert not used - known - PLAIN, "write an entry of docs/glossary.md, or use a word of it"
     assert not PLAIN - used | PLAIN & known, "take these words out of PLAIN"
+
+
+def test_architecture_begins_with_the_spine() -> None:
+    """Its first table has each file of the spine once."""
+    table = text(ROOT / "ARCHITECTURE.md").partition("\n## A forgetting")[0]
+    assert sorted(re.findall(r"`([\w/]+\.py)`", table)) == sorted(SPINE)
+
+
+def is_there(name: str) -> bool:
+    """True if a dotted name leads to a folder, a file, or a word of a file."""
+    place, parts = PACKAGE, name.split(".")
+    while parts and (place / parts[0]).is_dir():
+        place /= parts.pop(0)
+    file = place / f"{parts[0]}.py" if parts else place
+    inside, words = (file, parts[1:]) if file.exists() else (place / "__init__.py", parts)
+    return not words or (inside.exists() and re.search(rf"\b{words[0]}\b", text(inside)) is not None)
+
+
+@pytest.mark.parametrize("page", ["ARCHITECTURE.md", "CONTRIBUTING.md", "docs/method.md"])
+def test_modules_that_a_page_names_are_there(page: str) -> None:
+    wings = "|".join(sorted(groups()))
+    named = re.findall(rf"`(?:tsfusion\.)?((?:{wings})\.\w+(?:\.\w+)*)", text(ROOT / page))
+    files = re.findall(rf"`((?:{wings})/[\w/]+\.py)`", text(ROOT / page))
+    assert [name for name in named if not is_there(name)] == []
+    assert [file for file in files if not (PACKAGE / file).exists()] == []
+    assert not is_there("gateway.hosted_map")

@@ -19,7 +19,7 @@ from tsfusion.gateway.ports.access_control import AccessControl
 from tsfusion.gateway.ports.ports import Ports
 from tsfusion.wire.messages import messages
 from tsfusion.wire.records import codec
-from tsfusion.wire.records.record_header import stamp
+from tsfusion.wire.records.record_header import with_fields
 from tsfusion.wire.sockets import sockets
 
 
@@ -86,4 +86,4 @@ def serving_here(
 def record(seq: int, map_name: str = "default", session: bytes = bytes(16)) -> list[bytes]:
     """A keyframe as it is sent."""
     frames = codec.encode(wall(seq), session=session, seq=seq, previous=seq - 1, jpeg_quality=90)
-    return [stamp(frames[0], previous=seq - 1, sent_ns=1, map=map_name), *frames[1:]]
+    return [with_fields(frames[0], previous=seq - 1, sent_ns=1, map=map_name), *frames[1:]]

@@ -20,7 +20,7 @@ from tsfusion import Keyframe
 from tsfusion.core.config import ServerConfig, override
 from tsfusion.core.errors import DecodeError, InvalidConfig, InvalidKeyframe
 from tsfusion.wire.records import array_encoding, codec
-from tsfusion.wire.records.record_header import VERSION, Refused, pack, stamp, unpack
+from tsfusion.wire.records.record_header import VERSION, Refused, pack, unpack, with_fields
 
 SESSION = bytes(range(16))
 
@@ -124,7 +124,7 @@ def test_png_depth_is_accepted() -> None:
 
 def test_stamp_changes_only_what_it_says() -> None:
     frames = encode(wall())
-    before, after = unpack(frames[0]), unpack(stamp(frames[0], previous=3, sent_ns=99))
+    before, after = unpack(frames[0]), unpack(with_fields(frames[0], previous=3, sent_ns=99))
     assert (after.previous, after.sent_ns) == (3, 99)
     assert msgspec.structs.replace(after, previous=before.previous, sent_ns=0) == before
 
@@ -165,8 +165,8 @@ def test_fields_of_later_minor_versions_are_skipped() -> None:
 def test_a_record_names_its_world_only_where_there_is_one() -> None:
     """So that the records of before keep their bytes; the sender may say it of one that waited."""
     (head, *_) = golden("keyframe-v1-depth")
-    assert pack(unpack(stamp(head, world="", same_frame=False))) == head
-    moved = unpack(stamp(head, map="yard", world="w", same_frame=True))
+    assert pack(unpack(with_fields(head, world="", same_frame=False))) == head
+    moved = unpack(with_fields(head, map="yard", world="w", same_frame=True))
     assert (moved.map, moved.world, moved.same_frame) == ("yard", "w", True)
 
 

@@ -16,7 +16,7 @@ from tsfusion.gateway.intake.keyframe_intake import Quotas
 from tsfusion.geometry import se3
 from tsfusion.wire.records import codec, corrections
 from tsfusion.wire.records.corrections import Correction, checked
-from tsfusion.wire.records.record_header import CorrectionHeader, Refused, is_correction, stamp, unpack
+from tsfusion.wire.records.record_header import CorrectionHeader, Refused, is_correction, unpack, with_fields
 
 SESSION = bytes(range(16))
 
@@ -51,7 +51,7 @@ def test_corrections_survive_the_wire_to_the_bit(count: int) -> None:
     assert (numbers, header.map) == ((SESSION, count + 9, count + 8), "yard")
     assert sent.removed.tolist() == [count + 1, count + 3]
     assert same(decoded(frames), sent)
-    assert same(decoded([stamp(frames[0], previous=2, sent_ns=3), frames[1]]), sent)
+    assert same(decoded([with_fields(frames[0], previous=2, sent_ns=3), frames[1]]), sent)
 
 
 def test_the_golden_correction_stays_readable() -> None:

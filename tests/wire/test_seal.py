@@ -12,7 +12,7 @@ from tsfusion.core.errors import DecodeError
 from tsfusion.wire.messages import messages
 from tsfusion.wire.messages.messages import Stamps
 from tsfusion.wire.records import codec, corrections
-from tsfusion.wire.records.record_header import is_damaged, seal, stamp, unpack
+from tsfusion.wire.records.record_header import is_damaged, seal, unpack, with_fields
 
 SESSION = bytes(range(16))
 
@@ -69,7 +69,7 @@ def test_no_flipped_bit_changes_a_header(kind: str) -> None:
         frames = codec.encode(wall(3), session=SESSION, seq=7, jpeg_quality=90)
     else:
         frames = corrections.encode(corrections.checked({1: wall(2).T_world_camera}), session=SESSION, seq=7)
-    head = stamp(frames[0], previous=5, sent_ns=99)
+    head = with_fields(frames[0], previous=5, sent_ns=99)
     sent = unpack(head)
     for worn in flipped(head):
         try:

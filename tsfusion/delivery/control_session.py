@@ -102,7 +102,7 @@ class ControlSession:
         self.clock = ClockOffset()
         self.last_heard = 0.0  # time of the server's last message, `time.monotonic()`; 0 = never
         self.last_progress = 0.0  # when something last left the spool, or was turned away
-        self.last_moved = 0.0  # the same, or when something was sent while nothing was on its way
+        self.last_active = 0.0  # the same, or when something was sent while nothing was on its way
         self._outbox = outbox
         self._refused = refused
         self._send = send
@@ -187,7 +187,7 @@ class ControlSession:
         """Send everything that is not acknowledged once more."""
         self._outbox.rewind()
         self._asked_again = False
-        self._rewound = self.last_moved = time.monotonic()
+        self._rewound = self.last_active = time.monotonic()
 
     def on_connection(self, problem: str, before: str, *, refused: bool) -> None:
         """Note that a connection cannot be made, or can be (empty), after another problem with it."""
@@ -359,7 +359,7 @@ class ControlSession:
         if moved:
             self._outbox.change_link_state(self._outbox.link_state.moved())
             self._tries = False
-            self.last_moved = self.last_progress = self.last_heard
+            self.last_active = self.last_progress = self.last_heard
         return moved
 
     def _is_foreign(self, durable: int) -> bool:
@@ -373,7 +373,7 @@ class ControlSession:
         return foreign
 
     def _on_nack(self, nack: messages.Nack) -> None:
-        self.last_moved = self.last_progress = self.last_heard
+        self.last_active = self.last_progress = self.last_heard
         self._tries = False
         if nack.stage == "map":
             self._refused.note_rejected(nack, self.last_heard)

@@ -21,7 +21,7 @@ from tsfusion.core.errors import MISSING, DecodeError, InvalidConfig, JournalErr
 from tsfusion.delivery.control_session import ControlSession, RefusedRecords
 from tsfusion.delivery.outbox import Outbox
 from tsfusion.delivery.spool import Waiting
-from tsfusion.wire.records.record_header import stamp
+from tsfusion.wire.records.record_header import with_fields
 from tsfusion.wire.sockets import sockets
 from tsfusion.wire.sockets.connection import Patience, ServerLink
 from tsfusion.wire.sockets.curve import ClientKeys
@@ -187,7 +187,7 @@ class Sender:
         elif (
             self._outbox.outstanding
             and not session.held
-            and self._stall.has_ended(now, since=session.last_moved, sign=session.last_progress)
+            and self._stall.has_ended(now, since=session.last_active, sign=session.last_progress)
         ):
             log.info("nothing moves: connecting to %s again", self._data_address)
             self._connect_again(self._data)
@@ -204,8 +204,8 @@ class Sender:
     def _follow(self, place: tuple[str, str], now: float) -> None:
         self._data_address, self._control_address = place
         self._followed = 0.0 if place == self._home else now
-        self._data.move_to(self._data_address)
-        self._control.move_to(self._control_address)
+        self._data.connect_to(self._data_address)
+        self._control.connect_to(self._control_address)
         self._control_session.follow(self._control_address)
 
     def _connect_again(self, *connections: ServerLink) -> None:
@@ -257,7 +257,7 @@ class Sender:
     def _send(self, entry: Waiting, previous: int, frames: list[memoryview]) -> None:
         sent_ns = time.monotonic_ns()
         try:
-            head = stamp(
+            head = with_fields(
                 frames[0],
                 previous=previous,
                 sent_ns=sent_ns,
@@ -275,4 +275,4 @@ class Sender:
             self._outbox.unclaim()
             return
         if self._outbox.sent(entry, sent_ns):
-            self._control_session.last_moved = time.monotonic()
+            self._control_session.last_active = time.monotonic()

@@ -109,7 +109,7 @@ class Fuser:
             self._homes[_JOURNAL] = os.stat(self._folder / _JOURNAL)
         opened = opened or OpenedMap(begin)
         self._memory_limit, self._map = opened.memory_limit, opened.checkpoints
-        self._map.move_to(self._folder)
+        self._map.use_folder(self._folder)
         self._volume = self._map.volume
         self._warming: Iterator[None] | None = opened.warming
         self._touched_by = TouchedBy()

@@ -50,7 +50,7 @@ class MapCheckpoints:
     ) -> None:
         from tsfusion.tsdf.volume import Volume
 
-        self.move_to(folder)
+        self.use_folder(folder)
         durable_files.sweep(folder, _PARTS)  # of a process that was killed
         self._keep_previous = keep_previous
         self.problem = ""  # why the last checkpoint could not be written; empty = it could
@@ -69,7 +69,7 @@ class MapCheckpoints:
             self.blocks = dict(meta.get("blocks", {}))
         self.poses = KeyframePoses(meta.get("poses"), {key: one.seq for key, one in self.done.items()})
 
-    def move_to(self, folder: Path) -> None:
+    def use_folder(self, folder: Path) -> None:
         """Note that the map's folder has this name now."""
         self._path, self._previous = folder / state_folder.MAP_FILE, folder / state_folder.PREVIOUS_FILE
         self._new = folder / _NEW_FILE

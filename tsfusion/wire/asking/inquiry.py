@@ -95,12 +95,12 @@ class Inquiry:
             )
         )
 
-    def move_to(self, address: str) -> None:
+    def connect_to(self, address: str) -> None:
         """Ask another server from now on."""
         self.drop_question()
         self.address, self.version, self._health_asked = address, None, None
         self._seen = time.monotonic()
-        self._connection.move_to(address)
+        self._connection.connect_to(address)
 
     def drop_question(self) -> None:
         """Take no answer to the question that is under way."""

@@ -305,7 +305,7 @@ class MapClient:
             if reply.elsewhere is None:
                 break
             self.address, place = place_of(reply.elsewhere, self._keys)
-            self._connection.move_to(place)
+            self._connection.connect_to(place)
             reply, arrays = self._exchange(command, frames, began + seconds)
         delay = time.monotonic() - began
         if reply.late:

@@ -214,8 +214,8 @@ class MapWatcher:
             return
         self.address, self._control = data, control
         self._publish = sockets.connect_address(sockets.publish_address(data, control, None))
-        self._inquiry.move_to(control)
-        self._updates.move_to(self._publish)
+        self._inquiry.connect_to(control)
+        self._updates.connect_to(self._publish)
         self._health = None
         with self._weights_lock:
             if self._weights is not None:

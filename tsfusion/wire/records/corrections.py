@@ -135,7 +135,7 @@ def encode(
     world: str = "",
     same_frame: bool = False,
 ) -> list[bytes]:
-    """A correction as frames: header and body. `sent_ns` is 0 until `record_header.stamp` fills it in."""
+    """A correction as frames: header and body. `record_header.with_fields` fills in `sent_ns`, which is 0."""
     T = correction.T_map_odometry
     parts = ((correction.seqs, "<i8"), (correction.poses[:, :3], "<f8"), (correction.removed, "<i8"))
     body = b"".join(array.astype(dtype).tobytes() for array, dtype in parts)

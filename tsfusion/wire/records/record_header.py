@@ -215,7 +215,7 @@ def world_of(frame: Any) -> str:
         return ""
 
 
-def stamp(frame: Any, **fields: Any) -> bytes:
+def with_fields(frame: Any, **fields: Any) -> bytes:
     """Frame 0 again, sealed, with these fields: what is known only when the record is sent."""
     stamped = pack(msgspec.structs.replace(unpack(frame), **fields))
     return stamped[: MAGIC_BYTES + 1] + seal(stamped[MAGIC_BYTES + 1 :])

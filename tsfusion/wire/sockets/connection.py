@@ -97,7 +97,7 @@ class ServerLink:
         self.close()
         self._open()
 
-    def move_to(self, address: str) -> None:
+    def connect_to(self, address: str) -> None:
         """Connect to another address; what the old connection held is lost."""
         self.address, self.problem = address, ""
         self._is_name = sockets.is_name(address)
