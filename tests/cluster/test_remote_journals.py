@@ -3,6 +3,7 @@
 
 import importlib.util
 import os
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -76,6 +77,14 @@ def test_no_more_is_read_than_a_workers_share(stored: Any, monkeypatch: pytest.M
     assert sum(count for _, count in read) < min(max(sizes), sum(sizes) / 4)
     (keyframe,) = keyframe_sources.reading(first)
     assert keyframe().timestamp_ns == wall(1).timestamp_ns
+
+
+def test_a_url_that_nothing_here_reads_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "gcsfs", None)  # as where it is not installed
+    with pytest.raises(MissingDependency, match=r"reading gs://b/c needs another package .*gcsfs"):
+        keyframe_sources.listed(["gs://b/c"])
+    with pytest.raises(JournalError, match="foo://b/c cannot be read"):
+        keyframe_sources.listed(["foo://b/c"])
 
 
 def test_what_is_away_is_an_error(stored: Any, monkeypatch: pytest.MonkeyPatch) -> None:

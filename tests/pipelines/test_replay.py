@@ -346,7 +346,7 @@ def test_a_replay_without_a_surface_says_so(here: Here, tmp_path: Path) -> None:
     assert "no surface" in json.loads((tmp_path / "out" / "run.json").read_text())["missed"]
 
 
-@pytest.mark.parametrize("verb", ["replay", "check"])
+@pytest.mark.parametrize("verb", ["replay", "check", "fuse"])
 def test_a_live_source_is_for_scans(here: Here, verb: str) -> None:
     done = here(verb, "camera:0")
     assert done.returncode == 1

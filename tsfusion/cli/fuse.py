@@ -51,11 +51,13 @@ def fuse(
     One map: that of one machine, to the last bit. Keyframes count at their
     final poses. Started again, an interrupted run goes on where it was.
     """
-    from tsfusion.cli import output, progress
+    from tsfusion.cli import output, progress, runs
     from tsfusion.cluster import fusion, keyframe_sources
     from tsfusion.core.errors import IncompleteRun, InvalidConfig
     from tsfusion.pipelines.report import shortfall
 
+    for source in sources:
+        runs.refuse_live(source)
     memory = options.byte_count(worker_memory)
     if tile_size is not None and not 0 < tile_size < float("inf"):
         raise InvalidConfig(f"--tiles must be a number of metres above 0, got {tile_size:g}")

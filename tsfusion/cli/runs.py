@@ -325,6 +325,15 @@ def _open(context: typer.Context, spec: str, flags: dict[str, Any]) -> "tuple[So
     return RecordedSource(_part(dataset, flags), rate=flags["rate"]), warnings
 
 
+def refuse_live(source: str) -> None:
+    """Raise DatasetError for a live source: nothing but a scan finds its poses."""
+    from tsfusion.core.errors import DatasetError
+    from tsfusion.scanner.sources.named_sources import is_live
+
+    if is_live(source) and not Path(source).exists():
+        raise DatasetError(f"{source} is live and gives no poses: `tsfusion scan {source}` finds them")
+
+
 def open_recording(path: Path, /, *, unpack: bool = False, **given: Any) -> "Dataset":
     """Open a dataset or a journal.
 
@@ -334,10 +343,8 @@ def open_recording(path: Path, /, *, unpack: bool = False, **given: Any) -> "Dat
     """
     from tsfusion.core.errors import DatasetError
     from tsfusion.journal.state_folder import is_journal
-    from tsfusion.scanner.sources.named_sources import is_live
 
-    if is_live(str(path)) and not path.exists():
-        raise DatasetError(f"{path} is live and gives no poses: `tsfusion scan {path}` finds them")
+    refuse_live(str(path))
     if is_journal(path):
         from tsfusion.cluster import keyframe_sources
         from tsfusion.journal.journaled_keyframes import JournalRecording

@@ -10,7 +10,7 @@ import re
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 
-from tsfusion.core.errors import MissingDependency
+from tsfusion.core.errors import JournalError, MissingDependency
 
 _URL = re.compile(r"[a-z][a-z0-9+.-]+://")
 _RANGE_BYTES = 4 << 20  # read ahead
@@ -20,18 +20,23 @@ def location(text: str) -> Path:
     """The path that a person names; one of a URL has what is used of a `Path` to list and to read.
 
     Raises:
-        MissingDependency: for a URL without what reads it.
+        MissingDependency: for a URL without the package that reads it.
+        JournalError: for a URL of an unknown kind.
     """
     if not _URL.match(text):
         return Path(text)
     try:
         from upath import UPath
 
-        return cast(Path, UPath(text))
+        path: Any = UPath(text)
+        assert path.fs is not None  # the package is loaded here
+        return cast(Path, path)
     except ImportError as error:
         raise MissingDependency(
             f"reading {text} needs another package ({error}): run `pip install '.[s3]'` in a clone"
         ) from error
+    except ValueError as error:
+        raise JournalError(f"{text} cannot be read: {error}; give s3:// or the path of a folder") from error
 
 
 def is_url(path: Path) -> bool:
