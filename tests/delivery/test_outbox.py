@@ -115,7 +115,7 @@ def test_only_what_was_sent_can_be_corrected(outbox: Outbox, tmp_path: Path) -> 
     last = again.spool.next_seq - 1
     again.check_known(np.array([1, 3, last]))
     for never in (4, last - 1, last + 1):
-        with pytest.raises(InvalidKeyframe, match=f"keyframe {never} was never sent from here"):
+        with pytest.raises(InvalidKeyframe, match=f"keyframe {never} was never sent by this client"):
             again.check_known(np.array([1, never]))
     again.close()
 

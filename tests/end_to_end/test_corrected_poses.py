@@ -153,7 +153,7 @@ def test_only_what_was_sent_can_be_corrected(shared: Server, tmp_path: Path) -> 
     with Client(shared.address, spool=tmp_path) as client:
         (seq,) = scan(client, 1)
         for poses, removed in (({seq: pose(), seq + 1: pose()}, []), ({seq: pose()}, [seq + 1])):
-            with pytest.raises(InvalidKeyframe, match=f"keyframe {seq + 1} was never sent from here"):
+            with pytest.raises(InvalidKeyframe, match=f"keyframe {seq + 1} was never sent by this client"):
                 client.correct(poses, removed=removed)
         with pytest.raises(InvalidKeyframe, match="T_world_camera must have shape"):
             client.correct({seq: pose()}, T_map_odometry=np.eye(3))

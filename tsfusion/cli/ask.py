@@ -44,9 +44,12 @@ def ask(
         tuple[float, float] | None,
         typer.Option("--slice", metavar="LOW HIGH", help="Obstacles between two heights, metres."),
     ] = None,
-    distances: Annotated[bool, typer.Option("--distances", help="Also the distance from each cell.")] = False,
+    distances: Annotated[
+        bool, typer.Option("--distances", help="Also distances to the nearest obstacle.")
+    ] = False,
     unseen_is_free: Annotated[
-        bool, options.option("--unseen-is-free", None, "Distances where nothing was seen; else 0.", rare=True)
+        bool,
+        options.option("--unseen-is-free", None, "Count unseen space as free; default: 0 there.", rare=True),
     ] = False,
     box: Annotated[
         tuple[float, float, float, float] | None,

@@ -41,19 +41,19 @@ MAP_OPTIONS: dict[str, Any] = {
     "min_weight": Annotated[float | None, _map_option(
         "--min-weight", "COUNT", "Full-confidence samples that mesh a voxel.")],
     "space_carving": Annotated[bool | None, _map_option(
-        "--space-carving/--no-space-carving", None, "Clear what is looked through: no ghosts.")],
+        "--space-carving/--no-space-carving", None, "Clear voxels that rays pass: no ghosts.")],
     "regularizer": Annotated[str | None, _map_option(
-        "--regularizer", "MODE", "Smoothing along rays: off, paper or ray.", rare=True)],
+        "--regularizer", "MODE", "Smoothing along each ray: off, paper (as published) or ray.", rare=True)],
     "surface": Annotated[str | None, _map_option(
-        "--surface", "MODE", "Surface to mesh: raw, normal or field (smoothed).", rare=True)],
+        "--surface", "MODE", "Surface to mesh: raw, or smoothed: normal, field.", rare=True)],
     "lambda_": Annotated[float | None, _map_option(
-        "--lambda", "NUMBER", "Smoothing along rays and of the field.", rare=True)],
+        "--lambda", "NUMBER", "Strength of the smoothing along rays and of the field; 0 = none.", rare=True)],
     "truncation": Annotated[float | None, _map_option(
         "--truncation", "VOXELS", "Half-width of every ray's band, instead of 3 sigma of its noise.",
         rare=True)],
     "support": Annotated[str | None, _map_option(
-        "--support", "LEAST:MOST", "Bounds of a ray's begin before its end, such as 3:6; a third number "
-        "is its least reach behind it (::16 sets that alone).", rare=True)],
+        "--support", "LEAST:MOST", "Voxels that a ray reaches before its end, at least and at most, such "
+        "as 3:6; a third number: at least behind its end (::16 sets that alone).", rare=True)],
     "arch": Annotated[str | None, _map_option(
         "--arch", "NAME", "Fuse on cpu, cuda or vulkan; on the CPU where that is missing.", rare=True,
         autocompletion=lambda: ["cpu", "cuda", "vulkan", "metal"])],

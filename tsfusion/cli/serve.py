@@ -49,7 +49,7 @@ SERVER_OPTIONS: dict[str, Any] = {
     "directory": _flag("--directory", "FILE", "File that says which server has which map.", rare=True),
     "advertise": _flag("--advertise", "ADDRESS", "Address by which clients reach this server.", rare=True),
     "keys": _flag("--keys", "DIR",
-                  "Who may connect: `tsfusion keys`; needed beyond this machine."),
+                  "Keys of clients (`tsfusion keys`): other machines need them."),
     "fuser_memory_bytes": _flag("--memory", "BYTES",
                                 "Memory of each map's blocks, such as 2GB; more wait on the disk."),
     "fuser_disk_bytes": _flag("--disk", "BYTES",

@@ -275,7 +275,7 @@ class Outbox:
         with self._lock:
             known = (seqs <= self.spool.left) | ((seqs > self._used_before) & (seqs < self.spool.next_seq))
         if not known.all():
-            raise InvalidKeyframe(f"keyframe {seqs[np.argmin(known)]} was never sent from here")
+            raise InvalidKeyframe(f"keyframe {seqs[np.argmin(known)]} was never sent by this client")
 
     # --- on their way ---
 

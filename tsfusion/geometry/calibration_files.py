@@ -233,7 +233,9 @@ def _camera(tree: Tree, size: Size | None) -> tuple[Camera, Tree]:
         raise InvalidConfig(f"no camera in it, only {', '.join(list(tree)[:8])}")
     coefficients = _distortion(tree)
     if any(coefficients) and "inverse" in str(tree.get("model", "")):
-        raise InvalidConfig(f"model of a lens must not be an inverse one, got {tree['model']}")
+        raise InvalidConfig(
+            f"the lens model must not be an inverse one, got {tree['model']}: give the forward one"
+        )
     model = tree.get("distortion_model", "fisheye" if _is_fisheye(tree) else "plumb_bob")
     return Camera.named(K, _given(size), model if any(coefficients) else "none", coefficients), tree
 

@@ -382,7 +382,7 @@ def test_a_camera_that_is_not_there() -> None:
 def test_a_device_without_such_images() -> None:
     device = rs.software_device()
     device.add_sensor("Nothing")
-    with pytest.raises(SourceError, match="it has 0 of the 1 streams wanted"):
+    with pytest.raises(SourceError, match="the camera has 0 of the 1 streams wanted"):
         RealSense(device=device)
 
 

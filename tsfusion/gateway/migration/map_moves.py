@@ -136,7 +136,7 @@ class MapMoves:
             if command.hand_over is None:
                 raise JournalError("the request names no part of the map")
             if self._unread.of(identity)[0] >= _MOST_UNREAD or self._unread.nbytes > self._max_bytes:
-                raise JournalError("earlier answers were not read yet")
+                raise JournalError("earlier answers wait to be read: read them, then ask again")
             parcel, frames = self._departures.answer(command.map, command.hand_over)
         except TsfusionError as refusal:
             error = str(refusal)

@@ -118,7 +118,7 @@ class DeviceStream:
                 self._profiles += chosen
         if len(self._profiles) < len(wanted):
             self.stop()
-            raise RuntimeError(f"it has {len(self._profiles)} of the {len(wanted)} streams wanted")
+            raise RuntimeError(f"the camera has {len(self._profiles)} of the {len(wanted)} streams wanted")
 
     def wait(self, milliseconds: int) -> Any:
         there, frames = self._syncer.try_wait_for_frames(milliseconds)

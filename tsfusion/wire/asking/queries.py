@@ -175,7 +175,7 @@ def forget(
     )
     reply, _ = _request_if_present(address, control, command, timeout, keys)
     if reply.forgotten is None:
-        raise TransportError(f"the server at {address} answered without what it forgot")
+        raise TransportError(f"the server at {address} answered without a list of forgotten keyframes")
     return reply.forgotten
 
 
