@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The write-ahead log of keyframe messages: MCAP segments in a folder.
+"""Write and read a map's journal: the write-ahead log of its records, as MCAP segments in a folder.
 
-A keyframe is on the disk when `Journal.append` returns. MCAP cannot be appended to, so each start opens a
-new segment. One chunk a keyframe, uncompressed: the arrays are compressed already, and a chunk has a CRC.
+A keyframe is on the disk when `Journal.append` returns. MCAP files cannot be appended to, so each start opens
+a new segment. Each keyframe is one chunk with a CRC, uncompressed because its arrays are compressed already.
 """
 
 from tsfusion.journal.mcap_layout import Position, Record

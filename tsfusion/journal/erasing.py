@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""Deleting records out of a segment: their bytes become zeros, and all other records stay where they are.
+"""Erase records from a closed segment file: zeros replace their bytes, and all other records keep their
+offsets.
 
-In the place of an erased record, its chunk and its index, stands one MCAP record of a private opcode that is
-as long, which readers pass over. It says which record of which session was there: so it is not taken again
-when its client sends it once more.
+One MCAP record of a private opcode replaces an erased record, its chunk and its index. It is equally long,
+and MCAP readers skip it. It names the erased record, so the server does not take that record again from its
+client.
 
     opcode, length | mark | segment's identity | session | seq | client | CRC | zeros
 
-The index at the end of a segment goes first and is written anew at last. A crash in between leaves a segment
-without an index, as a server leaves one that was killed, and the next run goes on.
+Erasing first removes the index at the end of the segment, and last writes a new one. A crash in between
+leaves a segment without an index, as a killed server does. The next run then continues.
 """
 
 import ctypes
@@ -33,13 +34,13 @@ _ZEROS = bytes(1 << 20)
 
 
 def erase(path: Path, offsets: Collection[int]) -> Iterator[int]:
-    """Erase the records that begin at these bytes of a segment that nobody writes, a piece at a time.
+    """Erase the records at these byte offsets of a closed segment, a piece at a time.
 
     Yields:
-        How many records are erased so far; they are on the disk at the end.
+        The number of records erased so far; after the last step the changes are on the disk.
 
     Raises:
-        JournalError: when there is neither a record nor an erased one at such a place, or the disk refuses.
+        JournalError: an offset has neither a record nor an erased record, or the disk refuses.
     """
     try:
         with path.open("r+b", buffering=0) as file:
@@ -52,7 +53,7 @@ def erase(path: Path, offsets: Collection[int]) -> Iterator[int]:
                 os.fdatasync(file.fileno())
             for one in places:
                 _write(file, one.mark, one.offset)
-            os.fdatasync(file.fileno())  # from here on nobody takes what is left of them for damage
+            os.fdatasync(file.fileno())  # from now on, readers see these records as erased
             yield from _clear(file, places)
             if summary is not None:
                 _write(file, summary[1], summary[0])
@@ -64,7 +65,7 @@ def erase(path: Path, offsets: Collection[int]) -> Iterator[int]:
 class _RecordPlace(NamedTuple):
     offset: int
     nbytes: int
-    mark: bytes  # the first of them, from then on
+    mark: bytes  # first bytes of the erased record
 
 
 def _place(source: SegmentFile, offset: int) -> _RecordPlace:
@@ -88,7 +89,7 @@ def _write(file: FileIO, content: bytes, at: int) -> None:
 
 
 def _clear(file: FileIO, places: list[_RecordPlace]) -> Iterator[int]:
-    """Overwrite all but the marks with zeros."""
+    """Overwrite all bytes of these records with zeros, except the marks."""
     unsynced = 0
     for number, one in enumerate(places, 1):
         at, end = one.offset + len(one.mark), one.offset + one.nbytes
@@ -108,7 +109,7 @@ def _clear(file: FileIO, places: list[_RecordPlace]) -> Iterator[int]:
 
 
 def _give_back(file: FileIO, at: int, nbytes: int) -> None:
-    """Let the disk have the room of zeros, where the system can (Linux); they read as zeros still."""
+    """Release the disk space of zeros where the system can (Linux); the bytes still read as zeros."""
     with suppress(OSError, AttributeError):
         ctypes.CDLL(None).fallocate(file.fileno(), _PUNCH_HOLE, ctypes.c_int64(at), ctypes.c_int64(nbytes))
 
@@ -124,7 +125,7 @@ _FOOTER = struct.Struct("<BQQQI")
 
 
 def _summary(source: SegmentFile, end: record_scan.SegmentEnd, erased: set[int]) -> tuple[int, bytes] | None:
-    """Where the index begins, its end-of-data mark included, and the new one; None = there is none."""
+    """Return the offset of the end-of-data mark, and the mark with a new index; None without an index."""
     if end.data_end is None:
         return None
     start = end.data_end + len(mcap_layout.END_OF_DATA)
@@ -149,7 +150,7 @@ def _summary(source: SegmentFile, end: record_scan.SegmentEnd, erased: set[int])
 
 
 def _recount(statistics: bytes, chunks: int) -> bytes:
-    """The statistics of a segment of so many chunks, one message each."""
+    """Return the statistics record of a segment with this number of chunks, one message each."""
     fields = list(_STATISTICS.unpack_from(statistics, _RECORD.size))
     gone, fields[0], fields[5] = fields[0] - chunks, chunks, chunks
     counts = statistics[_RECORD.size + _STATISTICS.size :]
@@ -161,7 +162,7 @@ def _recount(statistics: bytes, chunks: int) -> bytes:
 
 
 def _packed(groups: dict[int, list[bytes]], start: int) -> bytes:
-    """The records of an index that begins at this byte, with the offsets of its groups and its footer."""
+    """Return the bytes of an index at offset `start`: its groups, their offsets and its footer."""
     records, offsets, at = b"", b"", start
     for opcode, group in groups.items():
         if group:

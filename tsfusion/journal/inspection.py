@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Contents of a journal, and the check that all of it is as it was written."""
+"""Summarise the contents of a journal, and verify that its records are intact."""
 
 import math
 from array import array
@@ -28,10 +28,10 @@ from tsfusion.wire.records.record_header import unpack, unpack_keyframe
 
 
 class JournalFault(Struct, frozen=True):
-    """A place in a journal that is not as it should be.
+    """A stretch of a journal with something to report.
 
-    `torn`: the end of a write that was cut off before it was acknowledged. `note`: nothing is wrong with
-    what is there. `erased`: a keyframe was deleted on purpose. None of these is damage.
+    `torn`: the end of a write that was cut off before it was acknowledged. `note`: the bytes there are right.
+    `erased`: a keyframe was deleted on purpose. None of these three kinds is damage.
     """
 
     kind: Literal["damage", "torn", "note", "erased"]
@@ -43,7 +43,7 @@ class JournalFault(Struct, frozen=True):
 
 
 class SegmentInfo(Struct, kw_only=True):
-    """One file. `state`: closed with an index, or open: being written, or its writer was killed."""
+    """One segment file. An `open` file has no index: it is being written, or its writer was killed."""
 
     name: str
     nbytes: int
@@ -55,14 +55,14 @@ class SegmentInfo(Struct, kw_only=True):
 
 
 class SessionInfo(Struct, kw_only=True):
-    """The records of one spool: `seq` numbers them, `client` is whose key they came under.
+    """The records of one spool: `seq` is their number, `client` the name of the key that they came under.
 
     Attributes:
-        corrected: keyframes whose pose a correction names.
+        corrected: keyframes whose pose a correction gives.
         removed: keyframes that a correction takes out of the map.
         forgotten: keyframes that the server was told to forget.
-        moved_m, turned_deg: the most that any corrected keyframe in the journal is away from where it was
-            sent, in metres and degrees, by the newest pose of each.
+        moved_m, turned_deg: the largest distance (metres) and angle (degrees) between the sent and the newest
+            pose of a corrected keyframe in the journal.
     """
 
     session: str
@@ -81,7 +81,7 @@ class SessionInfo(Struct, kw_only=True):
 
 
 class JournalInfo(Struct, kw_only=True):
-    """A journal at a glance."""
+    """A summary of a journal."""
 
     path: str
     keyframes: int
@@ -96,7 +96,7 @@ class JournalInfo(Struct, kw_only=True):
 
 
 class JournalVerdict(Struct, kw_only=True):
-    """Verdict on a journal, intact or not. `lost`: keyframes that cannot be had any more, at least."""
+    """The result of `verify`. `lost`: lower bound of the keyframes that are lost."""
 
     path: str
     intact: bool
@@ -109,10 +109,10 @@ class JournalVerdict(Struct, kw_only=True):
 
 
 def summarize(place: JournalPlace, watch: OnProgress) -> JournalInfo:
-    """Read every record's CRC and header; of arrays only those of corrections.
+    """Summarise a journal: check every record's CRC and header, and decode the arrays of corrections only.
 
     Raises:
-        JournalError: when the folder cannot be listed.
+        JournalError: the folder cannot be listed.
     """
     segments = {path: _segment(path) for path in place.files()}
     sessions: dict[bytes, SessionInfo] = {}
@@ -160,7 +160,7 @@ def _segment(path: Path) -> SegmentInfo:
 
 
 class _Moves:
-    """How far corrections move the keyframes of one session."""
+    """The poses of one session's keyframes, as sent and as corrected."""
 
     def __init__(self) -> None:
         self._seqs = array("q")
@@ -169,7 +169,7 @@ class _Moves:
         self._removed: set[int] = set()
 
     def note(self, record: Record) -> None:
-        """Take in the poses of a record; one that cannot be read is left to `verify`."""
+        """Add the poses of a record; an unreadable record is left to `verify`."""
         try:
             if record.is_correction:
                 self._correct(record)
@@ -187,7 +187,7 @@ class _Moves:
         self._removed.update(found.removed.tolist())
 
     def describe(self, session: SessionInfo) -> None:
-        """Fill in the figures of a session."""
+        """Fill in the corrected counts and largest moves of a session."""
         session.corrected, session.removed = len(self._corrected), len(self._removed)
         for at, seq in enumerate(self._seqs):
             if seq not in self._corrected:
@@ -221,7 +221,7 @@ def _count(sessions: dict[bytes, SessionInfo], record: Record) -> None:
 
 
 def problem(path: Path, damage: Damage) -> JournalFault:
-    """A damaged or erased place as a report names it."""
+    """Return the fault that a report shows for a damaged or erased stretch."""
     kind: Literal["damage", "torn", "erased"] = "torn" if damage.torn else "damage"
     if isinstance(damage, Erased):
         kind = "erased"
@@ -232,7 +232,7 @@ def verify(place: JournalPlace, watch: OnProgress) -> JournalVerdict:
     """Read and decode every record.
 
     Raises:
-        JournalError: when the folder cannot be listed.
+        JournalError: the folder cannot be listed.
     """
     files = place.files()
     checks = _Checks()
@@ -266,7 +266,7 @@ def _missing(files: list[Path]) -> Iterator[JournalFault]:
 
 
 class _Checks:
-    """Checks of a record whose CRC is right."""
+    """Checks for records with a correct CRC."""
 
     def __init__(self) -> None:
         self._last: dict[bytes, int] = {}
@@ -308,7 +308,7 @@ def _name(record: Record) -> str:
 
 
 class ForgottenNumbers:
-    """A set of (session, number) that grows with each record that forgets keyframes."""
+    """The set of forgotten keyframes, as (session, number); grows with each record that forgets keyframes."""
 
     def __init__(self) -> None:
         self._sessions: dict[bytes, NumberRanges] = {}
@@ -318,7 +318,7 @@ class ForgottenNumbers:
         return session in self._sessions and seq in self._sessions[session]
 
     def note(self, record: Record) -> None:
-        """Take in a record; any but those that forget keyframes, and a damaged one, are passed over."""
+        """Add the keyframes that a record forgets; ignore any other record, and a damaged one."""
         if record.session != SERVER_SESSION or not record.is_correction:
             return
         with suppress(DecodeError):  # `verify` tells of it
@@ -327,5 +327,5 @@ class ForgottenNumbers:
                 self._sessions.setdefault(found.target, NumberRanges()).add(found.removed)
 
     def of(self, session: bytes) -> NumberRanges:
-        """The numbers of one session."""
+        """Return the forgotten numbers of one session."""
         return self._sessions.get(session, NumberRanges())

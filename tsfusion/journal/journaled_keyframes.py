@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""The keyframes of a journal: at their final poses, as the map has them, or as they came, as a dataset.
+"""Read the keyframes of a journal at their final poses, for a map or as a dataset.
 
-Sessions and times can be chosen as a person writes them.
+Also parse the sessions and times that a person gives to choose keyframes.
 """
 
 import copy
@@ -36,11 +36,11 @@ from tsfusion.wire.records import codec
 from tsfusion.wire.records.corrections import Correction
 from tsfusion.wire.records.record_header import KeyframeHeader, unpack_keyframe
 
-_LEAST_DIGITS = 4  # of a session's name
+_LEAST_DIGITS = 4  # fewest hex digits that may name a session
 
 
 def last_logged_ns(place: JournalPlace) -> int:
-    """Wall clock of the last record of a journal; raises JournalError when there is none."""
+    """Return the wall clock time of the last record of a journal; raise JournalError without a record."""
     for file in reversed(place.files()):
         stamps = [step.logged_ns for step in scan_records(file) if isinstance(step, Record)]
         if stamps:
@@ -51,7 +51,7 @@ def last_logged_ns(place: JournalPlace) -> int:
 
 
 def moment_ns(text: str, last_ns: int) -> int:
-    """The wall clock that a person means.
+    """Return the wall clock time that a text means, nanoseconds.
 
     Args:
         text: seconds before the last record, such as `90`, or an ISO time such as `2026-05-01 14:30` (this
@@ -77,7 +77,7 @@ def moment_ns(text: str, last_ns: int) -> int:
 
 
 def clock(stamp_ns: int) -> str:
-    """A wall clock as `moment_ns` reads it, to the second."""
+    """Return a wall clock time as text that `moment_ns` can read, to the second."""
     try:
         moment = datetime.datetime.fromtimestamp(stamp_ns / 1e9, tz=datetime.timezone.utc)
     except (OverflowError, OSError, ValueError):
@@ -86,13 +86,13 @@ def clock(stamp_ns: int) -> str:
 
 
 def sessions_named(name: str, clients: Mapping[bytes, str]) -> list[bytes]:
-    """The sessions of a client, or the one session that begins with these digits.
+    """Return the sessions of a client, or the one session whose hex name begins with these digits.
 
     Args:
-        clients: session → name of its client; empty = no keys.
+        clients: session → name of its client; an empty name = the server has no keys.
 
     Raises:
-        JournalError: when there is none, or when several sessions begin so; it lists what there is.
+        JournalError: no session matches, or the digits match several; the message lists the sessions.
     """
     if found := [key for key, client in clients.items() if name and client == name]:
         return found
@@ -110,12 +110,12 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class JournaledSession:
-    """The records of one session, as far as they were read.
+    """The records of one session, as far as they are read.
 
     Attributes:
-        client: name of the key that they came under; empty = no keys.
-        last_seq: of its last record, a keyframe or a correction.
-        first_ns, last_ns: when its first and last records were journaled, by the server's wall clock.
+        client: name of the key that they came under; empty = the server has no keys.
+        last_seq: number of the last record, a keyframe or a correction.
+        first_ns, last_ns: when the first and last records were journaled, by the server's wall clock.
     """
 
     key: bytes
@@ -127,19 +127,19 @@ class JournaledSession:
 
     @property
     def name(self) -> str:
-        """The client's name, or the session's first digits where the server has no keys."""
+        """The client's name, or the session's first digits if the server has no keys."""
         return self.client or self.key.hex()[:8]
 
 
 class FinalKeyframe(NamedTuple):
-    """A keyframe at its final pose, and whose it is."""
+    """A keyframe at its final pose, and its session."""
 
     keyframe: Keyframe
     session: JournaledSession
 
 
 class KeyframePlace(NamedTuple):
-    """A keyframe's session and number, and where its record begins in a file."""
+    """A keyframe's session and number, and the file and byte offset of its record."""
 
     session: bytes
     seq: int
@@ -150,25 +150,24 @@ class KeyframePlace(NamedTuple):
 class JournaledKeyframes:
     """The keyframes of a journal that no correction removed, each at its newest pose, in journal order.
 
-    Each once, also when a crash left a second copy. Those that a map could not take are among them, those
-    that the server was told to forget are not. Arrays are read one keyframe at a time; a keyframe takes some
-    300 bytes otherwise.
+    Each keyframe counts once, even if a crash left a second copy. Keyframes that a map could not take are
+    included; forgotten keyframes are not. Arrays are read one keyframe at a time. Without them a keyframe
+    takes about 300 bytes of memory.
 
     Args:
-        until_ns: leave out all that was journaled later, also corrections; by the server's wall clock. What
-            was forgotten later does not come back.
-        watch: called with the bytes read and all bytes, while the headers are read.
-        tells: whether the log tells of damage.
+        until_ns: leave out all records journaled later, also corrections, by the server's wall clock.
+            Keyframes forgotten later stay left out.
+        watch: called with the bytes read and the total bytes, while the headers are read.
+        tells: write damage to the log.
 
     Attributes:
-        sessions: of the whole journal up to `until_ns`.
-        unreadable: number of records without a readable header by reason.
-        recorded: number of keyframes that are, or were until they were erased, in the journal.
-        lost: number of keyframes that damage has destroyed, at least.
-        left_out: session and number of those that the server was told to forget, of which `forgotten` are
-            so many, and of those that corrections removed.
-        worlds: that its keyframes name: coordinate frames of scans that found their poses themselves;
-            empty = poses were given.
+        sessions: sessions of the whole journal up to `until_ns`.
+        unreadable: number of records without a readable header, by reason.
+        recorded: number of keyframes in the journal, erased ones included.
+        lost: lower bound of the number of keyframes that damage has destroyed.
+        left_out: session and number of each forgotten keyframe and of each that a correction removed.
+        forgotten: number of forgotten keyframes in `left_out`.
+        worlds: worlds (coordinate frames) that the keyframes name; an empty name = poses were given.
     """
 
     def __init__(
@@ -211,8 +210,8 @@ class JournaledKeyframes:
         """Read a keyframe.
 
         Raises:
-            JournalError: when it cannot be read any more.
-            DecodeError, InvalidKeyframe: when it is of no use, to a server neither.
+            JournalError: the record cannot be read any more.
+            DecodeError, InvalidKeyframe: the record is no valid keyframe; a server cannot use it either.
         """
         place = self._places[index]
         found = codec.decode_keyframe(journal.read_at(place.file, place.offset).frames)
@@ -221,19 +220,19 @@ class JournaledKeyframes:
         return FinalKeyframe(replace(found, T_world_camera=T), self.sessions[place.session])
 
     def places(self) -> list[KeyframePlace]:
-        """Places of all keyframes, in their order."""
+        """Return the places of all keyframes, in their order."""
         return list(self._places)
 
     def poses(self) -> NDArray[np.float64]:
-        """(n, 4, 4) final poses of all, T_world_camera; nothing is read for it."""
+        """Return the final poses of all keyframes, (n, 4, 4) T_world_camera, without disk access."""
         return np.array([self._pose(place) for place in self._places]).reshape(-1, 4, 4)
 
     def keep_only(self, sessions: Collection[bytes]) -> None:
-        """Leave out the keyframes of other sessions. Corrections count whoever sent them."""
+        """Leave out the keyframes of other sessions. Corrections still count, whatever session sent them."""
         self._places = [place for place in self._places if place.session in sessions]
 
     def pose_of(self, session: bytes, seq: int) -> NDArray[np.float64] | None:
-        """Pose of a keyframe, (4, 4) T_world_camera; None = it is not there, or left out."""
+        """Return a keyframe's pose, (4, 4) T_world_camera; None if it is unknown or left out."""
         return self._poses.pose_of(session, seq)
 
     def _pose(self, place: KeyframePlace) -> NDArray[np.float64] | None:
@@ -273,7 +272,7 @@ class JournaledKeyframes:
 
 
 def _without_measurement(header: KeyframeHeader) -> Keyframe:
-    """A keyframe of no points, at its place."""
+    """Return a keyframe without points, at the pose of a header."""
     rows = np.array(header.pose).reshape(3, 4)
     T = np.vstack([rows, (0.0, 0.0, 0.0, 1.0)])
     return Keyframe(points=np.empty((0, 3), np.float32), T_world_camera=T)
@@ -283,17 +282,16 @@ LOST = "lost to damage"  # reason of `JournalRecording.skipped`
 
 
 class JournalRecording(ShownRecording):
-    """The keyframes of a state folder (of one map, or of the one named), a map's folder or its `journal`, a
-    spool folder or one `.mcap` segment: each once, at its final pose, in journal order.
+    """The keyframes of a state folder, map folder, `journal` folder, spool folder or `.mcap` segment.
 
-    Keyframes the map had to reject are among them. Those that the server was told to forget, that
-    corrections removed, or that damage cost are left out and counted in `skipped`.
+    Each keyframe appears once, at its final pose, in journal order. Keyframes that the map rejected are
+    included. `skipped` counts the keyframes forgotten, removed by corrections, or lost to damage.
 
     Raises:
-        JournalError: when there is no keyframe.
+        JournalError: there is no keyframe.
     """
 
-    usual: Mapping[str, Any] = MappingProxyType({})  # settings of the map whose journal it is, if known
+    usual: Mapping[str, Any] = MappingProxyType({})  # settings of the journal's map, if known
     absent: int = 0  # keyframes of that map that it no longer has, if known
 
     def __init__(self, path: str | os.PathLike[str], map_name: str | None = None) -> None:
@@ -325,7 +323,7 @@ class JournalRecording(ShownRecording):
     def __getitem__(self, index: slice) -> "JournalRecording": ...
 
     def __getitem__(self, index: int | slice) -> "Keyframe | JournalRecording":
-        """A keyframe, or some; raises JournalError when it cannot be read any more."""
+        """Return a keyframe, or a recording of some; raise JournalError if a record is unreadable."""
         if isinstance(index, slice):
             some = copy.copy(self)
             some._chosen = self._chosen[index]
@@ -339,7 +337,7 @@ class JournalRecording(ShownRecording):
         return self[0]
 
     def pose(self, index: int) -> NDArray[np.float64]:
-        """(4, 4) final T_world_camera of a keyframe, which is not read for it."""
+        """Return the final pose of a keyframe, (4, 4) T_world_camera, without reading the keyframe."""
         return np.asarray(self._poses[index])
 
     def __iter__(self) -> Iterator[Keyframe]:

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""Places at which a map's keyframes were fused, and at which the newest corrections say that they were taken.
+"""Track the pose at which each keyframe of a map is fused, and the newest pose that corrections give it.
 
-The map is settled when nothing is different: then it is the map that these keyframes make at their final
-poses, to the bit. A keyframe's pose is that of the newest correction that names it. Without one it is the
-pose that it came with, multiplied from the left by the newest `T_map_odometry` of its session before it.
+The map is settled when the two poses of every keyframe agree. Then it equals, to the bit, a fresh map of
+these keyframes at their final poses. A keyframe's newest pose is in the newest correction that names it.
+Without a correction, it is the sent pose, multiplied from the left by the newest earlier `T_map_odometry` of
+its session.
 
-A keyframe that the server was told to forget is not in the settled map, whatever corrections say: then the
-order in which records of several sessions are taken makes no difference.
+The settled map has no forgotten keyframe, whatever corrections say and in whatever order records arrive.
 """
 
 from array import array
@@ -33,7 +33,7 @@ FlatPose = NDArray[np.float64]  # (12,): the upper three rows of a pose; NaN = n
 
 
 class Move(NamedTuple):
-    """A keyframe that is to be fused elsewhere, or to leave or come back.
+    """A keyframe to be fused at another pose, taken out of the map, or put back.
 
     `fused`, `wanted`: (4, 4) float64 `T_world_camera`; None = not in the map.
     """
@@ -46,13 +46,13 @@ class Move(NamedTuple):
 
 
 class KeptKeyframes(NamedTuple):
-    """The keyframes that are in a map, and are to stay.
+    """The keyframes that are in a map and stay in it.
 
     Attributes:
         sessions: their sessions.
-        session: (n,) int64, the place in `sessions` of each keyframe's.
+        session: (n,) int64, the index in `sessions` of each keyframe's session.
         seqs, segments, offsets: (n,) int64, number and position of each.
-        centers: (n, 3) float64 metres, where the sensor was.
+        centers: (n, 3) float64 metres, the positions of the sensor.
     """
 
     sessions: list[bytes]
@@ -64,15 +64,16 @@ class KeptKeyframes(NamedTuple):
 
 
 class FusedKeyframes(NamedTuple):
-    """Some of a map's keyframes, and where they are.
+    """Some of a map's keyframes, and their fused poses.
 
     Attributes:
-        sessions: whose they are.
-        session: (n,) int32, the place in `sessions` of each keyframe's.
+        sessions: their sessions.
+        session: (n,) int32, the index in `sessions` of each keyframe's session.
         seqs: (n,) int64 numbers.
         poses: (n, 12) float64: the upper three rows of `T_world_camera`.
-        T_map_odometry: (k, 4, 4) float64: what the poses of each session's next keyframes are multiplied by.
-        last: session and number of the last that was looked at; None = there are no more.
+        T_map_odometry: (k, 4, 4) float64: factor from the left for the poses of each session's next
+            keyframes.
+        last: session and number of the last keyframe examined; None = there are no more.
     """
 
     sessions: list[bytes]
@@ -92,31 +93,31 @@ class _SessionPoses:
         self.offsets = array("q")
         self.fused = array("d")  # 12 numbers each
         self.T_map_odometry: NDArray[np.float64] | None = None  # (4, 4)
-        self.unknown = 0  # up to this number nothing is known of them: an earlier version fused them, or
-        # the journal has them no more
-        self.missed: set[int] = set()  # numbers of those that corrections name
+        self.unknown = 0  # no poses are known up to this number: an earlier version fused these keyframes,
+        # or the journal has them no more
+        self.missed: set[int] = set()  # numbers of unknown keyframes that corrections name
         self.forgotten = NumberRanges()
 
     def rows(self, at: int) -> FlatPose:
         return np.array(self.fused[_POSE * at : _POSE * (at + 1)])
 
     def place_of(self, seq: int) -> int:
-        """The place of a keyframe that is known."""
+        """Return the index of a known keyframe."""
         return bisect_left(self.seqs, seq)
 
     def find(self, seq: int) -> int | None:
-        """The place of a keyframe; None = it is not known."""
+        """Return the index of a keyframe; None if it is unknown."""
         at = self.place_of(seq)
         return at if at < len(self.seqs) and self.seqs[at] == seq else None
 
     def drop(self, start: int, stop: int) -> None:
-        """Know nothing any more of the keyframes at these places."""
+        """Remove the keyframes with indices from `start` to before `stop`."""
         for column in (self.seqs, self.segments, self.offsets):
             del column[start:stop]
         del self.fused[_POSE * start : _POSE * stop]
 
     def drop_deleted(self, before_segment: int) -> "array[int]":
-        """Drop the keyframes of segments below this number; these."""
+        """Remove the keyframes of segments below this number; return their numbers."""
         count = bisect_left(self.segments, before_segment)
         gone = self.seqs[:count]
         if count:
@@ -125,7 +126,7 @@ class _SessionPoses:
         return gone
 
     def kept(self) -> NDArray[np.bool_]:
-        """(n,) which of them are in the map and not forgotten."""
+        """Return an (n,) mask of the keyframes that are in the map and not forgotten."""
         first = np.array(self.fused).reshape(-1, _POSE)[:, 0]
         found: NDArray[np.bool_] = ~np.isnan(first) & ~self.forgotten.mask(np.array(self.seqs))
         return found
@@ -154,11 +155,11 @@ class _SessionPoses:
 
 
 class KeyframePoses:
-    """The poses of a map's keyframes, 120 bytes each, and the moves that are left to do.
+    """The poses of a map's keyframes, 120 bytes each, and the moves still to be done.
 
     Args:
-        saved: what `saved` gave when the map was written.
-        done: session → highest number in the map, of a map that was written without.
+        saved: the dict of `saved`, from the map's file.
+        done: session → highest number in the map; used for a map file without `saved`.
     """
 
     def __init__(self, saved: Mapping[str, Any] | None, done: Mapping[bytes, int]) -> None:
@@ -166,7 +167,7 @@ class KeyframePoses:
         self._waiting: dict[tuple[bytes, int], tuple[int, FlatPose]] = {}  # session, number → ticket, wanted
         self._heap: list[tuple[float, int, bytes, int]] = []  # minus metres, ticket, session, number
         self._tickets = 0
-        self._stuck: set[tuple[bytes, int]] = set()  # of those that wait, the ones that cannot be moved
+        self._stuck: set[tuple[bytes, int]] = set()  # waiting keyframes that cannot be moved
         for key, seq in ({} if saved else done).items():
             self._session(key).unknown = seq
         for name, one in (saved or {}).get("sessions", {}).items():
@@ -177,7 +178,7 @@ class KeyframePoses:
             self._want(bytes.fromhex(name), seq, np.frombuffer(rows))
 
     def saved(self) -> dict[str, Any]:
-        """All of it, for the file of a map: dicts, lists, numbers and bytes."""
+        """Return the whole state for the file of a map: dicts, lists, numbers and bytes."""
         sessions = {key.hex(): poses.saved() for key, poses in self._sessions.items()}
         waiting = [(key.hex(), seq, rows.tobytes()) for (key, seq), (_, rows) in self._waiting.items()]
         return {
@@ -194,14 +195,14 @@ class KeyframePoses:
 
     @property
     def unavailable(self) -> int:
-        """Number of keyframes that stay where they were fused, though a correction names another place."""
+        """Number of keyframes that a correction names but that cannot be moved."""
         return len(self._stuck) + sum(len(poses.missed) for poses in self._sessions.values())
 
     def placed(self, session: bytes, keyframe: Keyframe) -> Keyframe:
-        """A keyframe that comes in, at its place in the map.
+        """Return an arriving keyframe at its pose in the map.
 
         Raises:
-            InvalidKeyframe: when that is farther away than any pose may be.
+            InvalidKeyframe: that pose is farther away than any pose may be.
         """
         poses = self._sessions.get(session)
         if poses is None or poses.T_map_odometry is None:
@@ -209,7 +210,7 @@ class KeyframePoses:
         return replace(keyframe, T_world_camera=check_pose(poses.T_map_odometry @ keyframe.T_world_camera))
 
     def add(self, session: bytes, seq: int, position: Position, keyframe: Keyframe) -> None:
-        """Note that the session's next keyframe was fused."""
+        """Record that the session's next keyframe was fused."""
         poses = self._session(session)
         poses.seqs.append(seq)
         poses.segments.append(position.segment)
@@ -217,7 +218,7 @@ class KeyframePoses:
         poses.fused.extend(keyframe.T_world_camera[:3].ravel())
 
     def fused_after(self, session: bytes, seq: int, most: int) -> "FusedKeyframes":
-        """Poses at which keyframes are fused, in the order of sessions and numbers: those behind this one."""
+        """Return fused poses of up to `most` keyframes after this one, by session and number."""
         sessions = sorted(key for key in self._sessions if key >= session)
         chosen: list[bytes] = []
         numbers, poses, rows = [np.zeros(0, np.int64)], [np.zeros((0, _POSE))], [np.zeros(0, np.int32)]
@@ -249,7 +250,7 @@ class KeyframePoses:
         )
 
     def pose_of(self, session: bytes, seq: int) -> NDArray[np.float64] | None:
-        """Pose of a keyframe, now or to be: (4, 4) float64; None = it is not in the map, or not known."""
+        """Return a keyframe's newest pose, (4, 4) float64; None if it is not in the map or unknown."""
         poses = self._sessions.get(session)
         at = None if poses is None else poses.find(seq)
         if poses is None or at is None:
@@ -258,7 +259,7 @@ class KeyframePoses:
         return _pose(rows)
 
     def kept(self) -> KeptKeyframes:
-        """The keyframes that are in the map and not forgotten; where they are to be counts."""
+        """Return the keyframes in the map that are not forgotten, with the centres of their newest poses."""
         keys, all_ = list(self._sessions), list(self._sessions.values())
         masks = [one.kept() for one in all_]
         numbers = [np.full(int(mask.sum()), number) for number, mask in enumerate(masks)]
@@ -289,19 +290,19 @@ class KeyframePoses:
 
     @property
     def first_segment(self) -> int:
-        """The lowest number of a segment with a keyframe of the map; 0 = there is none."""
+        """The lowest number of a segment with a keyframe of the map; 0 without keyframes."""
         return min((one.segments[0] for one in self._sessions.values() if one.segments), default=0)
 
     def is_forgotten(self, session: bytes, seq: int) -> bool:
-        """True if the server was told to forget a keyframe."""
+        """Return True if the server was told to forget a keyframe."""
         return session in self._sessions and seq in self._sessions[session].forgotten
 
     def unknown(self) -> Iterator[tuple[bytes, int]]:
-        """The sessions with keyframes of which nothing is known, and the highest number of those."""
+        """Yield each session with keyframes of unknown pose, and the highest number of these keyframes."""
         return ((key, poses.unknown) for key, poses in self._sessions.items() if poses.unknown)
 
     def forget(self, session: bytes, seqs: NDArray[np.int64]) -> None:
-        """Note that keyframes are to leave the map for good, those too that come in later."""
+        """Record that keyframes leave the map for good, including those that arrive later."""
         poses = self._session(session)
         poses.forgotten.add(seqs)
         for seq in seqs.tolist():
@@ -317,7 +318,7 @@ class KeyframePoses:
         self._tidy_heap()
 
     def leave_out(self) -> None:
-        """Note that a forgotten keyframe came in, and was not fused."""
+        """Record that a forgotten keyframe arrived and was not fused."""
         self.removed += 1
         self.forgotten += 1
 
@@ -326,7 +327,7 @@ class KeyframePoses:
         self.forgotten += 1
 
     def correct(self, session: bytes, correction: Correction) -> None:
-        """Note where keyframes are to be. Those that the map did not take, or forgot, stay out of it."""
+        """Record new poses of keyframes. Keyframes that the map rejected or forgot stay out of it."""
         poses = self._session(session)
         if correction.T_map_odometry is not None:
             poses.T_map_odometry = correction.T_map_odometry
@@ -352,7 +353,7 @@ class KeyframePoses:
             heapify(self._heap)
 
     def next(self) -> Move | None:
-        """The move that is farthest; removals come first. None = there is none."""
+        """Return the move over the largest distance, removals first; None without moves."""
         while self._heap and not self._is_valid(self._heap[0]):
             heappop(self._heap)
         if not self._heap:
@@ -365,7 +366,7 @@ class KeyframePoses:
         return Move(session, seq, position, _pose(poses.rows(at)), _pose(wanted))
 
     def moved(self) -> None:
-        """Note that the move that is `next` was done."""
+        """Record that the move returned by `next` is done."""
         _, _, session, seq = heappop(self._heap)
         _, wanted = self._waiting.pop((session, seq))
         poses = self._sessions[session]
@@ -376,12 +377,12 @@ class KeyframePoses:
             self._drop_forgotten(poses, at)
 
     def give_up(self) -> None:
-        """Note that the move that is `next` cannot be done: the keyframe stays where it is."""
+        """Record that the move returned by `next` cannot be done: the keyframe stays at its fused pose."""
         _, _, session, seq = heappop(self._heap)
         self._stuck.add((session, seq))
 
     def drop_deleted(self, before_segment: int) -> None:
-        """Drop the keyframes that were deleted from the journal: they can be moved no more."""
+        """Remove the keyframes that were deleted from the journal: they can no longer be moved."""
         for key, poses in self._sessions.items():
             gone = poses.drop_deleted(before_segment)
             for seq in gone:
@@ -410,7 +411,7 @@ class KeyframePoses:
 
 
 def _metres(fused: FlatPose, wanted: FlatPose) -> float:
-    """Roughly how far a keyframe's surface moves; infinite where it comes or goes."""
+    """Return roughly how far a keyframe's surface moves; infinite if it enters or leaves the map."""
     apart = (fused - wanted).reshape(3, 4)
     metres = float(np.linalg.norm(apart[:, 3]) + _LEVER * np.linalg.norm(apart[:, :3]) / np.sqrt(2))
     return metres if np.isfinite(metres) else np.inf

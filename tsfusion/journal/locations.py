@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Where a journal lies: a path of this machine, or a URL such as `s3://bucket/folder` (extra `s3`).
+"""Open a journal on this machine, or at a URL such as `s3://bucket/folder` (needs the extra `s3`).
 
-Of a URL nothing is copied: ranges are read as they are needed. Who may read it is for the environment to say
-(of S3 `AWS_ACCESS_KEY_ID`, `AWS_ENDPOINT_URL` and the others that its tools know).
+A journal at a URL is not copied: byte ranges are read on demand. Credentials come from the environment (for
+S3 `AWS_ACCESS_KEY_ID`, `AWS_ENDPOINT_URL` and the other variables that its tools know).
 """
 
 import errno
@@ -17,11 +17,11 @@ _RANGE_BYTES = 4 << 20  # read ahead
 
 
 def location(text: str) -> Path:
-    """The path that a person names; one of a URL has what is used of a `Path` to list and to read.
+    """Return the path for a text; the path of a URL has the methods of `Path` that list and read.
 
     Raises:
-        MissingDependency: for a URL without the package that reads it.
-        JournalError: for a URL of an unknown kind.
+        MissingDependency: a URL needs a package that is not installed.
+        JournalError: the URL is of an unknown kind.
     """
     if not _URL.match(text):
         return Path(text)
@@ -40,20 +40,20 @@ def location(text: str) -> Path:
 
 
 def is_url(path: Path) -> bool:
-    """True for the path of a URL."""
+    """Return True if a path is the path of a URL."""
     return not isinstance(path, Path)
 
 
 def absolute(text: str) -> str:
-    """Name of a place for a process that runs in another folder."""
+    """Return a URL unchanged, or a local path made absolute, for a process that runs in another folder."""
     return text if _URL.match(text) else str(Path(text).absolute())
 
 
 class RemoteFile:
-    """A file of a URL, read by ranges.
+    """A file at a URL, read by byte ranges.
 
     Raises:
-        OSError: when it cannot be opened.
+        OSError: the file cannot be opened.
     """
 
     def __init__(self, path: Path) -> None:
@@ -65,18 +65,18 @@ class RemoteFile:
             self.size = int(self._file.seek(0, 2))
 
     def read_at(self, at: int, count: int) -> bytes:
-        """Up to `count` bytes from a place on; raises OSError."""
+        """Return up to `count` bytes from offset `at`; raises OSError."""
         with _Translated():
             self._file.seek(at)
             return self._file.read(count)
 
     def close(self) -> None:
-        """Release it."""
+        """Close the file."""
         self._file.close()
 
 
 class _Translated:
-    """Errors of whatever library reads a URL, as an OSError that is not one of a bad disk."""
+    """Context that turns errors of URL libraries into OSError, without EIO, the errno of a bad disk."""
 
     def __enter__(self) -> None:
         pass

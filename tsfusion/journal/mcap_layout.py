@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""The bytes of a segment: an MCAP file with one uncompressed chunk (and its CRC) a keyframe.
+"""Pack and parse the bytes of a segment: an MCAP file with one uncompressed chunk and CRC per keyframe.
 
     opening | chunk "segment" | index | (chunk "keyframe" | index) … | end of data | summary | footer | magic
 
-The first chunk holds the segment's identity, random bytes that every record repeats. A reader that lost its
-place takes only what carries them: a keyframe may contain whatever its sender likes, other records too.
-All lengths of a keyframe's chunk stand in it several times over, so a damaged one shows.
-Of a record that was erased a mark is left in its place (`journal.erasing`).
+The first chunk holds the segment's identity, random bytes that every record repeats. After damage, a reader
+accepts only records with this identity: a keyframe may contain any bytes its sender likes, other records too.
+A keyframe's chunk repeats all its lengths several times, so a damaged length shows.
+A mark replaces each erased record (`journal.erasing`).
 """
 
 import struct
@@ -28,7 +28,7 @@ ENCODING = "x-tsfusion"
 IDENTITY_BYTES = 8
 CLIENT_BYTES = 32
 _SESSION_BYTES = 16
-# What a segment begins with is as long as in the journals that earlier versions left
+# The opening of a segment has the same length as in journals of earlier versions
 _LAYOUT = b"""journal record, little-endian:
 segment: 8 bytes, the identity of the segment; session: 16 bytes; seq: u64;
 client: 32 bytes, the name its key is allowed under, UTF-8, zeros after it;
@@ -57,7 +57,7 @@ OPENING = MAGIC + struct.pack("<BQII", Opcode.HEADER, 8 + len(LIBRARY), 0, len(L
 END_OF_DATA = struct.pack("<BQI", Opcode.DATA_END, 4, 0)
 HEAD_BYTES = _HEAD.size
 INDEX_BYTES = _INDEX.size
-ERASED_BYTES = _ERASED.size + _CRC.size  # that are no zeros, of an erased record
+ERASED_BYTES = _ERASED.size + _CRC.size  # the bytes of an erased record that are not zeros
 INDEX_START = struct.pack("<BQHI", Opcode.MESSAGE_INDEX, INDEX_BYTES - _LENGTH_BYTES, _KEYFRAMES, 16)
 
 
@@ -85,12 +85,12 @@ class Record(Struct, frozen=True):
 
     @property
     def is_correction(self) -> bool:
-        """True for a correction, by the first bytes of the message."""
+        """True for a correction; read from the first bytes of the message."""
         return bool(self.frames) and is_correction(self.frames[0])
 
     @property
     def world(self) -> str:
-        """The world that the message names; empty = none, or its header cannot be read."""
+        """The world (coordinate frame) in the header; empty without one or with an unreadable header."""
         return world_of(self.frames[0]) if self.frames else ""
 
 
@@ -124,7 +124,7 @@ class ChunkHead(NamedTuple):
 
     @property
     def is_sound(self) -> bool:
-        """True if this can be the head of a keyframe's chunk: all its lengths agree."""
+        """True if these fields can be the head of a keyframe's chunk: all its lengths agree."""
         table = _RECORD.size + 4 * self.frame_count
         return (
             self.opcode == Opcode.CHUNK
@@ -137,7 +137,7 @@ class ChunkHead(NamedTuple):
 
     @property
     def message_index(self) -> bytes:
-        """The bytes that the writer puts behind the chunk."""
+        """The bytes that the writer puts after the chunk."""
         return _index(_KEYFRAMES, self.logged_ns, 0)
 
 
@@ -146,13 +146,13 @@ def _index(channel: int, logged_ns: int, offset: int) -> bytes:
 
 
 def wall_clock_ns() -> int:
-    """The wall clock, for people: nothing depends on it. 0 where it shows a time before 1970."""
+    """Return the wall clock time, for people to read; 0 if the clock shows a time before 1970."""
     return max(time.time_ns(), 0)  # MCAP has no earlier times
 
 
 def begin_segment(stream: IO[bytes], identity: bytes, now_ns: int) -> Any:
-    """Write the first bytes of a segment; returns the MCAP writer for `write_record`."""
-    from mcap.writer import CompressionType, Writer  # a tenth of the time in which a client is imported
+    """Write the first bytes of a segment; return the MCAP writer for `write_record`."""
+    from mcap.writer import CompressionType, Writer  # a tenth of a client's import time
 
     writer = Writer(stream, chunk_size=1, compression=CompressionType.NONE)
     writer.start(library=LIBRARY.decode())
@@ -165,15 +165,15 @@ def begin_segment(stream: IO[bytes], identity: bytes, now_ns: int) -> Any:
 
 
 def write_record(writer: Any, payload: bytes, seq: int, now_ns: int) -> None:
-    """Write one record that `pack_record` made."""
+    """Write one record made by `pack_record`."""
     writer.add_message(_KEYFRAMES, now_ns, payload, now_ns, sequence=seq % 2**32)
 
 
 def pack_record(frames: Sequence[Any], identity: bytes, session: bytes, seq: int, client: str) -> bytes:
-    """Frames and their origin as the message of one record.
+    """Return the message of one record: its frames, session, number and client.
 
     Raises:
-        JournalError: for a name that is too long; a cut one could be another client's.
+        JournalError: the client's name is too long; a shortened name could be another client's.
     """
     name = client.encode()
     if len(name) > CLIENT_BYTES:
@@ -184,7 +184,7 @@ def pack_record(frames: Sequence[Any], identity: bytes, session: bytes, seq: int
 
 
 def parse_head(raw: bytes) -> ChunkHead | None:
-    """Read the head of a keyframe's chunk; None when the bytes are not one."""
+    """Return the head of a keyframe's chunk, or None if the bytes are not such a head."""
     if len(raw) < HEAD_BYTES:
         return None
     parsed = ChunkHead(*_HEAD.unpack_from(raw))
@@ -192,7 +192,7 @@ def parse_head(raw: bytes) -> ChunkHead | None:
 
 
 def parse_record(raw: bytes, position: Position) -> Record | None:
-    """Read the record in a chunk; None unless all of it is there and its CRC agrees."""
+    """Return the record in a chunk, or None unless it is complete and its CRC agrees."""
     parsed = parse_head(raw)
     if parsed is None or len(raw) != parsed.nbytes:
         return None
@@ -215,7 +215,7 @@ def parse_record(raw: bytes, position: Position) -> Record | None:
 
 
 class ErasedHead(NamedTuple):
-    """Filler in the place of an erased record."""
+    """The first bytes of the filler that replaces an erased record."""
 
     segment: bytes
     session: bytes
@@ -225,14 +225,14 @@ class ErasedHead(NamedTuple):
 
 
 def erased_mark(head: ChunkHead, nbytes: int) -> bytes:
-    """The first bytes of what takes the place of a record, so many bytes long."""
+    """Return the first bytes of the filler for an erased record; `nbytes` is the filler's whole length."""
     fields = (head.segment, head.session, head.seq, head.client)
     mark = _ERASED.pack(_ERASED_OPCODE, nbytes - _LENGTH_BYTES, _ERASED_MAGIC, *fields)
     return mark + _CRC.pack(zlib.crc32(mark))
 
 
 def parse_erased(raw: bytes) -> ErasedHead | None:
-    """Read the first bytes of an erased record; None when they are none."""
+    """Return the head of an erased record, or None if the bytes are not such a head."""
     if len(raw) < ERASED_BYTES or raw[0] != _ERASED_OPCODE:
         return None
     _, length, magic, segment, session, seq, client = _ERASED.unpack_from(raw)
@@ -249,7 +249,7 @@ class SegmentChunk(NamedTuple):
     layout: bytes
     identity: bytes
     end: int
-    message_index: bytes  # that the writer puts behind the chunk
+    message_index: bytes  # the writer puts it after the chunk
 
     @property
     def is_ours(self) -> bool:
@@ -258,7 +258,7 @@ class SegmentChunk(NamedTuple):
 
 
 def parse_segment_chunk(raw: bytes) -> SegmentChunk | None:
-    """Read the segment's own chunk from the first bytes of a file; None when it is missing or damaged."""
+    """Return the segment's own chunk from the first bytes of a file, or None if it is missing or damaged."""
     at = len(OPENING)
     if len(raw) < at + _CHUNK.size:
         return None
@@ -278,7 +278,7 @@ def parse_segment_chunk(raw: bytes) -> SegmentChunk | None:
 
 @cache
 def segment_start_bytes() -> int:
-    """Bytes of a segment before its first keyframe."""
+    """Return the number of bytes of a segment before its first keyframe."""
     stream = BytesIO()
     begin_segment(stream, bytes(IDENTITY_BYTES), 0)
     return len(stream.getvalue())

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Keyframes put aside, each in a file of its own, so that a person can see what was wrong with them.
+"""Store keyframes that could not be used, one per file, so that a person can inspect them.
 
-A server keeps those that it could not fuse, a scanner those that the server refused.
+A server stores the keyframes that it could not fuse. A scanner stores those that the server refused.
 """
 
 import logging
@@ -24,15 +24,15 @@ _MAX_REASON_LENGTH = 32
 
 
 class Quarantine:
-    """A folder of `SESSION-SEQ-REASON.mcap` files; the oldest go beyond `max_bytes`, or a thousand.
+    """A folder of `SESSION-SEQ-REASON.mcap` files. Beyond `max_bytes` or 1000 files, the oldest are deleted.
 
-    The folder is read once: what a person takes away later counts until it would have gone anyway.
+    The folder is read once, at the start: files removed later by hand still count.
     """
 
     def __init__(self, folder: Path, max_bytes: int) -> None:
         self.folder = folder
         self._max_bytes = max_bytes
-        self.problem = ""  # why the last keyframe could not be kept, or older ones go; empty = neither
+        self.problem = ""  # why a keyframe was not kept, or old ones are deleted; empty = no problem
         durable_files.sweep(folder, rf"\.{_FILE_NAME.pattern}\.partial")  # of a writer that was killed
         self._files = dict(_by_age(folder))  # sizes, oldest first
         self._nbytes = sum(self._files.values())
@@ -43,10 +43,10 @@ class Quarantine:
     def keep(
         self, frames: Sequence[Any], *, session: bytes, seq: int, client: str = "", reason: str
     ) -> Path | None:
-        """Put a keyframe message aside; its file, or None when the disk refuses (which is logged).
+        """Store a keyframe message; return its file, or None if the disk refuses (the error is logged).
 
         Args:
-            reason: a word; it becomes a part of the file's name without what could lead out of the folder.
+            reason: a word for the file's name; characters that could lead out of the folder are replaced.
         """
         word = re.sub("[^a-z0-9]", "_", reason.lower())[:_MAX_REASON_LENGTH] or "unknown"
         path = self.folder / f"{session[:4].hex()}-{seq}-{word}.mcap"
@@ -68,9 +68,9 @@ class Quarantine:
         return path
 
     def drop(self, session: bytes, numbers: NumberRanges) -> int:
-        """Delete the keyframes of these numbers of a session; how many files that were.
+        """Delete the files of these keyframes of a session; return the number of files deleted.
 
-        The first eight digits of the session stand in a file's name, so another one's may go with them.
+        A file name holds only 8 hex digits of a session, so another session's file may go too.
         """
         count = 0
         for path in list(self._files):
@@ -92,15 +92,15 @@ class Quarantine:
 
 
 def quarantined_files(folder: Path) -> list[Path]:
-    """The files that `Quarantine` has put into a folder, by session and number."""
+    """Return the files that `Quarantine` has written into a folder, sorted by session and number."""
     found = [(match, path) for path in folder.iterdir() if (match := _FILE_NAME.fullmatch(path.name))]
     return [path for match, path in sorted(found, key=lambda one: (one[0][1], int(one[0][2]), one[0][3]))]
 
 
 def _by_age(folder: Path) -> list[tuple[Path, int]]:
-    """The files of a folder and their sizes, oldest first."""
+    """Return the files of a folder and their sizes, oldest first."""
     found = []
-    with suppress(OSError):  # none is there, or they are not known: none of them is deleted for room then
+    with suppress(OSError):  # the folder is missing or unreadable: no old file is deleted then
         for path in folder.iterdir():
             with suppress(OSError):  # a person took it away just now
                 stat = path.stat()

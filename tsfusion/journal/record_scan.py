@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Reading a segment file by byte offsets, and its records one after the other, past damaged places.
+"""Read the records of a segment file in order, and continue after damaged stretches.
 
-Behind a damaged place the scan searches for the next chunk by its shape, its segment's identity and its CRC,
-so that damage costs the records it hit and no other.
+After damage, the scan searches for the next chunk by its shape, its segment's identity and its CRC. So damage
+loses only the records that it hit.
 """
 
 import errno
@@ -34,11 +34,11 @@ class SegmentFile:
     """A segment file at its present length: bytes that a writer adds later are not seen.
 
     Args:
-        on_read: called before each read: a large file takes long.
-        descriptor: of the file where it is open already; it is closed with this. None = open the path.
+        on_read: called before each read, because a large file takes long.
+        descriptor: an open descriptor of the file, closed together with this object; None = open the path.
 
     Raises:
-        OSError: as `open` does.
+        OSError: as `open` raises it.
     """
 
     def __init__(
@@ -53,8 +53,8 @@ class SegmentFile:
         else:
             self._file = path.open("rb", buffering=0) if descriptor is None else FileIO(descriptor, "rb")
             self.size = os.fstat(self._file.fileno()).st_size
-        self.failed = False  # the disk could not read some part that was asked for
-        self.answered = False  # the disk has read some part
+        self.failed = False  # a read of some bytes failed
+        self.answered = False  # a read of some bytes succeeded
 
     def __enter__(self) -> "SegmentFile":
         return self
@@ -63,9 +63,9 @@ class SegmentFile:
         self._file.close()
 
     def read(self, at: int, count: int, end: int | None = None) -> bytes:
-        """Up to `count` bytes, none of them at or behind `end` (default: the file's).
+        """Return up to `count` bytes from offset `at` that lie before offset `end` (default: the file's end).
 
-        A part that the disk cannot read is zeros: the CRC of its record fails, and no other.
+        Bytes that the disk cannot read are returned as zeros: then only the CRC of their record fails.
         """
         self._on_read()
         count = min(count, (self.size if end is None else end) - at)
@@ -129,7 +129,7 @@ def read_segment_end(source: SegmentFile) -> SegmentEnd:
 
 
 def _summary(source: SegmentFile, footer_at: int) -> tuple[int, bytes] | None:
-    """Offset of the summary, and its bytes; None unless its CRC agrees."""
+    """Return the offset of the summary and its bytes; None unless its CRC agrees."""
     footer = source.read(footer_at, _FOOTER.size)
     opcode, length, start, _, crc32 = _FOOTER.unpack(footer)
     if (opcode, length) != (Opcode.FOOTER, _FOOTER.size - _RECORD.size):
@@ -141,7 +141,7 @@ def _summary(source: SegmentFile, footer_at: int) -> tuple[int, bytes] | None:
 
 
 def _keyframes(summary: bytes) -> int | None:
-    """The keyframes that the statistics count: all messages but the segment's own first one."""
+    """Return the number of keyframes by the statistics: all messages except the segment's own first one."""
     at = 0
     while at + _RECORD.size + _COUNT.size <= len(summary):
         opcode, length = _RECORD.unpack_from(summary, at)
@@ -153,30 +153,30 @@ def _keyframes(summary: bytes) -> int | None:
 
 _WINDOW_BYTES = 1 << 20
 _MAX_SEGMENT_CHUNK_BYTES = 1 << 16
-# Bytes that a search may spend on chunks whose CRC then differs, in sizes of the file: a made-up file could
-# have each byte begin a chunk that ends with the file.
+# Bytes that a search may spend on chunks with a wrong CRC, in file sizes: in a malicious file
+# every byte could be the start of a chunk that ends with the file.
 _PATIENCE = 64
 # The head of a keyframe's chunk, with lengths under 2^40 (see `mcap_layout.ChunkHead`).
 _HEAD_SHAPE = re.compile(rb"(?s)\x06(?=.{5}\0{3}.{16}.{5}\0{3}.{4}\0{4}.{5}\0{3}\x05.{5}\0{3}\x01\0)")
 
-# Of what is written behind a record: the next one, an index, the mark after the last.
+# First bytes of what may follow a record: the next record, an index, or the end-of-data mark.
 _FIRST_BYTES = (b"\x06", mcap_layout.INDEX_START[:1], mcap_layout.END_OF_DATA[:1])
 
 
 class Damage(Struct, frozen=True):
-    """A stretch of a segment that is not as it was written."""
+    """A stretch of a segment that differs from what was written."""
 
     position: Position
     nbytes: int
-    lost: int  # lower bound of the keyframes that it destroyed; 0 = only parts that readers do not need
+    lost: int  # lower bound of the keyframes destroyed; 0 = readers do not need these bytes
     what: str
     torn: bool = False  # the end of the last write, cut off before it was acknowledged: no keyframe is lost
 
 
 class Erased(Damage, frozen=True):
-    """A record whose bytes were deleted on purpose: no keyframe is lost.
+    """A record whose bytes were deleted on purpose; it does not count as a lost keyframe.
 
-    `is_clear`: whether none of them is left; a crash may have come between.
+    `is_clear`: True if none of its old bytes is left; False after a crash during the erasing.
     """
 
     session: bytes = b""
@@ -186,10 +186,10 @@ class Erased(Damage, frozen=True):
 
 
 def scan_records(path: Path, on_read: Callable[[], None] = lambda: None) -> Iterator[Record | Damage]:
-    """The records and damaged places of a segment file in their order; one record at a time is read.
+    """Yield the records and damaged stretches of a segment file in order, reading one record at a time.
 
     Raises:
-        JournalError: when the file cannot be opened or read.
+        JournalError: the file cannot be opened or read.
     """
     try:
         with SegmentFile(path, on_read) as source:
@@ -199,17 +199,17 @@ def scan_records(path: Path, on_read: Callable[[], None] = lambda: None) -> Iter
 
 
 def segment_number(path: Path) -> int:
-    """The number in a segment file's name; 0 = it has another name."""
+    """Return the number in a segment file's name, or 0 for any other name."""
     return int(path.stem) if re.fullmatch(r"[0-9]{6,9}", path.stem) else 0
 
 
 def journal_error(verb: str, path: Path, error: OSError) -> JournalError:
-    """The JournalError for what the disk refused: `cannot read FILE: reason`."""
+    """Return a JournalError for an error of the disk: `cannot read FILE: reason`."""
     return JournalError(f"cannot {verb} {path}: {error.strerror or error}", error.errno or errno.EIO)
 
 
 def _was_index(raw: bytes) -> bool:
-    """True if these bytes, one of them perhaps damaged, are an index and not the start of a record."""
+    """Return True if these bytes are an index rather than a record's start; one of them may be damaged."""
     return mcap_layout.INDEX_START[:1] == raw[:1] or mcap_layout.INDEX_START[1:9] == raw[1:9]
 
 
@@ -220,7 +220,7 @@ class _RecordScan:
         self._segment_end = read_segment_end(source)
         self._end = source.size if self._segment_end.data_end is None else self._segment_end.data_end
         self._identity: bytes | None = None
-        self._next: tuple[int, int | None] | None = None  # the last search: from where, what it found
+        self._next: tuple[int, int | None] | None = None  # the last search: its start offset, its result
         self._patience = _PATIENCE * source.size
         self._found = self._lost = 0
 
@@ -251,7 +251,7 @@ class _RecordScan:
         return Damage(Position(self._number, at), nbytes, lost, what, torn)
 
     def _behind(self, end: int, index: bytes) -> int:
-        """Offset of the next record. A damaged index is met there, as a place without a record."""
+        """Return the offset of the next record, or `end` if the index there is damaged."""
         return end + len(index) if self._source.read(end, len(index), self._end) == index else end
 
     def _is_end_of_data(self, at: int) -> bool:
@@ -287,7 +287,7 @@ class _RecordScan:
     # --- the start ---
 
     def _opening(self) -> Generator[Damage, None, int]:
-        """Returns where the first record starts."""
+        """Yield damage at the start of the file; return the offset of the first record."""
         expected, size = mcap_layout.OPENING, self._source.size
         opening = self._source.read(0, len(expected))
         if self._segment_end.state == "open" and size < mcap_layout.segment_start_bytes():
@@ -320,7 +320,7 @@ class _RecordScan:
     # --- between records ---
 
     def _damage(self, at: int) -> Damage:
-        """The damage at a place where a record should start, and how far it reaches."""
+        """Return the damage that begins at this offset, where a record should start."""
         raw = self._source.read(at, mcap_layout.HEAD_BYTES, self._end)
         head = mcap_layout.parse_head(raw)
         end = at + head.nbytes if head is not None else None
@@ -351,20 +351,20 @@ class _RecordScan:
         return behind if is_there and behind <= self._end else end
 
     def _is_zero(self, at: int, end: int | None = None) -> bool:
-        """True if nothing was ever written there: a file may grow before its bytes reach the disk."""
+        """Return True if nothing was ever written there: a file may grow before its bytes reach the disk."""
         end = self._end if end is None else end
         starts = range(at, end, _WINDOW_BYTES)
         rest = any(self._source.read(start, _WINDOW_BYTES, end).strip(b"\0") for start in starts)
         return not rest and not self._source.failed
 
     def _ends_behind(self, at: int) -> bool:
-        """True if the mark of a closed file is behind a place: the file has grown since."""
+        """Return True if a closed file's end mark follows this offset: the file has grown since."""
         magic, size = mcap_layout.MAGIC, self._source.size
         count = _WINDOW_BYTES + len(magic) - 1
         return any(magic in self._source.read(start, count) for start in range(at, size, _WINDOW_BYTES))
 
     def _search(self, start: int) -> int | None:
-        """Offset of the next whole record, at or behind `start`."""
+        """Return the offset of the next intact record from `start` on; None without one."""
         if self._next is not None:
             begun, found = self._next
             if begun <= start and (found is None or start <= found):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Copying everything that is whole in a damaged journal into a new one."""
+"""Copy every intact record of a damaged journal into a new journal."""
 
 import os
 from contextlib import closing, suppress
@@ -18,7 +18,7 @@ from tsfusion.journal.writer import Journal
 
 
 class Recovery(Struct, kw_only=True):
-    """Result of a recovery. `copies`: records that the journal held twice, the new one holds once."""
+    """Result of a recovery. `copies`: second copies in the old journal that were left out."""
 
     path: str
     keyframes: int
@@ -31,19 +31,18 @@ class Recovery(Struct, kw_only=True):
 
 
 def recover(place: JournalPlace, out: Path, segment_bytes: int, watch: OnProgress) -> Recovery:
-    """Write every whole record of a journal into the new folder `out`, in order, in closed segments.
+    """Write every intact record of a journal into the new folder `out`, in order, in closed segments.
 
-    Of a record that was erased nothing is written.
-
-    The journal itself is only read. `out` appears when all of it is on the disk, and not at all otherwise.
+    Erased records are left out. The journal itself is only read. `out` appears once all records are on the
+    disk; after an error it does not appear.
 
     Raises:
-        OutputError: `out` is not empty, inside the journal, or cannot be written.
-        JournalError: nothing can be saved, or the disk refuses.
+        OutputError: `out` is not empty, lies inside the journal, or cannot be written.
+        JournalError: no record can be saved, or the disk refuses.
     """
     _check(place, out)
     problems, copies, corrections, seen = [], 0, 0, set[tuple[bytes, int]]()
-    with suppress(OSError):  # an empty one: a whole folder then takes its place in one step
+    with suppress(OSError):  # removes an empty folder: then one rename puts the new folder there
         out.rmdir()
     with building(out) as work, closing(Journal(work, segment_bytes, sync=False)) as new:
         for path, step in place.steps(watch):
@@ -93,7 +92,7 @@ def _check(place: JournalPlace, out: Path) -> None:
 
 
 def _sync(folder: Path) -> int:
-    """Wait until the files of a folder are on the disk; returns their number."""
+    """Wait until the files of a folder are on the disk; return their number."""
     files = list(folder.iterdir())
     for path in files:
         with path.open("rb") as file:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Writing the messages of a journal into one MCAP file of the profile `ros2`."""
+"""Export the keyframes of a journal to one MCAP file of the profile `ros2`."""
 
 import re
 from collections import Counter
@@ -40,15 +40,15 @@ class Export(Struct, kw_only=True):
 
 
 def export(place: JournalPlace, out: Path, watch: OnProgress, *, clouds: bool = False) -> Export:
-    """Write every keyframe of a journal as ROS 2 messages; `out` appears when it is whole.
+    """Write every keyframe of a journal as ROS 2 messages; `out` appears when it is complete.
 
     Args:
-        clouds: write clouds of depth images, too.
+        clouds: also write clouds of depth images.
 
     Raises:
-        MissingDependency: without rosbags.
-        OutputError: `out` is no .mcap file, is one of the journal's, or cannot be written.
-        JournalError: there is no keyframe.
+        MissingDependency: rosbags is not installed.
+        OutputError: `out` is no .mcap file, belongs to a journal, or cannot be written.
+        JournalError: the journal has no keyframe.
     """
     store = _type_store()
     check_writable(out, (".mcap",))
@@ -66,7 +66,7 @@ def export(place: JournalPlace, out: Path, watch: OnProgress, *, clouds: bool = 
 
 
 def _is_one(path: Path) -> bool:
-    """True for an existing file that is a journal's segment and not empty."""
+    """Return True for an existing, non-empty file that is a segment of a journal."""
     return path.is_file() and durable_files.size_of(path) > 0 and is_segment(path)
 
 
@@ -79,7 +79,7 @@ def _type_store() -> Any:
 
 
 class _BagWriter:
-    """An MCAP file whose channels appear as they are used."""
+    """Writes an MCAP file; a channel is added with its first message."""
 
     def __init__(self, stream: IO[bytes], store: Any) -> None:
         self._store = store
@@ -126,8 +126,7 @@ class _Exporter:
         self._keyframes = 0
 
     def run(self, place: JournalPlace, watch: OnProgress) -> None:
-        """Write everything that is whole, each keyframe once, at its final pose, and none that was forgotten
-        or that corrections removed."""
+        """Write every intact keyframe that the final map keeps, once, at its final pose."""
         for path, step in place.steps(watch):
             if isinstance(step, Damage):
                 if not isinstance(step, Erased):
@@ -146,7 +145,7 @@ class _Exporter:
     def _add(self, path: Path, record: Record) -> None:
         """Write a keyframe, once it is known whether its session has a sensor's clock.
 
-        A first keyframe at time 0 may come from a clock that started with it, or from a sensor without one.
+        Time 0 in a first keyframe is ambiguous: the clock may start with it, or the sensor may have no clock.
         """
         try:
             has_stamp = unpack_keyframe(record.frames[0]).timestamp_ns > 0
@@ -170,12 +169,12 @@ class _Exporter:
             self._refuse(path, record, error)
             return
         T = self._final.pose_of(record.session, record.seq)
-        if T is not None:  # of one of which the pose alone is damaged it is not known
+        if T is not None:  # unknown if only the pose in its header is damaged
             keyframe = replace(keyframe, T_world_camera=T)
         stamp_ns = keyframe.timestamp_ns if self._has_clock.get(record.session) else record.logged_ns
         if stamp_ns // 10**9 > _LAST_SECOND:
             stamp_ns = min(record.logged_ns, _LAST_SECOND * 10**9)
-        while (record.session, stamp_ns) in self._stamps:  # a reader takes two of one time for one
+        while (record.session, stamp_ns) in self._stamps:  # a reader would merge two keyframes of equal time
             stamp_ns += 1
         self._stamps.add((record.session, stamp_ns))
         header = unpack_keyframe(record.frames[0])
@@ -190,7 +189,7 @@ class _Exporter:
         )
 
     def _name(self, record: Record) -> str:
-        """A session's name that ROS accepts: its client's, numbered from the second session on."""
+        """Return a session's ROS name: its client's name, with a number from the second session on."""
         if record.session not in self._names:
             base = re.sub(r"[^A-Za-z0-9_]", "_", record.client) or "scanner"
             base = base if base[0].isalpha() else f"scanner_{base}"
@@ -202,7 +201,7 @@ class _Exporter:
         return self._names[record.session]
 
     def result(self, out: Path) -> Export:
-        """Report what has been written to `out`."""
+        """Return a report of what has been written to `out`."""
         return Export(
             path=str(out),
             nbytes=out.stat().st_size,

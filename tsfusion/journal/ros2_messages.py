@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Keyframes as ROS 2 messages, by the conventions of REP 103, 105 and 118.
+"""Convert keyframes into ROS 2 messages, by the conventions of REP 103, 105 and 118.
 
-The frame of a keyframe is the optical one (x right, y down, z forward), its parent `world`. Arrays are as
-they were journaled: a uint16 depth in millimetres stays so, a JPEG keeps its bytes.
+A keyframe's frame is the optical one (x right, y down, z forward), and its parent frame is `world`. Arrays
+keep their journaled form: a uint16 depth in millimetres stays uint16, and a JPEG keeps its bytes.
 """
 
 from collections.abc import Iterator
@@ -23,7 +23,7 @@ _STRIDE = 2  # pixels between the points of a cloud
 
 
 class Outgoing(NamedTuple):
-    """One message, before it is bytes."""
+    """One message before serialisation."""
 
     topic: str
     kind: str
@@ -31,11 +31,11 @@ class Outgoing(NamedTuple):
 
 
 class Converter:
-    """Makes messages of keyframes.
+    """Converts keyframes into messages.
 
     Args:
-        types: classes of the messages by name (a rosbags type store's).
-        clouds: make clouds of depth images, too.
+        types: message classes by name (from a rosbags type store).
+        clouds: also make clouds from depth images.
     """
 
     def __init__(self, types: Any, *, clouds: bool = False) -> None:
@@ -44,10 +44,10 @@ class Converter:
     def convert(
         self, keyframe: Keyframe, header: KeyframeHeader, record: Record, name: str, stamp_ns: int
     ) -> Iterator[Outgoing]:
-        """The messages of one keyframe, its place first.
+        """Yield the messages of one keyframe, those of its pose first.
 
         Args:
-            name: of the frame, and the first part of the topics.
+            name: the frame's name, and the first part of the topics.
         """
         stamp = self._make("builtin_interfaces/msg/Time", sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
         yield from self._place(keyframe.T_world_camera, name, stamp)
@@ -169,9 +169,9 @@ class Converter:
 
 
 def depth_image(keyframe: Keyframe) -> NDArray[Any]:
-    """The depth of a keyframe as REP 118 wants it: uint16 millimetres with 0, or float32 metres with NaN.
+    """Return a keyframe's depth as REP 118 asks: uint16 millimetres with 0, or float32 metres with NaN.
 
-    Millimetres stay to the bit; a disparity and other units become metres.
+    Millimetres are copied unchanged; all else is converted to metres.
     """
     if keyframe.depth is None:
         assert keyframe.disparity is not None
@@ -186,7 +186,7 @@ def depth_image(keyframe: Keyframe) -> NDArray[Any]:
 
 
 def cloud_of(keyframe: Keyframe) -> tuple[NDArray[np.float32], NDArray[np.uint8] | None]:
-    """(n, 3) points of every other row and column of an image, in the camera's frame, and their colours."""
+    """Return (n, 3) camera-frame points of every second row and column of an image, and their colours."""
     z, K = depth_metres(keyframe)[::_STRIDE, ::_STRIDE], keyframe.intrinsics
     assert K is not None
     v, u = np.nonzero(z)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A folder of segments, the records in it, and the segment that is written to."""
+"""List, read and write the segment files of a journal."""
 
 import errno
 import logging
@@ -32,7 +32,7 @@ log = logging.getLogger(__name__)
 
 
 class RecordEntry(Struct, frozen=True):
-    """A record without its frames, as a list of a journal holds it."""
+    """A record without its frames, as an entry of a list in memory."""
 
     position: Position
     session: bytes
@@ -40,15 +40,15 @@ class RecordEntry(Struct, frozen=True):
     client: str
     nbytes: int
     is_correction: bool = False
-    world: str = ""  # as its header names it
+    world: str = ""  # coordinate frame, by the record's header
     is_erased: bool = False
 
 
 def segments(folder: Path) -> list[int]:
-    """The numbers of a folder's segments, oldest first. Files with other names are passed over.
+    """Return the numbers of a folder's segments, oldest first; files with other names are ignored.
 
     Raises:
-        JournalError: when the folder cannot be listed.
+        JournalError: the folder cannot be listed.
     """
     try:
         names = [path.name for path in folder.iterdir()]
@@ -62,10 +62,10 @@ def segments(folder: Path) -> list[int]:
 
 
 def is_away(folder: Path, home: os.stat_result | None) -> bool:
-    """True if a folder of segments is not to be found, or an empty one is in its place: it may come back.
+    """Return True if a folder of segments is missing, or an empty folder has replaced it; it may come back.
 
     Args:
-        home: of the folder as it was; None = it was not there.
+        home: the `stat` of the original folder; None = there was no folder.
     """
     try:
         return (home is None or not os.path.samestat(os.stat(folder), home)) and not segments(folder)
@@ -74,24 +74,24 @@ def is_away(folder: Path, home: os.stat_result | None) -> bool:
 
 
 def segment_path(folder: Path, number: int) -> Path:
-    """The file of a segment."""
+    """Return the file of a segment."""
     return folder / f"{number:06d}.mcap"
 
 
 def read(folder: Path, position: Position) -> Record:
-    """One record by its position, also while its segment is being written.
+    """Return one record by its position, even while its segment is being written.
 
     Raises:
-        JournalError: when it is not there or its CRC differs.
+        JournalError: there is no record, or its CRC differs.
     """
     return read_at(segment_path(folder, position.segment), position.offset)
 
 
 def logged_ns(folder: Path, position: Position) -> int:
-    """Wall clock of a record by its position; only the first bytes of it are read, and none is checked.
+    """Return the wall clock time of a record by its position; only its head is read, and no CRC is checked.
 
     Raises:
-        JournalError: when it is not there.
+        JournalError: there is no record.
     """
     path = segment_path(folder, position.segment)
     try:
@@ -105,10 +105,10 @@ def logged_ns(folder: Path, position: Position) -> int:
 
 
 def read_at(path: Path, offset: int) -> Record:
-    """One record of a segment file.
+    """Return one record of a segment file.
 
     Raises:
-        JournalError: when it is not there or its CRC differs, or with an `errno` when the system refuses.
+        JournalError: there is no record, or its CRC differs; with an `errno` if the system refuses.
     """
     try:
         source = SegmentFile(path)
@@ -119,10 +119,10 @@ def read_at(path: Path, offset: int) -> Record:
 
 
 def has_another(folder: Path, session: bytes, seq: int, position: Position, *, until_ns: int) -> bool:
-    """True if a journal has another record where it had this one. Damage and missing files show nothing.
+    """Return True if a journal has a different record at this position; damage proves nothing.
 
     Args:
-        until_ns: when the journal had it: one that was logged later begins a journal anew.
+        until_ns: when this record was logged; a record logged later begins a new journal and proves nothing.
     """
     path = segment_path(folder, position.segment)
     with suppress(JournalError):
@@ -137,7 +137,7 @@ def has_another(folder: Path, session: bytes, seq: int, position: Position, *, u
 
 
 class SegmentReader:
-    """Records of segments, one after the other: a segment stays open until one of another is read."""
+    """Reads records of segments. A segment stays open until a record of another segment is read."""
 
     def __init__(self) -> None:
         self._path: Path | None = None
@@ -150,7 +150,7 @@ class SegmentReader:
         self._open.close()
 
     def at(self, path: Path, offset: int) -> Record:
-        """One record of a segment file; raises JournalError as `read_at`."""
+        """Return one record of a segment file; raises JournalError like `read_at`."""
         if path != self._path:
             self._open.close()
             self._path = None
@@ -163,7 +163,7 @@ class SegmentReader:
 
 
 def record_at(source: SegmentFile, number: int, offset: int) -> Record:
-    """One record of the open segment file of this number; raises JournalError as `read_at`."""
+    """Return one record of an open segment file of this number; raises JournalError like `read_at`."""
     try:
         start = source.read(offset, mcap_layout.HEAD_BYTES)
         head = mcap_layout.parse_head(start)
@@ -185,15 +185,15 @@ def list_records(
     watch: Callable[[int, int], None] = lambda _at, _records: None,
     damaged: Callable[[Damage], None] = lambda _damage: None,
 ) -> tuple[list[RecordEntry], int]:
-    """Every whole or erased record of a segment, and how many keyframes are lost to damage between them.
+    """Return every intact or erased record of a segment, and the number of keyframes lost to damage.
 
-    A torn tail was never acknowledged and does not count as damage. Each damaged place is logged.
+    A torn tail was never acknowledged and does not count as damage. Each damaged stretch is logged.
 
     Args:
-        watch: called at each read with the byte that the list has come to, and its records so far.
+        watch: called at each read with the current byte offset and the number of records so far.
 
     Raises:
-        JournalError: when the file cannot be opened or read.
+        JournalError: the file cannot be opened or read.
     """
     found: list[RecordEntry] = []
     at = lost = 0
@@ -220,7 +220,7 @@ def list_records(
 
 
 def describe(path: Path, damage: Damage) -> str:
-    """Describe a damaged place in one line."""
+    """Return one line about a damaged stretch."""
     if damage.torn:
         outcome = "; nothing that was acknowledged is lost"
     else:
@@ -230,20 +230,20 @@ def describe(path: Path, damage: Damage) -> str:
 
 
 def is_segment(path: Path) -> bool:
-    """True for an `.mcap` file of a journal, damaged or not, and False for another program's recording."""
+    """Return True for an `.mcap` file of a journal, damaged or not; False for another program's recording."""
     if path.suffix != ".mcap":
         return False
     try:
         with SegmentFile(path) as file:
             opening = file.read(0, len(mcap_layout.OPENING))
-    except OSError:  # to be reported by who reads it
+    except OSError:  # whoever reads the file reports the error
         return True
     is_whole = len(opening) == len(mcap_layout.OPENING) and opening.startswith(mcap_layout.MAGIC)
     return opening == mcap_layout.OPENING or not is_whole
 
 
 def is_closed(path: Path) -> bool:
-    """True if a segment ends with an index, as normal MCAP readers need it; False when it cannot be read."""
+    """Return True if a segment ends with an index, as MCAP readers need it; False if it cannot be read."""
     try:
         with SegmentFile(path) as source:
             return record_scan.read_segment_end(source).state == "whole"
@@ -252,10 +252,10 @@ def is_closed(path: Path) -> bool:
 
 
 def records(path: Path) -> Iterator[Record]:
-    """The whole records of one segment file.
+    """Yield the intact records of one segment file.
 
     Raises:
-        JournalError: when the file cannot be opened or read.
+        JournalError: the file cannot be opened or read.
     """
     return (step for step in scan_records(path) if isinstance(step, Record))
 
@@ -264,69 +264,69 @@ _COPY_BYTES = 4 << 20
 
 
 class OpenSegment:
-    """A new segment file. `read` may be called by another thread; all else by the one that writes.
+    """A new segment file. Any thread may call `read`; only the writing thread calls the other methods.
 
-    Somebody may delete, move or replace the file under the process that writes it. Its descriptor then still
+    Another process may delete, move or replace the file during the writing. The open descriptor then still
     has every record, so the file can be put back.
 
     Args:
         sync: wait for the disk at each append.
 
     Raises:
-        FileExistsError: when there is such a file.
-        OSError: when the disk refuses.
+        FileExistsError: the file exists already.
+        OSError: the disk refuses.
     """
 
     def __init__(self, path: Path, *, sync: bool) -> None:
         self.path = path
-        self.first = 0  # where the first record starts; 0 = the segment is not begun
-        self.is_over = False  # a record was taken back: another segment has to be begun
+        self.first = 0  # offset of the first record; 0 = nothing is written yet
+        self.is_over = False  # a record was taken back: the writer must open another segment
         self._sync = sync
         self._identity = secrets.token_bytes(mcap_layout.IDENTITY_BYTES)
         self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
-        self._closing = threading.Lock()  # a reader's descriptor must not become another file's
+        self._closing = threading.Lock()  # else a reader's descriptor number could be reused for another file
         self._file = open(self._descriptor, "wb", closefd=False)  # noqa: SIM115
         self._writer: Any = None
         self._is_known_by_inode = True
 
     def begin(self) -> None:
-        """Write what comes before the first record; it is on the disk when this returns."""
+        """Write the bytes before the first record; they are on the disk when this returns."""
         self._writer = mcap_layout.begin_segment(self._file, self._identity, mcap_layout.wall_clock_ns())
-        # Before the first record: what a reader needs to find its way is never the end that a cut takes.
+        # Flushed before the first record: a cut of the file's end then never loses the identity.
         self._flush()
         if self._sync:
             durable_files.sync_folder(self.path.parent)
         self.first = self._file.tell()
-        # Some network file systems draw a new inode number at each look
+        # Some network file systems give a new inode number at each `stat`
         self._is_known_by_inode = os.path.samestat(os.stat(self.path), os.fstat(self._descriptor))
 
     @property
     def nbytes(self) -> int:
-        """Bytes that were written."""
+        """Number of bytes written."""
         return self._file.tell()
 
     def write(self, frames: Sequence[Any], session: bytes, seq: int, client: str, now_ns: int) -> None:
         """Write one record; it is on the disk after the next `sync`.
 
         Raises:
-            OSError: when the disk refuses; a part of the record may be there.
+            OSError: the disk refuses; the file may then hold a part of the record.
         """
         payload = mcap_layout.pack_record(frames, self._identity, session, seq, client)
         mcap_layout.write_record(self._writer, payload, seq, now_ns)
 
     def sync(self) -> None:
-        """Wait until the disk has every record; raises OSError as `write`."""
+        """Wait until the disk has every record; raises OSError like `write`."""
         self._flush()
 
     def take_back(self, at: int) -> None:
-        """Cut off the records from this place on, as far as the disk allows. None can be written any more."""
+        """Cut off the records from offset `at` on, if the disk allows it. Ends the writing."""
         self.is_over = True
         with suppress(OSError):
             os.ftruncate(self._descriptor, at)
             os.fsync(self._descriptor)
 
     def finish(self) -> None:
-        """Write the index; a segment from which a record was taken back has none."""
+        """Write the index, unless a record was taken back."""
         if self.is_over:
             return
         self._writer.finish()
@@ -341,7 +341,7 @@ class OpenSegment:
 
     @property
     def is_in_place(self) -> bool:
-        """True if the path leads to this file; raises OSError when the system does not say."""
+        """True if the path leads to this file; raises OSError if the system cannot tell."""
         try:
             there = os.stat(self.path)
         except (FileNotFoundError, NotADirectoryError):
@@ -350,21 +350,22 @@ class OpenSegment:
 
     @property
     def is_deleted(self) -> bool:
-        """True if no path at all leads to this file any more."""
+        """True if no path leads to this file any more."""
         return os.fstat(self._descriptor).st_nlink == 0
 
     def put_back(self) -> Iterator[None]:
-        """Write the file again where it was, a piece a step. What lies there then is kept as NAME.replaced.
+        """Write the file again at its path, one piece per step. A file found at the path is kept as
+        NAME.replaced.
 
         Raises:
-            OSError: when the disk refuses; nothing has changed then, and it can be tried again.
+            OSError: the disk refuses; nothing has changed then, and the caller may try again.
         """
         with durable_files.replacing(self.path) as copy:
             at = 0
             while part := os.pread(self._descriptor, _COPY_BYTES, at):
                 copy.write(part)
                 copy.flush()
-                os.fdatasync(copy.fileno())  # so that the end has to wait for no more than a piece either
+                os.fdatasync(copy.fileno())  # so that the final sync waits for one piece only
                 at += len(part)
                 yield
             copy.truncate(os.fstat(self._descriptor).st_size)  # a record may have been taken back meanwhile
@@ -372,10 +373,10 @@ class OpenSegment:
                 self.path.rename(self.path.with_name(f"{self.path.name}.replaced"))
 
     def read(self, number: int, offset: int) -> Record:
-        """One record by its descriptor, wherever the file is.
+        """Return one record by the open descriptor, even if the file was moved or deleted.
 
         Raises:
-            JournalError: when it is not there, or the file is closed.
+            JournalError: there is no record, or the file is closed.
         """
         with self._closing:
             if self._descriptor < 0:
@@ -387,10 +388,10 @@ class OpenSegment:
     # --- its end ---
 
     def end(self, cut: int | None = None) -> int:
-        """Write no more; its size. It can still be read.
+        """Stop writing; return the size of the file, which can still be read.
 
         Args:
-            cut: bytes behind this place go; they were reported as not written.
+            cut: bytes from this offset on are cut off; they were reported as not written.
         """
         with suppress(OSError):  # a full disk fails here a second time
             self._file.close()
@@ -401,7 +402,7 @@ class OpenSegment:
         return os.fstat(self._descriptor).st_size
 
     def close(self) -> None:
-        """Release the file."""
+        """Close the file."""
         with self._closing, suppress(OSError):
             descriptor, self._descriptor = self._descriptor, -1
             os.close(descriptor)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The folders of a server's maps, `STATE/maps/NAME/`, and the journals in them."""
+"""Find the folders of a server's maps, `STATE/maps/NAME/`, and the journals in them."""
 
 import os
 import re
@@ -22,26 +22,26 @@ JOURNAL_FOLDER = "journal"
 QUARANTINE_FOLDER = "quarantine"
 MAP_FILE = "map.tsf"
 ARRIVED_FILE = "arrived.json"  # in the folder of a map that came from another server
-MOVED_FOLDER = "moved"  # of maps that another server has
+MOVED_FOLDER = "moved"  # for maps that another server has taken over
 LOCK_FILE = "fuser.lock"
 PREVIOUS_FILE = "map.previous.tsf"
 
 
 def map_folder(state: str | Path, name: str) -> Path:
-    """The folder in which a map is, or will be."""
+    """Return the folder of a map; it need not exist yet."""
     return _maps(state) / name
 
 
 def _maps(state: str | Path) -> Path:
-    """The folder of the maps; a path may be that of a URL, which `Path` does not take."""
+    """Return the folder of the maps; `state` may be the path of a URL, which `Path` does not accept."""
     return (Path(state) if isinstance(state, str) else state) / MAPS_FOLDER
 
 
 def map_names(state: str | Path) -> list[str]:
-    """Names of the maps in a state folder.
+    """Return the names of the maps in a state folder.
 
     Raises:
-        JournalError: when it cannot be listed.
+        JournalError: the folder cannot be listed.
     """
     folder = _maps(state)
     try:
@@ -54,10 +54,10 @@ def map_names(state: str | Path) -> list[str]:
 
 
 def holds_a_map(folder: Path) -> bool:
-    """True if a map's folder holds more than its lock: a record, a checkpoint, or what a person put there.
+    """Return True if a map's folder holds any file besides its lock, such as a record or a checkpoint.
 
     Raises:
-        JournalError: when it cannot be listed.
+        JournalError: the folder cannot be listed.
     """
     try:
         return any(name != LOCK_FILE for _, _, names in os.walk(folder, onerror=_fail) for name in names)
@@ -68,10 +68,10 @@ def holds_a_map(folder: Path) -> bool:
 
 
 def holds_records(folder: Path) -> bool:
-    """True if a map's folder holds a checkpoint, or a segment of a journal that is not empty.
+    """Return True if a map's folder holds a checkpoint, or a non-empty segment of a journal.
 
     Raises:
-        JournalError: when it cannot be listed.
+        JournalError: the folder cannot be listed.
     """
     journal = folder / JOURNAL_FOLDER
     numbers = segments(journal) if journal.is_dir() else []
@@ -88,7 +88,7 @@ def is_state_folder(path: Path) -> bool:
 
 
 def check_no_map_of_a_server(path: Path) -> None:
-    """Raise OutputError where a file would take the place of a map that a server has saved of its journal."""
+    """Raise OutputError if a file at this path would replace the checkpoint of a server's map."""
     if path.name == MAP_FILE and (path.absolute().parent / JOURNAL_FOLDER).is_dir():
         raise OutputError(
             f"cannot write {path}: a server keeps its map there, beside the journal; choose another name"
@@ -96,13 +96,13 @@ def check_no_map_of_a_server(path: Path) -> None:
 
 
 def resolve_map(path: Path, name: str | None = None) -> Path:
-    """The map's folder when `path` is a state folder; any other path as it is.
+    """Return the map's folder if `path` is a state folder; return any other path unchanged.
 
     Args:
-        name: of the map, where the state folder has several.
+        name: the map's name, needed if the state folder has several maps.
 
     Raises:
-        JournalError: when it holds no map of that name, or several and none was named.
+        JournalError: the folder has no map of that name, or has several and no name was given.
     """
     if not is_state_folder(path):
         if name is not None:
@@ -124,17 +124,17 @@ def resolve_map(path: Path, name: str | None = None) -> Path:
 
 
 class JournalPlace(Struct, frozen=True):
-    """A journal on the disk."""
+    """The location of a journal on the disk."""
 
     path: Path  # a folder of segments, or one segment file
-    # Folder of the keyframes that could not be fused; None = the journal is no map's
+    # Folder of the keyframes that could not be fused; None = the journal belongs to no map
     quarantine: Path | None = None
 
     def files(self) -> list[Path]:
-        """List the segments, oldest first; of a quarantine the files.
+        """Return the segment files, oldest first; in a quarantine folder, return its files.
 
         Raises:
-            JournalError: when the folder cannot be listed.
+            JournalError: the folder cannot be listed.
         """
         if not self.path.is_dir():
             return [self.path]
@@ -142,10 +142,10 @@ class JournalPlace(Struct, frozen=True):
         return numbered + quarantined_files(self.path)
 
     def quarantined(self) -> list[Path]:
-        """The files in quarantine, by name.
+        """Return the files in quarantine, sorted by name.
 
         Raises:
-            JournalError: when the folder cannot be listed.
+            JournalError: the folder cannot be listed.
         """
         if self.quarantine is None or not self.quarantine.is_dir():
             return []
@@ -156,14 +156,13 @@ class JournalPlace(Struct, frozen=True):
 
     @property
     def is_a_maps(self) -> bool:
-        """True for a map's journal, of which segments are deleted oldest first alone."""
+        """True for the journal of a map: its segments are only ever deleted from the oldest on."""
         beside = self.path.parent
         is_there = (beside / MAP_FILE).exists() or (beside / LOCK_FILE).exists()
         return self.quarantine is not None or (self.path.name == JOURNAL_FOLDER and is_there)
 
     def steps(self, watch: OnProgress = lambda _done, _all: None) -> Iterator[tuple[Path, Record | Damage]]:
-        """Records and damaged places, each with its file; a file that cannot be read is a damaged place, and
-        segments that a map's journal lacks between others are one."""
+        """Yield records and damage, each with its file; unreadable files and missing segments are damage."""
         files = [(path, size_of(path)) for path in self.files()]
         total, before, last = sum(size for _, size in files), 0, 0
         has_no_gaps = self.is_a_maps
@@ -182,7 +181,7 @@ class JournalPlace(Struct, frozen=True):
 
 
 def gap_before(path: Path, last: int) -> Damage | None:
-    """The segments that are missing before one, after number `last` (0 = it is the first); None = none is."""
+    """Return damage for segments missing between number `last` (0 = none) and this file, or None."""
     number = segment_number(path)
     count = number - last - 1
     if not last or count <= 0:
@@ -192,13 +191,13 @@ def gap_before(path: Path, last: int) -> Damage | None:
 
 
 def find_journal(path: Path, map_name: str | None = None) -> JournalPlace:
-    """The journal at a path: a state folder, a map's folder in it, a folder of segments, or one segment.
+    """Return the journal at a path: a state folder, a map's folder, a folder of segments, or one segment.
 
     Args:
-        map_name: of the map, where the state folder has several.
+        map_name: the map's name, needed if the state folder has several maps.
 
     Raises:
-        JournalError: when there is none, or no single one.
+        JournalError: the path has no journal, or several.
     """
     if not path.exists():
         raise JournalError(
@@ -217,10 +216,10 @@ def find_journal(path: Path, map_name: str | None = None) -> JournalPlace:
 
 
 def is_journal(path: Path) -> bool:
-    """True if there is something to read at a path that `find_journal` takes.
+    """Return True if a path that `find_journal` accepts has anything to read.
 
     Raises:
-        JournalError: when a folder cannot be listed.
+        JournalError: a folder cannot be listed.
     """
     if not path.is_dir():
         return is_segment(path)

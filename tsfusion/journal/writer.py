@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Writing a journal: append, wait for the disk, begin the next segment, delete old ones."""
+"""Write a journal: append records, wait for the disk, open new segments and delete old ones."""
 
 import contextlib
 import errno
@@ -23,14 +23,14 @@ log = logging.getLogger(__name__)
 
 _PARTS = r"\.[0-9]{6,9}\.mcap\.partial"  # files that a killed writer leaves
 _KEPT_OPEN = 64  # segments
-# Bytes of the journal that were read, bytes of all, and records so far
+# Bytes read so far, bytes of the whole journal, and records so far
 ReadingWatcher = Callable[[int, int, int], None]
 _CHECK_BYTES = 16 << 20  # written between two checks of the disk, at most
 _CHECK_S = 1.0
 
 
 class FreeSpace:
-    """Room to write on a folder's disk, of which `min_free_bytes` stay free."""
+    """The free space on a folder's disk, of which `min_free_bytes` must stay free."""
 
     def __init__(self, folder: Path, min_free_bytes: int) -> None:
         self._folder = folder
@@ -39,7 +39,7 @@ class FreeSpace:
         self._check_at = 0.0
 
     def reserve(self, nbytes: int) -> None:
-        """Raise JournalError when writing so much would leave too little."""
+        """Raise JournalError if writing this many bytes would leave too little space."""
         now = time.monotonic()
         if self._kept and (now >= self._check_at or nbytes > self._left):
             spare = self.free_bytes - self._kept
@@ -55,10 +55,10 @@ class FreeSpace:
 
     @property
     def free_bytes(self) -> int:
-        """Room on the disk.
+        """Free bytes on the disk.
 
         Raises:
-            JournalError: when the disk does not say.
+            JournalError: the system cannot tell.
         """
         try:
             return durable_files.free_bytes(self._folder)
@@ -73,7 +73,7 @@ def _mb(count: int) -> str:
 
 
 class Unwritten(NamedTuple):
-    """A message that is to become a record."""
+    """A message to be written as a record."""
 
     frames: Sequence[Any]
     session: bytes
@@ -82,29 +82,30 @@ class Unwritten(NamedTuple):
 
 
 class Journal:
-    """The one writer of a folder of segments.
+    """The only writer of a folder of segments.
 
     Args:
-        folder: made when absent.
-        segment_bytes: a segment that has grown past this is closed and the next begun.
-        sync: wait for the disk at each append (fdatasync); without it a power cut may lose the tail.
-        min_free_bytes: what `append` leaves free on the disk.
-        keep_open: keep the files of closed segments open, so that `read_kept` finds their records although
-            somebody has deleted the folder.
-        longest_wait: seconds that a call may take to put back a segment that somebody has taken away; then it
-            raises JournalError, and the next call goes on.
-        watch: called again and again while the segments of earlier runs are read; what it raises ends that.
+        folder: made if absent.
+        segment_bytes: a segment larger than this is closed, and the next one is opened.
+        sync: wait for the disk at each append (fdatasync); without this a power cut may lose the tail.
+        min_free_bytes: bytes that `append` leaves free on the disk.
+        keep_open: keep the files of closed segments open, so that `read_kept` finds their records after
+            somebody deletes the folder.
+        longest_wait: seconds that one call spends on putting back a removed segment. Then it raises
+            JournalError, and the next call continues.
+        watch: called often while the segments of earlier runs are read; an exception from it ends the
+            reading.
 
     Attributes:
         found: records in the segments of earlier runs, in journal order; the caller may empty the list.
-        damaged: number of their damaged records. A segment that is damaged from end to end counts as one.
-        absent: number of segments that were not there at the start, between others that were.
-        missing: numbers of segments that somebody has taken away since, at the last look.
-        put_back: number of times that the open segment was taken away and written again.
+        damaged: number of their damaged records. A completely damaged segment counts as one.
+        absent: number of segments missing at the start between existing ones.
+        missing: numbers of segments that somebody has removed since, by the last check.
+        put_back: number of times that the open segment was removed and written again.
 
     Raises:
-        JournalError: when the folder cannot be made or listed, or one of its segments cannot be read or is
-            of another version: its records would be passed over for ever.
+        JournalError: the folder cannot be made or listed, or a segment cannot be read or is of another
+            version. Ignoring such a segment would lose its records for ever.
     """
 
     def __init__(
@@ -170,21 +171,21 @@ class Journal:
 
     @property
     def free_bytes(self) -> int:
-        """Room on the disk.
+        """Free bytes on the disk.
 
         Raises:
-            JournalError: when the disk does not say.
+            JournalError: the system cannot tell.
         """
         return self._room.free_bytes
 
     @property
     def first(self) -> int:
-        """The number of the oldest segment; more than 1 = older ones were deleted."""
+        """The number of the oldest segment; more than 1 = older segments were deleted."""
         return next(iter(self._closed), self._number)
 
     @property
     def segment(self) -> int:
-        """The number of the segment that is (or will be) written to."""
+        """The number of the segment that is, or will be, written."""
         return self._number
 
     def append(
@@ -208,14 +209,14 @@ class Journal:
         return self.append_all([Unwritten(frames, session, seq, client)], logged_ns=logged_ns)[0]
 
     def append_all(self, messages: Sequence[Unwritten], *, logged_ns: int | None = None) -> list[Position]:
-        """Write messages into one segment; they are on the disk, by one wait for it, when this returns.
+        """Write messages into one segment; one wait puts them on the disk before this returns.
 
         Args:
             logged_ns: wall clock; None = now.
 
         Raises:
-            JournalError: when the disk refuses, or too little would stay free. Nothing of any message
-                counts then.
+            JournalError: the disk refuses, or too little space would stay free. No message counts as written
+                then.
         """
         self._room.reserve(sum(memoryview(frame).nbytes for one in messages for frame in one.frames))
         self._keep_place()
@@ -236,9 +237,9 @@ class Journal:
             raise
         positions = [Position(self._number, offset) for offset in offsets]
         try:
-            self._keep_place()  # nothing is acknowledged in a file that nobody finds
+            self._keep_place()  # a record in a file that readers cannot find is not acknowledged
         except BaseException:
-            segment.take_back(offsets[0])  # they come again
+            segment.take_back(offsets[0])  # the sender sends these messages again
             raise
         if self._open is not None and segment.nbytes >= self._segment_bytes:
             self._rotate_or_abandon()
@@ -259,7 +260,7 @@ class Journal:
         return self._open
 
     def _rotate_or_abandon(self) -> None:
-        """Close the segment; an error is only logged: the keyframe is on the disk, with or without index."""
+        """Close the segment; only log an error, because the keyframe is on the disk even without an index."""
         try:
             self.rotate()
         except OSError as error:
@@ -267,17 +268,17 @@ class Journal:
             self._abandon()
 
     def rotate(self) -> None:
-        """Close the segment with its index; the next append begins another."""
+        """Close the segment with its index; the next append opens another."""
         if self._open is None:
             return
         self._open.finish()
         self._abandon()
 
     def close(self) -> None:
-        """Finish the segment. The journal may be read, not written, from here on.
+        """Finish the segment. Afterwards the journal can be read but not written.
 
         Raises:
-            JournalError: when the disk refuses, or the open segment was taken away and cannot be put back.
+            JournalError: the disk refuses, or the open segment was removed and cannot be put back.
         """
         self._longest_wait = math.inf
         try:
@@ -293,16 +294,16 @@ class Journal:
     # --- files that are taken away ---
 
     def check(self) -> None:
-        """Raise JournalError unless a record could be written: the folder is there, and the disk has room."""
+        """Raise JournalError unless a record could be written: the folder exists and the disk has space."""
         self._keep_place()
         self.look()
         self._room.reserve(0)
 
     def look(self) -> None:
-        """Note which segments are `missing`; raise JournalError when the folder is another one, or not there.
+        """Update `missing`; raise JournalError if the folder is missing or was replaced.
 
-        Another folder that has none of the segments is the place of a disk that is not mounted, or somebody
-        has made it anew: what is written there may never be found again.
+        A folder without the segments may be the mount point of a disk that is away: records there could get
+        lost.
         """
         there = set(segments(self.folder))
         missing = [number for number in self._closed if number not in there]
@@ -314,7 +315,7 @@ class Journal:
 
     @property
     def is_away(self) -> bool:
-        """True if the folder is not to be found, or an empty one is in its place. From any thread."""
+        """True if the folder is missing, or an empty folder has replaced it. From any thread."""
         return is_away(self.folder, self._home)
 
     def _strange_folder(self) -> JournalError:
@@ -325,10 +326,10 @@ class Journal:
         )
 
     def _keep_place(self) -> None:
-        """Put the open segment back where readers look for it, if it was taken away.
+        """Put the open segment back at its path if somebody removed it.
 
         Raises:
-            JournalError: when that cannot be done now. The file stays open, and nothing is lost yet.
+            JournalError: this cannot be done now. The file stays open, and nothing is lost yet.
         """
         segment = self._open
         if segment is None:
@@ -339,7 +340,7 @@ class Journal:
                 return
             here = os.stat(self.folder)
             if not segment.is_deleted and self.is_away:
-                raise self._strange_folder()  # the segment is with its folder, elsewhere
+                raise self._strange_folder()  # the segment was moved together with its folder
             self._put_back_some(segment)
         except OSError as error:
             self._putting_back = None
@@ -354,7 +355,7 @@ class Journal:
         self._abandon()
 
     def _put_back_some(self, segment: OpenSegment) -> None:
-        """Go on to put a segment back; raises JournalError when that takes longer, so that others wait."""
+        """Continue to put a segment back; raise JournalError after `longest_wait`, so that records wait."""
         until = time.monotonic() + self._longest_wait
         self._putting_back = self._putting_back or segment.put_back()
         for _ in self._putting_back:
@@ -365,19 +366,19 @@ class Journal:
                 )
 
     def read_kept(self, position: Position) -> Record | None:
-        """A record by its open file, wherever that is; None = it is not open. From any thread.
+        """Return a record from its open file, wherever that file is; None if it is not open. From any thread.
 
         Raises:
-            JournalError: when the disk has lost it.
+            JournalError: the disk has lost the record.
         """
         segment = self._kept.get(position.segment)
         return segment.read(position.segment, position.offset) if segment else None
 
     def forget(self, number: int) -> None:
-        """Delete a closed segment whose keyframes are safe elsewhere.
+        """Delete a closed segment whose keyframes are stored elsewhere.
 
         Raises:
-            JournalError: when the disk refuses.
+            JournalError: the disk refuses.
         """
         path = segment_path(self.folder, number)
         try:
@@ -391,13 +392,13 @@ class Journal:
             self._kept.pop(number).close()
 
     def erase(self, positions: Iterable[Position]) -> Iterator[int]:
-        """Delete the bytes of records, a piece at a time; all other records keep their positions.
+        """Erase the bytes of records, a piece at a time; all other records keep their positions.
 
         Yields:
-            How many are erased so far. A record of a segment that is not there any more is gone.
+            The number of records erased so far; records of a segment that no longer exists count as erased.
 
         Raises:
-            JournalError: when the disk refuses, or there is no record at such a place.
+            JournalError: the disk refuses, or a position has no record.
         """
         offsets: dict[int, set[int]] = {}
         for position in positions:
@@ -418,11 +419,11 @@ class Journal:
         """Delete the oldest closed segments until the journal is no larger than `limit`.
 
         Args:
-            below: segments from this number on stay: their keyframes are nowhere else.
+            below: segments from this number on stay, because their keyframes are stored nowhere else.
             limit: bytes of all segments.
 
         Returns:
-            The bytes that this freed. A segment that cannot be deleted is logged and passed over.
+            The bytes freed. A segment that cannot be deleted is logged and skipped.
         """
         before = self.nbytes
         for number in sorted(self._closed):
@@ -435,7 +436,7 @@ class Journal:
         return before - self.nbytes
 
     def _abandon(self, end: int | None = None) -> None:
-        """Leave the segment. Bytes behind `end` were reported as not written: nobody may find them later."""
+        """Stop using the open segment. Bytes from `end` on are cut off: they were reported as not written."""
         segment, number = self._open, self._number
         if segment is None:
             return
@@ -455,10 +456,10 @@ class Journal:
 
 
 def write_file(path: Path, frames: Sequence[Any], *, session: bytes, seq: int, client: str = "") -> None:
-    """Write one message into a file of its own that has the form of a segment, whole or not at all.
+    """Write one message into a file of its own in the form of a segment, completely or not at all.
 
     Raises:
-        JournalError: when the disk refuses.
+        JournalError: the disk refuses.
     """
     identity, now_ns = secrets.token_bytes(mcap_layout.IDENTITY_BYTES), mcap_layout.wall_clock_ns()
     try:
