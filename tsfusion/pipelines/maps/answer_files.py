@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Points to ask a map about, from files; and its answers, to files."""
+"""Read query points from files, and write a map's answers to files."""
 
 import csv
 import io
@@ -25,13 +25,13 @@ COLUMNS = ("x", "y", "z", "distance", "weight", "gradient_x", "gradient_y", "gra
 
 
 def read(source: str) -> NDArray[np.float64]:
-    """The (n, 3) points of a file: three columns of numbers, an array, or the vertices of a PLY.
+    """Return the (n, 3) float64 points of a file: columns of numbers, an array, or the vertices of a PLY.
 
     Args:
-        source: `-` = columns on the standard input.
+        source: path of a file, or `-` for columns of numbers on the standard input.
 
     Raises:
-        DatasetError: when it cannot be read, has no points, or one of them is not finite.
+        DatasetError: when the file cannot be read, has no points, or has a point that is not finite.
     """
     name = "standard input" if source == "-" else source
     try:
@@ -66,9 +66,9 @@ def _parsed(source: str, name: str) -> NDArray[Any]:
 
 
 def _columns(text: str, source: str) -> NDArray[np.float64]:
-    """Three columns, with commas, semicolons or spaces between them.
+    """Return (n, 3) numbers of a text whose columns are separated by commas, semicolons or spaces.
 
-    A first line without a number is a title: if it names x, y and z they are there, else they come first.
+    A first line without a number is a title. If it names x, y and z, they are read, else the first three.
     """
     rows: list[list[float]] = []
     places: list[int] | None = None
@@ -94,7 +94,7 @@ def _is_number(word: str) -> bool:
 
 
 def csv_text(points: NDArray[np.float64], found: Samples) -> str:
-    """A title and a line for each point, with the shortest numbers that stay the same; unseen is `nan`."""
+    """Return a CSV table with a title line. Numbers are as short as they read back equal; unseen is `nan`."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS)
@@ -104,7 +104,7 @@ def csv_text(points: NDArray[np.float64], found: Samples) -> str:
 
 
 def write_samples(path: Path, points: NDArray[np.float64], found: Samples) -> None:
-    """Write a table (.csv), the distances alone (.npy), or all arrays by name (.npz); whole or not at all.
+    """Write a table (.csv), only the distances (.npy), or all arrays by name (.npz). No partial file is left.
 
     Raises:
         OutputError: when it cannot be written.
@@ -120,7 +120,7 @@ def write_samples(path: Path, points: NDArray[np.float64], found: Samples) -> No
 
 
 def write_view(path: Path, found: View) -> None:
-    """Write a picture (.png), or the arrays by name (.npz); whole or not at all.
+    """Write a picture (.png), or the arrays by name (.npz). No partial file is left.
 
     Raises:
         OutputError: when it cannot be written.
@@ -136,9 +136,9 @@ def write_view(path: Path, found: View) -> None:
 
 
 def picture(view: View) -> NDArray[np.uint8]:
-    """(H, W, 3) RGB: the map's colours, or without any its shape in grey; white where nothing was hit.
+    """Return the (H, W, 3) RGB picture of a view. A pixel that hit nothing is white.
 
-    A view of depth alone is one grey.
+    Without colours the shape is shaded in grey. A view of depth alone is one grey.
     """
     hit = (view.depth > 0)[..., np.newaxis]
     if view.colors is not None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Maps made of a journal: all, until a time, of one scanner, elsewhere, painted by origin; and textures."""
+"""Fuse the keyframes of a journal, or a selection of them, into a map; make textures from its images."""
 
 from collections import Counter
 from collections.abc import Callable, Collection
@@ -31,12 +31,12 @@ FusionProgress = Callable[[int, int, int], None]  # keyframes read, in the map, 
 
 
 class Painter:
-    """Colours of keyframes by their origin, instead of what the cameras saw.
+    """Gives each keyframe the colour of its origin, in place of the camera's colours.
 
-    Where several saw a surface their colours are mixed by their votes.
+    A surface that several origins saw gets a mix of their colours, by their votes.
 
     Args:
-        by: client = by the name of its key, or by session where there are no keys.
+        by: `client` uses the name of the client's key, or the session where there are no keys.
     """
 
     def __init__(self, by: ColorBy) -> None:
@@ -44,7 +44,7 @@ class Painter:
         self._counts: Counter[str] = Counter()
 
     def __call__(self, found: FinalKeyframe) -> Keyframe:
-        """The keyframe with the colour of its origin."""
+        """Return the keyframe with the colour of its origin."""
         name = self._name(found.session)
         self._counts[name] += 1
         keyframe = found.keyframe
@@ -53,7 +53,7 @@ class Painter:
 
     @property
     def legend(self) -> list[dict[str, Any]]:
-        """`name`, `color` as #rrggbb and `keyframes` of each origin, in the order in which they came."""
+        """The `name`, `color` (#rrggbb) and number of `keyframes` of each origin, in order of arrival."""
         return [
             {"name": name, "color": color_scales.as_hex(color_scales.of_number(index)), "keyframes": count}
             for index, (name, count) in enumerate(self._counts.items())
@@ -69,9 +69,9 @@ class JournalMap(msgspec.Struct):
     Attributes:
         volume: the map.
         left_out: reason → number of keyframes that it could not take.
-        legend: of its colours, as `Painter` gives it; empty = the cameras'.
+        legend: meaning of its colours, see `Painter.legend`; empty if the colours are those of the cameras.
         missing: number of keyframes of the saved map that the journal does not have.
-        lost: number of keyframes that damage in the journal has cost this map, at least.
+        lost: number of keyframes (or more) that the map lacks because the journal is damaged.
     """
 
     volume: Volume
@@ -92,12 +92,12 @@ def fuse(
 ) -> JournalMap:
     """Add the keyframes of a journal, each at its final pose, to a map.
 
-    One that the map cannot take is counted and left out, as in the server.
+    A keyframe that the map cannot take is counted and left out, as a server does.
 
     Args:
-        T_map_journal: (4, 4) where the journal's frame lies in the map's; None = they are the same.
-        sensor: of keyframes that name none; None = the map's own.
-        paint: gives each its colour.
+        T_map_journal: (4, 4) pose of the journal's coordinate frame in the map's; None if both are the same.
+        sensor: sensor of keyframes that name none; None for the map's own.
+        paint: gives each keyframe its colour.
 
     Raises:
         JournalError: when a keyframe cannot be read any more.
@@ -121,15 +121,15 @@ def fuse(
 def choose(
     source: Path, *, until: str | None = None, only: Collection[str] = (), watch: OnProgress = lambda *_: None
 ) -> JournaledKeyframes:
-    """The keyframes of a journal that a person names.
+    """Return the keyframes of a journal that a user selects.
 
     Args:
         source: what `state_folder.find_journal` takes.
-        until: a time, as `journaled_keyframes.moment_ns` reads it: also later corrections are left out.
-        only: sessions or clients, as `journaled_keyframes.sessions_named` reads them; empty = all.
+        until: a time, as `journaled_keyframes.moment_ns` reads it. Later records do not count.
+        only: names of sessions or clients, see `journaled_keyframes.sessions_named`; empty for all.
 
     Raises:
-        InvalidConfig, JournalError: for a time or a name that is none, or when it leaves nothing.
+        InvalidConfig, JournalError: for an invalid time or name, or when no keyframe is left.
     """
     place = state_folder.find_journal(source)
     last_ns = journaled_keyframes.last_logged_ns(place)
@@ -163,15 +163,15 @@ def map_of(
     reading: OnProgress = lambda _done, _all: None,
     watch: FusionProgress = lambda _read, _fused, _all: None,
 ) -> JournalMap:
-    """The map of a state folder or a journal.
+    """Return the map of a state folder or a journal.
 
-    The saved one, with all that the journal holds, where that is what is asked for; otherwise the keyframes
-    of the journal fused anew, with the settings of the saved one.
+    Without `given` or a selection, this is the saved map with all that its journal holds. Otherwise the
+    journal's keyframes are fused anew, with the settings of the saved map.
 
     Args:
-        given: fuse anew with the settings of `config`. Otherwise only those of how the surface is read and
-            its threads count, and all where there is no saved map.
-        memory_for: gives `memory_bytes` of `Volume` for a saved map's file, or for a new map (None).
+        given: fuse anew with the settings of `config`. Otherwise `config` only says how the surface is read
+            and the number of threads. Without a saved map all of `config` counts.
+        memory_for: returns `memory_bytes` of `Volume` for the file of a saved map, or for a new map (None).
 
     Raises:
         InvalidConfig, JournalError, CheckpointError: as `choose`, `saved_maps.check_journal` and
@@ -204,13 +204,13 @@ def map_of(
 
 
 def _is_of_server(saved: Path) -> bool:
-    """True if a map says how far it is with the journal beside it; one that was put there does not."""
+    """True if a saved map says which records of its journal it has; a file copied here by hand does not."""
     with checkpoint.reading(saved) as (header, _):
         return "done" in header.meta
 
 
 class JournalImages:
-    """The keyframes of a journal as a texture takes them; None where one is of no use."""
+    """Sequence of a journal's keyframes for a texture. An item is None if it cannot be decoded."""
 
     def __init__(self, keyframes: JournaledKeyframes) -> None:
         self._keyframes = keyframes
@@ -226,7 +226,7 @@ class JournalImages:
         """
         try:
             return self._keyframes[index].keyframe
-        except (DecodeError, InvalidKeyframe):  # the map could not take it either, and whoever made it told
+        except (DecodeError, InvalidKeyframe):  # the map did not take it either, and this was reported
             return None
 
 
@@ -246,10 +246,10 @@ def textured(
     Args:
         source: what `state_folder.find_journal` takes.
         voxel_size: metres, of the map.
-        until, only: the keyframes, as `choose` has them.
+        until, only: selection of keyframes, see `choose`.
 
     Raises:
-        JournalError: when there is no journal, or it has no keyframes; others as `texturing.textured`.
+        JournalError: when there is no journal, or no keyframe in it. Others: see `texturing.textured`.
     """
     keyframes = choose(source, until=until, only=only, watch=reading)
     if not len(keyframes):

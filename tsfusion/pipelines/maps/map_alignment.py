@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Maps of different frames as one: find where the second lies in the first, or say that nobody can tell."""
+"""Find the pose of one map in the coordinate frame of another, or refuse; and merge the two maps."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -37,29 +37,29 @@ _CELLS = 100  # along the diagonal of the smaller map, at most
 _SCALES = (1.0, 1.6)  # of the cell, at which features are looked for
 _LAST_REACHES = (2.0, 1.0, 0.5)  # voxels, of the last refinement
 _MOST_COMPARED, _MIN_COMPARED = 4096, 100  # blocks; points along a direction
-_MOST_THROUGH = 0.16  # of a surface in the other's free space; of true pairs up to 0.13 (hand-held, kitchen)
+_MOST_THROUGH = 0.16  # share of a surface in the other's free space; true pairs have up to 0.13 (a kitchen)
 _PART_REACH = 6.0  # voxels within which a part looks for the other surface
 _TOLERANCE = 1.5  # voxels within which two surfaces are one
-_TILT = {"given": 10.0, "imu": 10.0, "floor": 20.0, "cameras": 30.0}  # degrees: how well up is known
-_VIEWS = 24  # keyframes of each journal that are asked what they saw
+_TILT = {"given": 10.0, "imu": 10.0, "floor": 20.0, "cameras": 30.0}  # degrees of error of the up direction
+_VIEWS = 24  # keyframes of each journal whose depth is compared
 _APART_DEG, _APART_CELLS = 10.0, 4.0  # two transforms that differ by more are two answers
-_RIVAL = 0.85  # of the best answer's overlap: another that has as much is as good
-_RIVAL_CONTRADICTED = 0.05  # though it may be contradicted more often, by this share
+_RIVAL = 0.85  # an answer with this share of the best answer's overlap is as good
+_RIVAL_CONTRADICTED = 0.05  # but at most so much more contradicted
 
 
 class Alignment(msgspec.Struct, kw_only=True):
-    """Place of a second map in a first, and its evidence.
+    """Pose of a map B in a map A, and the evidence for it.
 
     Attributes:
         T_a_b: (4, 4) rows; p_a = T_a_b @ p_b.
-        error_mm: about how far T_a_b may be off: so far apart the parts of the common surface want B, over
-            the share of the smaller surface that they are; a map that has drifted lies nowhere exactly.
-        overlap, rmse_mm, constraint: as `SurfaceFit` has them, the second in millimetres.
-        contradicted: share of what the sensors of one map saw of the other's surface where they looked
-            through it; of maps without keyframes, where it lies in the free space before their surface.
-        looks: number of such looks.
-        contradicted_alone: the same share of each map's own surface: noise, thin things, drift.
-        tilt_deg: angle between the up directions of both; None = one of them is not known.
+        error_mm: estimated error of T_a_b. Pieces of the common surface are aligned alone; this is the spread
+            of their results, divided by `overlap`. A map that has drifted fits nowhere exactly.
+        overlap, rmse_mm, constraint: see `SurfaceFit`; here the RMSE is in millimetres.
+        contradicted: share of a map's surface points, seen by the other map's sensors, that these looked
+            through. Without keyframes: share of points in the free space before the other surface.
+        looks: number of points so observed.
+        contradicted_alone: the same share for each map's own surface. Noise, thin things and drift cause it.
+        tilt_deg: angle between the up directions of both maps; None if one of them is unknown.
     """
 
     T_a_b: list[list[float]]
@@ -75,15 +75,15 @@ class Alignment(msgspec.Struct, kw_only=True):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class AlignedMap:
-    """A map as far as it is known.
+    """A map to be aligned.
 
     Attributes:
         mesh: its surface.
-        views: some of its keyframes, at their poses: what their cameras looked through is free.
-        volume: what knows the free space before its surface; None = it is elsewhere.
-        keyframes: of its journal; None = there is none.
+        views: some of its keyframes with their poses. Space that their cameras looked through is free.
+        volume: its voxels, to look up the free space before its surface; None if they are elsewhere.
+        keyframes: keyframes of its journal; None without a journal.
         missing: number of its keyframes that the journal does not have.
-        lost: keyframes of the journal that damage has cost, at least.
+        lost: number of keyframes (or more) that damage of the journal has cost.
     """
 
     name: str
@@ -97,16 +97,16 @@ class AlignedMap:
 
 
 def map_of_volume(name: str, volume: Volume, views: Sequence[Keyframe] = ()) -> AlignedMap:
-    """A map that is in memory."""
+    """Return a map in memory, ready to be aligned."""
     mesh = volume.extract_mesh().without_islands()
     return AlignedMap(name=name, mesh=mesh, voxel_size=volume.config.voxel_size, views=views, volume=volume)
 
 
 def open_map(source: Path, *, watch: FusionProgress = lambda *_: None) -> AlignedMap:
-    """A map (.tsf), or the settled one of a state folder or a journal.
+    """Open a map (.tsf), or the settled map of a state folder or a journal.
 
     Raises:
-        CheckpointError, JournalError: when there is none, or it cannot be read.
+        CheckpointError, JournalError: when there is no map, or it cannot be read.
     """
     if not source.exists():
         raise JournalError(f"{source} does not exist; expected a map (.tsf), a state folder or a journal")
@@ -126,7 +126,7 @@ def align(a: AlignedMap, b: AlignedMap) -> Alignment:
     """Find where map `b` lies in map `a`.
 
     Raises:
-        AlignmentRefused: when they share too little, or when what they share leaves it open.
+        AlignmentRefused: when the maps share too little surface, or several poses fit equally well.
         MissingDependency: without Open3D or scipy.
     """
     for one in (a, b):
@@ -152,13 +152,13 @@ def align(a: AlignedMap, b: AlignedMap) -> Alignment:
 
 
 def check_one_frame(a: Volume, b: Volume, names: Sequence[object]) -> None:
-    """Raise MapError unless what two maps both have shows that they are in one frame.
+    """Raise MapError unless the surfaces of two maps show that both are in one coordinate frame.
 
-    Where both saw, the surface of one must not lie in the free space before that of the other; of each
-    direction of normals alone, for the floors of two places agree.
+    Where both have blocks, the surface of one must not lie in the free space before that of the other. The
+    three directions of normals are judged separately, because the floors of two buildings always agree.
 
     Args:
-        names: of both, for the message.
+        names: names of both maps, for the message.
     """
     if a.config.voxel_size != b.config.voxel_size:
         return  # they are not added in any case
@@ -187,7 +187,7 @@ def check_one_frame(a: Volume, b: Volume, names: Sequence[object]) -> None:
 
 
 class _Looks(NamedTuple):
-    """Counts of looks through a surface, and of looks at it."""
+    """Counts of surface points that a sensor looked through (`through`) or saw in place (`seen`)."""
 
     through: int
     seen: int
@@ -203,7 +203,7 @@ class _Looks(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _JudgedTransform:
-    """A transform, and what speaks for and against it."""
+    """A transform, and the evidence for and against it."""
 
     T: Transform
     fit: SurfaceFit
@@ -245,7 +245,7 @@ class _MapPair:
         self.contradicted_alone = own.contradicted
 
     def candidates(self) -> list[Transform]:
-        """Different transforms, refined; those that turn up down are left out."""
+        """Return distinct refined transforms, without those that tilt the up direction too far."""
         found: list[Transform] = []
         for scale in _SCALES:
             for T in SurfaceRegistration(*self._sampled(scale * self._cell)).candidates():
@@ -255,7 +255,7 @@ class _MapPair:
         return found
 
     def turned(self, T: Transform) -> list[Transform]:
-        """Other answers of a symmetric place: quarter turns around the middle of what is common."""
+        """Return rivals of `T` in a symmetric scene: refined quarter turns about the middle of map `b`."""
         points, _ = self._coarse[1].moved(T)
         middles = (np.median(points, axis=0), (points.min(axis=0) + points.max(axis=0)) / 2)
         up = self._a.mesh.up
@@ -269,22 +269,22 @@ class _MapPair:
         return [self._registration.refined(turn @ T) for turn in turns]
 
     def finished(self, T: Transform) -> Transform:
-        """A transform that was refined, refined by every voxel of the surfaces."""
+        """Refine a transform once more, at the resolution of voxels."""
         return SurfaceRegistration(*self._sampled(self._voxel)).refined(T, _LAST_REACHES)
 
     def judged(self, T: Transform, *, fine: bool = False) -> _JudgedTransform:
-        """Evidence for and against a transform; `fine`: by every voxel of the surfaces."""
+        """Return the evidence for and against a transform; with `fine`, at the resolution of voxels."""
         surfaces = self._sampled(self._voxel) if fine else self._coarse
         moved = self._coarse[0].moved(se3.inverse(T))[0], self._coarse[1].moved(T)[0]
         looks = self._looks_at(moved[1], moved[0])
         return _JudgedTransform(T, fit(*surfaces, T, _TOLERANCE * self._voxel), looks, self._tilt(T))
 
     def spread(self, T: Transform) -> float:
-        """Distance between the places where parts of the common surface want the second map, metres."""
+        """Return how far apart, in metres, pieces of the common surface, each alone, would put map `b`."""
         return surface_fit.parts_spread(*self._sampled(self._voxel), T, _PART_REACH * self._voxel)
 
     def _looks_at(self, for_a: NDArray[np.float64], for_b: NDArray[np.float64]) -> _Looks:
-        """How map `a` sees some points, and map `b` others, (n, 3) in the world of each."""
+        """Count how map `a` sees points `for_a`, and map `b` points `for_b`: (n, 3), in that map's frame."""
         through = seen = 0
         for one, views, points in zip((self._a, self._b), self._views, (for_a, for_b), strict=True):
             looks = [view.looks(points) for view in views] or [self._in_free_space(one.volume, points)]
@@ -292,7 +292,7 @@ class _MapPair:
         return _Looks(through, seen)
 
     def check(self, best: _JudgedTransform) -> None:
-        """Raise AlignmentRefused unless an answer is beyond doubt, but for others that are as good."""
+        """Raise AlignmentRefused if the evidence for an answer is too weak. Rivals are not compared."""
         found, a, b = best.fit, self._a.name, self._b.name
         if found.matches < _MIN_MATCHES and found.overlap >= MIN_OVERLAP:
             raise AlignmentRefused(
@@ -330,7 +330,7 @@ class _MapPair:
         return SampledSurface(self._a.mesh, cell), SampledSurface(self._b.mesh, cell)
 
     def _in_free_space(self, volume: Volume | None, points: NDArray[np.float64]) -> tuple[int, int]:
-        """How many points lie before a map's surface and how many on it, by its signed distances."""
+        """Count the points before a map's surface, and those on it, by their signed distances."""
         if volume is None:
             return 0, 0
         distance = volume.signed_distance(points)
@@ -356,10 +356,10 @@ class _MapPair:
 
 
 class Merge(NamedTuple):
-    """Addition of a map to another.
+    """Result of the addition of a map to another.
 
     Attributes:
-        not_exact: why the result is not the map of the keyframes of both; empty = it is.
+        not_exact: why the result differs from a fusion of all keyframes of both maps; empty if it does not.
         left_out: reason → number of keyframes that the first map could not take.
     """
 
@@ -370,14 +370,14 @@ class Merge(NamedTuple):
 def merge(
     volume: Volume, b: AlignedMap, T_a_b: Transform, *, watch: FusionProgress = lambda *_: None
 ) -> Merge:
-    """Add map `b` to the volume of map `a`, where the alignment says.
+    """Add map `b` to the volume of map `a`, at the pose `T_a_b`.
 
-    From its journal that is exact. Without, the surface of `b` is added as points that were seen once. The
-    volume leaves its journal; sessions of `b` are not among those that a server may go on with, for their
-    poses are of another frame.
+    With the journal of `b` the result is exact. Without it, the surface of `b` is added as points seen once.
+    The volume no longer refers to its journal. A server cannot continue sessions of `b`, because their poses
+    are in another frame.
 
     Raises:
-        MapError: when both hold the same keyframes, as far as a server wrote down which.
+        MapError: when both hold the same keyframes, as far as a server recorded them.
     """
     theirs = {} if b.volume is None else b.volume.meta
     map_history.check_addable(volume.meta, theirs, same_frame=True)
@@ -404,7 +404,7 @@ def merge(
 
 
 def _surface_keyframes(mesh: Mesh) -> list[Keyframe]:
-    """A surface as points that were each seen from before it."""
+    """Return keyframes of points: the mesh's vertices, each seen from 1 m away along its normal."""
     found = []
     for first in range(0, len(mesh.vertices), MAX_POINTS):
         part = slice(first, first + MAX_POINTS)
@@ -415,6 +415,6 @@ def _surface_keyframes(mesh: Mesh) -> list[Keyframe]:
 
 
 def spread(count: int) -> list[int]:
-    """Indices of at most 24 keyframes, spread over so many."""
+    """Return at most 24 indices, spread evenly over `count` keyframes."""
     chosen = np.linspace(0, count - 1, min(count, _VIEWS)).round().astype(int)
     return [int(index) for index in chosen]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Last steps before a mesh is shared: cut to a box, freed of small pieces, thinned, and written."""
+"""Finish a mesh for sharing: crop it, remove small pieces, simplify it, and write it to files."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from tsfusion.tsdf.volume import Volume
 
 _MARGIN = 128  # voxels around a box that its surface depends on
-# Memory of a step beside the map and in its sizes, the most that lab/bench/mesh_sharing.py --memory found
+# Memory of a step beside the map, in map sizes: the most that lab/bench/mesh_sharing.py --memory found
 _FILLING, _SIMPLIFYING, _TEXTURING = 3.0, 6.0, 4.0
 Box = tuple[float, float, float, float, float, float]
 PICTURE = ".png"
@@ -25,11 +25,11 @@ _EXACT = (".ply", ".obj", *point_files.ONLY_POINTS)  # the whole map
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Finishing:
-    """Steps, in this order; None = left out.
+    """Steps that finish a mesh, in this order. A step that is None is left out.
 
     Attributes:
         crop: x0, y0, z0, x1, y1, z1 in metres.
-        min_component: metres from corner to corner of the box around a piece: smaller ones go.
+        min_component: metres. Pieces whose bounding box has a shorter diagonal are removed.
         simplify: arguments of `Mesh.simplified`.
         mark_guesses: guessed triangles get a colour of their own.
     """
@@ -45,7 +45,7 @@ class Finishing:
         return self == Finishing()
 
     def apply(self, mesh: Mesh) -> tuple[Mesh, dict[str, Any]]:
-        """The finished mesh, and how many `islands` with how many `triangles` were left out.
+        """Return the finished mesh, and the numbers of `islands` removed and of their `triangles`.
 
         Raises:
             OutputError: when nothing is left.
@@ -63,7 +63,7 @@ class Finishing:
         return mesh.with_guesses_marked() if self.mark_guesses else mesh, left_out
 
     def legend(self, mesh: Mesh) -> list[dict[str, str]]:
-        """Meaning of the colour of guesses, where there are any."""
+        """Return the legend of the colour of guessed triangles, or an empty list without any."""
         if not self.mark_guesses or mesh.guessed is None:
             return []
         return [{"color": "#{:02x}{:02x}{:02x}".format(*GUESS_COLOR), "name": "guessed: nobody saw this"}]
@@ -77,10 +77,10 @@ def checked(
     simplify: str | None,
     mark_guesses: bool,
 ) -> Finishing:
-    """Wishes of a person.
+    """Check what a user asked for, and return the steps.
 
     Raises:
-        InvalidConfig: for a value that is none, before anything takes time.
+        InvalidConfig: for an invalid value, before any slow work.
         MissingDependency: without the library that simplifies.
     """
     if crop is not None:
@@ -100,10 +100,10 @@ def checked(
 
 
 def check_memory(map_bytes: int, most_bytes: int, *, fill_holes: bool, simplify: bool, texture: bool) -> None:
-    """Refuse steps that take many times the memory of the map, before they take it.
+    """Refuse steps that would need too much memory, before they start.
 
     Args:
-        most_bytes: that the steps and the map may take.
+        most_bytes: limit for the map and the steps together.
 
     Raises:
         InvalidConfig: when they would take more.
@@ -124,14 +124,14 @@ def check_memory(map_bytes: int, most_bytes: int, *, fill_holes: bool, simplify:
 
 
 def fitting(volume: "Volume", crop: Box | None, most_bytes: int, **steps: bool) -> "Volume":
-    """The map that a mesh is made from: where the steps would outgrow memory, the part around the box alone.
+    """Return the map, or only its part around the box if the steps would otherwise need too much memory.
 
     Args:
-        most_bytes: that the map may take; the steps and the map together take twice as much.
-        steps: as of `check_memory`.
+        most_bytes: limit for the map. The map and the steps together may take twice as much.
+        steps: arguments of `check_memory`.
 
     Raises:
-        InvalidConfig: when they would take more, with the box, too; OutputError: as `part_around`.
+        InvalidConfig: when even the part needs too much. OutputError: see `part_around`.
     """
     try:
         check_memory(volume.stats().bytes, 2 * most_bytes, **steps)
@@ -144,10 +144,10 @@ def fitting(volume: "Volume", crop: Box | None, most_bytes: int, **steps: bool) 
 
 
 def part_around(volume: "Volume", box: Box, most_bytes: int) -> "Volume":
-    """The part of a large map that the mesh in a box is made from.
+    """Return the part of a large map that the mesh in a box depends on.
 
     Raises:
-        OutputError: when even this is too large.
+        OutputError: when this part is too large for memory.
     """
     margin = _MARGIN * volume.config.voxel_size
     around = [*(low - margin for low in box[:3]), *(high + margin for high in box[3:])]
@@ -158,7 +158,7 @@ def part_around(volume: "Volume", box: Box, most_bytes: int) -> "Volume":
 
 
 def simplification(text: str | None) -> dict[str, float] | None:
-    """Arguments of `Mesh.simplified` for `0.25` or `25%` (ratio), `50000` (triangles), `5mm` (largest error).
+    """Return arguments of `Mesh.simplified`: `0.25` or `25%` (ratio), `50000` (triangles), `5mm` (error).
 
     Raises:
         InvalidConfig: for anything else.
@@ -199,13 +199,13 @@ def write(mesh: Mesh, files: Sequence[Path], *, keep_islands: bool | None = None
     """Write a surface, its points (PCD, LAS, LAZ) or a picture (PNG) by each file's suffix.
 
     Args:
-        keep_islands: None = PLY, OBJ and points keep them; GLB, STL and pictures do not.
+        keep_islands: None: PLY, OBJ and point files keep islands; GLB, STL and pictures do not.
 
     Returns:
         Number of `islands` left out, their `triangles`, and the names of the `files` without them.
 
     Raises:
-        OutputError: for an empty mesh or a place that cannot be written.
+        OutputError: for an empty mesh or a path that cannot be written.
     """
     tidy, without = mesh.without_islands(), list[str]()
     for file in files:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A picture of a mesh, drawn on the CPU: the last step of every run, so that a person can look at it."""
+"""Draw a picture of a mesh on the CPU. Every run ends with such a picture."""
 
 import math
 import os
@@ -22,7 +22,7 @@ _ELEVATIONS = (28.0, 42.0, 58.0)  # degrees above the ground
 _AZIMUTHS = 12
 _NEAR = 0.05  # metres
 _BAND = 64  # rows of a picture that are painted at a time
-_WALL = 0.08  # share of a picture's height: a back that hides a front over more than that stays open
+_WALL = 0.08  # share of a picture's height: a back face that hides more than this is not drawn
 _SHADING = (0.06, 4.0)  # ambient occlusion: its reach as a share of the mesh's diagonal, and its strength
 
 
@@ -43,9 +43,9 @@ def render(
     height: int = 800,
     camera: PreviewCamera | None = None,
 ) -> Path:
-    """Draw `mesh` to a PNG file, its `up` above (+z where that is not known); complete or not at all.
+    """Draw `mesh` to a PNG file with its up direction upwards (+z if unknown). No partial file is left.
 
-    A wide back that hides a front is left out, so that a room can be looked into from outside.
+    A wide back face that hides a front face is left out: a room can be looked into from outside.
 
     Args:
         width: pixels.
@@ -53,7 +53,7 @@ def render(
         camera: None = chosen by `choose_camera`.
 
     Raises:
-        OutputError: for an empty mesh or a place that cannot be written.
+        OutputError: for an empty mesh or a path that cannot be written.
     """
     path = Path(path)
     if not len(mesh.faces):
@@ -65,14 +65,14 @@ def render(
 
 
 def up_of(mesh: Mesh) -> NDArray[np.float64]:
-    """(3,) the direction that is above in a picture: `mesh.up`, or +z where that is not known."""
+    """Return the (3,) direction that is upwards in a picture: `mesh.up`, or +z if that is unknown."""
     return np.array((0.0, 0.0, 1.0) if mesh.up is None else mesh.up.direction)
 
 
 def picture(
     mesh: Mesh, camera: PreviewCamera, width: int, height: int, *, up: NDArray[np.float64]
 ) -> NDArray[np.uint8]:
-    """(height, width, 3) uint8 sRGB: `draw` with smooth edges, and darker where surfaces are near others."""
+    """Return (height, width, 3) uint8 sRGB: `draw` with smooth edges and ambient occlusion."""
     size = (width * _OVERSAMPLING, height * _OVERSAMPLING)
     image = draw(mesh, camera, *size, up=up, texture=True)
     if has_colors(mesh) or not isinstance(mesh, TexturedMesh):
@@ -94,7 +94,7 @@ def has_colors(mesh: Mesh) -> bool:
 
 
 def _add_backs(image: NDArray[np.float32], backs: NDArray[np.float32]) -> None:
-    """Put backs of surfaces into a picture of the fronts: poles and chairs, not a wall before its room."""
+    """Add back faces to a picture of front faces: those of poles and chairs, not of a wall before a room."""
     import cv2
 
     depth, near = image[..., 3], backs[..., 3]
@@ -117,9 +117,9 @@ def draw(
     up: NDArray[np.float64] | None = None,
     texture: bool = False,
 ) -> NDArray[np.float32]:
-    """(height, width, 4) float32: linear RGB in 0…1 and depth z in metres (0 where nothing is seen).
+    """Return (height, width, 4) float32: linear RGB in 0…1, and depth z in metres (0 = nothing is seen).
 
-    The same bytes whatever the thread count: a pixel keeps the smallest depth, then the smallest triangle.
+    The bytes do not depend on the thread count: a pixel keeps the smallest depth, then the lowest triangle.
 
     Args:
         texture: draw the texture of a mesh that has one, instead of the colours at its vertices.
@@ -174,7 +174,7 @@ def _paint(
 def _see(
     mesh: Mesh, camera: PreviewCamera, width: int, height: int
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Vertices in camera coordinates (n, 3), and what each pixel sees (height, width); see `rasterise`."""
+    """Return vertices in camera coordinates (n, 3), and the (height, width) result of `rasterise`."""
     from tsfusion.kernels.answers import rasterizer
     from tsfusion.kernels.base import runtime
 
@@ -187,7 +187,7 @@ def _see(
 
 
 def _focal(camera: PreviewCamera, width: int) -> float:
-    """Focal length of a picture of so many pixels, pixels."""
+    """Return the focal length in pixels of a picture of this width."""
     return 0.5 * width / math.tan(0.5 * camera.fov)
 
 
@@ -196,7 +196,7 @@ def _faces(mesh: Mesh) -> NDArray[np.int32]:
 
 
 def height_colors(vertices: NDArray[np.float32], up: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """(n, 3) uint8 RGB for a mesh without colour: dark blue is low, light green high."""
+    """Return (n, 3) uint8 RGB by height: dark blue is low, light green is high."""
     import cv2
 
     height = vertices @ up
@@ -208,12 +208,12 @@ def height_colors(vertices: NDArray[np.float32], up: NDArray[np.float64]) -> NDA
 
 
 def choose_camera(mesh: Mesh, up: NDArray[np.float64], *, aspect: float) -> PreviewCamera:
-    """The view from above, among a ring of them, in which most of the picture shows a front side."""
+    """Return the camera, of a ring of cameras above the mesh, that sees front faces in most pixels."""
     return orbit(core(mesh), up, *choose_angles(mesh, up, aspect=aspect), aspect)
 
 
 def choose_angles(mesh: Mesh, up: NDArray[np.float64], *, aspect: float) -> tuple[float, float]:
-    """Azimuth and elevation, radians, of the view that `choose_camera` takes."""
+    """Return azimuth and elevation, radians, of the camera that `choose_camera` returns."""
     sample = core(mesh)
     best, best_score = (0.0, 0.0), -1.0
     for elevation in np.radians(_ELEVATIONS):
@@ -225,7 +225,7 @@ def choose_angles(mesh: Mesh, up: NDArray[np.float64], *, aspect: float) -> tupl
 
 
 def _score(mesh: Mesh, camera: PreviewCamera, aspect: float) -> float:
-    """The share of the pixels that see a front side."""
+    """Return the share of the pixels that see a front face."""
     from tsfusion.kernels.answers.rasterizer import EMPTY
 
     _, seen = _see(mesh, camera, int(96 * aspect), 96)
@@ -233,7 +233,7 @@ def _score(mesh: Mesh, camera: PreviewCamera, aspect: float) -> float:
 
 
 def core(mesh: Mesh) -> NDArray[np.float64]:
-    """At most 20 000 vertices without the strays: those about the 3 % to 97 % range of each axis."""
+    """Return fewer than 40 000 vertices without outliers: those near the 3 % to 97 % range of each axis."""
     sample = mesh.vertices[:: max(1, len(mesh.vertices) // 20_000)].astype(np.float64)
     low, high = np.percentile(sample, (3, 97), axis=0)
     margin = 0.05 * (high - low)
@@ -244,7 +244,7 @@ def core(mesh: Mesh) -> NDArray[np.float64]:
 def orbit(
     points: NDArray[np.float64], up: NDArray[np.float64], azimuth: float, elevation: float, aspect: float
 ) -> PreviewCamera:
-    """A camera that looks down on `points` at the given angles, as near as shows all of them."""
+    """Return a camera that looks down on `points` at the given angles, as near as it sees all of them."""
     east = np.cross(up, (0.0, 1.0, 0.0) if abs(up[1]) < 0.9 else (1.0, 0.0, 0.0))
     east /= np.linalg.norm(east)
     north = np.cross(up, east)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Saved maps on the disk, a file or the last checkpoint in a state folder: what they hold and answer."""
+"""Find, describe, resume and question saved maps: single files, or checkpoints of a state folder."""
 
 import time
 from collections import Counter
@@ -39,14 +39,14 @@ _EXPANDS = 8  # a map in memory against its file: more than any
 
 
 class SavedMap(Struct, frozen=True):
-    """A map's file. `folder`: of the map in a server's state folder; None = the file stands alone."""
+    """File of a saved map. `folder` is the map's folder in a state folder, or None for a single file."""
 
     path: Path
     folder: Path | None = None
 
 
 class SessionSummary(Struct, frozen=True):
-    """A session of a map. `listed`: keyframes that the map knows by number and pose."""
+    """A session of a map. `listed` counts the keyframes that the map knows by number and pose."""
 
     session: str
     client: str
@@ -57,15 +57,15 @@ class SessionSummary(Struct, frozen=True):
 
 
 class MapSummary(Struct, frozen=True):
-    """Facts of a saved map that is not opened.
+    """Facts of a saved map, read without opening it.
 
     Attributes:
-        nbytes: of the file; `voxel_bytes`: of its voxels in memory.
-        box: x0, y0, z0, x1, y1, z1 of its blocks, metres; None = it is empty.
+        nbytes: bytes of the file; `voxel_bytes` counts its voxels in memory.
+        box: x0, y0, z0, x1, y1, z1 of its blocks, metres; None if the map is empty.
         corrections_waiting: keyframes whose newest pose is not fused yet.
-        keyframes_after: in the journal behind this checkpoint, and `corrections_after` likewise; None =
-            there is no journal.
-        keyframes_lost: to damage in the journal, at least; None likewise.
+        keyframes_after: number of keyframes in the journal after this checkpoint; `corrections_after` counts
+            corrections. Both are None without a journal.
+        keyframes_lost: number of keyframes (or more) lost to damage in the journal; None without a journal.
     """
 
     path: str
@@ -88,13 +88,13 @@ class MapSummary(Struct, frozen=True):
 
 
 def find(path: Path, map_name: str | None = None) -> SavedMap:
-    """The saved map at a path: a file, a state folder, or the folder of one of its maps.
+    """Return the saved map at a path: a file, a state folder, or the folder of one of its maps.
 
     Args:
-        map_name: of the map, where the state folder has several.
+        map_name: name of the map, where the state folder has several.
 
     Raises:
-        CheckpointError: when there is none; JournalError: when no single one is meant.
+        CheckpointError: when there is no map. JournalError: when it is not clear which map is meant.
     """
     if not path.exists():
         raise CheckpointError(f"{path} does not exist; expected a map (.tsf) or a state folder", missing=True)
@@ -113,24 +113,24 @@ def find(path: Path, map_name: str | None = None) -> SavedMap:
 
 
 def memory_for(file: Path, *, maps: int = 1) -> int | None:
-    """Memory that a saved map may take, the rest waits in files; None = all of it, where it surely fits.
+    """Return the bytes that a saved map may take in memory (the rest stays in files), or None if all fits.
 
     Args:
-        maps: that are open at the same time.
+        maps: number of maps that are open at the same time.
     """
     share = process.physical_memory_bytes() // (2 * maps)
     return share if _EXPANDS * size_of(file) > share else None
 
 
 def missing(header: checkpoint.CheckpointHeader, keyframes: int) -> int:
-    """How many keyframes of a checkpoint are not in its journal, which has, or once had, so many."""
+    """Return how many keyframes of a checkpoint its journal lacks; `keyframes`: all that it ever had."""
     removed = (header.meta.get("poses") or {}).get("removed", 0)
     there: int = header.keyframes + sum(header.meta.get("rejected", {}).values()) + removed
     return max(0, there - keyframes)
 
 
 def check_journal(path: Path, keyframes: int) -> None:
-    """Raise JournalError where a checkpoint has keyframes that its journal, of so many, does not have."""
+    """Raise JournalError if a checkpoint has keyframes that its journal, of `keyframes`, does not have."""
     with checkpoint.reading(path) as (header, _):
         absent = missing(header, keyframes)
     if absent:
@@ -142,14 +142,14 @@ def check_journal(path: Path, keyframes: int) -> None:
 
 
 def resume(path: Path, state: Path, map_name: str) -> Path:
-    """Put a saved map into a state folder as a checkpoint, for a server to go on with; the map's folder.
+    """Copy a saved map into a state folder, as a checkpoint for a server. Return the map's folder.
 
-    No journal comes with it: keyframes that are in it can be neither moved nor removed from then on.
+    No journal comes with the map. So its keyframes of before can be neither moved nor removed.
 
     Raises:
         OutputError: when that folder holds a map already, or cannot be written.
         JournalError: when a server runs in the state folder.
-        InvalidConfig: for a name that is none; CheckpointError: when the map cannot be read or written.
+        InvalidConfig: for an invalid name. CheckpointError: when the map cannot be read or written.
     """
     map_name = override(ClientConfig(), map=map_name).map
     folder = state_folder.map_folder(state, map_name)
@@ -182,16 +182,16 @@ def opened(
     watch: OnProgress = lambda _done, _all: None,
     reading: OnProgress = lambda _done, _all: None,
 ) -> Iterator[tuple[Path, dict[str, int]]]:
-    """The file of a map with all that its journal holds, which is there during the block.
+    """Yield the file of a map with all that its journal holds. The file is valid during the block.
 
-    Where the checkpoint in a state folder is behind the journal, as after a crash or while the server runs,
-    what it lacks is fused into a copy.
+    A checkpoint in a state folder lacks records after a crash, or while its server runs. These records are
+    then fused into a copy of the map.
 
     Args:
-        watch: told the records that are fused, and all of them; `reading` the bytes of the journal.
+        watch: gets the number of records fused and of all; `reading` gets bytes of the journal likewise.
 
     Yields:
-        The file; reason → number of the journal's keyframes that are not in the map.
+        The file, and a dict of reason → number of the journal's keyframes that are not in the map.
 
     Raises:
         CheckpointError, JournalError: when the map or its journal cannot be read.
@@ -213,7 +213,7 @@ def opened(
 
 
 def check_checkpoint(saved: SavedMap, header: checkpoint.CheckpointHeader) -> None:
-    """Raise CheckpointError where the checkpoint in a map's folder is another map's."""
+    """Raise CheckpointError if the checkpoint in a map's folder belongs to another map."""
     try:
         map_checkpoints.check_journal(saved.path, header.meta)
     except DamagedCheckpoint as error:
@@ -223,15 +223,15 @@ def check_checkpoint(saved: SavedMap, header: checkpoint.CheckpointHeader) -> No
 
 
 def _lost(header: checkpoint.CheckpointHeader, tail: settled_maps.Tail) -> int:
-    """Keyframes that damage in its journal has cost a map, at least: what it had before that it still has."""
+    """Return the number of keyframes (or more) that damage has destroyed and the checkpoint does not have."""
     return max(0, tail.lost - missing(header, tail.keyframes)) + tail.lost_behind
 
 
 def summarise(saved: SavedMap, reading: OnProgress = lambda _done, _all: None) -> MapSummary:
-    """Describe a saved map; every byte of the file is checked, and the hash is that of its voxels.
+    """Describe a saved map. Every byte of the file is checked; the hash is that of its voxels.
 
     Args:
-        reading: told the bytes of the journal that are read, and all of them.
+        reading: gets the number of journal bytes read, and of all.
 
     Raises:
         CheckpointError: when the file is missing, damaged or of another version.
@@ -280,8 +280,7 @@ def _box(keys: "np.ndarray[Any, np.dtype[np.int64]]", block_size: float) -> list
 
 
 class SavedMapAnswers:
-    """A map in this process with the methods of `MapClient`. `timeout` and `max_age` have
-    no effect."""
+    """Answers of a map in this process, as `MapClient` gives them; `timeout` and `max_age` have no effect."""
 
     def __init__(self, volume: Volume) -> None:
         self._volume = volume

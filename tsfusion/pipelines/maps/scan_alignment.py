@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""A scan finds its place in a map that is there: where its first keyframes lie in that map's surface.
+"""Find the pose of a scan in an existing map, from the scan's first keyframes and the map's surface.
 
-Until it is found nothing is sent; the keyframes wait in memory. Then all are sent with poses of the map.
+Until then the keyframes wait in memory and nothing is sent. Then all are sent with poses in the map.
 """
 
 import math
@@ -28,11 +28,11 @@ from tsfusion.scanner.localization.localizer import Localizer, Lost, PoseCorrect
 
 FIRST_TRY = 12  # keyframes
 _MORE = 1.5  # times as many for the next try
-MOST_KEYFRAMES = 120  # that wait: some 400 MB
+MOST_KEYFRAMES = 120  # that may wait in memory: some 400 MB
 
 
 class ExistingMap(NamedTuple):
-    """The map in which a place is looked for."""
+    """The existing map in which a scan is to be found."""
 
     name: str
     mesh: Mesh
@@ -40,7 +40,7 @@ class ExistingMap(NamedTuple):
 
 
 class PlacementTry(NamedTuple):
-    """Result of a try: where the scan's world lies in the map, or why that is not known."""
+    """Result of one try: the pose of the scan's world in the map, or the reason why it is unknown."""
 
     T_map_world: Transform | None
     why: str
@@ -48,14 +48,14 @@ class PlacementTry(NamedTuple):
 
 @dataclass
 class Placing:
-    """Place of a scan, and its evidence.
+    """Pose of a scan's world in a map, and the frames that were taken while it was searched.
 
     Attributes:
-        T_map_world: (4, 4); None = it was not found.
-        why: reason, where it was not found.
-        frames: those that were taken meanwhile; what is no keyframe is without its measurement.
-        answers: the localizer's, of each.
-        keyframes: with their poses in the localizer's world.
+        T_map_world: (4, 4); None if it was not found.
+        why: reason why it was not found.
+        frames: all frames taken; a frame that is no keyframe has lost its measurement.
+        answers: the localizer's answer to each frame.
+        keyframes: keyframes with their poses in the localizer's world.
     """
 
     T_map_world: Transform | None = None
@@ -66,7 +66,7 @@ class Placing:
 
 
 def locate(existing: ExistingMap, config: VolumeConfig, keyframes: Sequence[Keyframe]) -> PlacementTry:
-    """Find where the world of some keyframes lies in a map. Runs in a process of its own."""
+    """Find the pose of the keyframes' world in a map. Runs in a process of its own."""
     from tsfusion.pipelines.maps import map_alignment
     from tsfusion.tsdf.volume import Volume
 
@@ -94,14 +94,14 @@ def find_place(
     live: bool,
     tell: Callable[[str], None],
 ) -> Placing:
-    """Localise frames until their place in the map is found, they end, or too many keyframes wait.
+    """Localise frames until their pose in the map is found, they end, or too many keyframes wait.
 
-    Where the source is live it is read on while a try runs.
+    A lost sensor ends the search, too. A live source is read on while a try runs.
 
     Args:
-        config: of the map that the scan makes of its keyframes to find its place.
-        live: whether the source goes on whether or not it is read.
-        tell: takes a line for a person at each try.
+        config: settings of the temporary map that is made of the scan's keyframes.
+        live: True if the source does not wait for its reader.
+        tell: gets a line for the user at each try.
     """
     from concurrent.futures import ProcessPoolExecutor  # a megabyte and more; most scans look for no place
     from multiprocessing import get_context
@@ -133,7 +133,7 @@ def find_place(
 
 
 def _take(frame: Frame, localizer: Localizer, selector: KeyframeSelector, placing: Placing) -> bool:
-    """Localise a frame and keep it; whether the sensor is lost."""
+    """Localise a frame and keep it. Return True if the sensor is lost."""
     found = localizer.track(frame)
     is_lost = isinstance(found, Lost)
     if not isinstance(found, Lost) and selector.reason(frame, found.T_world_camera) is not None:
@@ -158,12 +158,12 @@ def _answer(running: "Future[PlacementTry]") -> PlacementTry:
 
 
 class PlacedLocalizer:
-    """A localizer whose world is the map, where the place of its own world in the map is known.
+    """A localizer with poses in the map's frame: the poses of another localizer, moved by `T_map_world`.
 
     Args:
-        localizer: of the scan.
-        T_map_world: (4, 4); the identity where no place was found.
-        earlier: its answers for frames that it saw already, in order; those frames come first.
+        localizer: localizer of the scan.
+        T_map_world: (4, 4); the identity if no pose was found.
+        earlier: answers that `localizer` gave already, for the first frames in order.
     """
 
     def __init__(
@@ -197,7 +197,7 @@ class PlacedLocalizer:
         )
 
     def reset(self) -> None:
-        """Begin a new world: its place in the map is not known, and it gets a map of its own."""
+        """Begin a new world. Its pose in the map is unknown, so it gets a map of its own."""
         self._localizer.reset()
         if not self.absolute:
             self._T = np.eye(4)
@@ -208,6 +208,6 @@ class PlacedLocalizer:
 
 
 def _begin_worker() -> None:
-    """Leave Ctrl-C, which goes to every process of the terminal, to the scan; end when it does."""
+    """Ignore Ctrl-C, which the terminal sends to all its processes. End when the scan's process ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     process.on_parent_end(signal.SIGKILL)

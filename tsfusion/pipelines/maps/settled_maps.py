@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The map of a state folder with all that its journal holds, as a server would have it after a restart.
+"""Bring the map of a state folder up to date with its journal, as a server does after a restart.
 
-The fuser itself does the work, in a scratch folder that shows it the checkpoint and the journal: nothing of
-the state folder is changed, and a server may run there.
+The fuser does the work in a scratch folder with links to the checkpoint and the journal. The state folder
+is not changed, so a server may be running in it.
 """
 
 import tempfile
@@ -28,12 +28,12 @@ _POLL_S = 0.1
 
 
 class Tail(NamedTuple):
-    """Records of a journal that a checkpoint does not have, and what damage has cost.
+    """Records of a journal that a checkpoint lacks, and losses by damage.
 
     Attributes:
-        records: those that the checkpoint does not have, in order.
-        keyframes: that the journal has up to where the checkpoint is, erased ones too.
-        lost: keyframes up to there that damage has destroyed, at least; `lost_behind`: behind that.
+        records: the records that the checkpoint lacks, in order.
+        keyframes: number in the journal up to the checkpoint's last record; erased ones count, too.
+        lost: keyframes (or more) destroyed by damage up to that record; `lost_behind` counts those after it.
     """
 
     records: list[journal.RecordEntry]
@@ -43,7 +43,7 @@ class Tail(NamedTuple):
 
 
 class _Answers:
-    """Takes what the fuser would tell the gateway, and counts the keyframes that it could not take."""
+    """Receives the fuser's messages in place of the gateway, and counts keyframes that it could not take."""
 
     def __init__(self) -> None:
         self.left_out = Counter[str]()
@@ -59,10 +59,10 @@ def records_after(
     histories: list[map_history.SessionHistory],
     reading: OnProgress = lambda _done, _all: None,
 ) -> Tail:
-    """The records of a map's journal that a checkpoint with these sessions does not have.
+    """Return the records of a map's journal that a checkpoint with these sessions lacks.
 
     Args:
-        reading: told the bytes that are read, and all of them: each record's CRC is checked.
+        reading: gets the number of bytes read, and of all. The CRC of each record is checked.
 
     Raises:
         JournalError: when the journal cannot be read.
@@ -76,7 +76,7 @@ def records_after(
     ]
     before, total = 0, sum(map(size_of, files))
     keyframes = there = lost = all_lost = 0
-    # as in a backup whose checkpoint is older than what was deleted before the journal was copied
+    # As in a backup: the checkpoint was copied, then segments were deleted, then the journal was copied
     gap = state_folder.gap_before(files[0], _newest_segment(histories)) if files else None
     behind = 0 if gap is None else gap.lost
     for number, file in enumerate(files):
@@ -99,9 +99,9 @@ def records_after(
 
 
 def _newest_segment(histories: list[map_history.SessionHistory]) -> int:
-    """The segment with the newest record that a checkpoint has; 0 = it does not say.
+    """Return the number of the segment with a checkpoint's newest record, or 0 if it is not known.
 
-    It says so of keyframes in the map, not of others and of corrections.
+    A checkpoint has the positions of keyframes in the map only, not of rejected ones or of corrections.
     """
     if not all(len(one.seqs) and one.seqs[-1] == one.last for one in histories):
         return 0
@@ -119,14 +119,14 @@ def settled(
     config: VolumeConfig,
     watch: OnProgress = lambda _done, _all: None,
 ) -> Iterator[tuple[Path, dict[str, int]]]:
-    """A file with the settled map of a folder, which is there during the block, and what was left out.
+    """Yield a file with the settled map of a folder, valid during the block, and what was left out.
 
     Args:
-        records: those that its checkpoint does not have.
+        records: the records that its checkpoint lacks.
         config: settings of the checkpoint.
 
     Yields:
-        The file; reason → number of keyframes that the map could not take.
+        The file, and a dict of reason → number of keyframes that the map could not take.
 
     Raises:
         JournalError: when a record cannot be read.
@@ -162,7 +162,7 @@ def _begin(scratch: Path, config: VolumeConfig) -> fuser_messages.Begin:
 
 
 def _catch_up(fuser: Fuser, records: list[journal.RecordEntry], watch: OnProgress) -> None:
-    """Let the fuser take the records, and move what corrections move."""
+    """Give the records to the fuser, then let it move the keyframes that corrections move."""
     for index, record in enumerate(records):
         place = (record.position, record.session, record.seq, record.client, record.world)
         fuser.handle(fuser_messages.Fuse(index, *place, is_correction=record.is_correction))

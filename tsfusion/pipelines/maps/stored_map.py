@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The map of a state folder that no server uses, opened as a server does it, to forget keyframes."""
+"""Open the map of a state folder that no server uses, as a server does, to forget keyframes."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -34,13 +34,13 @@ class StoredMap:
         self._is_changed = False
 
     def forget(self, selection: Selection, *, erase: bool = False, dry_run: bool = False) -> Forgotten:
-        """Take keyframes out of the map, and if wanted out of its journal.
+        """Remove keyframes from the map, and with `erase` from its journal.
 
         Args:
-            dry_run: only say which.
+            dry_run: only return which keyframes would be removed.
 
         Raises:
-            JournalError: when that cannot be done; the message says what was.
+            JournalError: when the removal fails; the message says what was done.
         """
         answers: list[Forgotten | str] = []
         self._hosted.forgetting.add(ForgetRequest(selection, answers.append, erase=erase, dry_run=dry_run))
@@ -51,10 +51,10 @@ class StoredMap:
         return answers[0]
 
     def save(self) -> None:
-        """Wait until the map is settled, and write its checkpoint, if anything was forgotten.
+        """If anything was forgotten, wait until the map is settled and write its checkpoint.
 
         Raises:
-            MapError: when that cannot be written: the next server makes up for it.
+            MapError: when the checkpoint cannot be written. The next server then removes the keyframes.
         """
         if not self._is_changed:
             return
@@ -67,11 +67,11 @@ class StoredMap:
             raise MapError("the map cannot be saved; the next server leaves out what was forgotten, too")
 
     def open(self) -> None:
-        """Wait until the map is open; raises TsfusionError when it cannot be."""
+        """Wait until the map is open. Raise TsfusionError if it cannot be opened."""
         self._step_until(lambda: self._hosted.warm)
 
     def _step_until(self, reached: Callable[[], bool]) -> None:
-        """Let the map work; raises MapError when it is not well for long."""
+        """Let the map work until `reached` is true. Raise MapError if it has a problem for a minute."""
         well = time.monotonic()
         while not reached():
             self._step()
@@ -87,14 +87,14 @@ class StoredMap:
 
 @contextmanager
 def open_map(path: Path, name: str | None = None) -> Iterator[StoredMap]:
-    """Open the map of a state folder that no server uses; at the end it is saved.
+    """Open the map of a state folder that no server uses. It is saved when the block ends.
 
     Args:
         path: a state folder, or the folder of a map in it.
         name: of the map, where the state folder has several.
 
     Raises:
-        JournalError: when there is no such map, or a server has it.
+        JournalError: when there is no such map, or a server uses it.
         CheckpointError: when no server has saved it yet: its settings are not known.
     """
     folder = state_folder.resolve_map(path, name).absolute()
