@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The client: sends keyframes to a server, in five lines for whoever brings a localiser of their own.
+"""The client: sends keyframes to a server, in five lines for a program with its own localiser.
 
     with tsfusion.Client("tcp://127.0.0.1:5555", spool="spool-dir") as client:
         for keyframe in keyframes:
@@ -58,27 +58,27 @@ log = logging.getLogger(__name__)
 
 
 class Client:
-    """Sends keyframes to a server and keeps each until the server has it on its disk.
+    """Sends keyframes to a server, and keeps each keyframe until it is on the server's disk.
 
     Args:
         address: the server's data address.
-        spool: a folder for keyframes that are not acknowledged yet; what a dead client left there is sent
-            first. None = a temporary one, deleted by `close`. A `Spool` brings its own map and world.
+        spool: folder for keyframes that are not acknowledged yet. Records of a dead client in it are sent
+            first. None makes a temporary folder, deleted by `close`. A `Spool` brings its own map and world.
         control: the server's control address; default the port after `address`.
         world: name of the coordinate frame of the poses, up to 64 letters, digits, - and _ (such as
-            `uuid.uuid4().hex`), for whoever localises itself: a map takes keyframes of one world. Empty = the
-            poses are given, and whoever gives them sees to it that a map's share one frame. None = that of
-            what waits in the spool.
-        same_frame: declares that the poses are in the frame of the map, whatever worlds it has.
-        map: the map to scan into; default the config's, as with the following.
-        policy: what happens to keyframes that the map has no time for.
+            `uuid.uuid4().hex`), for a client that localises itself: a map takes keyframes of one world. Empty
+            is for poses from outside; their source ensures that all poses of a map share one frame. None
+            takes the world of the records in the spool.
+        same_frame: declares that the poses are in the frame of the map, whatever worlds the map has.
+        map: the map to scan into; default the config's, as for `policy`, `key` and `server_key`.
+        policy: treatment of keyframes that come faster than the map takes them.
         key: the file of this client's secret key.
         server_key: the server's public key, or its file.
-        config: the rest of the settings; its own addresses are not used.
+        config: the other settings.
 
     Raises:
-        InvalidConfig: for a malformed address or setting, or a key file that is of no use.
-        JournalError: when the spool cannot be used, another client uses it, or what waits in it is for
+        InvalidConfig: for a malformed address or setting, or a key file that cannot be used.
+        JournalError: when the spool cannot be used, another client uses it, or its records are for
             another map or of another world.
         TransportError: when no socket can be opened.
 
@@ -127,7 +127,7 @@ class Client:
             segment_bytes = min(self._config.segment_bytes, self._config.spool_bytes // _SEGMENTS)
             spool = Spool(spool, segment_bytes, map_name=self._config.map, world=world, same_frame=same_frame)
         self._own_outbox, self._pid = Outbox(spool), os.getpid()
-        self.logs_refusal = True  # of its world; a run that ends with `check_world` says it itself
+        self.logs_refusal = True  # log if the world is refused; False for a run that calls `check_world`
         self._pressure = Backpressure(self._outbox, self._config)
         try:
             self._sender = Sender(address, self._control, self._outbox, self._config, connection_keys)
@@ -136,7 +136,7 @@ class Client:
             raise TransportError(f"cannot open a socket: {error.strerror}") from error
         self._sending = threading.Lock()
         self._closed = self._began_sending = False
-        self.skewed = 0  # keyframes sent whose points have times, and no motion
+        self.skewed = 0  # number of keyframes sent with point times, but without motion
         self._began = time.monotonic()
         self._thread = threading.Thread(target=self._sender.run, name="tsfusion-client", daemon=True)
         self._thread.start()
@@ -144,16 +144,16 @@ class Client:
 
     @property
     def _outbox(self) -> Outbox:
-        """The records, for the process that they belong to: a forked one lacks their thread."""
+        """The outbox, for the process that made the client. A forked process lacks the sending thread."""
         if os.getpid() != self._pid:
             raise TransportError("the client is of the process that this one was forked from: make another")
         return self._own_outbox
 
     def send(self, keyframe: Keyframe) -> int | None:
-        """Put a keyframe into the spool; its number there, None when it is skipped (`stats.skipped`).
+        """Put a keyframe into the spool. Return its number, or None if it is skipped (`stats.skipped`).
 
-        Never waits for the network, unless the policy is `block`; never fails because of the disk. When the
-        map has keyframes of another world, that is logged, and the keyframe waits in the spool.
+        The call never waits for the network, unless the policy is `block`. It never fails because of the
+        disk. If the map has keyframes of another world, that is logged, and the keyframe waits in the spool.
 
         Args:
             keyframe: also a dict of a keyframe's fields, or an object with such attributes.
@@ -191,22 +191,22 @@ class Client:
         T_map_odometry: NDArray[np.float64] | None = None,
         removed: Iterable[int] = (),
     ) -> int | None:
-        """Correct where keyframes that were sent before were taken; the correction's number, or None.
+        """Correct the poses of keyframes that were sent before. Return the correction's number, or None.
 
-        A correction is a record like a keyframe: its number is the session's next, it waits in the spool
-        until the server has it on its disk (`stats.corrections_acknowledged`), and it is None when the spool
-        cannot keep it (`stats.corrections_refused`). The newest pose of a keyframe counts; one that is not
-        named keeps its pose. Never waits, whatever the policy.
+        A correction is a record like a keyframe, with the session's next number. It waits in the spool until
+        it is on the server's disk (`stats.corrections_acknowledged`). The number is None if the spool cannot
+        keep it (`stats.corrections_refused`). The newest pose of a keyframe counts; keyframes that are not
+        named keep theirs. The call never waits, whatever the policy.
 
         Args:
             poses: by the number that `send` returned, (4, 4) float64 `T_world_camera`.
-            T_map_odometry: (4, 4) float64, what poses after the last keyframe are to be multiplied by from
-                the left; None = as before.
-            removed: the numbers of keyframes that are to be taken out of the map.
+            T_map_odometry: (4, 4) float64, transform to multiply from the left to poses after the last
+                keyframe; None keeps the present one.
+            removed: numbers of keyframes to take out of the map.
 
         Raises:
-            InvalidKeyframe: for a number that was never sent, a pose that is no rigid transform, or more
-                than 100,000 keyframes.
+            InvalidKeyframe: for a number that was never sent, a pose that is no rigid transform, or more than
+                100,000 keyframes.
             TransportError: after `close`.
         """
         correction = corrections.checked(poses, T_map_odometry=T_map_odometry, removed=removed)
@@ -224,13 +224,13 @@ class Client:
         """Wait until the server has answered. Not needed before `send`.
 
         Args:
-            timeout: seconds; None = `connect_timeout` of the client's settings.
+            timeout: seconds; None takes `connect_timeout` of the client's settings.
 
         Raises:
-            NotAllowed: as soon as the server turns the keys away, or the lack of them.
+            NotAllowed: as soon as the server refuses the keys, or the lack of keys.
             WorldRefused: as soon as the server says that the map has keyframes of another world.
-            ServerUnreachable: when it has not within `timeout` seconds (default: the config's), or answers
-                that it will not have this client.
+            ServerUnreachable: when the server has not answered within `timeout` seconds, or refuses this
+                client.
         """
         timeout = self._config.connect_timeout if timeout is None else timeout
         box = self._outbox
@@ -246,10 +246,10 @@ class Client:
             )
 
     def wait_answer(self, timeout: float) -> None:
-        """Wait until the server has answered or is known not to be there.
+        """Wait until the server has answered or is known to be absent.
 
         Args:
-            timeout: seconds; then this returns without an error.
+            timeout: seconds; after it, the call returns without an error.
         """
 
         def is_known() -> bool:
@@ -271,16 +271,16 @@ class Client:
 
     @property
     def world(self) -> str:
-        """Name of the coordinate frame of the poses; empty = that of poses given from elsewhere."""
+        """Name of the coordinate frame of the poses; empty for poses from outside."""
         return self._outbox.spool.world
 
     @property
     def is_of_other_world(self) -> bool:
-        """True if the server said that the map has keyframes of another world: nothing is sent then."""
+        """True if the server said that the map has keyframes of another world. Nothing is sent then."""
         return self.link_state.kind == "other_world"
 
     def check_world(self) -> None:
-        """Raise WorldRefused when the server said that the map has keyframes of another world."""
+        """Raise WorldRefused if the server said that the map has keyframes of another world."""
         if self.is_of_other_world:
             raise WorldRefused(self.link_state.why)
 
@@ -292,9 +292,10 @@ class Client:
 
         Raises:
             WorldRefused: as soon as the map turns out to have keyframes of another world.
-            FlushTimeout: after `timeout` seconds; the rest stays in the spool and is still being sent.
-            KeyframeRefused: when the server turned some away for good since the last flush, or the spool had
-                no room for them.
+            FlushTimeout: after `timeout` seconds. The rest stays in the spool, and the client goes on sending
+                it.
+            KeyframeRefused: when the server refused some records for good since the last flush, or the spool
+                had no room for them.
         """
         done = self._wait(lambda: self._outbox.is_durable or self.is_of_other_world, timeout)
         if not self._outbox.is_durable:
@@ -321,8 +322,8 @@ class Client:
     def wait_settled(self, timeout: float = 60.0) -> None:
         """Wait until the map has everything sent, and each keyframe at its newest pose (`correct`).
 
-        The map is then the one that the keyframes make at these poses, to the bit. Corrections of other
-        clients are waited for, too.
+        The map then equals, to the bit, a fresh map of the keyframes at these poses. The wait includes
+        corrections of other clients.
 
         Args:
             timeout: seconds.
@@ -341,7 +342,7 @@ class Client:
         return self._outbox.is_settled
 
     def wait_meshed(self, timeout: float = 60.0) -> None:
-        """Wait until the server's mesh, or the next one that somebody asks for, shows everything sent.
+        """Wait until everything sent is in the server's mesh, or in the next mesh that a client asks for.
 
         Args:
             timeout: seconds.
@@ -354,12 +355,12 @@ class Client:
 
     @property
     def records(self) -> list[KeyframeTimes]:
-        """When each keyframe passed each stage, on this process's monotonic clock (the last 65536)."""
+        """Stamps of all stages of the last 65536 keyframes, on this process's monotonic clock."""
         return self._outbox.times()
 
     @property
     def newest_fused(self) -> KeyframeTimes | None:
-        """The stamps of the newest keyframe that is in the map; None = none is."""
+        """The stamps of the newest keyframe in the map, or None without one."""
         return self._outbox.newest_fused()
 
     @property
@@ -369,7 +370,7 @@ class Client:
 
     @property
     def first_rejection(self) -> str:
-        """Reason why the map did not take the first keyframe that it rejected; empty = it took all so far."""
+        """Reason why the map rejected a keyframe, for the first rejected one; empty without rejections."""
         return self._outbox.first_rejection
 
     @property
@@ -379,7 +380,7 @@ class Client:
 
     @property
     def problem(self) -> str:
-        """Reason why spool or server take nothing at the moment; empty when they do."""
+        """Reason why the spool or the server takes nothing at the moment; empty without a problem."""
         return "; ".join(filter(None, (self._outbox.spool_problem, self._link_problem())))
 
     def _link_problem(self) -> str:
@@ -390,7 +391,7 @@ class Client:
         return "" if state.is_connected or (is_early and not state.is_refused) else self._why()
 
     def close(self) -> None:
-        """Stop sending. Call `flush` first: what a temporary spool still holds is lost (and logged).
+        """Stop sending. Call `flush` first: records in a temporary spool are lost (and logged).
 
         In a forked process this does nothing.
         """
@@ -426,7 +427,7 @@ class Client:
         return self._outbox.wait(reached, timeout, self._check_running)
 
     def _why(self) -> str:
-        """Reason why not everything is at the server, for a person."""
+        """Return for a person the reason why some records are not at the server."""
         box, last_heard = self._outbox, self._sender.last_heard
         if box.link_state.why:
             return box.link_state.why

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The server: a gateway that journals and acknowledges keyframes, and the fuser processes that it starts."""
+"""The server: starts a gateway, which takes and journals keyframes, and one fuser process for each map."""
 
 import logging
 import signal
@@ -29,8 +29,8 @@ from tsfusion.wire.sockets.sockets import Addresses
 log = logging.getLogger(__name__)
 
 _SECOND_SIGNAL = 1.0  # seconds after the first
-_REPORT_INTERVAL = 0.5  # seconds between two reports of how far the start is
-_LOG_INTERVAL = 5.0  # seconds between two lines of that in the log
+_REPORT_INTERVAL = 0.5  # seconds between two reports of the start's progress
+_LOG_INTERVAL = 5.0  # seconds between two lines about the start's progress in the log
 
 
 def run(
@@ -44,24 +44,24 @@ def run(
 ) -> int:
     """Serve until SIGTERM or SIGINT, then drain the journals into the maps and write checkpoints.
 
-    A second signal, a second or more after the first, skips the drain: the next start makes up for it.
-    Call it from the main thread.
+    A second signal, a second or more after the first, skips the drain; the next start fuses the rest. Call
+    `run` from the main thread.
 
     Args:
-        server: `listen` with port 0 draws a random one.
-        volume: the settings of every map that has none of its own.
+        server: settings of the server; port 0 in `listen` draws a random one.
+        volume: settings of every map that has no settings of its own.
         on_ready: called once with the real addresses, when keyframes are accepted and kernels are warm.
-        volumes: maps with settings of their own, opened at the start. Others in the state folder are opened
-            one after the other when it is ready, or as soon as somebody asks for them.
-        guest: of a server with keys, a public key that may watch every map besides those in its list.
-        on_health: called with the server's state about once a second.
+        volumes: maps with settings of their own, opened at the start. Other maps of the state folder are
+            opened afterwards, one after the other, or as soon as a client asks for one.
+        guest: public key with the right to watch every map, in addition to the server's allow-list.
+        on_health: called with the server's health about once a second.
 
     Returns:
         The exit status: 0, or 1 when a checkpoint was not written.
 
     Raises:
-        TsfusionError: when it cannot start (port taken, state folder unwritable or in use, a map of other
-            settings, an address that others can reach without keys).
+        TsfusionError: when the server cannot start (port taken, state folder unwritable or in use, a map of
+            other settings, an address that others can reach without keys).
     """
     _check_addresses(server)
     with ExitStack() as stack:
@@ -132,18 +132,18 @@ class _StoppedAtStart(Exception):
 
 
 class _ReadingReport:
-    """How far a map's journal is read: for the health checks, the service manager and the log."""
+    """Progress of reading a map's journal, for the health checks, the service manager and the log."""
 
     def __init__(self, metrics: Metrics, watchdog: Watchdog, signals: list[int]) -> None:
         self._metrics = metrics
         self._watchdog = watchdog
         self._signals = signals
-        self.is_started = False  # from then on a signal is the main loop's, and no start is to be extended
+        self.is_started = False  # once True, signals are for the main loop, and the start is over
         self._next_report = 0.0
         self._next_line = time.monotonic() + _LOG_INTERVAL
 
     def __call__(self, map_name: str, done: int, total: int, records: int) -> None:
-        """Report it, unless that was done a moment ago.
+        """Report the progress, at most twice a second.
 
         Raises:
             _StoppedAtStart: when a signal to stop has come.
@@ -185,7 +185,7 @@ def _serve(gateway: Gateway, signals: list[int], watchdog: Watchdog) -> int:
 
 @contextmanager
 def _signals() -> Iterator[list[int]]:
-    """A list to which each signal to stop is appended when it comes."""
+    """Yield a list that collects the signals to stop."""
     came: list[int] = []
     last = 0.0
 
@@ -205,7 +205,7 @@ def _signals() -> Iterator[list[int]]:
 
 
 def _advertised(addresses: Addresses, server: ServerConfig) -> Addresses:
-    """The addresses by which clients on other machines reach this server."""
+    """Return the addresses by which clients on other machines reach this server."""
     if server.advertise is None:
         return addresses
     data = sockets.connect_address(server.advertise)
@@ -213,7 +213,7 @@ def _advertised(addresses: Addresses, server: ServerConfig) -> Addresses:
 
 
 def _check_addresses(server: ServerConfig) -> None:
-    """Raise for addresses that cannot be bound now, not after the kernels are compiled."""
+    """Raise now for addresses that cannot be bound, not only after the kernels are compiled."""
     for address in (server.listen, server.control):
         if address is not None:
             sockets.check_reachable(address, has_keys=server.keys is not None)

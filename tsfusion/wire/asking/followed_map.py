@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""A map as one follows it: what is held of its surface, and what has to be asked for. No sockets here.
+"""State of a viewer that follows a map: the cells it holds, and the next question to the server. No sockets.
 
-All cells are asked for with the raw surface first. From then on mesh updates bring what changes, and the
-refined surface behind it; they are numbered. Who misses one asks for what has changed since the last that
-came. The refined surface of cells that no update brings is asked for once the map is idle.
+The follower first asks for all cells with the raw surface. After that, numbered mesh updates bring each
+change: first the raw surface, later the refined one. A follower that misses an update asks for the changes
+since the last update that came. It asks for refined cells that no update brings once the map is idle.
 
-Questions and updates overtake each other: of each cell the newest state counts (`held_cells`).
+Answers and updates overtake each other: the newest state of each cell counts (`held_cells`).
 """
 
 from collections import deque
@@ -24,20 +24,20 @@ from tsfusion.wire.messages.health import MapHealth
 from tsfusion.wire.messages.mesh_updates import Meshed
 from tsfusion.wire.messages.questions import Cells
 
-_QUIET_S = 1.5  # without an update, in an idle map, until what is not refined is asked for
-_LOST_S = 2.0  # until an update that the server has sent is taken for lost
+_QUIET_S = 1.5  # an idle map without updates for so long is asked for its refined cells
+_LOST_S = 2.0  # an update that the server sent so long ago, and that did not come, is lost
 
 
 @dataclass
 class _Sweep:
-    """A pass over the cells.
+    """One pass over the cells of a map, by several questions.
 
     Attributes:
-        is_raw: whether the raw surface is asked for.
-        since: stamp after which cells changed; None = all cells.
+        is_raw: True if the pass asks for the raw surface.
+        since: ask only for cells changed after this stamp; None asks for all cells.
         drops: `Volume.drops` at that stamp.
-        first: where it goes on; None = at the first cell.
-        began: stamp and drops at its first answer; None = there was none.
+        first: next cell to ask for; None is the first cell.
+        began: stamp and drops of the first answer; None before it.
     """
 
     is_raw: bool
@@ -48,21 +48,21 @@ class _Sweep:
 
     @property
     def is_first(self) -> bool:
-        """True if nothing was asked before: the answer is the beginning of everything."""
+        """True if the next answer is the first one about this map."""
         return self.is_raw and self.since is None and self.began is None
 
 
 class FollowedMap:
-    """Known part of a map, and the next question about it.
+    """The cells of a map that are known, and the next question about the map.
 
     Attributes:
-        epoch: of the fuser's process; empty = nothing is known.
-        voxel_size: metres; 0 = not known.
+        epoch: name of the fuser's process; empty while nothing is known.
+        voxel_size: metres; 0 while not known.
     """
 
     def __init__(self, name: str) -> None:
         self.name, self.epoch, self.voxel_size = name, "", 0.0
-        self._past: deque[str] = deque(maxlen=8)  # epochs of which updates may still come
+        self._past: deque[str] = deque(maxlen=8)  # earlier epochs: their updates may still come
         self._server: tuple[str, int] | None = None
         self._is_idle = False
         self._begin()
@@ -73,16 +73,16 @@ class FollowedMap:
         self.epoch, self._held = "", HeldCells()
         self._number = 0  # of the newest update
         self._until = 0, 0  # stamp and drops up to which all updates came
-        self._missed: tuple[int, int] | None = None  # likewise, where something is missing
-        self._refined: tuple[int, int] | None = None  # likewise, of refined cells
+        self._missed: tuple[int, int] | None = None  # stamp and drops after which an update is missing
+        self._refined: tuple[int, int] | None = None  # stamp and drops up to which all cells are refined
         self._misses_refined = False
-        self._refines = True  # whether the map's settings ask for another surface than the raw one
-        self._behind: tuple[int, float] | None = None  # number that the server is at, and since when
+        self._refines = True  # the map's settings ask for another surface than the raw one
+        self._behind: tuple[int, float] | None = None  # server's newest number, and since when it is missed
         self._quiet_from = 0.0
         self._sweep: _Sweep | None = None
 
     def forget(self) -> list[MapEvent]:
-        """Hold nothing any more: there is no such map."""
+        """Drop all cells: the server has no such map."""
         was_known, self.voxel_size = self.voxel_size, 0.0
         self._begin()
         return [Cleared(self.name, was_known)] if was_known else []
@@ -90,7 +90,7 @@ class FollowedMap:
     # --- what to ask ---
 
     def question(self, now: float) -> Cells | None:
-        """Next question; None = none."""
+        """Return the next question, or None without one."""
         if self._missed is not None and (self._sweep is None or not self._sweep.is_raw):
             self._sweep, self._missed = _Sweep(True, *self._missed), None
         elif self._sweep is None and not self.epoch:
@@ -110,10 +110,10 @@ class FollowedMap:
     # --- what came ---
 
     def on_cells(self, epoch: str, arrays: dict[str, NDArray[Any]]) -> list[MapEvent]:
-        """Take the answer to the last question.
+        """Take the answer to the last question. Return the events that follow from it.
 
         Raises:
-            DecodeError: when it is none; ask again.
+            DecodeError: for a malformed answer; ask again.
         """
         events: list[MapEvent] = []
         sweep = self._sweep
@@ -130,7 +130,7 @@ class FollowedMap:
             self._number, self._until, self._sweep = number, (stamp, drops), sweep
             self._refines = not part.is_refined
             events.append(Cleared(self.name, self.voxel_size))
-        if sweep.since is not None and drops != sweep.drops:  # blocks have gone: no stamp says which
+        if sweep.since is not None and drops != sweep.drops:  # blocks were removed: no stamp says which
             self._sweep = _Sweep(sweep.is_raw)
             return events
         if sweep.began is None:
@@ -153,10 +153,10 @@ class FollowedMap:
         return events
 
     def on_update(self, meshed: Meshed, frames: Sequence[Any], now: float) -> list[MapEvent]:
-        """Take a mesh update.
+        """Take a mesh update. Return the events that follow from it.
 
         Raises:
-            DecodeError: when it is none; it is missed then.
+            DecodeError: for a malformed update; it then counts as missed.
         """
         update = meshed.update
         if update is None or update.epoch in self._past or not self.epoch:
@@ -181,7 +181,7 @@ class FollowedMap:
         return self._take(part)
 
     def on_health(self, health: MapHealth, server: str, now: float) -> None:
-        """Take the map's health, which a server of this epoch sent."""
+        """Take the health of the map, sent by the server of epoch `server`."""
         self._is_idle = health.state == "idle"
         before, self._server = self._server, (server, health.fuser_restarts)
         if before not in (None, self._server) and self.epoch:
@@ -195,7 +195,7 @@ class FollowedMap:
             self._miss()
 
     def _miss(self) -> None:
-        """Note that something after what came is missing."""
+        """Remember that an update after `_until` is missing."""
         self._missed = self._missed or self._until
         self._misses_refined = True
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Where a map's keyframes are, as one follows it: asked for page by page, again whenever some have moved."""
+"""Poses of a map's keyframes for a viewer: asked for in pieces, and again after keyframes moved."""
 
 from collections import defaultdict
 from typing import Any
@@ -14,28 +14,28 @@ from tsfusion.wire.messages.health import MapHealth
 from tsfusion.wire.messages.mesh_updates import Scanned
 from tsfusion.wire.messages.questions import Keyframes
 
-_PAUSE_S = 2.0  # for each answer of the last time, until all are asked for again
+_PAUSE_S = 2.0  # wait between two rounds of questions: so long for each answer of the last round
 _PathRows = tuple[NDArray[np.int64], NDArray[np.float64]]
 
 
 class FollowedPaths:
-    """The paths of a map's scanners, and the next question about them."""
+    """The paths of a map's scanners, and the next question about the paths."""
 
     def __init__(self) -> None:
         self._is_due = True
         self._next = 0.0  # time.monotonic()
         self._asked: Keyframes | None = None
-        self._answers = 0  # of this time, or the last
+        self._answers = 0  # of this round, or the last one
         self._pages: dict[bytes, list[_PathRows]] = defaultdict(list)
         self._epoch = ""
         self._moved: dict[bytes, NDArray[np.float64]] = {}  # T_map_odometry by session
         self._counts: tuple[int, ...] | None = None
         self._number: tuple[str, int] | None = None
-        self._fused = self._fused_then = 0  # keyframes in the map, as it tells, and when they were asked for
-        self._scanned = 0  # that scanners have sent since then
+        self._fused = self._fused_then = 0  # keyframes in the map: now, and when the last round began
+        self._scanned = 0  # keyframes that scanners have sent since the last round began
 
     def question(self, now: float) -> Keyframes | None:
-        """Next question; None = none."""
+        """Return the next question, or None without one."""
         if self._asked is None and self._is_due and now >= self._next:
             self._is_due, self._next = False, now + _PAUSE_S * max(self._answers, 1)
             self._asked, self._answers = Keyframes(), 0
@@ -44,15 +44,15 @@ class FollowedPaths:
         return self._asked
 
     def on_keyframes(self, epoch: str, arrays: dict[str, NDArray[Any]]) -> list[MapEvent]:
-        """Take the answer to the last question.
+        """Take the answer to the last question. Return the paths once all answers of the round are there.
 
         Raises:
-            DecodeError: when it is none; ask again.
+            DecodeError: for a malformed answer; ask again.
         """
         asked = self._asked
         if asked is None:
             return []
-        if asked.session and epoch != self._epoch:  # another process: what was asked before is not of it
+        if asked.session and epoch != self._epoch:  # another process: earlier answers do not belong to it
             self._asked, self._is_due = None, True
             return []
         self._epoch = epoch
@@ -103,7 +103,7 @@ class FollowedPaths:
         )
 
     def on_health(self, health: MapHealth) -> None:
-        """Take the map's health: it shows when keyframes have moved, gone, or come from the journal alone."""
+        """Take the map's health: it shows if keyframes moved, left, or came from the journal alone."""
         counts = (
             health.corrections,
             health.keyframes_moved,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Parts of a map's surface as they come, and which of their cells are newer than those that are held."""
+"""Cells of a map that a viewer holds: which cells of a new answer or update are newer."""
 
 from dataclasses import dataclass, replace
 
@@ -8,17 +8,17 @@ from numpy.typing import NDArray
 
 from tsfusion.geometry.mesh import Mesh
 
-_STEPS = np.array([1 << 42, 1 << 21, 1])  # of a cell's number, along x, y, z
+_STEPS = np.array([1 << 42, 1 << 21, 1])  # of a cell's key, along x, y, z
 _ROW = np.dtype([("key", "i8"), ("made", "i4"), ("changed", "i4"), ("is_refined", "?"), ("has_faces", "?")])
 
 
 @dataclass(frozen=True, eq=False)
 class SurfacePart:
-    """The triangles of some cells at one state of the map; as `map_events.SurfaceUpdate`, and:
+    """The triangles of some cells at one state of the map. More attributes: `map_events.SurfaceUpdate`.
 
     Attributes:
-        stamp: of the newest keyframe in the map then.
-        changed: (n,) int32: the stamp of the last change to what the cell shows as fused, or a later one.
+        stamp: stamp of the newest keyframe in the map at that state.
+        changed: (n,) int32: stamp of the last change to the cell's raw surface, or a later stamp.
     """
 
     cells: NDArray[np.int32]
@@ -31,7 +31,7 @@ class SurfacePart:
     changed: NDArray[np.int32]
 
     def only(self, chosen: NDArray[np.bool_]) -> "SurfacePart":
-        """The part with these rows alone."""
+        """Return the chosen cells alone, with their triangles. `chosen`: (n,) bool."""
         if chosen.all():
             return self
         counts = np.diff(self.first_face)
@@ -50,7 +50,7 @@ class SurfacePart:
 
 
 class HeldCells:
-    """Cells that a follower has of a map: for each one, of which state of the map it is."""
+    """Cells that a follower holds, each with the state of the map that it comes from."""
 
     def __init__(self) -> None:
         self._rows = np.zeros(0, _ROW)
@@ -59,9 +59,9 @@ class HeldCells:
         return len(self._rows)
 
     def take(self, part: SurfacePart) -> NDArray[np.bool_]:
-        """(n,) which cells of a part are newer than those that are held; they are held from now on.
+        """Hold the cells of a part that are newer than the held ones. Return (n,) bool: True for these.
 
-        What was refined counts until what it was made from has changed, and for more than what was not.
+        A refined cell stays until its raw surface changes; until then it wins over a raw cell.
         """
         new = np.zeros(len(part.cells), _ROW)
         new["key"], new["made"], new["changed"] = keys_of(part.cells), part.stamp, part.changed
@@ -79,9 +79,9 @@ class HeldCells:
     def take_absent(
         self, first: NDArray[np.int32] | None, end: NDArray[np.int32] | None, part: SurfacePart
     ) -> NDArray[np.int32]:
-        """The cells (n, 3) that have triangles, and are not in a part that has all from `first` to `end`.
+        """Return the held cells with triangles, (n, 3), that a complete part from `first` to `end` lacks.
 
-        They have none from now on.
+        These cells count as empty from now on.
         """
         keys = self._rows["key"]
         low = 0 if first is None else np.searchsorted(keys, keys_of(first[None])[0])
@@ -102,7 +102,7 @@ def _is_newer(new: NDArray[np.void], held: NDArray[np.void]) -> NDArray[np.bool_
 
 
 def keys_of(cells: NDArray[np.int32]) -> NDArray[np.int64]:
-    """(n,) int64 numbers of (n, 3) cells, in the order of x, y and z."""
+    """Return (n,) int64 keys of (n, 3) cells; keys sort by x, then y, then z."""
     keys: NDArray[np.int64] = cells.astype(np.int64) @ _STEPS
     return keys
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A connection to a server's control address over which one asks again and again, and never waits."""
+"""A connection to a server's control address that asks again and again without blocking."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -18,19 +18,19 @@ from tsfusion.wire.sockets.connection import ServerLink
 from tsfusion.wire.sockets.curve import ClientKeys
 
 _HEALTH_INTERVAL = 1.0  # seconds
-_SILENT_AFTER = 4.0  # seconds without the health that was asked for
-_GRACE_S = 1.0  # in which a connection may be made again
+_SILENT_AFTER = 4.0  # seconds without an answer to the request for health
+_GRACE_S = 1.0  # a new connection within this time is no problem to report
 _QUESTION_S = 5.0  # that a question may take
 _MOST_AT_ONCE = 32  # replies
 OnReply = Callable[[Reply, list[memoryview]], None]
 
 
 class Inquiry:
-    """Asks a server for its health once a second, and one question at a time.
+    """Asks a server for its health once a second, and asks one question at a time.
 
     Attributes:
-        map: whose other server is asked about with the health, where it has one.
-        version: the server's `PROTOCOL_VERSION`; None = not known yet.
+        map: map named in the health request; the reply names the map's new server, if it moved.
+        version: the server's `PROTOCOL_VERSION`; None while not known.
     """
 
     def __init__(
@@ -39,21 +39,21 @@ class Inquiry:
         self._connection: ServerLink = open_connection(context, sockets.connect_address(address), keys)
         self.address, self.map = address, map_name
         self.version: int | None = None
-        self._greeted = 0  # on which connection
-        self._seen = time.monotonic()  # when there was a connection, or none could be yet
+        self._greeted = 0  # number of the connection on which the server was greeted
+        self._seen = time.monotonic()  # last time with a connection; at first, the time of the start
         self._health_due = 0.0
         self._health_asked: float | None = None
-        self._number = 0  # of the question
+        self._number = 0  # number of the last question
         self._asked_until: float | None = None
 
     @property
     def polled(self) -> list[tuple[sockets.AnySocket, int]]:
-        """Sockets and events for which it is worth to call `step`."""
+        """Sockets and events to poll: call `step` when one of them is ready."""
         return [(self._connection.socket, zmq.POLLIN), (self._connection.events, zmq.POLLIN)]
 
     @property
     def due(self) -> float:
-        """When to call `step` without an event (`time.monotonic()`)."""
+        """Time of the next `step` if no event comes before (`time.monotonic()`)."""
         waits = [self._health_due if self._health_asked is None else self._health_asked + _SILENT_AFTER]
         if self._connection.due:
             waits.append(self._connection.due)
@@ -61,7 +61,7 @@ class Inquiry:
 
     @property
     def problem(self) -> str:
-        """Reason why the server does not answer, in words; empty = it does, or it is too early to say."""
+        """Reason for a person why the server does not answer; empty without one, or while it is too early."""
         now = time.monotonic()
         if self._connection.is_made:
             is_late = self._health_asked is not None and now - self._health_asked > _SILENT_AFTER / 2
@@ -81,7 +81,7 @@ class Inquiry:
         )
 
     def ask(self, map_name: str, question: Question, *, compress: bool) -> None:
-        """Ask; the reply comes by `step`, or never: then it is over after some seconds."""
+        """Ask a question. `step` delivers the reply; without one, the question ends after some seconds."""
         self._number += 1
         self._asked_until = time.monotonic() + _QUESTION_S + 1.0
         self._send(
@@ -103,12 +103,12 @@ class Inquiry:
         self._connection.connect_to(address)
 
     def drop_question(self) -> None:
-        """Take no answer to the question that is under way."""
+        """Ignore the answer to the open question."""
         self._number += 1
         self._asked_until = None
 
     def step(self, on_reply: OnReply) -> None:
-        """Read the replies that came, and ask for the health if it is time."""
+        """Read the replies that came, and ask for the health if that is due."""
         now, connection = time.monotonic(), self._connection
         connection.check(now)
         self._read(on_reply)
@@ -125,7 +125,7 @@ class Inquiry:
             self.drop_question()
         if self._health_asked is not None and now - self._health_asked > _SILENT_AFTER:
             self._health_asked, self._seen = None, now - _GRACE_S
-            connection.reopen()  # what stands may lead nowhere, and nobody would notice
+            connection.reopen()  # an open connection may be dead without an event
         elif self._health_asked is None and now >= self._health_due:
             self._health_due, self._health_asked = now + _HEALTH_INTERVAL, now
             self._send(Command(name="health", map=self.map))
@@ -142,11 +142,11 @@ class Inquiry:
             try:
                 reply = messages.decode_to_client(head.buffer)
             except DecodeError:
-                continue  # damaged on its way: it is asked again
+                continue  # damaged on its way: the question is asked again
             if isinstance(reply, Reply) and self._is_expected(reply):
                 on_reply(reply, _buffers(frames))
                 if reply.elsewhere is not None:
-                    return  # the connection may be another one now
+                    return  # `on_reply` may have replaced the connection
 
     def _is_expected(self, reply: Reply) -> bool:
         if reply.name == "ping":
@@ -160,7 +160,6 @@ class Inquiry:
         return False
 
     def close(self) -> None:
-        """Close the connection."""
         self._connection.close()
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The map of a running server, asked from a machine without Taichi: how far is it to the wall?"""
+"""Client that asks the map of a running server, without Taichi: how far is it to the wall?"""
 
 import time
 from collections.abc import Sequence
@@ -35,13 +35,14 @@ _GRID = ("origin", "resolution", "heights", "axes")
 
 
 class Answered(Struct, Generic[Result], frozen=True, kw_only=True, eq=False):
-    """Answer of a map, of which state of it, and how long it took.
+    """Answer of a map, the state of the map that it belongs to, and the time it took.
 
     Attributes:
-        result: as of the method of `Volume` with the same name.
-        state: the one state of the map that all of the result is of.
-        delay_s: from the question to the answer, here.
-        waited_s, took_s: of it, seconds in the server: until the map was free, and to answer.
+        result: the type that the method of `Volume` with the same name returns.
+        state: state of the map; the whole result belongs to this one state.
+        delay_s: seconds from question to answer, measured by the client.
+        waited_s: the part of `delay_s` in which the question waited in the server for the map.
+        took_s: the part of `delay_s` in which the server computed the answer.
     """
 
     result: Result
@@ -52,25 +53,24 @@ class Answered(Struct, Generic[Result], frozen=True, kw_only=True, eq=False):
 
 
 class MapClient:
-    """A map on a server, asked by the methods of `Volume`: each returns an `Answered` of what that returns.
+    """A map on a server, asked by the methods of `Volume`: each returns its result in an `Answered`.
 
-    The map answers between two keyframes, within milliseconds; one that has moved to another server is asked
-    there (without keys, on this machine alone). A question that is not answered in its time
-    raises, and never hangs. By custom the surface is the raw one here, as it was fused: smoothing it takes
-    the server longer. Use it from one thread.
+    The map answers between two keyframes, within milliseconds. After the map has moved, the client asks its
+    new server (without keys, only on this machine). A question without an answer in time raises. The default
+    surface is the raw one: smoothing takes the server longer. Use the client from one thread.
 
     Args:
-        address: of the server: tcp://HOST:PORT.
-        map_: which of its maps.
-        control: its control address; None = the port after the other.
-        timeout: seconds that a question may take, unless it says otherwise.
-        key, server_key: for a server with keys: one's own secret key, a file, and the server's public key, a
-            file or its 40 characters, as `Client` takes them.
-        keys: of `curve.client_keys`, in place of the two.
-        compress: large answers, for a slow link; None = unless the server is on this machine.
+        address: address of the server: tcp://HOST:PORT.
+        map_: name of the map on the server.
+        control: control address of the server; None takes the port after that of `address`.
+        timeout: seconds that a question may take; each method can take another value.
+        key: path of the client's secret key, for a server with keys.
+        server_key: the server's public key: its path, or the 40 characters.
+        keys: result of `curve.client_keys`, in place of `key` and `server_key`.
+        compress: compress large answers, for a slow link; None does so unless the server is on this machine.
 
     Raises:
-        InvalidConfig: for an address that is none.
+        InvalidConfig: for a malformed address, or for keys that cannot be used.
 
     Examples:
         >>> with tsfusion.MapClient("tcp://127.0.0.1:5555", timeout=5.0) as live:
@@ -124,15 +124,15 @@ class MapClient:
         surface: Surface | None = "raw",
         timeout: float | None = None,
     ) -> Answered[Samples]:
-        """The signed distance, its weight and its gradient at points; see `Volume.sample`.
+        """Return the signed distance, its weight and its gradient at points; see `Volume.sample`.
 
         Args:
             points: (n, 3) metres, at most `questions.MOST_POINTS`: an answer is of one state of the map.
-            min_weight, surface: as for `Volume.extract_mesh`; None = as the map's settings say.
-            timeout: seconds; None = the client's.
+            min_weight, surface: as for `Volume.extract_mesh`; None takes the map's settings.
+            timeout: seconds; None takes the client's.
 
         Raises:
-            InvalidConfig: for an array that holds no points, or too many.
+            InvalidConfig: for an array without points, of another shape, or with too many points.
             AnswerLate: when the map did not answer in time.
             ServerUnreachable: when no server answers.
             TransportError: when the server cannot answer, with the reason.
@@ -160,15 +160,15 @@ class MapClient:
         colors: bool = True,
         timeout: float | None = None,
     ) -> Answered[View]:
-        """View of the surface by a pinhole camera; see `Volume.raycast`. Raises as `sample`.
+        """Return the view of the surface by a pinhole camera; see `Volume.raycast`. Raises as `sample`.
 
         Args:
             intrinsics, T_world_camera, shape, min_weight, surface: as for `Volume.raycast`.
-            max_age: seconds for which the state that is shown may be behind the newest one. Of 0 the view is
-                of the newest, and what has just changed is meshed first. With 0.2 that is done ahead, for
-                cameras that look where the last one did; `state` says which state was shown.
-            normals, colors: whether with them. Depth alone is a fifth of the bytes.
-            timeout: seconds; None = the client's.
+            max_age: seconds by which the shown state may be older than the newest one. 0 shows the newest
+                state, and recent changes are meshed first. With 0.2 the server meshes ahead for cameras that
+                look where the last one looked. `state` says which state was shown.
+            normals, colors: True to get them. Depth alone is a fifth of the bytes.
+            timeout: seconds; None takes the client's.
         """
         camera, T, (height, width) = checked_camera(intrinsics, T_world_camera, shape)
         question = Raycast(
@@ -191,7 +191,7 @@ class MapClient:
         self, low: float, high: float, *, up: Up | str, timeout: float | None = None,
         **how: "Unpack[SliceSettings]",
     ) -> Answered[OccupancySlice]:  # fmt: skip
-        """Costmap of what stands between two heights; see `Volume.occupancy_slice`.
+        """Return the costmap of obstacles between two heights; see `Volume.occupancy_slice`.
 
         Args:
             low, high, up, timeout, how: as for `distance_slice`, without `max_distance`.
@@ -205,15 +205,15 @@ class MapClient:
         self, low: float, high: float, *, up: Up | str, unseen_is_free: bool = False,
         timeout: float | None = None, **how: "Unpack[SliceSettings]",
     ) -> Answered[DistanceSlice]:  # fmt: skip
-        """Horizontal distances to what stands between two heights; see `Volume.distance_slice`.
+        """Return horizontal distances to obstacles between two heights; see `Volume.distance_slice`.
 
-        The server keeps the slices of a `box` that were asked last, and brings them up to date: the first
-        answer takes it longest. Raises as `sample`.
+        The server keeps the slices of a `box` that were asked last, and updates them. The first answer
+        therefore takes longest. Raises as `sample`.
 
         Args:
             low, high: metres along `up`, such as "z".
             unseen_is_free: as for `Volume.distance_slice`.
-            timeout: seconds; None = the client's.
+            timeout: seconds; None takes the client's.
             how: `box`, `resolution`, `max_distance`, `min_weight`: as for `Volume.distance_slice`.
         """
         answer, arrays, delay = self._ask_slice("distance", low, high, up=up, timeout=timeout, **how)
@@ -259,7 +259,7 @@ class MapClient:
         unseen_is_free: bool = False,
         timeout: float | None = None,
     ) -> Answered[DistanceField]:
-        """Distance of each voxel in a box to the nearest surface; see `Volume.distance_field`.
+        """Return the distance of each voxel in a box to the nearest surface; see `Volume.distance_field`.
 
         Raises as `sample`.
 
@@ -267,7 +267,7 @@ class MapClient:
             box: x0 y0 z0 x1 y1 z1, metres in the map's frame.
             max_distance: metres; the cost grows with its cube.
             subvoxel, min_weight, unseen_is_free: as for `Volume.distance_field`.
-            timeout: seconds; None = the client's.
+            timeout: seconds; None takes the client's.
         """
         question = Field(
             box=_numbers(box, 6),  # type: ignore[arg-type]
@@ -285,7 +285,7 @@ class MapClient:
     def _ask(
         self, question: Question, frames: Sequence[Any], timeout: float | None
     ) -> tuple[Answer, dict[str, NDArray[Any]], float]:
-        """The answer, its arrays, and the seconds that it took."""
+        """Ask a question. Return the answer, its arrays, and the seconds it took."""
         seconds = self.timeout if timeout is None else timeout
         if not 0 < seconds <= questions.LONGEST_S:
             raise InvalidConfig(f"timeout must be > 0 and up to {questions.LONGEST_S:g} s, got {seconds:g}")
@@ -322,7 +322,7 @@ class MapClient:
     def _exchange(
         self, command: Command, frames: Sequence[Any], deadline: float
     ) -> tuple[Reply, list[memoryview]]:
-        """Send a question; the reply to it."""
+        """Send a question, and return the reply and its frames."""
         left = max(deadline - time.monotonic(), 0.0)
         try:
             return self._server.ask(command, frames, timeout=left)
@@ -332,12 +332,12 @@ class MapClient:
                     f"the map {self.map} at {self.address} did not answer within {command.timeout_s:g} s: "
                     "ask again, or give it longer (timeout)"
                 ) from error
-            self._connection.reopen()  # what stands may lead nowhere, and nobody would notice
+            self._connection.reopen()  # an open connection may be dead without an event
             raise
 
 
 def _all(arrays: dict[str, NDArray[Any]], *names: str) -> dict[str, NDArray[Any]]:
-    """The arrays of these names, and no others."""
+    """Return the arrays. Raise TransportError unless they have exactly these names."""
     if sorted(arrays) != sorted(names):
         raise TransportError(f"an answer has {', '.join(arrays) or 'nothing'} instead of {', '.join(names)}")
     return arrays
@@ -360,7 +360,7 @@ def _number(given: Any, name: str) -> float:
 
 
 def _grid(found: dict[str, NDArray[Any]]) -> SliceGrid:
-    """The cells of a slice, from the arrays of an answer: `SliceGrid.figures`."""
+    """Return the grid of a slice, from the arrays of an answer (`SliceGrid.figures`)."""
     rows, columns = found["cells"].shape
     u, v = found["origin"].tolist()
     low, high = found["heights"].tolist()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Events of a map, as its viewers hear of them: new triangles, where a scanner is, poses moved."""
+"""Events of a map for its viewers: new triangles, new poses, health, and the state of the link."""
 
 from dataclasses import dataclass
 
@@ -14,7 +14,7 @@ from tsfusion.wire.messages.health import Health
 
 @dataclass(frozen=True, eq=False)
 class Cleared:
-    """All that was shown is void: another map, or the same one from its beginning."""
+    """Order to drop all that is shown: another map follows, or the same map from its start."""
 
     map: str
     voxel_size: float  # metres
@@ -22,16 +22,16 @@ class Cleared:
 
 @dataclass(frozen=True, eq=False)
 class SurfaceUpdate:
-    """The triangles of some cells, instead of all earlier ones there. A cell is a block of 8³ voxels.
+    """The triangles of some cells. They replace all earlier triangles of these cells. A cell is a block.
 
     Attributes:
-        cells: (n, 3) int32, block coordinates; an edge is 8 voxels.
-        first_face: (n + 1,) int32: the cell in row i has the faces from `first_face[i]` to
-            `first_face[i + 1]` of the mesh; none, where the surface has gone.
-        mesh: of these cells, in metres of the map.
-        is_refined: whether it is the surface that the map's settings ask for, or the raw one.
+        cells: (n, 3) int32 block coordinates; an edge is 8 voxels.
+        first_face: (n + 1,) int32: cell i has the faces of the mesh from `first_face[i]` to `first_face[i +
+            1]`. A cell without surface has no faces.
+        mesh: triangles of these cells, in metres of the map.
+        is_refined: True if the surface is the one that the map's settings ask for, False if it is raw.
         clients: sessions (16 bytes each) that saw these cells.
-        client: (n,) int32, the row in `clients` of who saw the cell last; −1 = not known.
+        client: (n,) int32: row in `clients` of the session that saw the cell last, or −1 if not known.
     """
 
     cells: NDArray[np.int32]
@@ -48,11 +48,11 @@ class ScannerSeen:
 
     Attributes:
         session: 16 bytes.
-        seq: the keyframe's number in its session.
+        seq: number of the keyframe in its session.
         T_world_camera: (4, 4) float64.
-        intrinsics, shape: fx, fy, cx, cy and (height, width) in pixels; None = it has no camera (a LiDAR).
-        picture: JPEG, as the scanner sent it; None = there is none, or another one came just before.
-        client: name that its key is allowed under; empty without keys.
+        intrinsics, shape: fx, fy, cx, cy and (height, width) in pixels; None without a camera (LiDAR).
+        picture: JPEG as the scanner sent it; None without one, or if another picture came just before.
+        client: name under which the scanner's key is allowed; empty without keys.
     """
 
     session: bytes
@@ -66,11 +66,11 @@ class ScannerSeen:
 
 @dataclass(frozen=True, eq=False)
 class PathsFound:
-    """Poses of all of the map's keyframes, those that they are fused with now.
+    """Poses at which all keyframes of the map are fused now.
 
     Attributes:
         paths: by session: (n,) int64 numbers and (n, 4, 4) float64 T_world_camera.
-        held: how the sensors were held, by which up is found; None = nobody knows.
+        held: how the sensors were held, from which the up direction is found; None if not known.
     """
 
     paths: dict[bytes, tuple[NDArray[np.int64], NDArray[np.float64]]]
@@ -79,14 +79,14 @@ class PathsFound:
 
 @dataclass(frozen=True, eq=False)
 class HealthSeen:
-    """The health of the server, about once a second."""
+    """Health of the server. The event comes about once a second."""
 
     health: Health
 
 
 @dataclass(frozen=True, eq=False)
 class LinkSeen:
-    """Presence of what is watched: `problem` says why it is away, in words; empty = it is there."""
+    """State of the link to the watched map. `problem` says why it is away; empty while it is there."""
 
     problem: str
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A running server's map, watched: everything that a live page shows, event by event, without Taichi."""
+"""Client that follows a running server's map, and gives a live page its events, without Taichi."""
 
 import threading
 import time
@@ -27,28 +27,28 @@ from tsfusion.wire.sockets.connection import ServerLink
 from tsfusion.wire.sockets.curve import ClientKeys
 
 _MOST_AT_ONCE = 16  # updates of one call
-_TOGETHER_S = 0.2  # from one reading of updates to the next: each awakening costs
-_FEW = 6  # updates that may have come meanwhile: of more, the socket's queue could not hold the next
-_PAUSE_S, _BUSY_PAUSE_S = 0.02, 0.05  # between two questions; while the map has keyframes to fuse
+_TOGETHER_S = 0.2  # between two readings of updates: each time the thread wakes up costs
+_FEW = 6  # after a reading of more updates than this, the next comes at once: the socket's queue is short
+_PAUSE_S, _BUSY_PAUSE_S = 0.02, 0.05  # between two questions; the second while the map fuses keyframes
 _RETRY_S = 0.5  # after a question that was refused or not answered
-_WEIGHTS_S = 2.0  # that a question for weights may take
+_WEIGHTS_S = 2.0  # longest time of a question for weights
 
 
 class MapWatcher:
     """Events of a map of a running server (a `viewer.map_feed.MapFeed`).
 
-    It never ends by itself: while the server is away, `LinkSeen` says so, and all comes again afterwards. A
-    map that moves to another server is followed there (without keys, on this machine alone). Use it from one
-    thread, but for `weights`.
+    The watcher never ends by itself. While the server is away, `LinkSeen` says so; afterwards all cells come
+    again. A map that moves to another server is followed to it (without keys, only on this machine). Use the
+    watcher from one thread, except for `weights`.
 
     Args:
-        address: of the server: tcp://HOST:PORT.
-        map_name: which of its maps; it may be opened later.
-        control, publish: its other addresses; None = the ports after the first.
-        keys: of `curve.client_keys`, for a server with keys.
+        address: address of the server: tcp://HOST:PORT.
+        map_name: name of the map on the server; the map may be opened later.
+        control, publish: other addresses of the server; None takes the ports after that of `address`.
+        keys: result of `curve.client_keys`, for a server with keys.
 
     Raises:
-        InvalidConfig: for an address that is none.
+        InvalidConfig: for a malformed address.
         TransportError: when no socket can be opened.
     """
 
@@ -81,8 +81,8 @@ class MapWatcher:
         self._health: Health | None = None
         self._asked: Cells | Keyframes | None = None
         self._next_question = self._next_read = 0.0  # time.monotonic()
-        self._refusal = ""  # why a question was refused that no patience answers
-        self._said: str | None = None  # the problem of the link
+        self._refusal = ""  # why a question was refused for good
+        self._said: str | None = None  # problem of the link, as the last `LinkSeen` told it
         self._events: list[MapEvent] = []
         self._follow(map_name)
 
@@ -112,11 +112,11 @@ class MapWatcher:
         self._context.term()
 
     def maps(self) -> list[str]:
-        """Names of the server's maps, as far as its health was seen."""
+        """Return the names of the server's maps, from its last health."""
         return sorted({self._map, *(self._health.maps if self._health else ())})
 
     def choose(self, map_name: str) -> None:
-        """Watch another map; `Cleared` comes as soon as it is open."""
+        """Watch another map. `Cleared` comes as soon as that map is open."""
         for topic in sockets.topics_of(self._map):
             self._updates.socket.setsockopt(zmq.UNSUBSCRIBE, topic)
         self._events.clear()
@@ -129,7 +129,7 @@ class MapWatcher:
                 self._weights.map = map_name
 
     def seek(self, keyframes: int) -> None:
-        """A server shows its maps as they are now.
+        """Raise InvalidConfig: a running server shows only the newest state of its maps.
 
         Raises:
             InvalidConfig: always.
@@ -139,7 +139,7 @@ class MapWatcher:
     # --- events ---
 
     def events(self, timeout: float) -> list[MapEvent]:
-        """Events since the last call; waits at most `timeout` seconds for the first event."""
+        """Return the events since the last call. Wait at most `timeout` seconds for the first one."""
         deadline = time.monotonic() + timeout
         while True:
             self._step()
@@ -174,7 +174,7 @@ class MapWatcher:
         if now < self._next_question or not self._inquiry.may_ask or not self._is_open:
             return
         question: Cells | Keyframes | None = None
-        if self._followed.epoch:  # where keyframes are comes right after what is cleared
+        if self._followed.epoch:  # ask for the poses of keyframes right after `Cleared`
             question = self._paths.question(now)
         question = question or self._followed.question(now)
         is_busy = self._health is not None and self._health.maps[self._map].state == "busy"
@@ -206,7 +206,7 @@ class MapWatcher:
                 self._next_question = time.monotonic() + _RETRY_S
 
     def _go_to(self, elsewhere: Elsewhere) -> None:
-        """Watch the map at the server that has it by now."""
+        """Watch the map at its new server."""
         try:
             data, control = place_of(elsewhere, self._keys)
         except TransportError as error:
@@ -278,7 +278,7 @@ class MapWatcher:
             self._events.append(LinkSeen(problem))
 
     def _problem(self) -> str | None:
-        """Reason why there is nothing to see; empty = there is, None = nobody knows yet."""
+        """Return the reason why nothing can be shown. It is empty without a problem, None while not known."""
         if problem := self._inquiry.problem:
             return problem
         version = self._inquiry.version
@@ -299,7 +299,7 @@ class MapWatcher:
         return self._problem_of_updates()
 
     def _problem_of_updates(self) -> str:
-        """Reason why mesh updates do not come, though questions are answered."""
+        """Return the reason why mesh updates do not come, though the server answers; empty without one."""
         link = self._updates
         if link.is_made or not (link.problem or link.finds_nobody):
             return ""
@@ -309,7 +309,7 @@ class MapWatcher:
     # --- questions of others ---
 
     def weights(self, points: NDArray[np.float32]) -> NDArray[np.float32] | None:
-        """(n,) weight of the map at (n, 3) points; None = nobody knows now. For any thread."""
+        """Return the (n,) weights of the map at (n, 3) points, or None without an answer. For any thread."""
         found = [np.zeros(0, np.float32)]
         with self._weights_lock:
             try:

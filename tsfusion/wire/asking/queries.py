@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Queries to a running server: its health, the status of a map, the mesh of a map."""
+"""Commands to a running server: its health, the status of a map, the mesh of a map, forgetting, moving."""
 
 import math
 import time
@@ -25,20 +25,20 @@ from tsfusion.wire.sockets.curve import ClientKeys
 from tsfusion.wire.sockets.sockets import control_address
 
 _AGAIN_INTERVAL = 0.25  # seconds
-_MOST_HOPS = 4  # from server to server, after a map
-_PING_TIMEOUT = 5.0  # seconds; the gateway is never busy: without an answer for so long there is none
+_MOST_HOPS = 4  # from server to server, after a map that moved
+_PING_TIMEOUT = 5.0  # seconds; the gateway is never busy: after so long without an answer it is not there
 
 
 class CommandRefused(TransportError):
-    """The server answered that it cannot do what a command asks."""
+    """Answer of the server that it cannot do what a command asks."""
 
     def __init__(
         self, address: str, reason: str, *, retry: bool = False, elsewhere: Elsewhere | None = None
     ) -> None:
         super().__init__(f"the server at {address}: {reason}")
         self.reason = reason  # the server's words, without its address
-        self.retry = retry  # whether the same command may succeed soon
-        self.elsewhere = elsewhere  # the server that has the map; None = no other is known
+        self.retry = retry  # True if the same command may succeed soon
+        self.elsewhere = elsewhere  # the server that has the map; None if no other server is known
 
 
 def fetch_health(
@@ -49,14 +49,14 @@ def fetch_health(
     timeout: float = 10.0,
     keys: ClientKeys | None = None,
 ) -> Health:
-    """Ask the server at a data address for its health; it answers at once, whatever its fusers do.
+    """Ask the server at a data address for its health. It answers at once, even while its fusers are busy.
 
     Args:
-        map_name: where that map is at another server by now, that one is asked.
-        keys: of `curve.client_keys`, for a server with keys.
+        map_name: map whose server is asked, also after the map moved; None asks the server at `address`.
+        keys: result of `curve.client_keys`, for a server with keys.
 
     Raises:
-        NotAllowed: when the server turns the connection away.
+        NotAllowed: when the server refuses the connection.
         ServerUnreachable: when nobody answers in `timeout` seconds.
     """
     command = Command(name="health", map=map_name or DEFAULT_MAP)
@@ -77,7 +77,7 @@ def fetch_status(
     """Ask the server at a data address for the status of a map. See `fetch_health`.
 
     Raises:
-        TransportError: when the server cannot say.
+        TransportError: when the server cannot give the status.
     """
     command = Command(name="status", map=map_name, timeout_s=timeout)
     reply, _ = _request_if_present(address, control, command, timeout, keys)
@@ -94,12 +94,12 @@ def fetch_new_map(
     timeout: float = 10.0,
     keys: ClientKeys | None = None,
 ) -> str:
-    """Ask the server at a data address for the name of a map that nobody has: NAME, NAME-2, NAME-3, …
+    """Ask the server at a data address for a name that no map has: the first free of NAME, NAME-2, NAME-3, …
 
-    The server gives it to nobody else for some minutes. See `fetch_health`.
+    The server gives this name to nobody else for some minutes. See `fetch_health`.
 
     Raises:
-        TransportError: when it has no room for another map.
+        TransportError: when the server has no room for another map.
     """
     command = Command(name="new_map", map=like)
     reply, _ = _request_if_present(address, control, command, timeout, keys)
@@ -119,12 +119,12 @@ def fetch_mesh(
 ) -> Mesh:
     """Ask the server at a data address for the present mesh of a map. See `fetch_health`.
 
-    A server makes one at a time, and none while keyframes have to come first: it is asked again.
+    A server makes one mesh at a time, and none while keyframes wait to be fused; until then this asks again.
 
     Raises:
-        ServerUnreachable: when nobody is there (known after a few seconds), or the mesh takes longer than
+        ServerUnreachable: when no server answers (known after a few seconds), or the mesh takes longer than
             `timeout` seconds.
-        TransportError: when the server cannot make it, or not within `timeout` seconds.
+        TransportError: when the server cannot make the mesh, or not within `timeout` seconds.
     """
     command = Command(name="mesh", map=map_name, min_weight=min_weight, timeout_s=timeout)
     deadline = time.monotonic() + timeout
@@ -141,7 +141,7 @@ def fetch_mesh(
         except ServerUnreachable as error:
             if refused is None:
                 raise
-            raise refused from error  # it is there, and said why not
+            raise refused from error  # the server is there, and said why it has no mesh
         time.sleep(_AGAIN_INTERVAL)
     if reply.mesh is None:
         raise TransportError(f"the server at {address} answered without a mesh")
@@ -162,13 +162,13 @@ def forget(
     """Tell the server at a data address to forget keyframes of a map. See `fetch_health`.
 
     Args:
-        erase: also delete them from its journal; it answers when that is done.
-        dry_run: only ask which that would be.
-        timeout: seconds; a server that does not answer in time may still forget them.
+        erase: also delete the keyframes from the journal. The server answers when that is done.
+        dry_run: only ask which keyframes would be forgotten.
+        timeout: seconds; a server that does not answer in time may still forget the keyframes.
 
     Raises:
-        ServerUnreachable: when nobody is there, or it takes longer.
-        TransportError: when the server cannot, or this client may not.
+        ServerUnreachable: when no server answers in `timeout` seconds.
+        TransportError: when the server cannot forget them, or this client has no right to ask.
     """
     command = Command(
         name="forget", map=map_name, selection=selection, erase=erase, dry_run=dry_run, timeout_s=timeout
@@ -182,11 +182,12 @@ def forget(
 def move_map(
     name: str, source: str, to: str, *, timeout: float = 3600.0, keys: ClientKeys | None = None
 ) -> Moved:
-    """Tell the server at a data address, `to`, to take over a map from another one. See `fetch_health`.
+    """Tell the server at data address `to` to take over a map from the server `source`. See `fetch_health`.
 
     Raises:
-        ServerUnreachable: when nobody is there, or it takes longer; the move may go on then.
-        TransportError: when it cannot, or this client may not; the map stays where it is.
+        ServerUnreachable: when no server answers in `timeout` seconds; the move may still go on.
+        TransportError: when the server cannot move the map, or this client has no right to ask. The map then
+            stays at `source`.
     """
     command = Command(name="move", map=name, source=sockets.connect_address(source))
     reply, _ = _request_if_present(to, None, command, timeout, keys)
@@ -204,10 +205,10 @@ def _request_if_present(
     *,
     follow: bool = True,
 ) -> tuple[Reply, list[memoryview]]:
-    """Send a command, also to the server that its map has moved to.
+    """Send a command. If the map has moved, send the command to its new server.
 
     Args:
-        follow: ask the server that the map is at, where the first one says so.
+        follow: False returns the first server's reply, also when it names another server.
     """
     address = sockets.connect_address(address)
     for hops_left in reversed(range(_MOST_HOPS + 1)):
@@ -228,7 +229,7 @@ def _request_if_present(
 
 
 def place_of(elsewhere: Elsewhere, keys: ClientKeys | None) -> tuple[str, str]:
-    """Data and control address of a server that a map is said to be at.
+    """Return the data and control address of the server that `elsewhere` names.
 
     Raises:
         TransportError: as `sockets.place_of` raises InvalidConfig.
@@ -243,7 +244,7 @@ def mesh_of(layout: MeshLayout, frames: list[memoryview]) -> Mesh:
     """Build a mesh from its frames (see `MeshLayout`).
 
     Raises:
-        TransportError: when the frames are not what the layout says.
+        TransportError: when the sizes of the frames differ from the layout.
     """
     wanted: list[tuple[int, type]] = [(layout.vertices, np.float32), (layout.faces, np.int32)]
     wanted.append((layout.vertices, np.float32))
@@ -270,18 +271,18 @@ def request(
     keys: ClientKeys | None = None,
     name: str = "",
 ) -> tuple[messages.Reply, list[memoryview]]:
-    """Send a command to a server's control address; its reply and the raw frames that came with it.
+    """Send a command to a server's control address. Return the reply, and the raw frames after it.
 
     Args:
-        keys: of `curve.client_keys`; None = a connection without.
-        name: of the server, in errors; empty = the address.
+        keys: result of `curve.client_keys`; None connects without keys.
+        name: name of the server in errors; empty takes the address.
 
     Raises:
         InvalidConfig: for a malformed address.
-        NotAllowed: as soon as the server turns the connection away.
+        NotAllowed: as soon as the server refuses the connection.
         ServerUnreachable: when nobody answered within `timeout` seconds.
         CommandRefused: when the server answered that it cannot.
-        TransportError: when what answers is no tsfusion server, or too few files can be opened.
+        TransportError: when the other end is no tsfusion server, or too few files can be opened.
     """
     address = sockets.connect_address(address)
     with sockets.open_context() as context, closing(open_connection(context, address, keys)) as connection:
@@ -292,7 +293,7 @@ def request(
 
 
 def open_connection(context: "zmq.Context[Any]", address: str, keys: ClientKeys | None) -> ServerLink:
-    """A connection to a server's control address. Raises TransportError."""
+    """Connect to a server's control address. Raise TransportError without a socket."""
     try:
         return ServerLink(context, sockets.dealer, address, keys)
     except zmq.ZMQError as error:
@@ -300,12 +301,12 @@ def open_connection(context: "zmq.Context[Any]", address: str, keys: ClientKeys 
 
 
 class Exchange:
-    """Commands to a server, one after the other, each sent again on a connection that is made anew.
+    """Commands to a server, one after the other. A command is sent again on each new connection.
 
-    A ping goes before the first one on each connection, and behind one that is not answered at once.
+    A ping goes out before the first command on each connection, and after a command without a quick answer.
 
     Attributes:
-        is_there: whether the server has answered a ping, for which it is never too busy, since it was asked.
+        is_there: True if the server has answered a ping since `ask` began. It is never too busy for that.
     """
 
     def __init__(self, connection: ServerLink, name: str = "") -> None:
@@ -313,17 +314,17 @@ class Exchange:
         self._connection, self._name = connection, name  # of the server, in errors; empty = the address
         self._asked = self._greeted = 0  # connections on which the command was sent, and a ping answered
         self._ping_at = 0.0  # time.monotonic()
-        self._why = ""  # there is no connection
+        self._why = ""  # reason why there is no connection
 
     def ask(
         self, command: Command, frames: Sequence[Any] = (), *, timeout: float
     ) -> tuple[Reply, list[memoryview]]:
-        """Send a command and its frames; its reply, and the raw frames that came with it.
+        """Send a command and its frames. Return the reply, and the raw frames after it.
 
         Raises:
-            NotAllowed: as soon as the server turns the connection away.
-            ServerUnreachable: when nobody answered within `timeout` seconds, or the ping in a few.
-            TransportError: when what answers is no tsfusion server, or one of another version.
+            NotAllowed: as soon as the server refuses the connection.
+            ServerUnreachable: when nobody answered within `timeout` seconds, or a ping within a few.
+            TransportError: when the other end is no tsfusion server, or one of another version.
         """
         began, timeout = time.monotonic(), min(timeout, _MAX_TIMEOUT_S)
         self.is_there, self._asked, self._ping_at = False, 0, began + min(timeout / 2, _POLL_S)
@@ -339,7 +340,7 @@ class Exchange:
                 return reply, found
 
     def _step(self, sent: list[Any], left: float) -> list[zmq.Frame] | None:
-        """Send what is due, and wait a moment for a message."""
+        """Send what is due, then wait a moment for a message. Return it, or None without one."""
         connection, now = self._connection, time.monotonic()
         link, is_new = connection.socket, connection.made > self._asked
         polled = [(link, zmq.POLLIN | (zmq.POLLOUT if is_new else 0)), (connection.events, zmq.POLLIN)]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Parts of a map's surface from what a server sends: mesh updates, and answers about cells."""
+"""Decoding of what a server sends about cells (mesh updates and answers) into `SurfacePart`."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -17,10 +17,10 @@ Arrays = dict[str, NDArray[Any]]
 
 
 def part_of_update(meshed: Meshed, frames: Sequence[Any]) -> SurfacePart:
-    """The part that a mesh update brings.
+    """Return the cells and triangles of a mesh update.
 
     Raises:
-        DecodeError: when it is none.
+        DecodeError: for a malformed update.
     """
     update, layout = meshed.update, meshed.layout
     if update is None or layout is None or not frames:
@@ -45,10 +45,10 @@ def part_of_update(meshed: Meshed, frames: Sequence[Any]) -> SurfacePart:
 
 
 def part_of_answer(arrays: Arrays, *, is_raw: bool) -> SurfacePart:
-    """The part that an answer about cells brings.
+    """Return the cells and triangles of an answer.
 
     Raises:
-        DecodeError: when it is none.
+        DecodeError: for a malformed answer.
     """
     try:
         mesh = Mesh(arrays["vertices"], arrays["faces"], arrays["normals"], arrays.get("colors"))
@@ -74,7 +74,7 @@ def _array(content: Any, dtype: DTypeLike, columns: int = 1) -> NDArray[Any]:
 
 
 def _checked(part: SurfacePart) -> SurfacePart:
-    """The part, if its arrays fit together; raises DecodeError."""
+    """Return the part. Raise DecodeError unless its arrays fit together."""
     rows, mesh = len(part.cells), part.mesh
     fits = part.cells.shape == (rows, 3) and len(part.first_face) == rows + 1
     fits = fits and len(part.client) == len(part.changed) == rows

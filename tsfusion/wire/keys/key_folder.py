@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: MIT
-"""A folder of keys: this machine's own pairs and, on a server, the list of those that may connect.
+"""A folder of keys: this machine's own key pairs and, on a server, the allow-list of clients.
 
-| file | holds |
+| file | content |
 |---|---|
 | `NAME.key_secret`, `NAME.key` | a pair, and its public half to give away; `server` is the server's own |
-| `allowed.toml` | the server's allow-list: names, public keys, the maps they may use; and revoked keys |
+| `allowed.toml` | the server's allow-list: names, public keys, maps of each name; and revoked keys |
 
-In `[allowed]` stands `"NAME" = "KEY"` for a client that may use every map, and `"NAME" = { key = "KEY",
-maps = ["house", "yard-*"] }` for one that may use these: a map's name, or with a `*` all that begin so.
-With `forget = true` in the braces it may make the server forget keyframes of other clients, too.
+A line `"NAME" = "KEY"` in `[allowed]` lets a client use every map. With `"NAME" = { key = "KEY", maps =
+["house", "yard-*"] }` it may use only these; a `*` at the end stands for any rest of a name. With `forget =
+true` in the braces the client has the right to forget keyframes of other clients, too.
 
-The folder is its owner's alone (0700), every file 0600 from its first byte, and replaced whole.
+Only the owner can read the folder (0700) and its files (0600 from the first byte). Files are replaced whole.
 """
 
 import logging
@@ -47,15 +47,15 @@ class Allowed(Struct, frozen=True):
 
     allowed: dict[str, str] = {}  # name → public key
     revoked: dict[str, str] = {}  # public key → the name it had
-    maps: dict[str, tuple[str, ...]] = {}  # name → the maps it may use; a name without may use every map
-    forget: tuple[str, ...] = ()  # names that may make the server forget keyframes of other clients
+    maps: dict[str, tuple[str, ...]] = {}  # name → its maps; a name that is absent may use every map
+    forget: tuple[str, ...] = ()  # names with the right to forget keyframes of other clients
 
 
 _KeyText = Annotated[str, Meta(max_length=64)]
 
 
 class _Entry(Struct, frozen=True, forbid_unknown_fields=True):
-    """A client in the file that may not use every map, or may make the server forget."""
+    """A client in the file that is limited to some maps, or has the right to forget."""
 
     key: _KeyText
     maps: Annotated[tuple[MapPattern, ...], Meta(max_length=256)] = ("*",)
@@ -63,7 +63,7 @@ class _Entry(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class _ListFile(Struct, frozen=True, forbid_unknown_fields=True):
-    """The allow-list as it stands in its file."""
+    """The content of the allow-list's file."""
 
     allowed: dict[ClientName, _KeyText | _Entry] = {}
     revoked: dict[str, ClientName] = {}
@@ -77,13 +77,13 @@ class Pair(Struct, frozen=True):
 
 
 def create_pair(folder: Folder, name: str, *, force: bool = False) -> Pair:
-    """Make a pair of keys under this name.
+    """Make a pair of keys for a name.
 
     Args:
-        force: replace the pair that is there.
+        force: replace an existing pair.
 
     Raises:
-        InvalidConfig: for a bad name, or one that has keys already.
+        InvalidConfig: for a bad name, or for a name that has keys already, without `force`.
         OutputError: when the files cannot be written.
     """
     check_name(name)
@@ -112,17 +112,17 @@ def allow(
     maps: Iterable[str] | None = None,
     forget: bool | None = None,
 ) -> str | None:
-    """Allow a client with this public key under this name; the name's earlier key is revoked.
+    """Allow a client with this name and public key. An earlier key of the name is revoked.
 
     Args:
-        key: 40 characters, or a file; None = the one that the name has.
-        maps: that it may use: names, or with a `*` at the end how names begin. None = those that the name
-            may use already, of a new name every map.
-        forget: whether it may make the server forget keyframes of other clients; None = as before, and a
-            new name may not.
+        key: 40 characters, or a file; None keeps the name's present key.
+        maps: names of maps that the client may use; a `*` at the end stands for any rest. None keeps the
+            name's present maps; a new name may then use every map.
+        forget: True gives the right to forget keyframes of other clients. None keeps the present right; a new
+            name then has none.
 
     Returns:
-        The name's earlier key, if it has another one now.
+        The name's earlier key if it was replaced, else None.
 
     Raises:
         InvalidConfig: for a bad name, key or map, a key that is taken, or a folder without a server's keys.
@@ -155,7 +155,7 @@ def allow(
 
 
 def revoke(folder: Folder, name: str) -> str:
-    """Revoke the key of the client of this name; returns the key.
+    """Revoke the key of a client's name. Return the key.
 
     Raises:
         InvalidConfig: when no key is allowed under the name.
@@ -188,7 +188,7 @@ def list_pairs(folder: Folder) -> list[Pair]:
 
 
 def has_allow_list(folder: Folder) -> bool:
-    """True if a folder has an allow-list, as only a server's has."""
+    """True if a folder has an allow-list. Only a server's folder has one."""
     return os.path.lexists(Path(folder).expanduser() / ALLOWED)
 
 
@@ -196,7 +196,7 @@ def read_allow_list(folder: Folder) -> Allowed:
     """Read the allow-list of a server's folder.
 
     Raises:
-        InvalidConfig: when it is missing or malformed, or others could change it.
+        InvalidConfig: when the list is missing or malformed, or other users can write the file.
     """
     path = Path(folder).expanduser() / ALLOWED
     try:
@@ -211,7 +211,7 @@ def read_allow_list(folder: Folder) -> Allowed:
 
 
 def check_name(name: str) -> None:
-    """Raise InvalidConfig unless a client can have this name."""
+    """Raise InvalidConfig unless the name is allowed for a client."""
     try:
         msgspec.convert(name, ClientName)
     except msgspec.ValidationError as error:
@@ -233,7 +233,7 @@ def _checked_patterns(maps: Iterable[str]) -> tuple[str, ...]:
 
 
 def _limits(rights: dict[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
-    """The rights without those of names that may use every map."""
+    """Return the limits to maps, without names that may use every map."""
     return {name: maps for name, maps in rights.items() if "*" not in maps}
 
 
@@ -304,7 +304,7 @@ def _check_not_taken(name: str, public: str, own: str, listed: Allowed) -> None:
 
 
 def _new_pair() -> tuple[str, str]:
-    """Draw a pair whose public key cannot be taken for an option."""
+    """Draw a pair whose public key does not begin with a character of command options."""
     while True:
         public, secret = (key.decode("ascii") for key in zmq.curve_keypair())
         if re.match("[0-9a-zA-Z]", public):
@@ -317,10 +317,10 @@ _RETRY = 1.0  # seconds
 
 
 class AllowedMaps(Struct, frozen=True):
-    """The maps that a key may send into, ask about and watch.
+    """The maps that a key may send keyframes into, ask about and watch.
 
     Attributes:
-        patterns: a map's name, or with `*` at its end the beginning of names; None = every map.
+        patterns: names of maps; a `*` at the end of one stands for any rest. None allows every map.
     """
 
     patterns: tuple[str, ...] | None = None
@@ -334,11 +334,11 @@ class AllowedMaps(Struct, frozen=True):
         return "every map" if self.patterns is None else ", ".join(self.patterns) or "no map"
 
     def denial(self, name: str) -> str:
-        """Reason why a map is not to be had. It does not say whether there is such a map."""
+        """Return the reason why this key may not use a map. It does not reveal if the map exists."""
         return f"this key may not use map {name}, but: {self}"
 
     def topics(self, topic: bytes) -> list[bytes]:
-        """The part of a subscription that is allowed: topics that begin with this one."""
+        """Return the allowed topics that a subscription to `topic` covers."""
         if self.patterns is None:
             return [topic]
         found = []
@@ -360,22 +360,22 @@ ALL_MAPS = AllowedMaps()
 
 
 class AllowList:
-    """Names and keys of the clients that may connect, as in the file now; nobody while it cannot be read."""
+    """The allow-list of a server, up to date with its file. It is empty while the file cannot be read."""
 
     def __init__(self, folder: Folder) -> None:
-        self.problem = ""  # reason why the file cannot be read; empty = it can
+        self.problem = ""  # reason why the file cannot be read; empty if it can
         self._folder = Path(folder).expanduser()
         self._path = self._folder / ALLOWED
-        self._seen: tuple[int, ...] | None = ()  # the file's stamp when it was read; None = there was none
-        self._again = 0.0  # when a list that cannot be read is tried once more, though nothing has changed
+        self._seen: tuple[int, ...] | None = ()  # the file's stamp when it was read; None without a file
+        self._again = 0.0  # when to read an unreadable file again, even an unchanged one
         self._names: dict[str, str] = {}  # public key → name
         self._revoked: dict[str, str] = {}
-        self._maps: dict[str, AllowedMaps] = {}  # name → what it may use
-        self._forget: frozenset[str] = frozenset()  # names that may forget keyframes of others, too
+        self._maps: dict[str, AllowedMaps] = {}  # name → its maps
+        self._forget: frozenset[str] = frozenset()  # names with the right to forget others' keyframes
         self.refresh()
 
     def refresh(self) -> bool:
-        """Read the file again if it changed. Returns True if a key lost its name or has other maps."""
+        """Read the file again if it changed. Return True if a key lost its name or got other maps."""
         seen = self._stamp()
         if seen == self._seen and not (self.problem and time.monotonic() > self._again):
             return False
@@ -400,7 +400,7 @@ class AllowList:
         )
 
     def name_of(self, key: str | None) -> str | None:
-        """The name under which a public key is allowed; None = it is not allowed."""
+        """Return the name under which a public key is allowed, or None if it is not allowed."""
         return self._names.get(key) if key is not None else None
 
     @property
@@ -409,22 +409,22 @@ class AllowList:
         return any(maps.patterns is not None for maps in self._maps.values())
 
     def maps_of(self, name: str) -> AllowedMaps:
-        """The maps that the client of a name may use."""
+        """Return the maps that a client may use."""
         return self._maps.get(name, AllowedMaps(()))
 
     def may_forget_all(self, name: str) -> bool:
-        """True if the client of a name may forget keyframes of others, too, in the maps that it may use."""
+        """True if a client has the right to forget keyframes of other clients, in its own maps."""
         return name in self._forget
 
     def rejection_reason(self, key: str) -> str:
-        """One word for the reason why a key is not allowed."""
+        """Return one word for the reason why a key is not allowed."""
         if self.problem:
             return "allow-list"
         return "revoked" if key in self._revoked else "unknown"
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of all clients that are allowed."""
+        """Names of all allowed clients, sorted."""
         return tuple(sorted(self._names.values()))
 
     def _stamp(self) -> tuple[int, ...] | None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Keyframes of a map that are to be forgotten, and those that were."""
+"""Messages about forgetting: a selection of keyframes, and the keyframes that were forgotten."""
 
 from typing import Annotated
 
@@ -17,16 +17,16 @@ _Bounds = tuple[float, float, float, float, float, float]
 
 
 class Selection(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """The keyframes for which all of this is true.
+    """The keyframes that match every attribute.
 
     Attributes:
-        session: how the session's id begins, hexadecimal; empty = any.
-        client: name that the sender's key is allowed under; None = any.
-        since_ns, until_ns: when the server journaled them, by its wall clock, both inclusive; below zero, so
-            long before the last record of a scanner. None = any.
-        numbers: first and last of each range of numbers in their session; None = any.
-        box: x, y, z of two opposite corners, metres, in the map's frame: the sensor was in it, and so is
-            nearly all that it measured; None = anywhere.
+        session: first hexadecimal digits of the session's id; empty matches any.
+        client: name under which the sender's key is allowed; None matches any.
+        since_ns, until_ns: first and last time of journaling, on the server's wall clock, both inclusive. A
+            negative time counts back from the last record of a scanner. None matches any.
+        numbers: first and last of each range of numbers in the session; None matches any.
+        box: x, y, z of two opposite corners, metres, in the map's frame. The sensor and nearly all measured
+            points were in this box. None matches any.
     """
 
     session: _SessionHex = ""
@@ -38,22 +38,22 @@ class Selection(Struct, frozen=True, kw_only=True, omit_defaults=True):
 
     @property
     def is_empty(self) -> bool:
-        """True if nothing is named, which would be every keyframe."""
+        """True if the selection has no condition, so it would match every keyframe."""
         return self == Selection()
 
     @property
     def counts_from_end(self) -> bool:
-        """True if a time is named as before the last record."""
+        """True if a time counts back from the last record."""
         return any(one is not None and one < 0 for one in (self.since_ns, self.until_ns))
 
     def at_end(self, last_ns: int) -> "Selection":
-        """The selection in a journal whose last record has this time."""
+        """Return the selection with absolute times, for a journal whose last record has time `last_ns`."""
         times = {name: getattr(self, name) for name in ("since_ns", "until_ns")}
         past = {name: last_ns + one for name, one in times.items() if one is not None and one < 0}
         return msgspec.structs.replace(self, **past)
 
     def has(self, *, session: bytes, client: str, seq: int, logged_ns: int) -> bool:
-        """True if a keyframe is selected, as far as that is known without its pose."""
+        """True if a keyframe matches all conditions but `box`, which needs its pose."""
         return (
             session.hex().startswith(self.session)
             and self.client in (None, client)
@@ -64,13 +64,13 @@ class Selection(Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class ForgottenSession(Struct, frozen=True, kw_only=True):
-    """The keyframes of one session that were selected.
+    """The selected keyframes of one session.
 
     Attributes:
-        session: its id, hexadecimal.
-        client: name that its key is allowed under; empty = it came without keys.
-        keyframes: that were not forgotten before.
-        selected: all of them, first and last number of each range.
+        session: id of the session, hexadecimal.
+        client: name under which the session's key is allowed; empty without keys.
+        keyframes: number of keyframes that were not forgotten before.
+        selected: all selected keyframes, first and last number of each range.
     """
 
     session: str
@@ -80,7 +80,6 @@ class ForgottenSession(Struct, frozen=True, kw_only=True):
 
     @property
     def numbers(self) -> NumberRanges:
-        """All of the selected keyframes."""
         return NumberRanges(self.selected)
 
 
@@ -88,11 +87,11 @@ class Forgotten(Struct, frozen=True, kw_only=True):
     """Result of a request to forget.
 
     Attributes:
-        sessions: that have keyframes of the selection.
-        erased: records whose bytes were deleted from the journal, those of earlier requests included.
-        quarantined: files that were deleted from the quarantine.
-        remains: files of the server that may still hold something of these keyframes.
-        unavailable: sessions with keyframes in the map that its journal has no more: these stay in the map.
+        sessions: sessions with selected keyframes.
+        erased: number of records whose bytes were deleted from the journal, also by earlier requests.
+        quarantined: number of files deleted from the quarantine.
+        remains: files of the server that may still hold bytes of these keyframes.
+        unavailable: sessions with keyframes in the map that the journal has lost; these stay in the map.
     """
 
     sessions: tuple[ForgottenSession, ...]
@@ -103,10 +102,10 @@ class Forgotten(Struct, frozen=True, kw_only=True):
 
     @property
     def keyframes(self) -> int:
-        """Number of keyframes that were forgotten now."""
+        """Number of keyframes that this request newly forgot."""
         return sum(one.keyframes for one in self.sessions)
 
     @property
     def selected(self) -> int:
-        """Number of keyframes that were selected, those that were forgotten before included."""
+        """Number of selected keyframes, also those forgotten before."""
         return sum(len(one.numbers) for one in self.sessions)

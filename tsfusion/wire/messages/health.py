@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Health and status of a server and its maps, as they are sent to whoever asks."""
+"""Health and status of a server and its maps, as the server sends them to clients."""
 
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -13,7 +13,7 @@ from tsfusion.geometry.up_direction import Up
 
 
 class Spread(Struct, frozen=True, kw_only=True):
-    """Statistics of a duration over `count` keyframes, milliseconds; all 0 where there is none."""
+    """Statistics of a duration over `count` keyframes, in milliseconds; all 0 without keyframes."""
 
     count: int = 0
     mean: float = 0.0
@@ -37,7 +37,7 @@ def spread(values_ms: NDArray[np.float64]) -> Spread:
 class MeshLayout(Struct, frozen=True, kw_only=True):
     """Row counts of the frames that follow: vertices float32, faces int32, normals float32, colors uint8.
 
-    `up` is of a whole map; None = not known.
+    `up` is the up direction, sent with whole maps only; None if not known.
     """
 
     vertices: int
@@ -50,14 +50,14 @@ MapState = Literal["opening", "idle", "busy", "restarting", "failed"]
 
 
 class Figure(NamedTuple):
-    """Figure of `/metrics` that a field of `MapHealth` is, for each map.
+    """Description of the `/metrics` figure that a field of `MapHealth` becomes, for each map.
 
     Attributes:
-        words: sentence that explains it.
-        name: without `tsfusion_`; empty = the field's.
-        by: name of the label, where the field is a count by reason.
-        grows: whether it never falls while the server runs: a counter.
-        unit: what one of the field is of the figure.
+        words: sentence that explains the figure.
+        name: name without `tsfusion_`; empty takes the field's name.
+        by: name of the label, for a field that counts by reason.
+        grows: True for a counter: the figure never falls while the server runs.
+        unit: factor from the field to the figure.
     """
 
     words: str
@@ -68,7 +68,7 @@ class Figure(NamedTuple):
 
 
 class MapCounts(Struct, frozen=True, kw_only=True):
-    """Counts of one map that both its health and its status have."""
+    """Counts of one map that its health and its status share."""
 
     keyframes_durable: Annotated[int, Figure("Keyframes that were journaled.")]
     keyframes_fused: Annotated[int, Figure("Keyframes in the map.")]
@@ -83,9 +83,9 @@ class MapCounts(Struct, frozen=True, kw_only=True):
     delay_bound_ms: Annotated[
         float, Figure("The total delays are right to within ±.", "delay_bound_seconds", unit=1e-3)
     ]
-    # Those whose newest pose is not fused yet; 0 = the map is settled
+    # Keyframes whose newest pose is not fused yet; 0 if the map is settled
     corrections_waiting: Annotated[int, Figure("Keyframes not yet at their new pose.")] = 0
-    # They stay where they were fused: the journal has them no more
+    # These keyframes stay where they were fused: the journal no longer has them
     corrections_unavailable: Annotated[int, Figure("Keyframes that a correction cannot move any more.")] = 0
     keyframes_moved: int = 0  # fused at a corrected pose, or taken out, since the fuser began
     moving_s: float = 0.0  # seconds of the fuser for that
@@ -94,29 +94,29 @@ class MapCounts(Struct, frozen=True, kw_only=True):
 
 
 class MapHealth(MapCounts, frozen=True, kw_only=True):
-    """Health of one map, as far as the gateway knows it without asking the fuser."""
+    """Health of one map, from what the gateway knows without asking the fuser."""
 
     state: MapState
-    # Reason why keyframes are not accepted or not fused; empty = they are
+    # Reason why keyframes are not accepted or not fused; empty without a problem
     problem: Annotated[str, Figure("Whether something keeps it from taking or fusing.", "map_problem")]
     waiting: Annotated[int, Figure("Keyframes journaled and not yet fused.", "keyframes_waiting")]
     rejected: Annotated[
         dict[str, int], Figure("Keyframes journaled, but not fusable.", "keyframes_rejected", "reason")
     ]
     quarantined: Annotated[int, Figure("Keyframes kept aside for inspection.", "keyframes_quarantined")]
-    # Seconds since the last keyframe was journaled; None = none since the server began
+    # Seconds since the last keyframe was journaled; None before the server's first one
     last_keyframe_s: float | None
     # Records of corrected poses: in the journal at the start, and journaled since
     corrections: Annotated[int, Figure("Corrections of keyframes' poses in the journal.", grows=True)] = 0
     checkpoints: int = 0  # written since the server began
     journal_missing: Annotated[int, Figure("Segments of the journal that are gone.")] = 0
-    journal_put_back: int = 0  # times that the segment being written was taken away, and written again
-    fusing_s: float = 0.0  # seconds since the fuser's last answer, while keyframes wait for one
+    journal_put_back: int = 0  # times that the segment being written was deleted, and written again
+    fusing_s: float = 0.0  # seconds since the fuser's last answer, while it has keyframes to answer
     # By outcome: answered, refused, late, failed; since the map was opened
     questions: Annotated[
         dict[str, int], Figure("Questions to the map, by what became of them.", by="outcome", grows=True)
     ] = {}
-    mesh_epoch: str = ""  # of the newest mesh update (`mesh_updates.MeshUpdate`); empty = none yet
+    mesh_epoch: str = ""  # epoch of the newest mesh update (`mesh_updates.MeshUpdate`); empty before it
     mesh_number: int = 0
     question_ms: Spread = Spread()  # from question to answer, in the server, of the newest 1024
 
@@ -125,7 +125,7 @@ ClientState = Literal["connected", "silent", "gone"]
 
 
 class ClientHealth(Struct, frozen=True, kw_only=True):
-    """Health of one session that sent a message since the server began."""
+    """Health of one session that has sent a message since the server began."""
 
     client: str  # name that its key is allowed under; empty without keys
     session: str  # first 8 hexadecimal digits of its number
@@ -136,25 +136,25 @@ class ClientHealth(Struct, frozen=True, kw_only=True):
     received_bytes: int
     waiting: int  # number of keyframes in its spool, as in its last Ping
     skipped: dict[str, int]  # number of keyframes that it never sent, by reason, as in its last Ping
-    held: str  # reason why no keyframe of it is accepted now; empty = they are
+    held: str  # reason why its keyframes are not accepted now; empty if they are
     corrections: int = 0  # in the journal
     # silent: nothing was heard for 5 s; gone: it said goodbye, or nothing was heard for 30 s
     state: ClientState = "connected"
-    address: str = ""  # of its machine; empty = not known
+    address: str = ""  # address of its machine; empty if not known
     refused: int = 0  # number of its keyframes and corrections that were turned away for good, not journaled
     rejected: int = 0  # number of its keyframes that the map could not take, since the server began
 
 
 class Health(Struct, frozen=True, kw_only=True):
-    """Health of a server, answered at once whatever its fusers do. Counts begin with its start.
+    """Health of a server, answered at once even while its fusers are busy. Counts begin with its start.
 
-    `ready`: keyframes are accepted, journaled and fused, into one map at least: a server with three good maps
-    and a bad one is ready, for whoever sends to the good ones. Not ready is a server that starts or ends,
-    that nobody can connect to, or of which every map has a `MapHealth.problem`.
+    `ready`: the server accepts, journals and fuses keyframes, into at least one map. A server with three good
+    maps and a bad one is ready, for clients of the good maps. A server is not ready while it starts or ends,
+    while nobody can connect to it, or while every map has a `MapHealth.problem`.
 
-    `problems`: why it is not ready, and all else that a person has to know of and may put right: a map that
-    takes or fuses nothing, whose fuser starts again, or that cannot be opened; a client of which next to no
-    keyframe comes into the map. One line each, with how long it has been so; it is gone when it is over.
+    `problems`: reasons why the server is not ready, and other problems that a person can solve. Examples: a
+    map without progress, a fuser that restarts, a client whose keyframes do not reach the map. One line each,
+    with its duration; a line goes when the problem is over.
     """
 
     ready: bool
@@ -169,14 +169,14 @@ class Health(Struct, frozen=True, kw_only=True):
 
 
 class Status(MapCounts, frozen=True, kw_only=True):
-    """Status of a map. Counts are of the whole journal and map, the delay is of this process."""
+    """Status of a map. Counts are of the whole journal and map; the delay is of this process."""
 
     epoch: str
     map: str
-    state: str  # the map's folder
+    state: str  # path of the map's folder
     fuser: Literal["starting", "idle", "busy"]
     uptime_s: float
-    keyframes_rejected: dict[str, int]  # journaled, but not fusable: reason → count
+    keyframes_rejected: dict[str, int]  # journaled, but not in the map: reason → count
     messages_refused: dict[str, int]  # never journaled: reason → count
     duplicates: int
     voxels: int
@@ -187,19 +187,19 @@ class Status(MapCounts, frozen=True, kw_only=True):
     versions: dict[str, str]
 
 
-_RECENT = 10.0  # seconds since the last keyframe in which a server counts as working
-_STILL = 5.0  # seconds in which keyframes wait and none is fused, until that is said
+_RECENT = 10.0  # a server counts as working for so many seconds after a keyframe
+_STILL = 5.0  # a map without progress for so many seconds is in trouble
 
 
 def headline(
     health: Health, *, only: str = "", rate: float = 0.0, still: dict[str, float] | None = None
 ) -> Headline:
-    """The state of a server in words.
+    """Return the state of a server in words.
 
     Args:
-        only: one map and its clients; empty = all.
-        rate: keyframes fused a second; 0 = not known.
-        still: map → seconds in which keyframes waited there and none was fused, as far as the caller knows.
+        only: name of a map: this map and its clients alone; empty takes all.
+        rate: keyframes fused a second; 0 if not known.
+        still: map → seconds in which keyframes waited and none was fused, measured by the caller.
     """
     maps = {name: one for name, one in health.maps.items() if only in ("", name)}
     clients = [one for one in health.clients if only in ("", one.map)]
@@ -218,17 +218,17 @@ def headline(
 
 
 def lost_of_map(one: MapHealth) -> int:
-    """Keyframes of the journal that are not in the map and will not be."""
+    """Return the number of journaled keyframes that will never be in the map."""
     return sum(one.rejected.values()) + one.journal_damaged
 
 
 def lost_of_client(one: ClientHealth) -> int:
-    """Keyframes that the client never sent, or that the server turned away."""
+    """Return the number of keyframes that the client never sent, or that the server refused."""
     return one.refused + sum(one.skipped.values())
 
 
 def _trouble(health: Health, maps: dict[str, MapHealth], still: dict[str, float]) -> str:
-    """Reason why a server or a map of it does not work: a few words, as the problems are told at length."""
+    """Return in a few words why a server or one of its maps does not work; empty without trouble."""
     longest = max((max(still.get(name, 0.0), one.fusing_s) for name, one in maps.items()), default=0.0)
     if longest >= _STILL:
         return f"nothing fused for {span(longest)}"

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Messages to viewers of a map: the triangles that have changed, and the keyframes as they come.
+"""Messages to viewers of a map: changed triangles, and keyframes as they come.
 
-A message of either kind begins with its topic, `mesh/MAP/` or `scan/MAP/`, then one of these structs as
-msgpack. After `Meshed` come the cells, (n, 3) int32, and the frames of `MeshLayout`: these triangles replace
-all earlier ones in these cells, which are blocks of 8³ voxels. After `Scanned` comes a JPEG, or nothing.
+Each message begins with its topic, `mesh/MAP/` or `scan/MAP/`. One of these structs follows, as msgpack.
+After `Meshed` come the cells, (n, 3) int32 block coordinates, and the frames of `MeshLayout`. These triangles
+replace all earlier ones of these cells. After `Scanned` comes a JPEG, or nothing.
 
-Each kind is numbered: who misses a number asks for what has changed since (`questions.Cells`).
+Each kind is numbered: a viewer that misses a number asks for the changes since (`questions.Cells`).
 """
 
 import msgspec
@@ -17,19 +17,19 @@ from tsfusion.wire.records.record_header import SessionId, TransformRows
 
 
 class MeshUpdate(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """Facts about a mesh update.
+    """Description of a mesh update.
 
     Attributes:
-        epoch: process of the server that fuses the map; a new one begins all numbers again.
-        number: of this update, from 1 on; some are of no triangles, and not sent.
-        stamp: of the newest keyframe in the map (`Volume.stamp`).
-        sent_until: stamp up to which all changes were sent, with this update and those before; `drops`:
-            `Volume.drops` then.
-        refined: whether it is the surface that the map's settings ask for.
-        settled: whether all cells were sent with that surface since they changed.
-        first_face: (n + 1,) int32, little-endian: where the faces of each cell begin.
-        client: (n,) int32: the row in `sessions` of who saw the cell last; −1 = not known.
-        sessions: of scanners.
+        epoch: process of the server that fuses the map; a new process starts all numbers again.
+        number: number of this update, from 1; updates without triangles count, but are not sent.
+        stamp: stamp of the newest keyframe in the map (`Volume.stamp`).
+        sent_until: stamp up to which all changes are sent, by this update and those before.
+        drops: `Volume.drops` at that stamp.
+        refined: True if the surface is the one that the map's settings ask for.
+        settled: True if all changed cells have been sent with that surface.
+        first_face: (n + 1,) int32, little-endian: index of each cell's first face.
+        client: (n,) int32: row in `sessions` of the session that saw the cell last, or −1 if not known.
+        sessions: sessions of scanners.
     """
 
     epoch: str
@@ -45,9 +45,9 @@ class MeshUpdate(Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class Meshed(Struct, frozen=True, tag="meshed"):
-    """Meshes have the first `count` keyframes that this process answered; viewers get the changed part.
+    """The first `count` keyframes that this process answered are in the mesh. The changed cells follow.
 
-    The changed part comes with the raw surface first, and again, with `blocks` = 0, once it is regularised.
+    Changed cells come with the raw surface first. They come again, with `blocks` = 0, once they are smoothed.
     """
 
     count: int
@@ -60,15 +60,15 @@ class Meshed(Struct, frozen=True, tag="meshed"):
 
 
 class Scanned(Struct, frozen=True, tag="scanned", omit_defaults=True):
-    """A scanner sent a keyframe, and the server has it. Its picture may follow, and may also come later.
+    """A scanner sent a keyframe, and the server has it. Its picture follows now, later, or never.
 
     Attributes:
-        session, seq: of the keyframe.
-        pose: the upper three rows of `T_world_camera`, row by row, as the scanner sent it.
-        epoch, number: of the server, and of this message among those of its map.
-        intrinsics, shape: of its images, pixels; None = there are none.
-        client: name that its key is allowed under; empty without keys.
-        late: whether it was sent before, without its picture.
+        session, seq: session and number of the keyframe.
+        pose: upper three rows of `T_world_camera`, row by row, as the scanner sent it.
+        epoch, number: epoch of the server, and number of this message among those of its map.
+        intrinsics, shape: of the keyframe's images, in pixels; None without images.
+        client: name under which the scanner's key is allowed; empty without keys.
+        late: True if the message was sent before, without its picture.
     """
 
     session: SessionId

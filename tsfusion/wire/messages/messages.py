@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Control messages between scanner and server (msgpack of tagged structs).
 
-All `*_ns` stamps of the server are its own monotonic clock; the client shifts them to its own.
+All `*_ns` stamps of the server are on its own monotonic clock; the client shifts them to its own clock.
 """
 
 from typing import Annotated, Any, Literal
@@ -18,8 +18,8 @@ from tsfusion.wire.messages.migration_messages import Address, HandOver, Moved, 
 from tsfusion.wire.messages.questions import Answer, Question
 from tsfusion.wire.records.record_header import SessionId, WorldName, is_damaged, seal
 
-PROTOCOL_VERSION = 3  # of these messages and of which kinds of records a server takes
-# Why a client never sends a keyframe: the reasons in `Ping.skipped`, in words
+PROTOCOL_VERSION = 3  # covers these messages, and the kinds of records that a server takes
+# Reasons why a client never sends a keyframe: the keys of `Ping.skipped`, in words
 SKIP_REASONS = {
     "thinned": "the map was too far behind",
     "room": "the spool's room ran short",
@@ -31,7 +31,7 @@ Counts = dict[Annotated[str, Meta(max_length=32)], Annotated[int, Meta(ge=0)]]  
 
 
 def other_version(*, server: int, client: int) -> str:
-    """Reason why a server and a client do not talk; empty = they speak one version."""
+    """Return the reason why a server and a client cannot talk; empty if they speak the same version."""
     if server == client:
         return ""
     return (
@@ -40,7 +40,7 @@ def other_version(*, server: int, client: int) -> str:
 
 
 def explained(counts: dict[str, int]) -> str:
-    """{"thinned": 2} → 2 × thinned (the map was too far behind)."""
+    """Return counts in words: {"thinned": 2} → 2 × thinned (the map was too far behind)."""
     named = {reason: f"{reason} ({SKIP_REASONS[reason]})" for reason in counts if reason in SKIP_REASONS}
     return counted({named.get(reason, reason): count for reason, count in counts.items()})
 
@@ -60,9 +60,9 @@ class Stamps(Struct, frozen=True, array_like=True):
 
 
 class KeyframeTimes(Struct, kw_only=True):
-    """The latency ledger's row: one keyframe, every stamp on the client's monotonic clock; 0 = unknown.
+    """All stamps of one keyframe, on the client's monotonic clock; 0 if not known.
 
-    `clock_bound_ns`: the server's stamps are right to within ± this (half the best round trip).
+    `clock_bound_ns`: largest error of the server's stamps (half the best round trip).
     """
 
     seq: int
@@ -90,7 +90,7 @@ DELAY = ("captured_ns", "fused_ns")
 
 
 class Hello(Struct, frozen=True, tag="hello", omit_defaults=True):
-    """A client opens (or re-opens) its session.
+    """A client opens (or opens again) its session.
 
     Attributes:
         version: `PROTOCOL_VERSION` of the client.
@@ -105,21 +105,21 @@ class Hello(Struct, frozen=True, tag="hello", omit_defaults=True):
 
 
 class Welcome(Struct, frozen=True, tag="welcome"):
-    """The server's answer. A new `epoch` is a new server process: resend everything after `durable`."""
+    """The answer to a Hello that opens the session. After a new `epoch`, send all after `durable` again."""
 
     epoch: str
     version: int
-    durable: Seq  # the highest seq of this session that is on the server's disk; 0 = none
-    fused: Seq  # the highest that the map has taken or refused; 0 = none
-    window_keyframes: int  # credit: sent, not yet durable
+    durable: Seq  # highest seq of this session on the server's disk; 0 without one
+    fused: Seq  # highest seq that the map has taken or rejected; 0 without one
+    window_keyframes: int  # most keyframes that may be sent and not yet durable
     window_bytes: int
     max_frame_bytes: int
 
 
 class Ack(Struct, frozen=True, tag="ack"):
-    """Progress. Everything up to `durable` may leave the spool.
+    """Progress. Records up to `durable` are on the server's disk: delete them from the spool.
 
-    `resend` asks to go back to durable + 1 at once: something in between never came.
+    `resend`: a record is missing; send all again from durable + 1, at once.
     """
 
     session: SessionId
@@ -133,8 +133,8 @@ class Nack(Struct, frozen=True, tag="nack"):
     """Refusal of a record, a keyframe or a correction, that will never count.
 
     Attributes:
-        stage: `door` = it was not journaled and must not be sent again; `map` = it is journaled, but the
-            map could not take it.
+        stage: `door`: the record was not journaled; do not send it again. `map`: it is journaled, but the map
+            could not take it.
     """
 
     session: SessionId
@@ -145,7 +145,7 @@ class Nack(Struct, frozen=True, tag="nack"):
 
 
 class Hold(Struct, frozen=True, tag="hold"):
-    """No keyframe of this session is accepted for `seconds`: keep all, then go on from durable + 1.
+    """No keyframe of this session is accepted for `seconds`. Keep them, then go on from durable + 1.
 
     `reason`: `disk` (full or failing) or `quota`; `message` explains it to a person.
     """
@@ -157,16 +157,16 @@ class Hold(Struct, frozen=True, tag="hold"):
 
 
 class Denied(Struct, frozen=True, tag="denied", omit_defaults=True):
-    """The answer to a Hello that opens no session (yet): ask again, but tell the user why.
+    """The answer to a Hello that opens no session (yet). Tell the user why, and ask again.
 
-    Also the answer to a record whose session must be opened first, or whose world the map is not of.
+    It also answers a record whose session is not open, or whose world is not the map's.
 
     Attributes:
-        reason: `opening` (the map is being opened), `map` (there is no such map, and no room for one, or it
-            cannot be opened), `session` (it is another client's), `world` (the map has keyframes of another
-            world), `moved` (another server has the map) or `version`.
-        free_map: of `world`, the name of a map that nobody has yet.
-        address, control: of `moved`, the data and control address of that server.
+        reason: `opening` (the map is being opened), `map` (the map cannot be opened, or there is no room for
+            it), `session` (it belongs to another client), `world` (the map has keyframes of another world),
+            `moved` (another server has the map) or `version`.
+        free_map: with `world`, the name of a map that does not exist yet.
+        address, control: with `moved`, data and control address of the other server.
     """
 
     session: SessionId
@@ -178,15 +178,15 @@ class Denied(Struct, frozen=True, tag="denied", omit_defaults=True):
 
 
 class Ping(Struct, frozen=True, tag="ping", omit_defaults=True):
-    """Sign of life of a client, and how it is doing.
+    """Sign of life of a client, with its figures.
 
     Attributes:
-        offset_ns: the client's estimate of the server's clock minus its own (None = not yet known).
+        offset_ns: the client's estimate of the server's clock minus its own; None if not known yet.
         bound_ns: error bound of this estimate.
         waiting: number of keyframes in its spool.
         skipped: number of keyframes that were not spooled or left the spool unsent, by reason, since the
             client began.
-        leaving: whether it is the client's last message.
+        leaving: True in the client's last message.
     """
 
     session: Annotated[bytes, Meta(max_length=16)]
@@ -201,7 +201,7 @@ class Ping(Struct, frozen=True, tag="ping", omit_defaults=True):
 class Pong(Struct, frozen=True, tag="pong"):
     """The answer to a Ping.
 
-    `corrections_waiting`: as in `MapHealth`, when the map had everything up to `fused`; None = not known.
+    `corrections_waiting`: as in `MapHealth`, when the map had everything up to `fused`; None if not known.
     """
 
     epoch: str
@@ -214,25 +214,25 @@ class Pong(Struct, frozen=True, tag="pong"):
 
 
 class Command(Struct, frozen=True, tag="command", kw_only=True):
-    """A request of a person or program; answered by one Reply. The points of an `ask` follow as frames."""
+    """A request of a person or program, answered by one Reply. The points of an `ask` follow as frames."""
 
     name: Literal["ping", "health", "status", "mesh", "new_map", "forget", "ask", "move", "hand_over"]
-    map: MapName = "default"  # of `new_map`: the name to begin with, where that is free
+    map: MapName = "default"  # `new_map`: the wished name, taken if it is free
     min_weight: float | None = None
-    selection: Selection | None = None  # of `forget`, with the two that follow
+    selection: Selection | None = None  # this and the next two: `forget`
     erase: bool = False  # also delete the records' bytes
     dry_run: bool = False  # only say what would be forgotten
-    source: Address = ""  # of `move`: the data address of the server that has the map
-    source_control: Address = ""  # its control address; empty = the next port
+    source: Address = ""  # `move`: the data address of the server that has the map
+    source_control: Address = ""  # its control address; empty takes the next port
     hand_over: HandOver | None = None
-    question: Question | None = None  # of `ask`, with what follows
+    question: Question | None = None  # this and all below: `ask`
     number: Annotated[int, Meta(ge=0)] = 0  # comes back with the answer
-    timeout_s: float = 1.0  # then nobody waits for the answer any more
-    compress: bool = False  # large arrays of the answer
+    timeout_s: float = 1.0  # after it, the client no longer waits for the answer
+    compress: bool = False  # compress large arrays of the answer
 
 
 class Elsewhere(Struct, frozen=True):
-    """Data and control address of the server that a map is at; an empty one is the port after the other."""
+    """Data and control address of the server that has a map; an empty `control` is the next port."""
 
     address: str
     control: str = ""
@@ -243,18 +243,18 @@ class Reply(Struct, frozen=True, tag="reply", kw_only=True, omit_defaults=True):
 
     name: str
     error: str | None = None  # why there is no answer, for a person
-    retry: bool = False  # whether the same command may be answered soon, though it is not now
-    map: MapName | None = None  # a name that is free, and kept for who asked
+    retry: bool = False  # True if the same command may succeed soon
+    map: MapName | None = None  # a free name, kept for the client that asked
     health: "Health | None" = None
     status: "Status | None" = None
     mesh: "MeshLayout | None" = None
     forgotten: Forgotten | None = None
     moved: Moved | None = None
-    elsewhere: Elsewhere | None = None  # where the command's map is, if another server has it
-    parcel: Parcel | None = None  # of `hand_over`
-    version: int = 2  # of a ping: the server's `PROTOCOL_VERSION`, which servers of version 2 leave out
-    number: int = 0  # of the question
-    late: bool = False  # whether its time was over
+    elsewhere: Elsewhere | None = None  # the server that has the command's map, if it is another one
+    parcel: Parcel | None = None  # answer to `hand_over`
+    version: int = 2  # answer to a ping: `PROTOCOL_VERSION`, which servers of version 2 leave out
+    number: int = 0  # number of the question
+    late: bool = False  # True if the question's time was over
     answer: Answer | None = None  # arrays follow as frames
 
 
@@ -266,17 +266,17 @@ encode = msgspec.msgpack.encode
 
 
 def encode_sealed(message: ToServer | ToClient) -> bytes:
-    """Encode a message for the way, with a seal by which the other end knows that it is whole."""
+    """Encode a message, with a seal (CRC-32) by which the receiver detects damage."""
     return seal(encode(message))
 
 
 def decode_to_server(frame: Any) -> ToServer:
-    """Decode a message to the server; raises DecodeError for anything else."""
+    """Decode a message to the server. Raise DecodeError for anything else."""
     return _decode(_TO_SERVER, frame)  # type: ignore[no-any-return]
 
 
 def decode_to_client(frame: Any) -> ToClient:
-    """Decode a message to the client; raises DecodeError for anything else."""
+    """Decode a message to the client. Raise DecodeError for anything else."""
     return _decode(_TO_CLIENT, frame)  # type: ignore[no-any-return]
 
 

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""Messages between two servers when a map moves: the one that gets it asks, the other answers.
+"""Messages between two servers when a map moves: the taker asks, the giver answers.
 
-    list    the map's files; from then on none of them is deleted, and a checkpoint is written
+    list    the map's files; from now on the giver deletes none, and writes a checkpoint
     read    a piece of a file
-    freeze  no record is taken any more; the files as they stay, and how far each session is
-    commit  the map is the other server's: written down before it is answered, and answered so ever after
+    freeze  the giver takes no more records; the final files, and the progress of each session
+    commit  the map belongs to the taker: written to the giver's disk first; always answered the same way
     cancel  the map stays, and takes records again
 
-Who may write is decided in one place: by the giver's disk, at `commit`. Before, the map is the giver's, and
-the taker's copy is worth nothing; afterwards it is the taker's, and the giver sends every client there.
+One disk decides who owns the map: the giver's, at `commit`. Before, the giver owns it and the taker's copy is
+worth nothing. Afterwards the taker owns it, and the giver sends every client to the taker.
 """
 
 from typing import Annotated, Any, Literal
@@ -25,12 +25,12 @@ Address = Annotated[str, Meta(max_length=256)]
 
 
 class HandOver(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """A question of the server that is to have the map.
+    """A question of the taker.
 
     Attributes:
-        move: drawn for this move.
-        file, offset: of `read`.
-        address, control: of `commit`, where clients find the map from then on.
+        move: 16 random bytes, the id of this move.
+        file, offset: with `read`, the file and the first byte of the piece.
+        address, control: with `commit`, the taker's addresses for clients.
     """
 
     move: MoveId
@@ -42,7 +42,7 @@ class HandOver(Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class MapFile(Struct, frozen=True):
-    """A file of a map. One of another version is another file in its place."""
+    """A file of a map. A new `version` is a new file under the same name."""
 
     name: Annotated[str, Meta(pattern=rf"\A{FILE_NAME}\Z")]
     nbytes: Natural
@@ -50,7 +50,7 @@ class MapFile(Struct, frozen=True):
 
 
 class MovedSession(Struct, frozen=True):
-    """Progress of a session: what was acknowledged must be known before the map is read."""
+    """Progress of a session. The taker must know acknowledged records before it reads the map."""
 
     key: SessionId
     client: str
@@ -59,13 +59,13 @@ class MovedSession(Struct, frozen=True):
 
 
 class Parcel(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """The answer: of `read`, the piece follows as a frame.
+    """The answer of the giver. After a `read` the piece follows as a frame.
 
     Attributes:
-        volume: the map's settings.
-        is_saved: of `list`, whether the checkpoint that the first one asked for is there.
-        sessions: of `freeze`.
-        crc32: of the piece.
+        volume: settings of the map.
+        is_saved: with `list`, True once the checkpoint that the first `list` ordered is written.
+        sessions: with `freeze`.
+        crc32: CRC-32 of the piece.
     """
 
     files: Annotated[tuple[MapFile, ...], Meta(max_length=MOST_FILES)] = ()
@@ -76,7 +76,7 @@ class Parcel(Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class Moved(Struct, frozen=True):
-    """Outcome of a move.
+    """Result of a move.
 
     Attributes:
         frozen_s: seconds in which the map took no records.

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Questions to the map of a running server, and their answers: small structs, then arrays as raw frames.
 
-A question has bounds that the server checks before it spends anything: points, pixels, cells. An answer
-belongs to one state of the map, and says which.
+The server checks the limits of a question (points, pixels, cells) before any work. An answer names the one
+state of the map that it belongs to.
 """
 
 import math
@@ -23,11 +23,11 @@ from tsfusion.wire.sockets.sockets import CONTROL_MAX_BYTES
 
 MOST_POINTS = 20_000  # of a question
 MOST_PIXELS = 1 << 20  # of a view
-MOST_CELLS = 1 << 20  # of a slice, with those around it from which its distances come
-MOST_VOXELS = 1 << 22  # of a distance field, likewise
-FARTHEST_M = 100.0  # that a distance field reaches
+MOST_CELLS = 1 << 20  # of a slice, with the cells around it that its distances need
+MOST_VOXELS = 1 << 22  # of a distance field, with the voxels around it
+FARTHEST_M = 100.0  # largest `max_distance` of a distance field
 CELLS_AT_ONCE = 256  # of an answer
-REFINED_AT_ONCE = 64  # likewise, where the surface is not the raw one
+REFINED_AT_ONCE = 64  # of an answer with the refined surface
 KEYFRAMES_AT_ONCE = 4096
 LONGEST_S = 60.0  # that a question may wait
 LATE = "its time was over before the map came to it"
@@ -40,12 +40,12 @@ Matrix16 = Annotated[tuple[float, ...], Meta(min_length=16, max_length=16)]
 
 
 class Sample(Struct, frozen=True, tag="sample", omit_defaults=True):
-    """How far is the surface from these points? They follow as (n, 3) float32 metres, little-endian.
+    """How far is the surface from these points? The points follow as (n, 3) float32 metres, little-endian.
 
     Attributes:
         points: n.
-        crc: CRC-32 of their bytes.
-        min_weight, surface: as of `Volume.sample`.
+        crc: CRC-32 of the points' bytes.
+        min_weight, surface: as for `Volume.sample`.
     """
 
     points: int
@@ -55,11 +55,11 @@ class Sample(Struct, frozen=True, tag="sample", omit_defaults=True):
 
     @property
     def most_bytes(self) -> int:
-        """Size of its answer, at the most."""
+        """Upper bound of the size of the answer."""
         return 20 * self.points
 
     def problem(self, frames: Sequence[Any]) -> str:
-        """Reason why this is not to be asked; empty = it may be. `frames`: what came with it."""
+        """Return the reason why the question is invalid, or "". `frames`: frames that came with it."""
         if not 1 <= self.points <= MOST_POINTS:
             return f"a question may have 1 to {MOST_POINTS} points, got {self.points}: ask in parts"
         if sum(map(len, frames)) != 12 * self.points:
@@ -72,14 +72,14 @@ class Sample(Struct, frozen=True, tag="sample", omit_defaults=True):
 
 
 class Raycast(Struct, frozen=True, tag="raycast", omit_defaults=True):
-    """Question for the view of a pinhole camera. Arguments as of `Volume.raycast`.
+    """Question for the view of a pinhole camera. Arguments as for `Volume.raycast`.
 
     Attributes:
         intrinsics: fx, fy, cx, cy, pixels.
         pose: the 16 numbers of T_world_camera, row by row.
         shape: height, width, pixels.
-        max_age: seconds since which the state of the map that is shown may not be the newest any more.
-        normals, colors: whether with them.
+        max_age: seconds by which the shown state of the map may be older than the newest state.
+        normals, colors: True to get them.
     """
 
     intrinsics: tuple[float, float, float, float]
@@ -93,11 +93,11 @@ class Raycast(Struct, frozen=True, tag="raycast", omit_defaults=True):
 
     @property
     def most_bytes(self) -> int:
-        """Size of its answer, at the most."""
+        """Upper bound of the size of the answer."""
         return (4 + 12 * self.normals + 3 * self.colors) * math.prod(self.shape)
 
     def problem(self, frames: Sequence[Any]) -> str:
-        """Reason why this is not to be asked; empty = it may be. `frames`: what came with it."""
+        """Return the reason why the question is invalid, or "". `frames`: frames that came with it."""
         if frames:
             return "a view has no points"
         try:
@@ -112,16 +112,16 @@ class Raycast(Struct, frozen=True, tag="raycast", omit_defaults=True):
 
     @property
     def matrix(self) -> NDArray[np.float64]:
-        """The pose T_world_camera, (4, 4)."""
+        """The pose T_world_camera, (4, 4) float64."""
         return np.array(self.pose, np.float64).reshape(4, 4)
 
 
 class Slice(Struct, frozen=True, tag="slice", omit_defaults=True):
-    """Question for what stands between two heights. Arguments as of `Volume.current_slice`.
+    """Question for the obstacles between two heights. Arguments as for `Volume.current_slice`.
 
     Attributes:
-        kind: `occupancy`, or also distances.
-        up: a direction in the map's frame. It is not looked for here: that takes the whole mesh.
+        kind: `occupancy`, or `distance` for distances too.
+        up: up direction in the map's frame. The server does not find it: that takes the whole mesh.
     """
 
     kind: Literal["occupancy", "distance"]
@@ -135,11 +135,11 @@ class Slice(Struct, frozen=True, tag="slice", omit_defaults=True):
 
     @property
     def most_bytes(self) -> int:
-        """Size of its answer, at the most."""
+        """Upper bound of the size of the answer."""
         return 5 * MOST_CELLS
 
     def problem(self, frames: Sequence[Any]) -> str:
-        """Reason why this is not to be asked; empty = it may be. `frames`: what came with it."""
+        """Return the reason why the question is invalid, or "". `frames`: frames that came with it."""
         numbers = (self.low, self.high, *self.up, *(self.box or ()), self.resolution or 0, self.max_distance)
         if frames or not all(map(math.isfinite, numbers)):
             return "a slice has finite numbers and no points"
@@ -153,7 +153,7 @@ class Slice(Struct, frozen=True, tag="slice", omit_defaults=True):
 
 
 class Field(Struct, frozen=True, tag="field", omit_defaults=True):
-    """How far is the surface from each voxel of a box? Arguments as of `Volume.distance_field`."""
+    """How far is the surface from each voxel of a box? Arguments as for `Volume.distance_field`."""
 
     box: tuple[float, float, float, float, float, float]
     max_distance: float
@@ -162,11 +162,11 @@ class Field(Struct, frozen=True, tag="field", omit_defaults=True):
 
     @property
     def most_bytes(self) -> int:
-        """Size of its answer, at the most."""
+        """Upper bound of the size of the answer."""
         return 5 * MOST_VOXELS
 
     def problem(self, frames: Sequence[Any]) -> str:
-        """Reason why this is not to be asked; empty = it may be. `frames`: what came with it."""
+        """Return the reason why the question is invalid, or "". `frames`: frames that came with it."""
         if frames or not all(map(math.isfinite, self.box)):
             return "a distance field has a box of finite numbers and no points"
         if not 0 < self.max_distance <= FARTHEST_M:
@@ -175,12 +175,12 @@ class Field(Struct, frozen=True, tag="field", omit_defaults=True):
 
 
 class Cells(Struct, frozen=True, tag="cells", omit_defaults=True):
-    """Question for the triangles of the map's cells, in the order of their x, y and z, some hundred at once.
+    """Question for the triangles of the map's cells, sorted by x, y and z, some hundred cells at once.
 
     Attributes:
-        first: block coordinates of where to begin; None = with the first cell.
-        since: only cells that changes after this stamp of the map reach (`mesh_updates.MeshUpdate`).
-        surface: None = the one that the map's settings say.
+        first: block coordinates of the first cell to send; None starts with the map's first cell.
+        since: only cells with changes after this stamp of the map (`mesh_updates.MeshUpdate`).
+        surface: None takes the surface of the map's settings.
     """
 
     first: tuple[int, int, int] | None = None
@@ -189,11 +189,11 @@ class Cells(Struct, frozen=True, tag="cells", omit_defaults=True):
 
     @property
     def most_bytes(self) -> int:
-        """Size of its answer, at the most."""
+        """Upper bound of the size of the answer."""
         return _CELL_BYTES * CELLS_AT_ONCE
 
     def problem(self, frames: Sequence[Any]) -> str:
-        """Reason why this is not to be asked; empty = it may be. `frames`: what came with it."""
+        """Return the reason why the question is invalid, or "". `frames`: frames that came with it."""
         if frames:
             return "cells are asked for without points"
         if any(not -_FARTHEST_BLOCK <= one < _FARTHEST_BLOCK for one in self.first or ()):
@@ -204,9 +204,9 @@ class Cells(Struct, frozen=True, tag="cells", omit_defaults=True):
 
 
 class Keyframes(Struct, frozen=True, tag="keyframes", omit_defaults=True):
-    """Where are the map's keyframes now? They come in the order of their sessions and numbers.
+    """Where are the map's keyframes now? They come sorted by session and number.
 
-    `session`, `after`: only those behind this one; empty = from the first one on.
+    `session`, `after`: only keyframes after this one; empty starts with the first one.
     """
 
     session: Annotated[bytes, Meta(max_length=16)] = b""
@@ -214,11 +214,11 @@ class Keyframes(Struct, frozen=True, tag="keyframes", omit_defaults=True):
 
     @property
     def most_bytes(self) -> int:
-        """Size of its answer, at the most."""
+        """Upper bound of the size of the answer."""
         return _KEYFRAME_BYTES * KEYFRAMES_AT_ONCE
 
     def problem(self, frames: Sequence[Any]) -> str:
-        """Reason why this is not to be asked; empty = it may be. `frames`: what came with it."""
+        """Return the reason why the question is invalid, or "". `frames`: frames that came with it."""
         if frames:
             return "keyframes are asked for without points"
         good = 0 <= self.after < 1 << 63
@@ -229,7 +229,7 @@ Question = Sample | Raycast | Slice | Field | Cells | Keyframes
 
 
 class ArrayLayout(Struct, frozen=True, array_like=True):
-    """One array of an answer, in the order of the frames. `packed`: as `array_encoding.pack` makes it."""
+    """One array of an answer, in the order of the frames. `packed`: encoded by `array_encoding.pack`."""
 
     name: str
     dtype: Literal["float32", "float64", "int8", "uint8", "int32", "int64", "bool"]
@@ -241,11 +241,11 @@ class MapVersion(Struct, frozen=True, kw_only=True):
     """The one state of a map that an answer belongs to.
 
     Attributes:
-        keyframes: in the map.
-        changes: records and moves that the process `epoch` of the server has taken: where both are equal,
-            the map is the same. An empty epoch is a file's.
-        segment, offset: the newest record of the journal in the map; 0 = none since it was opened.
-        waiting: keyframes whose corrected pose is not in the map yet.
+        keyframes: number of keyframes in the map.
+        changes: number of records and moves that the server's process `epoch` has taken. Two answers with
+            equal `changes` and `epoch` are of the same map. The epoch of a map from a file is empty.
+        segment, offset: position of the map's newest record in the journal; 0 before the first one.
+        waiting: number of keyframes whose corrected pose is not in the map yet.
     """
 
     keyframes: int
@@ -257,13 +257,13 @@ class MapVersion(Struct, frozen=True, kw_only=True):
 
 
 class Answer(Struct, frozen=True, kw_only=True):
-    """Answer of a map; its arrays follow as frames.
+    """Answer of a map. Its arrays follow as frames.
 
     Attributes:
         crc: CRC-32 of all frames.
-        waited_s: from when the server got the question until it was looked at.
-        took_s: to answer it.
-        reach: of samples, metres before a surface up to which they are known.
+        waited_s: seconds from the question's arrival at the server until the fuser began with it.
+        took_s: seconds to compute the answer.
+        reach: for samples, metres in front of a surface up to which distances are known.
     """
 
     arrays: tuple[ArrayLayout, ...]
@@ -275,7 +275,7 @@ class Answer(Struct, frozen=True, kw_only=True):
 
 
 def crc_of(frames: Sequence[Any]) -> int:
-    """CRC-32 of the bytes of all frames, one after the other."""
+    """Return the CRC-32 of the bytes of all frames, in order."""
     crc = 0
     for frame in frames:
         crc = zlib.crc32(frame, crc)
@@ -283,19 +283,19 @@ def crc_of(frames: Sequence[Any]) -> int:
 
 
 def point_frames(points: NDArray[np.float32]) -> list[memoryview]:
-    """(n, 3) float32 points as frames that a server's control socket takes."""
+    """Return (n, 3) float32 points as frames that a server's control socket takes."""
     rows = np.ascontiguousarray(points, "<f4")
     return [rows[i : i + _POINTS_A_FRAME].data.cast("B") for i in range(0, len(rows), _POINTS_A_FRAME)]
 
 
 def points_of(frames: Sequence[Any]) -> NDArray[np.float32]:
-    """The (n, 3) points of frames whose sizes were checked."""
+    """Return the (n, 3) points of frames whose sizes were checked."""
     joined = np.concatenate([np.frombuffer(frame, np.uint8) for frame in frames])
     return joined.view("<f4").reshape(-1, 3).astype(np.float32, copy=False)
 
 
 def pack(arrays: dict[str, NDArray[Any]], *, compress: bool) -> tuple[tuple[ArrayLayout, ...], list[Any]]:
-    """Arrays for the way: their layouts, and a frame each."""
+    """Encode the arrays of an answer. Return their layouts, and one frame for each."""
     layouts, frames = [], []
     for name, array in arrays.items():
         packed = compress and array.nbytes >= _PACKED_FROM and array.dtype.name in _PACKED
@@ -306,10 +306,10 @@ def pack(arrays: dict[str, NDArray[Any]], *, compress: bool) -> tuple[tuple[Arra
 
 
 def unpack(answer: Answer, frames: Sequence[Any]) -> dict[str, NDArray[Any]]:
-    """The arrays of an answer, by name.
+    """Return the arrays of an answer, by name.
 
     Raises:
-        DecodeError: when the frames are not what the answer says.
+        DecodeError: when the frames do not match the answer.
     """
     if len(frames) != len(answer.arrays) or crc_of(frames) != answer.crc:
         raise DecodeError("an answer was damaged on its way (CRC-32 differs)")
@@ -330,6 +330,6 @@ def _array(layout: ArrayLayout, frame: Any) -> NDArray[Any]:
 
 
 def _problem_of_weight(min_weight: float | None) -> str:
-    """Reason why a weight makes no sense; empty = it does."""
+    """Return the reason why a weight is invalid, or ""."""
     good = min_weight is None or (math.isfinite(min_weight) and min_weight >= 0)
     return "" if good else f"min_weight must be 0 or more, got {min_weight}"

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Arrays to bytes and back, without loss except for JPEG.
 
-`dzp+zstd`: difference to the previous element (of the bit patterns, modulo 2^width) → zigzag → byte
-planes → zstd level 1. Neighbours in a depth image are alike, so the high planes are nearly empty.
-`mm+dzp+zstd`: float32 metres that are whole millimetres, as int32.
+`dzp+zstd` does four steps. It takes differences to the previous element (of the bit patterns, modulo
+2^width). Zigzag coding makes them unsigned. Byte planes group the bytes of equal rank. zstd level 1 packs
+them. Neighbours in a depth image are alike, so the high planes are nearly empty. `mm+dzp+zstd`: float32
+metres that are whole millimetres, as int32.
 """
 
 import math
@@ -23,8 +24,8 @@ from tsfusion.wire.records.record_header import Refused
 _PNG = b"\x89PNG\r\n\x1a\n"
 _PNG_HEADER = struct.Struct(">I4sIIBBBBB")  # length, kind, width, height, bits, colour, then three methods
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by colour
-_WORST_RATIO = 1032  # that deflate reaches
-_FEW_TIMES = 4  # what unfolds to so many times its image, at most, is not looked into
+_WORST_RATIO = 1032  # best compression of deflate
+_FEW_TIMES = 4  # data that cannot unfold to more than so many times the image needs no check
 _PIECE = 1 << 20  # bytes unfolded at a time
 _PNG_CHUNK = struct.Struct(">I4s")
 _PNG_AROUND = 12  # bytes of a chunk besides its content
@@ -36,19 +37,19 @@ _JPEG = b"\xff\xd8"
 _JPEG_FRAMES = frozenset((0xC0, 0xC1, 0xC2))  # baseline, extended, progressive
 _JPEG_SEGMENTS = frozenset((0xC4, 0xDB, 0xDD, 0xFE, *range(0xE0, 0xF0)))  # tables, comments, application data
 _MAX_JPEG_SEGMENTS = 1024  # before the frame header; a colour profile is the longest, with 255
-_MAX_SCANS = 64  # each goes over the whole image, however short it is; ten are usual
+_MAX_SCANS = 64  # a decoder goes over the whole image for each, however short it is; ten are usual
 _SCAN = re.compile(rb"\xff\xda")
 
 
 def image_size(frame: Any) -> tuple[int, int]:
     """Read (height, width) of a PNG or JPEG without decoding it, more strictly than decoders do.
 
-    OpenCV's decoders believe what they read: a PNG of fifty bytes can have them take two gigabytes, and a
-    JPEG can have one size here and another one there. So only files are accepted that can be read in one way
-    alone.
+    OpenCV's decoders believe the headers: a PNG of fifty bytes can make them take two gigabytes. A JPEG can
+    state two different sizes. So this accepts only files that can be read in a single way.
 
     Raises:
-        Refused: `payload` when it is neither, or could cost its decoder more than an image of that size.
+        Refused: `payload` when the frame is no PNG or JPEG, or could cost a decoder more than an image of
+            that size.
     """
     view = memoryview(frame)
     head = bytes(view[:8])
@@ -60,13 +61,14 @@ def image_size(frame: Any) -> tuple[int, int]:
 
 
 def check_unfolding(frame: Any) -> None:
-    """Check that a PNG holds the pixels of its image and no more; `image_size` has checked the rest.
+    """Check that a PNG holds the pixels of its image and no more. Call it after `image_size`.
 
-    A decoder unfolds what follows the last pixel, too: 4 MB of it take 14 seconds. This takes up to two
-    thirds of the time of decoding, and none where so few bytes cannot unfold to much more.
+    A decoder also unfolds data after the last pixel: 4 MB of it take 14 seconds. This check takes up to two
+    thirds of the time of decoding. It is skipped where the file is too small to unfold to much more.
 
     Raises:
-        Refused: `limits` for more or fewer pixels than the image has, `payload` for what is not compressed.
+        Refused: `limits` for more or fewer pixels than the image has, `payload` for data that is not
+            compressed.
     """
     view = memoryview(frame)
     if bytes(view[:8]) != _PNG:
@@ -79,7 +81,7 @@ def check_unfolding(frame: Any) -> None:
 
 
 def _check_inflated(parts: list[memoryview], expected: int) -> None:
-    """Raise Refused unless these bytes unfold to exactly so many, which are not kept."""
+    """Raise Refused unless these parts unfold to exactly `expected` bytes. The bytes are not kept."""
     inflater, size = zlib.decompressobj(), 0
     try:
         for part in parts:
@@ -111,10 +113,10 @@ def _png_size(view: memoryview) -> tuple[int, int]:
 
 
 def _chunks(view: memoryview) -> Iterator[tuple[bytes, int, int]]:
-    """Kind, place of the content and length of each chunk between header and end.
+    """Yield kind, offset of the content, and length of each chunk between header and end.
 
     Raises:
-        Refused: `payload` for too many, or no end.
+        Refused: `payload` for too many chunks, or no end.
     """
     at, length = len(_PNG), 13
     for _ in range(_MAX_PNG_CHUNKS):
@@ -154,13 +156,13 @@ _MM_LIMIT = 2**31 - 1
 
 
 def pack(array: NDArray[Any]) -> bytes:
-    """`dzp+zstd` of an array of 1-, 2- or 4-byte elements; (n, 3) points go column by column."""
+    """Return `dzp+zstd` of an array of 1-, 2- or 4-byte elements; (n, 3) points go column by column."""
     planes = _planes(_zigzag(_bits(array)))
     return zstandard.ZstdCompressor(level=_ZSTD_LEVEL).compress(planes.data)
 
 
 def unpack(frame: Any, dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
-    """Undo `pack`.
+    """Decode `dzp+zstd`.
 
     Raises:
         Refused: `payload` unless the frame holds exactly this array.
@@ -179,27 +181,27 @@ def unpack(frame: Any, dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[
 
 
 def pack_mm(points: NDArray[np.float32]) -> bytes | None:
-    """`mm+dzp+zstd` of (n, 3) float32 metres, or None unless that gives the same floats back to the bit."""
+    """Return `mm+dzp+zstd` of (n, 3) float32 metres, or None if decoding would not give the same bits."""
     if not _whole_mm(points[:_SAMPLE]) or not _whole_mm(points):
         return None
     return pack(_to_mm(points))
 
 
 def unpack_mm(frame: Any, shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """Undo `pack_mm`."""
+    """Decode `mm+dzp+zstd`."""
     return _from_mm(unpack(frame, np.dtype(np.int32), shape))
 
 
 def pack_jpeg(image: NDArray[np.uint8], quality: int) -> bytes:
-    """(H, W, 3) uint8 BGR as JPEG."""
-    import cv2  # who sends no images does without its 16 MB
+    """Return a (H, W, 3) uint8 BGR image as JPEG."""
+    import cv2  # imported late: a sender without images saves its 16 MB
 
     _, encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
     return bytes(encoded)
 
 
 def unpack_image(frame: Any, dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
-    """A JPEG or PNG whose file header was checked to announce `shape` (see `image_size`).
+    """Decode a JPEG or PNG after `image_size` found `shape` in its header.
 
     Raises:
         Refused: `payload` unless it decodes to exactly that array, `limits` for a PNG that unfolds to more.
@@ -207,7 +209,7 @@ def unpack_image(frame: Any, dtype: np.dtype[Any], shape: tuple[int, ...]) -> ND
     import cv2
 
     check_unfolding(frame)
-    color = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION  # the other has no orientation either
+    color = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION  # IMREAD_UNCHANGED ignores it, too
     flags = color if len(shape) == 3 else cv2.IMREAD_UNCHANGED
     try:
         image = cv2.imdecode(np.frombuffer(frame, np.uint8), flags)
@@ -222,9 +224,9 @@ def unpack_image(frame: Any, dtype: np.dtype[Any], shape: tuple[int, ...]) -> ND
 
 
 def check_zstd(frame: Any, size: int) -> None:
-    """Raise Refused (`limits`) unless the zstd frame says it holds exactly `size` bytes.
+    """Raise Refused (`limits`) unless the zstd frame states exactly `size` bytes.
 
-    The decompressor obeys the size in the frame over any limit it is given, so this comes first.
+    The decompressor trusts the size in the frame more than its own limit, so this check comes first.
     """
     try:
         stated = zstandard.get_frame_parameters(frame).content_size
@@ -265,7 +267,7 @@ def _unzigzag(zigzag: NDArray[Any]) -> NDArray[Any]:
 
 
 def _planes(values: NDArray[Any]) -> NDArray[np.uint8]:
-    """The bytes of n unsigned integers, (size, n) uint8. Shifts are several times faster than a transpose."""
+    """Return the bytes of n unsigned integers as byte planes, (size, n) uint8. A transpose is far slower."""
     planes = np.empty((values.dtype.itemsize, len(values)), np.uint8)
     for byte, plane in enumerate(planes):
         np.right_shift(values, 8 * byte, out=plane, casting="unsafe")

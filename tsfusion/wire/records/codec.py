@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""A keyframe as a multipart message, and the checks a stranger's record passes before it is stored.
+"""Encoding of a keyframe as a multipart message, and the checks of a received record before it is stored.
 
-Order of the checks (cheapest first; none allocates more than the message itself): frame count and header
-length, magic, struct limits, lengths against shapes, what the compressed frames announce, finite values
-and proper rotation, CRC. Decompression is left to `decode`.
+The checks run cheapest first, and none allocates more than the message itself: frame count and header length,
+magic, struct limits, lengths against shapes, sizes stated by compressed frames, finite values and proper
+rotation, CRC. Only `decode` decompresses.
 """
 
 import math
@@ -33,12 +33,12 @@ from tsfusion.wire.records.record_header import (
 )
 
 MIN_FRAMES, MAX_FRAMES = 2, 5
-_MAX_DECODED_BYTES = 256 << 20  # that a small message may unfold to
+_MAX_DECODED_BYTES = 256 << 20  # limit for all arrays of a message together
 _MAX_FRAME_BYTES = 32 << 20
 _MEASUREMENTS = ("depth", "disparity", "points")
 _ZSTD = ("dzp+zstd", "mm+dzp+zstd")
 
-# What each array may be: dtype → codecs, for images and for points.
+# Allowed dtypes of each array, each with its codecs, for images and for points.
 _IMAGE: dict[str, dict[str, tuple[str, ...]]] = {
     "depth": {"uint16": ("dzp+zstd", "png"), "float32": ("dzp+zstd",)},
     "disparity": {"uint16": ("dzp+zstd", "png")},
@@ -66,8 +66,8 @@ def encode(
 ) -> list[bytes]:
     """Encode a keyframe as frames: the header, then one frame for each array.
 
-    Depth, disparity, points, origins and confidence come back bit for bit; the colour image is JPEG.
-    `sent_ns` is 0 until `stamp` fills it in.
+    Depth, disparity, points, origins and confidence come back bit for bit; the colour image becomes a JPEG.
+    `sent_ns` is 0 until `record_header.with_fields` sets it.
     """
     buffers, frames = [], []
     for name, array in _arrays(keyframe):
@@ -107,8 +107,8 @@ def decode(frames: Sequence[Any]) -> Keyframe | Correction:
     """Decode the keyframe or correction of a message.
 
     Raises:
-        DecodeError: when the bytes are neither.
-        InvalidKeyframe: when they are a keyframe with impossible values.
+        DecodeError: when the bytes are no keyframe and no correction.
+        InvalidKeyframe: when the bytes are a keyframe with impossible values.
     """
     header = check(frames)
     if isinstance(header, CorrectionHeader):
@@ -130,7 +130,7 @@ def decode(frames: Sequence[Any]) -> Keyframe | Correction:
 
 
 def decode_keyframe(frames: Sequence[Any]) -> Keyframe:
-    """Decode the keyframe of a message; raises as `decode`, and DecodeError for a correction."""
+    """Decode the keyframe of a message. Raise as `decode`, and DecodeError for a correction."""
     found = decode(frames)
     if not isinstance(found, Keyframe):
         raise Refused("magic", "a keyframe is expected, got a correction")
@@ -138,12 +138,12 @@ def decode_keyframe(frames: Sequence[Any]) -> Keyframe:
 
 
 def check(frames: Sequence[Any], max_frame_bytes: int = _MAX_FRAME_BYTES) -> RecordHeader:
-    """Check everything that can be checked in a message without decompressing it; returns its header.
+    """Check a message as far as possible without decompressing it. Return its header.
 
     Raises:
-        Refused: (a DecodeError) with the `reason` it is counted under: `frames`, `header`, `magic`,
-            `version`, `limits`, `size`, `payload`, `values` or `crc`; Damaged where it is not what its header
-            announces.
+        Refused: (a DecodeError) with a `reason` under which it is counted: `frames`, `header`, `magic`,
+            `version`, `limits`, `size`, `payload`, `values` or `crc`. It is a Damaged if the bytes differ
+            from what the header announces.
     """
     if not MIN_FRAMES <= len(frames) <= MAX_FRAMES:
         raise Damaged("frames", f"a record has {MIN_FRAMES} to {MAX_FRAMES} frames, got {len(frames)}")
@@ -162,7 +162,7 @@ def check(frames: Sequence[Any], max_frame_bytes: int = _MAX_FRAME_BYTES) -> Rec
 
 
 def measurement(header: KeyframeHeader) -> str:
-    """The measurement that a keyframe carries: `depth`, `disparity` or `points`."""
+    """Return the name of the keyframe's measurement: `depth`, `disparity` or `points`."""
     return next(buffer.name for buffer in header.buffers if buffer.name in _MEASUREMENTS)
 
 

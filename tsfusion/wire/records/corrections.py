@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""Corrections: where keyframes that were sent before really were taken, and which are to leave the map.
+"""Corrections: new poses of keyframes that were sent before, and keyframes that leave the map.
 
-A loop that closes shows it. A correction is a record of the session like a keyframe, with the next number, so
-it can only name keyframes with lower numbers. The newest pose of a keyframe counts.
+A loop closure gives new poses. A correction is a record of the session with the next number, like a keyframe,
+so it can only name keyframes with lower numbers. The newest pose of a keyframe counts.
 
-A server that is told to forget keyframes writes such records, too: into a session of its own, each with the
-session that it is about as its `target`. A keyframe that one of them removes never comes back, whatever
-corrections come before or after. No client may send one.
+A server that is told to forget keyframes writes such records, too. They are in a session of the server, and
+their `target` is the session of the keyframes. A keyframe that such a record removes never comes back,
+whatever corrections come before or after. No client has the right to send one.
 
 Message: `CorrectionHeader`, then one body frame, little-endian: `count` numbers (int64, rising), as many
 poses (12 float64 each: the upper three rows of `T_world_camera`), then `removed` numbers (int64, rising).
@@ -25,9 +25,9 @@ from tsfusion.core.errors import InvalidKeyframe
 from tsfusion.geometry.keyframe import MAX_TRANSLATION, check_pose
 from tsfusion.wire.records.record_header import CorrectionHeader, Damaged, RecordHeader, Refused, pack
 
-MAX_KEYFRAMES = 100_000  # named by one correction
+MAX_KEYFRAMES = 100_000  # limit for one correction
 _NUMBER_BYTES, _POSE_BYTES = 8, 12 * 8
-_EXACT = 1e-9  # |RᵀR - I|, as `check_pose` leaves it
+_EXACT = 1e-9  # bound of |RᵀR - I| after `check_pose`
 _MAX_NUMBER = (1 << 63) - 1
 
 Numbers = NDArray[np.int64]
@@ -39,12 +39,12 @@ class Correction:
     """The content of one correction.
 
     Attributes:
-        seqs: (n,) int64, rising: the numbers of the keyframes that get another pose.
+        seqs: (n,) int64, rising: numbers of the keyframes that get another pose.
         poses: (n, 4, 4) float64, their `T_world_camera`.
-        removed: (m,) int64, rising: the numbers of the keyframes that are to be taken out of the map.
+        removed: (m,) int64, rising: numbers of the keyframes to take out of the map.
         T_map_odometry: (4, 4) float64: p_map = T_map_odometry @ p_odometry, for the poses after the last
-            keyframe; None = as before.
-        target: the session of the removed keyframes, which are removed for good; None = its own.
+            keyframe. None keeps the present one.
+        target: session of the removed keyframes, which are removed for good. None: the record's own session.
     """
 
     seqs: Numbers
@@ -57,7 +57,7 @@ class Correction:
 def checked(
     poses: Mapping[int, Any], *, T_map_odometry: Any = None, removed: Iterable[int] = ()
 ) -> Correction:
-    """A correction of these keyframes, by number; each pose as `check_pose` gives it.
+    """Return a correction of these keyframes, by number. Each pose passes `check_pose`.
 
     Raises:
         InvalidKeyframe: naming the keyframe and what is wrong.
@@ -102,7 +102,7 @@ def _checked_pose(seq: int, pose: Any) -> NDArray[np.float64]:
 
 
 def _are_rigid(rows: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """(n,): which of the (n, 3, 4) are proper rigid transforms, as `check_pose` leaves them."""
+    """Return (n,) bool: True where (3, 4) rows are a proper rigid transform, as `check_pose` makes it."""
     R, t = rows[:, :, :3], rows[:, :, 3]
     with np.errstate(all="ignore"):  # NaN compares as wrong
         good = np.ones(len(rows), np.bool_)
@@ -114,13 +114,13 @@ def _are_rigid(rows: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def forgetting(target: bytes, seqs: Numbers) -> Correction:
-    """The correction by which a server forgets these keyframes of a session."""
+    """Return the correction by which a server forgets these keyframes of a session."""
     none = checked({})
     return Correction(seqs=none.seqs, poses=none.poses, removed=np.unique(seqs), target=target)
 
 
 def is_servers_own(header: RecordHeader) -> bool:
-    """True if only a server may write such a record."""
+    """True if only a server has the right to write such a record."""
     has_target = isinstance(header, CorrectionHeader) and header.target is not None
     return has_target or header.session == SERVER_SESSION
 
@@ -135,7 +135,7 @@ def encode(
     world: str = "",
     same_frame: bool = False,
 ) -> list[bytes]:
-    """A correction as frames: header and body. `record_header.with_fields` fills in `sent_ns`, which is 0."""
+    """Encode a correction as header and body. `sent_ns` is 0 until `record_header.with_fields` sets it."""
     T = correction.T_map_odometry
     parts = ((correction.seqs, "<i8"), (correction.poses[:, :3], "<f8"), (correction.removed, "<i8"))
     body = b"".join(array.astype(dtype).tobytes() for array, dtype in parts)
@@ -156,11 +156,11 @@ def encode(
 
 
 def check(header: CorrectionHeader, frames: Sequence[Any]) -> None:
-    """Check the body of a correction; nothing is allocated before its length agrees.
+    """Check the body of a correction. Nothing is allocated before the length is right.
 
     Raises:
-        Refused: `frames`, `limits`, `size`, `crc`, or `values`: numbers that do not rise from 1 or are both
-            corrected and removed, a pose that is not finite or whose rotation is not exact to 1e-9.
+        Refused: `frames`, `limits`, `size`, `crc`, or `values`. `values`: numbers do not rise from 1, a
+            number is both corrected and removed, or a pose is not finite or not a rotation exact to 1e-9.
     """
     if len(frames) != 1:
         raise Damaged("frames", f"a correction has 2 frames, got {1 + len(frames)}")
@@ -197,7 +197,7 @@ def _check_values(
 
 
 def arrays(header: CorrectionHeader, body: Any) -> tuple[Numbers, NDArray[np.float64], Numbers]:
-    """The arrays in the body of a correction whose size is right, without a copy.
+    """Return views of the arrays in the body of a correction whose size is right.
 
     Returns:
         (n,) int64 numbers, (n, 3, 4) float64 upper rows of their poses, (m,) int64 numbers to remove.
@@ -209,7 +209,7 @@ def arrays(header: CorrectionHeader, body: Any) -> tuple[Numbers, NDArray[np.flo
 
 
 def unpack(header: CorrectionHeader, body: Any) -> Correction:
-    """The content of a correction that passed `check`."""
+    """Decode a correction that passed `check`."""
     seqs, rows, removed = arrays(header, body)
     last_rows = np.broadcast_to((0.0, 0.0, 0.0, 1.0), (len(seqs), 1, 4))
     T = header.T_map_odometry

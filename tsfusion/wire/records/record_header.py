@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Frame 0 of a record: three bytes that name its kind, one byte of major version, then a header as msgpack.
+"""Frame 0 of a record: three bytes for its kind, one byte of major version, then a header as msgpack.
 
-A session's records are keyframes (`TSF`) and corrections of them (`TSC`), numbered in one line. The version
-byte changes when an old reader must not try; new optional fields are minor changes that an old reader skips.
+A session's records are keyframes (`TSF`) and corrections of keyframes (`TSC`), in one series of numbers. A
+new version byte stops old readers. New optional fields need no new version: old readers skip them.
 """
 
 import sys
@@ -16,18 +16,18 @@ from tsfusion.core.config import MapName
 from tsfusion.core.errors import DecodeError
 from tsfusion.geometry.keyframe import MAX_SENSOR_NAME, Intrinsics
 
-_MARK = b"\xa5check\xc4\x04"  # the key, and the head of a value of four bytes
+_MARK = b"\xa5check\xc4\x04"  # msgpack: the key "check", and the head of a value of four bytes
 _CRC_BYTES = 4
-_MOST_WORN = 4  # bits of its 64 by which a mark may differ and be one: of random bytes 1 in 10¹³ come so near
+_MOST_WORN = 4  # wrong bits of 64 with which a mark still counts: 1 in 10¹³ random byte strings is so near
 _FIXMAP, _MOST_IN_FIXMAP, _MAP16 = 0x80, 15, 0xDE  # of the msgpack format
 
 
 def seal(message: bytes) -> bytes:
-    """A message, a msgpack map of less than 65535 entries, with its seal: its CRC-32, as its last entry.
+    """Return a message with a seal: its CRC-32, as the last entry of its msgpack map (under 65535 entries).
 
-    TCP's own checksum misses one damaged segment in 65536, and a relay may damage what it carries between two
-    connections. Keys authenticate every byte; without keys, a number or a pose would be changed unnoticed.
-    Readers that do not know the entry skip it; a message may be without one.
+    TCP's own checksum misses one damaged segment in 65536, and a relay may damage bytes between two
+    connections. Keys authenticate every byte. Without keys and seal, a changed number or pose would stay
+    unnoticed. Readers that do not know the entry skip it. A message without a seal is valid, too.
     """
     if message[0] == _MAP16:
         count, entries = int.from_bytes(message[1:3], "big"), message[3:]
@@ -42,9 +42,9 @@ def seal(message: bytes) -> bytes:
 
 
 def is_damaged(message: Any) -> bool:
-    """True if a message (any bytes-like object) carries a seal that does not fit it.
+    """True if a message (any bytes-like object) carries a seal that does not match.
 
-    A seal whose mark is changed counts, too: without it nobody would look whether the rest is as it was sent.
+    A seal with a changed mark counts as damaged, too: otherwise its CRC would not be checked.
     """
     view = memoryview(message)
     sealed, crc = view[:-_CRC_BYTES], view[-_CRC_BYTES:]
@@ -72,7 +72,7 @@ TransformRows = Annotated[tuple[float, ...], Meta(min_length=12, max_length=12)]
 
 
 class Refused(DecodeError):
-    """A message that is no record; `reason` is the short name it is counted under."""
+    """A message that is no valid record; `reason` is the short name under which it is counted."""
 
     def __init__(self, reason: str, message: str) -> None:
         super().__init__(message)
@@ -80,11 +80,11 @@ class Refused(DecodeError):
 
 
 class Damaged(Refused):
-    """A message that is not what it announces: its bytes changed on the way; what was sent may be well."""
+    """A message whose bytes changed on the way. The sender's copy may be good."""
 
 
 class Buffer(Struct, frozen=True, kw_only=True):
-    """One array of the keyframe and the frame that carries it (buffers[i] is frame i + 1)."""
+    """One array of the keyframe, carried by one frame (buffers[i] by frame i + 1)."""
 
     name: ArrayName
     codec: ArrayCodec
@@ -95,18 +95,18 @@ class Buffer(Struct, frozen=True, kw_only=True):
 
 
 class KeyframeHeader(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """Everything of a keyframe but its arrays.
+    """All fields of a keyframe but its arrays.
 
     Attributes:
-        session: 16 random bytes, one value a spool.
+        session: 16 random bytes, one value for each spool.
         seq: number of the record in its session, rising by one.
-        previous: the seq before this one among those the sender still offers, 0 = none: what lies
-            between the two was dropped on purpose.
-        map: the map it is for.
-        world: name of the coordinate frame of its pose, drawn by whoever localised it; empty = the pose was
-            given from elsewhere.
-        same_frame: the sender declares that this frame is the map's, whatever worlds the map has.
-        sent_ns: the sender's monotonic clock when this copy was handed to the socket.
+        previous: seq of the record before this one, among those that the sender still offers; 0 without one.
+            The sender dropped the records between the two on purpose.
+        map: name of the map that it is for.
+        world: name of the coordinate frame of its pose, drawn by the localizer; empty for poses given from
+            outside.
+        same_frame: True if the sender declares that this frame is the map's, whatever worlds the map has.
+        sent_ns: the sender's monotonic clock when this copy went to the socket.
         pose: the upper three rows of `T_world_camera`, row by row.
         scale: `depth_scale` or `disparity_scale`.
     """
@@ -134,13 +134,13 @@ class CorrectionHeader(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """The first frame of a correction, before the numbers and poses of its body.
 
     Attributes:
-        session, seq, previous, map, world, same_frame, sent_ns: as of a keyframe.
-        count: keyframes that get another pose.
-        removed: keyframes that are to be taken out of the map.
-        crc32: of the body.
-        T_map_odometry: the upper three rows, row by row, of what poses after the last keyframe are to be
-            multiplied by from the left; None = as before.
-        target: the session whose keyframes it removes, for good; only a server writes it. None = its own.
+        session, seq, previous, map, world, same_frame, sent_ns: as for a keyframe.
+        count: number of keyframes that get another pose.
+        removed: number of keyframes to take out of the map.
+        crc32: CRC-32 of the body.
+        T_map_odometry: upper three rows, row by row, of the transform to multiply from the left to poses
+            after the last keyframe. None keeps the present one.
+        target: session whose keyframes it removes for good, written only by a server. None: its own session.
     """
 
     kind: ClassVar[str] = "correction"
@@ -167,7 +167,7 @@ _DECODERS: dict[bytes, Any] = {
 
 
 def pack(header: RecordHeader) -> bytes:
-    """The bytes of frame 0."""
+    """Encode a header as frame 0, without a seal."""
     return _MAGIC[type(header)] + bytes([VERSION]) + msgspec.msgpack.encode(header)
 
 
@@ -175,7 +175,7 @@ def unpack(frame: Any) -> RecordHeader:
     """Read frame 0 (any bytes-like object) of a keyframe or a correction.
 
     Raises:
-        Refused: `header` (too long, or not such a struct), `magic`, `version` or `crc`.
+        Refused: `header` (too long, or malformed), `magic`, `version` or `crc`.
     """
     view = memoryview(frame)
     if view.nbytes > MAX_HEADER_BYTES:
@@ -195,7 +195,7 @@ def unpack(frame: Any) -> RecordHeader:
 
 
 def unpack_keyframe(frame: Any) -> KeyframeHeader:
-    """Read frame 0 of a keyframe; raises Refused as `unpack`, and (`magic`) for a correction."""
+    """Read frame 0 of a keyframe. Raise Refused as `unpack`, and (`magic`) for a correction."""
     header = unpack(frame)
     if not isinstance(header, KeyframeHeader):
         raise Refused("magic", f"a keyframe is expected, got a {header.kind}")
@@ -203,12 +203,12 @@ def unpack_keyframe(frame: Any) -> KeyframeHeader:
 
 
 def is_correction(frame: Any) -> bool:
-    """True if frame 0 begins as that of a correction; the rest of it is not looked at."""
+    """True if the first bytes of frame 0 are those of a correction. The rest is not checked."""
     return bytes(memoryview(frame)[:MAGIC_BYTES]) == _MAGIC[CorrectionHeader]
 
 
 def world_of(frame: Any) -> str:
-    """The world that frame 0 names; empty also when it is no header."""
+    """Return the world that frame 0 names, or "" for a malformed header."""
     try:
         return sys.intern(unpack(frame).world)
     except Refused:
@@ -216,6 +216,6 @@ def world_of(frame: Any) -> str:
 
 
 def with_fields(frame: Any, **fields: Any) -> bytes:
-    """Frame 0 again, sealed, with these fields: what is known only when the record is sent."""
+    """Return frame 0 with these fields set, and a seal: for fields known only when it is sent."""
     stamped = pack(msgspec.structs.replace(unpack(frame), **fields))
     return stamped[: MAGIC_BYTES + 1] + seal(stamped[MAGIC_BYTES + 1 :])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A connecting socket under watch: why it cannot connect, and when it is time for a new one."""
+"""A connecting socket that is watched: why it cannot connect, and when to replace it."""
 
 from collections.abc import Callable
 from typing import Any
@@ -11,16 +11,18 @@ from tsfusion.wire.sockets.connection_monitor import ConnectionMonitor
 from tsfusion.wire.sockets.curve import ClientKeys
 
 _RETRY_INTERVAL = 2.0  # seconds; an allowed key is let in soon, a forbidden one is no burden
-_MOST_PATIENCE = 16  # times the least: a link that takes so long for one keyframe still carries it
+_MOST_PATIENCE = 16  # times the shortest wait: a link that needs so long for one keyframe still works
 
 
 class ServerLink:
-    """One connection to the server, over one socket after the other. For one thread.
+    """One connection to the server, over one socket after another. For one thread.
 
-    A name may stand for an IPv4 and an IPv6 address. Where nobody listens at the one, the other is tried.
+    A host name may have an IPv4 and an IPv6 address. If nobody listens at one address, the link tries the
+    other.
 
     Raises:
-        zmq.ZMQError: when no socket can be opened, here and where one is replaced: close it then.
+        zmq.ZMQError: when no socket can be opened, also later by `check`, `reopen` and `connect_to`: then
+            call `close`.
     """
 
     def __init__(
@@ -30,7 +32,7 @@ class ServerLink:
         address: str,
         keys: ClientKeys | None,
     ) -> None:
-        self.problem = ""  # why there is no connection; empty = there is one, or nothing is known
+        self.problem = ""  # why there is no connection; empty with one, or while nothing is known
         self.address = address
         self._context = context
         self._make = make
@@ -38,7 +40,7 @@ class ServerLink:
         self._retry_due = 0.0
         self._made_before = 0  # connections of earlier sockets
         self._is_name = sockets.is_name(address)
-        self._named_ipv6 = self._tried_both = False  # of a name
+        self._named_ipv6 = self._tried_both = False  # addresses of a host name: IPv6 in use, both tried
         self._open()
 
     def _open(self) -> None:
@@ -48,7 +50,7 @@ class ServerLink:
         except zmq.ZMQError:
             self.socket.close()
             raise
-        self._cuts = 0  # connections that ended, and that were made after one
+        self._cuts = 0  # connections that ended, and connections made after them
         sockets.connect(self.socket, self.address, named_ipv6=self._named_ipv6)
 
     @property
@@ -62,22 +64,22 @@ class ServerLink:
 
     @property
     def made(self) -> int:
-        """Number of connections made so far: what was sent over earlier ones may be lost."""
+        """Number of connections made so far. Messages sent over earlier connections may be lost."""
         return self._made_before + self._monitor.made
 
     @property
     def gave_up(self) -> bool:
-        """True if ZeroMQ will not try again: `check` opens a new socket after a while."""
+        """True if ZeroMQ will not try again. `check` then opens a new socket after a while."""
         return self._monitor.gave_up
 
     @property
     def made_at(self) -> float:
-        """When it was made (`time.monotonic()`), where it stands."""
+        """Time when the present connection was made (`time.monotonic()`)."""
         return self._monitor.connected_since
 
     @property
     def finds_nobody(self) -> bool:
-        """True if nobody listens, as far as the last attempt to connect shows."""
+        """True if nobody listened at the last attempt to connect, on either address of a name."""
         return self._monitor.retrying and (self._tried_both or not self._is_name)
 
     @property
@@ -87,29 +89,29 @@ class ServerLink:
 
     @property
     def due(self) -> float:
-        """When `check` must be called next (`time.monotonic()`), without any event; 0 = only after one."""
+        """Time of the next `check` without any event (`time.monotonic()`); 0 if only events need one."""
         return self._retry_due
 
     def reopen(self) -> None:
-        """Replace the socket; what the old connection held is lost."""
+        """Replace the socket. Unsent messages of the old one are lost."""
         self._retry_due = 0.0
         self._made_before = self.made
         self.close()
         self._open()
 
     def connect_to(self, address: str) -> None:
-        """Connect to another address; what the old connection held is lost."""
+        """Connect to another address. Unsent messages of the old connection are lost."""
         self.address, self.problem = address, ""
         self._is_name = sockets.is_name(address)
         self._named_ipv6 = self._tried_both = False
         self.reopen()
 
     def check(self, now: float) -> tuple[str | None, bool]:
-        """Read the events, and connect anew when that is due.
+        """Read the events, and connect again when that is due.
 
         Returns:
-            The problem, if that is a new one (empty = it is over, None = nothing new), and whether a
-            connection ended, or another one stands after it: what was sent in between is lost, too.
+            The problem if it is a new one ("" when it is over, None without news). True if a connection
+                ended, or was replaced, since the last call: messages sent in between may be lost.
         """
         news = self._monitor.problem()
         cuts = self._monitor.lost + max(self._monitor.made - 1, 0)
@@ -124,7 +126,7 @@ class ServerLink:
         return news, ended
 
     def _try_again(self, now: float) -> bool:
-        """Open a new socket if its time has come. Returns True if the old one had been connected."""
+        """Open a new socket if it is time. Return True if there was a connection before."""
         is_unknown = self._monitor.retrying and not self._tried_both
         if not is_unknown and now < (self._retry_due or now + 1):
             self._retry_due = self._retry_due or now + _RETRY_INTERVAL
@@ -136,17 +138,17 @@ class ServerLink:
         return self._made_before > 0
 
     def close(self, linger_ms: int = 0) -> None:
-        """Close it; what was not sent has so long to leave."""
+        """Close the link. Unsent messages have `linger_ms` milliseconds to leave."""
         self._monitor.close()
         self.socket.close(linger_ms)
 
 
 class Patience:
-    """Time to wait for a sign of life before a connection is made anew.
+    """Time to wait for a sign of life before a client connects again.
 
-    TCP itself waits a quarter of an hour where a path is no more: the scanner roamed to another address, or a
-    NAT forgot the connection. Each wait in vain doubles the next: a link may be slow, not dead, and what was
-    under way is sent over it again.
+    TCP itself waits a quarter of an hour on a dead path, for example after the scanner got another address,
+    or a NAT forgot the connection. Each wait in vain doubles the next one: a slow link is not a dead one, and
+    after each new connection the client sends its unacknowledged messages again.
     """
 
     def __init__(self, least: float) -> None:
@@ -154,11 +156,11 @@ class Patience:
         self._ended = 0.0
 
     def has_ended(self, now: float, *, since: float, sign: float) -> bool:
-        """True if the wait has ended; a new one begins then (all times: `time.monotonic()`).
+        """True if the wait has ended; then a new one begins (all times: `time.monotonic()`).
 
         Args:
-            since: when there was something to wait for.
-            sign: when the last sign of life came.
+            since: time from which there was something to wait for.
+            sign: time of the last sign of life.
         """
         if sign > self._ended:
             self._seconds = self._least

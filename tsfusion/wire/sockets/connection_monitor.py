@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Reasons why a client's connection is not made, in words for a person.
+"""Reasons why a client has no connection, in words for a person.
 
-libzmq's `send` succeeds while the other side turns the connection away, so its events are watched instead.
+libzmq's `send` succeeds while the server refuses the connection, so this watches libzmq's events instead.
 Measured with libzmq 4.3.5:
 
 | case | events |
@@ -10,9 +10,9 @@ Measured with libzmq 4.3.5:
 | only one side has keys | HANDSHAKE_FAILED_NO_DETAIL a few times, then .._PROTOCOL, and no further try |
 | the server keeps this client out for a while | as another key, or a frozen server |
 | another server key than the server's | HANDSHAKE_FAILED_NO_DETAIL, again and again |
-| nobody listens behind a tunnel | HANDSHAKE_FAILED_NO_DETAIL, again and again |
+| nobody listens at the far end of a tunnel | HANDSHAKE_FAILED_NO_DETAIL, again and again |
 | a frozen server | HANDSHAKE_FAILED_NO_DETAIL after HANDSHAKE_IVL, again and again |
-| what answers is no ZeroMQ | DISCONNECTED and no further try, or HANDSHAKE_FAILED_NO_DETAIL again and again |
+| the other end is no ZeroMQ | DISCONNECTED, no further try; or HANDSHAKE_FAILED_NO_DETAIL again and again |
 | bytes that are no message, after the handshake | DISCONNECTED, and no further try |
 | nobody listens | CONNECT_RETRIED alone |
 """
@@ -39,25 +39,25 @@ _EVENTS = (
 )
 _MISMATCH = 0x11000002  # ZMQ_PROTOCOL_ERROR_ZMTP_MECHANISM_MISMATCH
 _REFUSAL_S = 1.0  # a server that closes the connection later than this has not refused it, but is stuck
-_MIN_FAILURES = 2  # one may be a server that ends
+_MIN_FAILURES = 2  # a single failure may be a server that is ending
 _RETRY_S = 0.5  # libzmq reports at once when it is going to try again
 _KEEPS_OUT = "it keeps this client out for a minute (its log says why)"
 _numbers = itertools.count()
 
 
 class ConnectionMonitor:
-    """Monitor of one connecting socket; make it before `connect`, close it before the socket.
+    """Monitor of one connecting socket. Make it before `connect`, and close it before the socket.
 
     Attributes:
-        socket: becomes readable when something has happened; call `problem` then, and from time to time.
-        connected: whether the handshake is done and the connection stands.
-        connected_since: when that was (`time.monotonic()`).
-        made: number of connections made so far, this one included. Messages on earlier ones may be lost: send
-            them again when this rises; before that they would be lost, too.
-        retrying: whether the last attempt to connect found nobody.
+        socket: becomes readable after an event; then call `problem`, and also from time to time.
+        connected: True while the connection exists and its handshake is done.
+        connected_since: time of that handshake (`time.monotonic()`).
+        made: number of connections made so far. When it rises, messages on earlier connections may be lost:
+            send them again then, not before.
+        retrying: True if the last attempt to connect found nobody.
         lost: number of connections that were made and have ended.
-        gave_up: libzmq will not try again, whatever the server does: close the socket and make another.
-        refused: the server has certainly refused this client.
+        gave_up: True if libzmq will never try again: close the socket and make another.
+        refused: True if the server has certainly refused this client.
     """
 
     def __init__(self, socket: "zmq.Socket[Any]", address: str, keys: ClientKeys | None = None) -> None:
@@ -89,7 +89,7 @@ class ConnectionMonitor:
         self.socket.close()
 
     def problem(self) -> str | None:
-        """The reason why there is no connection; empty = it is made; None = nothing new."""
+        """Return the reason why there is no connection. It is "" once connected, None without news."""
         news: str | None = None
         while sockets.has_message(self.socket):
             head, _endpoint = self.socket.recv_multipart(zmq.NOBLOCK)

@@ -36,10 +36,10 @@ class ServerKeys(Struct, frozen=True):
     secret: str
 
     def secure(self, socket: "zmq.Socket[Any]") -> None:
-        """Let this socket take connections from allowed keys only; call it before `bind`.
+        """Accept only connections from allowed keys on this socket. Call it before `bind`.
 
-        Without a ZAP handler in the socket's context nobody can connect (with libzmq's defaults
-        everybody could).
+        Without a ZAP handler in the socket's context nobody can connect (libzmq's default would let everybody
+        in).
         """
         socket.setsockopt(zmq.CURVE_SERVER, 1)
         socket.setsockopt_string(zmq.CURVE_SECRETKEY, self.secret)
@@ -47,7 +47,7 @@ class ServerKeys(Struct, frozen=True):
         socket.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)
 
     def as_client(self) -> "ClientKeys":
-        """The keys with which this server is a client of another one that has the same pair."""
+        """Return keys with which this server is a client of another server that has the same pair."""
         return ClientKeys(self.public, self.secret, self.public)
 
     def __repr__(self) -> str:
@@ -55,21 +55,21 @@ class ServerKeys(Struct, frozen=True):
 
 
 class ClientKeys(Struct, frozen=True):
-    """A client's own pair, and the public key that its server must have."""
+    """A client's own pair, and the public key of its server."""
 
     public: str
     secret: str
     server: str
 
     def secure(self, socket: "zmq.Socket[Any]") -> None:
-        """Let this socket talk to that server only; call it before `connect`."""
+        """Connect this socket only to that server. Call it before `connect`."""
         socket.setsockopt_string(zmq.CURVE_PUBLICKEY, self.public)
         socket.setsockopt_string(zmq.CURVE_SECRETKEY, self.secret)
         socket.setsockopt_string(zmq.CURVE_SERVERKEY, self.server)
 
     @classmethod
     def drawn(cls, server: str) -> "ClientKeys":
-        """A new pair, for a server with this public key; it is in no file."""
+        """Draw a new pair, for a server with this public key. It is in no file."""
         public, secret = (key.decode("ascii") for key in zmq.curve_keypair())
         return cls(public, secret, server)
 
@@ -78,10 +78,10 @@ class ClientKeys(Struct, frozen=True):
 
 
 def server_keys(folder: str | os.PathLike[str]) -> ServerKeys:
-    """The pair of the server whose keys are in this folder.
+    """Read the pair of the server whose keys are in this folder.
 
     Raises:
-        InvalidConfig: when there is none, others can read it, or it is malformed.
+        InvalidConfig: when there is no pair, other users can read it, or it is malformed.
     """
     path = Path(folder).expanduser() / f"{SERVER}{SECRET}"
     if not path.exists():
@@ -93,15 +93,15 @@ def server_keys(folder: str | os.PathLike[str]) -> ServerKeys:
 
 
 def client_keys(key: str | None, server_key: str | None) -> ClientKeys | None:
-    """Read the keys that `ClientConfig.key` and `.server_key` name; None when neither is given.
+    """Read the keys that `ClientConfig.key` and `.server_key` name. Return None if both are None.
 
     Args:
-        key: the client's own secret key, a file.
-        server_key: the server's public key, a file or the 40 characters.
+        key: file of the client's own secret key.
+        server_key: the server's public key, as a file or its 40 characters.
 
     Raises:
-        InvalidConfig: when one is given without the other, a file is missing or malformed, or others can read
-            the secret one.
+        InvalidConfig: when one is given without the other, a file is missing or malformed, or other users can
+            read the secret key.
     """
     if key is None and server_key is None:
         return None
@@ -118,7 +118,7 @@ def public_key(given: str) -> str:
     """Read a public key from a file, or take its 40 characters.
 
     Raises:
-        InvalidConfig: when it is neither.
+        InvalidConfig: for anything else.
     """
     if is_key(given):
         return given
@@ -137,7 +137,7 @@ def read_pair(path: Path) -> tuple[str, str]:
     """Read public and secret key from a file that only its owner can read.
 
     Raises:
-        InvalidConfig: for a file that is missing or malformed, or that others can read.
+        InvalidConfig: for a file that is missing or malformed, or that other users can read.
     """
     keys = _read(path, secret=True)
     secret = keys.get("secret") or _none_in(path, "secret", f"a file NAME{SECRET}")

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""ZeroMQ sockets with their limits and keys: every socket of the package is made here.
+"""ZeroMQ sockets with their limits and keys: all sockets of the package are made here.
 
-No ZeroMQ heartbeats: a full PULL stops reading them and drops live connections (libzmq #3937). No
+No socket uses ZeroMQ heartbeats: a full PULL stops reading them and drops live connections (libzmq #3937). No
 socket lingers: keyframes that must survive are in the spool.
 """
 
@@ -20,12 +20,12 @@ from tsfusion.core.errors import InvalidConfig, TransportError
 from tsfusion.wire.sockets.curve import ClientKeys, ServerKeys
 
 CONTROL_MAX_BYTES = 64 << 10
-# XPUB keeps a subscription at some fifty times its size; a greeting with keys needs about 330 bytes.
+# XPUB keeps a subscription in some fifty times its bytes; a greeting with keys needs about 330 bytes.
 TOPIC_MAX_BYTES = 512
 _KINDS = (b"mesh/", b"scan/")  # of topics
-# HANDSHAKE_IVL, ms: then a connection that is not made is closed. The others end a connection whose other end
-# has left without a word. Seconds: KEEPALIVE_IDLE and _INTVL between the probes of one that is idle, of which
-# KEEPALIVE_CNT are lost. Milliseconds: TCP_MAXRT without an answer to what is under way.
+# HANDSHAKE_IVL (ms): a connection without a handshake is closed after it. The other options end a connection
+# whose other end has disappeared. An idle one is probed after KEEPALIVE_IDLE, then each KEEPALIVE_INTVL
+# (seconds); it ends after KEEPALIVE_CNT lost probes. TCP_MAXRT (ms): sent bytes stay so long unanswered.
 _LISTENING: dict[int, int] = {
     zmq.HANDSHAKE_IVL: 5000,
     zmq.TCP_MAXRT: 30_000,
@@ -46,10 +46,10 @@ _CONNECTING: dict[int, int] = {
     zmq.TCP_KEEPALIVE_INTVL: 1,
     zmq.TCP_KEEPALIVE_CNT: 3,
 }
-_CONTEXT_FILES = 8  # that libzmq opens for a context, and a few for others
+_CONTEXT_FILES = 8  # files that libzmq opens for a context, and a few more
 _RANDOM_PORT_TRIES = 32
 LAST_PORT = 65535
-_MAPS_TOPIC = re.compile(rf"(mesh|scan)/({MAP_NAME}/?)?".encode())  # or its beginning
+_MAPS_TOPIC = re.compile(rf"(mesh|scan)/({MAP_NAME}/?)?".encode())  # a map's topic, or its first part
 _HOST6 = r"[0-9A-Fa-f]*:[0-9A-Fa-f:.]*(%[\w.-]+)?"
 _PORT = r"[0-9]{1,5}|\*"
 _ADDRESS = re.compile(rf"tcp://((?P<host>[\w.*-]+)|\[(?P<host6>{_HOST6})\]):(?P<port>{_PORT})", re.ASCII)
@@ -67,14 +67,14 @@ class Addresses(Struct, frozen=True):
 
 
 def check_context() -> None:
-    """Raise OSError when too few files can be opened for a context; libzmq would end this process then."""
+    """Raise OSError if too few files can be opened for a context: libzmq would end this process."""
     with ExitStack() as tried:
         for _ in range(_CONTEXT_FILES):
             tried.enter_context(open(os.devnull))
 
 
 def open_context() -> "zmq.Context[Any]":
-    """A context for a few sockets.
+    """Open a context for a few sockets.
 
     Raises:
         TransportError: when too few files can be opened for it.
@@ -87,22 +87,22 @@ def open_context() -> "zmq.Context[Any]":
 
 
 def push(context: "zmq.Context[Any]", keys: ClientKeys | None = None) -> AnySocket:
-    """The scanner's data socket. IMMEDIATE: nothing is queued for a server that is not there."""
+    """Make the scanner's data socket. IMMEDIATE: nothing is queued for a server that is not there."""
     return _make(context, zmq.PUSH, {**_CONNECTING, zmq.SNDHWM: 10}, keys)
 
 
 def pull(context: "zmq.Context[Any]", max_frame_bytes: int, keys: ServerKeys | None = None) -> AnySocket:
-    """The server's data socket; a larger frame is dropped with its connection before it is in memory."""
+    """Make the server's data socket. A frame over the limit drops its connection before it is in memory."""
     return _make(context, zmq.PULL, {**_LISTENING, zmq.RCVHWM: 16, zmq.MAXMSGSIZE: max_frame_bytes}, keys)
 
 
 def dealer(context: "zmq.Context[Any]", keys: ClientKeys | None = None) -> AnySocket:
-    """The scanner's control socket. IMMEDIATE: greetings do not pile up for a server that is not there."""
+    """Make the scanner's control socket. IMMEDIATE: no greetings pile up for a server that is not there."""
     return _make(context, zmq.DEALER, {**_CONNECTING, zmq.SNDHWM: 100, zmq.RCVHWM: 1000}, keys)
 
 
 def router(context: "zmq.Context[Any]", keys: ServerKeys | None = None) -> AnySocket:
-    """The server's control socket."""
+    """Make the server's control socket."""
     limits: dict[int, int] = {zmq.SNDHWM: 1000, zmq.RCVHWM: 100, zmq.MAXMSGSIZE: CONTROL_MAX_BYTES}
     return _make(context, zmq.ROUTER, {**_LISTENING, **limits}, keys)
 
@@ -110,47 +110,47 @@ def router(context: "zmq.Context[Any]", keys: ServerKeys | None = None) -> AnySo
 def publisher(
     context: "zmq.Context[Any]", keys: ServerKeys | None = None, *, manual: bool = False
 ) -> AnySocket:
-    """The server's mesh updates; a slow viewer misses some, never holds the server up.
+    """Make the server's socket for mesh updates. A slow viewer misses some and never slows the server.
 
     Args:
-        manual: who subscribes gets nothing before SUBSCRIBE is set for it: at once, since that counts for the
-            sender of the message that was received last.
+        manual: send a viewer nothing before SUBSCRIBE is set for it. Set it at once: it applies to the sender
+            of the message that was received last.
     """
     limits: dict[int, int] = {zmq.SNDHWM: 16, zmq.MAXMSGSIZE: TOPIC_MAX_BYTES, zmq.XPUB_MANUAL: int(manual)}
     return _make(context, zmq.XPUB, {**_LISTENING, **limits}, keys)
 
 
 def mesh_topic(map_name: str) -> bytes:
-    """Topic of a map's mesh updates. No map's topic is the beginning of another map's."""
+    """Return the topic of a map's mesh updates. No map's topic is the beginning of another map's."""
     return topics_of(map_name)[0]
 
 
 def scan_topic(map_name: str) -> bytes:
-    """Topic of the keyframes that a map's scanners send."""
+    """Return the topic of the keyframes that a map's scanners send."""
     return topics_of(map_name)[1]
 
 
 def topics_of(map_name: str) -> list[bytes]:
-    """All topics of a map."""
+    """Return all topics of a map."""
     return [kind + map_name.encode() + b"/" for kind in _KINDS]
 
 
 def is_topic(topic: bytes) -> bool:
-    """True if a subscription is for what comes of one map or of all maps; no other is allowed."""
+    """True if a subscription is for one map or for all maps. No other subscription is allowed."""
     return any(kind.startswith(topic) for kind in _KINDS) or _MAPS_TOPIC.fullmatch(topic) is not None
 
 
 def subscriber(
     context: "zmq.Context[Any]", keys: ClientKeys | None = None, *, map_name: str = DEFAULT_MAP
 ) -> AnySocket:
-    """A viewer's socket for a map's mesh updates (`wire/messages/mesh_updates.py`). Use `connect`."""
+    """Make a viewer's socket for a map's mesh updates (`wire/messages/mesh_updates.py`)."""
     made = _make(context, zmq.SUB, {**_CONNECTING, zmq.IMMEDIATE: 0, zmq.RCVHWM: 16}, keys)
     made.setsockopt(zmq.SUBSCRIBE, mesh_topic(map_name))
     return made
 
 
 def pose_feed(context: "zmq.Context[Any]", max_frame_bytes: int) -> AnySocket:
-    """A scanner's socket for the poses of another process; a flood of them fills its queue and no more."""
+    """Make a scanner's socket for the poses of another process. A flood of poses fills only its queue."""
     limits: dict[int, int] = {zmq.IMMEDIATE: 0, zmq.RCVHWM: 256, zmq.MAXMSGSIZE: max_frame_bytes}
     made = _make(context, zmq.SUB, {**_CONNECTING, **limits})
     made.setsockopt(zmq.SUBSCRIBE, b"")
@@ -158,7 +158,7 @@ def pose_feed(context: "zmq.Context[Any]", max_frame_bytes: int) -> AnySocket:
 
 
 def pair(context: "zmq.Context[Any]") -> AnySocket:
-    """The socket between gateway and fuser, over a file that only this user can open."""
+    """Make the socket between gateway and fuser, over a file that only this user can open."""
     return _make(context, zmq.PAIR, {zmq.SNDHWM: 64, zmq.RCVHWM: 64})
 
 
@@ -178,13 +178,13 @@ def _make(
 
 
 def has_message(made: AnySocket) -> bool:
-    """True if a message can be read at once: asking costs a tenth of an exception."""
+    """True if a message can be read at once. This check costs a tenth of an exception."""
     waiting: Any = made.getsockopt(zmq.EVENTS)
     return bool(waiting & zmq.POLLIN)
 
 
 def peer_address(frame: zmq.Frame) -> str:
-    """Address of the machine that sent a frame; empty where ZeroMQ does not know it."""
+    """Return the address of the machine that sent a frame, or "" where ZeroMQ does not know it."""
     try:
         return str(frame.get("Peer-Address")).removeprefix(MAPPED)
     except zmq.ZMQError:
@@ -192,7 +192,7 @@ def peer_address(frame: zmq.Frame) -> str:
 
 
 def file_of(frame: zmq.Frame) -> int | None:
-    """File number of the connection over which a frame came; None where ZeroMQ does not know it."""
+    """Return the file number of the connection that brought a frame, or None if ZeroMQ does not know it."""
     try:
         return int(frame.get(zmq.SRCFD))
     except (zmq.ZMQError, ValueError):
@@ -200,7 +200,7 @@ def file_of(frame: zmq.Frame) -> int | None:
 
 
 def parse_address(address: str) -> tuple[str, int]:
-    """Host and port of `tcp://host:port` (port `*` or 0 = random); an IPv6 address stands in brackets.
+    """Return host and port of `tcp://host:port` (port `*` or 0 = random). Brackets enclose an IPv6 address.
 
     Raises:
         InvalidConfig: for anything else.
@@ -220,7 +220,7 @@ def parse_address(address: str) -> tuple[str, int]:
 
 
 def _ip(host: str) -> IPv4Address | IPv6Address | None:
-    """A host that is a number; None = it is a name. The IPv4 address, where it is one in the form of IPv6."""
+    """Return the address if a host is a number, else None. An IPv4 address in IPv6 form becomes IPv4."""
     try:
         found = ip_address(host)
     except ValueError:
@@ -237,7 +237,7 @@ def connect(made: AnySocket, address: str, *, named_ipv6: bool = False) -> None:
     """Connect a socket.
 
     Args:
-        named_ipv6: of a name, take the IPv6 address; libzmq itself tries one of the two and no other.
+        named_ipv6: for a host name, take the IPv6 address; libzmq tries only one of the two.
     """
     host, port = parse_address(address)
     if named_ipv6 and host == "localhost":
@@ -252,14 +252,14 @@ def format_address(host: str, port: int) -> str:
 
 
 def publish_address(address: str, control: str | None = None, publish: str | None = None) -> str:
-    """Address at which a server publishes: `publish` if given, else the port after its control address."""
+    """Return the address at which a server publishes: `publish`, or the port after its control address."""
     if publish is not None:
         return format_address(*parse_address(publish))
     return _next_port(control_address(address, control), "mesh updates")
 
 
 def control_address(address: str, control: str | None = None) -> str:
-    """The control address of a server: `control` if given, else the port after that of the data address."""
+    """Return the control address of a server: `control`, or the port after the data address."""
     if control is not None:
         return format_address(*parse_address(control))
     return _next_port(address, "control")
@@ -273,7 +273,7 @@ def _next_port(address: str, purpose: str) -> str:
 
 
 def connect_address(address: str) -> str:
-    """Check an address to connect to; returns its plain form. Raises InvalidConfig."""
+    """Check an address to connect to. Return it in plain form. Raise InvalidConfig."""
     host, port = parse_address(address)
     if port == 0:
         raise InvalidConfig(f"connecting needs a port, got {address}")
@@ -281,7 +281,7 @@ def connect_address(address: str) -> str:
 
 
 def check_reachable(address: str, *, has_keys: bool) -> None:
-    """Raise InvalidConfig when other machines can reach the address and there are no keys."""
+    """Raise InvalidConfig if other machines can reach the address, and there are no keys."""
     if has_keys or is_loopback(parse_address(address)[0]):
         return
     raise InvalidConfig(
@@ -293,11 +293,14 @@ def check_reachable(address: str, *, has_keys: bool) -> None:
 
 
 def place_of(address: str, control: str, *, has_keys: bool) -> tuple[str, str]:
-    """Data and control address of a server that a map is said to be at; an empty one is the next port.
+    """Return data and control address of the server that is said to have a map.
+
+    Args:
+        control: empty takes the port after `address`.
 
     Raises:
-        InvalidConfig: for addresses that are none, and without keys for those of other machines: anybody may
-            have said so.
+        InvalidConfig: for malformed addresses. Without keys also for other machines: anybody may have sent
+            them.
     """
     place = connect_address(address), connect_address(control_address(address, control or None))
     for one in place:
@@ -306,7 +309,7 @@ def place_of(address: str, control: str, *, has_keys: bool) -> tuple[str, str]:
 
 
 def check_own_machine(address: str) -> None:
-    """Raise InvalidConfig when other machines can reach the address."""
+    """Raise InvalidConfig if other machines can reach the address."""
     if not is_loopback(parse_address(address)[0]):
         raise InvalidConfig(
             f"there are no keys here, so that only tcp://127.0.0.1 can be bound, got {address}; let the "
@@ -321,7 +324,7 @@ def is_loopback(host: str) -> bool:
 
 
 def check_free(address: str) -> None:
-    """Raise TransportError when a server could not listen on an address; no port is opened for that."""
+    """Raise TransportError if a server cannot listen on an address. The port is only tried, not kept."""
     host, port = parse_address(address)
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
@@ -337,10 +340,10 @@ def check_free(address: str) -> None:
 
 
 def bind(data: AnySocket, control: AnySocket, publish: AnySocket, listen: str, to: str | None) -> Addresses:
-    """Bind a server's three sockets: `listen`, `to` (default: the next port), and the one after that.
+    """Bind a server's three sockets: `listen`, `to` (default: the next port), and the port after that.
 
     Raises:
-        TransportError: when a port is taken (a random one is drawn again until its neighbours are free).
+        TransportError: when a port is taken. A random port is drawn again until its neighbours are free.
     """
     host, port = parse_address(listen)
     tries = _RANDOM_PORT_TRIES if port == 0 else 1
@@ -360,7 +363,7 @@ def bind(data: AnySocket, control: AnySocket, publish: AnySocket, listen: str, t
 
 
 def bind_socket(made: AnySocket, address: str) -> str:
-    """Bind a socket; returns its address with the real port number. Raises TransportError.
+    """Bind a socket. Return its address with the real port number. Raise TransportError.
 
     `[::]` takes connections over IPv6 and IPv4, `*` and `0.0.0.0` over IPv4 alone.
     """
