@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The sending side inside the client: spool, outbox, backpressure.
+"""Send records from a client to its server: spool, outbox and backpressure.
 
-Everything is kept, and sent again, until the server has it on its disk.
+Every record is kept, and sent again if needed, until the server has it on its disk.
 """

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""Taking keyframes and corrections into the spool, or skipping and counting them.
+"""Put keyframes and corrections into the spool, or skip them by a policy and count them.
 
-The policies act on how far the map is behind: on keyframes in the spool, and on those the server has on its
-disk but not yet in the map.
+The policies act on the number of keyframes that the map lacks: those in the spool, and those on the server's
+disk but not yet fused.
 
-    thin         everything is kept until the map is `catch_up` seconds behind or the spool's room runs short,
-                 then 1 of n, so that the map can follow: it gets less detail, but no hole
+    thin         keeps everything until the map is `catch_up` seconds behind or the spool is nearly full; then
+                 keeps 1 of n keyframes, so that the map can follow with less detail but without holes
     block        `send` waits: nothing is skipped, the sensor is held up (replays)
-    drop_oldest  the oldest goes: the map follows the sensor closely, with holes (teleoperation)
-    spool_all    everything is kept: the map may be long behind, and complete (surveys)
+    drop_oldest  drops the oldest: the map follows the sensor closely, with holes (teleoperation)
+    spool_all    keeps everything: the map may be long behind, but is complete (surveys)
 """
 
 import logging
@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 
 
 class Backpressure:
-    """Puts records into the spool, as the policy and the spool's limits allow. For one thread at a time."""
+    """Puts records into the spool within the policy and the spool's limits. For one thread at a time."""
 
     def __init__(self, outbox: Outbox, config: ClientConfig) -> None:
         self._outbox = outbox
@@ -39,14 +39,14 @@ class Backpressure:
 
     @property
     def must_wait(self) -> bool:
-        """True if the policy lets no keyframe in for now."""
+        """True if the policy accepts no keyframe for now."""
         return self._config.policy == "block" and self._outbox.behind >= self._config.backlog
 
     def put(self, keyframe: Keyframe) -> int | None:
-        """Put a keyframe into the spool; its number there, None = it was skipped.
+        """Put a keyframe into the spool; return its number there, or None if it was skipped.
 
         Raises:
-            JournalError: never for what the disk refuses; that is skipped.
+            JournalError: any failure but the disk's; a keyframe that the disk refuses is skipped instead.
         """
         if self._config.policy == "thin" and (reason := self._thinning.reason(self._limits.room())):
             self._outbox.skip(reason)
@@ -59,7 +59,7 @@ class Backpressure:
         return self._store(frames, keyframe)
 
     def put_correction(self, correction: Correction) -> int | None:
-        """Put a correction into the spool; its number there, None = the spool or its disk is full.
+        """Put a correction into the spool; return its number there, or None if the spool or its disk is full.
 
         No policy thins corrections out or holds them up.
 
@@ -69,7 +69,7 @@ class Backpressure:
         return self._store(corrections.encode(correction, **self._addressed()), None)
 
     def _addressed(self) -> dict[str, Any]:
-        """The fields of a header that say whose record is next, and what it is for."""
+        """Return the header fields that identify the next record and its map."""
         spool = self._outbox.spool
         return {
             "session": spool.session,
@@ -100,7 +100,7 @@ class Backpressure:
         return entry.seq
 
     def _why_full(self, nbytes: int) -> str:
-        """The reason why so many bytes more cannot be kept; empty = they can."""
+        """Return the reason why the spool cannot keep so many more bytes; empty if it can."""
         while self._limits.is_full(nbytes):
             if self._config.policy != "drop_oldest" or not self._outbox.drop_oldest():
                 self._limits.on_full()
@@ -109,15 +109,15 @@ class Backpressure:
 
 
 _ARRIVALS = 64  # keyframes of the sensor over which their rate is measured
-_THINNEST = 16  # of so many one is kept in any case
-_LATEST = 3  # a map that is later than so many times `catch_up` gets no fewer keyframes
+_THINNEST = 16  # at least one of this many keyframes is kept
+_LATEST = 3  # a map later than this many times `catch_up` is thinned no further
 
 
 class Thinning:
-    """Keyframes that `thin` leaves out: none while there is time to catch up, and room. For one thread.
+    """Chooses the keyframes that `thin` leaves out: none while the map keeps up and the spool has room.
 
     Args:
-        catch_up: seconds; the map may be so far behind, and the spool must not be full sooner than that.
+        catch_up: seconds; limit for the lag of the map, and for the time until the spool is full.
     """
 
     def __init__(self, outbox: Outbox, catch_up: float) -> None:
@@ -128,7 +128,7 @@ class Thinning:
         self._left_out = self._in_a_row = 0
 
     def reason(self, room: int) -> str:
-        """Reason why the next keyframe is left out: `thinned` or `room`; empty = it is kept."""
+        """Return the reason to leave out the next keyframe, `thinned` or `room`; empty to keep it."""
         self._arrivals.append(self._outbox.clock())
         lag, full = self._outbox.lag, self._fullness(room)
         shortage = max(lag.seconds / self._catch_up, full)  # 1 = act, 0.5 = enough
@@ -149,23 +149,24 @@ class Thinning:
 
     @staticmethod
     def _one_of(shortage: float, faster: float) -> int:
-        """Number n of which one keyframe is kept, so that a map gets no more than it takes.
+        """Return n: one of n keyframes is kept, so that the map gets no more than it can fuse.
 
         Args:
-            faster: times that the sensor is faster than the map; 0 = the spool's room is what runs short.
+            faster: the sensor's rate divided by the map's rate; 0 = only the spool's room is short.
         """
         pressure = max(int(shortage), 1)
         return min((min(pressure, _LATEST) if faster else pressure) + max(int(faster), 1), _THINNEST)
 
     def _arrival_rate(self) -> float:
-        """Keyframes a second that the sensor gives."""
+        """Return the keyframes a second that the sensor gives."""
         seconds = self._arrivals[-1] - self._arrivals[0]
         return (len(self._arrivals) - 1) / seconds if seconds > 0 else 0.0
 
     def _fullness(self, room: int) -> float:
-        """Waiting keyframes, or those of `catch_up` seconds if they are fewer, as a share of the free room.
+        """Return the bytes of the waiting keyframes, or of `catch_up` seconds if fewer, divided by the free
+        room.
 
-        So nothing is left out while the spool is not half full: it may be small and empty again soon.
+        So nothing is left out until the spool is half full: a small spool may soon be empty again.
         """
         _, waiting, nbytes = self._outbox.usage()
         if not waiting:
@@ -200,7 +201,7 @@ _MAX_WAITING = 1_000_000  # records: some 200 bytes of memory each
 
 
 class SpoolLimits:
-    """The limits of a spool; `outbox.state` says whether it is at one. For one thread at a time."""
+    """The limits of a spool; `outbox.state` shows a limit that is reached. For one thread at a time."""
 
     def __init__(self, outbox: Outbox, spool_bytes: int, min_free_bytes: int) -> None:
         self._outbox = outbox
@@ -210,7 +211,7 @@ class SpoolLimits:
         self._look_due = self._retry_due = 0.0
 
     def is_full(self, nbytes: int) -> bool:
-        """True if the spool would pass its own limit with `nbytes` more."""
+        """Return True if the spool would pass its own limit with `nbytes` more."""
         used, *_ = self._outbox.usage()
         if used + nbytes > self._spool_bytes:
             self._outbox.tidy()
@@ -218,7 +219,7 @@ class SpoolLimits:
         return used + nbytes > self._spool_bytes or waiting >= _MAX_WAITING
 
     def room(self) -> int:
-        """Bytes that the spool may still take."""
+        """Return the number of bytes that the spool can still take."""
         used, *_ = self._outbox.usage()
         room = self._spool_bytes - used
         if self._min_free_bytes:
@@ -229,11 +230,11 @@ class SpoolLimits:
         return room
 
     def on_full(self) -> None:
-        """Note that the spool is at its limit, and nothing could be dropped."""
+        """Record that the spool is at its limit, and that nothing could be dropped."""
         self._enter("spool", f"it has reached its limit of {self._spool_bytes} bytes (spool_bytes)")
 
     def disk_refuses(self, nbytes: int) -> bool:
-        """True if the disk has failed just now, or would have too little left with `nbytes` more."""
+        """Return True if the disk has just failed, or `nbytes` more would leave too little free space."""
         now = time.monotonic()
         if now < self._retry_due:
             return True
@@ -241,7 +242,7 @@ class SpoolLimits:
             return False
         wanted = self._min_free_bytes
         if self._outbox.state == "disk":
-            wanted += wanted // 4  # else each keyframe that leaves the spool would end the state
+            wanted += wanted // 4  # else the state would end with each keyframe that leaves the spool
         if now >= self._look_due or self._free - self._written - nbytes < wanted:
             self._measure_free_space(now)
         free = self._free - self._written
@@ -252,12 +253,12 @@ class SpoolLimits:
         return True
 
     def on_failed_write(self, error: Exception) -> None:
-        """Note that the disk would not take a record."""
+        """Record that the disk did not take a record."""
         self._retry_due = time.monotonic() + _RETRY_INTERVAL
         self._enter("disk", str(error))
 
     def on_write(self, nbytes: int) -> None:
-        """Note that the disk took a record."""
+        """Record that the disk took a record."""
         self._written += nbytes
         state, (used, *_) = self._outbox.state, self._outbox.usage()
         if state == "disk" or (state == "spool" and used < 0.9 * self._spool_bytes):

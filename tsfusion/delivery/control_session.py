@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The client's side of the control socket, without the socket: greetings, pings, progress, refusals."""
+"""Handle the client's control messages, without the socket: greetings, pings, progress, refusals."""
 
 import logging
 import math
@@ -23,26 +23,26 @@ REFUSED_BYTES = 64 << 20
 
 
 class RefusedRecords:
-    """Records that were turned away: told, counted, and if refused kept in a folder of the spool.
+    """Logs and counts records that were turned away; copies refused ones into a folder of the spool.
 
-    A temporary spool keeps none.
+    A temporary spool keeps no copies.
     """
 
     def __init__(self, outbox: Outbox) -> None:
         self._outbox = outbox
-        self._warning_due = 0.0  # time.monotonic(), when rejected records may be named again
-        self._unsaid = 0  # records that were rejected since they were
+        self._warning_due = 0.0  # time.monotonic() of the next warning about rejected records
+        self._unsaid = 0  # records rejected since the last warning
         self._kept = Quarantine(outbox.spool.folder / REFUSED_FOLDER, REFUSED_BYTES)
 
     def give_up(self, entry: Waiting, reason: str, message: str, *, readable: bool = True) -> None:
-        """Take a record out of the spool for good, and keep a copy when it can be read."""
+        """Remove a record from the spool for good, and keep a copy if it can be read."""
         log.error("%s %d is lost (%s): %s", entry.kind, entry.seq, reason, message)
         if readable and not self._outbox.spool.temporary:
             self._keep(entry, reason)
         self._outbox.refuse(entry, reason, message)
 
     def note_rejected(self, nack: messages.Nack, now: float) -> None:
-        """Say at once that the map did not take a record, the first of each reason as an error."""
+        """Log that the map rejected a record: the first of each reason at once, as an error."""
         counted = self._outbox.reject(nack.seq, nack.reason, nack.message)
         if counted is None:  # it was told twice
             return
@@ -72,21 +72,22 @@ log = logging.getLogger(__name__)
 
 _HELLO_INTERVAL = (0.02, 0.5)  # seconds: first and longest, doubling until there is an answer
 _PING_INTERVAL = 0.5
-_FIRST_PINGS_INTERVAL = 0.02  # until the clock estimate stands on all its samples
-_REWIND_INTERVAL = 0.2  # one gap is reported by every keyframe behind it
+_FIRST_PINGS_INTERVAL = 0.02  # until the clock estimate has all its samples
+_REWIND_INTERVAL = 0.2  # every keyframe after a gap reports the gap
 _LATEST = 1 << 62  # nanoseconds; no clock shows more than a century
 _OTHER_WORLD_INTERVAL = 5.0  # seconds; a map's frame changes when the server begins anew
 _WARNING_INTERVAL = 10.0  # seconds between two warnings of rejected records
 _MOST_HOPS = 4  # from server to server, before there is a pause between two
-_HOP_INTERVAL = 2.0  # seconds; servers that send a client to each other are put right by a person
+_HOP_INTERVAL = 2.0  # seconds; a person must repair servers that send a client to each other
 _HOLD = (0.05, 60.0)  # seconds: no server may hold a client for less or longer at a time
 
 
 class ControlSession:
-    """The client's side of the control socket. For the sending thread; `last_heard` may be read by any.
+    """The client's side of the control socket. For the sending thread; any thread may read `last_heard`.
 
     Args:
-        send: sends a message, or drops it when it cannot leave at once: it is sent again when due.
+        send: sends a message, or drops it if it cannot leave at once; a dropped message is sent again when
+            due.
     """
 
     def __init__(
@@ -98,11 +99,11 @@ class ControlSession:
         address: str,
         map_name: str,
     ) -> None:
-        self.welcome: messages.Welcome | None = None  # the server's terms; None = it has not let us in (yet)
+        self.welcome: messages.Welcome | None = None  # the server's terms; None before a Welcome
         self.clock = ClockOffset()
         self.last_heard = 0.0  # time of the server's last message, `time.monotonic()`; 0 = never
-        self.last_progress = 0.0  # when something last left the spool, or was turned away
-        self.last_active = 0.0  # the same, or when something was sent while nothing was on its way
+        self.last_progress = 0.0  # time at which a record last left the spool or was turned away
+        self.last_active = 0.0  # the same, or the time of a send while nothing was on its way
         self._outbox = outbox
         self._refused = refused
         self._send = send
@@ -113,26 +114,26 @@ class ControlSession:
         self._hello_due = self._ping_due = self._rewound = self._held_until = 0.0
         self._hello_interval = _HELLO_INTERVAL[0]
         self._asked_again = False
-        self._tries = False  # since a hold: one record, until the server says what became of it
-        self._is_lost = False  # whether it was said that the server is gone or silent
+        self._tries = False  # after a hold: one record at a time, until its outcome is known
+        self._is_lost = False  # the log says that the server is gone or silent
         self._moved_to: tuple[str, str] | None = None
-        self._hops = 0  # to other servers, since one let us in
+        self._hops = 0  # moves to other servers since the last Welcome
 
     @property
     def terms(self) -> messages.Welcome | None:
-        """The server's terms while records may be sent: it let us in, and its answers fit our clock."""
+        """The server's terms; None while no record may be sent (no Welcome, no clock offset, or a hold)."""
         if self.welcome is None or not self.clock.count or self._held_until:
             return None
         return replace(self.welcome, window_keyframes=1) if self._tries else self.welcome
 
     @property
     def held(self) -> bool:
-        """True if the server wants nothing for now."""
+        """True if the server takes no record for now."""
         return self._held_until > 0
 
     @property
     def due(self) -> float:
-        """When `tick` has something to do next, `time.monotonic()`."""
+        """Time of the next work of `tick`, `time.monotonic()`."""
         due = self._ping_due
         if self.welcome is None:
             due = min(due, self._hello_due)
@@ -162,7 +163,7 @@ class ControlSession:
         self._say_how_it_is()
 
     def take_leave(self) -> None:
-        """Tell the server the last counts, and that this client ends."""
+        """Send the server the last counts, and announce the end of this client."""
         self._say_how_it_is(leaving=True)
 
     def _say_how_it_is(self, *, leaving: bool = False) -> None:
@@ -178,19 +179,19 @@ class ControlSession:
         self._send(messages.encode_sealed(ping))
 
     def greet_again(self, after: float = 0.0) -> None:
-        """Ask to be let in (once more), first after so many seconds."""
+        """Send a Hello again, after so many seconds."""
         self.welcome = None
         self._hello_due = time.monotonic() + after
         self._hello_interval = max(_HELLO_INTERVAL[0], after)
 
     def rewind(self) -> None:
-        """Send everything that is not acknowledged once more."""
+        """Send all unacknowledged records once more."""
         self._outbox.rewind()
         self._asked_again = False
         self._rewound = self.last_active = time.monotonic()
 
     def on_connection(self, problem: str, before: str, *, refused: bool) -> None:
-        """Note that a connection cannot be made, or can be (empty), after another problem with it."""
+        """Handle a connection's new problem (empty = it works again); `before` is its earlier problem."""
         if refused:
             self._turned_away(self._outbox.link_state.locked_out(problem))
         elif not problem:
@@ -199,12 +200,12 @@ class ControlSession:
             self._outbox.change_link_state(self._outbox.link_state.unreachable(problem))
 
     def on_silence(self, why: str = "") -> None:
-        """Note that no message of the server came for too long, and why no connection stands."""
+        """Handle a silence of the server that is too long; `why` is the connection's problem, if any."""
         if self._outbox.change_link_state(self._outbox.link_state.silent(why)):
             self._note_loss("is silent")
 
     def on_cut(self) -> None:
-        """Note that the control connection ended: the server does not know the next one yet."""
+        """Handle the end of the control connection: the server does not know the next connection yet."""
         if self.welcome is not None:
             self._note_loss("is gone")
         self.greet_again()
@@ -226,7 +227,7 @@ class ControlSession:
     # --- messages of the server ---
 
     def receive(self, frames: list[bytes]) -> None:
-        """Deal with a message of the server."""
+        """Handle a message of the server."""
         returned_ns = time.monotonic_ns()
         try:
             message = messages.decode_to_client(b"".join(frames))
@@ -245,7 +246,7 @@ class ControlSession:
         elif isinstance(message, messages.Nack):
             self._on_nack(message)
         elif self.welcome is None:
-            return  # it is from before: the Welcome will say where the server stands
+            return  # an old message: the Welcome will tell the server's progress
         elif isinstance(message, messages.Ack):
             self._on_ack(message)
         else:
@@ -269,7 +270,7 @@ class ControlSession:
             if lost := self._outbox.welcome(welcome.durable, welcome.window_keyframes):
                 log.error("%s", lost)
             self._on_progress(welcome.durable, welcome.fused)
-            self._outbox.note_meshed(welcome.fused)  # a new server stamps only what it fuses from here on
+            self._outbox.note_meshed(welcome.fused)  # a new server stamps only what it fuses itself
             self.rewind()
 
     def _on_denied(self, denied: messages.Denied) -> None:
@@ -286,12 +287,12 @@ class ControlSession:
             self._refuse(f"the server at {self._address} refuses this client: {denied.message}")
 
     def take_move(self) -> tuple[str, str] | None:
-        """Addresses, data and control, of the server that has the map; told once. None = go nowhere."""
+        """Return the server that has the map (data and control address) once; None without a move."""
         found, self._moved_to = self._moved_to, None
         return found
 
     def follow(self, address: str) -> None:
-        """Begin anew with the server at another control address."""
+        """Start again with the server at another control address."""
         why = f"map {self._hello.map} is on another server: going on at {address}"
         self._outbox.change_link_state(self._outbox.link_state.away(why))
         log.info("%s", why)
@@ -304,11 +305,11 @@ class ControlSession:
         self.rewind()
 
     def refuse_move(self, why: str) -> None:
-        """Stay, and say why this client does not go where the server sent it."""
+        """Stay with this server, and say why this client does not go to the other one."""
         self._refuse(f"the server at {self._address} sends this client elsewhere: {why}")
 
     def _on_other_world(self, denied: messages.Denied) -> None:
-        """Keep everything, and stop sending. Whoever sends says so (`Client.check_world`)."""
+        """Keep everything and stop sending; callers of `send` get the error (`Client.check_world`)."""
         own = f"--map {denied.free_map} or --map auto" if denied.free_map else "another map"
         why = (
             f"the server at {self._address} refuses this client: {denied.message}: use {own}, or "
@@ -321,7 +322,7 @@ class ControlSession:
         self._turned_away(self._outbox.link_state.refused(why))
 
     def _turned_away(self, state: LinkState) -> None:
-        """Keep asking: a person may put it right at the other end."""
+        """Keep asking: a person may repair the cause at the server."""
         self.greet_again(_HELLO_INTERVAL[1])
         if self._outbox.change_link_state(state):
             log.error("%s", state.why)
@@ -351,7 +352,7 @@ class ControlSession:
         self._asked_again = ack.resend or (self._asked_again and not moved)
 
     def _on_progress(self, durable: int, fused: int, stamps: tuple[Stamps, ...] = ()) -> bool:
-        """Note what the server has. Returns True if anything left the spool."""
+        """Record the server's progress; return True if a record left the spool."""
         if self._is_foreign(durable):
             return False
         offset_ns, bound_ns = self.clock.offset_ns or 0, self.clock.bound_ns
@@ -363,7 +364,7 @@ class ControlSession:
         return moved
 
     def _is_foreign(self, durable: int) -> bool:
-        """Refuse our session if somebody else sends under it. Returns True then: no record of it is ours."""
+        """Return True, and refuse our session, if another scanner sends under it."""
         foreign = self._outbox.is_foreign(durable)
         if foreign:
             self._refuse(

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Spools in a folder of spools: which hold keyframes of an earlier scan, and where a new one may begin.
+"""Find spools that still hold keyframes of an earlier scan, and a free folder for a new spool.
 
-A scan writes into a spool in which nothing waits: `FOLDER/MAP`, or `FOLDER/MAP.2`, `FOLDER/MAP.3`, … where an
-earlier scan's keyframes wait there. The name is for people: which map and world a spool is for stands in the
-headers of its records.
+A scan writes into a spool in which nothing waits: `FOLDER/MAP`, or `FOLDER/MAP.2`, `FOLDER/MAP.3`, … if
+keyframes of an earlier scan wait there. Record headers, not the folder's name, give a spool's map and world.
 """
 
 import logging
@@ -26,7 +25,7 @@ log = logging.getLogger(__name__)
 
 
 class LeftSpool(Struct, frozen=True):
-    """A spool that holds records, as its first one describes it."""
+    """A spool that holds records, described by its first record."""
 
     folder: Path
     map: str
@@ -37,14 +36,14 @@ class LeftSpool(Struct, frozen=True):
 
     @property
     def own_world(self) -> str:
-        """The world, or where none is named a name that a map has only by this spool."""
+        """The world (coordinate frame), or without one a name made from the session, which is unique."""
         return self.world or self.session.hex()
 
     def count(self) -> tuple[int, int, int]:
-        """Keyframes, corrections, and bytes that wait. Reads all of it.
+        """Return the keyframes, corrections and bytes that wait; reads the whole spool.
 
         Raises:
-            JournalError: when a file cannot be read.
+            JournalError: a file cannot be read.
         """
         kinds = [(record.is_correction, record.nbytes) for record in _waiting(self.folder)]
         corrections = sum(is_correction for is_correction, _ in kinds)
@@ -52,7 +51,7 @@ class LeftSpool(Struct, frozen=True):
 
 
 def find(root: Path) -> list[LeftSpool]:
-    """The spools in a folder, or the folder itself where it is one, that hold records; oldest first."""
+    """Return the spools with records in a folder, oldest first; the folder itself may be a spool."""
     found = (_describe(folder) for folder in _folders(root))
     return sorted((one for one in found if one is not None), key=lambda one: one.since_ns)
 
@@ -62,7 +61,7 @@ def _folders(root: Path) -> list[Path]:
 
 
 def damaged(root: Path) -> dict[Path, int]:
-    """Spools in a folder, or the folder itself, of which damage has destroyed records: how many, at least."""
+    """Return the damaged spools, each with a lower bound of its lost records; `root` may be a spool."""
     found = {}
     for folder in _folders(root):
         with suppress(JournalError):  # `find` tells
@@ -74,17 +73,17 @@ def damaged(root: Path) -> dict[Path, int]:
 
 
 def free_folder(root: Path, map_name: str) -> Path:
-    """The first of MAP, MAP.2, MAP.3, … in which nothing waits and that nobody has open."""
+    """Return the first of MAP, MAP.2, MAP.3, … in which nothing waits and that no process has open."""
     names = (map_name if number == 1 else f"{map_name}.{number}" for number in count(1))
     folders = (root / name for name in names)
     return next(folder for folder in folders if not any(folder.glob("*.mcap")) and owner_of(folder) is None)
 
 
 def drop(left: LeftSpool) -> None:
-    """Delete a spool and all that waits in it; what the server refused stays, in its folder `refused`.
+    """Delete a spool and all waiting records; records that the server refused stay in its folder `refused`.
 
     Raises:
-        JournalError: when somebody has it open, or the disk refuses.
+        JournalError: another process has the spool open, or the disk refuses.
     """
     lock = lock_folder(left.folder, "spool", "scanner")
     try:
@@ -100,7 +99,7 @@ def drop(left: LeftSpool) -> None:
 def _describe(folder: Path) -> LeftSpool | None:
     try:
         for record in _waiting(folder):
-            with suppress(DecodeError, IndexError):  # damaged: a later one says the same
+            with suppress(DecodeError, IndexError):  # damaged: a later record names the same map
                 header = unpack(record.frames[0])
                 place = (folder, header.map, header.world)
                 return LeftSpool(*place, record.session, record.logged_ns, owner_of(folder))

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The client's records and what became of each: shared by the thread that sends and those that call.
+"""Track a client's records and their outcomes, for the sending thread and the calling threads.
 
-Every method locks by itself and gives out copies, so callers cannot hold the lock too briefly or too long.
-`Spool.write` and `Spool.read` use the disk and are outside the lock.
+Every method takes the lock itself and returns copies, so callers never handle the lock. `Spool.write` and
+`Spool.read` use the disk and run outside the lock.
 """
 
 import threading
@@ -34,31 +34,31 @@ LinkKind = Literal[
 
 
 class LinkState(Struct, frozen=True):
-    """State of the link between client and server; each method gives the next one after an event.
+    """State of the link between client and server; each method returns the state after an event.
 
-        connecting   nobody has answered yet, or a server has let us in and its first answer is awaited
-        connected    the server answers, and takes what is sent
-        held         the server answers, but wants nothing for now: its disk is full, or the quota is used up
+        connecting   no server has answered yet, or the client waits for the first Pong after a Welcome
+        connected    the server answers and takes records
+        held         the server answers but takes no records for now: full disk or used quota
         opening      the server answers, but the map is not open yet
-        refused      the server does not want this client: another version, another's session, no such map
-        moved        another server has the map, and the client goes there
+        refused      the server refuses this client: other version, another's session, no such map
+        moved        another server has the map, and the client goes to that server
         other_world  the map has keyframes of another session, in another coordinate frame
         locked_out   the server does not know the client's key, or asks for one
-        silent       the server answered once, and has not been heard for too long
+        silent       the server has answered before, but not for too long a time
 
-    A client begins as `connecting`. A Welcome leads back there from anywhere but `connected` and `held`: the
-    server has let us in, and the next Pong means `connected`. From there a Hold leads to `held`, and progress
-    back again. A Denied leads to `opening`, `moved`, `refused` or `other_world`, a refused handshake to
-    `locked_out`, and they stay until a Welcome, another Denied or, with `locked_out`, until the handshake
-    succeeds. Silence leads to `silent` from `connected`, `held`, `opening` and `moved`; the others say why
-    nothing moves already.
+    A client begins as `connecting`. A Welcome leads from any state except `connected` and `held` to
+    `connecting`; the next Pong leads to `connected`. From there a Hold leads to `held`, and progress back to
+    `connected`. A Denied leads to `opening`, `moved`, `refused` or `other_world`, a refused handshake to
+    `locked_out`. These states last until a Welcome or another Denied; `locked_out` also ends with a
+    successful handshake. Silence leads to `silent` from `connected`, `held`, `opening` and `moved`; the other
+    states already give a reason.
 
-    Nobody gives up in any state: the client asks again for ever, because a person may put it right at the
-    other end. `ControlSession` sees the events and replaces the present state by the next.
+    The client asks again for ever in every state, because a person may repair the cause at the server.
+    `ControlSession` sees the events and replaces the state.
     """
 
     kind: LinkKind = "connecting"
-    why: str = ""  # for a person, why nothing is taken; empty = nothing is known against it
+    why: str = ""  # why no records are taken, for a person; empty = no known reason
 
     @property
     def is_connected(self) -> bool:
@@ -72,58 +72,58 @@ class LinkState(Struct, frozen=True):
     # --- the transport ---
 
     def unreachable(self, why: str) -> "LinkState":
-        """The state when no connection can be made: no server ever answered, or no socket opens."""
+        """Return the state if no connection can be made: no server ever answered, or no socket opens."""
         return LinkState("connecting", why)
 
     def reachable(self, problem: str) -> "LinkState":
-        """The state when a connection stands again that had this problem."""
+        """Return the state after the connection with this problem works again."""
         return LinkState() if self.why == problem else self
 
     def locked_out(self, why: str) -> "LinkState":
-        """The state after a refused handshake."""
+        """Return the state after a refused handshake."""
         return LinkState("locked_out", why)
 
     def silent(self, why: str = "") -> "LinkState":
-        """The state when no message of the server came for too long; empty = the connection stands."""
+        """Return the state after too long a silence of the server; `why` is empty if the connection works."""
         is_so = self.is_connected or self.kind in ("opening", "moved", "silent")
         return LinkState("silent", why) if is_so else self
 
     # --- the server's messages ---
 
     def misunderstood(self, why: str) -> "LinkState":
-        """The state when something answers that is no server of ours."""
+        """Return the state after an answer from a program that is no tsfusion server."""
         return self if self.why else LinkState(self.kind, why)
 
     def opening(self, why: str) -> "LinkState":
-        """The state after a Denied, because the map is not open yet."""
+        """Return the state after a Denied because the map is not open yet."""
         return LinkState("opening", why)
 
     def away(self, why: str) -> "LinkState":
-        """The state after a Denied, because another server has the map."""
+        """Return the state after a Denied because another server has the map."""
         return LinkState("moved", why)
 
     def refused(self, why: str) -> "LinkState":
-        """The state when server and client cannot work together, by a Denied or by what a Welcome says."""
+        """Return the state if server and client cannot work together, by a Denied or a Welcome."""
         return LinkState("refused", why)
 
     def other_world(self, why: str) -> "LinkState":
-        """The state when the map's coordinate frame is not that of this client's poses."""
+        """Return the state if the map's coordinate frame differs from that of this client's poses."""
         return LinkState("other_world", why)
 
     def welcomed(self) -> "LinkState":
-        """The state after a Welcome."""
+        """Return the state after a Welcome."""
         return LinkState("connected" if self.is_connected else "connecting")
 
     def answered(self) -> "LinkState":
-        """The state after a Pong of the server that let this client in."""
+        """Return the state after a Pong of the server that let this client in."""
         return LinkState("connected") if self.kind in ("connecting", "silent") else self
 
     def held(self, why: str) -> "LinkState":
-        """The state after a Hold."""
+        """Return the state after a Hold."""
         return self if self.is_refused else LinkState("held", why)
 
     def moved(self) -> "LinkState":
-        """The state after the server has taken a record."""
+        """Return the state after the server has taken a record."""
         return LinkState("connected") if self.kind == "held" else self
 
 
@@ -131,27 +131,27 @@ _CHECK_INTERVAL = 0.5  # seconds between two calls of what `wait` was given to c
 
 
 class Outbox:
-    """The spool, the fate of what passed through it, and the state of the link. For any thread."""
+    """The spool, the outcomes of its records, and the state of the link. For any thread."""
 
     def __init__(self, spool: Spool, clock: Callable[[], float] = time.monotonic) -> None:
         # The condition's own `with` may be left by Ctrl-C with the lock taken: it is written in Python.
         self._lock = threading.RLock()
         self._changed = threading.Condition(self._lock)
-        self.spool = spool  # its queue is for this class alone; all else uses the disk, outside the lock
-        self.clock = clock  # seconds, of the rates
+        self.spool = spool  # only this class uses its queue; other calls use the disk, outside the lock
+        self.clock = clock  # seconds, for the rates
         self._rate = TakingRate()
-        # How client and server stand with each other; replaced whole, by the sending thread alone
+        # Only the sending thread replaces the state, always as a whole
         self.link_state = LinkState()
-        self.state = "ok"  # of the spool, as in `ClientStats`; set by the one thread that writes to it
-        self.spool_problem = ""  # why the spool cannot keep what comes; empty = it can
-        self._outstanding = 0  # of the oldest in the spool, so many are on their way
-        self._progress = DeliveryProgress()  # of what is durable
+        self.state = "ok"  # state of the spool, as in `ClientStats`; set by its writing thread
+        self.spool_problem = ""  # why the spool cannot keep new records; empty = it can
+        self._outstanding = 0  # number of the spool's oldest records that are on their way
+        self._progress = DeliveryProgress()  # progress of the durable records
         self._corrections_waiting = 0
         self._times = KeyframeTimesTable()
         self._outcomes = Outcomes()
         for _ in range(spool.damaged):
             self._outcomes.skip("damaged", "")
-        # Of what a dead scanner left, any may have been sent; and what a power cut took of it, too.
+        # Any record of a dead scanner may have been sent, even one lost in a power cut.
         self._perhaps_sent = spool.waiting[-1].seq if spool.waiting else 0
         self._used_before = spool.next_seq - 1
         self._claimed = 0
@@ -160,11 +160,11 @@ class Outbox:
     # --- for those who wait ---
 
     def wait(self, reached: Callable[[], bool], timeout: float | None, check: Callable[[], None]) -> bool:
-        """Wait until `reached()`, asked at every change; False when it is not after `timeout` seconds.
+        """Wait until `reached()` is true, checked at every change; return False after `timeout` seconds.
 
         Args:
             timeout: None = for ever.
-            check: called in between; ends the wait when it raises.
+            check: called in between; an exception from it ends the wait.
         """
         deadline = None if timeout is None else time.monotonic() + timeout
         try:
@@ -182,12 +182,12 @@ class Outbox:
         return True
 
     def wake_waiting(self) -> None:
-        """Have everybody who waits look again."""
+        """Make every waiting thread check its condition again."""
         with self._lock:
             self._changed.notify_all()
 
     def change_link_state(self, state: LinkState) -> bool:
-        """Replace the link's state. Returns True if it is another one."""
+        """Replace the link's state; return True if the state differs from the old one."""
         with self._lock:
             is_new = state != self.link_state
             self.link_state = state
@@ -201,7 +201,7 @@ class Outbox:
 
     @property
     def behind(self) -> int:
-        """Number of keyframes that the map has yet to get: in the spool, or durable and unfused."""
+        """Number of keyframes that the map still lacks: in the spool, or durable and unfused."""
         with self._lock:
             return self.keyframes_waiting + self._progress.unfused_keyframes
 
@@ -218,7 +218,7 @@ class Outbox:
             return len(self.spool.waiting) - self.spool.corrections
 
     def add(self, entry: Waiting, keyframe: Keyframe | None) -> None:
-        """Queue a keyframe, or a correction (None), that was written."""
+        """Queue a written keyframe, or a written correction (`keyframe` None)."""
         with self._lock:
             if not self.behind:
                 self._rate.rest()
@@ -236,20 +236,19 @@ class Outbox:
             self._outcomes.skip(reason, problem, is_correction=is_correction)
 
     def usage(self) -> tuple[int, int, int]:
-        """Bytes of the disk that the spool takes, records in it, and their bytes."""
+        """Return the spool's bytes on the disk, the number of waiting records, and their bytes."""
         with self._lock:
             return self.spool.used_bytes, len(self.spool.waiting), self.spool.waiting_bytes
 
     def tidy(self) -> None:
-        """Delete files that hold nothing any more. For the one thread that writes."""
+        """Delete files without waiting records. For the writing thread."""
         with self._lock:
             self.spool.tidy()
 
     def drop_oldest(self, newest: int | None = None) -> bool:
-        """Take the oldest keyframe that was never sent out of the spool; False = there is none but `newest`.
+        """Drop the oldest unsent keyframe from the spool; return False if there is none, or only `newest`.
 
-        One that was sent may be in the server's journal by now, though no answer came: it stays.
-        Corrections stay, too.
+        A sent keyframe stays, because it may be in the server's journal without an answer. Corrections stay.
         """
         with self._lock:
             sent = max(self._perhaps_sent, self._claimed)
@@ -265,13 +264,13 @@ class Outbox:
         return False
 
     def drop_to(self, backlog: int, newest: int) -> None:
-        """Drop the oldest until no more than `backlog` are behind; the keyframe `newest` stays."""
+        """Drop the oldest keyframes until at most `backlog` are behind; the keyframe `newest` stays."""
         with self._lock:
             while self.behind > backlog and self.drop_oldest(newest):
                 pass
 
     def check_known(self, seqs: NDArray[np.int64]) -> None:
-        """Raise InvalidKeyframe unless each is the number of a record of this session, now or before."""
+        """Raise InvalidKeyframe if a number belongs to no record of this session, now or earlier."""
         with self._lock:
             known = (seqs <= self.spool.left) | ((seqs > self._used_before) & (seqs < self.spool.next_seq))
         if not known.all():
@@ -288,13 +287,13 @@ class Outbox:
     def claim(
         self, window_keyframes: int, window_bytes: int, ahead: int | None = None
     ) -> tuple[Waiting, int] | None:
-        """The next record to send and the number sent before it, if the credit allows it.
+        """Return the next record to send and the number sent before it; None if the credit does not allow it.
 
-        One on its way is always allowed. It stays in the spool until `sent`, `unclaim` or `refuse` says
-        what became of it.
+        One record on its way is always allowed. The record stays in the spool until `sent`, `unclaim` or
+        `refuse` reports its outcome.
 
         Args:
-            ahead: so many may be on their way or unfused; None = any number.
+            ahead: most records that may be on their way or unfused; None = any number.
         """
         with self._lock:
             waiting, count = self.spool.waiting, self._outstanding
@@ -310,12 +309,12 @@ class Outbox:
             return entry, waiting[count - 1].seq if count else 0
 
     def unclaim(self) -> None:
-        """Note that the claimed record was not sent after all."""
+        """Record that the claimed record was not sent after all."""
         with self._lock:
             self._claimed = 0
 
     def sent(self, entry: Waiting, sent_ns: int) -> bool:
-        """Note that the claimed record is on its way. Returns True if it is the only one."""
+        """Record that the claimed record is on its way; return True if no other record is."""
         with self._lock:
             self._outstanding += 1
             self._perhaps_sent = max(self._perhaps_sent, entry.seq)
@@ -324,18 +323,18 @@ class Outbox:
             return self._outstanding == 1
 
     def rewind(self) -> None:
-        """Count nothing as on its way: all that is not acknowledged is sent once more."""
+        """Count no record as on its way: all unacknowledged records are sent once more."""
         with self._lock:
             self._outstanding = 0
 
     # --- at the server ---
 
     def welcome(self, durable: int, window_keyframes: int) -> str:
-        """Note how far the server is, when it lets this client in.
+        """Record the server's progress when it lets this client in; return a text about lost records.
 
-        Of what a dead scanner left, only a window's worth can have been sent and not be durable yet.
-        (Were that server's window larger, one that is dropped now might be in the journal all the same.)
-        What it had acknowledged and does not have is lost: returned in words, empty = nothing is.
+        The text is empty unless the server lacks records that it had acknowledged. Of a dead scanner's
+        records, at most one window can be sent and not durable. (If that window was larger, a record dropped
+        now may still arrive.)
         """
         with self._lock:
             told = self._lose_beyond(durable)
@@ -348,12 +347,12 @@ class Outbox:
             return told
 
     def _lose_beyond(self, durable: int) -> str:
-        """Count what was acknowledged beyond a number as lost, and tell it. The lock is held."""
+        """Count acknowledged records beyond a number as lost; return a text about them. The lock is held."""
         keyframes, fused, corrections = self._progress.lose(durable)
         return self._outcomes.lose(keyframes, fused, corrections) if keyframes or corrections else ""
 
     def is_foreign(self, durable: int) -> bool:
-        """True if the server has records of this session that were never sent from here."""
+        """Return True if the server has records of this session that this client never sent."""
         with self._lock:
             return durable > max(self._perhaps_sent, self._used_before)
 
@@ -366,10 +365,11 @@ class Outbox:
         offset_ns: int = 0,
         bound_ns: int = 0,
     ) -> bool:
-        """Let go of what the server has, and note its stamps. Returns True if anything left the spool.
+        """Remove the records that the server has, and store its stamps; return True if a record left the
+        spool.
 
         Args:
-            offset_ns, bound_ns: the server's clock minus ours, and how wrong that may be.
+            offset_ns, bound_ns: the server's clock minus ours, and the largest error of that.
         """
         with self._lock:
             dropped = self.spool.drop(durable)
@@ -390,13 +390,13 @@ class Outbox:
             return bool(dropped)
 
     def note_meshed(self, seq: int) -> None:
-        """Note that the mesh shows everything up to `seq`."""
+        """Record that the mesh shows all keyframes up to `seq`."""
         with self._lock:
             self._progress.meshed = max(self._progress.meshed, seq)
             self._changed.notify_all()
 
     def note_moves(self, fused: int, waiting: int) -> None:
-        """Note how many keyframes of the map were to be moved when it had everything up to `fused`."""
+        """Record how many keyframes of the map waited to be moved when it had everything up to `fused`."""
         with self._lock:
             self._corrections_waiting = waiting
             if not waiting:
@@ -406,13 +406,10 @@ class Outbox:
     # --- turned away ---
 
     def reject(self, seq: int, reason: str, message: str = "") -> tuple[str, bool] | None:
-        """Count a record that the server has and the map will not take.
+        """Count a record that the server has but the map does not take.
 
-        It may hear that the map has answered a record before it hears that this one was rejected: then that
-        was counted as fused, and is no more.
-
-        Returns its kind in words, and whether it is the first of this session for that reason; None = it was
-        counted before.
+        If the map's answer was reported first, the record counted as fused; this call corrects that. Returns
+        the kind of record, and True if it is the session's first for this reason; None if already counted.
         """
         with self._lock:
             entry = self.find_sent(seq)
@@ -425,12 +422,12 @@ class Outbox:
 
     @property
     def first_rejection(self) -> str:
-        """Reason why the map did not take the first record that it rejected; empty = it took all."""
+        """Reason why the map rejected its first record; empty without rejections."""
         with self._lock:
             return self._outcomes.first_rejection
 
     def find_sent(self, seq: int) -> Waiting | None:
-        """The record of this number, if it waits and was sent."""
+        """Return the waiting record of this number if it was sent, else None."""
         with self._lock:
             if seq <= self._perhaps_sent:
                 for entry in self.spool.waiting:
@@ -439,7 +436,7 @@ class Outbox:
             return None
 
     def refuse(self, entry: Waiting, reason: str, message: str) -> None:
-        """Give a record up. What was sent behind it has to be sent again: the server saw a gap there."""
+        """Give a record up. Records sent after it must be sent again, because the server saw a gap."""
         with self._lock:
             place = self.spool.waiting.index(entry)
             self._outstanding = min(self._outstanding, place)
@@ -452,52 +449,52 @@ class Outbox:
 
     @property
     def is_durable(self) -> bool:
-        """True if everything sent is on the server's disk, or was given up."""
+        """True if every sent record is on the server's disk, or was given up."""
         with self._lock:
             return not self.spool.waiting
 
     @property
     def is_fused(self) -> bool:
-        """True if the map has answered for everything sent."""
+        """True if the map has answered every sent record."""
         with self._lock:
             return not self.spool.waiting and not self._progress.unfused
 
     @property
     def is_settled(self) -> bool:
-        """True if the map has everything sent, and each keyframe at its newest pose."""
+        """True if the map has every sent record, and each keyframe at its newest pose."""
         with self._lock:
             return self.is_fused and self._progress.settled >= self._progress.fused
 
     @property
     def is_meshed(self) -> bool:
-        """True if the mesh shows everything sent."""
+        """True if the mesh shows every sent record."""
         with self._lock:
             return self.is_fused and self._progress.meshed >= self._progress.fused
 
     def describe_waiting(self) -> str:
-        """The records in the spool, counted: `3 keyframes and 1 correction`."""
+        """Return the number of records in the spool as text: `3 keyframes and 1 correction`."""
         with self._lock:
             keyframes, corrections = self.keyframes_waiting, self.spool.corrections
         counts = [count_of(keyframes, "keyframe")] if keyframes or not corrections else []
         return " and ".join([*counts, *([count_of(corrections, "correction")] if corrections else [])])
 
     def take_refusals(self) -> str:
-        """The records given up, or not kept, since the last call, in words; empty = none."""
+        """Return a text about records given up or not kept since the last call; empty without any."""
         with self._lock:
             return self._outcomes.take_refusals()
 
     def times(self) -> list[KeyframeTimes]:
-        """When each keyframe passed each stage, oldest first, as far as it is known."""
+        """Return the known times at which each keyframe passed each stage, oldest keyframe first."""
         with self._lock:
             return self._times.copy()
 
     def newest_fused(self) -> KeyframeTimes | None:
-        """The stamps of the newest keyframe that is in the map; None = none is."""
+        """Return the stamps of the newest keyframe in the map; None without one."""
         with self._lock:
             return self._times.newest_fused()
 
     def stats(self) -> ClientStats:
-        """A copy of the counts."""
+        """Return a copy of the counts."""
         with self._lock:
             return self._outcomes.stats(
                 waiting=len(self.spool.waiting),
@@ -507,7 +504,7 @@ class Outbox:
             )
 
     def close(self) -> bool:
-        """Close the spool. Returns True if a temporary one still held records: they are lost."""
+        """Close the spool; return True if a temporary spool still held records, which are then lost."""
         with self._lock:
             loses = self.spool.temporary and bool(self.spool.waiting)
             self.spool.close()

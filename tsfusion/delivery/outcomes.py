@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Records of a client: what became of each, how far they are, when each was where; and the server's clock."""
+"""Count a client's records by outcome, and track their progress, their times and the clock offset."""
 
 from collections import Counter, OrderedDict, deque
 from collections.abc import Iterable, Iterator
@@ -11,11 +11,11 @@ from tsfusion.core.readable_numbers import count_of
 from tsfusion.delivery.spool import Waiting
 from tsfusion.wire.messages.messages import KeyframeTimes, Stamps
 
-_ANSWERED_RUNS = 4096  # of numbers without a gap, that are remembered: the server may say more of them
+_ANSWERED_RUNS = 4096  # runs of numbers remembered: the server may report more about them
 
 
 class NumberRuns:
-    """Rising numbers, kept as runs without a gap: however many, they take the room of a few."""
+    """Rising numbers, stored as runs without gaps: many numbers need the memory of a few."""
 
     def __init__(self) -> None:
         self._runs: deque[range] = deque()
@@ -27,13 +27,13 @@ class NumberRuns:
         return self.count(0)
 
     def append(self, number: int) -> None:
-        """Put a number behind the others."""
+        """Add a number above all others."""
         follows = bool(self._runs) and self._runs[-1].stop == number
         first = self._runs.pop().start if follows else number
         self._runs.append(range(first, number + 1))
 
     def _above(self, most: int) -> Iterator[range]:
-        """The runs with numbers above `most`, as far as they are above it, oldest first."""
+        """Return the runs of numbers above `most`, oldest first, each cut to the part above."""
         above: list[range] = []
         for run in reversed(self._runs):
             if run.stop <= most + 1:
@@ -42,16 +42,16 @@ class NumberRuns:
         return reversed(above)
 
     def count(self, most: int) -> int:
-        """Number of those above `most`."""
+        """Return how many numbers are above `most`."""
         return sum(map(len, self._above(most)))
 
     def between(self, after: int, last: int) -> Iterator[int]:
-        """The numbers above `after` up to `last`."""
+        """Yield the numbers above `after`, up to and including `last`."""
         for run in self._above(after):
             yield from range(run.start, min(run.stop, last + 1))
 
     def cut(self, most: int) -> list[int]:
-        """Remove the numbers above `most`; returns them."""
+        """Remove the numbers above `most`; return them."""
         gone = [number for run in self._above(most) for number in run]
         while self._runs and self._runs[-1].stop > most + 1:
             run = self._runs.pop()
@@ -60,13 +60,13 @@ class NumberRuns:
         return gone
 
     def keep_newest(self, runs: int, *, after: int) -> None:
-        """Forget the oldest numbers, down to so many runs, but none above `after`."""
+        """Forget the oldest numbers until `runs` runs are left, but no number above `after`."""
         while len(self._runs) > runs and self._runs[0].stop <= after + 1:
             self._runs.popleft()
 
 
 class DeliveryProgress:
-    """Records that the server has, and marks that only rise unless it has lost some.
+    """Records that the server has, and marks that only rise, unless the server has lost records.
 
     Attributes:
         fused: number of the last record that the map has answered.
@@ -82,7 +82,7 @@ class DeliveryProgress:
         )  # and those of them that are corrections
 
     def acknowledge(self, entries: Iterable[Waiting]) -> None:
-        """Note records that are on the server's disk."""
+        """Add records that are on the server's disk."""
         for entry in entries:
             self._durable.append(entry.seq)
             if entry.is_correction:
@@ -91,16 +91,17 @@ class DeliveryProgress:
             runs.keep_newest(_ANSWERED_RUNS, after=self.fused)
 
     def answer(self, fused: int) -> list[int]:
-        """Note that the map has answered everything up to `fused`; the keyframes among that."""
+        """Record that the map has answered everything up to `fused`; return the newly answered keyframes."""
         answered = list(self._durable.between(self.fused, fused))
         self.fused = answered[-1] if answered else self.fused
         return [seq for seq in answered if seq not in self._corrections]
 
     def lose(self, durable: int) -> tuple[list[int], list[int], int]:
-        """Note that the server has nothing beyond a number.
+        """Record that the server has no record beyond a number.
 
         Returns:
-            Numbers of the keyframes that are lost, of those that the map had answered; lost corrections.
+            The numbers of lost keyframes; those of them that the map had answered; the number of lost
+            corrections.
         """
         corrections = set(self._corrections.cut(durable))
         keyframes = [seq for seq in self._durable.cut(durable) if seq not in corrections]
@@ -109,11 +110,11 @@ class DeliveryProgress:
         return keyframes, answered, len(corrections)
 
     def is_correction(self, seq: int) -> bool:
-        """True if a record that the server has is a correction."""
+        """Return True if a record on the server is a correction."""
         return seq in self._corrections
 
     def is_fused(self, seq: int) -> bool:
-        """True if the map has answered a record that the server has."""
+        """Return True if the map has answered a record that the server has."""
         return seq <= self.fused and seq in self._durable
 
     @property
@@ -123,7 +124,7 @@ class DeliveryProgress:
 
     @property
     def unfused_keyframes(self) -> int:
-        """Number of keyframes among them."""
+        """Number of keyframes among the unfused records."""
         return self.unfused - self._corrections.count(self.fused)
 
 
@@ -131,26 +132,26 @@ _MOST_REMEMBERED = 65536  # numbers of rejected records
 
 
 class ClientStats(Struct, frozen=True):
-    """Counts since the client began; leftovers of an earlier one count from `durable` on.
+    """Counts since the client began; records left by an earlier client count from `durable` on.
 
     Attributes:
         sent: keyframes that `send` took.
         durable: keyframes on the server's disk.
         fused: keyframes in the server's map.
-        refused: keyframes that the server turned away (or that are unreadable here) for good: reason → count.
-            `lost`: it had them, and has them no more.
+        refused: keyframes that the server turned away for good, or that the spool cannot read: reason →
+            count. `lost`: the server had them, and has them no more.
         rejected: keyframes on the server's disk that the map could not take: reason → count.
-        skipped: keyframes that were never sent: reason → count. by the policy `thinned` (the map was too
-            far behind), `room` (the spool's ran short) and `dropped` (it was taken before); `spool` (it has
-            reached `spool_bytes`), `disk` (full, failing or read-only), `damaged` (an earlier client's, which
-            its spool cannot give back).
+        skipped: keyframes that were never sent: reason → count. By the policy: `thinned` (the map was too far
+            behind), `room` (the spool was nearly full), `dropped` (taken, then dropped). Else: `spool`
+            (`spool_bytes` reached), `disk` (full, failing or read-only), `damaged` (an earlier client's,
+            unreadable).
         waiting: keyframes and corrections in the spool.
         waiting_bytes: the bytes of those.
-        state: of the spool: `ok`, or the reason why it cannot keep all that comes: `spool` or `disk`.
+        state: state of the spool: `ok`, or why it cannot keep all new records: `spool` or `disk`.
         corrections_sent: corrections that `correct` took.
         corrections_acknowledged: corrections on the server's disk.
         corrections_refused: corrections that were skipped, refused or rejected: reason → count.
-        corrections_waiting: keyframes of the map whose newest pose is not fused yet, as last heard.
+        corrections_waiting: keyframes of the map whose newest pose is not fused yet, by the last report.
     """
 
     sent: int
@@ -169,41 +170,41 @@ class ClientStats(Struct, frozen=True):
 
     @property
     def settled(self) -> int:
-        """Sent keyframes that are in the map, or never will be."""
+        """Number of sent keyframes that are in the map, or never will be."""
         turned_away = sum(self.rejected.values()) + sum(self.refused.values())
         return self.fused + turned_away + self.skipped.get("dropped", 0)
 
     @property
     def under_way(self) -> int:
-        """Keyframes that were taken, but are not settled: here, on their way, or waiting for the map."""
+        """Number of keyframes taken but not settled: in the spool, on their way, or waiting for the map."""
         return max(self.sent - self.settled, self.waiting)
 
     @property
     def left_out(self) -> dict[str, int]:
-        """Keyframes that are not in the map and will not come into it: reason → count."""
+        """Number of keyframes that will never be in the map: reason → count."""
         return dict(Counter(self.refused) + Counter(self.rejected) + Counter(self.skipped))
 
 
 class Outcomes:
-    """Counts of records by what became of them. For one thread at a time."""
+    """Counts of records by outcome. For one thread at a time."""
 
     def __init__(self) -> None:
         self.sent = self.durable = self.fused = 0  # keyframes
         self.corrections_sent = self.corrections_durable = 0
-        self.first_rejection = ""  # why the map did not take the first of them; empty = it took all
+        self.first_rejection = ""  # why the map rejected its first record; empty = no rejection
         self._skipped: Counter[str] = Counter()
         self._refused: Counter[str] = Counter()
         self._rejected: Counter[str] = Counter()
         self._corrections_refused: Counter[str] = Counter()
         self._rejected_seqs: OrderedDict[int, None] = OrderedDict()
-        self._refusal_count = 0  # of which `take_refusals` has not told yet
-        self._first_refusal = ""  # of those, in words
+        self._refusal_count = 0  # refusals that `take_refusals` has not returned yet
+        self._first_refusal = ""  # the first of these refusals, as text
 
     def skip(self, reason: str, problem: str, *, is_correction: bool = False) -> None:
         """Count a record that is not sent.
 
         Args:
-            problem: why the spool cannot keep it; empty = it is a policy's choice.
+            problem: why the spool cannot keep the record; empty = a policy skips it.
         """
         (self._corrections_refused if is_correction else self._skipped)[reason] += 1
         if problem:
@@ -215,11 +216,11 @@ class Outcomes:
         self._note_refusal(f"{entry.kind} {entry.seq} was refused ({reason}): {message}")
 
     def lose(self, keyframes: list[int], fused: list[int], corrections: int) -> str:
-        """Count records that the server has no more, and tell that.
+        """Count records that the server has lost; return a text about them.
 
         Args:
-            keyframes: numbers of those that it had acknowledged; `fused`: that it had fused.
-            corrections: that it had acknowledged.
+            keyframes: numbers of lost keyframes; `fused`: those of them that were fused.
+            corrections: number of lost corrections.
         """
         self.durable -= len(keyframes)
         self.fused -= sum(not self.is_rejected(seq) for seq in fused)
@@ -242,15 +243,15 @@ class Outcomes:
         self._refusal_count += 1
 
     def take_refusals(self) -> str:
-        """The records given up, or not kept, since the last call, in words; empty = none."""
+        """Return a text about records given up or not kept since the last call; empty without any."""
         count, self._refusal_count = self._refusal_count, 0
         more = f" (and {count - 1} more)" if count > 1 else ""
         return f"{self._first_refusal}{more}" if count else ""
 
     def reject(self, seq: int, reason: str, message: str, *, is_correction: bool) -> bool | None:
-        """Count a record that the map will not take.
+        """Count a record that the map does not take.
 
-        Returns whether it is the first for that reason; None = it was counted before.
+        Returns True if it is the first for this reason, None if it was counted before.
         """
         if seq in self._rejected_seqs:
             return None
@@ -263,11 +264,11 @@ class Outcomes:
         return counts[reason] == 1
 
     def is_rejected(self, seq: int) -> bool:
-        """True for one of the last records that the map did not take."""
+        """Return True for one of the last records that the map rejected."""
         return seq in self._rejected_seqs
 
     def stats(self, *, waiting: int, waiting_bytes: int, state: str, corrections_waiting: int) -> ClientStats:
-        """A copy of the counts, with how it stands."""
+        """Return a copy of the counts, together with the given state."""
         return ClientStats(
             sent=self.sent,
             durable=self.durable,
@@ -293,10 +294,10 @@ _SERVER_STAMPS = ("received_ns", "durable_ns", "fuse_start_ns", "fused_ns", "mes
 
 
 class KeyframeTimesTable:
-    """One row a keyframe; a new one takes the place of the one that came `CAPACITY` numbers before."""
+    """One row per keyframe; a new row replaces the row from `CAPACITY` numbers before."""
 
     def __init__(self) -> None:
-        self._rows = np.zeros((CAPACITY, len(_FIELDS)), np.int64)  # pages are taken when they are written to
+        self._rows = np.zeros((CAPACITY, len(_FIELDS)), np.int64)  # memory pages are only used once written
         self._newest_fused = 0
 
     def add(self, seq: int, *, timestamp_ns: int, captured_ns: int) -> None:
@@ -311,12 +312,12 @@ class KeyframeTimesTable:
             self._rows[seq % CAPACITY] = 0
 
     def sent(self, seq: int, sent_ns: int) -> None:
-        """Note when a keyframe was handed to the socket."""
+        """Store the time at which a keyframe was given to the socket."""
         if self._has(seq):
             self._rows[seq % CAPACITY, _COLUMN["sent_ns"]] = sent_ns
 
     def stamp(self, stamps: Stamps, offset_ns: int, bound_ns: int) -> None:
-        """Note the server's stamps, on our clock; the first of each counts."""
+        """Store the server's stamps, converted to our clock; the first of each counts."""
         if self._has(stamps.seq):
             row = self._rows[stamps.seq % CAPACITY]
             row[_COLUMN["clock_bound_ns"]] = min(bound_ns, _LARGEST)
@@ -327,14 +328,14 @@ class KeyframeTimesTable:
                 self._newest_fused = max(self._newest_fused, stamps.seq)
 
     def newest_fused(self) -> KeyframeTimes | None:
-        """The row of the newest keyframe that is in the map; None = there is none yet."""
+        """Return the row of the newest keyframe in the map; None without one."""
         if not self._newest_fused or not self._has(self._newest_fused):
             return None
         row = self._rows[self._newest_fused % CAPACITY].tolist()
         return KeyframeTimes(**dict(zip(_FIELDS, row, strict=True)))
 
     def copy(self) -> list[KeyframeTimes]:
-        """All rows, oldest first."""
+        """Return all rows, oldest first."""
         rows = self._rows[self._rows[:, 0] > 0]
         ordered = rows[np.argsort(rows[:, 0])].tolist()
         return [KeyframeTimes(**dict(zip(_FIELDS, row, strict=True))) for row in ordered]
@@ -343,39 +344,39 @@ class KeyframeTimesTable:
         return bool(self._rows[seq % CAPACITY, 0] == seq)
 
 
-_ANSWERS = 64  # of the map, over which its rate is measured
+_ANSWERS = 64  # answers of the map over which its rate is measured
 _FEWEST_ANSWERS = 8  # before there is a rate
 
 
 class TakingRate:
-    """Keyframes a second that the map takes, as far as that was seen.
+    """Measured number of keyframes a second that the map takes.
 
-    Time counts from one answer of the map to the next, and only while keyframes wait for it: what a map that
-    waits could take, nobody knows. The longest pause does not count: a fuser may have died in it.
+    Only time between two answers of the map counts, and only while keyframes wait: an idle map shows no rate.
+    The longest pause is left out: a fuser may have died in it.
     """
 
     def __init__(self) -> None:
         self._answers: deque[tuple[float, int]] = deque(maxlen=_ANSWERS)  # seconds, keyframes taken in them
-        self._since: float | None = None  # the map's last answer; None = it had nothing to do since
+        self._since: float | None = None  # time of the map's last answer; None = no keyframe has waited since
 
     def note(self, now: float, taken: int, *, is_more_waiting: bool) -> None:
-        """Note that the map took so many keyframes, and whether others wait."""
+        """Record that the map took so many keyframes, and whether more wait."""
         if self._since is not None:
             self._answers.append((now - self._since, taken))
         self._since = now if is_more_waiting else None
 
     def rest(self) -> None:
-        """Note that no keyframe waits any more, whatever became of the last."""
+        """Record that no keyframe waits any more, whatever the last one's outcome."""
         self._since = None
 
     def forget(self) -> None:
-        """Begin anew: the link was down, and that is not the map's fault."""
+        """Start the measurement again after a break of the link, which is not the map's fault."""
         self._answers.clear()
         self._since = None
 
     @property
     def per_second(self) -> float | None:
-        """The rate; None = not known."""
+        """The rate; None if unknown."""
         if len(self._answers) < _FEWEST_ANSWERS:
             return None
         pause, taken_after = max(self._answers)
@@ -390,27 +391,27 @@ SAMPLES = 16
 class ClockOffset:
     """Server clock minus client clock, by the ping with the shortest round trip of the last 16.
 
-    The true offset lies within half that round trip of the estimate: queueing can only lengthen a round
-    trip, so averaging over pings adds error where the minimum sheds it.
+    The true offset differs from the estimate by at most half that round trip. Queueing only lengthens round
+    trips: an average would contain that error, the minimum avoids it.
     """
 
     def __init__(self) -> None:
         self._samples: deque[tuple[int, int]] = deque(maxlen=SAMPLES)
 
     def add(self, sent_ns: int, received_ns: int, replied_ns: int, returned_ns: int) -> None:
-        """One ping: sent and returned by the client's clock, received and replied by the server's."""
+        """Add one ping: sent and returned by the client's clock, received and replied by the server's."""
         round_trip = (returned_ns - sent_ns) - (replied_ns - received_ns)
         if round_trip >= 0:
             offset = ((received_ns - sent_ns) + (replied_ns - returned_ns)) // 2
             self._samples.append((round_trip, offset))
 
     def clear(self) -> None:
-        """Forget all pings: the clock at the other end is another one."""
+        """Forget all pings, because the server's clock is another one."""
         self._samples.clear()
 
     @property
     def count(self) -> int:
-        """Number of pings that the estimate stands on."""
+        """Number of pings in the estimate."""
         return len(self._samples)
 
     @property
@@ -420,7 +421,7 @@ class ClockOffset:
 
     @property
     def bound_ns(self) -> int:
-        """The estimate is right to within ± this; 0 before the first ping."""
+        """Largest error (±) of the estimate; 0 before the first ping."""
         return (min(self._samples)[0] + 1) // 2 if self._samples else 0
 
 
@@ -432,5 +433,5 @@ class Lag(Struct, frozen=True):
 
     @property
     def seconds(self) -> float:
-        """Time to catch up with what was sent up to now; 0 where the rate is not known."""
+        """Time that the map needs for its waiting keyframes; 0 if the rate is unknown."""
         return self.keyframes / self.rate if self.rate else 0.0

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The client's thread: sends what the spool holds, as far as the server's credit goes.
+"""Send the records of the spool from the client's thread, as far as the server's credit allows.
 
-PUSH loses what is under way when a server dies, silently; so everything is kept until the server says it is
-on its disk, and sent again from there when the server is a new one (epoch) or silent, or nothing moves
-(stall).
+A PUSH socket silently loses messages under way when a server dies. So every record is kept until it is on the
+server's disk. It is sent again after a restart of the server (epoch), silence, or a stall (no progress).
 """
 
 import errno
@@ -30,19 +29,19 @@ log = logging.getLogger(__name__)
 
 _READ_INTERVAL = 0.5  # seconds until a record that could not be read is tried again
 _MAX_READS = 6
-_MAX_READS_AWAY = 120  # the folder may come back
-_HOME_AFTER = 10.0  # seconds without being let in, until the first server is asked where the map is
+_MAX_READS_AWAY = 120  # while the folder is missing: it may come back
+_HOME_AFTER = 10.0  # seconds without a Welcome, until the client asks the first server again
 _LEAST_SILENCE = 2.0  # seconds; a server answers each ping, two a second, and never waits
 _FAREWELL_MS = 100  # for the last message to leave
 _SOCKET_INTERVAL = 0.5  # seconds until a socket that could not be opened is tried again
-_SCARCE = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)  # what others of this machine will give back
+_SCARCE = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)  # other processes will release these
 
 
 class Sender:
-    """Owns the sockets; `run` is the thread's body.
+    """Owns the sockets; `run` is the body of the sending thread.
 
     Raises:
-        OSError: when too few files can be opened.
+        OSError: too few files can be opened.
     """
 
     def __init__(
@@ -75,16 +74,16 @@ class Sender:
 
     @property
     def last_heard(self) -> float:
-        """Time of the server's last message, `time.monotonic()`; 0 = never. From any thread."""
+        """Time of the server's last message, `time.monotonic()`; 0 = none yet. From any thread."""
         return self._control_session.last_heard
 
     def wake(self) -> None:
-        """Have the thread look into the outbox. From any thread."""
+        """Make the thread check the outbox. From any thread."""
         with suppress(OSError):  # it is being woken already, or has ended
             self._waker.send(b"\0")
 
     def stop(self) -> None:
-        """Let `run` return. From any thread."""
+        """Make `run` return. From any thread."""
         self._stopping.set()
         self.wake()
 
@@ -117,7 +116,7 @@ class Sender:
             control.close(_FAREWELL_MS)
 
     def _wait_for_files(self, reason: str) -> None:
-        """Say that no socket can be opened, and pause; what is not acknowledged is sent again then."""
+        """Report that no socket can be opened, and pause; then send unacknowledged records again."""
         self._no_socket = f"cannot open a socket: {reason}; it is tried again, and keyframes wait for it"
         if self._outbox.change_link_state(self._outbox.link_state.unreachable(self._no_socket)):
             log.error("%s", self._no_socket)
@@ -176,7 +175,7 @@ class Sender:
         if session.welcome is not None:
             self._followed = now if self._followed else 0.0
         elif self._followed and now - self._followed > _HOME_AFTER:
-            self._follow(self._home, now)  # the server that it was sent to does not let it in
+            self._follow(self._home, now)  # the other server does not let this client in
         if now - session.last_heard > self._config.stall_timeout:
             session.on_silence(self._control.problem)
         if self._control.is_made and self._silence.has_ended(
@@ -193,7 +192,7 @@ class Sender:
             self._connect_again(self._data)
 
     def _follow_if_allowed(self, place: tuple[str, str], now: float) -> None:
-        """Go to the server that has the map. Without keys only one of this machine is believed."""
+        """Go to the server that has the map. Without keys, accept only a server of this machine."""
         try:
             found = sockets.place_of(*place, has_keys=self._keys is not None)
         except InvalidConfig as error:
@@ -209,7 +208,7 @@ class Sender:
         self._control_session.follow(self._control_address)
 
     def _connect_again(self, *connections: ServerLink) -> None:
-        """Make connections anew, and send again what is not acknowledged as soon as the server lets us in."""
+        """Reopen connections, and send unacknowledged records again after the next Welcome."""
         for connection in connections:
             connection.reopen()
         self._control_session.greet_again()
@@ -233,7 +232,7 @@ class Sender:
                 self._send(entry, previous, frames)
 
     def _read(self, entry: Waiting, now: float) -> list[memoryview] | None:
-        """The frames of a record; None = they cannot be read now, or never."""
+        """Return the frames of a record, or None if they cannot be read now or ever."""
         try:
             frames = self._outbox.spool.read(entry)
         except JournalError as error:
@@ -245,7 +244,7 @@ class Sender:
                 self._outbox.unclaim()
                 return None
             self._refused.give_up(entry, "spool", str(error), readable=False)
-            if error.errno not in MISSING:  # those of a file that is gone are not waited for one by one
+            if error.errno not in MISSING:  # a missing file has many records: do not wait for each of them
                 self._unread = 0
             return None
         self._unread = 0

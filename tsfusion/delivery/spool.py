@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""The spool on the scanner's disk: every record waits there until the server has it on its own disk.
+"""Keep records in a spool on the scanner's disk until the server has them on its own disk.
 
-A spool is one session: what a dead scanner left in it is resent under the session and numbers that the
-server may already know, and a spool that was emptied starts a new session. Reading back from the page
-cache costs less than holding the queue in memory, and bounds it.
+A spool is one session. Records left by a dead scanner are sent again under the session and numbers that the
+server may already know. An emptied spool starts a new session. Reading from the page cache costs less than a
+queue in memory, and limits memory.
 """
 
 import contextlib
@@ -33,7 +33,7 @@ _SESSION_BYTES = 16
 
 
 def buried(folder: Path, session: bytes) -> set[int] | None:
-    """The numbers in a spool's file; None = it is another session's."""
+    """Return the numbers in a spool's file of tombstones; None if the file belongs to another session."""
     try:
         content = (folder / TOMBSTONES).read_bytes()
     except OSError:
@@ -45,37 +45,36 @@ def buried(folder: Path, session: bytes) -> set[int] | None:
 
 
 def _whole_bytes(size: int) -> int:
-    """Bytes of a file of this size up to its last whole number."""
+    """Return the bytes of a file of this size up to the end of its last complete number."""
     numbers = (size - _SESSION_BYTES) // _NUMBER.itemsize
     return _SESSION_BYTES + numbers * _NUMBER.itemsize if size >= _SESSION_BYTES else 0
 
 
 class Tombstones:
-    """Numbers of records that left a spool unsent or refused, while one of its files still holds them.
+    """Numbers of records that left a spool unsent or refused, while a file of the spool still holds them.
 
-    Without them a scanner that starts after a crash would find these records again and send them. The file is
-    not synced: a record whose number a power cut takes is found again, and sent. A disk that refuses is
-    passed over.
+    Without them, a scanner that starts after a crash would find these records and send them again. The file
+    is not synced: if a power cut takes a number, its record is found and sent again. Errors of the disk are
+    ignored.
     """
 
     def __init__(self, folder: Path, session: bytes) -> None:
         self._path = folder / TOMBSTONES
         self._session = session
-        self.numbers = self._read()  # those in the file at the start
+        self.numbers = self._read()  # numbers in the file at the start
         self.written = len(self.numbers)  # count of the numbers in the file
 
     def _read(self) -> set[int]:
         found = buried(self._path.parent, self._session)
-        if found is None:  # of a spool that was here before
+        if found is None:  # the file belongs to an earlier spool in this folder
             self.clear()
         return found or set()
 
     def add(self, seq: int) -> None:
-        """Append a number."""
         self._write([seq])
 
     def keep(self, numbers: Iterable[int]) -> None:
-        """Write the file anew with these numbers; the records of all others are deleted."""
+        """Rewrite the file with these numbers; the records of all other numbers are deleted."""
         self.clear()
         self._write(numbers)
 
@@ -90,7 +89,7 @@ class Tombstones:
         try:
             with self._path.open("ab") as file:
                 whole = _whole_bytes(file.tell())
-                file.truncate(whole)  # what a full disk took of the last number would shift all that follow
+                file.truncate(whole)  # a partial last number (full disk) would shift all later ones
                 head = b"" if whole else self._session
                 file.write(head + added.tobytes())
         except OSError as error:
@@ -100,13 +99,13 @@ class Tombstones:
 
 log = logging.getLogger(__name__)
 
-# A restarted scanner skips numbers: those of records that a power cut took must never be used again. How many
-# is drawn, so that two scanners with copies of one spool do not go on with the same: then each would take the
-# answer to the other's keyframe for its own, and lose one in silence.
+# A restarted scanner skips numbers: numbers of records lost in a power cut must never be used again. The
+# count is random, so that two scanners with copies of one spool do not use the same numbers. Else each would
+# take the answer to the other's keyframe for its own, and silently lose a keyframe.
 _RESTART_GAP = 1024
 _RESTART_SPREAD = 1 << 24
 _MANY_TOMBSTONES = 65536  # numbers before those of deleted files are forgotten
-_LOOK_SECONDS = 0.2  # for which somebody may hold the lock who only looks whether it is held
+_LOOK_SECONDS = 0.2  # another process may hold the lock this long just to test it
 _RECORD_OVERHEAD = 512  # what MCAP adds to a keyframe, its share of the index at the end included
 
 
@@ -120,7 +119,6 @@ class Waiting(Struct, frozen=True, gc=False):
 
     @property
     def kind(self) -> str:
-        """`keyframe` or `correction`."""
         return "correction" if self.is_correction else "keyframe"
 
 
@@ -135,18 +133,19 @@ class Segment(Struct):
 class Spool:
     """A folder of unacknowledged keyframes and corrections, oldest first. One process at a time.
 
-    Threads: `write` and `tidy` may run in one while another does anything else; the rest is not thread-safe.
+    Threads: `write` and `tidy` may run in one thread while another calls anything else; the rest is not
+    thread-safe.
 
     Args:
-        folder: None = a temporary folder, deleted at `close` with all that is in it.
-        world: name of the coordinate frame of their poses, empty = given from elsewhere; None = that of the
-            records that wait. One that waits and names none takes this one.
-        same_frame: that frame is declared to be the map's; what waits may have declared it before.
-        elsewhere: take what waits for another map to this one.
+        folder: None = a temporary folder, deleted with its contents at `close`.
+        world: name of the poses' coordinate frame, empty = poses given from elsewhere; None = the frame of
+            the waiting records. Waiting records without a name take this name.
+        same_frame: the frame is declared to be the map's; waiting records may have declared it before.
+        elsewhere: send waiting records for another map to this map.
 
     Raises:
-        JournalError: when the folder cannot be used, another scanner uses it, or what waits in it is for
-            another map or of another world.
+        JournalError: the folder cannot be used, another scanner uses it, or its waiting records are for
+            another map or world.
     """
 
     def __init__(
@@ -181,7 +180,7 @@ class Spool:
     def _open(self, segment_bytes: int) -> None:
         self._journal = journal.Journal(self.folder, segment_bytes, sync=not self.temporary, keep_open=True)
         found, self._journal.found = self._journal.found, []
-        self.damaged = self._journal.damaged  # records that waited and cannot be read any more
+        self.damaged = self._journal.damaged  # waiting records that can no longer be read
         sessions = {record.session for record in found} or {secrets.token_bytes(_SESSION_BYTES)}
         if len(sessions) > 1:
             raise JournalError(f"{self.folder} holds keyframes of {len(sessions)} sessions: not one spool")
@@ -212,7 +211,7 @@ class Spool:
         self.used_bytes = sum(segment.nbytes for segment in self._segments.values())
 
     def _take_over(self, left: RecordHeader, world: str | None, *, elsewhere: bool) -> None:
-        """Go on with what a dead scanner left, or raise JournalError when that must not be."""
+        """Continue with the records of a dead scanner; raise JournalError if the map or world differs."""
         held = f"{self.folder} holds {count_of(len(self.waiting), 'keyframe')}"
         if left.map != self.map_name and not elsewhere:
             raise JournalError(
@@ -227,20 +226,20 @@ class Spool:
         self.world, self.same_frame = world or left.world, self.same_frame or left.same_frame
 
     def _first_left(self) -> RecordHeader | None:
-        """The header of the first record that a dead scanner left and that can be read."""
+        """Return the header of the first readable record of a dead scanner; None without one."""
         for entry in self.waiting:
             try:
                 return unpack(self.read(entry)[0])
             except (JournalError, DecodeError, IndexError):
-                continue  # it is found again, and reported, when it is to be sent
+                continue  # found again and reported when it is sent
         return None
 
     def write(self, frames: list[bytes]) -> Waiting:
-        """Put the record that was encoded as `next_seq` on the disk; `add` then makes it count.
+        """Write the record encoded as `next_seq` to the disk; `add` then makes it count.
 
         Raises:
-            JournalError: when the disk refuses. The number is not used again: where the disk did not even
-                let the failed record be taken back, it must not be found in the place of another.
+            JournalError: the disk refuses. The number is not used again: if the disk still holds the failed
+                record, that record must not stand for another.
         """
         seq = self.next_seq
         self.next_seq += 1
@@ -253,7 +252,6 @@ class Spool:
         return Waiting(seq, position, sum(map(len, frames)), is_correction(frames[0]))
 
     def add(self, entry: Waiting) -> None:
-        """Queue a written record."""
         self.waiting.append(entry)
         self.waiting_bytes += entry.nbytes
         self.corrections += entry.is_correction
@@ -266,10 +264,10 @@ class Spool:
         self._idle.discard(number)
 
     def read(self, entry: Waiting) -> list[memoryview]:
-        """The frames of a record, also of one that this process wrote when its file was deleted since.
+        """Return the frames of a record; works for this process's records even after their file is deleted.
 
         Raises:
-            JournalError: when the disk has lost it.
+            JournalError: the disk has lost the record.
         """
         newest = self._newest
         if newest is not None and newest[0] == entry.position:
@@ -284,11 +282,11 @@ class Spool:
 
     @property
     def is_away(self) -> bool:
-        """True if the folder is not to be found, or an empty one is in its place. From any thread."""
+        """True if the folder is missing, or an empty folder has replaced it. From any thread."""
         return self._journal.is_away
 
     def drop(self, durable: int) -> list[Waiting]:
-        """Let go of everything up to `durable`; the records that waited."""
+        """Remove all records up to `durable`; return the removed ones."""
         dropped = []
         while self.waiting and self.waiting[0].seq <= durable:
             dropped.append(self._let_go(0))
@@ -297,7 +295,7 @@ class Spool:
         return dropped
 
     def remove(self, place: int) -> None:
-        """Let go of one record that the server does not have, by its place in the queue."""
+        """Remove one record that the server does not have, by its index in the queue."""
         entry = self._let_go(place)
         self._segments[entry.position.segment].withdrawn.append(entry.seq)
         self._tombstones.add(entry.seq)
@@ -307,7 +305,7 @@ class Spool:
             self._compact_at = 2 * self._tombstones.written + _MANY_TOMBSTONES
 
     def tidy(self) -> None:
-        """Delete the files that `drop` had to leave. For the thread that writes, while it does not."""
+        """Delete the files that `drop` had to keep. For the writing thread, between writes."""
         self._delete_segments(self._journal.segment)
 
     def _let_go(self, place: int) -> Waiting:
@@ -322,21 +320,22 @@ class Spool:
         return entry
 
     def _delete_segments(self, below: int | None = None) -> None:
-        # The newest stays: a record that `write` has just put there may not be queued yet.
+        # The newest stays: it may hold a record that `write` has written and `add` has not queued yet.
         newest = next(reversed(self._segments), 0)
         self._forget(n for n in self._idle if n < (newest if below is None else below))
 
     def _forget(self, numbers: Iterable[int]) -> bool:
-        """Delete segments, the oldest first. Returns False if one cannot be deleted now: the rest stays, too.
+        """Delete segments, oldest first; return False at the first one that cannot be deleted, and keep the
+        rest.
 
-        Its records are only sent once more, and recognised. Were newer ones deleted, the next scanner would
-        take its last number for the last of all.
+        Records of a kept segment are only sent once more, and the server recognises them. Deleting newer
+        segments would give the next scanner a wrong last number.
         """
         for number in sorted(numbers):
             try:
                 self._journal.forget(number)
             except JournalError as error:
-                if error.errno not in MISSING:  # else it is away with its folder, and may come back
+                if error.errno not in MISSING:  # else the folder is missing and may come back
                     log.warning("%s", error)
                 return False
             self.used_bytes -= self._segments.pop(number).nbytes
@@ -344,9 +343,9 @@ class Spool:
         return True
 
     def close(self) -> None:
-        """Release the folder. An empty spool takes its files with it: the next starts a new session.
+        """Release the folder. Delete the files of an empty spool, so that the next scan starts a new session.
 
-        In a process forked from the one that opened it this does nothing.
+        Does nothing in a process forked from the one that opened the spool.
         """
         if os.getpid() != self._pid:
             return
