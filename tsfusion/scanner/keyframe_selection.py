@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Selection of the map's keyframes. (Trackers have keyframes of their own.)"""
+"""Select the frames that become keyframes of the map. (Trackers have other keyframes, for themselves.)"""
 
 from collections.abc import Callable
 from typing import Protocol
@@ -12,33 +12,33 @@ from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
 
 INDOORS, OUTDOORS = 0.1, 2.0  # metres between keyframes
-_STRIDE = 16  # pixels between those whose overlap is computed
+_STRIDE = 16  # the overlap is computed for every 16th pixel of every 16th row
 
 
 class Selector(Protocol):
     """Rule that chooses keyframes."""
 
     def reason(self, frame: Frame, T_world_camera: NDArray[np.float64]) -> str | None:
-        """Reason why the frame is one, in a word; None = it is not."""
+        """Return the reason why the frame becomes a keyframe, in one word, or None if it does not."""
 
     def accept(self, frame: Frame, T_world_camera: NDArray[np.float64]) -> None:
         """Make the frame the last keyframe."""
 
     def reset(self) -> None:
-        """Make the next frame the first of a new world."""
+        """Forget the last keyframe: the next frame is the first of a new world (coordinate frame)."""
 
 
 class KeyframeSelector:
     """Select frames that see enough new surface.
 
-    A frame becomes a keyframe when less than `min_overlap` of the last keyframe's pixels (those with a depth)
-    lie in its view, or the sensor has moved by `distance` or turned by `angle` since, but not sooner than
-    `max_rate` allows.
-    Stereo pairs and points have no overlap: their depth is unknown yet, or on all sides.
+    A frame becomes a keyframe when one of three things happened since the last keyframe: the sensor moved by
+    `distance`, it turned by `angle`, or less than `min_overlap` of the last keyframe's pixels with depth lie
+    in the new view. Keyframes come no faster than `max_rate`. Stereo pairs and points have no overlap. A
+    pair's depth is not known yet; points have depth on all sides.
 
     Args:
         config: the rules.
-        outdoors: whether `distance` is 2 m where the config leaves it open, instead of 0.1 m.
+        outdoors: True sets `distance` to 2 m instead of 0.1 m, unless the config gives a distance.
     """
 
     def __init__(self, config: ScanConfig, *, outdoors: bool) -> None:
@@ -48,7 +48,7 @@ class KeyframeSelector:
         self._overlap: Callable[[NDArray[np.float64]], float] | None = None
 
     def reason(self, frame: Frame, T_world_camera: NDArray[np.float64]) -> str | None:
-        """Rule that selects the frame: `first`, `distance`, `angle` or `overlap`; None = not selected."""
+        """Return the selecting rule, `first`, `distance`, `angle` or `overlap`, or None if none selects."""
         if self._last is None:
             return "first"
         T_world_last, stamp = self._last
@@ -65,17 +65,15 @@ class KeyframeSelector:
         return None
 
     def accept(self, frame: Frame, T_world_camera: NDArray[np.float64]) -> None:
-        """Make the frame the last keyframe, which the next ones are compared with."""
         self._last = (T_world_camera, frame.timestamp_ns)
         self._overlap = _overlap(frame)
 
     def reset(self) -> None:
-        """Make the next frame the first of a new world."""
         self._last = self._overlap = None
 
 
 class EveryFrame:
-    """Selector of a replay, whose frames are keyframes already."""
+    """Selector for a replay: each of its frames was a keyframe before."""
 
     def reason(self, _frame: Frame, _T_world_camera: NDArray[np.float64]) -> str:
         return "every"
@@ -88,7 +86,7 @@ class EveryFrame:
 
 
 def _overlap(frame: Frame) -> Callable[[NDArray[np.float64]], float] | None:
-    """Function from T_now_last to the share of this frame's pixels that are in the view from there."""
+    """Return a function from `T_now_last` to the share of this frame's pixels that lie in the view then."""
     K, depth = frame.intrinsics, frame.depth_m
     if depth is None or K is None:
         return None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The scanner: a source of frames, a localizer, keyframe selection, and the client that sends keyframes.
+"""The scanner localizes the frames of a source, selects keyframes, and sends them with a client.
 
 It runs on the robot, without Taichi.
 """
@@ -32,13 +32,13 @@ log = logging.getLogger(__name__)
 
 @dataclass(eq=False)
 class Submap:
-    """Frames tracked in one world, between two losses."""
+    """Frames that were tracked in one world, and the client that sends their keyframes to one map."""
 
-    name: str  # of its map
+    name: str  # name of the submap's map
     client: Client
-    located: TrackedTrajectory = field(default_factory=TrackedTrajectory)  # its frames with a pose, in order
-    corrections: PoseCorrections | None = None  # the newest from loop closure; None = there were none
-    corrected_seq: int = 0  # number of the last keyframe that the last sent correction names
+    located: TrackedTrajectory = field(default_factory=TrackedTrajectory)  # the frames with a pose, in order
+    corrections: PoseCorrections | None = None  # the newest from loop closure; None before the first
+    corrected_seq: int = 0  # number of the last keyframe in the newest correction that was sent
 
     def correct(self) -> None:
         """Hand the corrected poses of all keyframes to the client."""
@@ -47,7 +47,7 @@ class Submap:
         if len(seqs):
             corrected = dict(zip(seqs.tolist(), poses, strict=True))
             sent = self.client.correct(corrected, T_map_odometry=self.corrections.T_corrected_world)
-            if sent is not None:  # else the spool had no room, and `finish` tries again
+            if sent is not None:  # None: the spool had no room; `finish` tries again
                 self.corrected_seq = int(seqs[-1])
 
 
@@ -61,30 +61,31 @@ class ScanState(msgspec.Struct, frozen=True, kw_only=True):
     lost: int
     submap: str
     submaps: int
-    selected: dict[str, int]  # number of keyframes by the rule that selected them
+    selected: dict[str, int]  # selecting rule → number of keyframes
     loops: int  # number of closed loops over all submaps
     stats: ClientStats  # sums over all clients
-    link: str  # why the server takes no keyframes at the moment; empty when it does
-    keyframe_delay_ms: float | None  # from capture to fusion, of the newest fused keyframe; None = none yet
+    link: str  # why the server takes no keyframes at the moment; empty while it takes them
+    keyframe_delay_ms: float | None  # from capture to fusion of the newest fused keyframe; None before it
 
 
 class Scanner:
     """Localize frames and send keyframes.
 
-    A lost sensor sends nothing. When it is not found again within `patience` seconds of the frames' clock,
-    the localizer begins a new world, whose keyframes go into a map of their own: NAME-2, NAME-3, …; it is
-    opened when there is a pose again.
+    While the sensor is lost, nothing is sent. After `patience` seconds of the frames' clock without a pose,
+    the localizer begins a new world. The keyframes of that world go into another map: NAME-2, NAME-3, …; this
+    map is opened when the first pose in the new world is found.
 
     Args:
         localizer: finds the pose of each frame.
         config: rules of keyframe selection, and `patience`.
-        connect: opens a client that sends to the map of that name.
-        map_name: name of the first submap.
-        taken: names that no submap may have.
-        free_name: asks for the name of a map that nobody has; None = nobody can say.
+        connect: opens a client that sends to the map of a given name.
+        map_name: name of the first submap's map.
+        taken: map names that no submap may get.
+        free_name: asks for an unused map name; it returns None if nobody can tell one.
         outdoors: see `KeyframeSelector`.
-        most: largest number of submaps; then a lost sensor has to be found again in the last one. None = any.
-        selector: chooses the keyframes; None = one with the config's rules.
+        most: largest number of submaps; after the last one begins, a lost sensor must be found in that one
+            again. None = no limit.
+        selector: chooses the keyframes; None = `KeyframeSelector` with the config's rules.
     """
 
     def __init__(
@@ -104,9 +105,9 @@ class Scanner:
         self._connect, self._map_name, self._taken = connect, map_name, {map_name, *taken}
         self._free_name = free_name
         self._selector = selector or KeyframeSelector(config, outdoors=outdoors)
-        # The first frame of a world whose motion in its sweep only the next pose tells
+        # First frame of a world, kept until the next pose gives the motion during its sweep
         self._waiting: tuple[TrackedPose, Frame] | None = None
-        self._next: str | None = None  # the map of the submap that begins with the next pose
+        self._next: str | None = None  # map name of the submap that starts with the next pose
         self._lost_since: int | None = None
         self._why = ""
         self.last_loss = ""  # reason; empty = the sensor was never lost
@@ -139,7 +140,7 @@ class Scanner:
         self._correct_if_known()
 
     def finish(self) -> None:
-        """Correct the keyframes since the last loop closure too. Call it after the last frame."""
+        """Correct also the keyframes since the last loop closure. Call it after the last frame."""
         self._take_waiting(None)
         self._localizer.settle()
         self._correct_if_known()
@@ -149,7 +150,7 @@ class Scanner:
 
     @property
     def first_rejection(self) -> str:
-        """Reason why a map did not take the first keyframe that it rejected; empty = none did."""
+        """Reason why a map rejected a keyframe, for the first one rejected; empty if none was."""
         return next(filter(None, (submap.client.first_rejection for submap in self.submaps)), "")
 
     @property
@@ -158,7 +159,6 @@ class Scanner:
         return 1000 * self._tracking_cpu / max(self._frames, 1)
 
     def state(self) -> ScanState:
-        """Progress so far."""
         clients = [submap.client for submap in self.submaps]
         return ScanState(
             state=self._state,
@@ -190,13 +190,13 @@ class Scanner:
             self._take(pose, frame)
 
     def _take_waiting(self, motion: Motion | None) -> None:
-        """Take the frame that waits for a motion, where one does."""
+        """Take the waiting frame, if there is one, with the motion during its sweep."""
         if self._waiting is not None:
             (pose, frame), self._waiting = self._waiting, None
             self._take(dataclasses.replace(pose, motion=motion), frame)
 
     def _take(self, pose: TrackedPose, frame: Frame) -> None:
-        """Note where a frame is, and send it if it is a keyframe."""
+        """Store the pose of a frame, and send the frame if it is a keyframe."""
         submap, T = self.submaps[-1], pose.T_world_camera
         reason = self._selector.reason(frame, T)
         seq = None
@@ -250,7 +250,7 @@ class Scanner:
 
 
 def _total(stats: list[ClientStats]) -> ClientStats:
-    """Sum the counts; of the state, take the first that is not ok."""
+    """Sum the counts. Of the states, take the first that is not "ok"."""
 
     def together(values: list[Any]) -> Any:
         if isinstance(values[0], dict):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Trajectory that may grow for hours: the poses of its frames in about 300 bytes each."""
+"""Store the poses of a trajectory that may grow for hours, in about 300 bytes a frame."""
 
 import math
 from array import array
@@ -19,7 +19,7 @@ _COLUMNS = 4  # other numbers of a frame
 class TrackedTrajectory:
     """Frames with a pose, in order.
 
-    The keyframe number is -1 for frames that are no keyframes, or were dropped.
+    A frame that is no keyframe, or whose keyframe was dropped, has the keyframe number -1.
     """
 
     def __init__(self) -> None:
@@ -38,9 +38,10 @@ class TrackedTrajectory:
         """Append a frame.
 
         Args:
-            reference: (4, 4), the source's own pose; None = it has none.
-            seq: keyframe number; None = no keyframe.
-            specific_force: as of a `Frame`.
+            pose: pose found by the localizer.
+            reference: (4, 4) pose that the source gives; None if it gives none.
+            seq: keyframe number; None for a frame that is no keyframe.
+            specific_force: as in `Frame`; None if nothing was measured.
         """
         at = _NONE
         if reference is not None:
@@ -60,30 +61,30 @@ class TrackedTrajectory:
 
     @property
     def seqs(self) -> NDArray[np.int64]:
-        """Keyframe numbers of the frames, (n,); -1 where a frame is none."""
+        """Keyframe numbers of the frames, (n,); -1 for frames that are no keyframes."""
         return np.array(self._numbers[2::_COLUMNS], dtype=np.int64)
 
     def forces(self) -> list[NDArray[np.float64] | None]:
-        """Specific force of each frame, (3,) m/s² in its sensor's axes; None = nothing was measured."""
+        """Return the specific force of each frame, (3,) m/s² in its sensor's axes; None = not measured."""
         rows = np.array(self._forces).reshape(-1, 3)
         return [None if np.isnan(row).any() else row for row in rows]
 
     @property
     def last_seq(self) -> int:
-        """Number of the last keyframe; -1 without one."""
+        """Number of the last keyframe; -1 if there is none."""
         return int(self.seqs.max(initial=_NONE))
 
     def poses(self, corrections: PoseCorrections | None = None) -> Poses:
-        """Poses of all frames, (n, 4, 4) T_world_camera: as tracked, or corrected."""
+        """Return the poses of all frames, (n, 4, 4) T_world_camera: as tracked, or corrected."""
         return self._corrected(corrections, np.arange(len(self)))
 
     def keyframes(self, corrections: PoseCorrections | None = None) -> tuple[NDArray[np.int64], Poses]:
-        """Keyframe numbers, (m,), and poses, (m, 4, 4) T_world_camera: as tracked, or corrected."""
+        """Return keyframe numbers, (m,), and T_world_camera, (m, 4, 4): as tracked, or corrected."""
         chosen = np.flatnonzero(self.seqs != _NONE)
         return self.seqs[chosen], self._corrected(corrections, chosen)
 
     def with_reference(self) -> tuple[NDArray[np.int64], Poses]:
-        """Indices of the frames with a pose of the source's own, (m,), and those poses, (m, 4, 4)."""
+        """Return the indices of the frames with a pose by the source, (m,), and these poses, (m, 4, 4)."""
         references = np.array(self._references).reshape(-1, 3, 4)
         return np.flatnonzero(self._columns[:, 3] != _NONE), _matrices(references)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Corners tracked from image to image (Shi and Tomasi 1994; Lucas and Kanade 1981); poses from them."""
+"""Find and track corners (Shi and Tomasi 1994; Lucas and Kanade 1981), and find camera poses from them."""
 
 import cv2
 import numpy as np
@@ -13,25 +13,25 @@ Pixels = NDArray[np.float32]  # (n, 2), x then y
 _WINDOW = (19, 16)  # pixels across and down: as exact as 21 × 21 on recordings, and cheaper; 15 × 15 is worse
 _LEVELS = 3
 _STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.01)
-_MAX_RETURN_ERROR = 1.0  # pixels between a corner and where tracking there and back leads
+_MAX_RETURN_ERROR = 1.0  # pixels between a corner and the result of tracking it forth and back
 _BLOCK = 5  # pixels a side of the window around a corner
 _SECOND_DIFFERENCES = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
-# Least eigenvalue of the Sobel gradients in a window: noise of one grey level hardly ever gives more.
+# Smallest eigenvalue of the Sobel gradients in a window: noise of one grey level hardly ever gives more.
 _NOISE_EIGENVALUE = 1000.0
 
 
 def corners(gray: NDArray[np.uint8], count: int, *, mask: NDArray[np.uint8] | None = None) -> Pixels:
-    """Find (n, 2) at most `count` corners, at least a 60th of the width apart, where `mask` is not 0."""
+    """Find at most `count` corners, (n, 2), where `mask` is not 0, at least a 60th of the width apart."""
     apart = max(4, gray.shape[1] // 60)
     found = cv2.goodFeaturesToTrack(gray, count, 0.005, apart, mask=mask, blockSize=_BLOCK)
     return np.empty((0, 2), np.float32) if found is None else found.reshape(-1, 2).astype(np.float32)
 
 
 def stronger_than_noise(gray: NDArray[np.uint8], pixels: Pixels) -> NDArray[np.bool_]:
-    """True where a corner stands out of the image's noise: (n, 2) → (n,).
+    """Return True for corners that are stronger than the image's noise: (n, 2) → (n,).
 
-    The noise is estimated after Immerkær ("Fast noise variance estimation", 1996), by the median, so that
-    plain walls count.
+    The noise is estimated after Immerkær ("Fast noise variance estimation", 1996), but by the median, because
+    plain walls must count.
     """
     rough = cv2.filter2D(gray, cv2.CV_16S, _SECOND_DIFFERENCES)[::3, ::3]
     sigma = float(np.median(np.abs(rough))) / (0.6745 * 6)
@@ -54,11 +54,11 @@ def follow(
     guess: Pixels | None = None,
     thorough: bool = True,
 ) -> tuple[Pixels, NDArray[np.bool_]]:
-    """Track (n, 2) points from one grey image to another; also (n,) which lead back to where they began.
+    """Track (n, 2) points from one grey image to another. Also return (n,) True where tracking back agrees.
 
     Args:
-        guess: (n, 2) pixels where they are expected.
-        thorough: look for the way back at all scales, not at the finest alone: where a guess may be far off.
+        guess: (n, 2) pixels, expected in the new image.
+        thorough: True tracks back at all scales instead of the finest alone, for guesses that may be far off.
     """
     if not len(points):
         return points.copy(), np.zeros(0, bool)
@@ -90,13 +90,13 @@ def resection(
     """Find the camera pose from (n, 3) points and their (n, 2) pixels, by RANSAC and refinement (PnP).
 
     Args:
-        guess: T_points_camera to begin with.
-        tolerance: pixels by which an inlier may be off.
+        guess: T_points_camera to start with.
+        tolerance: largest error of an inlier, pixels.
         minimum: number of inliers that must agree.
         iterations, method: of RANSAC; `cv2.SOLVEPNP_…`.
 
     Returns:
-        T_points_camera (4, 4) and the (n,) inliers; None where fewer than `minimum` agree.
+        T_points_camera (4, 4) and the (n,) inliers, or None if fewer than `minimum` agree.
     """
     if len(points) < minimum:
         return None
@@ -120,7 +120,7 @@ def resection(
 
 
 def bilinear(image: NDArray[np.floating], pixels: Pixels) -> NDArray[np.float32]:
-    """Interpolate the image at (n, 2) pixels; 0 outside, and where a neighbour is 0 (no depth)."""
+    """Interpolate the image at (n, 2) pixels. Return 0 outside, and where a neighbour is 0 (no depth)."""
     u, v = pixels[:, 0], pixels[:, 1]
     x, y = np.floor(u).astype(np.int64), np.floor(v).astype(np.int64)
     inside = (x >= 0) & (y >= 0) & (x < image.shape[1] - 1) & (y < image.shape[0] - 1)
@@ -133,7 +133,7 @@ def bilinear(image: NDArray[np.floating], pixels: Pixels) -> NDArray[np.float32]
 
 
 def back_project(pixels: Pixels, depth: NDArray[np.floating], intrinsics: Intrinsics) -> NDArray[np.float64]:
-    """Points of pixels with depth: (n, 2) pixels, (n,) metres → (n, 3) metres in the camera's axes."""
+    """Return the 3D points of pixels: (n, 2) pixels, (n,) metres → (n, 3) metres in the camera's axes."""
     K = intrinsics
     z = depth.astype(np.float64)
     return np.stack([(pixels[:, 0] - K.cx) / K.fx * z, (pixels[:, 1] - K.cy) / K.fy * z, z], axis=1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Localizers that take known poses: those of a trajectory file (TUM or KITTI), or those of the source."""
+"""Localizers that take known poses, from a trajectory file (TUM or KITTI) or from the source."""
 
 from dataclasses import replace
 from functools import partial
@@ -20,19 +20,19 @@ from tsfusion.scanner.localization.localizer import Localizer, Lost, TrackedPose
 class TrajectoryFilePoses(Localizer):
     """`Localizer` that interpolates the poses of a file at each frame's timestamp.
 
-    Times of a file in KITTI's format are read from `times.txt` (seconds, a line a pose), beside the file or,
-    for `poses/NN.txt`, in `sequences/NN` as in the benchmark. Counting frames instead would move all poses
-    after a dropped frame.
+    The times of a file in KITTI's format are read from `times.txt` (seconds, a line for each pose). It lies
+    beside the file or, for `poses/NN.txt`, in `sequences/NN` as in the benchmark. Frames are not counted
+    instead: a dropped frame would move all poses after it.
 
     Args:
-        path: `timestamp tx ty tz qx qy qz qw` or 12 numbers a line, poses of the sensor whose frames are
-            followed (not of a robot's body).
-        max_gap_s: seconds between two poses at most; there is no pose in longer gaps.
+        path: lines of `timestamp tx ty tz qx qy qz qw` or of 12 numbers. The poses are of the sensor that
+            makes the frames, not of a robot's body.
+        max_gap_s: most seconds between two poses; longer gaps have no pose.
         time_offset_s: seconds to add to a frame's stamp before its pose is looked up.
-        origin: as of `origin.found`.
+        origin: as for `origin.found`.
 
     Raises:
-        DatasetError: for a file that is missing, malformed, or without times.
+        DatasetError: the file is missing, malformed, or without times.
     """
 
     absolute = True
@@ -52,9 +52,9 @@ class TrajectoryFilePoses(Localizer):
         self._begun = False
 
     def track(self, frame: Frame) -> TrackedPose | Lost:
-        """Look up the pose at the frame's timestamp; Lost in gaps and beyond the ends."""
+        """Look up the pose at the frame's timestamp. Return Lost in gaps and outside the trajectory."""
         stamp = frame.timestamp_ns + self._offset_ns
-        # A recording's first frame may be its time 0; 0 again is a source without times.
+        # Stamp 0 may be right for the first frame of a recording; a second 0 means a source without times.
         known = bool(frame.timestamp_ns) or not self._begun
         self._begun = True
         at = partial(self._trajectory.at, max_gap_ns=self._max_gap_ns)
@@ -65,7 +65,7 @@ class TrajectoryFilePoses(Localizer):
         return self._anchors.pose(T, frame.timestamp_ns, motion=motion)
 
     def reset(self) -> None:
-        """Begin a new tracking keyframe; the world stays the trajectory's."""
+        """Start a new tracking keyframe. The world stays that of the trajectory."""
         self._anchors.reset()
 
     def _missing(self, own: int, stamp: int) -> str:
@@ -86,7 +86,7 @@ class TrajectoryFilePoses(Localizer):
 
 
 def read_trajectory(path: Path) -> Trajectory:
-    """Read a trajectory, whose times are in `times.txt` where its format has none. Raises DatasetError."""
+    """Read a trajectory with its times, in KITTI's format from `times.txt`. Raises DatasetError."""
     if has_times(path):
         return read_tum(path)
     _, poses = read_poses(path)
@@ -115,7 +115,7 @@ def _times_of(path: Path) -> Path:
 
 
 class GivenPoses(Localizer):
-    """`Localizer` that takes `frame.T_world_camera`, the source's own pose."""
+    """`Localizer` that takes `frame.T_world_camera`, the pose that the source gives."""
 
     absolute = True
 
@@ -123,11 +123,10 @@ class GivenPoses(Localizer):
         self._anchors = TrackingKeyframes()
 
     def track(self, frame: Frame) -> TrackedPose | Lost:
-        """Return the frame's own pose; Lost where it has none."""
+        """Return the frame's own pose, or Lost if the frame has none."""
         if frame.T_world_camera is None:
             return Lost(reason="the source gives no pose for this frame", timestamp_ns=frame.timestamp_ns)
         return self._anchors.pose(frame.T_world_camera, frame.timestamp_ns, motion=frame.motion)
 
     def reset(self) -> None:
-        """Begin a new tracking keyframe; the world stays the source's."""
         self._anchors.reset()

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""LiDAR odometry with KISS-ICP (Vizzo et al. 2023): point-to-point ICP against a local map.
+"""Track point clouds with KISS-ICP (Vizzo et al. 2023): point-to-point ICP against a local map.
 
-The steps of KISS-ICP are called one by one, so that a scan that does not fit is kept out of the map.
+The steps of KISS-ICP are called one by one. So a scan that does not fit is kept out of the local map.
 """
 
 from typing import Any
@@ -20,30 +20,31 @@ Points = NDArray[np.float64]  # (n, 3) metres
 _INSTALL = "the localizer lidar needs kiss-icp; install: pip install '.[lidar]' in your clone of tsfusion"
 MIN_POINTS = 30  # after thinning
 MIN_UPRIGHT_POINTS = 50
-MIN_OVERLAP = 0.6  # share of the points; 0.88 and more in real and synthetic scans, 0.5 in another street
-MAX_SURPRISE = 3.0  # adaptive thresholds from the expected place: ICP has not searched beyond
+MIN_OVERLAP = 0.6  # share of the points; measured: 0.88 and more in true scans, 0.5 in another street
+MAX_SURPRISE = 3.0  # adaptive thresholds from the expected position: ICP does not search farther
 MAX_TURN = np.radians(45)  # from the expected direction
-SETTLING_SCANS = 4  # until the motion is known
-COLUMN_WIDTH, UPRIGHT_HEIGHT = 1.0, 0.5  # voxels: a column, and the height that makes it upright
+SETTLING_SCANS = 4  # scans until the motion is known
+COLUMN_WIDTH, UPRIGHT_HEIGHT = 1.0, 0.5  # voxels; points of a higher column are upright
 FINE_THRESHOLD = 0.5  # voxels, once the upright points are aligned
 OUTDOOR_RANGE = 100.0  # metres; with a hundredth of it as voxel, KISS-ICP's own defaults
-OUTDOORS_FROM = 20.0  # metres: distance beyond which a hundredth of the points lies
+OUTDOORS_FROM = 20.0  # metres: if a hundredth of the points is farther away, the scan is outdoors
 POINTS_A_VOXEL = 20
-MAX_MISSED_SCANS = 5  # without a pose, through which the motion is thought to go on
+MAX_MISSED_SCANS = 5  # scans without a pose after which the motion is no longer extrapolated
 KEYFRAME_DISTANCE = 2.0  # voxels to the next tracking keyframe
 
 
 class LidarLocalizer(Localizer):
     """`Localizer` of point clouds, z up. Needs the extra `lidar`.
 
-    KISS-ICP alone fails when the sensor moves fast from the first scan on: rings on the ground look the same
-    everywhere and hold the pose back. Until the motion is known, upright points are aligned first.
+    KISS-ICP alone fails when the sensor moves fast from the first scan on. Rings on the ground look the same
+    everywhere, and pull the pose back to the last one. Until the motion is known, upright points are aligned
+    first.
 
     Args:
-        max_range: metres; farther points are left out. None = 100 outdoors, by the first scan indoors.
-        voxel_size: metres, of the local map. None = by the first scan: 1 outdoors, a tenth of the median
-            distance indoors.
-        threads: 1 gives equal poses for equal scans.
+        max_range: metres; farther points are left out. None = 100 outdoors; indoors the first scan decides.
+        voxel_size: metres, voxel of the local map. None = the first scan decides: 1 outdoors, a tenth of the
+            median distance indoors.
+        threads: number of threads; only 1 gives equal poses for equal scans.
     """
 
     absolute = False
@@ -91,7 +92,6 @@ class LidarLocalizer(Localizer):
         return self._anchors.pose(T, frame.timestamp_ns, quality=quality, motion=motion)
 
     def reset(self) -> None:
-        """Begin a new world at the next frame."""
         self._icp: Any = None
         self._first: Frame | None = None
         self._T_first_map = np.eye(4)
@@ -126,7 +126,7 @@ class LidarLocalizer(Localizer):
         self._anchors.distance = KEYFRAME_DISTANCE * voxel
 
     def _expected(self) -> se3.Transform:
-        """Predict the pose from the motion, also over missed scans; after many of them, the last pose."""
+        """Predict the pose from the last motion, also over missed scans. After many, return the last pose."""
         steps = self._missed + 1 if self._missed < MAX_MISSED_SCANS else 0
         T: se3.Transform = self._icp.last_pose @ se3.exp(se3.log(self._icp.last_delta) * steps)
         return T
@@ -153,7 +153,7 @@ class LidarLocalizer(Localizer):
         return made
 
     def _problem(self, T: se3.Transform, overlap: float) -> str:
-        """Reason to reject the pose; empty = it is accepted."""
+        """Return the reason to reject the pose, or "" to accept it."""
         if overlap < MIN_OVERLAP:
             return f"{overlap:.0%} of the points lie where some were before"
         surprise = se3.inverse(self._expected()) @ T
@@ -166,13 +166,13 @@ class LidarLocalizer(Localizer):
         return ""
 
     def _note_period(self, frame: Frame) -> None:
-        """Seconds from scan to scan: as stamped, at least a sweep; a recording may have no times."""
+        """Set the seconds between scans: from the stamps if there are any, but at least those of a sweep."""
         times = self._times(frame)
         stamped_s = (frame.timestamp_ns - self._last_ns) / 1e9 / (self._missed + 1) if self._last_ns else 0.0
         self._period_s = max(stamped_s, float(np.ptp(times)) if len(times) else 0.0)
 
     def _straightened(self, frame: Frame, motion: se3.Transform) -> Points:
-        """Points in range, in the sensor's axes at the scan's end."""
+        """Return the points in range, in the sensor's axes at the scan's end."""
         assert frame.points is not None
         times = self._times(frame)
         if len(times):
@@ -181,20 +181,20 @@ class LidarLocalizer(Localizer):
         return scan
 
     def _times(self, frame: Frame) -> NDArray[np.float64]:
-        """Times of the points, (N,) seconds; (0,) where they are all of one time."""
+        """Return the times of the points, (N,) seconds, or (0,) if all points have the same time."""
         times = frame.point_times_s
         if times is None or np.ptp(times) <= 0:
             return np.zeros(0)
         return times.astype(np.float64)
 
     def _from_stamp(self, frame: Frame) -> se3.Transform:
-        """Pose of the sensor at the scan's end, in its axes at the frame's timestamp."""
+        """Return the sensor's pose at the scan's end, in the sensor's axes at the frame's timestamp."""
         times = self._times(frame)
         end = float(times.max()) / self._period_s if len(times) else 0.0
         return se3.exp(end * se3.log(self._icp.last_delta))
 
     def _accept(self, T: se3.Transform, map_points: Points, frame: Frame) -> se3.Transform:
-        """Put the scan into the map; return the sensor's pose at the frame's timestamp."""
+        """Put the scan into the local map. Return the sensor's pose at the frame's timestamp."""
         icp = self._icp
         moved = se3.exp(se3.log(se3.inverse(icp.last_pose) @ T) / (self._missed + 1))
         if icp.local_map.empty():
@@ -203,7 +203,7 @@ class LidarLocalizer(Localizer):
             icp.adaptive_threshold.update_model_deviation(se3.inverse(self._expected()) @ T)
         icp.last_delta, before, icp.last_pose = moved, icp.last_pose, T
         if self._first is not None and self._first is not frame:
-            if len(self._times(self._first)):  # both were taken for scans of a sensor at rest
+            if len(self._times(self._first)):  # both scans were straightened for a sensor at rest
                 icp.local_map.clear()
                 icp.local_map.update(icp.voxelize(self._straightened(self._first, moved))[1], before)
                 map_points = icp.voxelize(self._straightened(frame, moved))[1]
@@ -215,7 +215,7 @@ class LidarLocalizer(Localizer):
         return self._T_first_map @ T @ se3.inverse(self._from_stamp(frame))
 
     def _fail(self, frame: Frame, reason: str) -> Lost:
-        """Count a scan without a pose; the next one is sought around the last good one."""
+        """Count a scan without a pose. The next scan's pose is searched around the last good one."""
         self._missed += 1
         self._settling = SETTLING_SCANS
         return _lost(frame, reason)
@@ -226,7 +226,7 @@ def _lost(frame: Frame, reason: str) -> Lost:
 
 
 def _is_upright(points: Points, voxel: float) -> NDArray[np.bool_]:
-    """True where a point lies in a column higher than the ground: (n, 3) → (n,)."""
+    """Return True for points in a column with more height than the ground: (n, 3) → (n,)."""
     cells = np.floor(points[:, :2] / (COLUMN_WIDTH * voxel)).astype(np.int64)
     _, column = np.unique(cells, axis=0, return_inverse=True)
     lowest, highest = np.full(len(points), np.inf), np.full(len(points), -np.inf)
@@ -237,7 +237,7 @@ def _is_upright(points: Points, voxel: float) -> NDArray[np.bool_]:
 
 
 def _overlap(points: Points, around: Points, voxel: float) -> float:
-    """Share of the points whose voxel, or a neighbour of it, holds points of the map."""
+    """Return the share of the points that have a point of the map in their voxel or next to it."""
     occupied = distinct(_keys(around, voxel))
     keys = _keys(points, voxel)
     hit = np.zeros(len(keys), bool)
@@ -248,7 +248,7 @@ def _overlap(points: Points, around: Points, voxel: float) -> float:
 
 
 def _keys(points: Points, voxel: float) -> NDArray[np.int64]:
-    """Number of each point's voxel, 21 bits an axis: (n, 3) → (n,)."""
+    """Return the number of each point's voxel, 21 bits an axis: (n, 3) → (n,)."""
     cells = np.floor(points / voxel).astype(np.int64) + (1 << 20)
     keys: NDArray[np.int64] = (cells[:, 0] << 42) + (cells[:, 1] << 21) + cells[:, 2]
     return keys

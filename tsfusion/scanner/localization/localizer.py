@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The `Localizer` protocol, and its answers: a pose or a loss a frame, and corrections of earlier poses."""
+"""The `Localizer` protocol, and its results: a pose or a loss for each frame, and corrections of poses."""
 
 import math
 from dataclasses import dataclass
@@ -18,14 +18,15 @@ class TrackedPose:
     """Pose of the sensor at one frame.
 
     Attributes:
-        T_world_camera: (4, 4) float64; the world is the first frame's camera since the start or the last
-            `reset`, or the given trajectory's. Odometry: corrections never make it jump.
-        timestamp_ns: the frame's.
-        anchor: number of the tracking keyframe it is relative to; numbers grow, also across a `reset`.
+        T_world_camera: (4, 4) float64. The world's axes are those of a given trajectory, or those of the
+            first camera since the start or the last `reset`. Corrections never make these poses jump.
+        timestamp_ns: timestamp of the frame.
+        anchor: number of the tracking keyframe that `T_anchor_camera` is relative to. Numbers grow, also
+            across a `reset`.
         T_anchor_camera: (4, 4); the corrected pose is the corrected anchor times this.
-        starts_anchor: whether this frame is that tracking keyframe.
-        quality: 0 to 1, the share of what was compared that agrees; 1 where poses are given.
-        motion: of the sensor in the time of the frame's points; None = not known, or all are of one time.
+        starts_anchor: True if this frame is itself that tracking keyframe.
+        quality: 0 to 1, share of the compared points that agree; 1 for given poses.
+        motion: motion of the sensor during the frame's points. None = not known, or all points have one time.
     """
 
     T_world_camera: Transform
@@ -39,11 +40,11 @@ class TrackedPose:
 
 @dataclass(frozen=True, kw_only=True)
 class Lost:
-    """Answer for a frame without a pose. Such a frame must not be fused.
+    """Result for a frame without a pose. Such a frame must not be fused.
 
     Attributes:
         reason: text for the user, such as `12 of 300 points agree`.
-        timestamp_ns: the frame's.
+        timestamp_ns: timestamp of the frame.
     """
 
     reason: str
@@ -52,13 +53,13 @@ class Lost:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PoseCorrections:
-    """Poses given before, corrected by loop closure. The newest revision replaces all others.
+    """Earlier poses, corrected by loop closure. The newest revision replaces all others.
 
     Attributes:
         revision: counts up from 1 since the last `reset`.
-        anchors: tracking keyframe → its corrected (4, 4) T_world_camera, for all since the last `reset`.
+        anchors: tracking keyframe → corrected (4, 4) T_world_camera, for all since the last `reset`.
         T_corrected_world: (4, 4); `T_corrected_world @ T_world_camera` corrects poses after the last anchor.
-        loops: loops closed so far.
+        loops: number of loops closed so far.
     """
 
     revision: int
@@ -70,42 +71,43 @@ class PoseCorrections:
 class Localizer(Protocol):
     """Tracker of a sensor. Frames come in time order, from one thread.
 
-    A localizer that holds a socket has a `close()`, too.
+    A localizer that holds a socket also has a `close()`.
 
     Attributes:
-        absolute: whether its world stays the same after `reset`, as that of poses from elsewhere does.
+        absolute: True if `reset` keeps the world (coordinate frame), as with poses from a file.
     """
 
     absolute: bool
 
     def track(self, frame: Frame) -> TrackedPose | Lost:
-        """Find the sensor's pose; Lost when it is not known (then try the next frame, or `reset`).
+        """Find the sensor's pose. Return Lost when it is not known (then try the next frame, or `reset`).
 
         Raises:
-            InvalidKeyframe: when the frame lacks what this localizer needs (colour, depth, a stereo pair).
+            InvalidKeyframe: the frame has not what this localizer needs (colour, depth, a stereo pair).
         """
 
     def prepare(self) -> None:
-        """Do what the next frame needs of the last one, whose pose does not wait for it.
+        """Compute from the last frame what the next frame needs.
 
-        Call it when the pose was used; otherwise `track` does it first.
+        This is apart from `track` so that the pose need not wait for it. Call it after the use of the pose;
+        otherwise `track` does it first.
         """
         return
 
     def corrections(self) -> PoseCorrections | None:
-        """Return corrections that are new since the last call; None = there are none, as in odometry."""
+        """Return the corrections that are new since the last call, or None if there are none."""
         return None
 
     def settle(self) -> None:
-        """Finish what is done beside `track`; then `corrections` has what comes of it."""
+        """Finish the work in other threads. After it, `corrections` returns their results."""
         return
 
     def reset(self) -> None:
-        """Forget the world: the next pose begins a new one, unrelated to the old."""
+        """Forget the world. The next pose starts a new one, unrelated to the old."""
 
 
 class TrackingKeyframes:
-    """Make every pose relative to the last tracking keyframe; begin a new one when the sensor has moved away.
+    """Make each pose relative to the last tracking keyframe. Far from it, make a new tracking keyframe.
 
     Args:
         angle: degrees to the next keyframe.
@@ -118,10 +120,10 @@ class TrackingKeyframes:
         self._T_world_anchor: se3.Transform | None = None
 
     def pose(self, T_world_camera: se3.Transform, timestamp_ns: int, **known: Any) -> TrackedPose:
-        """Make a localizer's answer of (4, 4) `T_world_camera`, relative to the tracking keyframe.
+        """Return the result of a localizer with (4, 4) `T_world_camera`, relative to the tracking keyframe.
 
         Args:
-            known: quality and motion, as of a `TrackedPose`.
+            known: `quality` and `motion` as in `TrackedPose`.
         """
         T = np.eye(4) if self._T_world_anchor is None else se3.inverse(self._T_world_anchor) @ T_world_camera
         moved = se3.distance(T) > self.distance or se3.angle(T) > self._angle
@@ -139,5 +141,5 @@ class TrackingKeyframes:
         )
 
     def reset(self) -> None:
-        """Make the next pose a tracking keyframe. Numbers go on."""
+        """Make the next pose a tracking keyframe. Its number follows the last one."""
         self._T_world_anchor = None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Choice and construction of the localizer that a scan's settings and its first frame ask for."""
+"""Choose and construct the localizer that fits a scan's settings and its first frame."""
 
 import logging
 
@@ -32,7 +32,7 @@ log = logging.getLogger(__name__)
 
 
 def localizer_name(config: ScanConfig, first: Frame) -> LocalizerName:
-    """Name of the localizer: the setting's, or for `auto` the one that fits the first frame's kind."""
+    """Return the localizer's name: from the setting, or with `auto` by the kind of the first frame."""
     if config.localizer != "auto":
         return config.localizer
     if config.trajectory is not None:
@@ -43,11 +43,11 @@ def localizer_name(config: ScanConfig, first: Frame) -> LocalizerName:
 
 
 def create_localizer(config: ScanConfig, first: Frame) -> Localizer:
-    """Construct the localizer that `localizer_name` names, with loop closure if it tracks by images.
+    """Construct the localizer given by `localizer_name`. If it tracks images, add loop closure.
 
     Raises:
-        InvalidConfig: its file or address is missing, or it cannot track frames of this kind.
-        MissingDependency: its optional package is not installed.
+        InvalidConfig: the localizer's file or address is missing, or it cannot track frames of this kind.
+        MissingDependency: the localizer's optional package is not installed.
     """
     name = localizer_name(config, first)
     if first.kind not in _ACCEPTED_KINDS.get(name, (first.kind,)):

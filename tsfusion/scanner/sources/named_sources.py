@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Live sources by name.
+"""Open live sources by name.
 
-Another package adds its own with an entry point of the group `tsfusion.sources`: a function that takes what
-follows the colon (None without one) and keyword options, and returns a `Source`.
+Another package adds a source with an entry point of the group `tsfusion.sources`. The entry point is a
+function that returns a `Source`. It takes the text after the colon (None without a colon) and keyword
+options.
 """
 
 from collections.abc import Callable
@@ -19,7 +20,7 @@ _FORMS = "realsense, realsense:SERIAL, realsense:FILE.db3, camera:NUMBER|DEVICE|
 
 
 def is_live(spec: str) -> bool:
-    """True if `spec` names a live source, of tsfusion or an installed package; otherwise it is a path."""
+    """Return True if `spec` names a live source of tsfusion or of an installed package, False for a path."""
     name = spec.partition(":")[0]
     return name in _BUILT_IN or name in entry_points(group=GROUP).names
 
@@ -28,13 +29,13 @@ def open_source(spec: str, /, **options: object) -> Source:
     """Open `realsense[:SERIAL|FILE]`, `camera:PLACE`, `folder:PATH` or an installed package's `name[:…]`.
 
     Args:
-        spec: name and place, as `tsfusion scan` takes them.
-        options: as the source's class takes them; for None the source has its own default.
+        spec: name and address of the source, as for `tsfusion scan`.
+        options: keyword arguments of the source's class; None means the default of the class.
 
     Raises:
-        InvalidConfig: no such source, it takes no such option, or not of that type.
-        SourceError: it cannot be opened.
-        MissingDependency: its optional package is not installed.
+        InvalidConfig: there is no such source, or it has no such option, or an option has the wrong type.
+        SourceError: the source cannot be opened.
+        MissingDependency: the source's optional package is not installed.
 
     Examples:
         >>> with tsfusion.open_source("folder:incoming", idle=0.1) as source:  # or "realsense", "camera:0"

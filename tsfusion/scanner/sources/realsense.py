@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Intel RealSense through librealsense: a camera, a recording of one, or a device made by a program."""
+"""Read Intel RealSense cameras, their recordings, and software devices, with librealsense."""
 
 import threading
 import time
@@ -26,12 +26,12 @@ _LENSES = {
 }
 _ADVICE = "Close other programs that use it, or try another cable and USB 3 port"
 _WAIT_MS = 100  # between two checks whether the source was closed
-_MAX_SKEW = 0.75  # of a period: images further apart are not of one exposure
-_MAX_REORDERED = 16  # framesets that librealsense may have under way
-_OLDEST_S = 1.0  # timestamps of frames that seem older are of another clock
+_MAX_SKEW = 0.75  # share of a period: images with a larger time difference are not of one exposure
+_MAX_REORDERED = 16  # framesets that librealsense may be working on
+_OLDEST_S = 1.0  # a frame that seems older has a timestamp of another clock
 Images = Literal["depth", "infrared"]
 
-_QUEUE = 4  # framesets a syncer keeps; the oldest goes first
+_QUEUE = 4  # framesets that a syncer keeps; it drops the oldest
 
 
 class RealSenseStream(Protocol):
@@ -40,23 +40,23 @@ class RealSenseStream(Protocol):
     device: Any  # `pyrealsense2.device`
 
     def wait(self, milliseconds: int) -> Any:
-        """Wait for the next frameset; None if there is none in time."""
+        """Wait for the next frameset. Return None if no frameset comes in time."""
 
     def over(self) -> bool:
-        """True if no frameset will follow those that are queued."""
+        """Return True if no frameset will follow the queued ones."""
 
     def profile(self, stream: Any, index: int = -1) -> Any:
-        """Video stream profile in use."""
+        """Return the profile of a video stream in use."""
 
     def stop(self) -> None:
-        """Stop streaming; may be called twice and from another thread."""
+        """Stop streaming. It may be called twice, and from another thread."""
 
 
 class PipelineStream:
-    """Camera or recording of a librealsense `config`; `real_time` is None for a camera.
+    """Stream of a librealsense `config`, from a camera (`real_time` is None) or a recording.
 
-    A recording stands still until the first `wait`: librealsense reads on while it starts one sensor after
-    the other, and would drop what it reads for those that are not started yet.
+    A recording is paused until the first `wait`. Librealsense starts the sensors one after the other; without
+    the pause it would already read the file, and drop the data of sensors that are not started yet.
     """
 
     def __init__(self, rs: Any, config: Any, *, real_time: bool | None) -> None:
@@ -82,7 +82,7 @@ class PipelineStream:
 
     def over(self) -> bool:
         if self._playback is None or self._resuming is None or self._resuming.is_alive():
-            return False  # one that has not begun to play counts as stopped, too
+            return False  # librealsense reports "stopped" also before it plays
         return bool(self._playback.current_status() == self._stopped)
 
     def profile(self, stream: Any, index: int = -1) -> Any:
@@ -96,10 +96,10 @@ class PipelineStream:
 
 
 class DeviceStream:
-    """Streams of a device, matched by librealsense's syncer.
+    """Streams of a device, which librealsense's syncer combines to framesets.
 
     Args:
-        wanted: (stream, index or -1) of each.
+        wanted: stream and index of each stream; index -1 means any.
     """
 
     def __init__(self, rs: Any, device: Any, wanted: list[tuple[Any, int]]) -> None:
@@ -149,7 +149,7 @@ def open_stream(
     fps: int,
     real_time: bool,
 ) -> tuple[RealSenseStream, bool]:
-    """Open the stream; also return whether it has colour.
+    """Open the stream. Return it, and True if it has colour.
 
     Raises:
         SourceError: there is no such camera.
@@ -185,7 +185,7 @@ def plugged_in(rs: Any, device: Any) -> bool:
 
 
 def baseline_of(rs: Any, device: Any) -> float | None:
-    """Baseline of the stereo cameras, metres; None for other kinds of camera."""
+    """Return the baseline of the stereo cameras in metres, or None for other kinds of camera."""
     for sensor in device.query_sensors():
         if sensor.supports(rs.option.stereo_baseline):
             return abs(float(sensor.get_option(rs.option.stereo_baseline))) / 1000
@@ -193,10 +193,10 @@ def baseline_of(rs: Any, device: Any) -> float | None:
 
 
 def bgr(rs: Any, frame: Any) -> NDArray[np.uint8]:
-    """Copy a colour frame as (H, W, 3) uint8 BGR.
+    """Return a copy of a colour frame as (H, W, 3) uint8 BGR.
 
     Raises:
-        SourceError: a pixel format other than bgr8 and rgb8.
+        SourceError: the pixel format is neither bgr8 nor rgb8.
     """
     order = {rs.format.bgr8: 1, rs.format.rgb8: -1}.get(frame.profile.format())
     if order is None:
@@ -234,28 +234,29 @@ def _is(profile: Any, stream: Any, index: int) -> bool:
 
 
 class RealSense(LiveSource):
-    """Depth registered to colour, or the rectified infrared pair, of one RealSense.
+    """Frames of one RealSense: depth registered to colour, or the rectified infrared pair.
 
-    The projector and all other options stay as they are on the camera. A live camera yields its newest
-    frames; those that a slow consumer misses count as `dropped`. A recording yields all of them.
+    All options of the camera, also the projector, stay as set on the camera. A live camera yields its newest
+    frames; frames that a slow consumer misses count as `dropped`. A recording yields all frames.
 
     Args:
-        camera: serial number; default the first one found.
-        recording: a file instead of a camera, as librealsense records it.
-        device: a `pyrealsense2.device` of this process instead (a software device).
-        images: `depth`, or `infrared`: the pair of the stereo cameras. Switch the dot projector off for it:
-            its dots move with the camera.
-        color: whether to use the colour camera, where there is one; without it depth keeps its own pixels.
+        camera: serial number; by default the first camera found.
+        recording: a file recorded by librealsense, instead of a camera.
+        device: a `pyrealsense2.device` of this process (a software device), instead of a camera.
+        images: `depth`, or `infrared` for the pair of the stereo cameras. For `infrared`, switch the dot
+            projector off: its dots move with the camera.
+        color: True uses the colour camera if there is one. Otherwise depth keeps the depth camera's pixels.
         size: (height, width) of all images of a camera.
         fps: frames a second of a camera.
-        real_time: whether to play a recording at its own speed, which may drop frames.
+        real_time: True plays a recording at its own speed, which may drop frames.
         deadline: seconds without a frame after which a camera counts as stopped.
         sensor: sensor model; default `realsense`, `tof` for a camera without a baseline, `stereo` for the
             infrared pair.
 
     Raises:
-        SourceError: no such camera, it is in use or lacks such images; the recording cannot be played.
-        MissingDependency: without pyrealsense2, or without the USB library that it loads.
+        SourceError: there is no such camera, or another program uses it, or it has no such images, or the
+            recording cannot be played.
+        MissingDependency: pyrealsense2 is not installed, or the USB library that it loads.
     """
 
     def __init__(
@@ -314,7 +315,7 @@ class RealSense(LiveSource):
                 raise self._stopped()
 
     def close(self) -> None:
-        """Stop the camera; a blocked iteration ends within a tenth of a second."""
+        """Stop the camera. A blocked iteration ends within a tenth of a second."""
         super().close()
         self._stream.stop()
 
@@ -397,10 +398,10 @@ class RealSense(LiveSource):
         )
 
     def _is_complete(self, first: Any, second: Any, *, needed: bool) -> bool:
-        """Check a frameset for a new first image and a second of the same exposure; count those without.
+        """Return True for a new first image with a second one of the same exposure. Count the missing images.
 
-        Missing frame numbers were dropped; a set may repeat an image beside the next one of the other stream;
-        a number that is much smaller comes from a camera that was restarted.
+        Missing frame numbers count as dropped frames. A frameset may repeat an image beside the next image of
+        the other stream. A much smaller number comes from a camera that was restarted.
         """
         if not first or 0 <= self._number - first.frame_number < _MAX_REORDERED:
             return False
@@ -417,7 +418,7 @@ class RealSense(LiveSource):
         return True
 
     def _stamps(self, frame: Any) -> tuple[int, int]:
-        """`timestamp_ns` and `captured_ns`."""
+        """Return `timestamp_ns` and `captured_ns`."""
         stamp = round(frame.timestamp * 1e6)  # from milliseconds
         foreign = self._played or frame.frame_timestamp_domain == self._rs.timestamp_domain.hardware_clock
         captured = time.monotonic_ns() if foreign else monotonic_of(stamp, oldest_s=_OLDEST_S)
@@ -425,7 +426,7 @@ class RealSense(LiveSource):
 
 
 def _undistorter(profile: Any, name: str) -> Undistorter | None:
-    """Undistorter of colour cameras whose images are distorted (D455, D405); None for all others.
+    """Return an undistorter for colour cameras with distorted images (D455, D405), or None for all others.
 
     Librealsense projects with the forward polynomial in all three Brown-Conrady models (`rs2_project`).
     """

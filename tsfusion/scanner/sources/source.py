@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The `Source` protocol, the base of sources that wait for frames, and recordings as sources."""
+"""The `Source` protocol, the base class of live sources, and the source that plays a recording."""
 
 import dataclasses
 import math
@@ -18,14 +18,14 @@ from tsfusion.geometry.frame import Frame
 
 
 class Source(Protocol):
-    """Frames in time order: a sensor, a folder that is being written to, a recording.
+    """Frames in time order, from a sensor, a folder that is being written to, or a recording.
 
     Attributes:
         name: name for reports.
-        sensor: name of the sensor model of its frames.
-        live: whether frames are lost while nobody takes them; those of a recording or a folder wait.
+        sensor: name of the sensor model of the frames.
+        live: True if frames are lost while nobody takes them. Frames of a recording or a folder wait.
         length: number of frames; None = unknown.
-        skipped: number of frames left out so far, by reason.
+        skipped: reason → number of frames left out so far.
 
     Examples:
         >>> with tsfusion.open_source("folder:incoming", idle=0.1) as source:
@@ -41,14 +41,14 @@ class Source(Protocol):
     skipped: dict[str, int]
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yield each frame as soon as it arrives; end when the source does.
+        """Yield each frame as soon as it arrives, until the source ends.
 
         Raises:
             SourceError: the sensor stopped; the message says what to do.
         """
 
     def close(self) -> None:
-        """Release the sensor; may be called twice, and from another thread to end the iteration."""
+        """Release the sensor. It may be called twice, and from another thread to end the iteration."""
 
     def __enter__(self) -> "Source": ...
 
@@ -62,11 +62,11 @@ _Self = TypeVar("_Self", bound="LiveSource")
 
 
 class CloseFlag:
-    """Like `threading.Event`, but a signal handler may set it while its own thread waits."""
+    """Flag like `threading.Event`, but a signal handler may set it while the same thread waits for it."""
 
     def __init__(self) -> None:
         self._set = False
-        self._wakeups: queue.SimpleQueue[None] = queue.SimpleQueue()  # its `put` is reentrant; a lock is not
+        self._wakeups: queue.SimpleQueue[None] = queue.SimpleQueue()  # its `put` is reentrant, unlike a lock
 
     def set(self) -> None:
         """Set the flag and wake the waiting thread."""
@@ -74,11 +74,10 @@ class CloseFlag:
         self._wakeups.put(None)
 
     def is_set(self) -> bool:
-        """True once the flag is set."""
         return self._set
 
     def wait(self, timeout: float) -> bool:
-        """Wait up to `timeout` seconds for the flag, in one thread at a time. Returns True if it is set."""
+        """Wait up to `timeout` seconds for the flag, in one thread at a time. Return True if it is set."""
         if not self._set:
             with suppress(queue.Empty):
                 self._wakeups.get(timeout=timeout)
@@ -86,11 +85,11 @@ class CloseFlag:
 
 
 class LiveSource(ABC):
-    """Base of sources: `close` ends the iteration, which checks `_closed` whenever it waits."""
+    """Base class of sources. `close` sets `_closed`; the iteration checks it whenever it waits, and ends."""
 
     live = True
     length: int | None = None
-    camera = ""  # intrinsics and where they came from, in one line; empty = its frames alone tell
+    camera = ""  # intrinsics and their origin, in one line; empty if only the frames have them
 
     def __init__(self, name: str, sensor: str) -> None:
         self.name, self.sensor = name, sensor
@@ -102,11 +101,11 @@ class LiveSource(ABC):
         """Yield each frame as soon as it arrives."""
 
     def waits_for(self) -> str:
-        """Needs of a source, and its end, for a person; empty = nothing to say."""
+        """Return for the user what the source waits for, and when it ends; empty = nothing to say."""
         return ""
 
     def close(self) -> None:
-        """End the iteration; may be called twice."""
+        """End the iteration. It may be called twice."""
         self._closed.set()
 
     def __enter__(self: _Self) -> _Self:
@@ -123,24 +122,24 @@ class LiveSource(ABC):
 
 
 def monotonic_of(wall_ns: int, *, oldest_s: float) -> int:
-    """Convert a wall clock time to `time.monotonic_ns()`; now, if it is in the future or too old."""
+    """Convert a wall clock time to `time.monotonic_ns()`. If it is too old or in the future, return now."""
     now, age = time.monotonic_ns(), time.time_ns() - wall_ns
     return now - age if 0 <= age <= oldest_s * SECOND else now
 
 
-_POLL_S = 0.1  # between looks at what else there is to do while a time is waited for
-_READ_AHEAD = 3  # times as long as the last frame took to be read: disks and images differ
+_POLL_S = 0.1  # seconds between two calls of `attend` during a wait
+_READ_AHEAD = 3  # multiple of the last frame's reading time: disks and images differ
 
 
 class RecordedSource(LiveSource):
     """Play a dataset's frames in order, as if they came from a sensor.
 
     Args:
-        dataset: opened with poses or without.
-        rate: frames a second; None = as fast as they are taken.
+        dataset: an open dataset, with or without poses.
+        rate: frames a second; None = as fast as the caller takes them.
 
     Attributes:
-        attend: called again and again while a frame's time is waited for.
+        attend: called again and again while the source waits for a frame's time.
     """
 
     live = False
@@ -157,12 +156,13 @@ class RecordedSource(LiveSource):
         self.camera = str(camera) if isinstance(camera, RecordedCamera) else ""
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yield frames with the recording's timestamps, or nominal ones where it has none.
+        """Yield frames with the recording's timestamps, or with nominal ones if it has none.
 
-        At a rate, a sensor that was late does not catch up, and a frame is read when its time is near: read
-        at once it would take a core while the server fuses the last one, a third of the delay on two cores.
+        With a rate, a late frame delays all later ones, as with a sensor. Each frame is read shortly before
+        its time. Reading it earlier would take a core while the server fuses the previous frame: on two cores
+        that adds a third to the delay.
         """
-        due, ahead = -math.inf, math.inf  # of the last frame; how long before its time the next one is read
+        due, ahead = -math.inf, math.inf  # the last frame's time; seconds from reading a frame to its time
         for index in range(len(self._dataset)):
             self._wait_until(self._after(due) - ahead)
             if self._closed.is_set():
@@ -181,7 +181,6 @@ class RecordedSource(LiveSource):
             yield dataclasses.replace(frame, timestamp_ns=stamp, captured_ns=time.monotonic_ns())
 
     def _after(self, due: float) -> float:
-        """Time of the frame after one."""
         return -math.inf if self._rate is None else due + 1 / self._rate
 
     def _wait_until(self, due: float) -> None:
@@ -191,7 +190,7 @@ class RecordedSource(LiveSource):
 
 
 class LimitedSource(LiveSource):
-    """The first `limit` frames of a source; closes the source with itself."""
+    """The first `limit` frames of a source. Closing it closes the source too."""
 
     def __init__(self, source: Source, limit: int) -> None:
         super().__init__(source.name, source.sensor)
@@ -202,17 +201,14 @@ class LimitedSource(LiveSource):
 
     @property
     def camera(self) -> str:  # type: ignore[override]
-        """The source's camera; a folder knows its own with the first frame."""
+        """Camera of the source. A watched folder knows its camera from the first frame on."""
         return getattr(self._source, "camera", "")
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yield the source's frames, up to the limit."""
         return islice(iter(self._source), self._limit)
 
     def waits_for(self) -> str:
-        """Needs of the source, and its end."""
         return self._source.waits_for() if isinstance(self._source, LiveSource) else ""
 
     def close(self) -> None:
-        """Close the source."""
         self._source.close()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Source of stereo pairs side by side in one picture, from a camera, a stream or a video file (OpenCV)."""
+"""Read stereo pairs from a camera, a stream or a video file whose pictures hold both images side by side."""
 
 import logging
 import os
@@ -30,23 +30,23 @@ _JOIN_S = 2.0  # seconds to wait for a driver that hangs
 
 
 class StereoVideo(LiveSource):
-    """Rectified pairs from the left and right halves of pictures.
+    """Rectified pairs from the left and right halves of pictures, read by OpenCV.
 
-    A camera or a network stream yields its newest picture, and those in between count as `dropped`; a file
-    yields every picture.
+    A camera or a network stream yields its newest picture; the pictures missed in between count as `dropped`.
+    A file yields every picture.
 
     Args:
-        place: the camera's number or device (`0`, `/dev/video0`), a stream's URL, or a file (or a pattern of
-            files, `%06d.png`).
-        calibration: file or folder, as `stereo_pairs.read_rectifier` reads it.
-        intrinsics, baseline: instead, for rectified pictures; pixels, metres.
-        size: (height, width) of one half to set the camera to; default the calibration's or the camera's.
-        fps: pictures a second to set the camera to; default its own.
+        place: number or device of a camera (`0`, `/dev/video0`), URL of a stream, or a video file (or a
+            pattern of image files, `%06d.png`).
+        calibration: file or folder, as for `stereo_pairs.read_rectifier`.
+        intrinsics, baseline: pixels, metres; instead of a calibration, for pictures that are rectified.
+        size: (height, width) of one half, set on the camera; default the calibration's or the camera's.
+        fps: pictures a second, set on the camera; default the camera's.
         deadline: seconds without a picture after which a camera counts as stopped.
 
     Raises:
-        SourceError: it cannot be opened or the calibration cannot be read.
-        InvalidConfig: neither calibration nor intrinsics with baseline are given.
+        SourceError: the camera, stream or file cannot be opened, or the calibration cannot be read.
+        InvalidConfig: neither a calibration nor intrinsics with a baseline are given.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class StereoVideo(LiveSource):
             yield self._frame(picture)
 
     def close(self) -> None:
-        """Release the camera; a blocked iteration ends within a tenth of a second."""
+        """Release the camera. A blocked iteration ends within a tenth of a second."""
         super().close()
         if self._thread is not None:
             self._thread.close()
@@ -106,7 +106,7 @@ class StereoVideo(LiveSource):
 
     def _all(self) -> Iterator["VideoPicture"]:
         count, fps = 0, self._capture.get(cv2.CAP_PROP_FPS)
-        period = round(1e9 / fps) if fps > 0 else 1  # a time of 0 would mean that it is unknown
+        period = round(1e9 / fps) if fps > 0 else 1  # timestamp 0 means "unknown"
         while not self._closed.is_set():
             with self._reading:
                 there, image = self._capture.read()
@@ -162,13 +162,13 @@ class VideoPicture:
 
 
 class CameraThread:
-    """Thread that keeps a camera's newest picture, so that none grows old in the driver's queue."""
+    """Thread that keeps only a camera's newest picture, so that none grows old in the driver's queue."""
 
     def __init__(self, capture: Any) -> None:
         self.dropped = 0  # pictures replaced by a newer one
         self.ended = False  # the camera has stopped
         self._capture = capture
-        # The newest, and None where there is something else to see. Ctrl-C leaves this queue as it was; a
+        # Holds the newest picture, or None to wake the reader. Ctrl-C cannot damage this queue; a
         # `Condition` is written in Python, and may be left locked.
         self._pictures: queue.SimpleQueue[VideoPicture | None] = queue.SimpleQueue()
         self._closed = False
@@ -176,13 +176,13 @@ class CameraThread:
         self._thread.start()
 
     def newest(self, timeout: float) -> VideoPicture | None:
-        """Remove and return the newest picture; None if there is none in time."""
+        """Remove and return the newest picture, or return None if none comes in time."""
         with suppress(queue.Empty):
             return self._pictures.get(timeout=timeout)
         return None
 
     def close(self) -> None:
-        """Stop the thread, which releases the camera: while it reads, no other thread may."""
+        """Stop the thread. Only the thread itself releases the camera, because it may be reading."""
         self._closed = True
         self._pictures.put(None)
         self._thread.join(_JOIN_S)
@@ -208,7 +208,7 @@ class CameraThread:
 
 
 def _rectifier(calibration: str | Path, size: Size | None, *, required: bool = True) -> Any:
-    """Read the rectifier; None if it is not required and the file has no image size: the camera has it."""
+    """Read the rectifier. Return None if the file has no image size, unless it is `required`."""
     try:
         return read_rectifier(calibration, size=size)
     except DatasetError as error:
@@ -265,6 +265,6 @@ def _cause(place: str, file: bool) -> str:
 
 
 def _half_size(capture: Any) -> Size:
-    """Size of one half, (height, width)."""
+    """Return the size of one half, (height, width)."""
     width, height = (capture.get(p) for p in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
     return int(height), int(width) // 2

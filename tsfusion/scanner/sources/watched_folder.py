@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Source of frames that another program writes to a folder."""
+"""Yield the frames that another program writes to a folder."""
 
 import logging
 import os
@@ -29,11 +29,11 @@ log = logging.getLogger(__name__)
 END_MARKERS = ("DONE", ".end")  # a file of this name ends the source
 SENSORS = {"depth": "kinect", "pair": "stereo", "points": "lidar"}
 
-_PAUSE_FACTOR = 10  # pause between two listings, at least, in times a listing took
+_PAUSE_FACTOR = 10  # the pause between two listings is at least 10 times as long as a listing
 _AT_REST_S = 0.5  # seconds without a change after which a file without an end mark counts as complete
-_OLDEST_S = 600.0  # file times before this are of another clock
-_FIRST_TRIES = 5  # frames that cannot be read and none before them that can: so it is with all
-_ENOUGH = 10  # names that tell what their fractions are
+_OLDEST_S = 600.0  # a file time that seems older is of another clock
+_FIRST_TRIES = 5  # so many unreadable frames, with no readable one before, end the source
+_ENOUGH = 10  # names needed to check the fractions in them
 _WAIT = object()  # the frame's files are not complete yet
 
 
@@ -43,20 +43,20 @@ _POINT = 16  # bytes: x, y, z and intensity in float32
 
 
 class FolderLayout(NamedTuple):
-    """Files of a frame: the first, and of images the second, which shares a part of its name.
+    """Names of a frame's files: the first file, and for images a second file with the same part in its name.
 
-    `files` names both in words, with {} for the folder of the second. The unit of depth is usual in `of`.
+    `files` describes both files; {} stands for the folder of the second. `of` gives the usual depth unit.
     """
 
     kind: Literal["depth", "pair", "points"]
     files: str
     first: ImagesAt
     second: ImagesAt | None = None
-    suffixes: tuple[str, ...] = readers.DEPTH_SUFFIXES  # of the first
+    suffixes: tuple[str, ...] = readers.DEPTH_SUFFIXES  # of the first file
     of: type[DepthImages] = DepthImages
 
     def is_in(self, root: Path) -> bool:
-        """True if a folder has this layout: folders that are its own, else a first file."""
+        """Return True if a folder has this layout: the layout's own subfolders, or else a first file."""
         needed = [self.first, *([self.second] if self.second and self.kind == "pair" else ())]
         if not all(at.folder(root).is_dir() for at in needed):
             return False
@@ -66,20 +66,20 @@ class FolderLayout(NamedTuple):
         return any(pattern.fullmatch(name) for name in os.listdir(where))
 
     def first_files(self, root: Path) -> tuple[Path, re.Pattern[str]]:
-        """Folder of the first files, and the pattern of their names, whose group the frame's files share."""
+        """Return the folder of the first files, and a name pattern whose group is the shared part."""
         start, end = map(re.escape, self.first.name.split("{}"))
         suffixes = "|".join(map(re.escape, self.suffixes))
         return self.first.folder(root), re.compile(rf"{start}([^.].*){end}(?:{suffixes})")
 
     def partner(self, root: Path, shared: str) -> Path | None:
-        """Second file of a frame; None = not there."""
+        """Return the second file of a frame, or None if it does not exist."""
         if self.second is None:
             return None
         stem = self.second.folder(root) / self.second.name.format(shared)
         return next((path for suffix in SUFFIXES if (path := Path(f"{stem}{suffix}")).exists()), None)
 
     def words(self, root: Path) -> str:
-        """Files of a frame in words."""
+        """Return the description of a frame's files."""
         return self.files.format("" if self.second is None else self.second.folder(root).name)
 
 
@@ -95,7 +95,7 @@ LAYOUTS = (
     FolderLayout("depth", "results/depth*.png with results/frame*.jpg",
                  Replica.depth_at, Replica.color_at, (".png",), Replica),
     *(FolderLayout("points", f"NAME{suffix}", ImagesAt(("",)), None, (suffix,))
-      for suffix in scan_files.SUFFIXES),  # a file of another may be no scan, such as a mesh
+      for suffix in scan_files.SUFFIXES),  # a file of another format may be no scan, such as a mesh
 )  # fmt: skip
 EXPECTED = (
     "depth/NAME.png|tiff|exr|npy with color/, colour/, rgb/, image/ or images/NAME.png|jpg; "
@@ -105,31 +105,30 @@ EXPECTED = (
 
 
 class WatchedFolder(LiveSource):
-    """Frames in the order of their names, each as soon as its files are complete.
+    """Frames of a folder in the order of their names. Each is yielded as soon as its files are complete.
 
-    Layouts: `LAYOUTS`. Existing files come first. A frame waits for an incomplete one
-    before it, which is left out after `deadline` without a change. Colour must be registered to depth.
-    Timestamps are those in the names (decimal seconds, or nanoseconds), or the times of the files.
-
-    A file `DONE` or `.end` ends the source, or `idle` seconds without a new frame. The name of every frame is
-    remembered (100 bytes each).
+    `LAYOUTS` lists the layouts. Existing files come first. An incomplete frame delays the frames after it,
+    and is left out after `deadline` seconds without a change. Colour must be registered to depth. Timestamps
+    come from the names (decimal seconds, or nanoseconds), otherwise from the times of the files. The source
+    ends with a file `DONE` or `.end`, or after `idle` seconds without a new frame. It remembers the name of
+    every frame (100 bytes each).
 
     Args:
         path: an existing folder; its layout and its camera may be written later.
-        intrinsics: default from a file of the camera in the folder or its parent (`cameras.FILES`).
-        calibration: a camera's file instead; for left/ and right/ a stereo camera's, as
-            `stereo_pairs.read_rectifier` reads it, by default from the folder; without one the images are
-            taken as rectified, with intrinsics and `baseline.txt`.
-        baseline: metres, of rectified images in left/ and right/.
-        depth_scale: metres per unit; default as a file of the camera states, else 0.001, and 1 for floats.
-        depth_along_ray: depth images hold distances along each pixel's ray, instead of z.
-        deskew: False for points that are put right already, though they have times.
+        intrinsics: by default from a camera file in the folder or its parent (`cameras.FILES`).
+        calibration: a camera file, instead of intrinsics. For left/ and right/ the file of a stereo camera,
+            as for `stereo_pairs.read_rectifier`; by default from the folder. Without one, the images must be
+            rectified, with intrinsics and `baseline.txt`.
+        baseline: metres, for rectified images in left/ and right/.
+        depth_scale: metres per unit; by default from a camera file, else 0.001, and 1 for floats.
+        depth_along_ray: True if depth images hold distances along each pixel's ray, instead of z.
+        deskew: False for points that are already corrected for the motion, though they have times.
         idle: seconds; None = wait for ever.
         deadline: seconds to wait for an incomplete frame or a missing camera.
-        poll: seconds between two listings of the folder, at least.
+        poll: smallest number of seconds between two listings of the folder.
 
     Raises:
-        SourceError: no such folder or calibration.
+        SourceError: the folder or the calibration does not exist.
     """
 
     live = False  # files stay until they are read
@@ -155,7 +154,7 @@ class WatchedFolder(LiveSource):
         if calibration is not None and not Path(calibration).expanduser().exists():
             raise SourceError(f"calibration: {calibration} does not exist")
         self._root, self._layout = root, _layout_of(root)
-        self._places = (root, root.absolute().parent)  # where a file of the camera may lie
+        self._places = (root, root.absolute().parent)  # folders that may hold a camera file
         super().__init__(f"folder {root.name}", "kinect")
         self._sensor = sensor
         self._name_sensor()
@@ -166,7 +165,7 @@ class WatchedFolder(LiveSource):
         self._opened_ns, self._stamp = time.time_ns(), 0
         self._handled: set[str] = set()  # names of first files
         self._last: file_names.SortKey = ()
-        self._colored: bool | None = None  # whether frames come with colour; None = not known yet
+        self._colored: bool | None = None  # True if frames come with colour; None = not known yet
         self._camera: Any = None  # a RecordedCamera or a PairRectifier
         self._depth = DepthReader()
         self._depth.not_measured = NOT_MEASURED
@@ -176,7 +175,7 @@ class WatchedFolder(LiveSource):
         self._since = time.monotonic()  # when something last changed
 
     def waits_for(self) -> str:
-        """Contents of the folder, needs of the next frame, and the end of the source, for a person."""
+        """Return for the user the folder's contents, the next frame's needs, and when the source ends."""
         there = len(self._list())
         if self._layout is None:
             wanted = f"no frames yet; waits for {EXPECTED}"
@@ -192,7 +191,7 @@ class WatchedFolder(LiveSource):
         return f"{self._root}: {wanted}; ends {ends}"
 
     def _needs_camera(self) -> bool:
-        """True if the folder holds no camera yet, and none was given."""
+        """Return True if no camera was given and the folder holds none yet."""
         if self._intrinsics is not None or self._calibration is not None:
             return False
         if self._layout is not None and self._layout.kind == "points":
@@ -228,7 +227,7 @@ class WatchedFolder(LiveSource):
             self._closed.wait(pause)
 
     def _list(self) -> list[tuple[str, Path]]:
-        """List (name, first file) of new frames, in order."""
+        """Return (name, first file) of new frames, in order."""
         try:
             if self._layout is None or not self._handled:  # the folder of colour may still come
                 self._layout = _layout_of(self._root)
@@ -254,7 +253,7 @@ class WatchedFolder(LiveSource):
         return sorted(found, key=lambda item: file_names.order(item[0]))
 
     def _check_times(self, names: list[str]) -> None:
-        """Raise SourceError where the series of names tells other times than each of them alone."""
+        """Raise SourceError if the names give other times together than each name gives alone."""
         alone = sorted(stamp for name in names if (stamp := file_names.time_of(name)) is not None)
         try:
             series = file_names.in_time([Path(name) for name in names], names)[1]
@@ -267,7 +266,7 @@ class WatchedFolder(LiveSource):
             )
 
     def _read(self, name: str, first: Path, *, final: bool) -> Any:
-        """Read a frame; None if it is left out, or `_WAIT`."""
+        """Return a frame, or None if it is left out, or `_WAIT` if its files are not complete."""
         assert self._layout is not None
         kind, second = self._layout.kind, self._layout.partner(self._root, name)
         state = (name, *(_state(path) for path in (first, second)))
@@ -297,10 +296,10 @@ class WatchedFolder(LiveSource):
         return frame
 
     def _unreadable(self, first: Path, error: object) -> None:
-        """Leave a frame out; of the first one the log says why.
+        """Leave out a frame. For the first such frame, log the reason.
 
         Raises:
-            SourceError: so it is with all of them.
+            SourceError: the first `_FIRST_TRIES` frames are all unreadable.
         """
         if not self._why_unreadable:
             self._why_unreadable = str(error)
@@ -327,7 +326,7 @@ class WatchedFolder(LiveSource):
         return frame.along_axis() if self._along_ray and kind == "depth" else frame
 
     def _find_camera(self, kind: str, first: Path, *, final: bool) -> bool:
-        """Read the camera, for which the size of an image is needed; return whether it is there."""
+        """Read the camera, which needs the size of an image. Return True if the camera is found."""
         assert self._layout is not None
         image = _image(first) if kind == "pair" else read_depth(first)
         size = image.shape[0], image.shape[1]
@@ -353,7 +352,7 @@ class WatchedFolder(LiveSource):
         return self._camera is not None
 
     def _stamps(self, name: str, first: Path) -> tuple[int, int]:
-        """`timestamp_ns`, which always grows, and `captured_ns`."""
+        """Return `timestamp_ns`, which always grows, and `captured_ns`."""
         written_ns = first.stat().st_mtime_ns
         self._stamp = max(file_names.time_of(name) or written_ns, self._stamp + 1)
         own = written_ns >= self._opened_ns
@@ -377,12 +376,12 @@ def _state(path: Path | None) -> tuple[int, int] | None:
 
 
 def _layout_of(root: Path) -> FolderLayout | None:
-    """Layout of the files so far; None = unknown."""
+    """Return the layout of the files so far, or None if it is unknown."""
     return next((one for one in LAYOUTS if one.is_in(root)), None)
 
 
 def is_whole(path: Path, *, is_at_rest: bool) -> bool:
-    """True if a file is complete: by the mark at its end or, where it has none, once it is at rest."""
+    """Return True if a file is complete: by its end mark, or without one if it is `is_at_rest`."""
     if path.suffix.lower() in _ENDS:
         with path.open("rb") as file:
             file.seek(max(0, path.stat().st_size - len(_PNG_END)))

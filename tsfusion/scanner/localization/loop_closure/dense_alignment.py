@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Alignment of two places' depth images: how far they agree, and the pose at which they agree best."""
+"""Align two views with depth: refine their relative pose, and measure how well the depths agree."""
 
 from dataclasses import dataclass
 
@@ -12,23 +12,23 @@ from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.scanner.localization.loop_closure.place_index import PlaceView
 
 MAX_ITERATIONS = 8
-STRIDE = 3  # every third depth pixel finds the pose; all of them judge it
-DEPTH_FLOOR = 0.01  # metres of depth error that do not grow with distance
-DENSE_WEIGHT = 3000  # independent measurements that a whole depth image counts as
-MATCH_SIGMA = 5.0  # pixels of error of a match at 640 of width: colour and depth may not be registered
+STRIDE = 3  # every third depth pixel is used to find the pose; all pixels to judge it
+DEPTH_FLOOR = 0.01  # metres, the part of the depth error that does not grow with distance
+DENSE_WEIGHT = 3000  # a whole depth image counts as so many independent measurements
+MATCH_SIGMA = 5.0  # pixels, error of a match at width 640: colour and depth may not be registered
 
 
 @dataclass(frozen=True, kw_only=True)
 class Agreement:
-    """Shares of one place's depth pixels projected into the other, the worse of both directions."""
+    """Shares of one view's depth pixels, projected into the other; each the worse of both directions."""
 
-    overlap: float  # share of the pixels with depth that fall on a pixel with depth
-    agree: float  # share of these where the depth is the expected one
-    through: float  # share of these where the other camera saw farther, through the surface
+    overlap: float  # share of the depth pixels that fall on a depth pixel
+    agree: float  # share of these pixels where the depth is the expected one
+    through: float  # share of these pixels where the other camera saw farther, through the surface
 
 
 def agreement(old: PlaceView, new: PlaceView, T_old_new: se3.Transform) -> Agreement:
-    """Agreement of the depths if the new camera is at `T_old_new` (4, 4) in the old one's axes."""
+    """Return how well the depths agree if the new camera is at `T_old_new` (4, 4) in the old one's axes."""
     one, two = _into(new, old, T_old_new), _into(old, new, se3.inverse(T_old_new))
     return Agreement(
         overlap=min(one.overlap, two.overlap),
@@ -44,9 +44,10 @@ def refine(
     first: NDArray[np.int64],
     second: NDArray[np.int64],
 ) -> se3.Transform:
-    """Refine T_old_new by matched features (`first` of the old place, `second` of the new) and depths.
+    """Refine T_old_new by matched features (rows `first` of the old view, `second` of the new) and by depth.
 
-    Gauss-Newton over reprojection both ways, and for depth cameras over distances to the old depth's planes.
+    Gauss-Newton minimises reprojection errors in both directions and, for depth cameras, also distances to
+    the tangent planes of the old depth image.
     """
     T = T_old_new
     target = _DepthNormals(old) if old.measured and new.measured else None
@@ -81,7 +82,7 @@ def _reprojection(
     *,
     towards_old: bool,
 ) -> Term:
-    """Reprojection errors, pixels, of points in the other camera; the step is a twist in the old axes."""
+    """Return reprojection errors, pixels, of points in the other camera. The step is a twist in old axes."""
     known = np.isfinite(points[:, 2])
     p, pixels = points[known].astype(np.float64), pixels[known]
     q = se3.apply(T, p)
@@ -93,7 +94,7 @@ def _reprojection(
     projection = np.zeros((len(q), 2, 3))
     projection[:, 0, 0], projection[:, 0, 2] = K.fx / z, -K.fx * x / z**2
     projection[:, 1, 1], projection[:, 1, 2] = K.fy / z, -K.fy * y / z**2
-    # q = exp(step) T p there, or T' exp(-step) p where T' leads from the old view to the new one.
+    # q = exp(step) T p towards the old view, or T' exp(-step) p where T' leads from the old view to the new.
     motion = np.zeros((len(q), 3, 6))
     motion[:, :, :3] = np.eye(3)
     motion[:, :, 3:] = -se3.hat(q if towards_old else p)
@@ -107,7 +108,7 @@ def _reprojection(
 
 
 class _DepthNormals:
-    """Points and normals of a place's depth image."""
+    """Points and normals of a view's depth image."""
 
     def __init__(self, view: PlaceView) -> None:
         self._view = view
@@ -121,7 +122,7 @@ class _DepthNormals:
         self._normals = np.where(whole[:, :, None], normals / np.maximum(length, 1e-12)[:, :, None], 0)
 
     def planes(self, T: se3.Transform, points: NDArray[np.float64], noise: float) -> Term:
-        """Distances, metres, of points from the tangent plane at the pixel each falls on."""
+        """Return distances, metres, of points from the tangent planes at the pixels that they fall on."""
         q = se3.apply(T, points)
         rows, columns, inside = _pixels(q, self._view)
         q = q[inside]
@@ -136,7 +137,7 @@ class _DepthNormals:
 
 
 def _into(source: PlaceView, target: PlaceView, T: se3.Transform) -> Agreement:
-    """Agreement in one direction; `T` is T_target_source."""
+    """Return the agreement in one direction; `T` is T_target_source."""
     points = _points(source)
     low, high = _window(target.depth_mm.astype(np.float32) / 1000)
     q = se3.apply(T, points)
@@ -153,13 +154,13 @@ def _into(source: PlaceView, target: PlaceView, T: se3.Transform) -> Agreement:
 
 
 def _points(view: PlaceView) -> NDArray[np.float64]:
-    """Points of all depth pixels, (n, 3) metres in the camera's axes."""
+    """Return the points of all depth pixels, (n, 3) metres in the camera's axes."""
     z = view.depth_mm.astype(np.float64) / 1000
     return _lift(z, view.small)[z > 0]
 
 
 def _lift(z: NDArray[np.float64], K: Intrinsics) -> NDArray[np.float64]:
-    """Points of a depth image: (h, w) metres → (h, w, 3)."""
+    """Return the points of a depth image: (h, w) metres → (h, w, 3)."""
     v, u = np.mgrid[: z.shape[0], : z.shape[1]]
     return np.stack([(u - K.cx) / K.fx * z, (v - K.cy) / K.fy * z, z], axis=2)
 
@@ -167,7 +168,7 @@ def _lift(z: NDArray[np.float64], K: Intrinsics) -> NDArray[np.float64]:
 def _pixels(
     points: NDArray[np.float64], view: PlaceView
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
-    """Rows and columns of the depth pixels that points fall on, and (n,) which points do."""
+    """Return rows and columns of the depth pixels that points fall on, and (n,) True for these points."""
     K, (height, width) = view.small, view.depth_mm.shape
     z = np.maximum(points[:, 2], 1e-6)
     u, v = np.rint(points[:, 0] / z * K.fx + K.cx), np.rint(points[:, 1] / z * K.fy + K.cy)
@@ -176,7 +177,7 @@ def _pixels(
 
 
 def _window(z: NDArray[np.floating]) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-    """Smallest and largest depth of 3×3 pixels; 0 where the middle one has none."""
+    """Return the smallest and largest depth of 3×3 pixels, 0 if the middle pixel has no depth."""
     far = np.where(z > 0, z, np.inf).astype(np.float32)
     kernel = np.ones((3, 3), np.uint8)
     low, high = cv2.erode(far, kernel), cv2.dilate(z.astype(np.float32), kernel)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Loop closure around any localizer of images with depth."""
+"""Add loop closure to any localizer of images with depth."""
 
 import itertools
 import logging
@@ -27,21 +27,21 @@ from tsfusion.scanner.localization.loop_closure.loop_consensus import (
 )
 from tsfusion.scanner.localization.loop_closure.place_index import CAPACITY, PlaceIndex, PlaceView, place_view
 
-MIN_KEYFRAMES, MIN_WAY = 10, 3.0  # keyframes, and metres plus radians of way: younger places are no loops
-MOST_WAITING = 4  # keyframes that wait for the search beside the tracker; with more the tracker waits
+MIN_KEYFRAMES, MIN_WAY = 10, 3.0  # a loop has at least so many keyframes, and metres plus radians of way
+MOST_WAITING = 4  # most keyframes that wait for the search thread; then the tracker waits
 MAX_CHECKS = 4  # places compared with each keyframe
-MAX_LOOPS = 2  # of one keyframe; one is enough if it changes little
-NEAR_DISTANCE, NEAR_ANGLE = 1.0, np.radians(30)  # metres, radians: places compared whatever they look like
-WAIT_KEYFRAMES = 10  # until the next optimisation, for loops that change little
-LARGE_CHANGE, LARGE_TURN = 0.04, np.radians(1.0)  # metres, radians: a loop that changes more does not wait
-KEYFRAMES_AN_OPTIMISATION = 50  # of this many keyframes costs as much as finding the loops of one
-LOST_FRAMES_A_SEARCH = 2  # looking for a place costs more than tracking
-MIN_RELOCALISATION_MATCHES = 30  # that must agree where no odometry supports a place
-MAX_PLACE_SPREAD = 0.3  # metres between the poses that several places give
+MAX_LOOPS = 2  # loops of one keyframe; the first is enough if it changes little
+NEAR_DISTANCE, NEAR_ANGLE = 1.0, np.radians(30)  # metres, radians: nearer places are compared in any case
+WAIT_KEYFRAMES = 10  # keyframes until the next optimisation, after loops that change little
+LARGE_CHANGE, LARGE_TURN = 0.04, np.radians(1.0)  # metres, radians: loops that change more do not wait
+KEYFRAMES_AN_OPTIMISATION = 50  # an optimisation of 50 keyframes costs as much as the loop search for one
+LOST_FRAMES_A_SEARCH = 2  # every second lost frame is searched: a search costs more than tracking
+MIN_RELOCALISATION_MATCHES = 30  # matches that must agree when no odometry supports a place
+MAX_PLACE_SPREAD = 0.3  # metres between the poses that the places give
 
 log = logging.getLogger(__name__)
 Given = ParamSpec("Given")
-_NICE = 10  # of the thread
+_NICE = 10  # nice value of the search thread
 
 
 @dataclass(kw_only=True)
@@ -49,30 +49,30 @@ class LoopCounts:
     """Counts since the last `reset`."""
 
     keyframes: int = 0  # tracking keyframes
-    checks: int = 0  # places compared
+    checks: int = 0  # comparisons with a place
     verified: int = 0  # comparisons that found the same place
     closed: int = 0  # loops accepted
     optimisations: int = 0  # of the pose graph
 
 
 class LoopClosing:
-    """`Localizer` that passes on another one's poses, and corrects them where a place is seen again.
+    """`Localizer` that passes on another one's poses, and corrects them when a place is seen again.
 
-    Poses never jump; `corrections()` has the corrected ones. Each tracking keyframe with an image
-    and depth costs about 30 CPU ms, plus 0.15 ms a keyframe of the graph when it is optimised, which with
-    1,000 keyframes is every twentieth time at most. Memory: 52 KB a place, of which at most `capacity`
-    are remembered (the one nearest to its neighbours is forgotten), and 2 KB a tracking keyframe.
+    The poses never jump; `corrections()` returns the corrected ones. Each tracking keyframe with an image and
+    depth costs about 30 CPU ms. An optimisation costs 0.15 ms for each keyframe of the graph; with 1,000
+    keyframes it runs at most every twentieth time. Memory: 2 KB for each tracking keyframe, and 52 KB for
+    each remembered place. Of at most `capacity` places, the one nearest to its neighbours is forgotten first.
     No loops are found among LiDAR frames, which have no image.
 
     Args:
         localizer: the tracker; its world must stay the same between resets.
-        drift: uncertainty of its poses.
+        drift: uncertainty of the tracker's poses.
         capacity: number of places remembered.
-        beside: search in a thread of its own, in the keyframes' order, while the tracker goes on; then
-            corrections come a little later, and the last ones after `settle`. They are the same.
+        beside: True searches in another thread, in the keyframes' order, while the tracker goes on. The same
+            corrections then come a little later, the last ones after `settle`.
 
     Raises:
-        MissingDependency: without scipy.
+        MissingDependency: scipy is not installed.
     """
 
     def __init__(
@@ -95,14 +95,14 @@ class LoopClosing:
         self._places = PlaceIndex(self._capacity)
         self._corrected: dict[int, se3.Transform] = {}
         self.counts = LoopCounts()
-        self._news: deque[PoseCorrections] = deque(maxlen=1)  # those that `corrections` did not return yet
+        self._news: deque[PoseCorrections] = deque(maxlen=1)  # not yet returned by `corrections`
         self._optimisation_due = False
-        self._optimised_at = 0  # keyframes then
-        self._lost = 0  # frames, since the last that was not
-        self._T_world_tracker: se3.Transform = np.eye(4)  # another where the tracker was restarted
+        self._optimised_at = 0  # number of keyframes at the last optimisation
+        self._lost = 0  # number of frames lost in a row
+        self._T_world_tracker: se3.Transform = np.eye(4)  # changes when the tracker is restarted
 
     def track(self, frame: Frame) -> TrackedPose | Lost:
-        """Track with the wrapped localizer; when it is lost, search for a known place to go on from."""
+        """Track with the wrapped localizer. When it is lost, search a known place from which it can go on."""
         found = self._localizer.track(frame)
         if isinstance(found, Lost):
             self._lost += 1
@@ -119,16 +119,15 @@ class LoopClosing:
         return pose
 
     def prepare(self) -> None:
-        """Let the wrapped localizer prepare for the next frame."""
         self._localizer.prepare()
 
     def settle(self) -> None:
-        """Wait until every keyframe so far was compared with the places before it."""
+        """Wait until every keyframe so far was compared with earlier places."""
         if self._search is not None:
             self._search.wait()
 
     def _relocalised(self, frame: Frame, lost: Lost) -> TrackedPose | Lost:
-        """Restart the tracker at a place that was seen before."""
+        """Restart the tracker at a place that was seen before. Return Lost if none is found."""
         place = self.relocalise(frame)
         if place is None:
             return lost
@@ -139,19 +138,19 @@ class LoopClosing:
         return begun
 
     def corrections(self) -> PoseCorrections | None:
-        """Poses of all tracking keyframes after the last optimisation; None if they were returned before."""
+        """Return all tracking keyframes' poses after the last optimisation, or None if already returned."""
         with suppress(IndexError):
             return self._news.pop()
         return None
 
     def reset(self) -> None:
-        """Forget the world, its places and corrections."""
+        """Forget the world, with its places and corrections."""
         self.settle()
         self._localizer.reset()
         self._forget()
 
     def relocalise(self, frame: Frame) -> TrackedPose | None:
-        """Find a frame's pose by the remembered places alone; None unless the place is certain."""
+        """Find a frame's pose by the remembered places alone. Return None unless the place is certain."""
         self.settle()
         seen = _described(frame)
         if seen is None:
@@ -179,7 +178,7 @@ class LoopClosing:
         )
 
     def _correction(self) -> se3.Transform:
-        """`T_corrected_world` after the last keyframe."""
+        """Return `T_corrected_world` after the last keyframe."""
         last = next(reversed(self._corrected))
         return self._corrected[last] @ se3.inverse(self._chain.poses[last])
 
@@ -202,7 +201,7 @@ class LoopClosing:
             self._remember(pose.anchor, seen)
 
     def _loops(self, number: int, seen: PlaceView) -> list[Loop]:
-        """Verified loops from a new keyframe to earlier places."""
+        """Return the verified loops from a new keyframe to earlier places."""
         before = self._old_enough(number)
         if before is None:
             return []
@@ -222,13 +221,13 @@ class LoopClosing:
         return found
 
     def _old_enough(self, number: int) -> int | None:
-        """Number below which keyframes may form loops; None = none is old enough."""
+        """Return the number below which keyframes may form loops, or None if no keyframe is old enough."""
         ways = self._chain.ways
         earlier = itertools.islice(reversed(ways), MIN_KEYFRAMES, None)
         return next((other + 1 for other in earlier if ways[number] - ways[other] >= MIN_WAY), None)
 
     def _nearby(self, number: int, before: int) -> list[int]:
-        """Places whose corrected poses are near the keyframe's, the nearest first."""
+        """Return places whose corrected poses are near the keyframe's, the nearest first."""
         places = [place for place in self._places.views if place < before]
         if not places:
             return []
@@ -270,7 +269,7 @@ class LoopClosing:
         self._places.add(number, seen)
 
     def _dispensable(self) -> int:
-        """Place whose removal leaves the smallest gap along the way."""
+        """Return the place whose removal leaves the smallest gap along the way."""
         places = sorted(self._places.views)
         ways = np.array([self._chain.ways[place] for place in places])
         return places[1 + int(np.argmin(ways[2:] - ways[:-2]))] if len(places) > 2 else places[0]
@@ -282,7 +281,7 @@ def _described(frame: Frame) -> PlaceView | None:
 
 
 def _depth(frame: Frame) -> NDArray[np.float32] | None:
-    """Depth of a frame, (H, W) metres; of a stereo pair by quick matching."""
+    """Return the depth of a frame, (H, W) metres. For a stereo pair it comes from quick matching."""
     disparity = frame.tracking_disparity
     if disparity is None or frame.baseline_fx is None:
         return frame.depth_m
@@ -292,11 +291,11 @@ def _depth(frame: Frame) -> NDArray[np.float32] | None:
 
 
 class OrderedWork:
-    """Calls that one thread makes, one after the other.
+    """Thread that makes calls one after the other.
 
     Args:
         name: of the thread.
-        most: number of calls that wait or are under way; `add` waits for room.
+        most: largest number of unfinished calls; `add` waits until there are fewer.
     """
 
     def __init__(self, name: str, most: int) -> None:
@@ -305,19 +304,18 @@ class OrderedWork:
         self._waiting: deque[Future[None]] = deque()
 
     def add(self, call: Callable[Given, None], *args: Given.args, **kwargs: Given.kwargs) -> None:
-        """Have a call made after those before it. An earlier call's error is raised here, or by `wait`."""
+        """Add a call after the earlier ones. An error of an earlier call is raised here, or by `wait`."""
         while self._waiting and (self._waiting[0].done() or len(self._waiting) >= self._most):
             self._waiting.popleft().result()
         self._waiting.append(self._thread.submit(call, *args, **kwargs))
 
     def wait(self) -> None:
-        """Wait until all calls were made."""
         while self._waiting:
             self._waiting.popleft().result()
 
 
 def _be_nice() -> None:
-    """Let the tracker's thread go first, where threads have a priority of their own."""
+    """Lower the thread's priority below the tracker's, on systems where each thread has a priority."""
     if hasattr(os, "setpriority") and hasattr(os, "sched_setaffinity"):  # Linux
         with suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Acceptance of loops: views show one place, odometry allows it, and loops support each other."""
+"""Decide which loops to accept, by the views, the odometry, and the support of other loops."""
 
 import itertools
 from collections.abc import Iterable
@@ -15,22 +15,23 @@ from tsfusion.scanner.localization.loop_closure.dense_alignment import Agreement
 from tsfusion.scanner.localization.loop_closure.place_index import PlaceView
 from tsfusion.scanner.localization.loop_closure.pose_graph import PoseGraphEdge, information
 
-GATE = 6.0  # standard deviations by which a loop may contradict the known poses
-AMBIGUITY_GATE = 12.0  # deviations up to which another explanation is not ruled out
-MIN_SUPPORT = 3  # keyframes whose loops must agree before the first is accepted,
-EXPECTED_GATE = 3.0  # or one less within this many deviations of the known poses
+GATE = 6.0  # most standard deviations between a loop and the known poses
+AMBIGUITY_GATE = 12.0  # standard deviations; up to this, another explanation is not ruled out
+MIN_SUPPORT = 3  # keyframes whose loops must agree before the first loop is accepted;
+EXPECTED_GATE = 3.0  # one less is enough within so many standard deviations of the known poses
 SUPPORT_WINDOW = 15  # keyframes for which a loop waits for support
-MAX_TWINS = 4  # look-alikes remembered of a place
+MAX_TWINS = 4  # similar other places remembered for each place
 ROTATION_SIGMA = 0.005  # radians, standard deviation of a loop
-MAX_RATIO = 0.9  # of the best descriptor distance to the second
+MAX_RATIO = 0.9  # best descriptor distance divided by the second best
 MAX_DIFFERENT_BITS = 64  # of 256, in a match
-PIXEL_TOLERANCE = 3.0  # pixels at 640 of width
+PIXEL_TOLERANCE = 3.0  # pixels at width 640
 MIN_INLIERS = 20
-MIN_SPREAD = 0.05  # share of the image covered by the hull of the matches that agree
-MAX_DISTANCE, MAX_DEGREES = 0.06, 4.0  # between the poses found both ways; the first of the scene's depth
-# Shares of the pixels with depth in both views, for measured depth and for depth from stereo: those that
-# must agree, and those, at most, where one camera sees through the other's surface. True loops in a kitchen
-# (Kinect) have >= 0.92 and <= 0.007, false ones of a corridor with a tiled floor <= 0.90 and >= 0.065.
+MIN_SPREAD = 0.05  # share of the image inside the convex hull of the matches that agree
+MAX_DISTANCE, MAX_DEGREES = 0.06, 4.0  # between the poses of both directions; 0.06 of the scene's depth
+# Shares of the pixels with depth in both views; first for measured depth, second for depth from stereo. The
+# first line is for pixels that agree, the second for pixels where a camera sees through the other's surface.
+# Measured with a Kinect: true loops in a kitchen have >= 0.92 and <= 0.007, false loops in a corridor with a
+# tiled floor <= 0.90 and >= 0.065.
 MIN_AGREEMENT = (0.85, 0.6)
 MAX_THROUGH = (0.04, 0.12)
 MIN_OVERLAP = 0.2  # share of the pixels with depth
@@ -38,28 +39,28 @@ MIN_OVERLAP = 0.2  # share of the pixels with depth
 
 @dataclass(frozen=True, kw_only=True)
 class OdometryDrift:
-    """Standard deviations of odometry over a way; a radian of turning counts as a metre of way."""
+    """Standard deviations of odometry over a way. One radian of turning counts as one metre of way."""
 
-    translation: float = 0.02  # metres after one metre; grows with the root of the way
-    rotation: float = 0.01  # radians, likewise
-    translation_bias: float = 0.01  # systematic error, metres a metre
-    rotation_bias: float = 0.002  # radians a metre
-    floor: float = 0.002  # metres (and a third of it in radians) of each single step
+    translation: float = 0.02  # metres after one metre; grows with the square root of the way
+    rotation: float = 0.01  # radians after one metre; grows likewise
+    translation_bias: float = 0.01  # systematic error, metres for each metre
+    rotation_bias: float = 0.002  # systematic error, radians for each metre
+    floor: float = 0.002  # metres (and a third of it in radians) for each single step
 
 
 class OdometryChain:
     """Tracking keyframes in order: odometry's poses, and the motion between any two with its covariance.
 
-    The covariance of a stretch is a difference of two sums in the world's axes: it costs the same over ten
-    keyframes and over ten thousand.
+    The covariance of a stretch is the difference of two sums in the world's axes. So it costs the same over
+    ten keyframes and over ten thousand.
     """
 
     def __init__(self, drift: OdometryDrift) -> None:
         self._drift = drift
         self.poses: dict[int, se3.Transform] = {}  # keyframe → (4, 4) T_world_camera by odometry
-        self.edges: list[PoseGraphEdge] = []  # from each to the next, for the pose graph
-        self.ways: dict[int, float] = {}  # keyframe → metres and radians along the path since the first
-        self._sums: dict[int, se3.Matrix6] = {}  # (6, 6), world axes
+        self.edges: list[PoseGraphEdge] = []  # from each keyframe to the next, for the pose graph
+        self.ways: dict[int, float] = {}  # keyframe → metres plus radians along the path since the first
+        self._sums: dict[int, se3.Matrix6] = {}  # keyframe → (6, 6) sum of covariances, world axes
 
     def add(self, number: int, T_world_camera: se3.Transform) -> None:
         """Append a keyframe with its (4, 4) pose by odometry."""
@@ -78,7 +79,7 @@ class OdometryChain:
         self.poses[number] = T_world_camera
 
     def between(self, start: int, end: int) -> tuple[se3.Transform, se3.Matrix6]:
-        """`T_start_end` by odometry, and its (6, 6) covariance as a twist in the axes of `end`."""
+        """Return `T_start_end` by odometry, and its (6, 6) covariance as a twist in the axes of `end`."""
         T = se3.inverse(self.poses[start]) @ self.poses[end]
         A = se3.adjoint(se3.inverse(self.poses[end]))
         way, d = abs(self.ways[end] - self.ways[start]), self._drift
@@ -106,26 +107,26 @@ class Loop:
 
     @property
     def covariance(self) -> se3.Matrix6:
-        """Covariance (6, 6) of a twist in the axes of `new`."""
+        """Covariance (6, 6) of the loop, as a twist in the axes of `new`."""
         return np.diag([self.sigma**2] * 3 + [ROTATION_SIGMA**2] * 3)
 
 
 class LoopConsensus:
-    """Decide which of the loops that were verified one by one to accept.
+    """Decide which loops to accept. Each loop was verified before, by comparing its two views.
 
-    1. The loop must not contradict the odometry, taken over the shortest way: from the start of the loop to
-       its end, or through a loop accepted before.
-    2. No other explanation may remain: a view that also fits a place elsewhere, or whose place was seen to
-       look like another one (a *twin*), is accepted only where odometry rules the other out.
-    3. Loops of three keyframes near each other must agree pairwise (Mangelson et al., "Pairwise Consistent
-       Measurement Set Maximization", 2018) before any is accepted, or of two where odometry expects them;
-       later loops nearby need only agree with one of those.
+    1. The loop must not contradict the odometry. This is checked over the shortest way: from the start of the
+       loop to its end, or through a loop accepted before.
+    2. No other explanation may remain. A view may fit two places, or its place may look like another one (a
+       *twin*). Then the loop is accepted only if odometry rules the other place out.
+    3. Loops of three keyframes near each other must agree pairwise before any is accepted (Mangelson et al.,
+       "Pairwise Consistent Measurement Set Maximization", 2018). Two are enough if odometry expects the loop.
+       Later loops nearby need only agree with one accepted loop.
     """
 
     def __init__(self, chain: OdometryChain) -> None:
         self._chain = chain
         self.accepted: list[Loop] = []
-        self._ends = np.empty((0, 2))  # ways of the accepted loops' ends
+        self._ends = np.empty((0, 2))  # (way at `old`, way at `new`) of each accepted loop
         self._waiting: list[Loop] = []
         self._twins: dict[
             int, list[tuple[int, se3.Transform]]
@@ -133,7 +134,7 @@ class LoopConsensus:
         self.refused: dict[str, int] = {}
 
     def add(self, loops: list[Loop]) -> list[Loop]:
-        """Add one keyframe's loops; return the loops to accept now, among them some that waited."""
+        """Add one keyframe's loops. Return the loops to accept now; some of them may have waited."""
         if not loops:
             return []
         deviations = [self.deviation(loop.old, loop.new, loop.T_old_new, loop.covariance) for loop in loops]
@@ -153,13 +154,13 @@ class LoopConsensus:
         return [found for loop in allowed for found in self._supported(loop)]
 
     def deviation(self, old: int, new: int, T_old_new: se3.Transform, covariance: se3.Matrix6) -> float:
-        """Standard deviations (the root of χ²) between a claim and the known poses."""
+        """Return the standard deviations (the square root of χ²) between a claim and the known poses."""
         T, known = self._known(old, new)
         error = se3.log(se3.inverse(T_old_new) @ T)
         return float(np.sqrt(error @ np.linalg.solve(known + covariance, error)))
 
     def unique(self, place: int) -> bool:
-        """True if no other place looks like this one."""
+        """Return True if no other place looks like this one."""
         return place not in self._twins
 
     def withdraw(self, loop: Loop) -> None:
@@ -169,7 +170,7 @@ class LoopConsensus:
         self._count("contradicts other loops")
 
     def _known(self, old: int, new: int) -> tuple[se3.Transform, se3.Matrix6]:
-        """`T_old_new` and covariance over the shortest way."""
+        """Return `T_old_new` and its covariance over the shortest way."""
         ways = self._chain.ways
         direct = abs(ways[new] - ways[old])
         if self.accepted:
@@ -180,7 +181,7 @@ class LoopConsensus:
         return self._chain.between(old, new)
 
     def _through(self, loop: Loop, old: int, new: int) -> tuple[se3.Transform, se3.Matrix6]:
-        """`T_old_new` and covariance by odometry to a loop, over it, and on."""
+        """Return `T_old_new` and its covariance by odometry to a loop, the loop, and odometry again."""
         first, first_covariance = self._chain.between(old, loop.old)
         last, covariance = self._chain.between(loop.new, new)
         for behind, known in ((last, loop.covariance), (loop.T_old_new @ last, first_covariance)):
@@ -189,7 +190,7 @@ class LoopConsensus:
         return first @ loop.T_old_new @ last, covariance
 
     def _supported(self, loop: Loop) -> list[Loop]:
-        """The loop, with the waiting ones that agree with it, once they are enough."""
+        """Accept the loop, and waiting loops that agree, if they are enough. Return the accepted loops."""
         if any(
             self._age(other, loop) <= SUPPORT_WINDOW and self._agree(other, loop) for other in self.accepted
         ):
@@ -225,7 +226,7 @@ class LoopConsensus:
         return bool(error @ np.linalg.solve(known + two.covariance, error) <= GATE**2)
 
     def _remember_twin(self, wrong: Loop, right: Iterable[Loop]) -> None:
-        """`wrong.old` looks like the place of `new`: seen from there, or from the place it truly is."""
+        """Remember that `wrong.old` looks like `wrong.new` and like the old places of the loops `right`."""
         self._add_twin(wrong.new, wrong.old, wrong.T_old_new)
         for loop in right:
             self._add_twin(loop.old, wrong.old, wrong.T_old_new @ se3.inverse(loop.T_old_new))
@@ -237,7 +238,7 @@ class LoopConsensus:
             del twins[:-MAX_TWINS]
 
     def _ambiguous(self, loops: list[Loop]) -> bool:
-        """True if one keyframe's loops leave its pose ambiguous."""
+        """Return True if one keyframe's loops leave its pose ambiguous."""
         for one, two in itertools.combinations(loops, 2):
             if not self._agree(one, two):
                 self._remember_twin(two, [one])
@@ -245,7 +246,7 @@ class LoopConsensus:
         return any(self._has_twin(loop) for loop in loops)
 
     def _has_twin(self, loop: Loop) -> bool:
-        """True if the loop's place looks like another one where the keyframe could as well be."""
+        """Return True if the keyframe could as well be at another place that looks like the loop's."""
         for other, T_other_old in self._twins.get(loop.old, []):
             claim = T_other_old @ loop.T_old_new
             if (
@@ -263,19 +264,19 @@ class LoopConsensus:
 class LoopCheck:
     """Result of comparing two views."""
 
-    # (4, 4) pose of the new camera in the old one's axes; None = none was found
+    # (4, 4) pose of the new camera in the old camera's axes; None if none was found
     T_old_new: se3.Transform | None = None
-    refused: str | None = None  # reason not to take them for the same place; None = they are the same
-    inliers: int = 0  # number of matches that agree with the pose
+    refused: str | None = None  # reason why the views are not of one place; None if they are
+    inliers: int = 0  # matches that agree with the pose
     sigma: float = 0.0  # standard deviation of the pose, metres
-    depths: Agreement | None = None  # agreement of the dense depths; None = not compared
+    depths: Agreement | None = None  # agreement of the depth images; None if not compared
 
 
 def check_loop(old: PlaceView, new: PlaceView) -> LoopCheck:
-    """Compare two views of a camera, or of two cameras.
+    """Compare two views, of one camera or of two.
 
-    Repeated structure is refused where the depth of either view contradicts the other. Places that are alike
-    in every pixel pass; only the trajectory tells them apart.
+    Repeated structure is refused if the depth of either view contradicts the other. Two places that look the
+    same in every pixel pass; only the trajectory can tell such places apart.
     """
     first, second = matches(old.descriptors, new.descriptors)
     if len(first) < MIN_INLIERS:
@@ -307,10 +308,10 @@ def check_loop(old: PlaceView, new: PlaceView) -> LoopCheck:
 
 
 def matches(old: NDArray[np.uint8], new: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Match (n, 32) and (m, 32) descriptors: rows that are clearly each other's nearest."""
+    """Match (n, 32) and (m, 32) descriptors. Return the rows that are clearly each other's nearest."""
     if min(len(old), len(new)) < 2:
         return np.empty(0, np.int64), np.empty(0, np.int64)
-    # Of ±1 vectors the product is 256 minus twice the Hamming distance: one for both directions.
+    # The product of ±1 vectors is 256 minus twice the Hamming distance; one product serves both directions.
     distance = 128 - (_signs(old) @ _signs(new).T) / 2
     rows, best = np.arange(len(old)), distance.argmin(axis=1)
     mutual = distance.argmin(axis=0)[best] == rows
@@ -329,7 +330,7 @@ def _signs(descriptors: NDArray[np.uint8]) -> NDArray[np.float32]:
 def _pose(
     points: NDArray[np.float32], pixels: NDArray[np.float32], camera: PlaceView
 ) -> tuple[se3.Transform, NDArray[np.bool_]] | None:
-    """T_points_camera by RANSAC over three points (P3P) and refinement, and (n,) which points agree."""
+    """Find T_points_camera by RANSAC over three points (P3P) and refinement; also return (n,) inliers."""
     known = np.isfinite(points[:, 2])
     tolerance = PIXEL_TOLERANCE * max(camera.size[0] / 640, 0.5)
     found = features.resection(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Place recognition: descriptions of keyframes, and the index that finds the most similar ones."""
+"""Recognise places: describe keyframes, and find the most similar ones with an index."""
 
 from dataclasses import dataclass
 
@@ -13,20 +13,20 @@ from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.scanner.localization.features import back_project, bilinear
 
 FEATURES = 500
-CAPACITY = 1000  # places remembered
-_LEAST = 64  # places that there is room for from the first on; a multiple of 8
+CAPACITY = 1000  # places remembered, at most
+_LEAST = 64  # places that the first table has room for; a multiple of 8
 
 _MIN_SIDE = 32  # pixels of an image's shorter side
-_DEPTH_PIXELS = 4800  # of the kept depth image, about
+_DEPTH_PIXELS = 4800  # pixels of the small depth image, about
 _TABLES, _BITS = 8, 14  # hash tables, and bits of their keys
 _DEPTH_NOISE = 0.002  # metres at one metre (Khoshelham and Elberink 2012: 0.0014)
 _DISPARITY_NOISE = 0.5  # pixels
-_MAX_COMMON = 0.3  # share of the places beyond which a key tells nothing
+_MAX_COMMON = 0.3  # a key that a larger share of the places has is ignored
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PlaceView:
-    """Features and small depth image of a keyframe: 36 KB with 500 features."""
+    """Features and a small depth image of a keyframe: 36 KB with 500 features."""
 
     descriptors: NDArray[np.uint8]  # (n, 32) uint8, ORB (Rublee et al. 2011)
     pixels: NDArray[np.float32]  # (n, 2) float32
@@ -35,12 +35,12 @@ class PlaceView:
     intrinsics: Intrinsics  # camera of `pixels`
     small: Intrinsics  # camera of `depth_mm`
     size: tuple[int, int]  # width and height of the image, pixels
-    noise: float  # metres of depth error at one metre; it grows with the square
-    measured: bool  # whether a depth camera measured the depth, rather than a stereo matcher
+    noise: float  # metres of depth error at one metre; grows with the square of the depth
+    measured: bool  # True for a depth camera, False for a stereo matcher
 
 
 def place_view(frame: Frame, depth_m: NDArray[np.float32]) -> PlaceView | None:
-    """Describe a frame with its (H, W) metres of depth; None without intrinsics or an image large enough."""
+    """Describe a frame with (H, W) metres of depth; None without intrinsics or a large enough image."""
     gray, K = frame.gray, frame.intrinsics
     if gray is None or K is None or min(gray.shape) < _MIN_SIDE:
         return None
@@ -65,7 +65,7 @@ def place_view(frame: Frame, depth_m: NDArray[np.float32]) -> PlaceView | None:
 
 
 def _medians(depth: NDArray[np.uint16], factor: int) -> NDArray[np.uint16]:
-    """Shrink a depth image: the median of nine pixels a block, where five or more of them have depth."""
+    """Shrink a depth image to medians of nine pixels a block, 0 unless five of them or more have depth."""
     height, width = depth.shape[0] // factor, depth.shape[1] // factor
     if factor < 3:
         return np.ascontiguousarray(depth[::factor, ::factor][:height, :width])
@@ -79,18 +79,19 @@ def _medians(depth: NDArray[np.uint16], factor: int) -> NDArray[np.uint16]:
 
 
 class PlaceIndex:
-    """Places by number, found by similar descriptors.
+    """Index of places by number, which finds places with similar descriptors.
 
-    Descriptors vote for places that have a similar one: locality-sensitive hashing (Gionis, Indyk and Motwani
-    1999), eight tables over 14 bits each. Memory: 16 to 33 KB a place beside its view, 1 MB at least.
+    Each descriptor votes for the places with a similar one. Similar ones share a key: locality-sensitive
+    hashing (Gionis, Indyk and Motwani 1999), eight tables over 14 bits each. Memory: 16 to 33 KB for each
+    place beside its view, 1 MB at least.
     """
 
     def __init__(self, capacity: int = CAPACITY) -> None:
         rng = np.random.default_rng(7)
         self._bits = np.stack([rng.choice(256, _BITS, replace=False) for _ in range(_TABLES)])
         self._capacity = capacity
-        self._table = np.zeros((_TABLES << _BITS, _LEAST // 8), np.uint8)  # a bit for each place
-        self._votes = np.ones(capacity)  # by how many descriptors a place can get votes
+        self._table = np.zeros((_TABLES << _BITS, _LEAST // 8), np.uint8)  # key → a bit for each place
+        self._votes = np.ones(capacity)  # votes are divided by the root of a place's descriptor count
         self._numbers = np.full(capacity, -1, np.int64)
         self.views: dict[int, PlaceView] = {}
 
@@ -100,7 +101,7 @@ class PlaceIndex:
         return len(self.views) >= self._capacity
 
     def add(self, number: int, view: PlaceView) -> None:
-        """Remember a place under its number; there must be room."""
+        """Remember a place under its number. The index must not be full."""
         slot = int(np.flatnonzero(self._numbers < 0)[0])
         self._numbers[slot] = number
         if slot >> 3 == self._table.shape[1]:
@@ -110,14 +111,13 @@ class PlaceIndex:
         self.views[number] = view
 
     def forget(self, number: int) -> None:
-        """Forget a place, which makes room for another."""
         slot = int(np.flatnonzero(self._numbers == number)[0])
         self._numbers[slot] = -1
         self._table[:, slot >> 3] &= np.uint8(255 ^ 128 >> (slot & 7))
         del self.views[number]
 
     def most_similar(self, view: PlaceView, *, before: int | None = None, count: int = 4) -> list[int]:
-        """The places (with numbers below `before`) that look most like the view, best first."""
+        """Return the places (with numbers below `before`) that look most like the view, best first."""
         allowed = self._numbers >= 0
         slots = np.flatnonzero(allowed if before is None else allowed & (self._numbers < before))
         scores = self._votes_for(view)[slots] / self._votes[slots]
@@ -125,7 +125,7 @@ class PlaceIndex:
         return [int(self._numbers[slots[i]]) for i in best if scores[i] > 0]
 
     def _keys(self, view: PlaceView) -> NDArray[np.int64]:
-        """Rows of `_table` that the descriptors fall into."""
+        """Return the rows of `_table` for the view's descriptors."""
         bits = np.unpackbits(view.descriptors, axis=1)
         powers = 1 << np.arange(_BITS)
         keys = [(bits[:, chosen] @ powers) + (table << _BITS) for table, chosen in enumerate(self._bits)]

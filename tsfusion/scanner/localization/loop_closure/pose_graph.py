@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Pose-graph optimisation: poses from measurements between pairs of them.
+"""Optimise a pose graph: find the poses that fit measurements between pairs of poses.
 
-Sparse Levenberg-Marquardt over SE(3) with analytic Jacobians. Edges marked `robust` (loops) may be wrong:
-graduated non-convexity with truncated least squares (Yang, Antonante, Tzoumas and Carlone, "Graduated
-Non-Convexity for Robust Spatial Perception", 2020) finds the wrong ones from any start.
+The method is sparse Levenberg-Marquardt over SE(3) with analytic Jacobians. Edges marked `robust` (loops) may
+be wrong. Graduated non-convexity with truncated least squares finds the wrong ones from any start (Yang,
+Antonante, Tzoumas and Carlone, "Graduated Non-Convexity for Robust Spatial Perception", 2020).
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from tsfusion.core.errors import MissingDependency
 from tsfusion.geometry import se3
 
-TRUSTED = 22.5  # χ² of six degrees of freedom that one in a thousand exceeds
+TRUSTED = 22.5  # χ² with six degrees of freedom; one in a thousand exceeds it
 _GROWTH = 1.4  # factor of the control parameter, as in the paper
-_FIRST_ITERATIONS = 10  # with all edges, before wrong ones are sought
+_FIRST_ITERATIONS = 10  # iterations with all edges, before the search for wrong ones
 _MIN_STEP = 1e-9  # metres and radians: a smaller step ends the iterations
 
 
@@ -28,10 +28,10 @@ class PoseGraphEdge:
     """Measured pose of node `end` in the axes of node `start`.
 
     Attributes:
-        T_start_end: (4, 4), pose of `end` in the axes of `start`.
+        T_start_end: (4, 4), the measured pose.
         information: (6, 6) inverse covariance of the twist `log(T_start_end⁻¹ · T_start⁻¹ T_end)`,
-            translation first; `information(…)` makes one.
-        robust: whether the measurement may be altogether wrong.
+            translation first; the function `information` makes such a matrix.
+        robust: True if the measurement may be completely wrong.
     """
 
     start: int
@@ -47,10 +47,10 @@ class PoseGraphSolution:
 
     Attributes:
         nodes: node → (4, 4), in the order given.
-        weights: (edges,) 0 to 1; 0 = found wrong and left out; always 1 where not robust.
-        chi2: (edges,) squared error of each edge in its own units, before any weight.
-        before, after: sum of `chi2` times `weights` at the poses given and at those found.
-        iterations: linear systems solved.
+        weights: (edges,) 0 to 1. 0 = found wrong and left out; edges that are not robust have 1.
+        chi2: (edges,) squared error of each edge, by its information matrix and without weights.
+        before, after: sum of `chi2` times `weights`, at the given poses and at the found poses.
+        iterations: number of linear systems solved.
     """
 
     nodes: dict[int, se3.Transform]
@@ -62,7 +62,7 @@ class PoseGraphSolution:
 
 
 def information(translation: float, rotation: float) -> se3.Matrix6:
-    """Information (6, 6) of independent errors with standard deviations in metres and radians."""
+    """Return the information (6, 6) of independent errors with standard deviations in metres and radians."""
     return np.diag([translation**-2.0] * 3 + [rotation**-2.0] * 3)
 
 
@@ -73,15 +73,15 @@ def optimise(
     trusted: float = TRUSTED,
     iterations: int = 300,
 ) -> PoseGraphSolution:
-    """Find the poses that fit the edges best; the first node stays where it is.
+    """Find the poses that fit the edges best. The first node keeps its pose.
 
     Args:
-        nodes: node → (4, 4) to begin with, each connected to the first one by edges.
-        trusted: χ² up to which a robust edge counts as right.
+        nodes: node → (4, 4) start pose; edges must connect each node to the first one.
+        trusted: a robust edge with a larger χ² is wrong.
         iterations: maximum number of linear systems solved.
 
     Raises:
-        MissingDependency: without scipy.
+        MissingDependency: scipy is not installed.
     """
     problem = _NormalEquations(nodes, edges)
     T = np.array([nodes[key] for key in nodes], dtype=np.float64)
@@ -104,7 +104,7 @@ def optimise(
             if np.isin(weights, (0.0, 1.0)).all():
                 break
         weights = np.where(robust & (chi2 > trusted), 0.0, 1.0)
-    if used >= _FIRST_ITERATIONS:  # too early to stop
+    if used >= _FIRST_ITERATIONS:  # `descend` may have ended too early
         T, more = problem.descend(T, weights, max(iterations - used, 1))
         used, chi2 = used + more, problem.chi2(T)
     return PoseGraphSolution(
@@ -118,7 +118,7 @@ def optimise(
 
 
 def _truncated(chi2: NDArray[np.float64], trusted: float, control: float) -> NDArray[np.float64]:
-    """Weights of truncated least squares, smoothed by the control parameter (the paper's eq. 14)."""
+    """Return weights of truncated least squares, smoothed by the control parameter (the paper's eq. 14)."""
     inner, outer = control / (control + 1) * trusted, (control + 1) / control * trusted
     between = np.sqrt(trusted * control * (control + 1) / np.maximum(chi2, 1e-300)) - control
     return np.where(chi2 <= inner, 1.0, np.where(chi2 >= outer, 0.0, np.clip(between, 0, 1)))
@@ -138,11 +138,11 @@ class _NormalEquations:
         self._end = np.array([place[edge.end] for edge in edges], dtype=np.int64)
         self._inverse = se3.inverse(np.array([e.T_start_end for e in edges]).reshape(-1, 4, 4))
         self._information = np.array([edge.information for edge in edges]).reshape(-1, 6, 6)
-        self._size = 6 * (len(nodes) - 1)  # the first node is no variable
+        self._size = 6 * (len(nodes) - 1)  # the first node is fixed
         self._lay_out()
 
     def _lay_out(self) -> None:
-        """Find the place in a CSC matrix of each number of the edges' four 6×6 blocks."""
+        """Find the index in a CSC matrix of each number of the edges' four 6×6 blocks."""
         six = np.arange(6)
         first, second = (6 * (ends[:, None] - 1) + six for ends in (self._start, self._end))  # (m, 6)
         rows, columns = [], []
@@ -160,17 +160,17 @@ class _NormalEquations:
         self._known, self._ends = ends >= 0, ends[ends >= 0]
 
     def errors(self, T: se3.Transform) -> se3.Twist:
-        """Errors of the edges, (m, 6) twists."""
+        """Return the errors of the edges, (m, 6) twists."""
         return se3.log(self._inverse @ se3.inverse(T[self._start]) @ T[self._end])
 
     def chi2(self, T: se3.Transform) -> NDArray[np.float64]:
-        """Squared errors, (m,), weighted by the edges' information."""
+        """Return squared errors, (m,), weighted by the edges' information."""
         return _squares(self.errors(T), self._information)
 
     def descend(
         self, T: se3.Transform, weights: NDArray[np.float64], steps: int
     ) -> tuple[se3.Transform, int]:
-        """Run at most `steps` of Levenberg-Marquardt; return the poses and the number of steps."""
+        """Run at most `steps` steps of Levenberg-Marquardt. Return the poses and the number of steps."""
         damping, error = 1e-7, self.errors(T)
         cost = float(weights @ _squares(error, self._information))
         for step in range(steps):
@@ -194,7 +194,7 @@ class _NormalEquations:
     def _normal(
         self, T: se3.Transform, error: NDArray[np.float64], weights: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """The values of the CSC matrix JᵀΩJ, and −JᵀΩe."""
+        """Return the values of the CSC matrix JᵀΩJ, and −JᵀΩe."""
         second = se3.right_jacobian_inverse(error)
         first = -second @ se3.adjoint(se3.inverse(T[self._end]) @ T[self._start])
         information = weights[:, None, None] * self._information
@@ -228,10 +228,10 @@ def _squares(error: NDArray[np.float64], information: NDArray[np.float64]) -> ND
 
 
 def require() -> None:
-    """Check that there is scipy, which is imported when the first loop is closed: it takes 25 MB.
+    """Check that scipy is installed. It is imported with the first loop only: it takes 25 MB.
 
     Raises:
-        MissingDependency: without scipy.
+        MissingDependency: scipy is not installed.
     """
     with suppress(ImportError):
         if find_spec("scipy.sparse") is not None:

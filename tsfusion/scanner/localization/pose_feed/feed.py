@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Localizer that receives poses from another process, such as a SLAM, over a ZeroMQ socket.
+"""Localizer that receives poses from another process, such as a SLAM program, over a ZeroMQ socket.
 
-`messages` defines the format; contrib/pose_sender.py is a sender.
+`feed_messages` defines the format; contrib/pose_sender.py is an example of a sender.
 """
 
 import logging
@@ -28,12 +28,12 @@ from tsfusion.wire.sockets import sockets
 log = logging.getLogger(__name__)
 
 WAIT = 0.1  # seconds to wait for a pose; also in docs/localization.md
-MAX_RECEIVE = 0.1  # seconds of receiving messages for one frame, so that a flood cannot hold it up
-RECONNECT_AFTER = 5.0  # seconds of silence; libzmq gives some connections up for good
-ANOTHER_CLOCK = 3600.0  # seconds between pose and frame
-MAX_REASONS = 20  # counted apart
+MAX_RECEIVE = 0.1  # seconds spent on messages for one frame: a flood must not block it
+RECONNECT_AFTER = 5.0  # seconds of silence; libzmq does not reconnect in all cases
+ANOTHER_CLOCK = 3600.0  # seconds between pose and frame that mean another clock
+MAX_REASONS = 20  # that are counted separately
 _NS = 1_000_000_000  # nanoseconds a second
-_NUMBERS = 7  # translation and quaternion; all NaN where the sender was lost
+_NUMBERS = 7  # translation and quaternion of a pose; all NaN for a loss of the sender
 
 
 class PoseFeed:
@@ -43,15 +43,15 @@ class PoseFeed:
     tracking keyframes.
 
     Args:
-        address: `tcp://host:port` to connect to, where a PUB socket is bound; or `@tcp://127.0.0.1:port` to
-            bind here, for senders that connect. There are no keys, so only local addresses can be bound.
-        max_gap_s: seconds between two poses at most; there is no pose in longer gaps.
+        address: `tcp://host:port` of a bound PUB socket, to connect to; or `@tcp://127.0.0.1:port` to bind a
+            socket here, for senders that connect. It has no keys, so only local addresses can be bound.
+        max_gap_s: most seconds between two poses; longer gaps have no pose.
         time_offset_s: seconds to add to a frame's stamp before its pose is looked up.
-        wait_s: seconds a frame waits for the pose after it.
+        wait_s: seconds that a frame waits for the pose after it.
 
     Raises:
-        InvalidConfig: for a malformed address, or one open to other machines.
-        TransportError: when it cannot be bound.
+        InvalidConfig: the address is malformed, or open to other machines.
+        TransportError: the address cannot be bound.
     """
 
     absolute = True
@@ -71,11 +71,10 @@ class PoseFeed:
 
     @property
     def address(self) -> str:
-        """Address it is bound to, with the real port, or connected to."""
+        """Address that the socket is connected to, or bound to with the real port."""
         return self._socket.endpoint
 
     def close(self) -> None:
-        """Close the socket; may be called twice."""
         self._closing()
 
     def __enter__(self) -> "PoseFeed":
@@ -85,7 +84,7 @@ class PoseFeed:
         self.close()
 
     def track(self, frame: Frame) -> TrackedPose | Lost:
-        """Interpolate the feed's poses at the frame's timestamp; wait up to `wait_s` for the next one.
+        """Interpolate the feed's poses at the frame's timestamp. Wait up to `wait_s` for the next pose.
 
         A frame with point times waits for the pose after its last point.
         """
@@ -110,22 +109,22 @@ class PoseFeed:
         return pose
 
     def corrections(self) -> PoseCorrections | None:
-        """Return the sender's corrections if there are new ones since the last call."""
+        """Return the sender's corrections that are new since the last call, or None."""
         return self._deformation.new_corrections()
 
     def prepare(self) -> None:
-        """Nothing of a frame is left for later."""
+        """Do nothing: `track` leaves no work for later."""
 
     def settle(self) -> None:
-        """Nothing is done beside `track`."""
+        """Do nothing: no work is done in other threads."""
 
     def reset(self) -> None:
-        """Forget the tracking keyframes; the world stays the sender's."""
+        """Forget the tracking keyframes. The world stays that of the sender."""
         self._anchors.reset()
         self._deformation.reset()
 
     def _receive(self, seconds: float) -> None:
-        """Process the messages that are there; wait at most `seconds` for the first one."""
+        """Process all messages that arrived. Wait at most `seconds` for the first one."""
         parts = self._socket.receive(seconds)
         enough = time.monotonic() + MAX_RECEIVE
         while parts is not None:
@@ -176,7 +175,7 @@ class PoseFeed:
 
 
 class _FeedSocket:
-    """SUB socket that is opened anew after a silence."""
+    """SUB socket that is opened again after a silence."""
 
     def __init__(self, address: str) -> None:
         self.binds = address.startswith("@")
@@ -194,7 +193,7 @@ class _FeedSocket:
             raise
 
     def receive(self, seconds: float) -> list[bytes] | None:
-        """Receive the frames of the next message; None when none comes in time."""
+        """Return the frames of the next message, or None if none comes in time."""
         if self._socket.poll(round(seconds * 1000)):
             self._last_received = time.monotonic()
             return self._socket.recv_multipart()
@@ -216,7 +215,7 @@ class _FeedSocket:
 
 
 class PoseHistory:
-    """At most `limit` poses and losses, sorted by timestamp; 64 bytes each. The oldest are forgotten."""
+    """Poses and losses of the sender, sorted by timestamp: the newest `limit`, 64 bytes each."""
 
     def __init__(self, limit: int = 100_000) -> None:
         self._limit = limit
@@ -228,11 +227,11 @@ class PoseHistory:
 
     @property
     def last_ns(self) -> int:
-        """Latest timestamp; the history must not be empty."""
+        """Latest timestamp. The history must not be empty."""
         return self._stamps[-1]
 
     def add(self, stamp_ns: int, T: Transform | None) -> None:
-        """Add a pose, or None for a loss; an entry with the same timestamp is replaced."""
+        """Add a pose, or None for a loss. It replaces an entry with the same timestamp."""
         row = array("d", [np.nan] * _NUMBERS if T is None else [*T[:3, 3], *quaternion(T[:3, :3])])
         at = bisect_left(self._stamps, stamp_ns)
         if at < len(self) and self._stamps[at] == stamp_ns:
@@ -245,7 +244,7 @@ class PoseHistory:
             del self._stamps[:oldest], self._numbers[: _NUMBERS * oldest]
 
     def at(self, stamp_ns: int, *, max_gap_ns: int) -> Transform | None:
-        """Pose at a time, interpolated between its neighbours as `Trajectory.at` does; None = unknown."""
+        """Return the pose at a time, interpolated as by `Trajectory.at`, or None if it is unknown."""
         right = bisect_left(self._stamps, stamp_ns)
         neighbours = [k for k in (right - 1, right) if 0 <= k < len(self)]
         rows = np.array([self._numbers[_NUMBERS * k : _NUMBERS * (k + 1)] for k in neighbours])
@@ -256,7 +255,7 @@ class PoseHistory:
         return Trajectory(stamps[known], rows[known, :3], rows[known, 3:]).at(stamp_ns, max_gap_ns=max_gap_ns)
 
     def decided(self, stamp_ns: int, *, max_gap_ns: int) -> bool:
-        """True if later messages cannot change the pose: there is an entry at the time or soon after it."""
+        """Return True if later messages cannot change the pose: an entry is at the time or soon after it."""
         right = bisect_left(self._stamps, stamp_ns)
         return right < len(self) and self._stamps[right] - stamp_ns <= max_gap_ns
 
@@ -264,8 +263,8 @@ class PoseHistory:
 class MapDeformation:
     """Motion of odometry's world by corrected poses, as a function of time.
 
-    At each corrected timestamp it is the corrected pose times the inverse of the pose sent before. Between
-    two timestamps it is interpolated; before the first and after the last it is constant.
+    At each corrected timestamp, the motion is the corrected pose times the inverse of the pose sent before.
+    Between two timestamps it is interpolated. Before the first and after the last timestamp it is constant.
     """
 
     def __init__(self) -> None:
@@ -278,11 +277,10 @@ class MapDeformation:
         self._revision = 0
 
     def add(self, anchor: int, stamp_ns: int, T_world_camera: se3.Transform) -> None:
-        """Add a tracking keyframe."""
         self._anchors[anchor] = stamp_ns, T_world_camera
 
     def apply(self, corrected: FeedCorrections, history: PoseHistory, max_gap_ns: int) -> int:
-        """Apply new corrections; return the number of their timestamps without a known pose."""
+        """Apply new corrections. Return the number of their timestamps without a known pose."""
         before = [history.at(stamp, max_gap_ns=max_gap_ns) for stamp in corrected.stamps_ns]
         known = [
             (stamp, after @ se3.inverse(T))
@@ -300,7 +298,7 @@ class MapDeformation:
         return unknown
 
     def new_corrections(self) -> PoseCorrections | None:
-        """Corrected poses of all tracking keyframes since `reset`; None if they were returned before."""
+        """Return all tracking keyframes' poses corrected, since `reset`, or None without new corrections."""
         if not self._is_new:
             return None
         self._is_new, self._revision = False, self._revision + 1
@@ -314,7 +312,7 @@ class MapDeformation:
         )
 
     def reset(self) -> None:
-        """Forget the tracking keyframes; the corrections stay."""
+        """Forget the tracking keyframes, but not the corrections."""
         self._anchors.clear()
         self._revision = 0
 

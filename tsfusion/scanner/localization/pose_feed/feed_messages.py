@@ -1,16 +1,17 @@
 # SPDX-License-Identifier: MIT
-"""Messages of a pose feed, and their decoding.
+"""Define and decode the messages of a pose feed.
 
-A message is one frame, JSON or MessagePack, a map of:
+A message is one ZeroMQ frame. It holds a map, in JSON or MessagePack, with the keys:
 
-- `stamp_ns`: integer, of the clock that stamps the frames.
-- `pose`: `[tx, ty, tz, qx, qy, qz, qw]`, or the 16 numbers of T_world_camera row by row; of the sensor whose
-  frames are followed, OpenCV axes (a LiDAR: its own). Poses are odometry: none may jump at a closed loop.
+- `stamp_ns`: integer, by the clock that stamps the frames.
+- `pose`: `[tx, ty, tz, qx, qy, qz, qw]`, or the 16 numbers of T_world_camera row by row. It is the pose of
+  the sensor that makes the frames, with OpenCV axes (a LiDAR: its own). Poses are odometry: they must not
+  jump when a loop is closed.
 - `lost`: true instead of a pose: the sender does not know the pose.
-- `corrections`: result of loop closure, alone or beside a pose. A map of `stamps_ns`, of poses sent before;
-  `poses`, their corrected ones, each as above; `loops`, closed so far (optional); and `T_corrected_world`, as
-  a pose, which moves odometry poses from now on (optional; RTAB-Map's map_to_odom). The newest replaces all
-  others.
+- `corrections`: result of loop closure, alone or beside a pose. The newest replaces all others. It is a map
+  of `stamps_ns`, timestamps of poses sent before; `poses`, the corrected poses for them; `loops`, the number
+  of loops closed so far (optional); and `T_corrected_world`, in the form of a pose, which moves odometry
+  poses from now on (optional; RTAB-Map's map_to_odom).
 
 Unknown keys are ignored.
 """
@@ -26,7 +27,7 @@ from tsfusion.geometry.keyframe import check_pose
 from tsfusion.geometry.se3 import Transform
 from tsfusion.geometry.trajectory import rigid
 
-MAX_BYTES = 1 << 20  # a message: corrections of 5,000 poses in JSON, 15,000 in MessagePack
+MAX_BYTES = 1 << 20  # for a message: it holds corrections of 5,000 poses in JSON, 15,000 in MessagePack
 MAX_DISTANCE = 1e7  # metres from the origin
 
 Stamp = Annotated[int, Meta(ge=1, le=2**63 - 1)]
@@ -57,7 +58,7 @@ class FeedCorrections(Struct, frozen=True, kw_only=True):
 
 
 class FeedMessage(Struct, frozen=True, kw_only=True):
-    """One message. `pose` is None with a timestamp when the sender is lost."""
+    """One message. A message with a timestamp but without a pose means that the sender is lost."""
 
     stamp_ns: int | None
     pose: Transform | None
@@ -69,10 +70,10 @@ _msgpack = msgspec.msgpack.Decoder(_RawMessage)
 
 
 def decode(message: bytes) -> FeedMessage:
-    """Decode a message of either encoding.
+    """Decode a message in JSON or MessagePack.
 
     Raises:
-        DecodeError: the message is not as described above.
+        DecodeError: the message has another form than described above.
     """
     try:
         # A map never begins with `{` in MessagePack.
@@ -103,7 +104,7 @@ def _corrections(raw: _RawCorrections) -> FeedCorrections:
 
 
 def _matrix(numbers: list[float]) -> Transform:
-    """Convert 7 or 16 numbers to (4, 4). Raises DecodeError or InvalidKeyframe."""
+    """Convert 7 or 16 numbers to a (4, 4) pose. Raises DecodeError or InvalidKeyframe."""
     values = np.array(numbers, dtype=np.float64)
     if len(values) == 16:
         T = values.reshape(4, 4)

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Depth images as small planes, and the distances of one image's points from the planes of another.
+"""Fit small planes to a depth image, and measure the distances of other points from them.
 
-Projective association after Blais and Levine, "Registering multiview range data" (1995); point to plane after
-Chen and Medioni (1992). A plane is linear in inverse depth over the pixels: blocks of pixels are averaged
-there, and planes fitted there by least squares.
+Points are paired with planes by projection, after Blais and Levine, "Registering multiview range data"
+(1995), and aligned by point-to-plane distances, after Chen and Medioni (1992). Inverse depth of a plane is
+linear over the pixels. So inverse depth is averaged over blocks of pixels, and planes are fitted to it by
+least squares.
 """
 
 from dataclasses import dataclass, replace
@@ -19,22 +20,22 @@ from tsfusion.geometry.keyframe import Intrinsics
 
 Floats = NDArray[np.float32]
 
-COLUMNS = 160  # blocks a row, about
+COLUMNS = 160  # blocks in a row, about
 _FIT_RADIUS = 1  # blocks
-_FIT_SHARE = 0.6  # share of the blocks around one that must be valid
+_FIT_SHARE = 0.6  # share of the 3×3 blocks around a block that must be valid
 _NEAREST = 0.1  # metres
-_MAX_CURVATURE = 0.006  # deviation within a block or from its plane, as a share of the depth
+_MAX_CURVATURE = 0.006  # deviation inside a block or from its plane, as a share of the depth
 _MIN_COSINE = 0.17  # between ray and normal
-_CELL = 8  # blocks a side, over which errors are averaged
-_NORMAL = np.float32(1 / 32767)  # unit of packed normals: a thirtieth of a millimetre a metre
-_STRIP = 8  # rows of blocks averaged at once: their pixels stay in the cache
+_CELL = 8  # errors are averaged over 8×8 blocks
+_NORMAL = np.float32(1 / 32767)  # unit of packed normals: 1/30 mm for each metre
+_STRIP = 8  # rows of blocks averaged together: their pixels stay in the CPU's cache
 
 
 @dataclass(frozen=True, eq=False)
 class PlaneImage:
     """Planes fitted to the blocks of one depth image, in its camera's axes."""
 
-    intrinsics: Intrinsics  # those of the image of blocks
+    intrinsics: Intrinsics  # of an image with one pixel for each block
     shape: tuple[int, int]  # rows and columns of blocks
     points: Floats  # (3, n) float32 metres, the blocks' centres
     sigma: Floats  # (n,) float32 metres, standard deviation of a depth camera at these depths
@@ -50,16 +51,16 @@ class PlaneImage:
         return float(np.count_nonzero(self.offsets) / len(self.offsets))
 
     def planes(self, block: NDArray[np.intp]) -> tuple[Floats, Floats]:
-        """Normals, (3, m) float32, and offsets, (m,), of blocks."""
+        """Return normals, (3, m) float32, and offsets, (m,), of blocks."""
         normals = self.normals.take(block, axis=1)
         is_packed = normals.dtype == np.int16
         unpacked = normals * _NORMAL if is_packed else normals.astype(np.float32, copy=False)
         return unpacked, self.offsets.take(block)
 
     def without_points(self) -> "PlaneImage":
-        """The planes alone, their normals in 16 bits: a quarter of the memory.
+        """Return the planes alone, with normals in 16 bits: a quarter of the memory.
 
-        Points of other images can be matched with them.
+        Points of other images can still be matched with them.
         """
         if self.normals.dtype == np.int16:
             return self
@@ -72,25 +73,25 @@ class PlaneImage:
         )
 
     def every(self, step: int) -> NDArray[np.intp]:
-        """Indices of the points on every `step`-th row and column of blocks."""
+        """Return the indices of the points on every `step`-th row and column of blocks."""
         return np.flatnonzero(_lattice(self.shape, step).take(self.index))
 
 
 @lru_cache(maxsize=16)
 def _lattice(shape: tuple[int, int], step: int) -> NDArray[np.bool_]:
-    """Mask of the blocks on every `step`-th row and column, (rows·columns,)."""
+    """Return a mask of the blocks on every `step`-th row and column, (rows·columns,)."""
     row, column = np.indices(shape)
     chosen: NDArray[np.bool_] = ((row % step == step // 2) & (column % step == step // 2)).ravel()
     return chosen
 
 
 def deviation(depth: Any) -> Any:
-    """Standard deviation of structured light's depth, metres at metres (Nguyen, Izadi and Lovell 2012)."""
+    """Return the standard deviation of structured-light depth, metres (Nguyen, Izadi and Lovell 2012)."""
     return 0.0012 + 0.0019 * (depth - 0.4) ** 2
 
 
 def fit_planes(depth: Floats, intrinsics: Intrinsics) -> PlaneImage:
-    """Fit planes to a depth image, (H, W) float32 metres; 0 = no depth."""
+    """Fit planes to a depth image, (H, W) float32 metres, 0 = no depth."""
     block = max(1, round(depth.shape[1] / COLUMNS))
     inverse, valid = _blocks(depth, block)
     K, shape = intrinsics.scaled(1 / block), (inverse.shape[0], inverse.shape[1])
@@ -100,14 +101,14 @@ def fit_planes(depth: Floats, intrinsics: Intrinsics) -> PlaneImage:
     points = np.stack([(u - K.cx) / K.fx * z, (v - K.cy) / K.fy * z, z]).astype(np.float32)
     normals, roughness = _normals(inverse, valid, K)
     offsets = np.zeros(valid.size, np.float32)
-    # Through the block's own point, not its neighbours' mean: that lies inside of what is round.
+    # The plane goes through the block's own point. The neighbours' mean would lie inside a round object.
     offsets[index] = np.einsum("in,in->n", normals[:, index], points)
     sigma = deviation(points[2]).astype(np.float32)
     return PlaneImage(K, shape, points, sigma, index, normals, offsets, roughness)
 
 
 def _blocks(depth: Floats, block: int) -> tuple[Floats, NDArray[np.bool_]]:
-    """Mean inverse depth of blocks, and where at least half of a block lies on one smooth surface."""
+    """Return the mean inverse depth of blocks, and True if at least half of a block is one smooth surface."""
     rows, columns = depth.shape[0] // block, depth.shape[1] // block
     share, mean, square = (np.empty((rows, columns), np.float32) for _ in range(3))
     for top in range(0, rows, _STRIP):
@@ -126,7 +127,7 @@ def _blocks(depth: Floats, block: int) -> tuple[Floats, NDArray[np.bool_]]:
 
 
 def _normals(inverse: Floats, valid: NDArray[np.bool_], K: Intrinsics) -> tuple[Floats, float]:
-    """Normals, (3, n), of planes fitted to inverse depth around each block, 0 where none fits; roughness."""
+    """Return normals, (3, n), of planes fitted around each block, 0 where none fits, and the roughness."""
     r = _FIT_RADIUS
     ones, step = np.ones(2 * r + 1), np.arange(-r, r + 1, dtype=np.float64)
     w = valid.astype(np.float32)
@@ -159,18 +160,18 @@ def _normals(inverse: Floats, valid: NDArray[np.bool_], K: Intrinsics) -> tuple[
     normals = np.stack([nx, ny, c - nx * x - ny * y])
     length = np.maximum(np.sqrt((normals * normals).sum(axis=0)), np.float32(1e-12))
     ok &= c > _MIN_COSINE * length * np.sqrt(x * x + y * y + 1)
-    free = 1 - 3 / (2 * r + 1) ** 2  # of the residuals, with three parameters fitted
+    free = 1 - 3 / (2 * r + 1) ** 2  # share of free residuals: three parameters are fitted
     roughness = float(np.median(off[ok] / sigma[ok]) / np.sqrt(free)) if ok.any() else 0.0
     return np.where(ok, normals / length, 0).reshape(3, -1), roughness
 
 
 @dataclass(frozen=True, eq=False)
 class Match:
-    """Points of one image paired with the planes of another whose blocks they project onto."""
+    """Points of one image, each paired with the plane of the other image's block that it projects onto."""
 
     moved: Floats  # (3, m) float32 metres, the points in the other camera's axes
-    normals: Floats  # (3, m) float32, of the planes
-    distance: Floats  # (m,) float32 metres from the planes, signed
+    normals: Floats  # (3, m) float32, normals of the planes
+    distance: Floats  # (m,) float32 metres, signed distances from the planes
     sigma: Floats  # (m,) float32 metres, standard deviation of the points' depth
     chosen: NDArray[np.intp]  # (m,) indices of the points
     block: NDArray[np.intp]  # (m,) numbers of the other image's blocks
@@ -179,7 +180,7 @@ class Match:
 def match(
     there: PlaneImage, here: PlaneImage, T_there_here: se3.Transform, some: NDArray[np.intp] | None
 ) -> Match:
-    """Pair the points of `here` (or those with indices `some`) with the planes of `there`."""
+    """Pair the points of `here` (all, or those with the indices `some`) with the planes of `there`."""
     points, sigma = (here.points, here.sigma) if some is None else (here.points[:, some], here.sigma[some])
     K, (rows, columns) = there.intrinsics, there.shape
     moved = T_there_here[:3, :3].astype(np.float32) @ points + T_there_here[:3, 3:].astype(np.float32)
@@ -197,9 +198,9 @@ def match(
 
 
 def correlated_blocks(found: Match, columns: int) -> float:
-    """Number of blocks that share one error: 1 for white noise, dozens where a sensor's errors are smooth.
+    """Return how many blocks share one error: 1 for white noise, dozens for a sensor with smooth errors.
 
-    Variance of the distances' means over cells of blocks, in units of what white noise would give.
+    It is the variance of the distances' means over cells of blocks, divided by that of white noise.
     """
     near = np.abs(found.distance) < 4 * found.sigma
     whitened = (found.distance[near] / found.sigma[near]).astype(np.float64)
@@ -214,7 +215,7 @@ def correlated_blocks(found: Match, columns: int) -> float:
 
 
 def equations(found: Match, weight: Floats) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Normal equations, (6, 6) and (6,), of the step that brings the points to their planes.
+    """Return normal equations, (6, 6) and (6,), of the step that brings the points to their planes.
 
     The step is applied as `exp(step) @ T_there_here`.
     """

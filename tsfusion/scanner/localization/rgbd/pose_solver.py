@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Pose from corners and planes together, by Gauss-Newton over both distances, and its acceptance.
+"""Find a pose from corners and planes together by Gauss-Newton, and decide whether to accept it.
 
-Both errors are weighted by their deviations and made robust with the Geman-McClure kernel, whose width
-shrinks as the estimate settles.
+Reprojection errors of corners and distances to planes are weighted by their deviations. The Geman-McClure
+kernel makes both robust; its width shrinks from round to round.
 """
 
 from collections.abc import Sequence
@@ -16,18 +16,18 @@ from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.scanner.localization.rgbd import point_to_plane
 from tsfusion.scanner.localization.rgbd.rgbd_frame import RGBDFrame, TrackingKeyframe
 
-PIXEL = 1.0  # deviation of a followed corner, at 640 columns
-ROBUST_WIDTH = 3.0  # deviations at which a residual counts a quarter
-FIRST_PLANE_WEIGHT = 0.1  # against a corner's 1, until the correlation of neighbouring blocks is known
-MIN_SCALE, MAX_SCALE = 0.25, 3.0  # deviation of the distances to planes, as a share of the sensor's
+PIXEL = 1.0  # pixels at 640 columns, deviation of a followed corner
+ROBUST_WIDTH = 3.0  # deviations; a residual of this size counts a quarter
+FIRST_PLANE_WEIGHT = 0.1  # a corner has 1; used until the correlation of neighbouring blocks is known
+MIN_SCALE, MAX_SCALE = 0.25, 3.0  # bounds: distances' deviation divided by the sensor's
 FIT_OFFSETS_SQUARED = 6.0  # blocks²: sum over a plane's 3 × 3 blocks of their offsets along one axis
-SMOOTH_TILT = 0.03  # radians by which smooth errors of a sensor tilt its planes
+SMOOTH_TILT = 0.03  # radians: smooth errors of a sensor tilt its planes by this
 DAMPING = 1e-6  # share of the information's trace
-COARSE_STEP, FINE_STEP = 3e-4, 2e-5  # metres or radians: a smaller step ends a coarse, the last round
+COARSE_STEP, FINE_STEP = 3e-4, 2e-5  # metres or radians: a smaller step ends a coarse round, the last
 ROUNDS = ((4, 15, 0.3), (2, 6, 0.05), (1, 3, 0.03))  # blocks between points, iterations, gate in metres
-ON_PLANE = 0.01  # metres, beside three deviations, from which a point counts as on its plane
-MIN_PATTERN_ENERGY = 0.1  # of 1: with less, there is no pattern to compare
-NOISE_FACTOR = 3.0  # safety factor on the information that noise alone would give
+ON_PLANE = 0.01  # metres: a point so near, plus three deviations, is on its plane
+MIN_PATTERN_ENERGY = 0.1  # of 1: with less energy, there is no pattern to compare
+NOISE_FACTOR = 3.0  # safety factor for the information that noise alone would give
 
 MIN_OVERLAP, MIN_OVERLAP_STRICT = 0.25, 0.4  # shares
 MIN_AGREEING, MIN_AGREEING_STRICT, MIN_AGREEING_DEPTH_ALONE = 0.7, 0.8, 0.92  # shares
@@ -37,11 +37,11 @@ MAX_UNCERTAINTY = 0.01  # metres
 
 @dataclass(frozen=True, eq=False)
 class AlignmentTarget:
-    """A tracking keyframe that the new frame is aligned to."""
+    """Tracking keyframe that the new frame is aligned to."""
 
-    T_target_anchor: se3.Transform  # (4, 4), known
+    T_target_anchor: se3.Transform  # (4, 4), known pose of the anchor
     surface: point_to_plane.PlaneImage
-    points: NDArray[np.float64]  # (n, 3) metres, its corners in its camera's axes
+    points: NDArray[np.float64]  # (n, 3) metres, corners in the target camera's axes
     pixels: NDArray[np.float32]  # (n, 2), these corners in the new image
 
 
@@ -51,7 +51,7 @@ class PoseEstimate:
 
     T_anchor_camera: se3.Transform  # (4, 4)
     planes: se3.Matrix6  # information from the distances to planes
-    spurious: se3.Matrix6  # the part of it that noise in the planes' normals alone would give
+    spurious: se3.Matrix6  # the part of `planes` that noise in the normals alone would give
     corners: se3.Matrix6  # information from the reprojection of corners
 
 
@@ -62,12 +62,12 @@ def solve(
     columns: int,
     T_anchor_camera: se3.Transform,
 ) -> PoseEstimate:
-    """Find the pose at which corners and planes agree best, starting from a pose nearby.
+    """Find the pose near a start pose that fits corners and planes best.
 
     Args:
-        targets: the anchor first; the others take part in the last round.
+        targets: the anchor first; the other targets are used in the last round only.
         here: planes of the new frame.
-        camera, columns: intrinsics and width of its image.
+        camera, columns: intrinsics and width of the new frame's image.
         T_anchor_camera: (4, 4) start.
     """
     T, trust = T_anchor_camera, FIRST_PLANE_WEIGHT
@@ -103,7 +103,7 @@ def solve(
 def _planes(
     found: point_to_plane.Match, gate: float, trust: float
 ) -> tuple[se3.Matrix6, se3.Twist, point_to_plane.Floats]:
-    """Normal equations of the distances to planes, and the (m,) weights of the distances."""
+    """Return normal equations of the distances to planes, and the (m,) weights of the distances."""
     near = np.abs(found.distance) < np.float32(gate) + 3 * found.sigma
     if np.count_nonzero(near) < 12:
         return np.zeros((6, 6)), np.zeros(6), np.zeros(len(near), np.float32)
@@ -120,13 +120,13 @@ def _planes(
 def _spurious(
     found: point_to_plane.Match, weight: point_to_plane.Floats, there: point_to_plane.PlaneImage
 ) -> se3.Matrix6:
-    """Information that errors of the planes' normals alone would give, (6, 6)."""
+    """Return the information that errors of the planes' normals alone would give, (6, 6)."""
     slope = there.roughness * found.sigma * (there.intrinsics.fx / found.moved[2])
     return _isotropic(found.moved, weight * (slope * slope / FIT_OFFSETS_SQUARED + SMOOTH_TILT**2))
 
 
 def _isotropic(points: point_to_plane.Floats, weight: NDArray[np.floating]) -> se3.Matrix6:
-    """Information of points that are known in all three directions, (6, 6)."""
+    """Return the information of points that are known in all three directions, (6, 6)."""
     p, w = points.astype(np.float64), weight.astype(np.float64)
     total, first, second = w.sum(), p @ w, (p * w) @ p.T
     H = np.zeros((6, 6))
@@ -140,7 +140,7 @@ def _isotropic(points: point_to_plane.Floats, weight: NDArray[np.floating]) -> s
 def _corners(
     target: AlignmentTarget, camera: Intrinsics, T_target_camera: se3.Transform, pixel: float
 ) -> tuple[se3.Matrix6, se3.Twist]:
-    """Normal equations of the reprojection errors of a target's corners."""
+    """Return normal equations of the reprojection errors of a target's corners."""
     if not len(target.points):
         return np.zeros((6, 6)), np.zeros(6)
     X = target.points.T
@@ -167,22 +167,23 @@ def _corners(
 
 @dataclass(frozen=True)
 class PoseEvidence:
-    """Agreement of a frame with a keyframe at the pose found."""
+    """Evidence for a pose: how well the frame agrees with a keyframe."""
 
     overlap: float  # share of the frame's points that fall onto planes of the keyframe
     agreeing: float  # share of these points that lie on their planes
-    likeness: float | None  # -1 to 1, correlation of the grey patterns there; None = no image, or no pattern
+    likeness: float | None  # -1 to 1, correlation of grey patterns; None without image or pattern
     corners: int  # number of corners that agree
-    uncertainty: float  # metres; deviation of the pose in its worst direction, rotations taken at the surface
+    uncertainty: float  # metres, deviation in the worst direction; of a rotation, the motion of the surface
 
     def doubt(self, *, strict: bool) -> str | None:
-        """Reason to reject the pose; None = it is accepted.
+        """Return the reason to reject the pose, or None to accept it.
 
-        In a recorded kitchen poses from frame to frame agreed by 0.92 or more in depth and by 0.35 or more in
-        the image, wrong ones by 0.26 and 0.05 or less, but depth alone by 0.9 when centimetres off.
+        Measured in a recorded kitchen: true poses agreed by 0.92 or more in depth and 0.35 or more in the
+        image, wrong poses by 0.26 and 0.05 or less. But poses some centimetres off agreed by 0.9 in depth
+        alone.
 
         Args:
-            strict: whether to ask for more, because the pose was not expected.
+            strict: True asks for more, for a pose that was not expected.
         """
         agreeing = MIN_AGREEING_STRICT if strict else MIN_AGREEING
         likeness = MIN_LIKENESS_STRICT if strict else MIN_LIKENESS
@@ -206,7 +207,7 @@ class PoseEvidence:
 def pose_evidence(
     current: RGBDFrame, keyframe: TrackingKeyframe, estimate: PoseEstimate, corners: int
 ) -> PoseEvidence:
-    """Evidence for an estimate of the current frame's pose in a keyframe's axes."""
+    """Return the evidence for an estimate of the current frame's pose in a keyframe's axes."""
     found = point_to_plane.match(keyframe.frame.surface, current.surface, estimate.T_anchor_camera, None)
     agree = np.abs(found.distance) < ON_PLANE + 3 * found.sigma
     total = max(1, current.surface.points.shape[1])

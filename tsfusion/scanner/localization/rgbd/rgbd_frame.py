@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""An RGB-D frame prepared for tracking, and the tracking keyframe it may become."""
+"""Prepare an RGB-D frame for tracking, and make tracking keyframes from frames."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -16,13 +16,13 @@ from tsfusion.scanner.localization import features
 from tsfusion.scanner.localization.rgbd import point_to_plane
 
 Gray = NDArray[np.uint8]
-MAX_CORNERS = 400  # followed from a tracking keyframe
+MAX_CORNERS = 400  # corners followed from a tracking keyframe
 MAX_ORB_CORNERS = 600
-MAX_RATIO = 0.8  # of the best match's distance to the second best's
+MAX_RATIO = 0.8  # best match's distance divided by the second best's
 MAX_DIFFERENT_BITS = 64  # of 256, in a match
-PATTERN_WINDOW = 9  # blocks a side, over which grey is normalised
+PATTERN_WINDOW = 9  # grey is normalised over 9×9 blocks
 HALF_CONTRAST = 8.0  # grey levels
-JPEG_QUALITY = 95  # of kept images: a fifth of the memory; changed by less than a camera's noise
+JPEG_QUALITY = 95  # for kept images: a fifth of the memory, and a change below a camera's noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +31,7 @@ class RGBDFrame:
 
     intrinsics: Intrinsics
     shape: tuple[int, ...]  # (H, W) of the image
-    image: Gray | bytes | None  # grey, (H, W) uint8, or as a JPEG; None = depth alone
+    image: Gray | bytes | None  # grey, (H, W) uint8 or a JPEG; None without an image
     surface: point_to_plane.PlaneImage  # planes of the depth image
 
     @classmethod
@@ -39,7 +39,7 @@ class RGBDFrame:
         """Prepare a frame.
 
         Raises:
-            InvalidKeyframe: when the frame has no depth image.
+            InvalidKeyframe: the frame has no depth image.
         """
         depth = frame.depth_m
         if depth is None or frame.intrinsics is None:
@@ -53,17 +53,17 @@ class RGBDFrame:
 
     @property
     def gray(self) -> Gray | None:
-        """Grey image, (H, W) uint8; None = depth alone."""
+        """Grey image, (H, W) uint8; None without an image."""
         if not isinstance(self.image, bytes):
             return self.image
         return np.asarray(cv2.imdecode(np.frombuffer(self.image, np.uint8), cv2.IMREAD_GRAYSCALE), np.uint8)
 
     def packed(self) -> "RGBDFrame":
-        """The frame with its image as a JPEG, and without what was derived from it."""
+        """Return the frame with its image as a JPEG, without cached results."""
         if self.image is None or isinstance(self.image, bytes):
             return self
         done, jpeg = cv2.imencode(".jpg", self.image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-        return replace(self, image=jpeg.tobytes()) if done else self  # wider than a JPEG may be
+        return replace(self, image=jpeg.tobytes()) if done else self  # a JPEG cannot be so wide
 
     @property
     def columns(self) -> int:
@@ -72,7 +72,7 @@ class RGBDFrame:
 
     @cached_property
     def pattern(self) -> NDArray[np.float32] | None:
-        """Normalised grey of the blocks, (rows·columns,): less mean, over contrast; None = no image."""
+        """Normalised grey of the blocks, (rows·columns,): (grey - mean) / contrast. None without an image."""
         gray = self.gray
         if gray is None:
             return None
@@ -97,7 +97,7 @@ class RGBDFrame:
         return np.empty((0, 2), np.float32), np.empty((0, 32), np.uint8)
 
     def back_project(self, pixels: features.Pixels) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Points where the rays of (n, 2) pixels meet their blocks' planes, (n, 3); (n,) which have one."""
+        """Intersect the rays of (n, 2) pixels with blocks' planes. Return (n, 3) points, (n,) found."""
         K, (rows, columns) = self.intrinsics, self.surface.shape
         column, row = ((pixels + 0.5) / (self.columns // columns)).astype(np.intp).T
         inside = (column >= 0) & (row >= 0) & (column < columns) & (row < rows)
@@ -111,9 +111,9 @@ class RGBDFrame:
 
 @dataclass(frozen=True, eq=False)
 class TrackingKeyframe:
-    """A frame with a pose, which later frames are aligned to."""
+    """Frame with a pose, which later frames are aligned to."""
 
-    number: int  # its number as an anchor
+    number: int  # anchor number
     T_world_camera: se3.Transform  # (4, 4)
     frame: RGBDFrame
     corners: features.Pixels  # (n, 2) pixels
@@ -121,7 +121,7 @@ class TrackingKeyframe:
 
     @classmethod
     def of(cls, frame: RGBDFrame, number: int, T_world_camera: se3.Transform) -> "TrackingKeyframe":
-        """Make a frame a tracking keyframe: find its corners."""
+        """Make a tracking keyframe of a frame: find its corners."""
         kept = replace(frame, surface=frame.surface.without_points())
         if frame.gray is None:
             return cls(number, T_world_camera, kept, np.empty((0, 2), np.float32), np.empty((0, 3)))
@@ -131,13 +131,13 @@ class TrackingKeyframe:
         return cls(number, T_world_camera, kept, corners[ok], points[ok])
 
     def packed(self) -> "TrackingKeyframe":
-        """The keyframe in little memory, to be kept once a newer one is followed."""
+        """Return the keyframe in little memory, for use after a newer keyframe exists."""
         return replace(self, frame=self.frame.packed())
 
     def follow(
         self, frame: RGBDFrame, T_keyframe_camera: se3.Transform
     ) -> tuple[NDArray[np.float64], features.Pixels]:
-        """Follow corners into a frame near `T_keyframe_camera`: (n, 3) points, (n, 2) pixels in the frame."""
+        """Follow corners into a frame near `T_keyframe_camera`. Return (n, 3) points, (n, 2) pixels."""
         old, new = self.frame.gray, frame.gray
         if old is None or new is None or old.shape != new.shape or not len(self.points):
             return np.empty((0, 3)), np.empty((0, 2), np.float32)
@@ -154,7 +154,7 @@ class TrackingKeyframe:
         return self.points[ok][found], moved[found]
 
     def recall(self, frame: RGBDFrame) -> tuple[NDArray[np.float64], features.Pixels]:
-        """Match ORB corners with a frame at any pose: (n, 3) points, (n, 2) pixels in the frame."""
+        """Match ORB corners with a frame at any pose. Return (n, 3) points, (n, 2) pixels in the frame."""
         pixels, here = frame.orb_corners
         mine, there = self.frame.orb_corners
         if len(here) < 2 or len(there) < 2:

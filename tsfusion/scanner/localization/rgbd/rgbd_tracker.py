@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""RGB-D odometry: every frame against the last tracking keyframe, by corners and planes together."""
+"""Track RGB-D frames: align each frame to the last tracking keyframe, by corners and planes together."""
 
 from collections import deque
 from collections.abc import Iterator
@@ -16,20 +16,20 @@ from tsfusion.scanner.localization.rgbd import point_to_plane, pose_solver
 from tsfusion.scanner.localization.rgbd.rgbd_frame import RGBDFrame, TrackingKeyframe
 
 MAX_KEYFRAMES = 40  # tracking keyframes kept, about 0.3 MB each at 640×480
-KEYFRAME_DISTANCE, KEYFRAME_ANGLE = 0.1, np.radians(10)  # metres and radians to the next one
-KEYFRAME_OVERLAP = 0.6  # share of the last one's view, below which the next one begins
+KEYFRAME_DISTANCE, KEYFRAME_ANGLE = 0.1, np.radians(10)  # metres and radians to the next keyframe
+KEYFRAME_OVERLAP = 0.6  # share of the last keyframe's view; with less, the next keyframe starts
 MIN_PLANES = 0.03  # share of the depth image that must show planes
 MIN_INLIERS = 12  # corners
 PIXEL_TOLERANCE = 2.0  # pixels at 640 columns
-NEWEST_COMPARED, COMPARED = 4, 10  # keyframes whose ORB corners a lost frame is compared with: always, in all
-MAX_RECALLED = 4  # the most similar of them, from which the pose is sought
-MAX_EXTRAPOLATION = 3.0  # times the last interval between frames, over which the motion is thought to go on
+NEWEST_COMPARED, COMPARED = 4, 10  # newest keyframes, and all keyframes, that a lost frame is compared with
+MAX_RECALLED = 4  # most similar keyframes, from which the pose is searched
+MAX_EXTRAPOLATION = 3.0  # the motion is continued over at most 3 times the last frame interval
 
-MAX_OLDER = 2  # keyframes that take part beside the last one
+MAX_OLDER = 2  # older keyframes that are used together with the last one
 MAX_OLDER_ANGLE = np.radians(60)
 MIN_OLDER_OVERLAP, MIN_OLDER_AGREEING = 0.5, 0.75  # shares
-COARSE_AGREEMENT = 0.03  # metres, beside three deviations: depth that agrees before the pose is exact
-# Corners lie on something that moves where they raise the misfit by more than this factor and offset.
+COARSE_AGREEMENT = 0.03  # metres, plus three deviations: agreement before the pose is exact
+# Corners that raise the misfit by more than this factor and offset lie on a moving object.
 MISFIT_FACTOR, MISFIT_OFFSET = 1.2, 0.3  # the offset in deviations
 
 _NO_CORNERS = (np.empty((0, 3)), np.empty((0, 2), np.float32))
@@ -43,13 +43,13 @@ class _Attempt:
 
 
 class RGBDLocalizer(Localizer):
-    """`Localizer` of depth cameras, with colour where there is some.
+    """`Localizer` of depth cameras, with colour if there is any.
 
-    Corners are followed from the tracking keyframe (Lucas and Kanade); the pose they give begins a
-    Gauss-Newton over their reprojection and the distances of the frame's points to the planes of that
-    keyframe and of the two oldest that see the same. Frames without an image go by depth alone. A pose is
-    accepted only where depth, image and geometry support it. A lost camera is sought near the last pose,
-    then by ORB corners of the last keyframes.
+    Corners are followed from the last tracking keyframe (Lucas and Kanade) and give a first pose.
+    Gauss-Newton then refines it by the corners' reprojection errors and by the distances of the frame's
+    points to planes. The planes are those of this keyframe and of the two oldest keyframes that see the same
+    surface. Frames without an image use depth alone. A pose is accepted only if depth, image and geometry
+    support it. A lost camera is searched near the last pose, then by ORB corners of the last keyframes.
     """
 
     absolute = False
@@ -60,18 +60,18 @@ class RGBDLocalizer(Localizer):
         self.reset()
 
     def reset(self) -> None:
-        """Forget the world: the next frame's camera is the origin of the new one."""
+        """Forget the world. The next frame's camera is the origin of the new one."""
         self._kept.clear()
         self._last: se3.Transform = np.eye(4)
         self._last_ns = self._interval_ns = 0
-        self._motion: se3.Transform | None = None  # between the last two frames; None = not known
+        self._motion: se3.Transform | None = None  # motion between the last two frames; None = not known
         self._is_lost = False
 
     def track(self, frame: Frame) -> TrackedPose | Lost:
         """Find the camera's pose.
 
         Raises:
-            InvalidKeyframe: when the frame has no depth image.
+            InvalidKeyframe: the frame has no depth image.
         """
         current = RGBDFrame.of(frame)
         if current.surface.covered < MIN_PLANES:
@@ -88,9 +88,9 @@ class RGBDLocalizer(Localizer):
         return self._lost(frame, reason or "nothing known is in view")
 
     def _guesses(self, frame: Frame, current: RGBDFrame) -> Iterator[tuple[TrackingKeyframe, se3.Transform]]:
-        """Keyframes and first guesses of T_keyframe_camera, the likeliest first.
+        """Yield keyframes and first guesses of T_keyframe_camera, the likeliest first.
 
-        After the last pose itself the camera counts as lost.
+        The camera counts as lost when the last pose itself, the second guess, has failed.
         """
         last = self._kept[-1]
         T_keyframe_last = se3.inverse(last.T_world_camera) @ self._last
@@ -109,7 +109,7 @@ class RGBDLocalizer(Localizer):
     def _recalled(
         self, current: RGBDFrame
     ) -> list[tuple[TrackingKeyframe, NDArray[np.float64], features.Pixels]]:
-        """The most similar of the newest keyframes and of some others in turn, with matched corners."""
+        """Return the most similar of the newest and some older keyframes, with matched corners."""
         newest, others = list(self._kept)[-NEWEST_COMPARED:][::-1], list(self._kept)[:-NEWEST_COMPARED]
         self._turn += COMPARED - NEWEST_COMPARED
         turned = others[self._turn % len(others) :] + others if others else []
@@ -118,7 +118,7 @@ class RGBDLocalizer(Localizer):
         return sorted(recalled, key=lambda entry: -len(entry[1]))[:MAX_RECALLED]
 
     def _expected_motion(self, frame: Frame) -> se3.Transform:
-        """The last motion, continued over the time since the last frame."""
+        """Return the last motion, continued over the time since the last frame."""
         assert self._motion is not None
         now_ns = frame.timestamp_ns - self._last_ns
         if now_ns <= 0 or self._interval_ns <= 0:
@@ -151,7 +151,7 @@ class RGBDLocalizer(Localizer):
     def _older(
         self, current: RGBDFrame, T_world_camera: se3.Transform, keyframe: TrackingKeyframe
     ) -> list[TrackingKeyframe]:
-        """The oldest keyframes that see the same surface as the frame, and agree about its pose."""
+        """Return the oldest keyframes that see the frame's surface and agree about the frame's pose."""
         some, chosen = current.surface.every(8), list[TrackingKeyframe]()
         for older in self._kept:
             if len(chosen) == MAX_OLDER or older is keyframe:
@@ -212,7 +212,7 @@ class RGBDLocalizer(Localizer):
 
 
 def _misfit(current: RGBDFrame, keyframe: TrackingKeyframe, T_keyframe_camera: se3.Transform) -> float:
-    """Median distance of the frame's points from the keyframe's planes, in deviations of the sensor."""
+    """Return the median distance of the frame's points from the keyframe's planes, in sensor deviations."""
     found = point_to_plane.match(
         keyframe.frame.surface, current.surface, T_keyframe_camera, current.surface.every(4)
     )

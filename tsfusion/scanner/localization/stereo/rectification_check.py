@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Check of a stereo pair's rectification from its own images, without a calibration target.
+"""Check the rectification of a stereo pair from its own images, without a calibration target.
 
-Rows: a corner of the left image and its match in the right one must lie in the same row. Disparity: an error
-that is the same everywhere bends space, which shows when the camera moves (see `reprojection`). Both errors
-come from a wrong or an old calibration.
+Two errors of a wrong or an old calibration are found. Rows: a corner of the left image and its match in the
+right image must lie in the same row. Disparity: an error that is the same everywhere bends space, which shows
+when the camera moves (see `reprojection`).
 """
 
 import logging
@@ -16,14 +16,14 @@ from tsfusion.scanner.localization.features import Pixels
 
 _log = logging.getLogger(__name__)
 
-ROWS_LIMIT = 0.8  # pixels; KITTI 06 has 0.6
-DISPARITY_LIMIT = 0.4  # pixels; KITTI 06 has 0.1
-SAMPLES = 8  # pairs, and motions, until the verdict
-MIN_MATCHES = 30  # of one pair
+ROWS_LIMIT = 0.8  # pixels; 0.6 in KITTI 06
+DISPARITY_LIMIT = 0.4  # pixels; 0.1 in KITTI 06
+SAMPLES = 8  # pairs until the verdict on rows, and motions until that on disparity
+MIN_MATCHES = 30  # in one pair
 SIGNIFICANT = 3.0  # standard deviations
-MAX_OFFSET_SIGMA = 0.3  # pixels: with more, the sensor did not move enough
+MAX_OFFSET_SIGMA = 0.3  # pixels; a motion with a larger deviation was too small
 FIT_ROUNDS = 3
-MIN_SWAP, MIN_SWAPPED_SHARE = 2.0, 0.7  # pixels to the wrong side, and share of the matches that are there
+MIN_SWAP, MIN_SWAPPED_SHARE = 2.0, 0.7  # pixels to the wrong side, share of such matches
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,13 +32,13 @@ class RectificationCheck:
 
     pairs: int  # number of pairs compared
     matches: int  # number of corners compared
-    rows_px: float  # rows by which the right image's points lie lower than the left's, at the image's centre
-    roll_deg: float  # clockwise turn of the right image against the left one, seen along the view
-    stretch: float  # factor of the right image's height against the left's
+    rows_px: float  # rows at the image's centre by which the right image's points lie lower than the left's
+    roll_deg: float  # clockwise rotation of the right image against the left, seen along the view
+    stretch: float  # right image's height divided by the left's
     worst_rows_px: float  # the largest row error of these three within the image
     # Pixels by which every disparity is too high; None = not known yet (too little motion)
     disparity_px: float | None
-    problems: tuple[str, ...]  # texts for the user, each with what to do; empty = nothing was found
+    problems: tuple[str, ...]  # texts for the user, each with a remedy; empty if no error was found
 
     @property
     def ok(self) -> bool:
@@ -46,10 +46,10 @@ class RectificationCheck:
 
 
 class RectificationMonitor:
-    """Collect errors of pairs and motions, and warn once of each problem."""
+    """Collect the errors of pairs and motions, and warn once of each problem."""
 
     def __init__(self) -> None:
-        self.check: RectificationCheck | None = None  # result so far; None until there were enough pairs
+        self.check: RectificationCheck | None = None  # result so far; None before enough pairs
         self._left: list[Pixels] = []
         self._right: list[Pixels] = []
         self._offsets: list[float] = []
@@ -64,7 +64,7 @@ class RectificationMonitor:
         return len(self._offsets) < SAMPLES
 
     def add_pair(self, left: Pixels, right: Pixels, shape: tuple[int, ...]) -> None:
-        """Add the (n, 2) pixels of the same corners in both images of one pair."""
+        """Add the (n, 2) pixels of the same corners in the left and the right image of one pair."""
         if len(left) < MIN_MATCHES:
             return
         self._left.append(left)
@@ -76,7 +76,7 @@ class RectificationMonitor:
             self._check_disparity()
 
     def add_motion(self, offset: float, sigma: float) -> None:
-        """Add the offset of all disparities that one motion gives, pixels."""
+        """Add the offset of all disparities that was estimated from one motion, pixels."""
         if np.isfinite([offset, sigma]).all() and sigma < MAX_OFFSET_SIGMA:
             self._offsets.append(offset)
             self._sigmas.append(sigma)
@@ -130,7 +130,7 @@ def _disparity_problem(too_high: float) -> str:
 
 
 def _sure_offset(offsets: NDArray[np.float64], sigmas: NDArray[np.float64]) -> float:
-    """Median of the motions' offsets, or 0 where it is not significant."""
+    """Return the median of the motions' offsets, or 0 if it is not significant."""
     middle = float(np.median(offsets))
     spread = 1.4826 * float(np.median(np.abs(offsets - middle)))
     error = max(spread, float(np.median(sigmas))) / np.sqrt(len(offsets))
@@ -138,7 +138,7 @@ def _sure_offset(offsets: NDArray[np.float64], sigmas: NDArray[np.float64]) -> f
 
 
 def _plane(centred: NDArray[np.floating], rows: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Fit (shift, by column, by row) to the row differences by least squares, without mismatches."""
+    """Fit (shift, slope by column, slope by row) to row differences by least squares, without mismatches."""
     A = np.column_stack([np.ones(len(centred)), centred]).astype(np.float64)
     kept = np.abs(rows - np.median(rows)) < 4.0
     solution = np.zeros(3)

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Motion between two stereo views by reprojection, weighted by the uncertainty of the points' depth.
+"""Find the motion between two stereo views by reprojection, weighted by the uncertainty of depth.
 
-A point's error in the second view has two causes: the corner was followed inexactly, and its disparity is
-inexact. The second moves it along a line, farther the nearer the point is. The weight is reduced along that
-line alone (each point's disparity is marginalised), so that noise in depth does not turn the camera.
+A point's error in the second view has two causes. The corner was followed inexactly, and its disparity is
+inexact. An inexact disparity moves the point along a line, farther the nearer the point is. The weight is
+reduced along this line alone (each point's disparity is marginalised), so that noise in depth does not turn
+the camera.
 """
 
 from dataclasses import dataclass
@@ -17,30 +18,30 @@ from tsfusion.scanner.localization.features import Pixels, back_project
 
 Vectors = NDArray[np.float64]
 
-PIXEL_SIGMA = 0.3  # pixels, of a followed corner
+PIXEL_SIGMA = 0.3  # pixels, deviation of a followed corner
 DISPARITY_SIGMA = (
-    0.5  # pixels, of half-resolution matching: median 0.3, ninth decile 1.5 on Middlebury's Motorcycle
+    0.5  # pixels, for half-resolution matching: median 0.3, ninth decile 1.5 on Middlebury's Motorcycle
 )
 HUBER = 2.0  # standard deviations
-MAX_DEVIATION = 4.0  # standard deviations of a point that agrees
+MAX_DEVIATION = 4.0  # standard deviations, for points that agree
 MIN_DEPTH = 0.01  # metres
-MIN_DISPARITY = 0.2  # pixels, with the offset
+MIN_DISPARITY = 0.2  # pixels, after the offset is added
 MAX_ITERATIONS = 10
 
 
 @dataclass(frozen=True)
 class StereoCamera:
-    """Rectified pair of cameras; `baseline_fx` is the focal length times the baseline, px·m."""
+    """Rectified pair of cameras. `baseline_fx` is the focal length times the baseline, px·m."""
 
     intrinsics: Intrinsics
     baseline_fx: float
 
     def lift(self, pixels: Pixels, disparity: NDArray[np.floating]) -> Vectors:
-        """Points of the left camera: (n, 2) pixels with (n,) pixels of disparity > 0 → (n, 3) metres."""
+        """Return points of the left camera: (n, 2) pixels, (n,) pixels of disparity > 0 → (n, 3) metres."""
         return back_project(pixels, self.baseline_fx / disparity, self.intrinsics)
 
     def project(self, points: Vectors) -> Pixels:
-        """Pixels of points of the left camera: (n, 3) metres → (n, 2); points behind it land far outside."""
+        """Return the left camera's pixels: (n, 3) metres → (n, 2). Points behind it land far outside."""
         K, z = self.intrinsics, np.maximum(points[:, 2], MIN_DEPTH)
         return np.stack([K.fx * points[:, 0] / z + K.cx, K.fy * points[:, 1] / z + K.cy], 1).astype(
             np.float32
@@ -52,8 +53,8 @@ class StereoMotion:
     """Motion found by `refine`."""
 
     T_old_new: se3.Transform  # (4, 4) pose of the second camera in the axes of the first
-    agree: NDArray[np.bool_]  # (n,) bool, points whose errors their uncertainties explain
-    offset: float  # pixels to add to every disparity; 0 unless it was estimated
+    agree: NDArray[np.bool_]  # (n,) bool, points with an error that their uncertainty explains
+    offset: float  # pixels to add to every disparity; 0 if not estimated
     offset_sigma: float  # pixels, standard deviation of the offset
 
 
@@ -66,13 +67,14 @@ def refine(
     *,
     with_offset: bool = False,
 ) -> StereoMotion | None:
-    """Refine a motion by Gauss-Newton; None when the points do not determine it.
+    """Refine a motion by Gauss-Newton. Return None if the points do not determine it.
 
     Args:
         old, new: (n, 2) pixels in the first and the second image.
-        disparity: (n,) pixels in the first, > 0.
-        with_offset: whether to estimate an offset of all disparities too. It differs from a motion because it
-            bends space: far points pass by too slowly for their disparity, near ones as they should.
+        disparity: (n,) pixels in the first image, > 0.
+        with_offset: True also estimates one offset for all disparities. The offset differs from a motion
+            because it bends space: far points pass too slowly for their disparity, near points as fast as
+            expected.
     """
     size = 7 if with_offset else 6
     T_new_old, offset = se3.inverse(T_old_new), 0.0
@@ -105,7 +107,7 @@ def refine(
 def _normal_equations(
     J: Vectors, along: Vectors, residual: Vectors, weight: Vectors, taken: Vectors
 ) -> tuple[Vectors, Vectors]:
-    """Sums of weight·JᵀJ and weight·Jᵀr, reduced by the weights `taken` along each point's line."""
+    """Return sums of weight·JᵀJ and weight·Jᵀr, reduced by the weights `taken` along each point's line."""
     weighted = (J * weight).reshape(len(J), -1)
     J_along = along[0] * J[:, 0] + along[1] * J[:, 1]
     taken_along = J_along * taken
@@ -116,7 +118,7 @@ def _normal_equations(
 def _linearised(
     T_new_old: se3.Transform, old: Pixels, disparity: NDArray[np.floating], new: Pixels, rig: StereoCamera
 ) -> tuple[Vectors, Vectors]:
-    """Residuals (2, n), pixels, and their Jacobian (7, 2, n) by a twist in the new axes and by disparity."""
+    """Return residuals (2, n), pixels; and their Jacobian (7, 2, n) by a twist in new axes and disparity."""
     K, X = rig.intrinsics, rig.lift(old, disparity).T
     x, y, z = T_new_old[:3, :3] @ X + T_new_old[:3, 3:]
     behind = z < MIN_DEPTH

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Stereo odometry from frame to frame: corners, their disparity, and the motion they agree on."""
+"""Track stereo pairs from frame to frame: find corners, their disparity, and the motion that fits them."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,24 +17,24 @@ from tsfusion.scanner.localization.stereo.rectification_check import Rectificati
 from tsfusion.scanner.localization.stereo.reprojection import StereoCamera, refine
 
 MAX_CORNERS = 1000
-MIN_POINTS = 25  # that must agree
-MIN_SHARE, MIN_SHARE_SUDDEN = 0.25, 0.4  # of the followed points that must agree; in a sudden motion
-MIN_POINTS_EXPECTED = 15  # that must agree on the motion that was expected, after a gap
-PIXEL_TOLERANCE = 1.0  # KITTI 06 drifts by 0.82 % with it, by 0.90 % with 1.5
-MAX_OFFSET_ERROR = 3.0  # pixels: points with larger errors are left out of the search for offsets
-MIN_MOTION = 1.0  # pixels of median motion below which the old frame stays the reference
+MIN_POINTS = 25  # points that must agree
+MIN_SHARE, MIN_SHARE_SUDDEN = 0.25, 0.4  # of the followed points must agree; in a sudden motion
+MIN_POINTS_EXPECTED = 15  # points that must agree with the expected motion, after a gap
+PIXEL_TOLERANCE = 1.0  # drift on KITTI 06: 0.82 %; with a tolerance of 1.5: 0.90 %
+MAX_OFFSET_ERROR = 3.0  # pixels: points with larger errors are not used to estimate offsets
+MIN_MOTION = 1.0  # pixels: with less median motion, the old frame stays the reference
 MIN_DISPARITY = 1.0  # pixels
-SUDDEN_DISTANCE = 0.1  # of the points' median depth by which a motion may differ from the last one
+SUDDEN_DISTANCE = 0.1  # of the points' median depth; a motion that differs more from the last is sudden
 SUDDEN_ANGLE = np.radians(10)
-BELIEVED_S = 1.5  # seconds that the last velocity is believed when frames were missed
+BELIEVED_S = 1.5  # seconds for which the last velocity is used when frames are missing
 KEYFRAME_DISTANCE = 0.15  # of the points' median depth to the next tracking keyframe
 HINT = " (is the view blank, the pair rectified, and left the left camera's?)"
-DEPTH_CAMERA_BASELINE_FX = 43.0  # px·m, of depth cameras without a known one (Kinect: 0.075 m × 575 px)
+DEPTH_CAMERA_BASELINE_FX = 43.0  # px·m, for depth cameras with unknown baseline (Kinect: 0.075 m × 575 px)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Reference:
-    """Corners with disparity of the frame that the next ones are compared with."""
+    """Frame that the next frames are compared with: its corners with disparity."""
 
     gray: NDArray[np.uint8]
     pixels: features.Pixels  # (n, 2) corners with depth
@@ -46,7 +46,7 @@ class _Reference:
 
     @cached_property
     def points(self) -> NDArray[np.float64]:
-        """Points of the corners, (n, 3) metres in the camera's axes."""
+        """3D points of the corners, (n, 3) metres in the camera's axes."""
         return self.rig.lift(self.pixels, self.disparity)
 
     @property
@@ -56,7 +56,7 @@ class _Reference:
 
 @dataclass(frozen=True, eq=False)
 class _StereoView:
-    """One frame as the tracker sees it; its corners are found when they are asked for."""
+    """Grey image and camera of one frame. Its corners and disparity are computed on first use."""
 
     frame: Frame
     gray: NDArray[np.uint8]
@@ -64,7 +64,7 @@ class _StereoView:
 
     @classmethod
     def of(cls, frame: Frame) -> "_StereoView":
-        """Make the view of a frame. Raises InvalidKeyframe without an image or without depth."""
+        """Make the view of a frame. Raise InvalidKeyframe for a frame without an image or depth."""
         gray = frame.gray
         if gray is None or (frame.depth_m is None and frame.right is None):
             raise InvalidKeyframe(
@@ -76,7 +76,7 @@ class _StereoView:
 
     @cached_property
     def disparity(self) -> NDArray[np.float32]:
-        """(H, W) pixels of disparity; 0 = none."""
+        """(H, W) pixels of disparity; 0 = no disparity."""
         quick, depth = self.frame.tracking_disparity, self.frame.depth_m
         if quick is not None:
             return quick
@@ -90,7 +90,7 @@ class _StereoView:
         return pixels, features.bilinear(self.disparity, pixels)
 
     def reference(self, T_world_camera: se3.Transform) -> _Reference:
-        """The corners with disparity, at the frame's pose."""
+        """Return the corners with disparity, with the frame's pose."""
         pixels, disparity = self.corners
         deep = disparity > MIN_DISPARITY
         return _Reference(
@@ -105,9 +105,9 @@ class _StereoView:
 
 
 class StereoLocalizer(Localizer):
-    """`Localizer` of rectified stereo pairs; also of disparity or depth images with an image beside them.
+    """`Localizer` of rectified stereo pairs, and of disparity or depth images with a grey or colour image.
 
-    A frame is compared with the last one that had a pose and had moved: a few bad or missing frames are
+    A frame is compared with the last frame that had a pose and had moved. So a few bad or missing frames are
     bridged, and a camera that stands still does not drift. (Keyframes several metres apart were worse in
     turns.)
     """
@@ -118,18 +118,18 @@ class StereoLocalizer(Localizer):
         self._anchors = TrackingKeyframes()
         self._rectification = RectificationMonitor()
         self._reference: _Reference | None = None
-        self._velocity: NDArray[np.float64] | None = None  # twist a second; a frame without timestamps
-        # The last frame, with its pose where it may be the next reference, until `prepare`.
+        self._velocity: NDArray[np.float64] | None = None  # twist per second; per frame without timestamps
+        # The last frame until `prepare`; with its pose if it may become the reference.
         self._newest: tuple[_StereoView, se3.Transform | None] | None = None
 
     @property
     def rectification(self) -> RectificationCheck | None:
-        """Check of the rectification by the pairs so far; None until there were eight."""
+        """Check of the rectification by the pairs so far; None before eight pairs."""
         self.prepare()
         return self._rectification.check
 
     def track(self, frame: Frame) -> TrackedPose | Lost:
-        """Find the left camera's pose in the axes of the first one."""
+        """Find the left camera's pose in the axes of the first frame's left camera."""
         self.prepare()
         view = _StereoView.of(frame)
         if self._reference is None:
@@ -144,7 +144,7 @@ class StereoLocalizer(Localizer):
         return self._anchors.pose(T, frame.timestamp_ns, quality=quality)
 
     def prepare(self) -> None:
-        """Find the corners of the last frame and their disparity, with which the next one is compared."""
+        """Find the corners of the last frame and their disparity. The next frame is compared with them."""
         newest, self._newest = self._newest, None
         if newest is None:
             return
@@ -159,12 +159,11 @@ class StereoLocalizer(Localizer):
             self._anchors.distance = KEYFRAME_DISTANCE * reference.median_depth
 
     def reset(self) -> None:
-        """Begin a new world at the next frame."""
         self._reference = self._velocity = self._newest = None
         self._anchors.reset()
 
     def _start(self, view: _StereoView) -> TrackedPose | Lost:
-        """Make a frame the first of a world, if it has enough corners with depth."""
+        """Make a frame the first of a world if it has enough corners with depth; otherwise return Lost."""
         self._newest = view, np.eye(4)
         self.prepare()
         if self._reference is None:
@@ -176,7 +175,7 @@ class StereoLocalizer(Localizer):
     def _compare(
         self, reference: _Reference, gray: NDArray[np.uint8], timestamp_ns: int
     ) -> tuple[se3.Transform, float, float] | str:
-        """T_reference_camera, share of points that agree, their median motion in pixels; or why not."""
+        """Return T_reference_camera, share of agreeing points, their median motion in pixels; or why not."""
         if gray.shape != reference.gray.shape:
             return f"the image is {gray.shape[1]}×{gray.shape[0]}, unlike those before"
         elapsed = _elapsed(reference.timestamp_ns, timestamp_ns)
@@ -185,7 +184,7 @@ class StereoLocalizer(Localizer):
         expected = None if self._velocity is None else se3.exp(self._velocity * elapsed)
         matches = _follow(reference, gray, expected, thorough=self._rectification.wants_motion)
         found = self._motion(reference, *matches, expected)
-        if isinstance(found, str) and expected is not None:  # frames were missed, and all looks larger now
+        if isinstance(found, str) and expected is not None:  # after missing frames, all looks larger
             matches = _follow_warped(reference, gray, expected)
             again = self._motion(reference, *matches, expected, only_expected=True)
             found = found if isinstance(again, str) else again
@@ -203,9 +202,9 @@ class StereoLocalizer(Localizer):
         *,
         only_expected: bool = False,
     ) -> tuple[se3.Transform, float, float] | str:
-        """The motion that corners agree on, as `_compare`: (n, 2) where they are, (n,) which are known.
+        """Find the motion from the corners' (n, 2) `pixels` where `followed` is True. Return as `_compare`.
 
-        `only_expected`: fewer are enough, but for the expected motion alone.
+        With `only_expected` fewer points are enough, but no motion other than the expected one is accepted.
         """
         least = MIN_POINTS_EXPECTED if only_expected else MIN_POINTS
         old, disparity, new = reference.pixels[followed], reference.disparity[followed], pixels[followed]
@@ -232,7 +231,7 @@ class StereoLocalizer(Localizer):
         return motion.T_old_new, share, float(np.median(np.abs(new - old)[agree].max(axis=1)))
 
     def _check_rows(self, view: _StereoView, right: NDArray[np.uint8]) -> None:
-        """Add a pair to the check, also corners without disparity: bad rectification may be the reason."""
+        """Add a pair to the check, also corners without disparity: bad rectification may be the cause."""
         pixels, disparity = view.corners
         matched = disparity > 0
         guess = pixels.copy()
@@ -254,14 +253,14 @@ class StereoLocalizer(Localizer):
 
 
 def _elapsed(before_ns: int, now_ns: int) -> float:
-    """Seconds between two timestamps; 1 where one is unknown or they do not grow."""
+    """Return the seconds between two timestamps, or 1 if one is unknown or they do not grow."""
     return (now_ns - before_ns) / 1e9 if 0 < before_ns < now_ns else 1.0
 
 
 def _follow(
     reference: _Reference, gray: NDArray[np.uint8], expected: se3.Transform | None, *, thorough: bool
 ) -> tuple[features.Pixels, NDArray[np.bool_]]:
-    """Follow the reference's corners into the new image, first from where they are expected."""
+    """Follow the reference's corners into the new image, first from their expected positions."""
     if expected is not None:
         guess = reference.rig.project(se3.apply(se3.inverse(expected), reference.points))
         pixels, found = features.follow(
@@ -275,16 +274,16 @@ def _follow(
 def _follow_warped(
     reference: _Reference, gray: NDArray[np.uint8], expected: se3.Transform
 ) -> tuple[features.Pixels, NDArray[np.bool_]]:
-    """Follow the reference's corners into the new image as the reference's camera would see it.
+    """Follow the reference's corners into the new image, after warping it to the reference's camera.
 
-    After a gap all that is near has grown; seen from the same place it has its old size, but for what the
-    expected motion is wrong by.
+    After a gap, near objects look larger. In the warped image they have their old size, except for the error
+    of the expected motion.
     """
     rig, T = reference.rig, se3.inverse(expected)
     K, (height, width) = rig.intrinsics, gray.shape
     u, v = np.arange(width), np.arange(height)[:, None]
     x, y = ((u - K.cx) / K.fx).astype(np.float32), ((v - K.cy) / K.fy).astype(np.float32)
-    inverse_depth = reference.dense * np.float32(1 / rig.baseline_fx)  # 0: as far as can be
+    inverse_depth = reference.dense * np.float32(1 / rig.baseline_fx)  # 0 = infinitely far
     R, t = T[:3, :3].astype(np.float32), T[:3, 3].astype(np.float32)
     X, Y, Z = (R[k, 0] * x + R[k, 1] * y + R[k, 2] + t[k] * inverse_depth for k in range(3))
     ahead = np.maximum(Z, 1e-3)
