@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""The map: integer sums in blocks of 8³ voxels, regularised surface values, meshes, checkpoints.
+"""The map: integer sums in blocks of 8³ voxels, with the surfaces, meshes and files made from them.
 
 Rooms:
-    device: the map on a GPU, in a process of its own.
-    files: saved maps, read, written and added.
-    texture: images laid over a mesh.
-    answers: samples, views, slices and distances of a map.
-    sums: maps added, cropped and compared.
-    surface: the regularised field, and meshes of it.
-    integration: rays of a keyframe, and their votes.
-    store: blocks in memory or in a file, and what is counted of each.
+    device: keeps a map's blocks on a GPU, in a separate process.
+    files: reads, writes and adds saved maps.
+    texture: projects camera images onto a mesh.
+    answers: computes samples, views, slices and distances of a map.
+    sums: adds, crops and compares maps.
+    surface: smooths the surface (the field) and meshes the result.
+    integration: turns a keyframe into rays, and adds their votes to the map.
+    store: keeps blocks in memory or in a file, with counts for each block.
 """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Questions to a map: distances at points, views, free space, distance fields, points and voxels."""
+"""Answer questions about a map: distances at points, views, free space, distance fields, points, voxels."""
 
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
@@ -34,12 +34,12 @@ if TYPE_CHECKING:
 
     from tsfusion.geometry.map_grids import OwnSliceSettings
 
-MOST_SURFACES = 2  # that answers are kept of
-MOST_NEW_CUBES = 2  # of a surface that is not kept, in an answer about cells
+MOST_SURFACES = 2  # surfaces whose values are kept for later answers
+MOST_NEW_CUBES = 2  # new cubes that one answer about cells may solve, if the surface is not kept
 
 
 class AskableMap(ReadableMap):
-    """Map that answers questions, and keeps solved values and meshes for the next question."""
+    """Map that answers questions, and keeps solved values and meshes for later questions."""
 
     def __init__(self, config: VolumeConfig, store: BlockStore) -> None:
         super().__init__(config, store)
@@ -48,9 +48,10 @@ class AskableMap(ReadableMap):
     def sample(
         self, points: ArrayLike, *, min_weight: float | None = None, surface: Surface | None = None
     ) -> Samples:
-        """Signed distance, its weight and its gradient at points, interpolated between voxel centres.
+        """Sample the signed distance, its weight and its gradient at points, interpolated between voxel
+        centres.
 
-        NaN beyond the band around surfaces (`reach`) does not mean free: planners ask `distance_field`.
+        NaN beyond `reach` does not mean free: planners ask `distance_field`.
 
         Args:
             points: (n, 3) float32 or float64 metres.
@@ -63,20 +64,20 @@ class AskableMap(ReadableMap):
 
     @property
     def reach(self) -> float:
-        """Distance before a surface up to which `sample` knows values, metres: least half-width of a band."""
+        """Distance before a surface up to which `sample` has values, metres: least half-width of a band."""
         return self.model.min_support * self.config.voxel_size
 
     def signed_distance(
         self, points: NDArray[np.floating], min_weight: float | None = None
     ) -> NDArray[np.float32]:
-        """Signed distances in the map at points, without interpolation: positive in the free space it saw.
+        """Return the signed distances at points, without interpolation: positive in free space.
 
         Args:
-            points: (n, 3) metres; each takes the value of the voxel that it lies in.
+            points: (n, 3) metres; each point takes the value of the voxel that contains it.
             min_weight: as for `extract_mesh`.
 
         Returns:
-            (n,) metres; NaN where the map saw nothing, which is everywhere but a band around its surfaces.
+            (n,) metres; NaN in unseen voxels, which are all voxels outside a band around surfaces.
         """
         centres = np.floor(checked_points(points) / self.config.voxel_size) + 0.5
         return self.sample(centres * self.config.voxel_size, min_weight=min_weight, surface="raw").distance
@@ -92,23 +93,23 @@ class AskableMap(ReadableMap):
         normals: bool = True,
         colors: bool = True,
     ) -> View:
-        """View of the surface by a pinhole camera: depth, normals, and colours if the map has them.
+        """Render the surface as a pinhole camera sees it: depth, normals, and colours if the map has them.
 
-        A surface is seen from its front alone, where the sensors were.
+        Only the front of a surface is visible: the side that the sensors saw.
 
         Args:
             intrinsics: `Intrinsics`, a (3, 3) camera matrix, or fx, fy, cx, cy; pixels.
             T_world_camera: (4, 4) pose, camera axes x right, y down, z forward.
             shape: (height, width), pixels.
             min_weight, surface: as for `extract_mesh`.
-            normals, colors: images beside depth; depth alone is quicker.
+            normals, colors: images to render in addition to depth; depth alone is faster.
         """
         camera = checked_camera(intrinsics, T_world_camera, shape)
         tiles = self._tiles_of(surface, self._checked_min_weight(min_weight))
         return camera_views.cast(tiles, *camera, normals=normals, colors=colors)
 
     def settled_stamp(self, min_weight: float | None = None, surface: Surface | None = None) -> int | None:
-        """`stamp` of the last state that `raycast` or `settle` meshed as a whole; None = no longer kept."""
+        """Return the `stamp` of the last state that was meshed completely, or None if it is not kept."""
         return self._tiles_of(surface, self._checked_min_weight(min_weight)).settled
 
     def raycast_settled(
@@ -122,15 +123,14 @@ class AskableMap(ReadableMap):
         normals: bool = True,
         colors: bool = True,
     ) -> View | None:
-        """As `raycast`, of the state of `settled_stamp`. Returns None where some of it is no longer kept."""
+        """Return the view of `raycast` in the state of `settled_stamp`, or None if that is no longer kept."""
         camera = checked_camera(intrinsics, T_world_camera, shape)
         least = self._checked_min_weight(min_weight)
         tiles = self._tiles_of(surface, least)
         return camera_views.cast_settled(tiles, *camera, normals=normals, colors=colors)
 
     def settle(self, most: int, *, min_weight: float | None = None, surface: Surface | None = None) -> bool:
-        """Mesh again the changed part of the last `raycast`, at most `most` cubes, as of `min_weight` and
-        `surface`.
+        """Mesh changes since the last `raycast` with this `min_weight` and `surface`, at most `most` cubes.
 
         Returns True if `raycast_settled` now shows the current map.
         """
@@ -138,7 +138,7 @@ class AskableMap(ReadableMap):
         return tiles.settled is not None and tiles.settle_some(most)
 
     def point_cloud(self, *, min_weight: float | None = None, surface: Surface | None = None) -> PointCloud:
-        """Points of the surface, the vertices of its mesh: at most three a voxel.
+        """Return the points of the surface, the vertices of its mesh: at most three per voxel.
 
         Args:
             min_weight, surface: as for `extract_mesh`.
@@ -148,15 +148,15 @@ class AskableMap(ReadableMap):
         return PointCloud(mesh.vertices, mesh.normals, weights, mesh.colors)
 
     def blocks(self) -> Blocks:
-        """Blocks of voxels as NumPy arrays: the stored sums without copying, decoded values on request."""
+        """Return blocks of voxels as NumPy arrays: stored sums without a copy, decoded values on request."""
         return Blocks(self._store)
 
     def to_open3d(self) -> Any:
-        """Make an `open3d.t.geometry.VoxelBlockGrid` of the map as it was fused.
+        """Make an `open3d.t.geometry.VoxelBlockGrid` of the fused values, without smoothing.
 
-        Open3D takes a voxel's value for that of its lowest corner: `translate` its meshes and points by half
-        a voxel along x, y and z. A distance of 8 voxels is 1 there (`trunc_voxel_multiplier=8`, the default).
-        `extract_mesh().to_open3d()` and `point_cloud().to_open3d()` need no such care.
+        Open3D puts a voxel's value at its lowest corner: `translate` its meshes and points by half a voxel
+        along x, y and z. Our own `to_open3d()` of meshes and point clouds needs no shift. A distance of 8
+        voxels becomes 1 in Open3D (`trunc_voxel_multiplier=8`, its default).
 
         Raises:
             MissingDependency: without Open3D.
@@ -172,20 +172,21 @@ class AskableMap(ReadableMap):
         min_weight: float | None = None,
         unseen_is_free: bool = False,
     ) -> DistanceField:
-        """Euclidean distance to the nearest surface, for every voxel in a box.
+        """Return the Euclidean distance to the nearest surface, for every voxel in a box.
 
-        Surfaces around the box count, too: a voxel has the same distance in any box.
+        Surfaces outside the box count too: a voxel has the same distance in any box.
 
         Args:
             box: x0, y0, z0, x1, y1, z1 in metres, one voxel thick for a plane; None = around the whole map.
-            max_distance: metres; farther voxels have this distance.
-            subvoxel: distances to the surface within its voxel; else between voxel centres, as SciPy's
+            max_distance: metres; farther voxels get this distance.
+            subvoxel: measure to the surface within its voxel; False = between voxel centres, as SciPy's
                 `distance_transform_edt`.
             min_weight: as for `extract_mesh`.
-            unseen_is_free: an unseen voxel has the distance to the nearest seen surface; else 0.
+            unseen_is_free: give an unseen voxel the distance to the nearest seen surface; False = 0.
 
         Raises:
-            InvalidConfig: for another box, or one of too many voxels; MapError: no box, and an empty map.
+            InvalidConfig: for an invalid box, or a box of too many voxels.
+            MapError: for an empty map without a box.
         """
         weight = self._checked_min_weight(min_weight)
         found = distance_fields.in_box(self._store, box, max_distance, weight, subvoxel=subvoxel)
@@ -195,10 +196,10 @@ class AskableMap(ReadableMap):
     def distance_blocks(
         self, *, max_distance: float = 0.5, min_weight: float | None = None
     ) -> Iterator[FieldBlocks]:
-        """Distance field of the whole map: blocks of 8³ voxels nearer than `max_distance` to a surface.
+        """Yield the distance field of the whole map: blocks of 8³ voxels nearer than `max_distance` to
+        surfaces.
 
-        Memory holds one tile of 16³ blocks and its surroundings, for a map of any size. The values equal
-        those of `distance_field`.
+        Memory holds one tile of 16³ blocks and its surroundings. The values equal those of `distance_field`.
 
         Args:
             max_distance: metres.
@@ -223,23 +224,24 @@ class AskableMap(ReadableMap):
         above_floor: bool = False,
         most_cells: int = map_slices.MOST_CELLS,
     ) -> CurrentSlice:
-        """Occupancy and horizontal distances between two heights, which can follow the map.
+        """Return occupancy and horizontal distances between two heights, as an object that can follow the
+        map.
 
         Args:
             low, high: metres along `up` from the map's origin.
-            box: u0, v0, u1, v1 in metres along the slice's own axes (`SliceGrid`; they are x and y where z is
-                up); None = around the whole map.
-            up: away from the ground, such as `"z"`, `"-y"` or `"0,-0.9,0.1"`; None = it is found, for which
-                the map is meshed.
-            resolution: metres, edge of a cell; None = the voxel size. A cell holds the least of its voxels.
+            box: u0, v0, u1, v1 in metres along the slice's own axes (`SliceGrid`; x and y if z is up);
+                None = around the whole map.
+            up: direction away from the ground, such as `"z"`, `"-y"` or `"0,-0.9,0.1"`; None = find the
+                direction, which meshes the map.
+            resolution: edge of a cell, metres; None = the voxel size. A cell takes the minimum of its voxels.
             max_distance, min_weight: as for `distance_field`.
-            above_floor: count `low` and `high` from the floor, which is found (`up_direction.floor_height`);
-                `grid.floor` of the slice says where it lies.
-            most_cells: with those around the box from which distances come; for more there is an error.
+            above_floor: count `low` and `high` from the floor, which `up_direction.floor_height` finds;
+                `grid.floor` of the slice is its height.
+            most_cells: limit, including the cells around the box that distances depend on.
 
         Raises:
-            InvalidConfig: for another box, or too many cells; MapError: for an empty map and no box, or when
-                nobody can tell which way is up, or where the floor is.
+            InvalidConfig: for an invalid box, or too many cells.
+            MapError: for an empty map without a box, or if the up direction or the floor cannot be found.
         """
         direction, floor = self._level(up, above_floor=above_floor)
         return CurrentSlice(
@@ -263,44 +265,45 @@ class AskableMap(ReadableMap):
     def occupancy_slice(
         self, low: float, high: float, *, need_free: bool = False, **options: "Unpack[OwnSliceSettings]"
     ) -> OccupancySlice:
-        """A costmap: free, occupied or unseen between two heights; `save` writes it for ROS's map_server.
+        """Return a costmap: free, occupied or unseen between two heights; its `save` writes ROS map_server
+        files.
 
-        A cell is occupied where a surface, or what lies behind one, was seen between the heights; free where
-        half of its samples or more were seen, and no surface. Made without `space_carving`, a map knows free
-        space in a band before surfaces, and blocks of 8³ voxels that a keyframe looks through as a whole.
+        A cell is occupied if a surface, or the space behind one, was seen. It is free if at least half of its
+        samples were seen, and no surface. A map without `space_carving` knows free space in a band before
+        surfaces, and in blocks of 8³ voxels that a keyframe looks through completely.
 
         Args:
             low, high, options: as for `distance_slice`.
-            need_free: refuse a map that knows free space near surfaces alone: one of an earlier version,
-                made without `space_carving`.
+            need_free: refuse a map of an earlier version without `space_carving`, which knows free space only
+                near surfaces.
 
         Raises:
-            InvalidConfig, MapError: as `distance_slice`; MapError also for such a map.
+            InvalidConfig, MapError: as `distance_slice`; MapError also for a map that `need_free` refuses.
         """
         if need_free and not self.knows_free_space:
             raise MapError(
                 "no keyframe of the map looks through a whole block, so it knows free space near surfaces "
                 "alone: fuse it anew with space_carving=True (--space-carving)"
             )
-        options.setdefault("max_distance", self.config.voxel_size)  # nobody asks for distances
+        options.setdefault("max_distance", self.config.voxel_size)  # distances are not needed
         return self.current_slice(low, high, **options).occupancy()
 
     def distance_slice(
         self, low: float, high: float, *, unseen_is_free: bool = False, **options: "Unpack[OwnSliceSettings]"
     ) -> DistanceSlice:
-        """Horizontal distance of each cell to what stands between two heights.
+        """Return the horizontal distance from each cell to the nearest surface between two heights.
 
         Args:
-            low, high: metres along up from the map's origin.
-            unseen_is_free: where nothing was seen the distance is that to what was; else 0.
-            options: `box`: u0, v0, u1, v1 in metres along the slice's own axes (x and y where z is up; None =
-                around the whole map); `up`: away from the ground, such as "z" or "-y" (None = it is found);
-                `resolution`: metres, edge of a cell (None = the voxel size); `max_distance`: metres (2);
+            low, high: metres along the up direction from the map's origin.
+            unseen_is_free: give an unseen cell the distance to the nearest seen surface; False = 0.
+            options: `box`: u0, v0, u1, v1 in metres along the slice's own axes (x and y if z is up; None =
+                around the whole map); `up`: direction away from the ground, such as "z" or "-y" (None = find
+                it); `resolution`: edge of a cell, metres (None = the voxel size); `max_distance`: metres (2);
                 `min_weight`: as for `extract_mesh`; `above_floor`: count the heights from the floor.
 
         Raises:
-            InvalidConfig: for another box, or too many cells.
-            MapError: for an empty map without a box, or where up or the floor cannot be found.
+            InvalidConfig: for an invalid box, or too many cells.
+            MapError: for an empty map without a box, or if the up direction or the floor cannot be found.
         """
         return self.current_slice(low, high, **options).distances(unseen_is_free=unseen_is_free)
 
@@ -311,7 +314,7 @@ class AskableMap(ReadableMap):
         *,
         values: SurfaceView | None = None,
     ) -> CellMeshes:
-        """Mesh of `extract_mesh(blocks=cells)`, and the faces of each cell.
+        """Return the mesh of `extract_mesh(blocks=cells)`, and the faces of each cell.
 
         Args:
             cells: (n, 3) int32 block coordinates; a block that the map does not have adds no faces.
@@ -336,16 +339,16 @@ class AskableMap(ReadableMap):
         surface: Surface | None = None,
         most: int = 256,
     ) -> tuple[CellMeshes, NDArray[np.int32] | None]:
-        """Some of the map's cells in key order, and the first of the remaining ones; None = no more.
+        """Return some of the map's cells in key order, and the first remaining cell, or None at the end.
 
-        Their meshes depend on the map alone, for every surface; `extract_mesh` of some blocks may differ by a
+        Their meshes depend only on the map, for every surface. `extract_mesh` of some blocks can differ by a
         hundredth of a voxel.
 
         Args:
             first: block coordinates of the first cell; None = the map's first cell.
-            since: only cells that changes after this `stamp` reach. Cells of blocks removed since are
-                missing: `drops` tells that there are some.
-            most: cells in one answer.
+            since: return only cells that changes after this `stamp` affect. Cells of blocks removed after it
+                are missing; `drops` shows that blocks were removed.
+            most: maximum number of cells in one answer.
         """
         store, surface = self._store, surface or self.model.surface
         start = 0 if first is None else int(pack_keys(np.array([first], np.int32))[0])
@@ -369,23 +372,23 @@ class AskableMap(ReadableMap):
         return found, None if rest is None else unpack_keys(np.array([rest]))[0]
 
     def cell_stamps(self, cells: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """Stamps of the last changes to (n, 3) cells as fused, and to their own blocks: (n,) each."""
+        """Return the stamps of the last changes to (n, 3) fused cells, and to their own blocks: (n,) each."""
         return mesh_extraction.stamps_of(self._store, pack_keys(cells))
 
     @property
     def stamp(self) -> int:
-        """Number of the last keyframe that was added or taken away; a map that is opened begins at 0."""
+        """Number of the last added or retracted keyframe; 0 when a map is opened."""
         return self._store.stamp
 
     @property
     def drops(self) -> int:
-        """Number of times that blocks were removed; cells that read them have changed without a new stamp."""
+        """Number of removals of blocks. A removal changes neighbouring cells without a new stamp."""
         return self._store.drops
 
     def _level(
         self, given: Up | str | None, *, above_floor: bool
     ) -> tuple[tuple[float, float, float], float | None]:
-        """Up as given, or found; with `above_floor` also the floor's height."""
+        """Return the given or the found up direction; with `above_floor` also the floor's height."""
         if isinstance(given, str):
             given = up_direction.parse(given)
         if given is not None and not above_floor:
@@ -409,13 +412,13 @@ class AskableMap(ReadableMap):
         return self._mesh_buffers.nbytes + sum(kept.nbytes for kept in self._tiles.values())
 
     def _tiles_of(self, surface: Surface | None, min_weight: float) -> SurfaceTiles:
-        """Kept values of a surface, without those that have changed since the last question."""
+        """Return the kept values of a surface, without those that have changed since the last question."""
         view, which = self._view(surface), (surface or self.model.surface, min_weight)
         try:
             changed = np.sort(self._store.keys[self._store.take_dirty(ASKED)])
             for kept in self._tiles.values():
                 kept.forget(changed)
-        except BaseException:  # Ctrl-C, too: nobody may be answered from before a change
+        except BaseException:  # also Ctrl-C: no answer may use values from before a change
             self._tiles.clear()
             raise
         if which not in self._tiles:

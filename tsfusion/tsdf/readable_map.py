@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Readings of a map that never change it: surfaces, hashes, files of voxels."""
+"""Read a map without changing it: surfaces, hashes, files of voxels."""
 
 import hashlib
 import math
@@ -39,24 +39,24 @@ from tsfusion.tsdf.surface.mesh_tiles import WholeMapValues, tiles
 from tsfusion.tsdf.surface.surface_tiles import KeptValues
 from tsfusion.tsdf.texture.texture_fitting import PosedImages
 
-_MOST_SHOWN = 50_000  # blocks of a map that has a picture: it is meshed for that
+_MOST_SHOWN = 50_000  # blocks; a larger map has no picture, because a picture needs a mesh
 
 
 def begin_hash(voxel_size: float) -> "hashlib.blake2b":
-    """Digest for the keys and then the sums of a map's used blocks, 1024 at a time."""
+    """Return a digest for the keys and then the sums of a map's used blocks, 1024 blocks per step."""
     digest = hashlib.blake2b(digest_size=16)
     digest.update(struct.pack("<di", voxel_size, integrate.QUANTA_PER_VOXEL))
     return digest
 
 
 class ReadableMap(object_cards.Shown):
-    """`Volume` without the methods that change it.
+    """Map with the methods of `Volume` that do not change it.
 
     Attributes:
         config, model: settings of the map, and of its sensor.
-        keyframes: number of those in it with a usable sample.
-        held: their sensors.
-        meta: anything JSON-like that is saved with it.
+        keyframes: number of fused keyframes with a usable sample.
+        held: how their sensors were held.
+        meta: JSON-like content that is saved with the map.
     """
 
     def __init__(self, config: VolumeConfig, store: BlockStore) -> None:
@@ -69,7 +69,7 @@ class ReadableMap(object_cards.Shown):
         self._mesh_buffers = MeshBuffers()
 
     def _facts(self) -> dict[str, str]:
-        count = self._blocks.count  # of any thread, as a debugger asks
+        count = self._blocks.count  # readable from any thread, such as a debugger's
         size = object_cards.extent(unpack_keys(self._blocks.keys) * (8 * self.config.voxel_size))
         return {
             "keyframes": count_of(self.keyframes, "keyframe"),
@@ -83,7 +83,7 @@ class ReadableMap(object_cards.Shown):
 
     @property
     def _store(self) -> BlockStore:
-        """Blocks, for the thread that they belong to. Raises MapError in another one."""
+        """Blocks of the map. Raises MapError in a thread other than the map's own."""
         runtime.check_thread()
         return self._blocks
 
@@ -96,18 +96,20 @@ class ReadableMap(object_cards.Shown):
         fill_holes: int | None = None,
         texture: PosedImages | None = None,
     ) -> Mesh:
-        """Surface by marching cubes over the whole map, or over the cells of some blocks.
+        """Return the surface by marching cubes over the whole map, or over the cells of some blocks.
 
         Args:
-            min_weight: full-confidence samples a voxel needs to count as seen; default the sensor's.
-            blocks: (n, 3) int32 block coordinates. A mesh of `cells_to_mesh(take_dirty())` replaces the
-                changed parts.
-            surface: surface to mesh, instead of that of the settings; for `raw`, `cells_of(take_dirty())` do.
-            fill_holes: close holes and gaps up to so many voxels wide with a guess that continues the field
-                (`surface/hole_filling.py`); the mesh's `guessed` marks these triangles. Of a whole map only,
-                and all of its field has to fit into memory.
-            texture: the map's keyframes at their poses, a list or anything that can be read several times:
-                the mesh is a `TexturedMesh` with colours as sharp as their images (`texturing.textured`).
+            min_weight: full-confidence samples that a voxel needs to count as seen; default: the sensor's
+                value.
+            blocks: (n, 3) int32 block coordinates. The mesh of `cells_to_mesh(take_dirty())` replaces the
+                changed parts of a mesh.
+            surface: surface instead of that of the settings; for `raw`, `cells_of(take_dirty())` suffice.
+            fill_holes: close holes and gaps up to this many voxels wide with a guess that continues the field
+                (`surface/hole_filling.py`); `guessed` of the mesh marks these triangles. Only for a whole
+                map, whose field must fit into memory.
+            texture: the map's keyframes at their poses, in a list or another collection to read several
+                times: the mesh is a `TexturedMesh` with colours as sharp as the images
+                (`texturing.textured`).
 
         Raises:
             InvalidConfig: for a value out of range, or `fill_holes` with `blocks`.
@@ -142,7 +144,7 @@ class ReadableMap(object_cards.Shown):
 
     @contextmanager
     def _own_buffers(self) -> Iterator[MeshBuffers]:
-        """Working memory for a mesh; a mesh made within a pause has its own."""
+        """Yield working memory for a mesh. A mesh that is made during a pause gets separate memory."""
         buffers, self._mesh_buffers = self._mesh_buffers, MeshBuffers()
         try:
             yield buffers
@@ -150,23 +152,23 @@ class ReadableMap(object_cards.Shown):
             self._mesh_buffers = buffers
 
     def whole_values(self, surface: Surface | None = None) -> WholeMapValues:
-        """Values that `extract_mesh` of the whole map meshes, for `mesh_cells`; valid until the map
-        changes."""
+        """Return the values that `extract_mesh` of the whole map meshes, for `mesh_cells`; valid until the
+        map changes."""
         return WholeMapValues(np.sort(self._store.keys), self._view(surface), field_regularizer.BATCH)
 
     def kept_values(self) -> KeptValues:
-        """Values of the map's surface for `mesh_cells`, kept from call to call while the map grows."""
+        """Return the values of the map's surface for `mesh_cells`, kept between calls while the map grows."""
         return KeptValues(self._store, self._view(None))
 
     def mesh_parts(
         self, folder: str | os.PathLike[str], min_weight: float | None = None, *, up: Up | None = None
     ) -> MeshParts:
-        """Mesh of `extract_mesh` of the whole map, made tile by tile in bounded memory, to be saved.
+        """Return the mesh of the whole map, made tile by tile in bounded memory, for saving.
 
         Args:
-            folder: for unnamed files in which it waits.
+            folder: folder for unnamed files that hold the mesh until then.
             min_weight: as for `extract_mesh`.
-            up: away from the ground; None = it is found.
+            up: direction away from the ground; None = find it.
 
         Raises:
             OutputError: when the folder's disk has no room.
@@ -176,52 +178,52 @@ class ReadableMap(object_cards.Shown):
         return MeshParts(parts, Path(folder), held=self.held, known_up=up)
 
     def mesh_run(self, keys: NDArray[np.int64], which: range) -> mesh_tiles.MeshRun:
-        """Some tiles of a larger map's mesh. The present map holds `mesh_tiles.blocks_of_run` of them, and
+        """Return some tiles of a larger map's mesh. This map has the blocks of `mesh_tiles.blocks_of_run` and
         their surroundings.
 
         Args:
-            keys: of all blocks of the larger map, sorted.
-            which: of its `mesh_tiles.tile_count` tiles.
+            keys: sorted keys of all blocks of the larger map.
+            which: numbers of the tiles, below `mesh_tiles.tile_count`.
         """
         least = self._checked_min_weight(None)
         return mesh_tiles.run(keys, which, self._store, least, self._view(None))
 
     def provenance(self, source: str | None = None) -> Provenance:
-        """Notes about the map for a file of its surface, with a newly computed hash.
+        """Return facts about the map for a file of its surface, with a newly computed hash.
 
-        `source`: file or folder that the map came from; the notes have its name, not its path.
+        `source` is the file or folder of the map's input; the result has its name, not its path.
         """
         return _provenance(self.meta, self.keyframes, self.map_hash(), self.config, source)
 
     def cells_to_mesh(self, dirty: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Blocks whose mesh depends on the changed blocks: (m, 3) int32.
+        """Return the blocks whose mesh depends on the changed blocks: (m, 3) int32.
 
-        Namely the changed blocks, those into which the field carries the change, and their neighbours
-        towards −x, −y, −z. In a raw mesh, normals at the rim may be a keyframe behind.
+        These are the changed blocks, the blocks into which the field carries the change, and their neighbours
+        towards −x, −y, −z. In a raw mesh, normals at the rim can lack the newest keyframe.
         """
         return self._cells_reached(dirty, self.model.surface)
 
     def _cells_reached(self, dirty: NDArray[np.int32], surface: Surface) -> NDArray[np.int32]:
-        """Cells to mesh again, as `cells_to_mesh`, for a surface."""
+        """Return the cells to mesh again, as `cells_to_mesh`, for a given surface."""
         return cells_of(unpack_keys(self.values_reached(dirty, surface)))
 
     def values_reached(self, dirty: NDArray[np.int32], surface: Surface | None = None) -> NDArray[np.int64]:
-        """Keys of the blocks whose values depend on the changed blocks (n, 3), for `KeptValues.forget`."""
+        """Return keys of the blocks whose values depend on the changed blocks (n, 3), for `KeptValues`."""
         keys, surface = pack_keys(dirty), surface or self.model.surface
         if surface == "normal":
             return field_regularizer.around(keys, self._store, 1)
         return field_regularizer.spread(keys, self._store, self._field) if surface == "field" else keys
 
     def diff(self, later: "ReadableMap", *, tolerance: float | None = None) -> MapDifference:
-        """Differences to a later map of the same frame, in numbers and as a coloured mesh.
+        """Compare with a later map of the same frame, in numbers and as a coloured mesh.
 
         Args:
             later: the other map.
-            tolerance: metres between two surfaces that count as the same; default two voxels.
+            tolerance: distance in metres up to which two surfaces count as the same; default two voxels.
 
         Raises:
             MapError: when the maps have voxels of different sizes.
-            InvalidConfig: for a tolerance that is not positive.
+            InvalidConfig: for a negative or infinite tolerance.
         """
         self._check_voxels(later)
         metres = 2 * self.config.voxel_size if tolerance is None else tolerance
@@ -244,7 +246,7 @@ class ReadableMap(object_cards.Shown):
         min_weight: float | None = None,
         watch: OnProgress = lambda _done, _all: None,
     ) -> Path:
-        """Write voxels for NumPy (.npz), zarr (.zarr, a folder) or OpenVDB (.vdb): complete or not at all.
+        """Write voxels for NumPy (.npz), zarr (.zarr, a folder) or OpenVDB (.vdb), completely or not at all.
 
         `tsdf/files/voxel_arrays.py` describes the arrays.
 
@@ -253,12 +255,13 @@ class ReadableMap(object_cards.Shown):
             dense: one array around the whole map, instead of its blocks; not for OpenVDB.
             field: `tsdf`, signed distances as fused with weights and colours, or `distance`, the Euclidean
                 distance field.
-            max_distance, min_weight: of the distance field, as for `distance_blocks`.
-            watch: called with the bytes written so far and in all (not for OpenVDB).
+            max_distance, min_weight: settings of the distance field, as for `distance_blocks`.
+            watch: called with the written bytes and the total bytes (not for OpenVDB).
 
         Raises:
-            InvalidConfig: for another suffix or field; OutputError: for an empty map, a box that is too
-                large, or a path that cannot be written; MissingDependency: zarr is not installed.
+            InvalidConfig: for another suffix or field.
+            OutputError: for an empty map, a too large box, or a path that cannot be written.
+            MissingDependency: zarr is not installed.
         """
         voxel_arrays.write(
             self._store, Path(path), dense=dense, field=field, max_distance=max_distance,
@@ -267,9 +270,9 @@ class ReadableMap(object_cards.Shown):
         return Path(path)
 
     def map_hash(self) -> str:
-        """Hex digest of the exact sums: equal for the same keyframes in any order, on any number of threads.
+        """Return a hex digest of the exact sums: equal for the same keyframes in any order, on any threads.
 
-        Colour, which may travel lossily, and smoothed values, which depend on order, are left out.
+        Colours, which compression may change, and smoothed values, which depend on order, are left out.
         """
         digest = begin_hash(self.config.voxel_size)
         for keys, sums in self._store.in_order("sums"):
@@ -278,7 +281,7 @@ class ReadableMap(object_cards.Shown):
         return digest.hexdigest()
 
     def color_hash(self) -> str:
-        """Hex digest of the exact colour sums."""
+        """Return a hex digest of the exact colour sums."""
         digest = hashlib.blake2b(digest_size=16)
         if self.config.color:
             for layer in ("color_rgn", "color_b"):
@@ -302,7 +305,7 @@ class ReadableMap(object_cards.Shown):
 
     @property
     def _halo(self) -> int:
-        """Blocks around a block, on each side, that its surface depends on."""
+        """Width of the halo of blocks, on each side, that a block's surface depends on."""
         return {"raw": 0, "normal": 1, "field": self._field.halo}[self.model.surface]
 
     @property
@@ -313,7 +316,7 @@ class ReadableMap(object_cards.Shown):
         )
 
     def _view(self, surface: Surface | None) -> SurfaceView:
-        """Function that reads a surface's signed distances from the map."""
+        """Return the function that reads a surface's signed distances from the map."""
         surface = surface or self.model.surface
         if surface not in get_args(Surface):
             raise InvalidConfig(f"surface must be one of {', '.join(get_args(Surface))}, got {surface!r}")
@@ -325,7 +328,7 @@ class ReadableMap(object_cards.Shown):
 
 
 def map_provenance(header: CheckpointHeader) -> Provenance:
-    """Provenance of a saved map's surface from its header, as `ReadableMap.provenance`."""
+    """Return the provenance of a saved map's surface, from the map's header."""
     return _provenance(header.meta, header.keyframes, header.map_hash, header.config, None)
 
 

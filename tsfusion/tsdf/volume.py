@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The map: a sum of integers in sparse blocks of 8³ voxels, and the surfaces read from it.
+"""Fuse keyframes into the map: a sum of integers in sparse blocks of 8³ voxels.
 
 A voxel holds Σ w·m and Σ w over all rays that crossed it: m is the signed distance to the surface along the
 ray, as an integer, w the ray's weight. A keyframe is a list of such additions. Hence the order of keyframes
@@ -61,7 +61,7 @@ if TYPE_CHECKING:
     from tsfusion.geometry.keyframe import KeyframeFields
 
 log = logging.getLogger(__name__)
-_OF_SERVERS = {  # names that no completion shows
+_OF_SERVERS = {  # names that completion omits
     "blocks_within", "cell_stamps", "changed_blocks", "drops", "kept_values", "load_blocks", "mesh_cells",
     "mesh_run", "most_blocks", "next_cells", "quota", "raycast_settled", "set_pause", "settle",
     "settled_stamp", "stamp", "values_reached", "warming_up", "whole_values", "why_no_samples",
@@ -76,7 +76,7 @@ class IntegrateStats(msgspec.Struct, frozen=True):
     rays: int
     blocks: int  # touched
     new_blocks: int
-    updates: int  # of voxels by rays
+    updates: int  # additions of rays to voxels
 
 
 class VolumeStats(msgspec.Struct, frozen=True):
@@ -88,31 +88,31 @@ class VolumeStats(msgspec.Struct, frozen=True):
     bytes: int
     bytes_per_block: int
     scratch_bytes: int  # working memory of rays and meshes
-    resident_bytes: int  # of `bytes`, those in memory: all, unless the map has `memory_bytes`
+    resident_bytes: int  # share of `bytes` in memory: all, unless the map has `memory_bytes`
 
 
 class Volume(AskableMap):
     """A sparse volume that keyframes are added to, and exactly removed from.
 
-        integrate, retract                        add a keyframe; take it out again
-        extract_mesh, point_cloud, raycast        see the surface
-        sample, distance_field, distance_slice    ask how far it is; occupancy_slice: what is free
-        save, load, save_voxels                   keep the map, or its voxels
-        merge, crop, copy, diff                   put maps together, take them apart, compare them
-        map_hash, stats                           know what is in it
+            integrate, retract                        add a keyframe; remove it again
+            extract_mesh, point_cloud, raycast        get the surface
+            sample, distance_field, distance_slice    get distances; occupancy_slice: get free space
+            save, load, save_voxels                   write and read the map, or write its voxels
+            merge, crop, copy, diff                   join maps, cut them, copy them, compare them
+            map_hash, stats                           get a hash of the content, and its size
 
     Give a `VolumeConfig`, or the edge of a voxel in metres and other fields by name: `Volume(0.02,
-    sensor="kinect", regularizer="ray")`. A volume belongs to the first thread of a process that makes one, in
-    which Taichi runs: calls from another, and in a process forked from it, are MapErrors. `threads` counts
-    for the first volume of a process. With `arch="cuda"` or another device, keyframes are fused there, in a
-    process that all volumes of this one share; where the device is missing, a warning says why, and they are
-    fused on the CPU.
+    sensor="kinect", regularizer="ray")`. A volume belongs to the first thread of a process that makes one,
+    because Taichi runs in that thread. Calls from another thread, or in a forked process, raise MapError.
+    `threads` counts for the first volume of a process. With `arch="cuda"` or another device, a process that
+    all volumes share fuses keyframes on the device. Without the device, a warning gives the reason, and the
+    CPU fuses them.
 
     Args:
         config: a `VolumeConfig`, or the edge of a voxel in metres.
-        others: none; arguments in the order of another library are answered with what to write.
-        memory_bytes: bytes of memory for the blocks; those that no keyframe has changed for longest wait
-            in files without names, and come back when they are touched (Linux). None = all stay in memory.
+        others: none; other libraries' positional arguments raise an error that says what to write.
+        memory_bytes: bytes of memory for the blocks. Blocks unchanged for longest move to unnamed files, and
+            return when they are touched (Linux). None = all blocks stay in memory.
         cache: folder of these files, on a disk, or a `CacheConfig`; default: `TMPDIR`, or /var/tmp.
         settings: fields of `VolumeConfig` by name.
 
@@ -164,10 +164,10 @@ class Volume(AskableMap):
         )
         super().__init__(config, store)
         self._cache = memory_bytes, cache  # for `copy`
-        self.quota: KeyframeQuota | None = None  # of the keyframes that are integrated from here on
-        self._has_warned = False  # of a keyframe without
+        self.quota: KeyframeQuota | None = None  # limits of the keyframes integrated from now on
+        self._has_warned = False  # True after a warning about a keyframe without samples
         self._has_retracted = False  # since `release_empty`
-        self._released: list[NDArray[np.int64]] = []  # keys of released blocks whose mesh has to go
+        self._released: list[NDArray[np.int64]] = []  # keys of released blocks whose mesh must be removed
         if memory_bytes is not None:
             self.limit_memory(memory_bytes)
         self._device = device
@@ -186,19 +186,19 @@ class Volume(AskableMap):
     def integrate(
         self, keyframe: Keyframe | None = None, *others: object, **fields: "Unpack[KeyframeFields]"
     ) -> IntegrateStats:
-        """Add a keyframe. On an error the map is as it was.
+        """Add a keyframe. On an error the map is unchanged.
 
-        A keyframe without a usable sample changes nothing and is not counted; the first of them is a warning.
+        A keyframe without a usable sample changes nothing and is not counted; only the first is logged.
 
         Args:
-            keyframe: also a dict of a keyframe's fields, or an object with such attributes.
-            others: none; arguments in the order of another library are answered with what to write.
+            keyframe: a `Keyframe`, a dict of its fields, or an object with such attributes.
+            others: none; other libraries' positional arguments raise an error that says what to write.
             fields: a keyframe's fields instead: `integrate(points=…, T_world_camera=…)`.
 
         Raises:
             InvalidKeyframe: the arguments are no keyframe.
             MapFull: the keyframe or the map would exceed its limit of blocks, or the keyframe its `quota`.
-            WeightOverflow: a voxel has taken as many votes as its integers hold.
+            WeightOverflow: a voxel already has as many votes as its integers hold.
         """
         given = _keyframe(keyframe, others, fields)
         stats = self._apply(given, +1)
@@ -208,7 +208,7 @@ class Volume(AskableMap):
         return stats
 
     def why_no_samples(self, keyframe: Keyframe) -> str:
-        """Reason why a `keyframe` has no usable sample, and its cure, for a person."""
+        """Return the reason why a `keyframe` has no usable sample, and what to change, for a person."""
         model = self.config.model(keyframe.sensor)
         reach = VOXEL_LIMIT * self.config.voxel_size
         return why_no_samples(keyframe, model.min_range, model.max_range, reach)
@@ -216,36 +216,37 @@ class Volume(AskableMap):
     def retract(
         self, keyframe: Keyframe | None = None, *others: object, **fields: "Unpack[KeyframeFields]"
     ) -> IntegrateStats:
-        """Remove a keyframe, given as to `integrate`: the sums get back the bytes they had without it.
+        """Remove a keyframe, given as to `integrate`: the sums get the same bytes as without it.
 
-        Smoothed values cannot be un-smoothed: in the blocks it touched they fall back to the raw ones.
+        In the blocks that the keyframe touched, smoothed values fall back to raw values.
 
         Args:
             keyframe, others, fields: as for `integrate`.
 
         Raises:
-            MapError: the map cannot hold this keyframe: a voxel of it has fewer votes than would be taken
-                away. A keyframe never integrated goes unnoticed where others left votes enough.
+            MapError: a voxel has fewer votes than the keyframe added. A keyframe that was never integrated is
+                not detected where other keyframes left enough votes.
         """
         return self._apply(_keyframe(keyframe, others, fields), -1)
 
     def merge(self, other: "Volume", *, same_frame: bool = False) -> None:
-        """Add another map of the same coordinate frame: the map of all keyframes of both, to the last bit.
+        """Add another map of the same coordinate frame: the result equals the map of all keyframes, to the
+        last bit.
 
-        Settled colours (32768 votes) are averaged. Smoothed values fall back to the raw ones in blocks that
-        both have. Each journal keeps its own keyframes: a server that goes on with the merged map can add
-        keyframes, and move or remove none of those that are in it. `retract` takes a keyframe of `other` out
-        exactly where both maps have the same settings.
+        Settled colours (32768 votes) are averaged. Smoothed values fall back to raw values in blocks of both
+        maps.
+        Each journal keeps its own keyframes: a server with the merged map can add keyframes, but cannot move
+        or remove those already in it. `retract` removes a keyframe of `other` exactly only if both maps have
+        the same settings.
 
         Args:
-            other: a map of the same voxel size and layers; it stays as it is.
-            same_frame: the maps are in one frame, although each scan found its poses itself.
+            other: a map of the same voxel size and layers; it does not change.
+            same_frame: the maps share a frame, although each scan found its poses itself.
 
         Raises:
-            MapError: when the voxels or layers differ, when both are the same map or hold the same keyframes,
-                as far as a server wrote down which, or are of different worlds. Parts of one map that share
-                no voxel (`crop`) may be merged; MapFull, WeightOverflow,
-                MemoryError: when the sum has no room. After each of them the map is as it was.
+            MapError: when voxels, layers or worlds differ, or when a keyframe would count twice, as far as a
+                server listed them. Parts of one map that share no voxel (`crop`) may be merged.
+            MapFull, WeightOverflow, MemoryError: without room. After each error the map is unchanged.
         """
         if other is self:
             raise MapError("a map cannot be merged with itself: each keyframe would count twice")
@@ -263,7 +264,7 @@ class Volume(AskableMap):
         self.meta = map_history.added(self.meta, other.meta)
 
     def copy(self) -> "Volume":
-        """Copy of the map, its keyframes, settings and counts; later changes to one do not affect the other.
+        """Copy the map, its keyframes, settings and counts; later changes to one do not affect the other.
 
         Raises MemoryError or MapFull without room for both.
         """
@@ -285,8 +286,8 @@ class Volume(AskableMap):
         raise MapError("a Volume cannot be pickled: use save, and Volume.load where it is needed")
 
     def _parts_with(self, other: "Volume") -> tuple[Part, Part] | None:
-        """Places of both in one map of which they are parts that share no voxel; None = they are no such
-        parts."""
+        """Return the positions of both maps in a common whole map, or None unless they are disjoint parts of
+        one map."""
         if map_crop.PART_OF not in self.meta or map_crop.PART_OF not in other.meta:
             return None
         one, two = (map_crop.part_of(each.meta, each.map_hash()) for each in (self, other))
@@ -303,18 +304,18 @@ class Volume(AskableMap):
             del self.meta[map_crop.PART_OF]
 
     def crop(self, box: Sequence[float], *, most_bytes: int | None = None) -> "Volume":
-        """A new map of the voxels whose centres lie in a box, with their sums, colours and smoothed values.
+        """Return a new map of the voxels whose centres lie in a box, with sums, colours and smoothed values.
 
-        The part can be merged, meshed and saved, and takes keyframes, anywhere. A keyframe that was cut can
-        no longer be retracted; `keyframes` counts all that the map was made from.
+        The part can be merged, meshed and saved, and accepts keyframes anywhere. A keyframe that was cut can
+        no longer be retracted; `keyframes` counts all keyframes of the original map.
 
         Args:
             box: x0, y0, z0, x1, y1, z1 in metres; a centre on the upper side is outside, so that maps of
-                boxes side by side add up to that of both.
-            most_bytes: that the part may take; it does not know then which map it is a part of.
+                adjacent boxes add up to that of both boxes.
+            most_bytes: limit of the part's memory; the part does not record which map it was cut from.
 
         Raises:
-            InvalidConfig: for another box; MemoryError: when there is no room for both maps.
+            InvalidConfig: for an invalid box; MemoryError: when there is no room for both maps.
         """
         first, end = map_crop.voxel_range(box, self.config.voxel_size)
         cropped = Volume(self.config)
@@ -324,7 +325,7 @@ class Volume(AskableMap):
         cropped.keyframes = self.keyframes if cropped._store.count else 0
         cropped.held = HeldSensor(self.held.numbers)
         cropped.meta = map_history.without_journal(self.meta)
-        if most_bytes is None:  # else it is a passing one, and hashing the whole would take longer
+        if most_bytes is None:  # else the part is temporary, and hashing the whole map would take longer
             whole, own = self.map_hash(), cropped.map_hash()
             before = map_crop.part_of(self.meta, whole)
             part = Part(whole, own, [[*first.tolist(), *end.tolist()]])
@@ -333,7 +334,7 @@ class Volume(AskableMap):
         return cropped
 
     def _has_content_of(self, other: "Volume") -> bool:
-        """True if the other map has the same sums; hashed only if the counts do not tell."""
+        """Return True if the other map has the same sums. Compares hashes only if the counts are equal."""
         counts = [(one.keyframes, one._store.count) for one in (self, other)]
         return counts[0] == counts[1] and all(
             hash_of(self) == hash_of(other) for hash_of in (Volume.map_hash, Volume.color_hash)
@@ -349,14 +350,14 @@ class Volume(AskableMap):
             raise MapError(f"the maps have different layers, {names} (colour, smoothing along rays): {cure}")
 
     def take_dirty(self) -> NDArray[np.int32]:
-        """Coordinates of the blocks changed since the last call: (n, 3) int32, in units of 8 voxels."""
+        """Return the blocks changed since the last call: (n, 3) int32 coordinates, in units of 8 voxels."""
         blocks = self.changed_blocks()
         self._store.take_dirty(MESHED)
         self._released.clear()
         return blocks
 
     def changed_blocks(self) -> NDArray[np.int32]:
-        """Blocks that the next `take_dirty` returns; they stay marked."""
+        """Return the blocks that the next `take_dirty` returns, without resetting their marks."""
         store = self._store
         changed = np.flatnonzero(store.dirty[: store.count] & MESHED)
         return unpack_keys(np.concatenate([store.keys[changed], *self._released]))
@@ -364,7 +365,7 @@ class Volume(AskableMap):
     def release_empty(self) -> int:
         """Remove the blocks that `retract` has left without votes. Returns their number.
 
-        The map stays the same, as if it were saved and loaded. Blocks that come later take their room.
+        The content of the map stays the same, as after saving and loading. Later blocks reuse the memory.
         """
         if not self._has_retracted:
             return 0
@@ -394,7 +395,7 @@ class Volume(AskableMap):
             pass
 
     def warming_up(self) -> Iterator[None]:
-        """Compile every kernel, in steps: after the first, those of keyframes and of their raw mesh are."""
+        """Compile every kernel, in steps. The first step covers keyframes and their raw mesh."""
         throwaway = Volume(override(self.config, max_blocks=1 << 14, max_blocks_per_keyframe=1 << 14))
         for keyframe in keyframes_of_every_kind(self.model, self.config.voxel_size):
             throwaway.integrate(keyframe)
@@ -416,14 +417,15 @@ class Volume(AskableMap):
         throwaway.sample(np.zeros((1, 3), np.float32), min_weight=0)
 
     def save(self, path: str | os.PathLike[str], meta: dict[str, Any] | None = None) -> Path:
-        """Write a checkpoint: complete and on disk, or not at all.
+        """Write a checkpoint, completely and durably on disk, or not at all.
 
         Args:
-            path: the file, by custom `*.tsf`.
-            meta: anything JSON-like to keep with it; comes back as `.meta`.
+            path: the file, by convention `*.tsf`.
+            meta: JSON-like content to save with the map; `load` returns it as `.meta`.
 
         Raises:
-            OutputError: for the name of a mesh or of voxels; CheckpointError: when it cannot be written.
+            OutputError: for a file name of a mesh or of voxels.
+            CheckpointError: when the file cannot be written.
         """
         suffix = Path(path).suffix.lower()
         if suffix in (*MESHES, *voxel_arrays.FORMATS):
@@ -431,7 +433,9 @@ class Volume(AskableMap):
             raise OutputError(f"a map is saved as .tsf, got {os.fspath(path)!r}: use {how}, or another name")
         layers = self._store.layers()
         header = checkpoint.CheckpointHeader(
-            config=msgspec.structs.replace(self.config, arch="cpu"),  # of where it is, not of what it holds
+            config=msgspec.structs.replace(
+                self.config, arch="cpu"
+            ),  # the device depends on the machine, not on the map
             keyframes=self.keyframes,
             map_hash="",
             meta={**(self.meta if meta is None else meta), HELD: self.held.numbers},
@@ -453,14 +457,14 @@ class Volume(AskableMap):
         cache: str | os.PathLike[str] | CacheConfig | None = None,
         **changed: "Unpack[LoadSettings]",
     ) -> "Volume":
-        """Read a checkpoint back, verified against its own hash.
+        """Read a checkpoint, and verify it by its own hash.
 
         Args:
             path: a `.tsf` file that `save` wrote.
-            threads: as of a new map; None = as many as the machine has cores.
-            memory_bytes, cache: as of a new map; one that is larger than the cache may be opens, too.
-            changed: settings instead of the saved ones, of how the surface is read (`config.VIEW_SETTINGS`)
-                or of how the map may grow (`config.LIMIT_SETTINGS`); None = as saved.
+            threads: as for a new map; None = as many as the machine has cores.
+            memory_bytes, cache: as for a new map; a map larger than the cache's limit opens, too.
+            changed: settings instead of the saved ones: how the surface is read (`config.VIEW_SETTINGS`)
+                or how the map may grow (`config.LIMIT_SETTINGS`); None = as saved.
 
         Raises:
             InvalidConfig: for a setting that the stored sums depend on.
@@ -491,15 +495,15 @@ class Volume(AskableMap):
         is_checked: bool = False,
         **changed: "Unpack[LoadSettings]",
     ) -> "Volume":
-        """A part of a saved map: the blocks in a box, and those around it that its mesh depends on.
+        """Load a part of a saved map: the blocks in a box, and the surrounding blocks that its mesh depends
+        on.
 
-        `extract_mesh(blocks=blocks_within(low, high))` of it is that of the whole map, to the last bit.
+        `extract_mesh(blocks=blocks_within(low, high))` of the part equals that of the whole map, bit by bit.
 
         Args:
-            path: as for `load`.
+            path, changed: as for `load`.
             low, high: (3,) block coordinates, first and last + 1.
-            is_checked: the file was read as a whole just now: its digest is not compared again.
-            changed: as of `load`.
+            is_checked: the whole file was just read, so its digest is not compared again.
 
         Raises:
             InvalidConfig, CheckpointError: as `load`; the map's own hash is not compared.
@@ -512,32 +516,32 @@ class Volume(AskableMap):
         return volume
 
     def blocks_within(self, low: Sequence[int], high: Sequence[int]) -> NDArray[np.int32]:
-        """Blocks of the map in a box: (n, 3) int32 coordinates, `low` ≤ (x, y, z) < `high`, (3,) block
+        """Return the map's blocks in a box: (n, 3) int32 coordinates, `low` ≤ (x, y, z) < `high`, (3,) block
         coordinates."""
         blocks = unpack_keys(self._store.keys)
         return blocks[((blocks >= np.array(low)) & (blocks < np.array(high))).all(axis=1)]
 
     def limit_memory(self, nbytes: int) -> None:
-        """Let a keyframe fail with MemoryError from now on if the map would take more than `nbytes` with it.
+        """Set a memory limit: from now on a keyframe fails with MemoryError if the map would exceed `nbytes`.
 
-        The map stays as it is, even if it takes more already. Working memory is not counted. In a map with
-        `memory_bytes` no keyframe fails: its coldest blocks leave memory instead.
+        The map stays unchanged, even if it is already larger. Working memory is not counted. In a map with
+        `memory_bytes` no keyframe fails: the coldest blocks leave memory instead.
         """
         self._store.limit(nbytes)
 
     def set_pause(self, pause: Callable[[], None]) -> None:
-        """Call a function, `pause`, between steps that leave the map alone: of meshes, hashes, saving, and
-        before a keyframe's rays are added. The function may ask the map anything, and must not change it."""
+        """Call `pause` between steps that do not change the map: of meshes, hashes, saving, and before a
+        keyframe's rays are added. The function may ask the map anything, but must not change the map."""
         self._store.pause = pause
 
     @property
     def arch(self) -> Arch:
-        """Device that fuses keyframes: that of the settings, or `cpu` if it is missing."""
+        """Device that fuses keyframes: that of the settings, or `cpu` if the device is missing."""
         return "cpu" if self._device is None else self._device.arch
 
     @property
     def most_blocks(self) -> int:
-        """Greatest number of blocks, by the settings and by `limit_memory`."""
+        """Largest number of blocks, by the settings and by `limit_memory`."""
         return min(self.config.max_blocks, self._store.most_blocks)
 
     def _apply(self, keyframe: Keyframe, sign: int) -> IntegrateStats:
@@ -545,7 +549,7 @@ class Volume(AskableMap):
             raise MapError("cannot retract a keyframe from a map that holds none")
         blocks_before = self._store.count
         self._ray_buffers.make_rays(keyframe, self.config)  # paper eq. 1
-        if sign > 0:  # one that is moved is there twice until it is retracted: no time to ask
+        if sign > 0:  # a moved keyframe is in the map twice until it is retracted: no pause then
             self._store.pause()
         self._has_retracted |= sign < 0
         with process.uninterrupted():
@@ -565,14 +569,14 @@ class Volume(AskableMap):
 
     def _note_held(self, keyframe: Keyframe, sign: int) -> None:
         sensor = keyframe.sensor or self.config.sensor
-        if keyframe.points is None or sensor == "lidar":  # of other points nobody knows the sensor's axes
+        if keyframe.points is None or sensor == "lidar":  # the sensor's axes are unknown for other points
             self.held.add(keyframe.T_world_camera, sensor, times=sign)
 
 
 def _writers(
     store: BlockStore, device: DeviceBlocks | None, config: VolumeConfig
 ) -> tuple[RayBuffers, Integrator]:
-    """Maker of rays of keyframes, and the integrator that adds them to a map."""
+    """Return the buffers that make rays of keyframes, and the integrator that adds them to a map."""
     if device is None:
         buffers = RayBuffers(color=config.color, regularised=store.corrected)
         return buffers, Integrator(store, buffers, config)
@@ -581,12 +585,12 @@ def _writers(
 
 
 def _number(value: Any) -> Any:
-    """Python number of a NumPy one: 0.05 in float32 is 0.05."""
+    """Convert a NumPy number to Python: 0.05 in float32 becomes 0.05."""
     return float(str(value)) if isinstance(value, np.floating) else value
 
 
 def _keyframe(keyframe: Any, others: tuple[object, ...], fields: Mapping[str, Any]) -> Keyframe:
-    """Keyframe of a call; further values by position are those of another library."""
+    """Return the keyframe of a call; further positional values are those of another library."""
     if others:
         return keyframe_of((keyframe, *others))
     return keyframe_of(fields if keyframe is None and fields else keyframe)

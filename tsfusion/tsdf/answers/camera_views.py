@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""View of a map's surface by a pinhole camera; the work is in `kernels/answers/rasterizer.py`."""
+"""Render a map's surface as a pinhole camera sees it, tile by tile (`kernels/answers/rasterizer.py`)."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -14,8 +14,8 @@ from tsfusion.kernels.answers import rasterizer
 from tsfusion.tsdf.store.block_store import unpack_keys
 from tsfusion.tsdf.surface.surface_tiles import SurfaceTiles
 
-NEAR = 0.05  # metres in front of the eye where the view starts
-MOST_TRIANGLES = 1 << 21  # that are drawn at a time
+NEAR = 0.05  # metres; nearer surfaces are not drawn
+MOST_TRIANGLES = 1 << 21  # drawn in one call
 
 
 class _Wanted(NamedTuple):
@@ -36,9 +36,9 @@ def cast(
     normals: bool = True,
     colors: bool = True,
 ) -> View:
-    """View, (H, W), of the tiles before the camera; `normals` and `colors` add these images."""
+    """Return the view, (H, W), of the tiles ahead of the camera; `normals` and `colors` add these images."""
     camera = intrinsics, T_world_camera, shape
-    with np.errstate(over="ignore", invalid="ignore"):  # a focal length may be next to none
+    with np.errstate(over="ignore", invalid="ignore"):  # an extreme focal length overflows
         numbers = _in_view(tiles, *camera).tolist()
         wanted = _Wanted(normals, colors and tiles.has_color)
         seen = _of_meshes(tiles.meshes(numbers), *camera, wanted)
@@ -55,7 +55,7 @@ def cast_settled(
     normals: bool = True,
     colors: bool = True,
 ) -> View | None:
-    """As `cast`, of the map's settled state. Returns None where that is no longer kept."""
+    """Return the same view as `cast`, of the map's settled state, or None if that state is no longer kept."""
     camera = intrinsics, T_world_camera, shape
     with np.errstate(over="ignore", invalid="ignore"):
         meshes = tiles.settled_meshes(_in_view(tiles, *camera).tolist())
@@ -88,7 +88,7 @@ def look_at(
     shape: tuple[int, int],
     wanted: _Wanted = _ALL,
 ) -> View:
-    """View of a mesh, (H, W): depth, and the wanted normals and colours, of the first front side."""
+    """Return the view of a mesh's front sides, (H, W): depth, and the wanted normals and colours."""
     focal = intrinsics.fx
     seen, vertices, faces = rasterised(mesh, intrinsics, T_world_camera, shape)
     of_normals = mesh.normals if wanted.normals else _NOTHING.normals
@@ -105,14 +105,14 @@ def look_at(
 def rasterised(
     mesh: Mesh, intrinsics: Intrinsics, T_world_camera: NDArray[np.float64], shape: tuple[int, int]
 ) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.int32]]:
-    """Hits of each pixel, as `rasterizer.rasterise` writes them, with the drawn vertices and faces.
+    """Return the hit of each pixel (`rasterizer.rasterise`), the drawn vertices, and the faces.
 
-    The rasteriser knows one focal length and a centred image. A shear of space that keeps z turns any pinhole
-    camera into such a one.
+    The rasteriser supports one focal length and a centred image. A shear of space that keeps z turns any
+    pinhole camera into such a camera.
     """
     height, width = shape
     K, focal = intrinsics, intrinsics.fx
-    shear = np.diag([1, K.fy / focal, 1])  # from the right: rows are points
+    shear = np.diag([1, K.fy / focal, 1])  # multiplied from the right, because rows are points
     shear[2, :2] = (K.cx - 0.5 * (width - 1)) / focal, (K.cy - 0.5 * (height - 1)) / focal
     from_eye = (mesh.vertices - T_world_camera[:3, 3]).astype(np.float32)
     vertices = from_eye @ (T_world_camera[:3, :3] @ shear).astype(np.float32)
@@ -125,25 +125,25 @@ def rasterised(
 def _in_view(
     tiles: SurfaceTiles, intrinsics: Intrinsics, T_world_camera: NDArray[np.float64], shape: tuple[int, int]
 ) -> NDArray[np.int64]:
-    """Numbers of the tiles that may be seen, nearest first."""
+    """Return the numbers of the tiles that can be visible, nearest first."""
     numbers, side = tiles.numbers(), tiles.side_m
     centres = (unpack_keys(numbers) + 0.5) * side - T_world_camera[:3, 3]
     centres = centres @ T_world_camera[:3, :3]
     K, (height, width) = intrinsics, shape
     down = np.sort([-0.5 - K.cy, height - 0.5 - K.cy] / np.float64(K.fy))
-    planes = np.array([  # inwards, through the eye and the sides of the image
+    planes = np.array([  # normals inwards; through the eye and the image's sides
         (1, 0, (0.5 + K.cx) / K.fx), (-1, 0, (width - 0.5 - K.cx) / K.fx), (0, 1, -down[0]), (0, -1, down[1]),
         (0, 0, 1),
     ])  # fmt: skip
     planes /= np.linalg.norm(planes, axis=1, keepdims=True)
-    radius = 0.5 * np.sqrt(3) * side * 1.05  # cells reach a voxel further
+    radius = 0.5 * np.sqrt(3) * side * 1.05  # cells reach one voxel beyond the tile
     shown = np.flatnonzero((centres @ planes.T > -radius).all(axis=1))
     nearest_first = np.argsort(centres[shown, 2], kind="stable")
     return np.asarray(numbers[shown[nearest_first]])
 
 
 def _parts(meshes: Iterator[Mesh], wanted: _Wanted) -> Iterator[Mesh]:
-    """Meshes joined up to `MOST_TRIANGLES`."""
+    """Join consecutive meshes until the result has `MOST_TRIANGLES` triangles or more."""
     part: list[Mesh] = []
     triangles = 0
     for mesh in meshes:

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Euclidean distances to the map's surface, in a box or block by block.
+"""Compute Euclidean distances to the map's surface, in a box or block by block.
 
-A site is a voxel within half a voxel of the surface, or the nearer one of two neighbours on its two sides.
-Sites come from the fused values, not from smoothed ones: a distance depends only on the map's sums around it.
-The exact transform finds each voxel's nearest site. The signed distances there place the surface within that
-voxel.
+A site is a voxel whose centre lies within half a voxel of the surface. Where the surface passes between two
+neighbours, the nearer of both is a site. Sites come from the fused values, not from smoothed values, so a
+distance depends only on the nearby sums. An exact transform finds the nearest site of each voxel. The signed
+distance at the site then gives the surface's position within that voxel.
 """
 
 import math
@@ -24,24 +24,24 @@ from tsfusion.tsdf.store.block_store import BlockStore, distinct_blocks, unpack_
 from tsfusion.tsdf.sums.map_crop import voxel_range
 from tsfusion.tsdf.surface.field_regularizer import values_of
 
-MOST_VOXELS = 1 << 27  # at once, 20 bytes each while distances are counted
-_LONGEST = 1 << 14  # voxels along an axis: squares of it fit the kernel's integers
-_TILE = 16  # blocks: edge of what is worked on at once where a whole map is
+MOST_VOXELS = 1 << 27  # in one call; the computation takes 20 bytes for each
+_LONGEST = 1 << 14  # voxels along an axis; their square fits the kernel's integers
+_TILE = 16  # blocks; edge of the tile computed in one step for a whole map
 _PART = 1 << 14  # blocks
 
 Shape = tuple[int, int, int]
-Nearest = tuple[NDArray[np.int32], NDArray[np.int32]]  # squared distance to the nearest site, its number
+Nearest = tuple[NDArray[np.int32], NDArray[np.int32]]  # squared distance to a site, its number
 
 
 class FieldBlocks(NamedTuple):
-    """Blocks of a distance field: coordinates (n, 3) int32 and metres (n, 8, 8, 8) float32."""
+    """Blocks of a distance field: block coordinates (n, 3) int32, and metres (n, 8, 8, 8) float32."""
 
     blocks: NDArray[np.int32]
     distance: NDArray[np.float32]
 
 
 class Reach:
-    """How far distances go: metres, voxels, and the margin around a box in which its sites lie."""
+    """Maximum distance in metres and in voxels, and the margin around a box in which its sites lie."""
 
     def __init__(self, max_distance: float, edge: float) -> None:
         if not 0 < max_distance < math.inf:
@@ -53,13 +53,13 @@ class Reach:
             )
         whole = math.ceil(self.voxels)
         self.most_squared = (whole + 1) ** 2  # the surface is up to a voxel nearer than a site's centre
-        self.margin = whole + 2  # whose outermost voxels are no sites that count: their neighbours are cut
+        self.margin = whole + 2  # its outermost voxels count as no sites, because they lack neighbours
 
 
 def in_box(
     store: BlockStore, box: Sequence[float] | None, max_distance: float, min_weight: float, *, subvoxel: bool
 ) -> DistanceField:
-    """Distances in a box, or around the whole map, also where unseen: see `AskableMap.distance_field`."""
+    """Return distances in a box, or around the whole map without a box. Unseen voxels get distances too."""
     size = store.voxel_size
     reach = Reach(max_distance, size)
     first, end = _bounds(store) if box is None else voxel_range(box, size)
@@ -87,7 +87,7 @@ def in_box(
 
 
 def in_blocks(store: BlockStore, max_distance: float, min_weight: float) -> Iterator[FieldBlocks]:
-    """Distances of the whole map, with memory for one tile: see `AskableMap.distance_blocks`."""
+    """Yield distances of the whole map, with memory for one tile (`AskableMap.distance_blocks`)."""
     reach = Reach(max_distance, store.voxel_size)
     _checked_shape(np.full(3, 8 * _TILE + 2 * (reach.margin + 8)), whole=True)
     blocks = unpack_keys(store.keys)
@@ -108,7 +108,7 @@ def in_blocks(store: BlockStore, max_distance: float, min_weight: float) -> Iter
 def _near(
     store: BlockStore, first: NDArray[np.int32], end: NDArray[np.int32], reach: Reach, min_weight: float
 ) -> Iterator[FieldBlocks]:
-    """Blocks in a box of blocks in which a distance is less than the largest."""
+    """Yield the blocks of a box that contain a distance below the maximum. The bounds count blocks."""
     edges = 8 * store.voxel_size * np.concatenate([first, end])
     field = in_box(store, edges.tolist(), reach.metres, min_weight, subvoxel=True)
     sides = (end - first).tolist()
@@ -121,7 +121,7 @@ def _near(
 
 
 def occupancy_of(values: NDArray[np.float32]) -> NDArray[np.int8]:
-    """Occupancy from signed distances in cells: occupied within half a cell of a surface and behind it."""
+    """Return the occupancy of cells: occupied behind a surface, and up to half a cell before it."""
     states = np.full(values.shape, UNSEEN, np.int8)
     states[values > 0.5] = FREE
     states[values <= 0.5] = OCCUPIED
@@ -129,7 +129,7 @@ def occupancy_of(values: NDArray[np.float32]) -> NDArray[np.int8]:
 
 
 def _bounds(store: BlockStore) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Box around the blocks that hold votes, voxels."""
+    """Return the box around the blocks that hold votes, in voxels."""
     used = store.used()
     if not len(used):
         raise MapError("the map is empty: there is no box around it; give one")
@@ -158,7 +158,7 @@ def _checked_shape(shape: NDArray[np.int64], *, whole: bool) -> Shape:
 def _read(
     store: BlockStore, first: NDArray[np.int64], shape: Shape, min_weight: float
 ) -> NDArray[np.float32]:
-    """Signed distances, voxels, of a box of whole blocks, flat; NaN where unseen."""
+    """Return the signed distances (voxels) in a box of whole blocks, as a flat array; NaN where unseen."""
     coordinates = unpack_keys(store.keys).astype(np.int64) - first
     count = np.array(shape) // 8
     inside = ((coordinates >= 0) & (coordinates < count)).all(axis=1)
@@ -175,7 +175,7 @@ def _read(
 
 
 def _clear(store: BlockStore, first: NDArray[np.int64], shape: Shape) -> NDArray[np.bool_]:
-    """Mask of the voxels that lie in wholly free blocks, for a box of whole blocks."""
+    """Return a mask of the voxels in wholly free blocks, for a box of whole blocks."""
     keys, counts = store.clear.counts()
     found, places = np.zeros([side // 8 for side in shape], bool), unpack_keys(keys) - first
     inside = ((places >= 0) & (places < found.shape)).all(axis=1) & (counts > 0)
@@ -191,7 +191,7 @@ def _nearest_sites(
     found = np.empty(values.size, np.int32), np.empty(values.size, np.int32)
     kernels.mark_sites(values, *shape, 0, shape[0], 0, *found)
     sides = list(shape)
-    # First along the axis that leaves the fewest lines: for a slice, across it
+    # The axis that leaves the fewest lines goes first: for a slice, the axis across the slice
     for axis in sorted(range(3), key=lambda a: extent[a] / shape[a]):
         length, inner = sides[axis], math.prod(sides[axis + 1 :])
         sides[axis] = extent[axis]
@@ -212,7 +212,7 @@ def spread(
     places: tuple[int, int],
     reach: Reach,
 ) -> Nearest:
-    """Carry distances along grid lines (…, length, inner) to the given places; `line` = (length, inner).
+    """Carry distances along grid lines (…, length, inner) to the range `places`. `line` is (length, inner).
     Returns `into`."""
     stack = np.empty((kernels.BANDS, line[0], 2), np.int32)
     kernels.spread_along_lines(*found, *line, *lines, *places, reach.most_squared, stack, *into)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Slices of the map between two heights, updated as keyframes come: occupancy and horizontal distances.
+"""Compute slices of the map between two heights, and update them: occupancy and horizontal distances.
 
-A cell is a column of samples between the heights; its value depends only on the sums at these samples. Cells
-above changed blocks are read again, and distances are computed again as far as the changed cells reach.
+A cell is a column of samples between the heights. Its value depends only on the sums at these samples. An
+update reads the cells above changed blocks again, and computes distances again within reach of these cells.
 """
 
 import math
@@ -28,29 +28,30 @@ from tsfusion.kernels.base.sensor_noise import WEIGHT_ONE
 from tsfusion.tsdf.answers.distance_fields import Reach, spread
 from tsfusion.tsdf.store.block_store import BlockStore, unpack_keys
 
-MOST_CELLS = 1 << 24  # with the margin; some 52 bytes each
-_MOST_SAMPLES = 1 << 12  # of a cell
-_PART = 1 << 14  # cells read at a time: their blocks may have to come from a file
-_SEEN_SHARE = 0.5  # of a cell's samples, for it to be free
-_FARTHEST = 1 << 20  # voxels from the origin: beyond any map
+MOST_CELLS = 1 << 24  # including the margin; a cell takes about 52 bytes
+_MOST_SAMPLES = 1 << 12  # in one cell
+_PART = 1 << 14  # cells read in one call: their blocks may have to be read from a file
+_SEEN_SHARE = 0.5  # share of its samples that must be seen before a cell is free
+_FARTHEST = 1 << 20  # voxels from the origin; no map is that large
 
 Rectangle = tuple[int, int, int, int]  # first row, first column, end row, end column
 
 
 def axes_of(up: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(3, 3) rows: the map's x axis (y, where x is up) as seen from above, the axis to its left, and up."""
+    """Return the slice's axes as rows, (3, 3). The first is the map's x axis seen from above, or its y axis
+    if x is up. The second points to the left of the first, the third up."""
     up = up / np.linalg.norm(up)
     ahead = np.eye(3)[0] if abs(up[0]) < 0.9 else np.eye(3)[1]
     ahead = ahead - (ahead @ up) * up
     ahead /= np.linalg.norm(ahead)
-    axes: NDArray[np.float64] = np.stack([ahead, np.cross(up, ahead), up]) + 0.0  # no -0.0
+    axes: NDArray[np.float64] = np.stack([ahead, np.cross(up, ahead), up]) + 0.0  # turns -0.0 into 0.0
     return axes
 
 
 class CurrentSlice:
-    """Slice that follows the map; `AskableMap.current_slice` makes it.
+    """Slice that follows the map; `AskableMap.current_slice` creates it.
 
-    After `update` with the changed blocks it equals a new slice.
+    After `update` with the changed blocks, the slice equals a newly computed slice.
     """
 
     def __init__(
@@ -70,19 +71,19 @@ class CurrentSlice:
         low, high = (one + (floor or 0.0) for one in _checked_heights(heights))
         self._store, self._least = store, max(1, math.ceil(min_weight * WEIGHT_ONE))
         self._carved = carved
-        self._noted = store.clear.noted  # blocks of free space that it has followed
+        self._noted = store.clear.noted  # last change of free blocks that the slice includes
         edge = _checked_resolution(resolution, store.voxel_size)
         self._reach = Reach(max_distance, edge)
         first, end = _cell_range(_box_around(store, axes) if box is None else box, edge)
         margin = self._reach.margin
-        self._first = first - margin  # row, column of the first cell that is read
+        self._first = first - margin  # row and column of the first cell, including the margin
         self._shape = rows, columns = _checked_shape(end - first + 2 * margin, most_cells)
         self.grid = SliceGrid(
             (float(first[1] * edge), float(first[0] * edge)), edge,
             (rows - 2 * margin, columns - 2 * margin), low, high, axes, floor,
         )  # fmt: skip
         self._across = math.ceil(edge / store.voxel_size - 1e-9)
-        # no layer of voxels lies between two samples
+        # samples lie at most one voxel apart in height
         self._heights = max(1, math.ceil((high - low) / store.voxel_size - 1e-9))
         if self._across**2 * self._heights > _MOST_SAMPLES:
             raise InvalidConfig(
@@ -102,15 +103,14 @@ class CurrentSlice:
 
     @property
     def extent(self) -> tuple[float, float]:
-        """Heights between which the map's blocks lie, metres; (inf, -inf) where there are none."""
+        """Heights of the lowest and highest block, metres; (inf, -inf) for an empty map."""
         axis, block = self.grid.axes[2], 8 * self._store.voxel_size
         centres = (unpack_keys(self._store.keys) + 0.5) * block @ axis
         half = block / 2 * float(np.abs(axis).sum())
         return float(centres.min(initial=np.inf)) - half, float(centres.max(initial=-np.inf)) + half
 
     def update(self, blocks: NDArray[np.int32]) -> bool:
-        """Follow the changed blocks, (n, 3) int32, of `Volume.take_dirty`. Returns True if the slice has
-        changed."""
+        """Apply changed blocks, (n, 3) int32, of `Volume.take_dirty`. Returns True if the slice changed."""
         cells = self._changed_cells(np.asarray(blocks, np.float64).reshape(-1, 3))
         if not len(cells):
             return False
@@ -124,7 +124,7 @@ class CurrentSlice:
         return bool(len(moved)) or bool((self._seen[cells] != before[1]).any())
 
     def _changed_cells(self, blocks: NDArray[np.float64]) -> NDArray[np.int32]:
-        """Cells above changed blocks, and above blocks newly looked through, or no longer."""
+        """Return the cells above changed blocks, and above blocks that became free or ceased to be."""
         others = self._store.clear.changed_since(self._noted)
         self._noted = self._store.clear.noted
         if others is None:
@@ -135,7 +135,7 @@ class CurrentSlice:
         return OccupancySlice(self.grid, self._cells(), self._carved or len(self._store.clear) > 0)
 
     def distances(self, *, unseen_is_free: bool = False) -> DistanceSlice:
-        """Distances; 0 where nothing was seen, unless unseen counts as free."""
+        """Return the distances. An unseen cell has distance 0 unless `unseen_is_free` is set."""
         cells, distance = self._cells(), self._inside(self._distance).copy()
         distance = blocked(distance, cells, unseen_is_free=unseen_is_free)
         return DistanceSlice(self.grid, distance, cells, self._reach.metres)
@@ -166,16 +166,16 @@ class CurrentSlice:
                 self._least, self._values, self._seen,
             )  # fmt: skip
             store.rest()
-            # kernel: voxels; here: cells
+            # the kernel works in voxels, the slice in cells
             self._values[part] *= np.float32(size / grid.resolution)
 
     def _cells_above(self, blocks: NDArray[np.float64]) -> NDArray[np.int32]:
-        """Numbers of the cells with a sample in one of the blocks, and of a few beside them."""
+        """Return the numbers of the cells with a sample in a given block, and of a few neighbours."""
         grid, block = self.grid, 8 * self._store.voxel_size
         centres = (blocks + 0.5) * block @ grid.axes.T
-        half = block / 2 * np.abs(grid.axes).sum(axis=1) + 1e-6 * block  # as samples are rounded
+        half = block / 2 * np.abs(grid.axes).sum(axis=1) + 1e-6 * block  # for rounded samples
         near = centres[(centres[:, 2] + half[2] >= grid.low) & (centres[:, 2] - half[2] <= grid.high)]
-        inset = 0.5 / self._across  # of the outermost samples in a cell
+        inset = 0.5 / self._across  # of the outermost samples from the cell's edge, in cells
         corners = np.ceil((near[:, :2] - half[:2]) / grid.resolution - 1 + inset)[:, ::-1]
         side = np.floor(2 * half[1::-1] / grid.resolution + 1 - 2 * inset).astype(np.int64) + 1
         corners = np.unique(corners.astype(np.int64) - self._first, axis=0)
@@ -189,10 +189,10 @@ class CurrentSlice:
         return np.flatnonzero(reached).astype(np.int32)
 
     def _count(self, changed: Rectangle) -> None:
-        """Compute distances again, as far as changed cells reach."""
+        """Compute distances again within reach of the changed cells."""
         rows, columns = self._shape
         top, left, bottom, right = changed
-        # Cells beside them may become sites, or their surface may move
+        # Neighbours of changed cells can become sites, or their surface can move
         top, bottom = max(top - 1, 0), min(bottom + 1, rows)
         left, right = max(left - 1, 0), min(right + 1, columns)
         reach = self._reach.margin
@@ -203,7 +203,7 @@ class CurrentSlice:
             self._values, (rows, columns, 1), self._marked[0], (top, bottom), (left, right), self._offsets
         )
         is_other = sites != before
-        if is_other.any():  # where the same cells are sites as before, the nearest ones are the same
+        if is_other.any():  # otherwise the sites, and so the nearest sites, are unchanged
             lines = top + np.flatnonzero(is_other.any(axis=1))
             places = np.flatnonzero(is_other.any(axis=0))
             spread(
@@ -249,7 +249,7 @@ def _checked_shape(shape: NDArray[np.int64], most: int) -> tuple[int, int]:
 
 
 def _cell_range(box: Sequence[float], edge: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """First (row, column) and end of the cells whose centres lie in a rectangle."""
+    """Return the first (row, column) and the end of the cells whose centres lie in a rectangle."""
     corners = np.asarray(box, np.float64)
     if corners.shape != (4,) or not np.isfinite(corners).all() or (corners[:2] >= corners[2:]).any():
         raise InvalidConfig(f"a slice's box must be u0 v0 u1 v1 in metres, each 0 less than its 1, got {box}")
@@ -263,7 +263,7 @@ def _cell_range(box: Sequence[float], edge: float) -> tuple[NDArray[np.int64], N
 
 
 def _box_around(store: BlockStore, axes: NDArray[np.float64]) -> list[float]:
-    """Rectangle around all blocks that hold votes, in the slice's frame."""
+    """Return the rectangle around all blocks that hold votes, in the slice's coordinate frame."""
     used = store.used()
     if not len(used):
         raise MapError("the map is empty: there is no box around it; give one")

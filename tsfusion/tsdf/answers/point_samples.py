@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Signed distances at points: the choice of blocks for `kernels/answers/point_sampling.py`."""
+"""Sample signed distances at points: choose the blocks, and call `kernels/answers/point_sampling.py`."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,15 +10,15 @@ from tsfusion.kernels.base.sensor_noise import WEIGHT_ONE
 from tsfusion.tsdf.store.block_store import BlockStore, unpack_keys
 from tsfusion.tsdf.surface.field_regularizer import SurfaceView, values_of
 
-_PART = 1 << 14  # points at a time where their blocks may have to come from a file
-_POINTS_A_BLOCK = 16  # of the map: where there are more, a table of its blocks pays
-_MOST_SOLVED = 1 << 14  # blocks whose values are gathered at a time: 32 MB
+_PART = 1 << 14  # points in one call, if their blocks may have to be read from a file
+_POINTS_A_BLOCK = 16  # from this many points per block of the map, a table of its blocks is faster
+_MOST_SOLVED = 1 << 14  # blocks whose values are computed in one call: 32 MB
 
 
 def sample(
     points: NDArray[np.floating], store: BlockStore, min_weight: float, view: SurfaceView = values_of
 ) -> Samples:
-    """Samples of a surface's signed distances at points (n, 3), metres."""
+    """Sample a surface's signed distances at points (n, 3), metres."""
     count = len(points)
     whole = Samples(
         np.empty(count, np.float32), np.empty(count, np.float32), np.empty((count, 3), np.float32)
@@ -69,7 +69,7 @@ def _fill(
 def _table(
     keys: NDArray[np.int64], most: int
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]] | None:
-    """Table by place: `rows`, `begin`, `size` of `interpolate_within`; None = more than `most` numbers."""
+    """Return a dense table of blocks for `interpolate_within`, or None for more than `most` entries."""
     blocks = unpack_keys(keys)
     begin = blocks.min(axis=0) - 2
     size = blocks.max(axis=0) + 2 - begin
@@ -81,7 +81,7 @@ def _table(
 
 
 def _needed(points: NDArray[np.floating], store: BlockStore) -> NDArray[np.intp]:
-    """Slots of the blocks that the points need, in key order."""
+    """Return the slots of the blocks that the points need, ordered by key."""
     is_needed = np.zeros(store.count, np.uint8)
     point_sampling.list_blocks(points, 1 / store.voxel_size, store.hash_keys, store.hash_slots, is_needed)
     slots = np.flatnonzero(is_needed)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Blocks of a map on a device, and the rows that differ from those of its `BlockStore`."""
+"""Keep a map's blocks on a device, and track which rows differ from those of its `BlockStore`."""
 
 import weakref
 from typing import Any, Literal
@@ -14,12 +14,12 @@ from tsfusion.tsdf.device.device_link import DeviceLink, Step
 from tsfusion.tsdf.store.block_store import DeviceRows
 from tsfusion.tsdf.store.growing_array import GrowingArray
 
-_CHUNK = 4096  # blocks copied at a time: 42 MB with colour
+_CHUNK = 4096  # blocks per copy: 42 MB with colour
 
 
 class DeviceBlocks(DeviceRows):
-    """Rows on the device, to which keyframes are added. `fetch` brings the store's rows up to date before a
-    read; `send` brings the device's up to date after a write to the store."""
+    """Rows on the device, to which keyframes are added. `fetch` updates the store's rows before a read.
+    `send` updates the device's rows after a write to the store."""
 
     first_blocks = FIRST_BLOCKS
     is_none = False
@@ -28,12 +28,12 @@ class DeviceBlocks(DeviceRows):
         self._link = link
         self._names = layers
         self._number = link.new_map(layers)
-        self._behind = np.zeros(0, bool)  # by slot: the store's row is behind the device's
+        self._behind = np.zeros(0, bool)  # by slot: True if the store's row is older than the device's
         self._is_behind = False
-        self._hash_size = FIRST_HASH  # of the device's copy
+        self._hash_size = FIRST_HASH  # size of the device's copy
         self.sends_blocks: Literal["now", "later", "never"] = "now"
         self._unsent: list[NDArray[Any]] = []
-        self._first: list[Step] = []  # what goes with the next call
+        self._first: list[Step] = []  # calls to make before the next one
         weakref.finalize(self, link.forget_later, self._number)
 
     @property
@@ -41,7 +41,6 @@ class DeviceBlocks(DeviceRows):
         return self._link.arch
 
     def call(self, verb: str, *arguments: Any) -> Any:
-        """Call a method of the `DeviceMap`."""
         first, self._first = self._first, []
         return self._link.call(self._number, verb, *arguments, first=first)
 

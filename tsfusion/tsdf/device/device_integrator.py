@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Rays and integration of a map whose blocks are on a device: the transaction is `Integrator`'s."""
+"""Add keyframes to a map whose blocks are on a device; `Integrator` controls the transaction."""
 
 from collections.abc import Sequence
 from typing import Any, Literal
@@ -26,36 +26,35 @@ from tsfusion.tsdf.store.block_store import BlockStore
 
 
 class DeviceRayBuffers(RayBuffers):
-    """Bands of rays that stay on the device, and what a launch reports about blocks."""
+    """Bands of rays that stay on the device, and a launch's report on blocks."""
 
     def __init__(self, *, color: bool) -> None:
         super().__init__(color=color, regularised=False)
         self._missing_keys = np.empty(0, np.int64)
-        self.asked: tuple[Any, ...] = ()  # for which rays: a kernel's name and its arguments
-        self.is_light = False  # whether no lane can overflow that has reserve for a part
+        self.asked: tuple[Any, ...] = ()  # requested rays: a kernel's name and its arguments
+        self.is_light = False  # True if the samples are too few to use up a lane's reserve
 
     def note_told(self, told: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Take over a launch's report on blocks. Returns the slots of blocks touched for the first time."""
+        """Read a launch's report on blocks. Returns the slots of blocks touched for the first time."""
         new = told[FRESH_AT + 2 * told[NEW] :]
         self._touched.reserve(TOUCHED_HEADER)
         self.touched[:TOUCHED_HEADER] = told[:TOUCHED_HEADER]
-        self.touched[TOUCHED_OVERFLOW] = 0  # which on the CPU is said of `missing`
+        self.touched[TOUCHED_OVERFLOW] = 0  # on the CPU this field reports on `missing`
         self.touched[TOUCHED_COUNT] -= len(new)
         self.note_touched(new)
         return new
 
     def note_touched(self, slots: NDArray[np.int32]) -> None:
-        """Note blocks that are touched for the first time."""
         first = TOUCHED_HEADER + int(self.touched[TOUCHED_COUNT])
         self._touched.reserve(first + len(slots))
         self.touched[first : first + len(slots)] = slots
         self.touched[TOUCHED_COUNT] += len(slots)
 
     def share_out(self, units: int) -> None:
-        """No work: each ray has a thread of its own."""
+        """Do nothing: on a device each ray has its own thread."""
 
     def note_missing(self, keys: NDArray[np.int64]) -> None:
-        """Take over the keys of missing blocks, in order."""
+        """Set the keys of missing blocks, in ascending order."""
         self._missing_keys = keys
         self.touched[TOUCHED_MISSING] = len(keys)
 
@@ -74,7 +73,7 @@ class DeviceRayBuffers(RayBuffers):
 
     @staticmethod
     def as_read(image: NDArray[Any]) -> NDArray[Any]:
-        return np.ascontiguousarray(image)  # half of the bytes, where it is uint16
+        return np.ascontiguousarray(image)  # uint16 has half of the bytes of float32
 
     def _rays_of_points(self, points: NDArray[Any], *rest: Any) -> None:
         self._ask("point_rays", points, *rest)
@@ -83,14 +82,14 @@ class DeviceRayBuffers(RayBuffers):
         self._ask("image_rays", image, *rest)
 
     def _ask(self, kind: str, measured: NDArray[Any], *rest: Any) -> None:
-        """Note the rays to be made: making and adding them is one call."""
+        """Store the arguments of the rays: one later call makes the rays and adds them."""
         self.asked = kind, measured, *rest
         samples = len(measured) if kind == "point_rays" else measured.size
         self.is_light = samples * WEIGHT_ONE < PART_WEIGHT
 
 
 class DeviceIntegrator(Integrator):
-    """Only writer of a map's sums on a device."""
+    """The only writer of a map's sums on a device."""
 
     _buffers: DeviceRayBuffers
 
@@ -101,10 +100,10 @@ class DeviceIntegrator(Integrator):
         self._device = device
         # Report of the first launch, and keys of missing blocks
         self._ahead: tuple[NDArray[np.int32], NDArray[np.int64]] | None = None
-        self._has_inserted = False  # it has inserted the missing blocks, too
+        self._has_inserted = False  # True if the launch also inserted the missing blocks
 
     def _begin(self, sign: int) -> None:
-        """Make the rays and add them in the same call: nearly always all of them are one part."""
+        """Make the rays and add them in the same call: nearly always they are a single part."""
         super()._begin(sign)
         store, buffers, config = self._store, self._buffers, self._config
         store.send()
@@ -121,7 +120,7 @@ class DeviceIntegrator(Integrator):
             self._ahead = told, keys_told(told, found)
 
     def _take_back(self, added: list[RayShare], sign: int, before: int) -> None:
-        if self._ahead is not None:  # refused before it was looked at
+        if self._ahead is not None:  # refused before the report was read
             self._ahead, added = None, [(0, len(self._buffers.bands))]
         super()._take_back(added, sign, before)
 
@@ -180,7 +179,7 @@ class DeviceIntegrator(Integrator):
 
 
 def keys_told(told: NDArray[np.int32], found: Sequence[NDArray[Any]]) -> NDArray[np.int64]:
-    """Keys of the blocks that a launch has inserted, or found missing."""
+    """Return the keys of the blocks that a launch inserted or found missing."""
     if new := int(told[NEW]):
         return told[FRESH_AT : FRESH_AT + 2 * new].view(np.int64)
     return found[1].copy() if len(found) > 1 else np.empty(0, np.int64)

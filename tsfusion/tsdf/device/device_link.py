@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Near end of the connection to the process that has a device (`device_process`)."""
+"""Connect to the process that computes on a device (`device_process`), and call its methods."""
 
 import atexit
 import logging
@@ -29,31 +29,31 @@ from tsfusion.core.shared_arrays import (
 log = logging.getLogger(__name__)
 
 Step = tuple[str, tuple[Any, ...]]  # a method and its arguments
-SentArray = tuple[int, str, tuple[int, ...], bytes | int]  # which argument, dtype, shape, content or offset
+SentArray = tuple[int, str, tuple[int, ...], bytes | int]  # argument, dtype, shape, content or offset
 
 _COMMAND = (sys.executable, "-m", "tsfusion.tsdf.device.device_process")
-_START_S = 120.0  # a device's first start compiles its driver's own kernels, too
+_START_S = 120.0  # the first start also compiles the driver's own kernels
 _END_S = 3.0
 _SENT_BYTES = 1 << 10
-_ANSWER_S = 0.002  # in which a GPU answers
+_ANSWER_S = 0.002  # usual answer time of a GPU
 
 
 class DeviceLost(RuntimeError):
-    """Error of a device process that has ended, or on which a kernel failed: additions since the map was last
-    read are lost.
+    """Error of a device process that has ended, or in which a kernel failed.
 
-    The error is no TsfusionError: no keyframe is to blame, and nothing may continue with the map. A fuser
-    that ends with it is started again, and fuses the journal's records after the last checkpoint.
+    Additions since the map was last read are lost. The error is no TsfusionError: no keyframe caused it, and
+    the map must not be used any more. The error ends a fuser. The next fuser starts from the last checkpoint,
+    and fuses the later records of the journal.
     """
 
 
 class DeviceLink:
-    """Calls to a device, one after the other, from the thread that uses maps."""
+    """Calls to a device, in sequence, from the thread that uses maps."""
 
     def __init__(self, arch: Arch) -> None:
         """Start the process. Raises DeviceLost, with the reason, without such a device."""
         self.arch = arch
-        self.is_trusted = False  # whether it was tried
+        self.is_trusted = False  # True after a trial that agreed with the CPU
         self._has_ended = False
         self._maps = 0
         self._forgotten: list[int] = []
@@ -87,23 +87,23 @@ class DeviceLink:
         return self._maps
 
     def forget_later(self, number: int) -> None:
-        """Release a map before the next call; safe at any time, also during a call."""
+        """Release a map before the next call. This is safe at any time, also during a call."""
         self._forgotten.append(number)
 
     def call(self, number: int, verb: str, *arguments: Any, first: Sequence[Step] = ()) -> Any:
         """Call a method of a map (`DeviceMap`). Arrays in the result are valid until the next call.
 
         Args:
-            number: of the map.
+            number: number of the map.
             verb: name of the method.
-            arguments: of the method; arrays are copied.
-            first: methods called before it, with their arguments; one that fails stops the rest.
+            arguments: arguments of the method; arrays are copied.
+            first: methods to call before, with their arguments; an error in one of them skips the rest.
 
         Raises:
-            MemoryError: the device has no memory for more; the map is as it was.
+            MemoryError: the device has too little memory; the map is unchanged.
             DeviceLost: the device is gone.
         """
-        with process.uninterrupted():  # an answer that nobody took would be the next call's
+        with process.uninterrupted():  # otherwise the next call would read this answer
             while self._forgotten:
                 self._ask(self._forgotten.pop(), [("forget", ())])
             return self._ask(number, [*first, (verb, arguments)])
@@ -121,7 +121,7 @@ class DeviceLink:
         return self._receive(None)
 
     def _packed(self, arguments: Sequence[Any]) -> tuple[list[Any], list[SentArray]]:
-        """Arguments as sent, and the arrays among them; a large one is sent as its place in shared memory."""
+        """Return the arguments as sent, and their arrays. A large array goes through shared memory."""
         values, arrays = list(arguments), list[SentArray]()
         for i, one in enumerate(arguments):
             if isinstance(one, np.ndarray):
@@ -167,12 +167,12 @@ class DeviceLink:
         self._replies.close()
 
 
-_links: dict[Arch, DeviceLink] = {}  # process-wide, as Taichi's own state is: a process a device
+_links: dict[Arch, DeviceLink] = {}  # for the whole process, as Taichi's own state: one process per device
 _missing = set[Arch]()
 
 
 def link_to(arch: Arch) -> DeviceLink | None:
-    """Process with a device, shared by all maps of this process; None = without one, which is logged once."""
+    """Return the process of a device, shared by all maps. Returns None without the device, and logs once."""
     if arch == "cpu" or arch in _missing:
         return None
     link = _links.get(arch)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Blocks of a map in the memory of a device: all that integration reads and writes (`ti.ndarray`).
+"""Keep a map's blocks in device memory, and add keyframes to them (`ti.ndarray`).
 
-`device_process` has one for each map of its parent process. The parent's `BlockStore` gives out slots and
-keeps the layers that integration does not change. A call copies in a keyframe and copies out the blocks it
-touched, no more.
+`device_process` has one `DeviceMap` for each map of its parent process. The parent's `BlockStore` assigns the
+slots, and keeps the layers that integration does not change. A call copies only a keyframe to the device, and
+a report on the touched blocks back.
 """
 
 from collections.abc import Iterator
@@ -34,8 +34,8 @@ from tsfusion.kernels.integration import integrate, rays_from_images
 from tsfusion.kernels.integration.integrate import CUBE, TOUCHED_COUNT, TOUCHED_MISSING, TOUCHED_OVERFLOW
 from tsfusion.tsdf.store.growing_array import LAYER_DTYPES
 
-_LISTED = 1 << 22  # updates, 16 bytes each, that a launch lists
-_FEW_TOUCHED = 4096  # blocks whose numbers are read at once
+_LISTED = 1 << 22  # updates that a launch lists; each takes 16 bytes
+_FEW_TOUCHED = 4096  # blocks whose numbers the first copy includes
 _DTYPES = {"sums": ti.i64, "color_rgn": ti.i64, "color_b": ti.i32, "hits": ti.i32}
 
 
@@ -52,8 +52,8 @@ class LaunchJob(NamedTuple):
 
 
 class Room(NamedTuple):
-    """Limits of a keyframe: new blocks for which all memory is there, touched blocks, and the cost of its
-    rays and new blocks (`integrator.KeyframeQuota`)."""
+    """Limits of a keyframe: new blocks that fit into reserved memory, touched blocks, and cost. The cost is
+    that of rays and new blocks (`integrator.KeyframeQuota`)."""
 
     new: int
     touched: int
@@ -62,7 +62,7 @@ class Room(NamedTuple):
 
 
 class DeviceMap:
-    """Blocks of one map, as numbered by its `BlockStore`, and the rays of its current keyframe."""
+    """Blocks of one map, with the slots of its `BlockStore`, and the rays of its current keyframe."""
 
     def __init__(self, layers: tuple[str, ...], copies: Copies) -> None:
         self._layer_names = layers
@@ -77,10 +77,10 @@ class DeviceMap:
         self._rays, self._marks = _zeros(ti.i32, 1, RAY_FIELDS), _zeros(ti.i32, 1)
         self._depths, self._tiles = _zeros(ti.i32, 1), _zeros(ti.i32, 1, device_rays.TILE_FIELDS)
         self._groups, self._totals = _zeros(ti.i32, 1, kernels.GROUP_FIELDS), _zeros(ti.i64, 2)
-        self._shared = 0, 0  # units of work, and places of each
-        self._begins = np.zeros(BANDS + 1, np.int64)  # first places of bands, and the last one's end
-        self._costs = np.zeros(BANDS, np.int64)  # of the bands' rays
-        self._known = 0  # touched blocks that were told of
+        self._shared = 0, 0  # units of work, and ray places per unit
+        self._begins = np.zeros(BANDS + 1, np.int64)  # first ray place of each band, and the last end
+        self._costs = np.zeros(BANDS, np.int64)  # cost of the rays of each band
+        self._known = 0  # touched blocks that were already reported
         self._listed = _zeros(ti.i32, 1, kernels.LISTED_FIELDS)
         self._reserve(FIRST_BLOCKS)
         self._reserve_list(_LISTED)
@@ -88,10 +88,10 @@ class DeviceMap:
     def fuse(
         self, kind: str, job: tuple[int, ...] | None, room: tuple[int, ...], *arguments: Any
     ) -> tuple[NDArray[Any], ...]:
-        """Make a keyframe's rays with the function `kind` of `device_rays`, and add them, if there is a
-        `LaunchJob`.
+        """Make a keyframe's rays with the function `kind` of `device_rays`. With a `LaunchJob`, also add
+        them.
 
-        Missing blocks are then inserted, if there is `Room` for them; `NEW` of the report says so. Returns as
+        Missing blocks are then inserted if `Room` allows it; `NEW` of the report is their number. Returns as
         `add`.
         """
         is_image = kind == "image_rays"
@@ -137,7 +137,7 @@ class DeviceMap:
         return (self._depths,)
 
     def _share_places(self, units: int, places: int) -> None:
-        """Distribute units of work over the bands, each with so many places for rays."""
+        """Distribute units of work over the bands; each unit has `places` places for rays."""
         if (units, places) == self._shared:
             return
         self._shared = units, places
@@ -153,7 +153,7 @@ class DeviceMap:
 
         Returns:
             Report of the keyframe (`device_integration`), with the slots of blocks touched for the first
-            time; and, if any are missing, the keys of missing blocks, in order.
+            time. If blocks are missing, their keys follow in ascending order.
         """
         job = LaunchJob(*given)
         self._launch(job, job.first_band, job.end_band)
@@ -171,8 +171,8 @@ class DeviceMap:
         return self._news(told, missing if job.which == integrate.ALL else missing[:0])
 
     def _news(self, told: NDArray[np.int32], missing: NDArray[np.int64]) -> tuple[NDArray[Any], ...]:
-        """Answer to the host: a launch's report, without slots reported before and places without a key; and
-        missing blocks, in order."""
+        """Return the answer to the host: the launch's report, and missing blocks in order. The report omits
+        slots reported before, and unused places for keys."""
         known, self._known = self._known, int(told[TOUCHED_COUNT])
         told = np.concatenate([told[: FRESH_AT + 2 * told[NEW]], told[TOUCHED_AT + known :]])
         return (told, distinct(missing)) if len(missing) else (told,)
@@ -186,15 +186,15 @@ class DeviceMap:
         )  # fmt: skip
 
     def _read_results(self) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
-        """`told` of the last launch, and the keys of missing blocks, with duplicates."""
+        """Return `told` of the last launch, and the keys of missing blocks, with duplicates."""
         size = TOUCHED_AT + min(_FEW_TOUCHED, self._stamps.shape[0])
-        for _ in range(2):  # the second time, if it was not all
+        for _ in range(2):  # the second copy is for longer reports
             (told,) = self._copies.read((self._told, size))
             all_ = TOUCHED_AT + int(told[TOUCHED_COUNT] + told[NEW])
             if all_ <= size:
                 break
             size = all_
-        told = told[:all_].copy()  # for some bytes are read anew
+        told = told[:all_].copy()  # the copy's memory is used again
         told[TOUCHED_COUNT] += told[NEW]
         if told[NEW] or not told[TOUCHED_MISSING]:
             return told, np.empty(0, np.int64)
@@ -202,8 +202,8 @@ class DeviceMap:
         return told, found.copy()
 
     def _runs(self, first: int, end: int) -> Iterator[tuple[int, int]]:
-        """Runs of bands whose updates fit into the list, which grows for a larger band."""
-        # The cost of a ray is no less than the number of voxels that it crosses
+        """Yield runs of bands whose updates fit into the list. The list grows for a larger band."""
+        # The cost of a ray is at least the number of voxels that it crosses
         costs = np.concatenate([[0], np.cumsum(self._costs)])
         while first < end:
             fits = int(np.searchsorted(costs, costs[first] + _LISTED, side="right")) - 1
@@ -231,8 +231,8 @@ class DeviceMap:
         keys: NDArray[np.int64],
         slots: NDArray[np.int32],
     ) -> None:
-        """Insert `count` blocks with zero voxels, with keys and slots at these places of the hash of `size`
-        places. A change of `size` empties the hash first."""
+        """Insert blocks up to `count` with zero voxels, and their keys and slots at `places` of the hash. A
+        change of the hash's `size` empties the hash first."""
         self._reserve(count)
         self._count = count
         if self._hash_keys.shape[0] != size:
@@ -243,7 +243,7 @@ class DeviceMap:
             self._copies.finish()
 
     def drop(self, count: int) -> None:
-        """Keep `count` blocks, none of them in the hash. Voxels of slots beyond become zero."""
+        """Keep `count` blocks, and empty the hash. Voxels of the other slots become zero."""
         gone = np.arange(count, self._count, dtype=np.int32)
         for name in self._layer_names:
             if len(gone):
@@ -253,7 +253,6 @@ class DeviceMap:
         self._hash_keys.fill(0)
 
     def largest_weights(self, slots: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Largest weight in each block."""
         self._marks = _at_least(self._marks, ti.i32, len(slots))
         handed = self._copies.given(slots)
         device_rows.largest_weights(self._layers["sums"], *handed, len(slots), self._marks)
@@ -261,15 +260,14 @@ class DeviceMap:
         return found
 
     def read(self, name: str, slots: NDArray[np.int32], rows: NDArray[Any]) -> None:
-        """Copy blocks' rows of a layer."""
+        """Copy the blocks' rows of a layer into `rows`."""
         device_rows.read_rows(self._layers[name], slots, rows)
 
     def write(self, name: str, slots: NDArray[np.int32], rows: NDArray[Any]) -> None:
-        """Set blocks' rows of a layer."""
         device_rows.write_rows(self._layers[name], slots, rows)
 
     def _reserve(self, count: int) -> None:
-        """Make room for so many blocks. Raises RuntimeError without memory; the map is as it was."""
+        """Make room for `count` blocks. Raises RuntimeError without memory; the map is unchanged."""
         capacity = self._stamps.shape[0]
         if count > capacity:
             size = max(count, 2 * capacity)
@@ -288,7 +286,7 @@ def bands_of(told: NDArray[np.int32]) -> NDArray[np.int32]:
 
 
 def last_layer(kind: int) -> str:
-    """Layer that votes of this kind need beside `color_rgn`."""
+    """Return the layer that this kind of votes needs in addition to `color_rgn`."""
     return "hits" if kind == integrate.HIT_VOTE else "color_b"
 
 

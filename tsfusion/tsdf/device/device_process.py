@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""`python -m tsfusion.tsdf.device.device_process`: the process in which Taichi runs on a device.
+"""Run Taichi on a device in a separate process: `python -m tsfusion.tsdf.device.device_process`.
 
-Taichi has one device a process. Readers of maps (meshes, the field, questions) run on the CPU. `device_link`
-starts this process and is the other end of its connection.
+Taichi allows one device per process. Readers of maps (meshes, the field, questions) use the CPU, in the
+parent process. `device_link` starts this process, and holds the other end of the connection.
 """
 
 import signal
@@ -26,17 +26,17 @@ if TYPE_CHECKING:
     from tsfusion.tsdf.device.device_link import SentArray
     from tsfusion.tsdf.device.device_map import DeviceMap
 
-NEXT_S = 0.001  # in which the next call comes, where keyframes follow each other
-GROWS = ("make", "insert")  # what may fail for lack of memory, and then changes nothing
+NEXT_S = 0.001  # usual time until the next call, while keyframes follow each other
+GROWS = ("make", "insert")  # calls that can fail for lack of memory, and then change nothing
 
 
 class _Device:
-    """Main loop: it answers calls of maps by their numbers."""
+    """Main loop: reads calls for maps by number, and sends the answers."""
 
     def __init__(self, link: socket.socket, requests: SharedArrays, replies: SharedArrays) -> None:
         self._link, self._requests, self._replies = link, requests, replies
         self._copies = device_copies.copies()
-        self._pinned = 0  # address of the requests' memory
+        self._pinned = 0  # address of the pinned memory of requests
         self._maps: dict[int, DeviceMap] = {}
 
     def run(self) -> None:
@@ -87,7 +87,6 @@ class _Device:
         return self._replies.write(found) if isinstance(found, tuple) else found
 
     def _read(self, one: "DeviceMap", names: list[str], slots: Any) -> list[SharedSlot]:
-        """Rows of layers, copied from the device into shared memory."""
         places = []
         for name in names:
             rows, place = self._replies.empty((len(slots), CUBE), LAYER_DTYPES[name])
@@ -97,15 +96,15 @@ class _Device:
 
 
 def main() -> None:
-    """Serve a connection: its descriptor, that of the shared memory, the device, and `1` to end at once with
-    the thread that started this process."""
+    """Serve one connection. The arguments are the descriptors of the connection and of both shared memories,
+    the device, and a flag. With flag `1`, the process ends with the thread that started it."""
     link, requests, replies = (int(argument) for argument in sys.argv[1:4])
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)  # who started it decides
+        signal.signal(number, signal.SIG_IGN)  # the parent process decides when this process ends
     if sys.argv[5] == "1":
         process.on_parent_end(signal.SIGKILL)
     process.end_first()
-    process.lift_memory_limit()  # which counts what a driver maps, too
+    process.lift_memory_limit()  # the limit also counts memory that a driver maps
     connection = socket.socket(fileno=link)
     try:
         runtime.start_device(sys.argv[4])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Check that a device fuses as the CPU does, before a map trusts it: drivers have errors."""
+"""Check that a device fuses exactly as the CPU does, before a map uses it, because drivers have errors."""
 
 import logging
 from typing import Any
@@ -24,10 +24,10 @@ _LAYERS = ("sums", "color_rgn", "color_b", "hits")
 
 
 def device_for(arch: Arch, *, color: bool, hits: bool, smooths: bool) -> DeviceBlocks | None:
-    """Blocks of a new map on a device; None = on the CPU, by its settings or for want of a device (a
-    warning).
+    """Return the blocks of a new map on a device, or None for the CPU.
 
-    Raises MemoryError if the device has no memory for another map.
+    The CPU is used if `arch` says so. Other reasons are logged as warnings: smoothing along rays, no device,
+    or a device that computes another map. Raises MemoryError if the device has no memory for another map.
     """
     if smooths and arch != "cpu":
         log.warning("smoothing along rays (regularizer) needs the CPU; keyframes are fused there")
@@ -45,7 +45,7 @@ def device_for(arch: Arch, *, color: bool, hits: bool, smooths: bool) -> DeviceB
 
 
 def agrees(link: DeviceLink) -> bool:
-    """True if two keyframes, one of them taken away again, make the same map there and on the CPU."""
+    """Return True if the device and the CPU make the same map from test keyframes, added and retracted."""
     runtime.start(None)
     on_cpu = _store(None)
     buffers = RayBuffers(color=True, regularised=False)
@@ -62,8 +62,8 @@ def _store(device: DeviceBlocks | None) -> BlockStore:
 
 
 def _fused(store: BlockStore, buffers: RayBuffers, integrator: Integrator) -> list[NDArray[Any]]:
-    """Keys, bounds and layers, in key order, of a map of two keyframes, the second of which was there
-    twice."""
+    """Return keys, bounds and layers, in key order, of a test map. An image is added twice and retracted
+    once."""
     for keyframe, sign in zip(_keyframes(), (1, 1, 1, -1), strict=True):
         buffers.make_rays(keyframe, _CONFIG)
         integrator.apply(sign)
@@ -76,7 +76,7 @@ def _fused(store: BlockStore, buffers: RayBuffers, integrator: Integrator) -> li
 
 
 def _keyframes() -> list[Keyframe]:
-    """Noisy surfaces, seen askew: no coordinate lies on the border between two voxels."""
+    """Return noisy surfaces, seen obliquely: no coordinate lies on the border between two voxels."""
     random = np.random.default_rng(0)
     turn, _ = np.linalg.qr(random.normal(size=(3, 3)))
     pose = np.eye(4)

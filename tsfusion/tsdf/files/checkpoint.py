@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-r"""A saved map: one file, written whole or not at all, verified when read.
+r"""Read and write a saved map: one file, written completely or not at all, and verified when read.
 
     TSFMAP1\n | header | chunk … | digest      each but the first: uint32 length, then its bytes
 
 The header is msgpack. A chunk is one zstd frame with the keys and then each layer of up to 1024 blocks, in
-key order (a sum of maps has shorter chunks among them). The digest is blake2b-128 of everything before it.
+key order. A sum of maps also has shorter chunks. The digest is blake2b-128 of everything before it.
 """
 
 import hashlib
@@ -35,15 +35,15 @@ MAGIC = b"TSFMAP1\n"
 CHUNK = 1024  # blocks
 CUBE = 512  # voxels a block
 _DIGEST_BYTES = 16
-_PART = 1 << 20  # bytes that are copied at a time
-_ROWS = 128  # that are gathered at a time
+_PART = 1 << 20  # bytes to copy per step
+_ROWS = 128  # rows to gather per step
 _MAX_WINDOW_BYTES = 1 << 24  # of zstd; level 1 uses less
 
-NamedArrays = Iterable[tuple[str, NDArray[Any]]]  # some rows of a chunk at a time, by the name of their layer
+NamedArrays = Iterable[tuple[str, NDArray[Any]]]  # for each layer: its name, and some rows of a chunk
 
 
 class CheckpointHeader(msgspec.Struct, kw_only=True):
-    """First part of a checkpoint: the settings and history of the map, and the layout of what follows."""
+    """First part of a checkpoint: the settings and history of the map, and the layout of the rest."""
 
     config: VolumeConfig
     keyframes: int
@@ -54,8 +54,8 @@ class CheckpointHeader(msgspec.Struct, kw_only=True):
     clear: bytes = b""  # blocks that keyframes look through (`clear_blocks.encoded`)
 
     def clear_blocks(self, path: Path) -> "ClearCounts":
-        """Blocks that keyframes look through, with the number of keyframes. Raises DamagedCheckpoint."""
-        from tsfusion.tsdf.store import clear_blocks  # with Taichi
+        """Return the blocks that keyframes look through, with counts. Raises DamagedCheckpoint."""
+        from tsfusion.tsdf.store import clear_blocks  # imports Taichi
 
         try:
             return clear_blocks.decoded(self.clear, self.config.max_blocks)
@@ -71,7 +71,7 @@ class Chunk(NamedTuple):
     """Up to 1024 blocks of a checkpoint that is being read.
 
     `fill` reads the next bytes into an array: first the keys (blocks,) int64, then, for each layer in the
-    header's order, rows (blocks, 512) of its dtype. `frame`: the whole chunk as stored.
+    header's order, rows (blocks, 512) of its dtype. `frame` is the whole chunk as stored.
     """
 
     first: int
@@ -81,10 +81,10 @@ class Chunk(NamedTuple):
 
 
 class Piece(NamedTuple):
-    """Up to 1024 blocks of a checkpoint that is being written.
+    """Up to 1024 blocks of a checkpoint that is being written, in one of three forms.
 
-    Either `rows`: the keys, then the layers in the header's order; or all of that in one array, `content`; or
-    the `frame` of a `Chunk`.
+    `rows` has the keys, then the layers in the header's order. `content` has all of that in one array.
+    `frame` is that of a `Chunk`.
     """
 
     blocks: int
@@ -105,8 +105,8 @@ def write(
 ) -> Path:
     """Write blocks `slots` of each layer (…, 512) under their keys.
 
-    The old file at `path` stays until the new one is whole and on the disk. A part that a killed writer left
-    is overwritten.
+    The old file at `path` stays until the new file is complete and on the disk. The partial file of a killed
+    writer is overwritten.
 
     Args:
         map_digest: takes the keys and sums in the same pass; its result is the header's `map_hash`.
@@ -147,9 +147,9 @@ def write_pieces(
     map_hash: Callable[[], str] | None = None,
     between: Callable[[], None] = lambda: None,
 ) -> Path:
-    """Write a map of `blocks` blocks in `pieces` in key order, as `write`, with one piece in memory.
+    """Write a map of `blocks` blocks from `pieces` in key order, as `write`, with one piece in memory.
 
-    `map_hash` is called when all pieces are taken; until then the header has a placeholder of its length.
+    `map_hash` is called after the last piece; until then the header has a placeholder of its length.
     """
     header.blocks = blocks
     try:
@@ -201,7 +201,7 @@ def copy(source: Path, target: Path, alter: Callable[[CheckpointHeader], None]) 
 
 
 def split(content: NDArray[np.uint8], layers: Iterable[str]) -> tuple[NDArray[np.int64], dict[str, Any]]:
-    """Keys (n,) and rows (n, 512) of each layer in the bytes of a chunk.
+    """Split the bytes of a chunk into keys (n,) and rows (n, 512) of each layer.
 
     `content` comes from `array_for`, or is a whole chunk; the arrays are views of it.
     """
@@ -221,16 +221,16 @@ def array_for(blocks: int, layers: Iterable[str]) -> NDArray[np.uint8]:
 
 @contextmanager
 def reading(path: Path, *, is_checked: bool = False) -> Iterator[tuple[CheckpointHeader, Iterator[Chunk]]]:
-    """Header and chunks of a checkpoint; the `with` block puts each chunk into its place.
+    """Open a checkpoint. Yields its header and chunks; the `with` block copies each chunk into a map.
 
-    Memory holds one chunk beside that place. A MemoryError of the `with` block becomes one about the
-    checkpoint.
+    Memory holds one chunk in addition to the map. A MemoryError of the `with` block becomes a
+    CheckpointError.
 
     Args:
-        is_checked: the caller has just read the file; its digest is not compared again.
+        is_checked: the caller has just read the file, so its digest is not compared again.
 
     Raises:
-        DamagedCheckpoint: when a byte differs from the one written.
+        DamagedCheckpoint: when a byte differs from the written byte.
         CheckpointError: when the file is missing, unreadable, or of another version.
     """
     try:
@@ -248,7 +248,7 @@ def reading(path: Path, *, is_checked: bool = False) -> Iterator[tuple[Checkpoin
 
 
 def keys_of(path: Path, *, is_checked: bool = False) -> tuple[CheckpointHeader, NDArray[np.int64]]:
-    """Header of a checkpoint and the sorted keys of its blocks. Arguments and errors as of `reading`."""
+    """Return the header and the sorted block keys of a checkpoint. Arguments and errors as in `reading`."""
     with reading(path, is_checked=is_checked) as (header, chunks):
         keys = np.empty(header.blocks, np.int64)
         for chunk in chunks:
@@ -265,14 +265,14 @@ def verify(path: Path, header: CheckpointHeader, map_hash: str) -> None:
 def _payloads(
     header: CheckpointHeader, pieces: Iterable[Piece], between: Callable[[], None]
 ) -> Iterator[list[bytes]]:
-    """Bytes of each piece, in parts: the map may have left little memory."""
+    """Yield the bytes of each piece as several parts, because the map may have left little memory."""
     left = header.blocks
     for piece in pieces:
         left -= piece.blocks
         if piece.frame:
             yield [piece.frame]
             continue
-        if piece.content is not None:  # at once is a quarter faster than bit by bit
+        if piece.content is not None:  # one call is a quarter faster than several
             yield [zstandard.ZstdCompressor(level=1).compress(piece.content.data)]
             continue
         size = piece.blocks * _block_bytes(header.layers)
@@ -286,7 +286,7 @@ def _payloads(
 def _rows(
     keys: NDArray[np.int64], slots: NDArray[np.int64], layers: dict[str, NDArray[Any]]
 ) -> Iterator[tuple[str, NDArray[Any]]]:
-    """Keys of a chunk, and its rows, some at a time."""
+    """Yield the keys of a chunk, then its rows, `_ROWS` rows per step."""
     yield "keys", keys
     for name, layer in layers.items():
         for j in range(0, len(slots), _ROWS):
@@ -311,9 +311,9 @@ def _read_header(file: BinaryIO, path: Path) -> CheckpointHeader:
     try:
         header = msgspec.msgpack.decode(encoded, type=CheckpointHeader)
         if "min_behind" not in msgspec.msgpack.decode(encoded, type=_SavedSettings).config:
-            # Rays of a version without this setting reach as far behind their ends as before; so do new ones
+            # Older rays reach equally far before and behind their ends; rays added later must, too
             header.config = msgspec.structs.replace(header.config, min_behind=SYMMETRIC)
-    except msgspec.ValidationError as error:  # the digest agrees: it is as its writer meant it
+    except msgspec.ValidationError as error:  # the digest agrees, so the writer wrote exactly this
         raise CheckpointError(f"{path} is of another version: {error}") from error
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise DamagedCheckpoint(f"{path} is malformed: {error}") from error
@@ -351,7 +351,7 @@ def _read_chunks(file: BinaryIO, path: Path, header: CheckpointHeader) -> Iterat
 
 
 def _fill(stream: zstandard.ZstdDecompressionReader, path: Path, rows: NDArray[Any]) -> None:
-    """Read the next bytes of a chunk into `rows`, which are contiguous."""
+    """Read the next bytes of a chunk into the contiguous array `rows`."""
     try:
         read = stream.readinto(rows.data)
     except zstandard.ZstdError as error:
@@ -361,9 +361,9 @@ def _fill(stream: zstandard.ZstdDecompressionReader, path: Path, rows: NDArray[A
 
 
 def _check_digest(file: BinaryIO, path: Path) -> None:
-    """Compare the digest of the whole file, before any allocation, and keep the position in `file`.
+    """Compare the digest of the whole file, and restore the position in `file`.
 
-    A header with one flipped bit may ask for all memory there is.
+    The check comes before any allocation, because a header with one flipped bit may ask for all memory.
     """
     here = file.tell()
     size = file.seek(0, os.SEEK_END) - _DIGEST_BYTES
@@ -373,7 +373,7 @@ def _check_digest(file: BinaryIO, path: Path) -> None:
 
 
 def _digest(file: BinaryIO, size: int) -> bytes:
-    """Digest of the first bytes of a file; leaves the position behind them."""
+    """Return the digest of the first `size` bytes of a file, and leave the position after these bytes."""
     file.seek(0)
     digest = hashlib.blake2b(digest_size=_DIGEST_BYTES)
     for at in range(0, size, _PART):

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Keyframes in a map, by session, as the fuser writes them into a checkpoint.
+"""Read and combine the lists of keyframes, by session, that the fuser writes into a checkpoint.
 
-A session is one scanner's stream of numbered records. Its keyframes count once: maps that hold the same ones
-must not be added. Its poses are in one coordinate frame, the session's world: maps of different worlds are
+A session is one scanner's stream of numbered records. A keyframe must count once: maps with common keyframes
+must not be added. All poses of a session are in one coordinate frame, its world. Maps of different worlds are
 added only if the caller knows that they share a frame.
 """
 
@@ -21,8 +21,8 @@ from tsfusion.core.readable_numbers import count_of
 from tsfusion.geometry.origin import Origin
 from tsfusion.geometry.up_direction import HeldSensor
 
-HELD = "held"  # in a checkpoint's meta: how the sensors were held, as the fuser wrote it first
-_POSE = 12  # numbers: the upper three rows
+HELD = "held"  # key of a checkpoint's meta: how the sensors were held
+_POSE = 12  # numbers per pose: the upper three rows
 _PLACES = ("seqs", "segments", "offsets", "fused")  # columns of a session's keyframes
 
 
@@ -31,13 +31,13 @@ class SessionHistory(Struct, frozen=True, eq=False):
 
     Attributes:
         session: 32 hex digits.
-        client: name of its key; empty = it came without keys.
-        world: its coordinate frame; empty = that of poses given from elsewhere.
-        last: up to this number, each keyframe is in the map or will never be.
+        client: name of the client's key; empty for a client without keys.
+        world: coordinate frame of the poses; empty for poses given from elsewhere.
+        last: every keyframe up to this number is in the map, or will never be.
         unlisted: up to this number the list of keyframes is unknown; 0 = all are listed.
-        seqs: (n,) int64 numbers of the others in the map, ascending.
-        poses: (n, 12) float64: upper three rows of each one's `T_world_camera` in the map.
-        positions: (n, 2) int64: segment of the journal and byte of each one's record.
+        seqs: (n,) int64 numbers of the listed keyframes in the map, ascending.
+        poses: (n, 12) float64, the upper three rows of `T_world_camera` of each.
+        positions: (n, 2) int64, journal segment and byte of each keyframe's record.
         taken_out: (k,) int64 numbers of keyframes that corrections have taken out of the map.
         waiting: number of keyframes whose corrected pose is not fused yet.
     """
@@ -55,13 +55,13 @@ class SessionHistory(Struct, frozen=True, eq=False):
 
 
 def sessions(meta: Mapping[str, Any]) -> list[SessionHistory]:
-    """Sessions of a map; none of a map that no server saved."""
+    """Return the sessions of a map; the list is empty for a map that no server saved."""
     saved = meta.get("poses") or {}
     listed = saved.get("sessions", {})
     waiting = [name for name, *_ in saved.get("waiting", ())]
     found = []
     for name, (last, client, *world) in meta.get("done", {}).items():
-        # An unlisted keyframe is not in the map, or an earlier version fused it
+        # Such a keyframe is absent from the map, or was fused by an earlier version
         nothing = {**dict.fromkeys(_PLACES, b""), "unknown": 0 if saved else last}
         one: Mapping[str, Any] = listed.get(name, nothing)
         fused = np.frombuffer(one["fused"]).reshape(-1, _POSE)
@@ -91,14 +91,14 @@ def check_readable(meta: Mapping[str, Any]) -> None:
 
 
 def of_clients(histories: Iterable[SessionHistory]) -> list[SessionHistory]:
-    """Sessions of scanners: all but the server's own, in which it forgets keyframes."""
+    """Return the sessions of scanners, without the server's own session, in which it forgets keyframes."""
     return [one for one in histories if one.session != SERVER_SESSION.hex()]
 
 
 def worlds(meta: Mapping[str, Any]) -> set[str]:
-    """Coordinate frames of a map's keyframes; empty text = that of poses given from elsewhere.
+    """Return the coordinate frames of a map's keyframes; an empty string is that of given poses.
 
-    A map that no server made states its own as `world`.
+    A map that no server made has its own frame as `world` in `meta`.
     """
     return {one.world for one in of_clients(sessions(meta))} or {str(meta.get("world", ""))}
 
@@ -108,7 +108,7 @@ def check_addable(here: Mapping[str, Any], there: Mapping[str, Any], *, same_fra
 
     Args:
         here, there: `meta` of each map.
-        same_frame: the maps are in one frame, whatever their worlds.
+        same_frame: the caller knows that the maps share a frame, even with different worlds.
     """
     ours, theirs = ({one.session: one for one in of_clients(sessions(meta))} for meta in (here, there))
     for name in ours:
@@ -133,7 +133,7 @@ def check_worlds(here: Set[str], there: Set[str], *, same_frame: bool, name: str
 
 
 def are_given(here: Mapping[str, Any], there: Mapping[str, Any]) -> bool:
-    """True if only given poses say that two maps are in one frame: no world, no session."""
+    """Return True if only given poses show that two maps share a frame: no common world or session."""
     ours, theirs = (of_clients(sessions(meta)) for meta in (here, there))
     worlds = [{one.world for one in each} or {""} for each in (ours, theirs)]
     names = [{one.session for one in each} for each in (ours, theirs)]
@@ -156,15 +156,14 @@ def _check_distinct(ours: SessionHistory, theirs: SessionHistory) -> None:
 
 
 def poses(meta: Mapping[str, Any]) -> set[bytes]:
-    """Listed poses of a map's keyframes; maps with a common pose likely share that keyframe."""
+    """Return the listed poses of a map's keyframes; maps with a common pose likely share that keyframe."""
     return {row.tobytes() for one in sessions(meta) for row in one.poses}
 
 
 def without_journal(meta: Mapping[str, Any]) -> dict[str, Any]:
-    """Meta of a map that leaves its journal behind, or is no longer a sum of whole keyframes.
+    """Return the meta of a map that loses its journal, or is no longer a sum of whole keyframes.
 
-    None of its keyframes can be moved or listed any more. Keyframes with waiting corrections stay where they
-    are.
+    Its keyframes can no longer be moved or listed. Keyframes with waiting corrections keep their poses.
     """
     if "done" not in meta:
         return dict(meta)
@@ -183,7 +182,7 @@ def without_journal(meta: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def added(here: Mapping[str, Any], there: Mapping[str, Any]) -> dict[str, Any]:
-    """Meta of two maps' sum; each session continues from the later of its two states."""
+    """Return the meta of two maps' sum; each session continues from the later of its two states."""
     one, other = without_journal(here), without_journal(there)
     together = {**other, **one}
     if "done" not in together:
@@ -213,7 +212,7 @@ def _sums(*parts: Mapping[str, Any]) -> dict[str, int]:
 
 
 def _later(parts: list[dict[str, Any]]) -> dict[str, Any]:
-    """A session of one map, or the later state of a session of two."""
+    """Return the session's only state, or the later state of two."""
     if len(parts) == 1:
         return parts[0]
     latest = max(parts, key=lambda part: part["unknown"])

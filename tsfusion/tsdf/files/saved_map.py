@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The blocks and settings of a checkpoint, checked on the way into a map."""
+"""Load the blocks and settings of a checkpoint into a map, and check them."""
 
 import hashlib
 from collections.abc import Iterable, Mapping
@@ -27,12 +27,12 @@ def fill(
     chunks: Iterable[checkpoint.Chunk],
     digest: "hashlib.blake2b",
 ) -> None:
-    """Put the blocks of a checkpoint into an empty store, and their keys and sums into a digest.
+    """Load the blocks of a checkpoint into an empty store, and their keys and sums into a digest.
 
     Raises CheckpointError for other layers than the store's, or for impossible blocks.
     """
     layers = store.layers()
-    if not layers.keys() - {"hits"} <= {*header.layers} <= layers.keys():  # earlier versions count none
+    if not layers.keys() - {"hits"} <= {*header.layers} <= layers.keys():  # optional
         raise CheckpointError(f"{path} is of another version: it has layers {header.layers}")
     checked = 0
     with SideThread() as side:
@@ -44,7 +44,7 @@ def fill(
                 chunk.fill(layers[name][chunk.first : store.count])
             store.note_written(np.arange(chunk.first, store.count))
             store.keep_within_memory()
-            # the hash is that of runs of 1024, wherever the file's chunks end
+            # the hash takes 1024 blocks per step, independent of the file's chunks
             while store.count - checked >= checkpoint.CHUNK or checked < store.count == header.blocks:
                 end = min(checked + checkpoint.CHUNK, store.count)
                 side.do(partial(_check_in, path, store, slice(checked, end), digest))
@@ -59,9 +59,9 @@ def fill_box(
     low: NDArray[np.int64],
     high: NDArray[np.int64],
 ) -> None:
-    """Put the blocks low ≤ (x, y, z) < high of a checkpoint into an empty store.
+    """Load the blocks low ≤ (x, y, z) < high of a checkpoint into an empty store.
 
-    A chunk without such a block is unpacked only up to its keys.
+    A chunk without such blocks is decompressed only up to its keys.
     """
     for chunk in chunks:
         keys = np.empty(chunk.blocks, np.int64)
@@ -81,7 +81,7 @@ def fill_box(
 
 
 def _check_in(path: Path, store: BlockStore, blocks: slice, digest: "hashlib.blake2b") -> None:
-    """Hash blocks just read, and measure their bounds."""
+    """Hash the blocks just read, and measure their bounds."""
     keys, sums = store.keys[blocks], store.sums[blocks]
     store.bounds[blocks] = (sums & integrate.WEIGHT_MASK).max(axis=1)
     before = store.keys[max(blocks.start - 1, 0) : blocks.stop]
@@ -94,11 +94,10 @@ def _check_in(path: Path, store: BlockStore, blocks: slice, digest: "hashlib.bla
 def loaded_config(
     header: checkpoint.CheckpointHeader, threads: int | None, changed: Mapping[str, Any]
 ) -> VolumeConfig:
-    """Settings of a saved map, with the changed ones."""
     saved = header.config
     fixed = {name for name in changed if name not in (*VIEW_SETTINGS, *LIMIT_SETTINGS, *RUN_SETTINGS)}
     if saved.model().regularizer != "off" and changed.get("smoothness") not in (None, saved.smoothness):
-        fixed.add("smoothness")  # it has smoothed along rays already
+        fixed.add("smoothness")  # smoothing along rays is already part of the map
     if fixed:
         raise InvalidConfig(f"a saved map cannot change {', '.join(sorted(fixed))}; fuse it anew")
     config = override(msgspec.structs.replace(saved, threads=threads, arch="cpu"), **changed)

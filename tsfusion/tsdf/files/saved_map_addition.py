@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Addition of any number of saved maps, file to file, with memory for one chunk of each.
+"""Add any number of saved maps, file to file, with memory for one chunk of each.
 
-A chunk whose blocks lie between those of all other maps goes to the sum as it is, compressed; only its keys
-and sums are read, for the hash.
+A chunk is copied without decompression if its blocks lie between the blocks of all other maps. Then only its
+keys and sums are read, for the hash.
 """
 
 from collections.abc import Iterator, Sequence
@@ -36,13 +36,13 @@ def add_files(paths: Sequence[Path], target: Path) -> CheckpointHeader:
     """Write the sum of saved maps of one frame, voxel size and set of layers, as `Volume.merge` makes it.
 
     Args:
-        paths: one or more; the caller makes sure that no keyframe is in two of them.
-        target: the file; it may be one of them.
+        paths: one or more files; the caller makes sure that no keyframe is in two of them.
+        target: the file to write; may be one of `paths`.
 
     Raises:
-        MapError: when they differ in voxel size or layers.
+        MapError: when the maps differ in voxel size or layers.
         MapFull, WeightOverflow: as `Volume.merge`; nothing is written.
-        CheckpointError: when one cannot be read, or the sum cannot be written.
+        CheckpointError: when a map cannot be read, or the sum cannot be written.
     """
     headers, keys = zip(*(checkpoint.keys_of(path) for path in paths), strict=True)
     blocks = len(distinct(np.concatenate(keys)))
@@ -59,7 +59,7 @@ def add_files(paths: Sequence[Path], target: Path) -> CheckpointHeader:
 
 
 def checked_keys(path: Path) -> tuple[CheckpointHeader, NDArray[np.int64]]:
-    """Header of a checkpoint, and the keys of its blocks, after a check of the voxels against the map's hash.
+    """Return the header and block keys of a checkpoint, after comparing its voxels with the map's hash.
 
     Raises as `checkpoint.reading`, and DamagedCheckpoint for another hash.
     """
@@ -95,7 +95,7 @@ def _header(paths: Sequence[Path], headers: Sequence[CheckpointHeader], blocks: 
     return CheckpointHeader(
         config=first.config,
         keyframes=sum(one.keyframes for one in headers),
-        map_hash="0" * len(first.map_hash),  # until it is known
+        map_hash="0" * len(first.map_hash),  # placeholder until the hash is known
         meta={**meta, HELD: held.numbers},
         layers=first.layers,
         clear=clear_blocks.encoded(clear),
@@ -103,7 +103,7 @@ def _header(paths: Sequence[Path], headers: Sequence[CheckpointHeader], blocks: 
 
 
 class MapDigest:
-    """Hash of a map from its blocks in key order, in pieces of any length."""
+    """Hash of a map from its blocks in key order, given in pieces of any length."""
 
     def __init__(self, voxel_size: float) -> None:
         self._digest, self._side = begin_hash(voxel_size), SideThread()
@@ -120,7 +120,7 @@ class MapDigest:
         self._side.__exit__(kind, error, where)
 
     def add(self, keys: NDArray[np.int64], sums: NDArray[np.int64]) -> None:
-        """Take blocks; the arrays must not change afterwards."""
+        """Add blocks; the arrays must not change afterwards."""
         while len(keys):
             now = min(CHUNK - self._count, len(keys))
             self._waiting.append((keys[:now], sums[:now]))
@@ -144,8 +144,8 @@ class MapDigest:
 class _BlockStream:
     def __init__(self, keys: NDArray[np.int64], opened: tuple[CheckpointHeader, Iterator[Chunk]]) -> None:
         self._keys, self._layers, self._chunks = keys, opened[0].layers, opened[1]
-        self._chunk: Chunk | None = None  # of which the next block is
-        self._rows: BlockColumns = {}  # of that chunk, once they are read
+        self._chunk: Chunk | None = None  # chunk of the next block
+        self._rows: BlockColumns = {}  # rows of that chunk, after they are read
         self._taken = 0
 
     @property
@@ -158,13 +158,11 @@ class _BlockStream:
 
     @property
     def last_key(self) -> int:
-        """Last key of the next block's chunk."""
         chunk = self._current()
         return int(self._keys[chunk.first + chunk.blocks - 1])
 
     @property
     def is_at_chunk(self) -> bool:
-        """True if no block of the current chunk has been taken."""
         return self._current().first == self._taken
 
     def _current(self) -> Chunk:
@@ -186,7 +184,7 @@ class _BlockStream:
         return rest[: np.searchsorted(rest, last, side="right")]
 
     def take(self, last: int) -> Iterator[tuple[NDArray[np.int64], BlockColumns]]:
-        """Keys and rows of the next blocks up to `last`, a chunk's at a time."""
+        """Yield keys and rows of the next blocks up to `last`, one chunk per step."""
         left = len(self.keys_up_to(last))
         while left:
             chunk = self._current()
@@ -218,7 +216,7 @@ def _pieces(streams: Sequence[_BlockStream], layers: Sequence[str], digest: MapD
 def _sum(
     keys: NDArray[np.int64], streams: Sequence[_BlockStream], layers: Sequence[str], digest: MapDigest
 ) -> Piece:
-    """Sums of the blocks `keys`, which are next in the streams."""
+    """Return the sums of the blocks `keys`, which are the next blocks of the streams."""
     content = checkpoint.array_for(len(keys), layers)
     own, sums = checkpoint.split(content, layers)
     own[:] = keys
@@ -238,10 +236,10 @@ def _sum(
 
 
 def _put(sums: BlockColumns, rows: BlockColumns, at: NDArray[np.int64]) -> None:
-    """Write the rows `at` of blocks that have none yet."""
+    """Write the rows of blocks into the indices `at`, which are still empty."""
     if not len(at):
         return
-    run = slice(int(at[0]), int(at[-1]) + 1)  # mostly they lie side by side
+    run = slice(int(at[0]), int(at[-1]) + 1)  # mostly the indices are consecutive
     where: Any = run if run.stop - run.start == len(at) else at
     for name, one in rows.items():
         sums[name][where] = one
@@ -250,7 +248,7 @@ def _put(sums: BlockColumns, rows: BlockColumns, at: NDArray[np.int64]) -> None:
 def _add(sums: BlockColumns, rows: BlockColumns, at: NDArray[np.int64]) -> None:
     both = sums["sums"][at]
     both += rows["sums"]
-    if (is_full := both & WEIGHT_LIMIT).any():  # the limit is a bit, and twice as much the lane's end
+    if (is_full := both & WEIGHT_LIMIT).any():  # the limit is a bit; a lane overflows at twice the limit
         full = int(is_full.any(axis=1).sum())
         raise WeightOverflow(
             f"{full} blocks hold voxels that would have more votes than their integers hold "

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""A map as arrays of voxels, in memory (NumPy, Open3D) or in a file: `.npz`, `.zarr`, `.vdb` (OpenVDB).
+"""Convert a map to arrays of voxels, in memory (NumPy, Open3D) or in a file: `.npz`, `.zarr` or `.vdb`.
 
-Both kinds of arrays hold `voxel_size` (metres) and, for each voxel, `tsdf` float32 (signed distance to the
+Both layouts of arrays hold `voxel_size` (metres) and, for each voxel, `tsdf` float32 (signed distance to the
 surface in metres, positive in front of it, NaN where unseen), `weight` float32 (votes, in full-confidence
 samples) and, in a map with colour, `color` uint8 RGB (0 where unseen). A distance field holds `distance`
 float32 (metres, at most `max_distance`) instead.
@@ -12,7 +12,8 @@ Blocks: `blocks` (n, 3) int32, and `tsdf`, `weight` (n, 8, 8, 8), `color` (n, 8,
 Dense: `tsdf`, `weight` (X, Y, Z), `color` (X, Y, Z, 3), and `origin` (3,) float64: the centre of voxel (i, j,
 k) is at origin + ((i, j, k) + 0.5) · voxel_size.
 
-OpenVDB: one grid, `tsdf` or `distance`; its background stands where nothing was seen, or nothing is near.
+OpenVDB: one grid, `tsdf` or `distance`. Its background value fills unseen voxels, or voxels far from
+surfaces.
 """
 
 import tempfile
@@ -39,12 +40,12 @@ from tsfusion.tsdf.store.block_store import BlockStore, unpack_keys
 from tsfusion.tsdf.surface.field_regularizer import values_of
 
 MOST_DENSE = 1 << 31  # voxels
-_CHUNK = 256  # blocks at a time
+_CHUNK = 256  # blocks per step
 _LANE = (1 << 24) - 1  # of Σ R and Σ G
 _VOTES = (1 << 16) - 1
-_EARLIEST = (1980, 1, 1, 0, 0, 0)  # as the date of every part: the same map gives the same file
+_EARLIEST = (1980, 1, 1, 0, 0, 0)  # date of every archive member, so that the same map gives the same file
 SIDE = 8  # voxels
-OPEN3D_TRUNCATION = 8.0  # voxels that stand for 1 in Open3D: its `trunc_voxel_multiplier`
+OPEN3D_TRUNCATION = 8.0  # distance in voxels that Open3D stores as 1: its `trunc_voxel_multiplier`
 
 
 class _GridField(NamedTuple):
@@ -70,12 +71,12 @@ FORMATS = (".npz", ".zarr", ".vdb")
 
 
 class _Voxels(NamedTuple):
-    """Arrays of voxels, only a part of which is in memory."""
+    """Arrays of voxels, of which memory holds only a part."""
 
-    plain: dict[str, NDArray[Any]]  # what stands beside them
-    names: list[str]  # of `_FIELDS`
-    shape: tuple[int, ...]  # without a field's own
-    parts: Callable[[str], Iterator[NDArray[Any]]]  # of a field, in order along the first axis
+    plain: dict[str, NDArray[Any]]  # small arrays, such as the voxel size
+    names: list[str]  # keys of `_FIELDS`
+    shape: tuple[int, ...]  # without a field's own dimensions
+    parts: Callable[[str], Iterator[NDArray[Any]]]  # yields the parts of a field along the first axis
 
 
 def write(
@@ -88,16 +89,16 @@ def write(
     min_weight: float = 0.0,
     watch: OnProgress = lambda _done, _all: None,
 ) -> None:
-    """Write the voxels of a map; complete or not at all, in little memory.
+    """Write the voxels of a map, completely or not at all, in little memory.
 
     Args:
         dense: one box around the whole map, instead of its blocks.
-        field: signed distances as fused, with weights and colours; or the distance field.
-        max_distance, min_weight: of the distance field, as for `AskableMap.distance_blocks`.
+        field: signed distances as fused, with weights and colours, or the distance field.
+        max_distance, min_weight: settings of the distance field, as for `AskableMap.distance_blocks`.
 
     Raises:
         InvalidConfig: for another suffix or field.
-        OutputError: when it cannot be written, a map is empty, or the box has more than `MOST_DENSE` voxels.
+        OutputError: for a write error, an empty map, or a box of more than `MOST_DENSE` voxels.
         MissingDependency: zarr is not installed.
     """
     suffix = path.suffix.lower()
@@ -155,7 +156,7 @@ def _dense_distances(store: BlockStore, max_distance: float, min_weight: float) 
 def _spooled_distances(
     store: BlockStore, near: Iterator[distance_fields.FieldBlocks], max_distance: float, spool: IO[bytes]
 ) -> _Voxels:
-    """Distance field near a map's surfaces, spooled to a file until its length is known."""
+    """Return the distance field near a map's surfaces, spooled to a file until its length is known."""
     blocks = []
     for one in near:
         spool.write(one.distance.data)
@@ -185,7 +186,7 @@ def _write_npz(path: Path, voxels: _Voxels, progress: "_Counted") -> None:
 
 
 def _write_zarr(path: Path, voxels: _Voxels, progress: "_Counted") -> None:
-    """Write a folder in which each array has chunks of `_CHUNK` blocks, or of 8 planes across x."""
+    """Write a folder in which each array has chunks of `_CHUNK` blocks, or of 8 layers along x."""
     try:
         import zarr
     except ImportError as error:
@@ -229,7 +230,7 @@ def _write_vdb(
     if near is not None:
         point_files.write(path, near, name="distance", voxel_size=size, background=max_distance)
         return
-    beyond = size * (MAX_DISTANCE + 1) / QUANTA_PER_VOXEL  # no distance that was fused is as large
+    beyond = size * (MAX_DISTANCE + 1) / QUANTA_PER_VOXEL  # larger than every fused distance
     used = used[point_files.order_of(unpack_keys(store.keys[used]))]
     parts = (
         (unpack_keys(store.keys[part]), np.nan_to_num(decoded(store, part, "tsdf"), nan=beyond))
@@ -262,7 +263,7 @@ def _write_array(
 
 
 def _blocks(store: BlockStore, used: NDArray[np.int64], name: str) -> Iterator[NDArray[Any]]:
-    """Parts (m, 8, 8, 8, …) of a field."""
+    """Yield parts (m, 8, 8, 8, …) of a field."""
     for i in range(0, len(used), _CHUNK):
         yield decoded(store, used[i : i + _CHUNK], name)
 
@@ -270,7 +271,7 @@ def _blocks(store: BlockStore, used: NDArray[np.int64], name: str) -> Iterator[N
 def _slabs(
     store: BlockStore, used: NDArray[np.int64], blocks: NDArray[np.int32], name: str
 ) -> Iterator[NDArray[Any]]:
-    """Parts (8, Y, Z, …) of a field: one for each block along x."""
+    """Yield parts (8, Y, Z, …) of a field: one part for each block along x."""
     field, low = _FIELDS[name], blocks.min(axis=0)
     x, y, z = (blocks - low).T
     wide, high = int(y.max()) + 1, int(z.max()) + 1
@@ -284,7 +285,7 @@ def _slabs(
 
 
 def decoded(store: BlockStore, slots: NDArray[np.int64], name: str) -> NDArray[Any]:
-    """Field `tsdf`, `weight` or `color` of blocks, (m, 8, 8, 8, …)."""
+    """Return the field `tsdf`, `weight` or `color` of blocks, (m, 8, 8, 8, …)."""
     shape = (len(slots), 8, 8, 8, *_FIELDS[name].shape)
     if name == "tsdf":
         quanta = values_of(store.keys[slots], store, 0.0)
@@ -299,14 +300,14 @@ def decoded(store: BlockStore, slots: NDArray[np.int64], name: str) -> NDArray[A
 
 
 class Blocks:
-    """The n blocks that a map has now, of 8³ voxels each: [block, x, y, z].
+    """The n current blocks of a map, 8³ voxels each: [block, x, y, z].
 
-    The centre of voxel (i, j, k) of block b is at (8 · coordinates[b] + (i, j, k) + 0.5) · voxel_size. Stored
-    sums are shown without copying, read-only: (n, 8, 8, 8) arrays that stay valid after any change of the
-    map. The arrays show later changes in these blocks until the map's memory grows.
+    The centre of voxel (i, j, k) of block b is at (8 · coordinates[b] + (i, j, k) + 0.5) · voxel_size. The
+    arrays of stored sums are read-only views, (n, 8, 8, 8), that stay valid after any change of the map. They
+    show later changes of these blocks until the map's memory grows.
 
     Args:
-        store: the blocks of a map; `Volume.blocks()` gives them.
+        store: the blocks of a map; `Volume.blocks()` passes them.
 
     Attributes:
         coordinates: (n, 3) int32, in units of 8 voxels.
@@ -340,17 +341,17 @@ class Blocks:
         return unpack_keys(self._keys)
 
     def distance(self) -> NDArray[np.float32]:
-        """(n, 8, 8, 8) signed distances along the rays, metres, NaN where unseen: a copy, of now."""
+        """Return signed distances along rays, (n, 8, 8, 8) metres, NaN where unseen: a copy of the state."""
         found: NDArray[np.float32] = self._decoded("tsdf")
         return found
 
     def weight(self) -> NDArray[np.float32]:
-        """(n, 8, 8, 8) votes in full-confidence samples: a copy, of now."""
+        """Return the votes in full-confidence samples, (n, 8, 8, 8): a copy of the current state."""
         found: NDArray[np.float32] = self._decoded("weight")
         return found
 
     def color(self) -> NDArray[np.uint8] | None:
-        """(n, 8, 8, 8, 3) RGB, 0 where none was seen: a copy, of now; None if the map holds none."""
+        """Return RGB, (n, 8, 8, 8, 3), 0 where unseen: a copy of the state, or None without colour."""
         return self._decoded("color") if self._store.color else None
 
     def _decoded(self, name: str) -> Any:
@@ -376,5 +377,5 @@ def to_voxel_block_grid(store: BlockStore) -> Any:
         values = decoded(store, used, name).astype(np.float32).reshape(len(used), SIDE, SIDE, SIDE, -1)
         if name == "tsdf":
             values = np.nan_to_num(values / (OPEN3D_TRUNCATION * store.voxel_size), nan=1.0).clip(-1, 1)
-        grid.attribute(name).numpy()[rows] = values.transpose(0, 3, 2, 1, 4)  # x runs fastest there
+        grid.attribute(name).numpy()[rows] = values.transpose(0, 3, 2, 1, 4)  # x runs fastest in Open3D
     return grid

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Space that the current keyframe looks through, found on the CPU.
+"""Find the space that the current keyframe looks through, on the CPU.
 
-A map that carves gets the blocks and voxels that an image carves; another map gets the blocks that an image
-or points look through as a whole.
+A map that carves gets the blocks and voxels that an image carves. Another map gets only whole blocks that an
+image or points look through.
 """
 
 import math
@@ -31,20 +31,20 @@ from tsfusion.kernels.integration.space_carving import (
     WORDS,
 )
 
-_FEW = 1024  # blocks of the first list
-_MOST_UNITS = 1 << 30  # of a place in an image
-_COARSEST = 64  # units a voxel
-_MOST_CUBES = VOXEL_LIMIT // SIDE - 1  # from the map's origin each way
-_FARTHEST = VOXEL_LIMIT - SIDE  # voxels, of a camera from there
-_LEAST_CUBE = 0.12  # metres: no smaller ones are looked for, where voxels are fine
-_THINNEST = 4  # only every fourth pixel of every fourth row is looked at, or more of them
-_THIN_VOXELS = 2.0  # that such a pixel is wide at the most
-_POINTS = 1 << 14  # about as many are looked at
-_PATCHES = 80  # a side of the images of points
-_GAP = 8.0  # voxels, a block: what lies farther apart than this between points is not looked through
-_GAPS = 3  # patches: so far from a point, less one, others are closed
-_MOST_STANDS = 4  # parts of a sweep that are seen from one place each
-_STAND = 2.0  # voxels that a point's own start may be away from there
+_FEW = 1024  # blocks in the list at first
+_MOST_UNITS = 1 << 30  # largest image coordinate
+_COARSEST = 64  # smallest number of units per voxel
+_MOST_CUBES = VOXEL_LIMIT // SIDE - 1  # cubes from the map's origin, in each direction
+_FARTHEST = VOXEL_LIMIT - SIDE  # voxels from a camera to the map's origin
+_LEAST_CUBE = 0.12  # metres; with fine voxels, no smaller cubes are looked for
+_THINNEST = 4  # largest step between the pixels that are read, and between their rows
+_THIN_VOXELS = 2.0  # largest width of such a pixel
+_POINTS = 1 << 14  # points that are drawn, about
+_PATCHES = 80  # patches per side of an image of points
+_GAP = 8.0  # voxels (a block); wider gaps between points count as not looked through
+_GAPS = 3  # patches; empty patches nearer than this to a point are filled
+_MOST_STANDS = 4  # largest number of viewpoints for one sweep
+_STAND = 2.0  # voxels that a ray's start may lie away from its viewpoint
 
 # Image, disparity flag, scale, confidence, confidence flag: arguments of the kernels
 Read = tuple[NDArray[np.float32], int, float, NDArray[Any], int]
@@ -52,7 +52,7 @@ Optics = tuple[NDArray[np.float64], ...]
 
 
 class PointRays(NamedTuple):
-    """Points (n, 3), the starts of their rays, (1, 3) or (n, 3), sensor frame, and optional confidence."""
+    """Points (n, 3), starts of their rays, (1, 3) or (n, 3), in the sensor's frame; optional confidence."""
 
     points: NDArray[np.float32]
     starts: NDArray[np.float32]
@@ -61,29 +61,29 @@ class PointRays(NamedTuple):
 
 
 class _Sight(NamedTuple):
-    """A view as the kernels read it (`space_carving`), and rays of depth one through its image's corners, (3,
-    4)."""
+    """A view as the kernels read it (`space_carving`). `rays`, (3, 4), go through the image's corners at
+    depth one."""
 
     numbers: NDArray[np.float64]
     rays: NDArray[np.float64]
 
 
 class CarvedBlocks:
-    """Keys of blocks, their clear voxels, and what is added to each voxel.
+    """Blocks that a keyframe carves: their keys, their clear voxels, and the amount added to each voxel.
 
     Attributes:
-        clear: distinct keys of the blocks that are clear as a whole, of a map that does not carve.
+        clear: distinct keys of blocks that are completely clear, for a map that does not carve.
     """
 
     def __init__(self) -> None:
-        self.voxels = 0  # clear ones
+        self.voxels = 0  # number of clear voxels
         self.keys = np.empty(0, np.int64)
         self.amounts = np.empty(0, np.int64)
         self.masks = np.empty((0, WORDS), np.int64)
         self.clear = np.empty(0, np.int64)
         self._room = _list_of(0)
         self._counts = np.zeros(2, np.int32)
-        self._kind: tuple[object, ...] = ()  # of the camera that this is:
+        self._kind: tuple[object, ...] = ()  # properties of the camera in `_found`
         self._found: Optics = ()
         self._image, self._points = _PatchImages(), _PatchImages()
 
@@ -91,19 +91,19 @@ class CarvedBlocks:
         return len(self.keys)
 
     def forget(self) -> None:
-        """Remove all blocks: the keyframe carves nothing."""
+        """Remove all blocks, for a keyframe that carves nothing."""
         self.voxels = 0
         self.keys, self.amounts, self.masks = (array[:0] for array in self._room)
         self.clear = self.clear[:0]
 
     def find(self, keyframe: Keyframe, read: Read, model: NDArray[np.float64], most: int) -> None:
-        """Find the blocks of a keyframe's image.
+        """Find the blocks that a keyframe's image carves.
 
         Args:
-            keyframe: one with an image.
+            keyframe: a keyframe with an image.
             read: its image as the kernels read it.
             model: the sensor model, as for `rays_from_images`.
-            most: blocks that a keyframe may touch; beyond it, one more than that is listed.
+            most: blocks that a keyframe may touch; a longer list is cut at one block more.
         """
         assert keyframe.intrinsics is not None  # checked by Keyframe
         self.forget()
@@ -127,8 +127,8 @@ class CarvedBlocks:
         self.voxels = int(self._counts[VOXELS])
 
     def find_clear(self, keyframe: Keyframe, read: Read, model: NDArray[np.float64], most: int) -> None:
-        """Find the blocks that an image looks through as a whole; none if more than `most`. Arguments as of
-        `find`."""
+        """Find the blocks that an image looks through completely, or none if there are more than `most`.
+        Arguments are those of `find`."""
         assert keyframe.intrinsics is not None
         self.forget()
         K, read = _thinned(keyframe.intrinsics, read, model)
@@ -141,7 +141,7 @@ class CarvedBlocks:
     def find_clear_of_points(
         self, points: PointRays, T_world_sensor: NDArray[np.float64], model: NDArray[np.float64], most: int
     ) -> None:
-        """As `find_clear`, of points, which are drawn into images around the places they are seen from."""
+        """Find the same blocks as `find_clear`, for points, drawn into images around their viewpoints."""
         self.forget()
         found = [self.clear]
         for part, centre in _stands(points, model[VOXEL_SIZE]):
@@ -157,7 +157,7 @@ class CarvedBlocks:
         model: NDArray[np.float64],
         most: int,
     ) -> NDArray[np.int64]:
-        """Blocks that points look through, by images around a centre."""
+        """Return the blocks that points look through, by images around a centre."""
         images, side, T = self._points, _PATCHES * PATCH, T_world_sensor
         images.make_room(side, side)
         focal, middle = side / (2 * VIEW_TANGENT), (side - 1) / 2
@@ -179,7 +179,7 @@ class CarvedBlocks:
     def _see(
         self, K: Intrinsics, T: NDArray[np.float64], read: Read, model: NDArray[np.float64]
     ) -> _Sight | None:
-        """Find how far the image's patches are clear. Returns its view; None = there is none."""
+        """Find how far the image's patches are clear. Returns the view, or None if no view is possible."""
         self._image.make_room(*read[0].shape)
         camera = self._camera(K, read[0].shape, model)
         read = (np.ascontiguousarray(read[0], np.float32), *read[1:])
@@ -195,7 +195,7 @@ class CarvedBlocks:
     def _listed(
         self, views: Sequence[_Sight], images: "_PatchImages", voxel_size: float, most: int
     ) -> NDArray[np.int64]:
-        """Unordered keys of the blocks that the images look through; none if there are too many."""
+        """Return the unordered keys of the blocks that the images look through, or none for too many."""
         cubes, numbers = _cubes_in(views, images), np.concatenate([view.numbers for view in views])
         power = max(0, min(3, math.ceil(math.log2(_LEAST_CUBE / (8 * voxel_size)))))
         keys, count = np.empty(0, np.int64), _FEW
@@ -210,7 +210,6 @@ class CarvedBlocks:
         return keys[: count if count <= most else 0]
 
     def _camera(self, K: Intrinsics, shape: tuple[int, ...], model: NDArray[np.float64]) -> Optics:
-        """`_camera_of` images, cached from the images before."""
         kind = K, shape, model[MAX_RANGE], model[VOXEL_SIZE]
         if kind != self._kind:
             self._kind, self._found = kind, _camera_of(K, shape, model)
@@ -222,10 +221,10 @@ class CarvedBlocks:
 
 
 class _PatchImages:
-    """Clear depth of image patches, and its least and greatest values in squares of patches."""
+    """Clear depth of 8x8 pixel patches, and its minimum and maximum over squares of patches."""
 
     def __init__(self) -> None:
-        self.pixels = 0, 0  # height, width of each
+        self.pixels = 0, 0  # height, width of each image
         self.clear = np.zeros((0, 0), np.int32)
         self.levels = np.zeros((0, 4), np.int32)
         self.least = self.most = np.zeros(0, np.int32)
@@ -240,12 +239,12 @@ class _PatchImages:
             begin, high, wide, _ = levels[-1]
             levels.append((begin + high * wide, -(-high // 2), -(-wide // 2), rows))
         least, most = (np.zeros(levels[-1][0] + 1, np.int32) for _ in range(2))
-        # All of them, or none for want of memory
+        # Set all or, for lack of memory, none
         self.pixels, self.clear, self.levels = (height, width), clear, np.array(levels, np.int32)
         self.least, self.most = least, most
 
     def use(self, clear: NDArray[np.int32]) -> None:
-        """Take the patches of images, (n, rows, columns)."""
+        """Set the patches of images, (n, rows, columns)."""
         squares = int(self.levels[-1, 0]) + 1
         self.clear = clear.reshape(-1, clear.shape[2])
         self.least, self.most = (np.empty(len(clear) * squares, np.int32) for _ in range(2))
@@ -269,9 +268,8 @@ def _list_of(blocks: int) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray
 def _view(
     camera: Optics, centre: NDArray[np.float64], orientation: NDArray[np.float64], model: NDArray[np.float64]
 ) -> _Sight:
-    """View of a camera at a centre, metres."""
     matrix, corners, rest = camera
-    # Sums in sequence, equal on every processor
+    # Sums in a fixed order are equal on every processor
     directions = matrix[:, :1] * orientation[:, 0] + matrix[:, 1:2] * orientation[:, 1]
     directions += matrix[:, 2:] * orientation[:, 2]
     numbers = np.concatenate([centre / model[VOXEL_SIZE], directions.ravel(), rest])
@@ -279,14 +277,14 @@ def _view(
 
 
 def _cubes_in(views: Sequence[_Sight], images: _PatchImages) -> NDArray[np.int32]:
-    """Cubes of 64 voxels for each view, (views + 1, 7): index of its first cube in the list of all, that
-    cube, and the number of cubes on each axis."""
+    """Return a row for each view, (views + 1, 7), about the cubes of 64 voxels in view. A row has the index
+    of the view's first cube in the list of all, the lowest cube, and the cubes per axis."""
     found = np.zeros((len(views) + 1, 7), np.int32)
     deepest = images.most.reshape(len(views), -1)[:, -1]
     for n, (numbers, rays) in enumerate(views):
         centre = numbers[:3]
         ends = centre[:, None] + float(deepest[n]) / numbers[SCALE] * rays
-        # No voxel centre lies on a cube's border
+        # A voxel centre never lies on a cube's border
         low, high = np.minimum(centre, ends.min(axis=1)), np.maximum(centre, ends.max(axis=1))
         found[n, 1:] = np.clip(np.floor(np.concatenate([low, high]) / SIDE), -_MOST_CUBES, _MOST_CUBES)
         found[n, 4:] -= found[n, 1:4] - 1
@@ -295,8 +293,8 @@ def _cubes_in(views: Sequence[_Sight], images: _PatchImages) -> NDArray[np.int32
 
 
 def _thinned(K: Intrinsics, read: Read, model: NDArray[np.float64]) -> tuple[Intrinsics, Read]:
-    """A camera's image of fewer pixels, none of them wide; surfaces that fall between pixels have hits in the
-    map."""
+    """Return the camera and its image with fewer pixels, none of them wide. Surfaces between these pixels
+    have hits in the map."""
     image, is_disparity, scale, confidence, has_confidence = read
     widest = _THIN_VOXELS * model[VOXEL_SIZE] / model[MAX_RANGE]
     step = max(1, min(_THINNEST, int(min(K.fx, abs(K.fy), 1e6) * widest)))
@@ -312,7 +310,7 @@ def _thinned(K: Intrinsics, read: Read, model: NDArray[np.float64]) -> tuple[Int
 
 
 def _stands(points: PointRays, voxel_size: float) -> Iterator[tuple[PointRays, NDArray[np.float32]]]:
-    """Parts of a sweep, each with its viewpoint; parts whose viewpoint varies too much are left out."""
+    """Yield parts of a sweep, each with its viewpoint; parts whose viewpoint varies too much are left out."""
     count, reach = len(points.points), _STAND * voxel_size
     parts = min(1 if len(points.starts) == 1 else _MOST_STANDS, count)
     for part in range(parts):
@@ -325,10 +323,10 @@ def _stands(points: PointRays, voxel_size: float) -> Iterator[tuple[PointRays, N
 
 
 def _closed(ends: NDArray[np.int32], scale: float, far: float) -> NDArray[np.int32]:
-    """Depths up to which patches (n, rows, columns) are clear, in units, from the ends of their points.
+    """Return the depth, in units, up to which patches (n, rows, columns) are clear.
 
-    A patch without a point is as clear as those around it. Sparse points say nothing about the space between
-    them: the wider the gap, the nearer its clear depth.
+    `ends` has the depths of the points in the patches. A patch without a point is as clear as its neighbours.
+    The wider the gap between points, the smaller is its clear depth: sparse points say little about it.
     """
     near, clear = ends, np.zeros_like(ends)
     for gap in range(_GAPS):
@@ -336,15 +334,15 @@ def _closed(ends: NDArray[np.int32], scale: float, far: float) -> NDArray[np.int
             near = np.pad(near, ((0, 0), (1, 1), (1, 1)), constant_values=NO_SAMPLE)
             near = np.minimum(np.minimum(near[:, :-2], near[:, 1:-1]), near[:, 2:])
             near = np.minimum(np.minimum(near[..., :-2], near[..., 1:-1]), near[..., 2:])
-        patch = (2 * gap + 2) * 2 * VIEW_TANGENT / _PATCHES  # at depth one, at the most between two points
+        patch = (2 * gap + 2) * 2 * VIEW_TANGENT / _PATCHES  # widest gap between two points, at depth one
         most = np.int32(min(_GAP / patch, far) * scale)
         np.maximum(clear, np.minimum(near, most) * (near < NO_SAMPLE), out=clear)
     return clear
 
 
 def _camera_of(K: Intrinsics, shape: tuple[int, ...], model: NDArray[np.float64]) -> Optics:
-    """A camera: steps right, down and forward in column · depth, row · depth and depth, (3, 3); rays of depth
-    one through the image's corners, (3, 4); and the last six numbers of a view."""
+    """Return a camera: (3, 3) steps right, down and forward in column · depth, row · depth and depth; rays at
+    depth one through the image's corners, (3, 4); the last six numbers of a view."""
     height, width = shape[:2]
     middle = (K.cx + 0.5) / PATCH, (K.cy + 0.5) / PATCH
     matrix = np.array([(K.fx / PATCH, 0, middle[0]), (0, K.fy / PATCH, middle[1]), (0, 0, 1)])
@@ -352,10 +350,10 @@ def _camera_of(K: Intrinsics, shape: tuple[int, ...], model: NDArray[np.float64]
     y = [(v - 0.5 - K.cy) / K.fy for v in (0, height)]
     corners = np.array([(a, b, 1.0) for a in x for b in y])
     widest = max(math.hypot(*corner) for corner in corners)
-    # Greatest image coordinate, units, of a place that lies a voxel away
+    # Largest image coordinate, units, one voxel away
     most = _MOST_UNITS / math.sqrt(3) / max(math.hypot(*row) for row in matrix)
     far = min(MAX_CARVED / widest, model[MAX_RANGE] / model[VOXEL_SIZE], (most / _COARSEST - SIDE) / widest)
-    if not far > NEAREST:  # as wide an image is no camera's; also where numbers are too large
+    if not far > NEAREST:  # false for an impossibly wide image, and for too large numbers
         return matrix, corners.T, np.zeros(6)
     scale = min(2.0 ** math.floor(math.log2(most / (far * widest + SIDE))), FINEST)
     return matrix, corners.T, np.array([far, scale, K.fx, K.fy, K.cx, K.cy])

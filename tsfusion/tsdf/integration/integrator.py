@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Addition of one keyframe's rays to the map, all or none, and their removal.
+"""Add one keyframe's rays to the map, completely or not at all, and remove them.
 
-Rays go straight into the map's sums. A keyframe proves unacceptable (no room for its blocks, a lane
-overflows) during or after that. The same rays are then added with the opposite sign, which restores every
-byte, because the sums are integers.
+Rays go directly into the map's sums. Only then can a keyframe prove unacceptable: its blocks find no room, or
+a lane overflows. The same rays are then added with the opposite sign. This restores every byte, because the
+sums are integers.
 """
 
 from collections.abc import Iterator
@@ -32,11 +32,11 @@ from tsfusion.kernels.integration.integrate import (
 from tsfusion.tsdf.integration.ray_buffers import BANDS, RayBuffers
 from tsfusion.tsdf.store.block_store import BlockStore
 
-PART_WEIGHT = WEIGHT_LIMIT  # what a lane has in reserve: no part can make one overflow unnoticed
+PART_WEIGHT = WEIGHT_LIMIT  # reserve of a lane: no part can overflow it unnoticed
 
 NO_LIMIT = 1 << 30  # blocks
-BLOCK_COST = 1000  # of a block that is added: it takes 9 µs where memory is touched for the first time
-CARVED_COST = 100  # of a block that an image looks through: to find it and to add to it takes 2 µs
+BLOCK_COST = 1000  # cost of a new block: 9 µs, as its memory is touched for the first time
+CARVED_COST = 100  # cost of a block that an image looks through: finding and adding take 2 µs
 
 RayShare = tuple[int, int]  # bands first … last - 1
 
@@ -45,8 +45,8 @@ class KeyframeQuota(Struct, frozen=True):
     """Limits of a keyframe.
 
     Attributes:
-        cost: of its rays (`voxel_traversal.write_ray`), 100 for each carved block, and 1000 for each new one.
-        blocks: new ones.
+        cost: limit of the cost of rays (`voxel_traversal.write_ray`), carved blocks (100), new blocks (1000).
+        blocks: limit of new blocks.
     """
 
     cost: int
@@ -54,30 +54,30 @@ class KeyframeQuota(Struct, frozen=True):
 
 
 class Integrator:
-    """Only writer of a map's sums."""
+    """The only writer of a map's sums."""
 
     def __init__(self, store: BlockStore, buffers: RayBuffers, config: VolumeConfig) -> None:
         self._store = store
         self._buffers = buffers
         self._config = config
         self._model = config.model()
-        self._admitted = 0  # blocks of the map that deferred rays have been added to
-        self._room = 0  # blocks that the keyframe may still add to the map, for its sender's share of it
-        self._affordable = 0  # blocks that it may still add, for what they cost
-        self._most_cost = NO_LIMIT  # of its rays and these
-        self._has_carved = False  # its votes for free space are in the map
-        self._has_cleared = False  # it counts in the blocks that it looks through
-        self.units = min(runtime.threads(), BANDS)  # which add at the same time
+        self._admitted = 0  # number of blocks to which the rays have been added
+        self._room = 0  # new blocks that the sender's quota still allows
+        self._affordable = 0  # new blocks that the cost limit still allows
+        self._most_cost = NO_LIMIT  # limit of the cost of rays and new blocks
+        self._has_carved = False  # True when its votes for free space are in the map
+        self._has_cleared = False  # True when it counts in the blocks that it looks through
+        self.units = min(runtime.threads(), BANDS)  # units that add in parallel
 
     def apply(self, sign: int, quota: KeyframeQuota | None = None) -> int:
-        """Add (+1) or take away (-1) the rays in the buffers. Returns the number of voxel updates.
+        """Add (+1) or subtract (-1) the rays in the buffers. Returns the number of voxel updates.
 
         Args:
-            quota: of a keyframe that is added; None = only the map's limits.
+            quota: limits of an added keyframe; None = only the map's limits.
 
         Raises:
             MapFull, WeightOverflow: when adding.
-            MapError: when taking away what is not there. After each error the map is as it was.
+            MapError: when subtracting rays that the map does not hold. After each error the map is unchanged.
         """
         self._room = self._affordable = self._most_cost = NO_LIMIT
         if quota is not None and sign > 0:
@@ -85,7 +85,7 @@ class Integrator:
         before = self._admitted = self._store.count
         self._has_carved = self._has_cleared = False
         self._begin(sign)
-        if not self._buffers.samples:  # one without a usable sample changes nothing
+        if not self._buffers.samples:  # a keyframe without a usable sample changes nothing
             self._buffers.carved.forget()
         added: list[RayShare] = []
         updates = 0
@@ -112,8 +112,8 @@ class Integrator:
         return updates
 
     def _take_back(self, added: list[RayShare], sign: int, before: int) -> None:
-        """Restore the map of `before` blocks after any failure."""
-        if self._store.count > self._admitted:  # blocks that nothing was added to yet
+        """Restore the map, which had `before` blocks, after any failure."""
+        if self._store.count > self._admitted:  # blocks that are still empty
             self._store.drop(self._admitted)
         if self._has_cleared:
             self._clear(-sign)
@@ -127,30 +127,30 @@ class Integrator:
 
     @property
     def _vote(self) -> int:
-        """Vote of the keyframe's rays at their ends."""
+        """Kind of vote at the ends of the keyframe's rays."""
         if self._buffers.colored:
             return integrate.COLOR_VOTE
         return integrate.HIT_VOTE if self._store.counts_hits else integrate.NO_VOTE
 
     def _begin(self, sign: int) -> None:
-        """Empty the list of touched blocks; `sign` is that of the additions to come."""
+        """Empty the list of touched blocks; `sign` is that of the following additions."""
         self._store.stamp += 1
         self._buffers.touched[:TOUCHED_HEADER] = 0
         self._buffers.reserve_touched(self._store.count)
         self._buffers.share_out(self.units)
 
     def _parts(self) -> Iterator[RayShare]:
-        """Bands in runs of limited weight; nearly always all of them."""
-        weights = np.cumsum(self._buffers.bands[:, WEIGHT], dtype=np.int64)  # of the bands up to each
+        """Yield runs of bands of limited weight; nearly always one run with all bands."""
+        weights = np.cumsum(self._buffers.bands[:, WEIGHT], dtype=np.int64)  # up to each band
         first = 0
         while first < len(weights):
             before = int(weights[first - 1]) if first else 0
-            end = int(np.searchsorted(weights, before + PART_WEIGHT))  # first band that is too much
+            end = int(np.searchsorted(weights, before + PART_WEIGHT))  # first band that exceeds the weight
             yield first, max(end, first + 1)
             first = max(end, first + 1)
 
     def _add(self, part: RayShare, sign: int) -> None:
-        """Add a part to the blocks of the map, and list missing blocks, until there are too many."""
+        """Add a part to the blocks of the map, and list missing blocks up to a limit."""
         buffers = self._buffers
         most = self._most_missing()
         self._launch(part, sign, most_missing=min(most, buffers.most_missing))
@@ -160,7 +160,7 @@ class Integrator:
             self._launch(part, sign, most_missing=most)
 
     def _most_missing(self) -> int:
-        """Missing blocks allowed for the rest of a keyframe."""
+        """Return the number of missing blocks allowed for the rest of a keyframe."""
         config, touched = self._config, int(self._buffers.touched[TOUCHED_COUNT])
         room = min(config.max_blocks - self._store.count, self._room, self._affordable)
         return max(min(room, config.max_blocks_per_keyframe - touched), 0)
@@ -196,7 +196,7 @@ class Integrator:
         self._store.insert(keys)
 
     def _check_cost(self, most: int) -> int:
-        """Cost of the rays. Refuses a keyframe that takes longer than one of any real sensor."""
+        """Return the cost of the rays. Refuses a keyframe that takes longer than one of any real sensor."""
         cost = int(self._buffers.bands[:, COST].sum(dtype=np.int64))
         cost += CARVED_COST * len(self._buffers.carved)
         if cost > most:
@@ -274,9 +274,9 @@ class Integrator:
         )  # fmt: skip
 
     def _check(self, most: int, sign: int) -> None:
-        """Refuse a keyframe after which a lane has left its range by no more than `most`.
+        """Refuse a keyframe that moved a lane out of its range by at most `most`.
 
-        The blocks' bounds grow by the most that could be added. Voxels are read only in blocks whose bound
+        The bounds of blocks grow by the largest possible addition. Voxels are read only in blocks whose bound
         reaches the limit.
         """
         store, slots = self._store, self._buffers.touched_slots
@@ -302,7 +302,7 @@ class Integrator:
         integrate.largest_weights(self._store.sums, self._buffers.touched, self._store.bounds)
 
     def _smooth(self, sign: int) -> None:
-        """Update the regularised layer in the blocks just touched."""
+        """Update the smoothed layer in the blocks just touched."""
         if sign < 0:
             self._forget_smoothed()
         else:
@@ -327,7 +327,7 @@ class Integrator:
                 s.signal, s.crossed, votes, voted,
             )  # fmt: skip
             ray_smoothing.commit_votes(s.touched, sums, votes, voted, correction)
-        except BaseException:  # no vote of this keyframe may count for the next one
+        except BaseException:  # no vote of this keyframe may count for the next keyframe
             listed = voted[1 : 1 + voted[0]]
             votes[listed[listed != ray_smoothing.NO_VOXEL]] = 0
             raise
@@ -335,7 +335,7 @@ class Integrator:
     def _launch(
         self, part: RayShare, sign: int, *, which: int = ALL, oldest: int = 0, most_missing: int = NO_LIMIT
     ) -> None:
-        """Add a part's rays to the blocks of slot ≥ `oldest`."""
+        """Add a part's rays to the blocks with slots ≥ `oldest`."""
         store, buffers = self._store, self._buffers
         job = which, *part, self.units, sign, oldest, most_missing, store.stamp, self._vote
         arguments = (

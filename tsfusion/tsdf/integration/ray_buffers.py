@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Memory for one keyframe at a time, reused by the next: its rays and the blocks they touch."""
+"""Hold the rays of one keyframe and the blocks they touch, in memory that the next keyframe reuses."""
 
 from typing import Any
 
@@ -22,18 +22,18 @@ from tsfusion.kernels.integration.integrate import (
 from tsfusion.tsdf.integration.carved_blocks import CarvedBlocks, PointRays
 from tsfusion.tsdf.store.growing_array import GrowingArray
 
-_FEW_MISSING = 1 << 15  # entries of the set for the blocks that a usual keyframe finds missing
-BANDS = 64  # units of parallel work; fixed, so that nothing depends on the thread count
-FULL_WEIGHT_SIGMA = 0.25  # voxels: noise below this no longer shows in the map
+_FEW_MISSING = 1 << 15  # size of the set of missing blocks for a usual keyframe
+BANDS = 64  # units of parallel work; fixed, so that no result depends on the thread count
+FULL_WEIGHT_SIGMA = 0.25  # voxels; smaller noise does not show in the map
 _NOTHING = {len(shape): np.zeros(shape, np.uint8) for shape in ((1,), (1, 3))}
 
 
 class RayBuffers:
-    """Rays of the current keyframe (`rays`, by `bands`), slots of the blocks they touch (`touched`), keys of
-    missing blocks (`missing`, a hash set), and the space it looks through (`carved`)."""
+    """Rays of the current keyframe (`rays`, by `bands`), slots of touched blocks (`touched`), keys of missing
+    blocks (`missing`, a hash set), and carved space (`carved`)."""
 
     def __init__(self, *, color: bool, regularised: bool) -> None:
-        self._modelled: tuple[Any, ...] = ()  # what `_parameters` are of
+        self._modelled: tuple[Any, ...] = ()  # inputs of `_parameters`
         self._parameters = np.empty(0)
         self.color = color
         self.colored = False  # the current keyframe brings colour, and the map keeps it
@@ -53,7 +53,7 @@ class RayBuffers:
 
     @property
     def touched(self) -> NDArray[np.int32]:
-        """Count, overflow of `missing`, and the slots (kernels/integration/integrate.py)."""
+        """Count of touched blocks, overflow of `missing`, and slots (kernels/integration/integrate.py)."""
         return self._touched.array
 
     @property
@@ -63,7 +63,7 @@ class RayBuffers:
 
     @property
     def voted(self) -> NDArray[np.int32]:
-        """Number of voxels that have votes, and their places in `votes` (`ray_smoothing`)."""
+        """Number of voxels that have votes, and their indices in `votes` (`ray_smoothing`)."""
         return self._voted.array
 
     @property
@@ -72,7 +72,7 @@ class RayBuffers:
 
     @property
     def owners(self) -> NDArray[np.int64]:
-        """Unit that adds to a block, by slot (kernels/integration/integrate.py)."""
+        """Unit that adds to each block, by slot (kernels/integration/integrate.py)."""
         return self._owners.array
 
     def reserve_touched(self, blocks: int) -> None:
@@ -81,7 +81,7 @@ class RayBuffers:
         self._owners.reserve(blocks)
 
     def share_out(self, units: int) -> None:
-        """Give each unit neighbouring bands of about equal cost."""
+        """Assign neighbouring bands of about equal cost to each unit."""
         if self.again.shape[1] < len(self.rays):
             self.again = np.zeros((2, len(self.rays)), np.int32)
         if len(self.scratch) < units * UNIT_SCRATCH:
@@ -91,7 +91,7 @@ class RayBuffers:
         self.bands[:, UNIT] = np.minimum(before * units // int(cost.sum()), units - 1)
 
     def make_rays(self, keyframe: Keyframe, config: VolumeConfig) -> None:
-        """Fill `rays` and `carved`."""
+        """Fill `rays` and `carved` from a keyframe."""
         voxel_size, bundle = config.voxel_size, int(config.bundle)
         parameters = self._model(config, keyframe.sensor, keyframe.baseline_fx)
         self.colored = self.color and keyframe.color is not None
@@ -126,7 +126,7 @@ class RayBuffers:
     def _model(
         self, config: VolumeConfig, sensor: str | None, baseline_fx: float | None
     ) -> NDArray[np.float64]:
-        """Sensor model, cached from the keyframe before."""
+        """Return the sensor model, cached from the keyframe before."""
         modelled = config, sensor, baseline_fx
         if modelled != self._modelled:
             self._parameters = model_parameters(
@@ -142,8 +142,7 @@ class RayBuffers:
 
     @staticmethod
     def as_read(image: NDArray[Any]) -> NDArray[Any]:
-        """Image in the one type that the kernel reads: a second type would cost a second of compilation a
-        start."""
+        """Return the image as float32. A second type would cost a second of compilation at each start."""
         return image.astype(np.float32, copy=False)
 
     def _rays_of_points(self, points: Any, *rest: Any) -> None:
@@ -156,13 +155,13 @@ class RayBuffers:
 
     @property
     def most_missing(self) -> int:
-        """Keys that `missing` takes while it stays half empty."""
+        """Number of keys that `missing` takes while it stays half empty."""
         return len(self.missing) // 2
 
     def take_missing(self) -> NDArray[np.int64]:
-        """Keys of the missing blocks; their order depends only on them and the set's size.
+        """Return the keys of the missing blocks; their order depends only on them and the set's size.
 
-        `missing` is emptied, and shrinks if it was much too large.
+        Empties `missing`, and shrinks it if it was much too large.
         """
         keys: NDArray[np.int64] = self.missing[self.missing != 0]
         if len(self.missing) > max(_FEW_MISSING, 16 * len(keys)):
@@ -171,19 +170,19 @@ class RayBuffers:
         return keys
 
     def forget_missing(self) -> None:
-        """Empty `missing`; takes no memory."""
+        """Empty `missing` without allocating memory."""
         self.missing[:] = 0
         self.touched[[TOUCHED_OVERFLOW, TOUCHED_MISSING]] = 0
 
     def grow_missing(self, keys: int) -> None:
-        """Empty `missing` and make room for so many keys."""
+        """Empty `missing`, and make room for `keys` keys."""
         self.missing = np.zeros(1 << max(2 * keys - 1, 1).bit_length(), np.int64)
         self.touched[[TOUCHED_OVERFLOW, TOUCHED_MISSING]] = 0
 
     def reserve_votes(self) -> None:
         """Make room for the votes of all touched blocks."""
         self._votes.reserve(int(self.touched[TOUCHED_COUNT]))
-        # One chunk for its length; each unit may leave a part of its last chunk empty
+        # One chunk holds the length; each unit may leave a part of its last chunk empty
         self._voted.reserve(int(self.touched[TOUCHED_COUNT]) + 1 + BANDS * ray_smoothing.CHUNK // CUBE)
 
     @property
@@ -205,7 +204,7 @@ def model_parameters(
     outlier_filter: bool = True,
     space_carving: bool = False,
 ) -> NDArray[np.float64]:
-    """Sensor model as the kernels read it: (12,) float64, indices in kernels/base/sensor_noise.py."""
+    """Return the sensor model for kernels: (12,) float64, indices in kernels/base/sensor_noise.py."""
     slope, z0 = model.sigma_slope, model.sigma_z0
     if baseline_fx is not None and model.disparity_sigma > 0:
         slope, z0 = model.disparity_sigma / baseline_fx, 0.0
@@ -227,7 +226,7 @@ def model_parameters(
 
 
 def _depth_scale(keyframe: Keyframe) -> float:
-    """Metres a unit, or metres times units (disparity)."""
+    """Return metres per unit of depth, or metres times units for disparity."""
     if keyframe.kind == "disparity":
         assert keyframe.baseline_fx is not None  # checked by Keyframe
         return keyframe.baseline_fx / keyframe.disparity_scale
@@ -235,7 +234,7 @@ def _depth_scale(keyframe: Keyframe) -> float:
 
 
 def _camera(keyframe: Keyframe, voxel_size: float) -> NDArray[np.float64]:
-    """(4, 3) float64, voxels: a pixel's step right, its step down, pixel (0, 0), and the camera's centre."""
+    """Return the camera in voxels, (4, 3) float64: steps per column and row, pixel (0, 0), and centre."""
     K, T = keyframe.intrinsics, keyframe.T_world_camera
     assert K is not None  # checked by Keyframe
     rows = np.ascontiguousarray(T[:3].T) / voxel_size
@@ -246,12 +245,12 @@ def _camera(keyframe: Keyframe, voxel_size: float) -> NDArray[np.float64]:
 
 
 def _optional(array: NDArray[np.uint8] | None, dims: int) -> tuple[NDArray[Any], int]:
-    """Array that a kernel accepts, and 1 if it holds anything."""
+    """Return an array that a kernel accepts, and 1 if it has content, else 0."""
     return (_NOTHING[dims], 0) if array is None else (array, 1)
 
 
 def keyframes_of_every_kind(model: SensorModel, voxel_size: float) -> list[Keyframe]:
-    """Keyframes of 16×16 samples within the sensor's range, one for each path through `make_rays`."""
+    """Return keyframes of 16×16 samples within the sensor's range, one for each path through `make_rays`."""
     near = max(model.min_range * 1.5, 4 * voxel_size)
     pose, camera = np.eye(4), Intrinsics(20.0, 20.0, 8.0, 8.0)
     color = np.zeros((16, 16, 3), np.uint8)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Memory of the map: blocks of 8³ voxels in slots, found by their packed coordinates."""
+"""Store the map in memory: blocks of 8³ voxels in slots, found by their packed coordinates."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -22,21 +22,21 @@ from tsfusion.tsdf.store.clear_blocks import ClearBlocks
 from tsfusion.tsdf.store.growing_array import LAYER_DTYPES, MAX_ITEMS, FileArray, GrowingArray
 from tsfusion.tsdf.store.residency import Residency
 
-# Followers of the changes of blocks: `Volume.take_dirty`, kept answers, `shows_surface`
+# Followers of changes: `Volume.take_dirty`, kept answers, `shows_surface`
 MESHED, ASKED, SURFACES = 1, 2, 4
 _FIRST_CAPACITY = 1024
-_CHUNK = 1024  # blocks read at a time where a whole layer would be copied
-_HASH_BYTES = 4 * 12  # most that a block takes in the hash, which is a quarter full or fuller
-# Differences of the keys of a block and its neighbours towards −x, −y, −z from the key of the block
+_CHUNK = 1024  # blocks per step, where a whole layer would otherwise be copied
+_HASH_BYTES = 4 * 12  # largest share of a block in the hash, which is at least a quarter full
+# Key of a block minus the keys of its neighbours towards −x, −y, −z
 CELL_STEPS = np.array([x << 42 | y << 21 | z for x in (0, 1) for y in (0, 1) for z in (0, 1)])
 
 
 class DeviceRows:
-    """Copy of a store's rows on a device; this class has no device, `DeviceBlocks` has one.
+    """Copy of a store's rows on a device. This class has no device; `DeviceBlocks` has one.
 
     Attributes:
-        first_blocks: number of blocks for which a store has room at first.
-        sends_blocks: when `insert` tells the device; later = with the next call, never = it has them.
+        first_blocks: number of blocks for which a new store has room.
+        sends_blocks: when `insert` tells the device: now, later = with the next call, never = it has them.
     """
 
     first_blocks = _FIRST_CAPACITY
@@ -44,16 +44,16 @@ class DeviceRows:
     sends_blocks: Literal["now", "later", "never"] = "never"
 
     def fetch(self, layers: dict[str, GrowingArray]) -> None:
-        """Bring the store's rows up to date."""
+        """Update the store's rows from the device."""
 
     def send(self, layers: dict[str, GrowingArray], count: int) -> None:
-        """Bring the device's rows of `count` blocks up to date."""
+        """Update the device's rows of `count` blocks from the store."""
 
     def note_written(self, slots: NDArray[Any]) -> None:
-        """Note a write to the store's rows."""
+        """Record a write to the store's rows."""
 
     def note_added(self, slots: NDArray[np.int32], count: int) -> None:
-        """Note that the device has added to blocks, of `count` in all."""
+        """Record that the device has added to blocks, of `count` in all."""
 
     def insert(
         self,
@@ -62,32 +62,31 @@ class DeviceRows:
         hash_keys: NDArray[np.int64],
         hash_slots: NDArray[np.int32],
     ) -> None:
-        """Give the device `count` blocks: the new ones at these places of the hash, or, after a change of its
-        size, all.
+        """Send the device `count` blocks: the new ones at `places` of the hash, or all if its size changes.
 
-        Raises MemoryError without room, with the next call if blocks are sent later; the device keeps its
-        former blocks.
+        Raises MemoryError without room, with the next call if blocks are sent later. The device then keeps
+        its former blocks.
         """
 
     def drop(self, count: int, hash_keys: NDArray[np.int64], hash_slots: NDArray[np.int32]) -> None:
-        """Keep `count` blocks on the device, as the hash has them, and no others."""
+        """Keep `count` blocks on the device, as in the given hash, and no others."""
 
 
 class BlockStore:
     """Slots 0 … count-1, each with a key and one row of 512 voxels in every layer.
 
     Layers, (slot, 512): `sums` int64; with colour `color_rgn` int64 and `color_b` int32; when smoothing
-    `correction` float32; where hits are counted `hits` int32 (see kernels/integration/integrate.py and
-    kernels/integration/ray_smoothing.py). One number a block: `dirty` uint8 (a bit for each follower of the
-    changes), and int32 `stamps` (the last keyframe that touched it), `places` (where in that keyframe's
-    list), `bounds` (no voxel has more weight than this). A layer the map does not have is one row of zeros,
-    so that kernels can be handed it.
+    `correction` float32; when hits are counted `hits` int32 (see kernels/integration/integrate.py and
+    kernels/integration/ray_smoothing.py). One number per block: `dirty` uint8 (a bit for each follower of
+    changes), and int32 `stamps` (the last keyframe that touched it), `places` (index in that keyframe's
+    list), `bounds` (limit of its weights). A missing layer is one row of zeros, because kernels need an
+    array.
 
-    With a `cache` the layers lie in files, and blocks unchanged for long leave memory: a caller that touches
-    rows of many blocks calls `keep_within_memory` now and then.
+    With a `cache` the layers are in files, and blocks unchanged for long leave memory. A caller that touches
+    rows of many blocks calls `keep_within_memory` repeatedly.
 
-    With a `device` keyframes are added there. Rows are brought up to date before they are read here; after a
-    write to rows, the writer names them with `note_written`.
+    With a `device` keyframes are added on the device. Rows are updated here before they are read. After a
+    write to rows, the writer calls `note_written`.
     """
 
     def __init__(
@@ -102,18 +101,18 @@ class BlockStore:
         device: DeviceRows | None = None,
     ) -> None:
         self.voxel_size = voxel_size
-        self.back_limits = back_limits  # of a mesh (`mesh_extraction.back_limits`)
+        self.back_limits = back_limits  # limits for a mesh (`mesh_extraction.back_limits`)
         self.color, self.corrected, self.counts_hits = color, corrected, hits
         self.count = 0
-        self.drops = 0  # how often blocks have gone, or moved to other slots
-        self.stamp = 0  # number of the last keyframe, added or taken away; a map that is opened begins at 0
+        self.drops = 0  # number of times that blocks were removed or moved to other slots
+        self.stamp = 0  # number of the last keyframe, added or retracted; 0 when a map is opened
         self.most_blocks = MAX_ITEMS
-        self.pause: Callable[[], None] = lambda: None  # between two steps of a long pass that only reads
+        self.pause: Callable[[], None] = lambda: None  # called in long passes that only read
         self._device = device or DeviceRows()
-        self._room = self._device.first_blocks  # that fit into the memory that is there
+        self._room = self._device.first_blocks  # blocks that fit into the reserved memory
         self._hash_keys = np.zeros(4 * self._room, np.int64)
         self._hash_slots = np.zeros(4 * self._room, np.int32)
-        self._hashed = 0  # blocks that are in the hash; the others follow when somebody asks
+        self._hashed = 0  # blocks in the hash; the others are added when the hash is read
         self._keys = GrowingArray((), np.int64, self._room)
         self._dirty = GrowingArray((), np.uint8, self._room)
         self._stamps, self._places, self._bounds = (GrowingArray((), np.int32, self._room) for _ in range(3))
@@ -141,7 +140,7 @@ class BlockStore:
 
     @contextmanager
     def opening(self, blocks: int) -> Iterator[None]:
-        """Accept `blocks` blocks of a saved map within the context, whatever the limits of growth."""
+        """Accept `blocks` blocks of a saved map within the context, without limits of growth."""
         limits = self.most_blocks, [file.min_free_bytes for file in self._files]
         self.most_blocks = MAX_ITEMS
         for file in self._files:
@@ -155,7 +154,7 @@ class BlockStore:
                 file.min_free_bytes = least
 
     def shown(self, layer: str) -> NDArray[Any] | None:
-        """(count, 512) rows of a layer, not copied (`GrowingArray.shown`); None without this layer."""
+        """Return the (count, 512) rows of a layer, not copied (`GrowingArray.shown`), or None without it."""
         self._fetch()
         return self._layers[layer].shown(self.count) if layer in self._present else None
 
@@ -167,7 +166,7 @@ class BlockStore:
 
     @property
     def hash_slots(self) -> NDArray[np.int32]:
-        """Slots of the same hash."""
+        """Slots of the hash from block to slot."""
         self._hash()
         return self._hash_slots
 
@@ -197,13 +196,13 @@ class BlockStore:
 
     @property
     def ray_ends(self) -> tuple[NDArray[np.int64], NDArray[np.int32], int]:
-        """Layers that count the ray ends in a voxel, and a number for those that the map has
+        """Layers that count the ray ends in a voxel, and a number that encodes the present layers
         (`surface_cells.held`)."""
         return self.color_rgn, self.hits, self.color + 2 * self.counts_hits
 
     @property
     def clear_blocks(self) -> tuple[NDArray[Any], ...]:
-        """Flags by slot of blocks that show a surface or hits; and the blocks that keyframes look through
+        """Flags by slot of blocks that show a surface or hits, and the blocks that keyframes look through
         (`surface_cells.is_clear`)."""
         clear = self.clear
         if len(clear):
@@ -232,7 +231,6 @@ class BlockStore:
         return self._bounds.array
 
     def layers(self) -> dict[str, NDArray[Any]]:
-        """Layers of the map, by name."""
         self._fetch()
         return {name: self._layers[name].array for name in self._present}
 
@@ -244,23 +242,22 @@ class BlockStore:
         self._device.fetch(self._layers)
 
     def send(self) -> None:
-        """Bring the device's rows up to date."""
         self._device.send(self._layers, self.count)
 
     def note_written(self, slots: NDArray[Any]) -> None:
-        """Note a write to rows from outside."""
+        """Record a write to rows by another module."""
         self._device.note_written(slots)
 
     def note_touched(self, slots: NDArray[np.int32]) -> None:
-        """Note that the current keyframe has changed blocks on the device."""
+        """Record that the current keyframe has changed blocks on the device."""
         self._device.note_added(slots, self.count)
         self.stamps[slots], self.dirty[slots] = self.stamp, CHANGED
 
     def limit(self, nbytes: int) -> None:
-        """Limit the map's memory, bytes, from now on; a larger map stays as it is.
+        """Limit the map's memory, bytes, from now on; a map that is already larger stays unchanged.
 
-        The number of blocks that this allows depends on the layers alone, never on how the map has grown.
-        With a cache the map may grow on; its coldest blocks leave memory.
+        The allowed number of blocks depends only on the layers, never on the history of growth. With a cache
+        the map may still grow; its coldest blocks leave memory.
         """
         if self._residency is None:
             self.most_blocks = nbytes // (self.bytes_per_block + _HASH_BYTES)
@@ -273,15 +270,15 @@ class BlockStore:
         return self._residency is not None
 
     def keep_within_memory(self) -> None:
-        """Let the coldest blocks leave memory if there are too many; call it after a touch of rows."""
+        """Let the coldest blocks leave memory if there are too many. Callers do this after touching rows."""
         if self._residency is not None:
             index = self.nbytes - self.count * self._residency.row_bytes
             self._residency.keep_within(max(self._memory_bytes - index, 0), self.stamps[: self.count])
 
     def rest(self) -> None:
-        """Let blocks leave memory, and other work have its turn, between the steps of a long pass.
+        """Let blocks leave memory and other work run, between the steps of a long pass.
 
-        Only for a pass that reads, and that allows other readers meanwhile.
+        Only for a pass that reads, and that allows other readers in between.
         """
         self.keep_within_memory()
         self.pause()
@@ -289,7 +286,7 @@ class BlockStore:
     def reserve(self, count: int) -> None:
         """Make room for `count` blocks in all.
 
-        Raises MemoryError, or MapFull for the disk of the cache, without room; the map is as it was.
+        Raises MemoryError, or MapFull for the disk of the cache, without room; the map is unchanged.
         """
         if count > max(self.most_blocks, self.count) and self._residency is not None:
             raise MapFull(
@@ -306,14 +303,14 @@ class BlockStore:
         for array in self._arrays():
             array.reserve(count)
         if 2 * count > len(self._hash_keys):
-            size = 1 << (2 * count - 1).bit_length()  # of the count alone, not of how it was reached
+            size = 1 << (2 * count - 1).bit_length()  # depends on the count alone, not on the history
             self._hash_keys, self._hash_slots = np.zeros(size, np.int64), np.zeros(size, np.int32)
             self._hashed = 0
         self._room = min(len(self._hash_keys) // 2, *(array.capacity for array in self._arrays()))
 
     @property
     def spare(self) -> int:
-        """Number of blocks that `insert` takes without more memory."""
+        """Number of blocks that `insert` accepts without more memory."""
         return max(min(self._room, self.most_blocks) - self.count, 0)
 
     def insert(self, keys: NDArray[np.int64]) -> None:
@@ -332,7 +329,7 @@ class BlockStore:
                 raise
 
     def drop(self, count: int) -> None:
-        """Take back the newest blocks, so that `count` remain; their voxels must be zero."""
+        """Remove the newest blocks, until `count` remain; their voxels must be zero."""
         for array in (self._keys, self._dirty, self._stamps, self._places, self._bounds):
             array.array[count : self.count] = 0
         self.count = count
@@ -343,7 +340,7 @@ class BlockStore:
             self._device.drop(count, self.hash_keys, self.hash_slots)
 
     def release(self, slots: NDArray[np.int64]) -> None:
-        """Remove blocks without votes: the last blocks take their slots, and new ones the room."""
+        """Remove blocks without votes: the last blocks move to their slots. New blocks reuse the room."""
         self._fetch()
         left = self.count - len(slots)
         is_free = np.zeros(self.count, bool)
@@ -358,7 +355,7 @@ class BlockStore:
         self.note_written(to)
 
     def slots_of(self, keys: NDArray[np.int64]) -> NDArray[np.int32]:
-        """(n,) slots of (n,) keys, −1 for an absent block."""
+        """Return the (n,) slots of (n,) keys, −1 for an absent block."""
         slots = np.empty(len(keys), np.int32)
         block_hash.find_blocks(keys, self.hash_keys, self.hash_slots, slots)
         return slots
@@ -386,13 +383,13 @@ class BlockStore:
             self.keep_within_memory()
 
     def take_dirty(self, follower: int) -> NDArray[np.int64]:
-        """Slots of the blocks changed since the last call for this follower: `MESHED` or `ASKED`."""
+        """Return the slots of blocks changed since this follower's last call, such as `MESHED` or `ASKED`."""
         slots = np.flatnonzero(self.dirty[: self.count] & follower)
         self.dirty[slots] &= 255 - follower
         return slots
 
     def used(self) -> NDArray[np.int64]:
-        """Slots with any vote left, in key order."""
+        """Return the slots of blocks with votes, in key order."""
         has_votes = np.empty(self.count, bool)
         for i in range(0, self.count, _CHUNK):
             chunk = slice(i, min(i + _CHUNK, self.count))
@@ -402,18 +399,18 @@ class BlockStore:
         return order[has_votes[order]]
 
     def in_order(self, layer: str) -> Iterator[tuple[NDArray[np.int64], NDArray[Any]]]:
-        """Keys and rows of the used blocks in key order, up to 1024 at a time."""
+        """Yield keys and rows of the used blocks in key order, up to 1024 blocks per step."""
         used, rows = self.used(), self._rows(layer)
         for i in range(0, len(used), _CHUNK):
             chunk = used[i : i + _CHUNK]
-            if (np.diff(chunk) == 1).all():  # as in a map that was just loaded: nothing has to be gathered
+            if (np.diff(chunk) == 1).all():  # consecutive, as in a newly loaded map: no gathering is needed
                 yield self.keys[chunk], rows[chunk[0] : chunk[-1] + 1]
             else:
                 yield self.keys[chunk], rows[chunk]
             self.rest()
 
     def _hash(self) -> None:
-        """Put new blocks into the hash. For the thread that kernels run in."""
+        """Add new blocks to the hash. Only for the thread that runs kernels."""
         runtime.check_thread()
         first, self._hashed = self._hashed, self.count
         if first < self.count:
@@ -445,22 +442,22 @@ class BlockStore:
 
 
 def pack_keys(coordinates: NDArray[np.int32]) -> NDArray[np.int64]:
-    """(n, 3) block coordinates → (n,) int64 keys, as `kernels.base.voxel_traversal.pack`."""
+    """Convert (n, 3) block coordinates to (n,) int64 keys, as `kernels.base.voxel_traversal.pack`."""
     x, y, z = (np.asarray(coordinates, np.int64) + (1 << 20)).reshape(-1, 3).T
     return np.ascontiguousarray(x << 42 | y << 21 | z)
 
 
 def unpack_keys(keys: NDArray[np.int64]) -> NDArray[np.int32]:
-    """(n,) keys → (n, 3) int32 block coordinates."""
+    """Convert (n,) keys to (n, 3) int32 block coordinates."""
     mask = (1 << 21) - 1
     return (np.stack([keys >> 42, keys >> 21, keys], axis=1) & mask).astype(np.int32) - (1 << 20)
 
 
 def distinct_blocks(coordinates: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Distinct block coordinates in key order: (n, 3) → (m, 3) int32."""
+    """Return the distinct block coordinates in key order: (n, 3) → (m, 3) int32."""
     return unpack_keys(distinct(pack_keys(coordinates)))
 
 
 def cells_of(coordinates: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Blocks whose cells read these blocks: themselves and their neighbours towards −x, −y, −z."""
+    """Return the blocks whose cells read these blocks: the same blocks and neighbours towards −x, −y, −z."""
     return unpack_keys(distinct(pack_keys(coordinates)[:, None] - CELL_STEPS))

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Number of keyframes that look through each block as a whole: free space that no voxel holds.
+"""Count the keyframes that look through each block completely: free space that no voxel holds.
 
 The blocks that a keyframe looks through (`carved_blocks`) depend on the keyframe alone. Counts are sums, as
-voxels are, and a keyframe that is taken away takes its own counts. A block is free if one keyframe or more
-looks through it and its voxels show neither a hit nor a surface.
+voxels are, so retraction of a keyframe subtracts its counts. A block is free if at least one keyframe looks
+through it and its voxels show neither a hit nor a surface.
 """
 
 import numpy as np
@@ -15,19 +15,17 @@ from tsfusion.kernels.base import block_hash
 from tsfusion.tsdf.store.growing_array import MAX_ITEMS, GrowingArray
 
 _FIRST = 64  # blocks
-_MOST_NOTED = 1 << 16  # blocks that became free or ceased to be, for those who follow
-_A_BLOCK = 8  # for each block that a map may have: they take a tenth of its memory at the most
+_MOST_NOTED = 1 << 16  # blocks that became free or ceased to be, kept for followers
+_A_BLOCK = 8  # limit per block of a map: at most a tenth of the map's memory
 
-ClearCounts = tuple[
-    NDArray[np.int64], NDArray[np.int32]
-]  # distinct keys of blocks, ascending, and their counts
+ClearCounts = tuple[NDArray[np.int64], NDArray[np.int32]]  # ascending distinct keys of blocks, counts
 
 
 class ClearBlocks:
-    """Blocks by their keys, in slots of their own, each with its count.
+    """Blocks by their keys, in separate slots, each with its count.
 
-    A count below one stands for none: a map of an earlier version did not count the keyframe that was taken
-    away.
+    A count below one means none: a map of an earlier version did not count a keyframe that was retracted
+    later.
     """
 
     def __init__(self) -> None:
@@ -35,9 +33,9 @@ class ClearBlocks:
         self._keys, self._counts = GrowingArray((), np.int64, _FIRST), GrowingArray((), np.int32, _FIRST)
         self._hash = np.zeros(4 * _FIRST, np.int64), np.zeros(4 * _FIRST, np.int32)
         self._noted: list[NDArray[np.int64]] = []
-        self.noted = 0  # number of blocks that were noted ever
-        self.shows_surface = np.zeros(1, np.uint8)  # by slot of the map's blocks: a hit, or a surface
-        self._known = 0, 0  # drops and blocks of the map that this is of
+        self.noted = 0  # total number of blocks ever added to `_noted`
+        self.shows_surface = np.zeros(1, np.uint8)  # by slot of the map's blocks
+        self._known = 0, 0  # drops and blocks of the map when `shows_surface` was updated
 
     def __len__(self) -> int:
         return self._count
@@ -48,7 +46,7 @@ class ClearBlocks:
         return *self._hash, self._counts.array
 
     def counts(self) -> ClearCounts:
-        """All blocks with a count."""
+        """Return all blocks with a count other than zero."""
         slots = np.flatnonzero(self._counts.array[: self._count])
         slots = slots[np.argsort(self._keys.array[slots])]
         return self._keys.array[slots], self._counts.array[slots]
@@ -57,9 +55,9 @@ class ClearBlocks:
         """Add to the counts of blocks, all or none. Subtraction from blocks without a count has no effect.
 
         Args:
-            keys: distinct.
-            amount: one for all, or one for each.
-            most: blocks with voxels that the map may have.
+            keys: distinct keys.
+            amount: one amount for all, or one for each key.
+            most: limit of the map's blocks with voxels.
 
         Raises MapFull for too many blocks, MemoryError without room.
         """
@@ -74,16 +72,16 @@ class ClearBlocks:
         self._note(keys[(before > 0) != (after > 0)])
 
     def replace(self, counts: ClearCounts) -> None:
-        """Take these counts instead. Raises MemoryError."""
+        """Replace all counts. Raises MemoryError."""
         self._keys.array[: self._count] = self._counts.array[: self._count] = 0
         for array in self._hash:
             array[:] = 0
         self._count = 0
         self.add(*counts, MAX_ITEMS // _A_BLOCK)
-        self._noted, self.noted = [], self.noted + _MOST_NOTED + 1  # more than anybody follows
+        self._noted, self.noted = [], self.noted + _MOST_NOTED + 1  # too many changes to follow
 
     def changed_since(self, noted: int) -> NDArray[np.int64] | None:
-        """Keys of blocks newly looked through, or no longer, since `noted` changes; None = too many."""
+        """Return keys of blocks that became free or ceased to be since `noted` changes; None for too many."""
         found, left = [np.empty(0, np.int64)], self.noted - noted
         for keys in reversed(self._noted):
             if left <= 0:
@@ -93,9 +91,9 @@ class ClearBlocks:
         return None if left > 0 else distinct(np.concatenate(found))
 
     def take_unknown(self, drops: int, blocks: int, changed: NDArray[np.int64]) -> NDArray[np.int32]:
-        """Slots of the map's blocks to look at again: changed and new ones.
+        """Return the slots of the map's blocks to check again: changed and new blocks.
 
-        `drops` and `blocks`: how often blocks have moved, and how many there are.
+        `drops` is the number of times that blocks have moved, `blocks` the number of blocks.
         """
         first = self._known[1] if self._known[0] == drops else 0
         if blocks > len(self.shows_surface):
@@ -128,7 +126,7 @@ class ClearBlocks:
         self._count = count
 
     def _forget_empty(self) -> None:
-        """Make room: remove blocks whose keyframes have all been taken away."""
+        """Make room: remove blocks whose keyframes have all been retracted."""
         counts = self.counts()
         if len(counts[0]) <= self._count // 2:
             noted = self._noted, self.noted
@@ -153,7 +151,7 @@ def check_count(blocks: int, most: int) -> None:
 
 
 def summed(several: list[ClearCounts], add: "np.ufunc" = np.add) -> ClearCounts:
-    """Sum of the counts of several maps; for parts of one map, which share keyframes, their `np.maximum`."""
+    """Return the sum of several maps' counts. Parts of one map share keyframes, and need `np.maximum`."""
     keys = np.concatenate([one[0] for one in several])
     found = distinct(keys)
     counts = np.zeros(len(found), np.int32)
@@ -162,12 +160,12 @@ def summed(several: list[ClearCounts], add: "np.ufunc" = np.add) -> ClearCounts:
 
 
 def encoded(counts: ClearCounts) -> bytes:
-    """ClearCounts as saved: keys (int64), then counts (int32), little-endian."""
+    """Encode counts for saving: keys (int64), then counts (int32), little-endian."""
     return counts[0].astype("<i8").tobytes() + counts[1].astype("<i4").tobytes()
 
 
 def decoded(saved: bytes, most: int) -> ClearCounts:
-    """ClearCounts from `encoded`. Raises ValueError for other bytes, or too many for a map of `most`
+    """Decode the bytes of `encoded`. Raises ValueError for other bytes, or too many for a map of `most`
     blocks."""
     count = len(saved) // 12
     if len(saved) != 12 * count or count > _A_BLOCK * most:

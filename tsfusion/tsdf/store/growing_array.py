@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Arrays that grow without copying: anonymous memory whose pages the operating system adds on first touch, or
-a file whose pages can leave memory."""
+"""Grow arrays without copying, in anonymous memory or in a file whose pages can leave memory."""
 
 import ctypes
 import mmap
@@ -21,7 +20,7 @@ from tsfusion.core.errors import InvalidConfig, MapFull
 
 _MOVES_PAGES = sys.platform == "linux"
 _HUGE_PAGE = 1 << 21  # bytes
-_STEP = 4096  # items more than are needed, at most: what is reserved counts against a memory limit
+_STEP = 4096  # largest number of items reserved ahead, because reserved memory counts against a memory limit
 LAYER_DTYPES = {
     "sums": np.int64, "color_rgn": np.int64, "color_b": np.int32, "correction": np.float32, "hits": np.int32,
 }  # fmt: skip
@@ -31,9 +30,9 @@ MAX_ITEMS = (1 << 22) - 1  # × 512 voxels stays below the 2³¹ elements that a
 class GrowingArray:
     """A zero-initialised array (capacity, *item) whose capacity can grow.
 
-    On Linux growing moves page-table entries, not bytes (`mremap`), and untouched pages take no memory;
-    elsewhere it copies. Take `array` anew after every `reserve`: an older one, or a view of it, points to
-    freed memory.
+    On Linux, growth moves page-table entries, not bytes (`mremap`), and untouched pages take no memory. Other
+    systems copy. Read `array` again after every `reserve`: an older array, or a view of it, points to freed
+    memory.
     """
 
     def __init__(self, item: tuple[int, ...], dtype: DTypeLike, capacity: int) -> None:
@@ -52,30 +51,30 @@ class GrowingArray:
         return int(np.prod(self._item, dtype=np.int64)) * self._dtype.itemsize
 
     def shown(self, count: int) -> NDArray[Any]:
-        """First items, read-only, without copying, in memory that stays valid however the array grows.
+        """Return the first items, read-only, without copying. Their memory stays valid when the array grows.
 
         After growth, an earlier result may be a copy of the old state.
         """
         items = self.array[:count]
-        if self._map is not None:  # as a buffer of the map, which then is not resized
+        if self._map is not None:  # a buffer of the map, which blocks `resize`
             of_map = np.asarray(memoryview(self._map)[: count * self.item_bytes])
             items = of_map.view(self._dtype).reshape(count, *self._item)
         items.flags.writeable = False
         return items
 
     def reserve(self, capacity: int) -> None:
-        """Make room for `capacity` items; new items are zero. Raises MemoryError; the array stays as it
-        was."""
+        """Make room for `capacity` items; new items are zero. Raises MemoryError; the array then is
+        unchanged."""
         if capacity <= self.capacity:
             return
         ahead = min(2 * self.capacity, self.capacity + _STEP if _MOVES_PAGES else MAX_ITEMS, MAX_ITEMS)
         try:
             self._grow(self._whole_pages(max(capacity, ahead)))
         except (MemoryError, MapFull):
-            self._grow(capacity)  # near the limit, no more than is needed
+            self._grow(capacity)  # near the limit, only the needed capacity
 
     def _whole_pages(self, capacity: int) -> int:
-        """Capacity rounded up to whole huge pages: only these are moved as they are."""
+        """Return the capacity rounded up to whole huge pages: only these move without splitting."""
         size = capacity * self.item_bytes
         if size < _HUGE_PAGE or _HUGE_PAGE % self.item_bytes:
             return capacity
@@ -92,8 +91,8 @@ class GrowingArray:
             self._map = self._resized(size)
         except OSError as error:
             raise MemoryError(f"no memory for {size >> 20} MB: {error.strerror}") from error
-        if size >= _HUGE_PAGE:  # first touches and misses of the TLB cost more than the sums themselves
-            with suppress(OSError):  # of a system that has no huge pages
+        if size >= _HUGE_PAGE:  # first touches and TLB misses cost more than the sums themselves
+            with suppress(OSError):  # the system may have no huge pages
                 self._map.madvise(mmap.MADV_HUGEPAGE)
         # By address, not as a buffer of the map: Taichi's launches leave reference cycles around their
         # arguments, and a map with a buffer still exported refuses to be resized.
@@ -111,7 +110,7 @@ class GrowingArray:
             try:
                 self._map.resize(size)
                 return self._map
-            except BufferError:  # somebody is shown items of it, and keeps that map
+            except BufferError:  # a result of `shown` keeps the old map
                 pass
         grown = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
         if self._map is not None:
@@ -122,12 +121,12 @@ class GrowingArray:
 class FileArray(GrowingArray):
     """A growing array in an unnamed file, in a folder on a disk (Linux).
 
-    Address space for the largest size is taken once: growing only asks the disk for room, and `array` keeps
-    its address. Its pages are the file's: the system counts them neither as this process's allocations nor
-    for ever as its resident memory (`let_go`).
+    Address space for the largest size is reserved once. Growth only asks the disk for room, and `array` keeps
+    its address. The system does not count its pages as allocations of this process, and only temporarily as
+    its resident memory (`let_go`).
 
-    `min_free_bytes`: disk space left free by growth beyond `capacity`; None = nothing. Raises InvalidConfig
-    if the folder cannot hold such a file.
+    `min_free_bytes` is the disk space that growth beyond `capacity` leaves free; None = none. Raises
+    InvalidConfig if the folder cannot hold such a file.
     """
 
     def __init__(
@@ -160,7 +159,7 @@ class FileArray(GrowingArray):
         try:
             if self.min_free_bytes is not None:
                 durable_files.require_room(self._folder, size - held + self.min_free_bytes)
-            # A page that the disk has no room for would end the process when it is written.
+            # Without room on the disk, a later write to the page would end the process.
             os.posix_fallocate(self._file, held, size - held)
         except OSError as error:
             raise MapFull(
@@ -175,11 +174,11 @@ class FileArray(GrowingArray):
         return int(self.array.ctypes.data)
 
     def let_go(self, first: int, end: int) -> None:
-        """Take items first … end-1, whole pages, out of this process's memory; touched, they come back.
+        """Remove items first … end-1, whole pages, from this process's memory; a touch brings them back.
 
-        The system then owns them: it writes them to the disk, and keeps a copy while nothing else needs the
-        memory. (Dropped with posix_fadvise, they are read again from disk: 1.6 times the CPU in a room four
-        times as large as its memory.)
+        The system writes the pages to disk, and keeps a copy while no one else needs the memory.
+        (posix_fadvise would drop the copy; reading the disk takes 1.6 times the CPU in a room of four times
+        its memory.)
         """
         size = self.item_bytes
         self._pages.madvise(mmap.MADV_DONTNEED, first * size, (end - first) * size)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Blocks of a map in files, of which memory holds a part; blocks leave it when they take too much."""
+"""Limit the memory that blocks in files take: the blocks unchanged for longest leave memory."""
 
 import mmap
 import os
@@ -17,9 +17,9 @@ from tsfusion.core.config import CacheConfig
 from tsfusion.core.errors import InvalidConfig
 from tsfusion.tsdf.store.growing_array import FileArray
 
-GROUP = 32  # blocks that leave memory together: whole pages of every layer, also where a page has 64 kB
-_LOW = 7 / 8  # of the budget, down to which blocks leave once it is passed
-_PART = 1 << 17  # entries of the page table read at a time
+GROUP = 32  # blocks that leave memory together: whole pages of every layer, even with pages of 64 kB
+_LOW = 7 / 8  # share of the budget that remains after blocks have left
+_PART = 1 << 17  # entries of the page table per read
 _PRESENT = np.uint64(63)  # bit of an entry: the page is in memory
 
 
@@ -28,8 +28,8 @@ class Residency:
 
     def __init__(self, layers: Collection[FileArray], disk_bytes: int = 0) -> None:
         self._layers, self.disk_bytes = layers, disk_bytes
-        self._measured = 0  # bytes of the layers that were in memory when it was last looked at,
-        self._shared = process.shared_rss_bytes()  # and of all files then
+        self._measured = 0  # bytes of the layers in memory at the last measurement,
+        self._shared = process.shared_rss_bytes()  # and bytes of all files at that time
 
     @cached_property
     def row_bytes(self) -> int:
@@ -37,13 +37,13 @@ class Residency:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the blocks in memory; includes a library that was loaded meanwhile."""
+        """Bytes of the blocks in memory, including libraries loaded since the last measurement."""
         return max(0, self._measured + process.shared_rss_bytes() - self._shared)
 
     def keep_within(self, budget: int, stamps: NDArray[np.int32]) -> None:
-        """Let the blocks unchanged for longest leave memory if all take more bytes than `budget`.
+        """Let the blocks unchanged for longest leave memory if all take more than `budget` bytes.
 
-        `stamps`: (count,) the last keyframe that changed each block.
+        `stamps`, (count,), has the last keyframe that changed each block.
         """
         if self.nbytes <= budget or not len(stamps):
             return
@@ -60,10 +60,10 @@ class Residency:
         self._measured, self._shared = total, process.shared_rss_bytes()
 
     def _in_memory(self, groups: int) -> NDArray[np.int64]:
-        """Bytes in memory of each of the first groups; of whole groups if the system does not tell."""
+        """Return the bytes in memory of each of the first groups; all bytes if the system gives no answer."""
         in_memory = np.zeros(groups, np.int64)
         for layer in self._layers:
-            pages = GROUP * layer.item_bytes // mmap.PAGESIZE  # of a group
+            pages = GROUP * layer.item_bytes // mmap.PAGESIZE  # pages in a group
             is_here = _pages_in_memory(layer.address // mmap.PAGESIZE, groups * pages)
             in_memory += is_here.reshape(groups, pages).sum(axis=1) * mmap.PAGESIZE
         return in_memory
@@ -75,7 +75,7 @@ class Residency:
 
 
 def _pages_in_memory(first: int, count: int) -> NDArray[np.bool_]:
-    """Mask of the pages, `count` from number `first` on, in this process's memory (Linux)."""
+    """Return a mask of the pages `first`, `first` + 1, … in this process's memory (Linux)."""
     found = np.ones(count, bool)
     with suppress(OSError), open("/proc/self/pagemap", "rb", buffering=0) as table:
         for i in range(0, count, _PART):
@@ -86,14 +86,14 @@ def _pages_in_memory(first: int, count: int) -> NDArray[np.bool_]:
 
 
 def _runs(numbers: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
-    """First and end of each run of consecutive numbers; the numbers are sorted."""
+    """Yield the first and the end of each run of consecutive numbers; the numbers are sorted."""
     cuts = np.flatnonzero(np.diff(numbers) != 1) + 1
     for part in np.split(numbers, cuts):
         yield int(part[0]), int(part[-1]) + 1
 
 
 def checked_cache(memory_bytes: int, cache: str | os.PathLike[str] | CacheConfig | None) -> CacheConfig:
-    """Folder for blocks that are not in memory."""
+    """Return the settings of the folder for blocks outside memory. Raises InvalidConfig for unusable ones."""
     if memory_bytes < 1:
         raise InvalidConfig(f"memory_bytes must be > 0, got {memory_bytes}")
     if sys.platform != "linux" or not process.shared_rss_bytes():

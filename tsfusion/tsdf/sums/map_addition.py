@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Sums of one map added to those of another, all or none of them.
+"""Add the sums of one map to those of another, all or none.
 
-A voxel whose colour would have more votes than `COLOR_LIMIT` is full: both colours are averaged by their
-votes, to one of so many. Smoothed values are not sums: a block of both maps falls back to raw values, as
-after a retraction; a block of one map keeps them.
+Where the colour of a voxel would get more votes than `COLOR_LIMIT`, both colours are averaged by their votes.
+The average has `COLOR_LIMIT` votes. Smoothed values are not sums: a block of both maps falls back to raw
+values, as after a retraction. A block of only one map keeps them.
 """
 
 import numpy as np
@@ -16,23 +16,23 @@ from tsfusion.kernels.integration.integrate import CHANGED, COLOR_LIMIT, WEIGHT_
 from tsfusion.tsdf.store import clear_blocks
 from tsfusion.tsdf.store.block_store import BlockStore
 
-_CHUNK = 256  # blocks at a time
-_SCRATCH_BYTES = 32 << 20  # more than so many take
+_CHUNK = 256  # blocks per step
+_SCRATCH_BYTES = 32 << 20  # scratch memory; a step needs less
 _LANE = (1 << 24) - 1  # of Σ R and Σ G in `color_rgn`
 _VOTES = (1 << 16) - 1
 
 
 def add(store: BlockStore, other: BlockStore, max_blocks: int, *, are_parts: bool = False) -> None:
-    """Add the blocks of `other`, which has the same voxel size and layers; it may lack hits.
+    """Add the blocks of `other`, which has the same voxel size and layers, possibly without hits.
 
     Args:
-        max_blocks: that `store` may have.
-        are_parts: both are parts of one map, with the same keyframes in both.
+        max_blocks: limit of blocks in `store`.
+        are_parts: both are parts of one map, and hold the same keyframes.
 
     Raises:
-        MapFull: when it would have more.
+        MapFull: when the sum would have more blocks.
         WeightOverflow: when a voxel would have more votes than its integers hold.
-        MemoryError: without room. After each error the map is as it was.
+        MemoryError: without room. After each error the map is unchanged.
     """
     theirs = other.used()
     keys = other.keys[theirs]
@@ -47,7 +47,7 @@ def add(store: BlockStore, other: BlockStore, max_blocks: int, *, are_parts: boo
     both = [store.clear.counts(), other.clear.counts()]
     clear = clear_blocks.summed(both, np.maximum if are_parts else np.add)
     clear_blocks.check_count(len(clear[0]), max_blocks)
-    room = np.empty(_SCRATCH_BYTES, np.uint8)  # or MemoryError, before anything is added
+    room = np.empty(_SCRATCH_BYTES, np.uint8)  # raises MemoryError before anything is added
     with process.uninterrupted():
         store.insert(keys[missing])
         del room
@@ -63,8 +63,7 @@ def add(store: BlockStore, other: BlockStore, max_blocks: int, *, are_parts: boo
 def _check_weights(
     store: BlockStore, other: BlockStore, slots: NDArray[np.int32], theirs: NDArray[np.int64]
 ) -> None:
-    """Raise WeightOverflow if a voxel's weights would overflow. Only blocks whose `bounds` make that possible
-    are read."""
+    """Raise WeightOverflow if a voxel's weight would overflow. Reads only blocks where `bounds` allow it."""
     bounds = store.bounds[slots].astype(np.int64) + other.bounds[theirs]
     full = 0
     near = np.flatnonzero(bounds >= WEIGHT_LIMIT)
@@ -112,9 +111,9 @@ Colors = tuple[NDArray[np.int64], NDArray[np.int32]]  # rows of `color_rgn` and 
 
 
 def added_colors(here: Colors, there: Colors) -> Colors:
-    """Sum of the colours of the same blocks in two maps, (n, 512) each; full ones are averaged."""
+    """Return the sum of the colours of blocks in two maps, (n, 512) each; full colours are averaged."""
     rgn, blue = here[0] + there[0], here[1] + there[1]
-    if not ((here[0] | there[0] | rgn) & COLOR_LIMIT).any():  # fewer votes in both, and together
+    if not ((here[0] | there[0] | rgn) & COLOR_LIMIT).any():  # below the limit, also in the sum
         return rgn, blue
     each = here[0] & _VOTES, there[0] & _VOTES
     votes = each[0] + each[1]

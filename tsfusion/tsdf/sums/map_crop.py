@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The part of a map in a box, voxel by voxel; and parts of one map, which may be joined again."""
+"""Copy the voxels of a map in a box into a new map, and record which map it was cut from."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -14,12 +14,12 @@ from tsfusion.kernels.integration.integrate import CHANGED
 from tsfusion.tsdf.store.block_store import BlockStore, unpack_keys
 
 PART_OF = "part_of"  # in a map's meta: `Part`
-_CHUNK = 1024  # blocks at a time
-_MOST = 1 << 24  # voxels from the origin: beyond any map
+_CHUNK = 1024  # blocks per step
+_MOST = 1 << 24  # voxels from the origin; no map is that large
 
 
 class Part(Struct, frozen=True):
-    """Place of a map in another one, the whole, of which it is a part; valid until its own hash changes.
+    """Position of a map inside the whole map that it was cut from; valid until its own hash changes.
 
     Attributes:
         whole: hash of the whole map.
@@ -31,17 +31,17 @@ class Part(Struct, frozen=True):
     boxes: list[list[int]]
 
     def within(self, first: NDArray[np.int64], end: NDArray[np.int64], own: str) -> "Part":
-        """Part of this part in another box, with the hash `own`."""
+        """Return the part of this part in another box, with the hash `own`."""
         cut = [[*np.maximum(box[:3], first), *np.minimum(box[3:], end)] for box in self.boxes]
         return Part(self.whole, own, [list(map(int, box)) for box in cut if _overlap(box, box)])
 
     def is_beside(self, other: "Part") -> bool:
-        """True if both parts are of one map and share no voxel."""
+        """Return True if both parts belong to one map and share no voxel."""
         return self.whole == other.whole and not any(_overlap(a, b) for a in self.boxes for b in other.boxes)
 
 
 def part_of(meta: Mapping[str, Any], own: str) -> Part | None:
-    """Place of a map of this meta and hash in another one; None = it is no part, or has changed."""
+    """Return the position of a map in its whole map, or None if the map is no part or has changed."""
     found = msgspec.convert(meta[PART_OF], Part) if PART_OF in meta else None
     return found if found is not None and found.own == own else None
 
@@ -51,10 +51,10 @@ def _overlap(one: Sequence[int], other: Sequence[int]) -> bool:
 
 
 def voxel_range(box: Sequence[float], voxel_size: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Voxels whose centres lie in a box: first (3,), and last + 1 (3,). Boxes side by side share none.
+    """Return the voxels whose centres lie in a box: first (3,), and last + 1 (3,). Adjacent boxes share none.
 
-    `box`: x0, y0, z0, x1, y1, z1 in metres; a centre on the upper side is outside. Raises InvalidConfig for
-    anything else.
+    `box` is x0, y0, z0, x1, y1, z1 in metres; a centre on the upper side is outside. Raises InvalidConfig for
+    an invalid box.
     """
     corners = np.asarray(box, np.float64)
     if corners.shape != (6,) or not np.isfinite(corners).all() or (corners[:3] >= corners[3:]).any():
@@ -64,7 +64,7 @@ def voxel_range(box: Sequence[float], voxel_size: float) -> tuple[NDArray[np.int
 
 
 def copy(store: BlockStore, into: BlockStore, first: NDArray[np.int64], end: NDArray[np.int64]) -> None:
-    """Copy the voxels `first` ≤ (x, y, z) < `end` to a store without blocks; those around them stay zero.
+    """Copy the voxels `first` ≤ (x, y, z) < `end` to an empty store; other voxels of the blocks stay zero.
 
     Raises MemoryError without room.
     """
@@ -87,7 +87,7 @@ def copy(store: BlockStore, into: BlockStore, first: NDArray[np.int64], end: NDA
         store.keep_within_memory()
     keys, counts = store.clear.counts()
     corners = 8 * unpack_keys(keys).astype(np.int64)
-    whole = ((corners >= first) & (corners + 8 <= end)).all(axis=1)  # others may lack what they show
+    whole = ((corners >= first) & (corners + 8 <= end)).all(axis=1)  # a cut block may lack its surface
     into.clear.replace((keys[whole], counts[whole]))
     into.measure_bounds()
     into.dirty[: into.count] = CHANGED

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Difference between two maps of one frame: counts, and the surface that came or went."""
+"""Compare two maps of one frame: counts of blocks and voxels, and the surface that appeared or vanished."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -12,8 +12,8 @@ from tsfusion.kernels.base.sensor_noise import WEIGHT_ONE
 from tsfusion.kernels.integration.integrate import QUANTA_PER_VOXEL, WEIGHT_BITS, WEIGHT_MASK
 from tsfusion.tsdf.store.block_store import BlockStore, pack_keys
 
-_CHUNK = 1024  # blocks at a time
-_VERTICES = 1 << 16  # at a time
+_CHUNK = 1024  # blocks per step
+_VERTICES = 1 << 16  # per step
 UNCHANGED, APPEARED, GONE, NEW, UNSEEN = "unchanged", "appeared", "gone", "new", "not_seen_again"
 COLORS = {
     UNCHANGED: (170, 170, 170),
@@ -26,7 +26,7 @@ _KINDS = list(COLORS)
 
 
 class MapSide(NamedTuple):
-    """One of the two maps. `min_weight`: full samples that a voxel needs to count as seen."""
+    """One of the two maps. `min_weight` is the full samples that a voxel needs to count as seen."""
 
     mesh: Mesh
     store: BlockStore
@@ -35,18 +35,18 @@ class MapSide(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class MapDifference:
-    """Difference between a map and a later one of the same place.
+    """Difference between a map and a later map in the same coordinate frame.
 
-    A voxel counts if it has votes. Surface of the later map is `unchanged` where the earlier map has its
-    surface within the tolerance, `appeared` where that saw free space, and `new` where it saw nothing.
-    Surface of the earlier map is `gone` where the later one saw free space, and `not_seen_again` where that
-    saw nothing. Without `space_carving`, free space is known only in the band around surfaces: many changes
-    then count as `new` and `not_seen_again`.
+    A voxel counts if it has votes. Surface of the later map is `unchanged` where the earlier map has a
+    surface within the tolerance, `appeared` where the earlier map saw free space, else `new`. Surface of the
+    earlier map is `gone` where the later map saw free space, and `not_seen_again` where it saw nothing.
+    Without `space_carving`, free space is known only near surfaces: many changes then count as `new` and
+    `not_seen_again`.
 
     Attributes:
-        blocks, voxels: number of those that are `same`, `changed`, `only_earlier` and `only_later`.
+        blocks, voxels: numbers that are `same`, `changed`, `only_earlier` and `only_later`.
         area_m2: square metres of surface, by kind.
-        mesh: the later surface, and the lost parts of the earlier one; each kind has a colour (`COLORS`).
+        mesh: the later surface, and vanished parts of the earlier one; each kind has a colour (`COLORS`).
     """
 
     blocks: dict[str, int]
@@ -61,7 +61,7 @@ class MapDifference:
 
 
 def count(earlier: BlockStore, later: BlockStore) -> tuple[dict[str, int], dict[str, int]]:
-    """Blocks and voxels of two maps that are `same`, `changed`, `only_earlier` or `only_later`."""
+    """Count the blocks and voxels of two maps that are `same`, `changed`, `only_earlier` or `only_later`."""
     slots = [store.used() for store in (earlier, later)]
     keys = [store.keys[used] for store, used in zip((earlier, later), slots, strict=True)]
     _, first, second = np.intersect1d(keys[0], keys[1], assume_unique=True, return_indices=True)
@@ -92,9 +92,9 @@ def count(earlier: BlockStore, later: BlockStore) -> tuple[dict[str, int], dict[
 
 
 def surfaces(earlier: MapSide, later: MapSide, tolerance: float) -> tuple[dict[str, float], Mesh]:
-    """Square metres of each kind of surface, and the coloured mesh.
+    """Return the square metres of each kind of surface, and the coloured mesh.
 
-    `tolerance`: metres between two surfaces that are the same.
+    `tolerance` is the distance in metres up to which two surfaces are the same.
     """
     kinds = [
         _kinds(earlier.mesh, later, tolerance, (GONE, UNSEEN)),
@@ -110,9 +110,9 @@ def surfaces(earlier: MapSide, later: MapSide, tolerance: float) -> tuple[dict[s
 
 
 def _kinds(mesh: Mesh, other: MapSide, tolerance: float, names: tuple[str, str]) -> NDArray[np.uint8]:
-    """(n,) index in `_KINDS` of a mesh's vertices, by the voxels of the other map that they lie in.
+    """Return (n,) indices in `_KINDS` for a mesh's vertices, by the other map's voxels around them.
 
-    `names`: kinds for voxels that the other map saw free, and did not see.
+    `names` are the kinds for voxels that the other map saw as free, and did not see.
     """
     free, unseen = map(_KINDS.index, names)
     store, least = other.store, max(1, int(np.ceil(other.min_weight * WEIGHT_ONE)))
@@ -132,7 +132,7 @@ def _kinds(mesh: Mesh, other: MapSide, tolerance: float, names: tuple[str, str])
 
 
 def _of_faces(faces: NDArray[np.int32], of_vertices: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Kind of each triangle: that of its three vertices if equal, else unchanged."""
+    """Return the kind of each triangle: the kind of its three vertices if equal, else unchanged."""
     corners = of_vertices[faces]
     same = (corners[:, 0] == corners[:, 1]) & (corners[:, 0] == corners[:, 2])
     return np.where(same, corners[:, 0], np.uint8(_KINDS.index(UNCHANGED)))
@@ -144,7 +144,7 @@ def _areas(mesh: Mesh) -> NDArray[np.float64]:
 
 
 def _painted(earlier: Mesh, kinds: NDArray[np.uint8], later: Mesh, later_kinds: NDArray[np.uint8]) -> Mesh:
-    """The later mesh and the changed faces of the earlier one, coloured by kind."""
+    """Return the later mesh and the changed faces of the earlier mesh, coloured by kind."""
     faces = earlier.faces[_of_faces(earlier.faces, kinds) != _KINDS.index(UNCHANGED)]
     used, numbers = np.unique(faces, return_inverse=True)
     moved = numbers.reshape(-1, 3).astype(np.int32) + np.int32(len(later.vertices))

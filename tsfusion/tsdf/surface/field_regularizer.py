@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Signed distances of a surface, raw or of the regularised field: plan of blocks and iterations.
-`kernels/surface/field_smoothing.py` solves.
+"""Read signed distances of a surface from the map, raw or smoothed, and plan the smoothing (the field).
 
-The result is a function of the map's sums: the order of keyframes and threads has no effect. Blocks are
-solved with a halo of neighbours, so that some blocks' values are nearly those of the whole map
-(docs/method.md says how nearly).
+`kernels/surface/field_smoothing.py` solves. The result is a function of the map's sums: the order of
+keyframes
+and threads has no effect. Blocks are solved with a halo of neighbours, which makes the values of a few blocks
+nearly equal to those of the whole map (docs/method.md has the error).
 """
 
 import math
@@ -21,13 +21,13 @@ from tsfusion.kernels.surface import field_smoothing as kernels
 from tsfusion.kernels.surface import normal_smoothing, surface_cells
 from tsfusion.tsdf.store.block_store import BlockStore
 
-BATCH = 8192  # blocks solved at once, beside their halo; some 10 kB each
-STEPS, LOWEST = 6, 0.015  # Chebyshev steps a round, and eigenvalue of M⁻¹A from which on they damp evenly
-STRONG_STEPS, STRONG_LOWEST = 12, 0.02  # with a coarser start: the mesh is 6 % (stereo) from the limit
-WIDEST = 1.8  # times ε, of the first round
+BATCH = 8192  # blocks solved per step, plus their halo; about 10 kB each
+STEPS, LOWEST = 6, 0.015  # Chebyshev steps per round; smallest eigenvalue of M⁻¹A that they damp evenly
+STRONG_STEPS, STRONG_LOWEST = 12, 0.02  # after a coarser start: the mesh is 6 % (stereo) from the limit
+WIDEST = 1.8  # factor on ε in the first round
 LEAST_REACH = 2.0  # voxels
-COARSE_FROM = 64.0  # λ that smooths over more voxels than so few iterations reach
-NORMAL_SAMPLES = 3  # voxels to each side of the surface: less would be no ray
+COARSE_FROM = 64.0  # from this λ on, smoothing reaches more voxels than so few iterations do
+NORMAL_SAMPLES = 3  # voxels on each side of the surface; fewer would be no ray
 
 WORD = 64  # cells
 
@@ -36,14 +36,14 @@ AROUND = np.array([(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-
 SIDES = np.array([sign * step for step in _KEY_STEP for sign in (-1, 1)], np.int64)
 
 
-Round = tuple[float, float, int]  # ε in quanta, ∞: ω = 1; least eigenvalue to damp; steps
-_PART = 1 << 14  # blocks read at a time: they may have to come from a file
+Round = tuple[float, float, int]  # ε in quanta, ∞: ω = 1; smallest eigenvalue to damp; steps
+_PART = 1 << 14  # blocks per read: they may have to be read from a file
 
 
 @dataclass(frozen=True)
 class FieldSettings:
-    """`smoothness` λ against data weights in full-confidence samples, `edge` ε in voxels: a larger D2 counts
-    as an edge, `reweightings`: rounds of steps, each with ω from the x of the last."""
+    """Settings of the field. `smoothness` is λ against data weights in full-confidence samples. `edge` is ε
+    in voxels: a larger D2 is an edge. Each of the `reweightings` rounds takes ω from the last round's x."""
 
     smoothness: float
     edge: float
@@ -51,16 +51,16 @@ class FieldSettings:
 
     @property
     def reach(self) -> float:
-        """Length over which the penalty smooths, voxels; what lies deeper does not move the surface."""
+        """Length over which the penalty smooths, voxels; deeper voxels do not move the surface."""
         return max(LEAST_REACH, float(self.smoothness**0.25))
 
     @property
     def coarser(self) -> int:
-        """Levels of cells of twice the size to start from, where λ against the data is 16 times smaller."""
+        """Number of levels to start from, of cells of twice the size and 1/16 of λ relative to the data."""
         return int(self.smoothness >= COARSE_FROM)
 
     def rounds(self, depth: int) -> list[Round]:
-        """Rounds of a level; depth 0 = voxels. ε begins wider: what noise bends is no edge."""
+        """Return the rounds of a level; depth 0 = voxels. ε starts wider, because noise also bends."""
         edge = self.edge * QUANTA_PER_VOXEL * 4**depth
         flat = (math.inf, STRONG_LOWEST, STRONG_STEPS)
         if self.coarser:
@@ -72,7 +72,7 @@ class FieldSettings:
 
     @property
     def halo(self) -> int:
-        """Blocks around the wanted ones, on each side, that are solved with them."""
+        """Width of the halo of blocks, on each side, that is solved together with the wanted blocks."""
         return 1 + 2 * self.coarser
 
 
@@ -84,7 +84,7 @@ def solve(
     *,
     settings: FieldSettings,
 ) -> NDArray[np.float32]:
-    """Regularised signed distances: the `SurfaceView` of the surface `field`."""
+    """Return smoothed signed distances: the `SurfaceView` of the surface `field`."""
     if out is None:
         out = np.empty((len(keys), CUBE), np.float32)
     for first in range(0, len(keys), BATCH):
@@ -101,9 +101,9 @@ def along_normals(
     *,
     smoothness: float,
 ) -> NDArray[np.float32]:
-    """Signed distances smoothed along the normals only: the `SurfaceView` of the surface `normal`.
+    """Return signed distances smoothed along the normals: the `SurfaceView` of the surface `normal`.
 
-    paper eq. 3 on samples along the gradient.
+    This is eq. 3 of the paper on samples along the gradient.
     """
     centre = np.zeros((NORMAL_SAMPLES + 1, NORMAL_SAMPLES + 1), np.float32)
     for n in range(NORMAL_SAMPLES + 1):
@@ -122,15 +122,15 @@ def along_normals(
 
 
 def spread(keys: NDArray[np.int64], store: BlockStore, settings: FieldSettings) -> NDArray[np.int64]:
-    """Blocks whose field may move by more than a hundredth of a voxel with the sums of these."""
+    """Return the blocks whose field can move by more than a hundredth of a voxel with the sums of `keys`."""
     return around(keys, store, 1 + settings.coarser)
 
 
 @dataclass
 class GridLevel:
-    """Listed cells of one resolution: `bits` = log2 of the cells a side of a block.
+    """List of the marked cells of one resolution: `bits` = log2 of the cells per side of a block.
 
-    `planes`, `places`: marked cells, and their places in the list (`kernels/surface/field_smoothing.py`).
+    `planes`: bit planes of the marked cells; `places`: their indices (`kernels/surface/field_smoothing.py`).
     """
 
     bits: int
@@ -143,10 +143,10 @@ class GridLevel:
 
     @classmethod
     def make(cls, bits: int, planes: NDArray[np.uint64], counts: NDArray[np.int32]) -> "GridLevel":
-        """Empty list of the marked cells; `counts` has the number in each word."""
+        """Return an empty list for the marked cells; `counts` has the number of marks in each word."""
         places = np.append(0, np.cumsum(counts)).astype(np.int32)
         total = -(-int(places[-1]) // kernels.ABREAST) * kernels.ABREAST
-        y, weight, x = (np.zeros(total + 1, np.float32) for _ in range(3))  # the last stands for "none"
+        y, weight, x = (np.zeros(total + 1, np.float32) for _ in range(3))  # the last entry means "none"
         links = np.empty((6, total), np.int32)
         links[:, int(places[-1]) :] = total
         return cls(bits, planes, places[:-1].reshape(counts.shape), links, y, weight, x)
@@ -154,7 +154,7 @@ class GridLevel:
     def relax(
         self, smoothness: float, rounds: Sequence[Round], pause: Callable[[], None] = lambda: None
     ) -> None:
-        """Descend the gradient in rounds, each with ω from the solution of the one before.
+        """Descend the gradient in rounds, each with ω from the solution of the round before.
 
         `pause` is called after each launch.
         """
@@ -194,7 +194,7 @@ def _solve_batch(
                 level.bits, coarse.links, coarse.planes, coarse.places, coarse.x,
                 level.planes, level.places, level.x,
             )  # fmt: skip
-        # Between cells of twice the size a bend is 4 times as large, and there are 8 times fewer
+        # Between cells of twice the size a bend is 4 times as large, and the cells are 8 times fewer
         level.relax(settings.smoothness / 2**depth, settings.rounds(depth), store.pause)
     kernels.write_values(levels[0].planes, levels[0].places, levels[0].x, values)
     if not is_all:
@@ -230,13 +230,13 @@ def _list(
 
 
 def marks_of(blocks: int, cells: int) -> tuple[NDArray[np.uint64], NDArray[np.int32]]:
-    """Room for the marks of so many cells a block, a bit each, and for the number in each word."""
+    """Return arrays for the marks of `cells` cells per block, one bit each, and for counts per word."""
     shape = blocks, -(-cells // WORD)
     return np.empty(shape, np.uint64), np.empty(shape, np.int32)
 
 
 def chebyshev(lowest: float, steps: int) -> Iterator[tuple[float, float]]:
-    """(share of the last step, gain of the residual) of each step, for eigenvalues in [lowest, 1]."""
+    """Yield (share of the last step, gain of the residual) of each step, for eigenvalues in [lowest, 1]."""
     middle, half = (1 + lowest) / 2, (1 - lowest) / 2
     rho = half / middle
     yield 0.0, 1 / middle
@@ -246,7 +246,7 @@ def chebyshev(lowest: float, steps: int) -> Iterator[tuple[float, float]]:
 
 
 def around(keys: NDArray[np.int64], store: BlockStore, rings: int = 1) -> NDArray[np.int64]:
-    """Blocks of the map up to `rings` blocks away, with these themselves; sorted."""
+    """Return the sorted keys of the map's blocks up to `rings` blocks away from `keys`, including `keys`."""
     for _ in range(rings):
         most = min(len(AROUND) * len(keys), store.count)
         table = np.zeros(1 << max(4, (2 * most).bit_length()), np.int64)
@@ -259,7 +259,7 @@ def around(keys: NDArray[np.int64], store: BlockStore, rings: int = 1) -> NDArra
 
 
 def index_of(keys: NDArray[np.int64], queries: NDArray[np.int64]) -> NDArray[np.int32]:
-    """Position of each query in the sorted `keys`, −1 where absent."""
+    """Return the index of each query in the sorted `keys`, −1 if absent."""
     if not len(keys):
         return np.full(queries.shape, -1, np.int32)
     at = np.minimum(np.searchsorted(keys, queries), len(keys) - 1)
@@ -267,7 +267,7 @@ def index_of(keys: NDArray[np.int64], queries: NDArray[np.int64]) -> NDArray[np.
 
 
 class SurfaceView(Protocol):
-    """Function that reads signed distances from the map: `values_of`, or one of `field_regularizer`."""
+    """Function that reads signed distances from the map: `values_of`, or one of this module."""
 
     def __call__(
         self,
@@ -276,7 +276,7 @@ class SurfaceView(Protocol):
         min_weight: float,
         out: NDArray[np.float32] | None = None,
     ) -> NDArray[np.float32]:
-        """(n, 512) values of blocks in quanta, NaN where unseen: below `min_weight` full samples.
+        """Return (n, 512) values of blocks in quanta, NaN where unseen: below `min_weight` full samples.
 
         Args:
             keys: sorted packed keys; a block that the map does not hold is unseen.
@@ -287,7 +287,7 @@ class SurfaceView(Protocol):
 def values_of(
     keys: NDArray[np.int64], store: BlockStore, min_weight: float, out: NDArray[np.float32] | None = None
 ) -> NDArray[np.float32]:
-    """Signed distances as they were fused: the `SurfaceView` of the surface `raw`."""
+    """Return signed distances as they were fused: the `SurfaceView` of the surface `raw`."""
     if out is None:
         out = np.empty((len(keys), CUBE), np.float32)
     least = max(1, int(np.ceil(min_weight * WEIGHT_ONE)))

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""Holes closed by the field: a guess of the surface where nothing was seen, with its triangles marked.
+"""Close holes with a guess of the surface that continues the field, and mark the guessed triangles.
 
-1. A rim is where a surface breaks off: a seen voxel that it passes, beside an unseen one.
-2. The unseen voxels within half a hole of a rim get values: paper eq. 3 with seen voxels as data and no
-   weight elsewhere, so that second differences are least; a ramp continues as it is. Seen voxels keep theirs.
+1. A rim is a seen voxel at which a surface ends: the surface passes it, and a neighbour is unseen.
+2. The unseen voxels within half a hole of a rim get values: eq. 3 of the paper with seen voxels as data and
+no weight elsewhere, which minimises second differences; a ramp continues unchanged. Seen voxels keep their
+values.
 3. Marching cubes meshes seen and guessed voxels together. A triangle is guessed if its cell has an unseen
-   voxel; all others are those of the mesh without guesses.
-4. A guessed patch stays if it closes, and its colours come from its rim.
+voxel; all others equal those of the mesh without guesses.
+4. A guessed patch stays if it closes a hole. Its colours come from its rim.
 """
 
 import math
@@ -28,23 +29,23 @@ from tsfusion.tsdf.surface.field_regularizer import SurfaceView
 from tsfusion.tsdf.surface.mesh_extraction import MeshBuffers, extract_rows
 
 MOST_VOXELS = 64
-BATCH = 4096  # blocks solved at once, beside their halo
-_STIFFEST = 48.0  # most that the operator of the preconditioner's units has: 4 · 4 an axis
-_SOFTEST = 500.0  # least eigenvalue of D2ᵀD2 between two held ends, times the distance⁴: (4.73)⁴
-_SLAB, _SLOPE = 2.5, 0.5  # voxels from the plane of a rim that are solved, and how that grows with distance
-_TOLERANCE = 1e-2  # of the first guess's error
-_SWEEPS = 256  # of colours, at most: across the widest hole
+BATCH = 4096  # blocks solved per step, plus their halo
+_STIFFEST = 48.0  # largest value of the operator in the preconditioner's units: 4 · 4 per axis
+_SOFTEST = 500.0  # smallest eigenvalue of D2ᵀD2 between two fixed ends, times the distance⁴: (4.73)⁴
+_SLAB, _SLOPE = 2.5, 0.5  # voxels solved around the plane of a rim, and their growth with distance
+_TOLERANCE = 1e-2  # share of the first guess's error that may remain
+_SWEEPS = 256  # largest number of sweeps of colours: across the widest hole
 
 
 def checked(voxels: int) -> int:
-    """Width of holes to close; raises InvalidConfig for an impossible one."""
+    """Return the width of holes to close. Raises InvalidConfig for an impossible width."""
     if not 1 <= voxels <= MOST_VOXELS:
         raise InvalidConfig(f"holes are filled up to 1 to {MOST_VOXELS} voxels, got {voxels}")
     return voxels
 
 
 def extract_filled(store: BlockStore, min_weight: float, view: SurfaceView, voxels: int) -> Mesh:
-    """Mesh of the whole map with its holes up to `voxels` wide closed; `guessed` marks the new triangles."""
+    """Return the mesh of the whole map with holes up to `voxels` wide closed; `guessed` marks the guess."""
     own, buffers = np.sort(store.keys), MeshBuffers()
     seen = view(own, store, min_weight)
     more, filled = _fill(own, seen, voxels)
@@ -56,7 +57,7 @@ def extract_filled(store: BlockStore, min_weight: float, view: SurfaceView, voxe
         min_weight: float,
         out: NDArray[np.float32] | None = None,
     ) -> NDArray[np.float32]:
-        assert out is not None  # `mesh_extraction` has rows for them
+        assert out is not None  # `mesh_extraction` passes rows
         out[: len(keys)] = np.nan
         out[np.searchsorted(keys, own)] = seen
         if keys is union:
@@ -75,7 +76,7 @@ def extract_filled(store: BlockStore, min_weight: float, view: SurfaceView, voxe
         buffers.first.array, marching_tables.TRIANGLE_COUNT, guessed,
     )  # fmt: skip
     seen_vertices = np.unique(mesh.faces[guessed == 0])
-    mesh.normals[seen_vertices] = plain.normals  # not bent by what was guessed beside them
+    mesh.normals[seen_vertices] = plain.normals  # guessed neighbours must not bend them
     guess = replace(mesh, guessed=guessed.astype(bool))
     return with_rim_colors(closing(guess))
 
@@ -83,7 +84,7 @@ def extract_filled(store: BlockStore, min_weight: float, view: SurfaceView, voxe
 def _fill(
     keys: NDArray[np.int64], seen: NDArray[np.float32], voxels: int
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Sorted keys of blocks with guessed values, and their (n, 512) values; NaN without a guess."""
+    """Return sorted keys of blocks with guessed values, and their (n, 512) values; NaN without a guess."""
     rims = np.zeros((len(keys), CUBE), np.uint8)
     kernels.find_rims(_rows(keys, keys[:, None] + field_regularizer.AROUND), seen, rims)
     rings = math.ceil(_reach(voxels) / 8)
@@ -103,7 +104,7 @@ def _fill(
 def _taken(
     local: NDArray[np.int64], keys: NDArray[np.int64], seen: NDArray[np.float32], rims: NDArray[np.uint8]
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Values and rims of some blocks; a block that the map does not have is unseen."""
+    """Return the values and rims of some blocks; a block that the map does not have is unseen."""
     at = _rows(keys, local)
     values, marks = np.full((len(local), CUBE), np.nan, np.float32), np.zeros((len(local), CUBE), np.uint8)
     values[at >= 0], marks[at >= 0] = seen[at[at >= 0]], rims[at[at >= 0]]
@@ -117,7 +118,7 @@ def _solve(
     rims: NDArray[np.uint8],
     voxels: int,
 ) -> NDArray[np.float32]:
-    """Guessed values of the blocks `part`, from those of the blocks `local` around them."""
+    """Return the guessed values of the blocks `part`, from the values of the blocks `local` around them."""
     marks = np.zeros((len(local), CUBE), np.uint8)
     around = _rows(local, local[:, None] + field_regularizer.AROUND)
     kernels.mark_unseen(local, around, values, rims, _ball(voxels), _SLAB, _SLOPE, marks)
@@ -127,7 +128,7 @@ def _solve(
     level.x[layer == kernels.EARLY] = np.nan
     values.fill(np.nan)
     field_smoothing.write_values(level.planes, level.places, level.x, values)
-    values[marks != kernels.UNSEEN] = np.nan  # they are not asked for
+    values[marks != kernels.UNSEEN] = np.nan  # seen or irrelevant
     return values[_rows(local, part)]
 
 
@@ -137,7 +138,7 @@ def _list(
     values: NDArray[np.float32],
     marks: NDArray[np.uint8],
 ) -> tuple[field_regularizer.GridLevel, NDArray[np.int32]]:
-    """Marked voxels with first values and the seen ones beside them; the layer of each, 0 where seen."""
+    """Return the list of marked voxels and seen neighbours, with first values; their layers, 0 = seen."""
     planes, counts = field_regularizer.marks_of(len(local), CUBE)
     kernels.take_marked(around, values, marks, planes, counts)
     level = field_regularizer.GridLevel.make(3, planes, counts)
@@ -153,19 +154,19 @@ def _list(
 
 
 def _relax(level: field_regularizer.GridLevel, voxels: int) -> None:
-    """Minimise second differences between the seen values, in as many steps as a hole of this width needs."""
+    """Minimise second differences between the seen values; a wider hole takes more steps."""
     lowest = _SOFTEST / _STIFFEST / (voxels + 2) ** 4
     steps = math.ceil(0.5 * math.log(2 / _TOLERANCE) / math.sqrt(lowest))
     level.relax(1.0, [(math.inf, lowest, steps)])
 
 
 def _reach(voxels: int) -> float:
-    """Voxels from a rim to the middle of the widest hole, and half a voxel along the normal."""
+    """Return the voxels from a rim to the middle of the widest hole, plus half a voxel along the normal."""
     return (voxels + 1) / 2 + 0.5
 
 
 def _ball(voxels: int) -> NDArray[np.int32]:
-    """(n, 3) columns of the ball that is marked around a rim: x, y, and the reach up and down."""
+    """Return columns, (n, 3), of the ball that is marked around a rim: x, y, and the reach up and down."""
     radius = _reach(voxels)
     n = int(radius)
     x, y = np.mgrid[-n : n + 1, -n : n + 1].reshape(2, -1)
@@ -175,7 +176,7 @@ def _ball(voxels: int) -> NDArray[np.int32]:
 
 
 def _spread(keys: NDArray[np.int64], rings: int) -> NDArray[np.int64]:
-    """Sorted keys of blocks up to `rings` blocks away, also of those that the map does not have."""
+    """Return sorted keys of blocks up to `rings` blocks away, including blocks that the map does not have."""
     for _ in range(rings):
         keys = distinct(keys[:, None] + field_regularizer.AROUND)
     return keys
@@ -186,10 +187,10 @@ def _rows(keys: NDArray[np.int64], queries: NDArray[np.int64]) -> NDArray[np.int
 
 
 def closing(mesh: Mesh) -> Mesh:
-    """Mesh without the guessed patches that close nothing.
+    """Return the mesh without the guessed patches that close no hole.
 
-    A patch with a free edge goes: it lies at the border of a scan, or in a hole that is too wide. So does a
-    patch with more triangles than the seen pieces that it hangs on: a crumb would grow to a bubble.
+    A patch with a free edge is removed: it lies at the border of a scan, or in a too wide hole. So is a patch
+    with more triangles than the seen pieces around it, because a small crumb would grow to a bubble.
     """
     assert mesh.guessed is not None
     guess = np.flatnonzero(mesh.guessed)
@@ -202,7 +203,7 @@ def closing(mesh: Mesh) -> Mesh:
     alone = np.ones(len(key), bool)
     alone[1:] &= ~same
     alone[:-1] &= ~same
-    rim = order[alone]  # edges that one guessed triangle has
+    rim = order[alone]  # edges of a single guessed triangle
     of, at = patch[owner[rim]], edges[rim]
     seen = mesh.faces[~mesh.guessed]
     touched = np.zeros(len(mesh.vertices), bool)
@@ -220,7 +221,7 @@ def closing(mesh: Mesh) -> Mesh:
 def _size_around(
     seen: NDArray[np.int32], patch: NDArray[np.int32], vertex: NDArray[np.int32], mesh: Mesh
 ) -> NDArray[np.int64]:
-    """Number of triangles of the seen pieces that each patch hangs on, by their shared vertices."""
+    """Return the number of triangles of the seen pieces that share vertices with each patch."""
     assert mesh.guessed is not None
     label = mesh_islands.pieces(seen, len(mesh.vertices))
     faces = np.bincount(label[seen[:, 0]], minlength=len(label))
@@ -239,7 +240,7 @@ def _keys(edges: NDArray[np.int32]) -> NDArray[np.int64]:
 
 
 def with_rim_colors(mesh: Mesh) -> Mesh:
-    """Colours of the guessed surface, diffused inward from its rim."""
+    """Return the mesh with colours on the guessed surface, diffused inward from its rim."""
     if mesh.guessed is None or mesh.colors is None:
         return mesh
     known = np.zeros(len(mesh.vertices), bool)

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Mesh extraction: choice of blocks, and working memory, for `kernels/surface/surface_cells.py` and
-`kernels/surface/marching_cubes.py`. Followers of the map get its cells in key order, with the triangles of
-each."""
+"""Mesh blocks of a map, and give followers of the map its cells in key order, each with its triangles."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,13 +17,13 @@ from tsfusion.tsdf.store.block_store import CELL_STEPS, BlockStore
 from tsfusion.tsdf.store.growing_array import GrowingArray
 from tsfusion.tsdf.surface.field_regularizer import SurfaceView, around, values_of
 
-_BEHIND, _CLEAR = 2 / 3, 0.97  # of a band's half-width, of the support
-KEPT_BLOCKS = 1 << 14  # working memory for so many is kept for the next mesh: 45 MB
-_X = 42  # bits of a key below x: keys of one x are a layer
+_BEHIND, _CLEAR = 2 / 3, 0.97  # shares of a band's half-width, and of the support
+KEPT_BLOCKS = 1 << 14  # working memory for this many blocks is kept for the next mesh: 45 MB
+_X = 42  # bits of a key below x; blocks with the same x are a layer
 
 
 class MeshBuffers:
-    """Working memory of one extraction: a row a block, and one row for absent blocks.
+    """Working memory of one extraction: one row per block, and one row for absent blocks.
 
     `kernels/surface/surface_cells.py` explains the arrays.
     """
@@ -55,7 +53,7 @@ class MeshBuffers:
             array.reserve(rows + 1)
 
     def release(self) -> None:
-        """Give the memory of a large mesh back to the system."""
+        """Free the memory of a large mesh."""
         if self.values.capacity > KEPT_BLOCKS:
             self._forget()
 
@@ -67,7 +65,7 @@ class MeshBuffers:
         return self._table[:size], self._table_rows[:size]
 
     def keys_around(self, wanted: NDArray[np.int64], store: BlockStore) -> NDArray[np.int64]:
-        """Sorted keys of the map's blocks that are, or touch, a wanted one."""
+        """Return the sorted keys of the wanted blocks and of their neighbours in the map."""
         if len(wanted) == store.count:
             return wanted
         return around(wanted, store)
@@ -80,12 +78,13 @@ class MeshBuffers:
 
 
 def back_limits(config: VolumeConfig) -> tuple[float, float]:
-    """Distances, quanta, from which voxels are far behind a surface, and clear. A voxel that all looked
-    through has the least support or more. No voxel is either in a map with varying bands, or without carving.
+    """Return two distances in quanta: from which voxels are far behind a surface, and from which they are
+    clear.
 
-    At a grazing angle, voxels of a street far ahead lie side by side with quite different distances: in maps
-    where noise widens the bands (stereo pairs), and where no planes are known (points, whose noise does not
-    grow with distance).
+    A voxel that every ray looks through has at least the support. Without carving, or with varying bands, no
+    voxel is far behind or clear: at a grazing angle, neighbouring voxels of a distant street have very
+    different distances where noise widens the bands (stereo pairs), and where no planes are known (points,
+    whose noise does not grow with distance).
     """
     model = config.model()
     away = model.max_range / 2 - model.sigma_z0
@@ -103,7 +102,7 @@ def extract(
     buffers: MeshBuffers | None = None,
     view: SurfaceView = values_of,
 ) -> Mesh:
-    """Mesh of the cells of the map's blocks `wanted` (sorted distinct keys)."""
+    """Return the mesh of the cells of the map's blocks `wanted` (sorted distinct keys)."""
     return extract_cells(wanted, store, min_weight, buffers, view)[0]
 
 
@@ -114,14 +113,14 @@ def extract_cells(
     buffers: MeshBuffers | None = None,
     view: SurfaceView = values_of,
 ) -> tuple[Mesh, NDArray[np.int32]]:
-    """Mesh as of `extract`, and (n + 1,) first faces of each block's cells."""
+    """Return the mesh of `extract`, and the (n + 1,) first faces of each block's cells."""
     buffers = buffers or MeshBuffers()
     try:
         mesh, keys = extract_rows(wanted, store, min_weight, buffers, view)
         first = buffers.first.array[np.searchsorted(keys, wanted), 1]
         return mesh, np.append(first, np.int32(len(mesh.faces)))
     finally:
-        buffers.release()  # also of a mesh that there was no memory for
+        buffers.release()  # even if memory ran out
 
 
 def extract_rows(
@@ -133,9 +132,9 @@ def extract_rows(
     *,
     keys: NDArray[np.int64] | None = None,
 ) -> tuple[Mesh, NDArray[np.int64]]:
-    """Mesh as of `extract`, and the (n,) keys of the blocks in the rows of `buffers`.
+    """Return the mesh of `extract`, and the (n,) keys of the blocks in the rows of `buffers`.
 
-    `keys`: the wanted blocks and those around them, of which `view` knows more than the map has.
+    `keys` are the wanted blocks and their neighbours. `view` may have values for more blocks than the map.
     """
     keys = buffers.keys_around(wanted, store) if keys is None else keys
     count = len(keys)
@@ -154,7 +153,7 @@ def extract_rows(
     vertices, triangles = first[count]
     positions, normals = np.empty((vertices, 3), np.float32), np.empty((vertices, 3), np.float32)
     colors = np.empty((vertices if store.color else 0, 3), np.uint8)
-    slots = np.append(store.slots_of(keys), np.int32(-1))  # the last stands for the blocks that are not there
+    slots = np.append(store.slots_of(keys), np.int32(-1))  # the last entry means an absent block
     marching_cubes.emit_vertices(
         count, keys, around, values, edges, first, buffers.padded, store.voxel_size, slots,
         store.color_rgn, store.color_b, int(store.color),
@@ -176,7 +175,7 @@ class CellMeshes:
     Attributes:
         cells: (n, 3) int32 block coordinates, in key order.
         first_face: (n + 1,) int32: the cell in row i has the faces `first_face[i]` to `first_face[i + 1]`.
-        mesh: of these cells.
+        mesh: mesh of these cells.
     """
 
     cells: NDArray[np.int32]
@@ -185,8 +184,8 @@ class CellMeshes:
 
 
 def listed(store: BlockStore, first: int, most: int) -> tuple[NDArray[np.int64], int | None]:
-    """Sorted keys of the map's blocks from `first` on, at most `most`; and the first of the remaining
-    ones."""
+    """Return the sorted keys of at most `most` of the map's blocks from `first` on, and the next key, or
+    None."""
     keys = store.keys[store.keys >= first]
     if len(keys) <= most:
         return np.sort(keys), None
@@ -203,13 +202,13 @@ def listed_since(
     to_cells: Callable[[NDArray[np.int64]], NDArray[np.int64]],
     reach: int,
 ) -> tuple[NDArray[np.int64], int | None]:
-    """Cells as of `listed`, restricted to those that changes after the stamp `since` reach.
+    """Return the cells of `listed` that changes after the stamp `since` affect, and the next key, or None.
 
     The search goes layer by layer: an answer costs the size of a few layers, not of the map.
 
     Args:
-        to_cells: gives the keys of the cells that changes of blocks reach.
-        reach: greatest distance of these cells from the blocks, blocks; towards −x one more.
+        to_cells: returns the keys of the cells that changed blocks affect.
+        reach: largest distance in blocks of these cells from the blocks; towards −x one more.
     """
     changed = store.keys[store.stamps[: store.count] > since]
     layer, low = changed >> _X, first >> _X
@@ -228,9 +227,9 @@ def listed_since(
 
 
 def stamps_of(store: BlockStore, keys: NDArray[np.int64]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Stamps of the last changes to cells, (n,) each: of all blocks that a cell reads, and of its own block.
+    """Return stamps of the last changes to cells, (n,) each: of all blocks that a cell reads, and of its own.
 
-    0 = no change since the map was opened.
+    0 means no change since the map was opened.
     """
     slots = store.slots_of((keys[:, None] + CELL_STEPS).ravel())
     stamps = np.where(slots >= 0, store.stamps[slots], 0).reshape(-1, len(CELL_STEPS))

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Mesh of a whole map in tiles, with memory for one tile: together the same vertices and triangles.
+"""Mesh a whole map tile by tile, with memory for one tile and the same vertices and triangles as at once.
 
-A tile is a run of blocks in key order: it has the vertices on its blocks' voxel edges and the triangles of
-their cells. Tiles come last first: a cell's other vertices lie towards +x, +y, +z, in tiles that are known by
-then. Vertices are counted from the end of the whole mesh, whose length is known after the last tile.
+A tile is a run of blocks in key order. It has the vertices on its blocks' voxel edges and the triangles of
+their cells. The last tile comes first: a cell's other vertices lie towards +x, +y, +z, in later tiles.
+Vertex numbers count from the end of the whole mesh, because its length is unknown until the last step.
 """
 
 from collections.abc import Iterable, Iterator
@@ -18,19 +18,19 @@ from tsfusion.tsdf.store.block_store import CELL_STEPS, BlockStore
 from tsfusion.tsdf.surface import field_regularizer, mesh_extraction
 from tsfusion.tsdf.surface.field_regularizer import SurfaceView
 
-_FARTHEST = int(CELL_STEPS.max())  # what the keys of blocks that share a cell differ by at most
+_FARTHEST = int(CELL_STEPS.max())  # largest difference of the keys of blocks that share a cell
 
 
 class Numbered(NamedTuple):
     """Blocks whose vertices have numbers: (n,) sorted keys, (n, 24) edges with a vertex, and (n,) the number
-    of the first vertex, from the end."""
+    of the first vertex, counted from the end."""
 
     keys: NDArray[np.int64]
     edges: NDArray[np.uint64]
     first: NDArray[np.int64]
 
     def before(self, later: "Numbered", last: np.int64) -> "Numbered":
-        """Join these blocks and later ones, up to a key."""
+        """Join these blocks and later blocks, up to a key."""
         n = int(np.searchsorted(later.keys, last, side="right"))
         return Numbered(
             np.concatenate([self.keys, later.keys[:n]]),
@@ -39,7 +39,7 @@ class Numbered(NamedTuple):
         )
 
     def numbers(self, vertices: "_Vertices") -> NDArray[np.int64]:
-        """(n,) numbers from the end of vertices on edges of these blocks."""
+        """Return the (n,) numbers, counted from the end, of vertices on edges of these blocks."""
         at, of = np.unique(np.searchsorted(self.keys, vertices.keys), return_inverse=True)
         rank = np.cumsum(_bits(self.edges[at]), axis=1, dtype=np.int16) - 1
         numbers: NDArray[np.int64] = self.first[at][of] - rank[of, vertices.edges]
@@ -47,7 +47,7 @@ class Numbered(NamedTuple):
 
 
 class _Vertices(NamedTuple):
-    """Vertices of other tiles, (n,) each: the key of the block, and the edge of it."""
+    """Vertices of other tiles, (n,) each: the key of the block, and the edge in the block."""
 
     keys: NDArray[np.int64]
     edges: NDArray[np.int64]
@@ -60,12 +60,12 @@ _NOBODY = Numbered(np.zeros(0, np.int64), np.zeros((0, 24), np.uint64), np.zeros
 
 
 class MeshRun(NamedTuple):
-    """Mesh of consecutive tiles, made without the others.
+    """Mesh of consecutive tiles, made without the other tiles.
 
     Attributes:
-        part: its numbers are from the end of these tiles; 0 stands for vertices behind them.
-        open_at: (n,) places of these zeros in the corners of all faces.
-        open_keys, open_edges: (n,) which vertices they are: the key of the block, and the edge of it.
+        part: the mesh; numbers count from the end of these tiles, 0 = a vertex of later tiles.
+        open_at: (n,) indices of these zeros in the corners of all faces.
+        open_keys, open_edges: (n,) key of the block, and edge in the block, of these vertices.
         border: the first blocks, whose vertices earlier tiles may need.
         first: key of the first block.
     """
@@ -79,9 +79,9 @@ class MeshRun(NamedTuple):
 
 
 def tiles(store: BlockStore, min_weight: float, view: SurfaceView) -> Iterator[MeshPart]:
-    """Parts of the mesh that `mesh_extraction.extract` makes of all blocks, the last first.
+    """Yield parts of the mesh that `mesh_extraction.extract` makes of all blocks, the last part first.
 
-    Beside a tile and its neighbours, memory holds the values of up to three layers of blocks, across x.
+    Besides a tile and its neighbours, memory holds the values of up to three layers of blocks, across x.
     """
     keys = np.sort(store.keys)
     for made in _tiles(keys, range(tile_count(len(keys))), store, min_weight, view):
@@ -95,8 +95,8 @@ def tile_count(blocks: int) -> int:
 def run(
     keys: NDArray[np.int64], which: range, store: BlockStore, min_weight: float, view: SurfaceView
 ) -> MeshRun:
-    """Some tiles of a map whose blocks have these sorted keys; the store holds `blocks_of_run` and their
-    surroundings."""
+    """Return some tiles of a map whose blocks have these sorted keys. The store holds `blocks_of_run` and
+    their surroundings."""
     made = list(_tiles(keys, which, store, min_weight, view))[::-1]
     corners = np.array([one.part.faces.size for one in made])
     begin = np.cumsum(corners) - corners
@@ -114,7 +114,7 @@ def run(
 
 
 def blocks_of_run(keys: NDArray[np.int64], which: range) -> NDArray[np.int64]:
-    """Keys of the blocks whose values a run of tiles needs: all that are solved with those at its cells."""
+    """Return the keys of the blocks whose values a run of tiles needs: whole batches around its cells."""
     size = field_regularizer.BATCH
     own = keys[which.start * size : which.stop * size]
     low, high = int(own[0]) - 2 * _FARTHEST, int(own[-1]) + _FARTHEST
@@ -124,7 +124,7 @@ def blocks_of_run(keys: NDArray[np.int64], which: range) -> NDArray[np.int64]:
 
 
 def together(runs: Iterable[MeshRun]) -> Iterator[MeshPart]:
-    """Parts of the whole mesh, as of `tiles`, from its runs, the last first."""
+    """Yield the parts of the whole mesh, as `tiles`, from its runs, the last run first."""
     done, known = 0, _NOBODY
     for one in runs:
         faces = one.part.faces.astype(np.int64) + done
@@ -139,7 +139,7 @@ def together(runs: Iterable[MeshRun]) -> Iterator[MeshPart]:
 def _tiles(
     keys: NDArray[np.int64], which: range, store: BlockStore, min_weight: float, view: SurfaceView
 ) -> Iterator[MeshRun]:
-    """Single tiles, the last first; their numbers are from the end of the last one."""
+    """Yield single tiles, the last tile first; their numbers count from the end of the last tile."""
     size = field_regularizer.BATCH
     values = WholeMapValues(keys, view, size)
     buffers = mesh_extraction.MeshBuffers()
@@ -148,7 +148,7 @@ def _tiles(
     for number in reversed(which):
         begin = number * size
         own = keys[begin : begin + size]
-        wanted = distinct(own[:, None] - CELL_STEPS)  # they share the edges of these blocks
+        wanted = distinct(own[:, None] - CELL_STEPS)  # blocks that share edges with these blocks
         wanted = wanted[store.slots_of(wanted) >= 0]
         mesh, rows = mesh_extraction.extract_rows(wanted, store, min_weight, buffers, values)
         a = int(np.searchsorted(rows, own[0]))
@@ -178,7 +178,7 @@ def _tiles(
 def _vertices(
     local: NDArray[np.int64], rows: NDArray[np.int64], first: NDArray[np.int32], edges: NDArray[np.uint64]
 ) -> _Vertices:
-    """Vertices on other tiles' edges, for which a tile has only its own numbers.
+    """Return vertices on other tiles' edges, for which a tile has only its own numbers.
 
     Args:
         local: (n,) the tile's numbers.
@@ -195,16 +195,16 @@ def _vertices(
 
 
 def _bits(planes: NDArray[np.uint64]) -> NDArray[np.uint8]:
-    """(n, 24) planes of 64 bits → (n, 1536) 0 or 1, in the order of the vertices."""
+    """Convert (n, 24) bit planes of 64 bits to (n, 1536) 0 or 1, in the order of the vertices."""
     octets = np.ascontiguousarray(planes, "<u8").view(np.uint8)
     return np.unpackbits(octets, axis=1, bitorder="little")
 
 
 class WholeMapValues:
-    """A `SurfaceView` with the values of the whole map, whose blocks are solved in the same batches, of
-    `size` blocks.
+    """A `SurfaceView` with the values of the whole map, whose blocks are solved in the same batches of `size`
+    blocks.
 
-    Valid until the map changes. `keys`: sorted, of all blocks of the map. `view` reads the surface.
+    Valid until the map changes. `keys` are the sorted keys of all blocks. `view` reads the surface.
     """
 
     def __init__(self, keys: NDArray[np.int64], view: SurfaceView, size: int) -> None:
@@ -218,7 +218,7 @@ class WholeMapValues:
         min_weight: float,
         out: NDArray[np.float32] | None = None,
     ) -> NDArray[np.float32]:
-        assert out is not None  # `mesh_extraction` has rows for them
+        assert out is not None  # `mesh_extraction` passes rows
         at = np.searchsorted(self._keys, keys)
         for number in np.unique(at // self._size).tolist():
             begin = number * self._size
@@ -229,7 +229,7 @@ class WholeMapValues:
         return out[: len(keys)]
 
     def forget_beyond(self, key: int) -> None:
-        """Release batches in which every key is larger."""
+        """Release batches in which every key is larger than `key`."""
         for number in [one for one in self._solved if self._keys[one * self._size] > key]:
             del self._solved[number]
 

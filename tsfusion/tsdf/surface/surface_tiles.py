@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Values and meshes of a surface in cubes of 8³ blocks, kept until the map changes; and values kept block by
-block while it grows.
+"""Keep values and meshes of a surface in cubes of 8³ blocks until the map changes, for later questions.
 
-The content of a cube depends on the map alone: neither on earlier questions nor on how the map came about.
-
-The last state of a complete view stays available while the map changes, until a newer view is complete: the
-old meshes of changed cubes are kept beside the new ones. A cube without changes is the same in both states.
+The content of a cube depends only on the map, neither on earlier questions nor on the map's history. While
+the
+map changes, the last complete view stays available until a newer view is complete: the old meshes of changed
+cubes are kept in addition to the new ones. A second class keeps values block by block while the map grows.
 """
 
 from collections import OrderedDict
@@ -25,7 +24,7 @@ from tsfusion.tsdf.surface.field_regularizer import SurfaceView, values_of
 
 SIDE = 8  # blocks
 AT_ONCE = 16  # cubes that are meshed together
-MOST_BYTES = 32 << 20  # of values that are kept, of meshes, and of meshes before a change
+MOST_BYTES = 32 << 20  # for kept values, for meshes, and for meshes before a change
 
 _INSIDE = np.stack(np.meshgrid(*[np.arange(SIDE)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 MOST_BLOCKS = 1 << 14  # 32 MB
@@ -34,7 +33,7 @@ MOST_BLOCKS = 1 << 14  # 32 MB
 class SurfaceTiles:
     """Values and meshes of one surface; `view` reads its values.
 
-    `reach`: distance, blocks, within which sums influence a block's values.
+    `reach` is the distance, in blocks, within which sums influence a block's values.
     """
 
     def __init__(self, store: BlockStore, view: SurfaceView, min_weight: float, reach: int) -> None:
@@ -44,12 +43,14 @@ class SurfaceTiles:
         self._buffers = mesh_extraction.MeshBuffers()
         self._listed, self._numbers = 0, np.empty(0, np.int64)
         self._drops = store.drops
-        self.settled: int | None = None  # stamp of the state that was whole last
+        self.settled: int | None = None  # stamp of the last complete state
         self._shown: list[int] = []  # cubes of that view
         self._settled_numbers = self._numbers
-        self._changed: set[int] = set()  # cubes with other meshes since
-        self._before: dict[int, _CubeMesh] = {}  # meshes that some of them had
-        self._lacking: list[int] | None = None  # cubes to mesh until it is settled; None: not looked for
+        self._changed: set[int] = set()  # cubes whose meshes have changed since then
+        self._before: dict[int, _CubeMesh] = {}  # former meshes of some of these cubes
+        self._lacking: list[int] | None = (
+            None  # cubes still to mesh before the next complete state; None: unknown
+        )
 
     @property
     def values(self) -> SurfaceView:
@@ -69,8 +70,8 @@ class SurfaceTiles:
         return self._values.nbytes + self._meshes.nbytes + before + self._buffers.nbytes
 
     def forget(self, changed: NDArray[np.int64]) -> None:
-        """Release all that depends on the changed blocks: sorted keys."""
-        if self._drops != self._store.drops:  # blocks have gone
+        """Release everything that depends on the changed blocks, given as sorted keys."""
+        if self._drops != self._store.drops:  # blocks were removed
             self._drops = self._store.drops
             self._values.clear()
             self._meshes.clear()
@@ -85,7 +86,6 @@ class SurfaceTiles:
             self._lacking = None
 
     def _keep_before(self, numbers: NDArray[np.int64]) -> None:
-        """Keep the settled meshes of these cubes."""
         if self.settled is None:
             return
         for number in set(numbers.tolist()) - self._changed:
@@ -93,21 +93,21 @@ class SurfaceTiles:
             if (piece := self._meshes.get(number)) is not None:
                 self._before[number] = piece
         if sum(piece.nbytes for piece in self._before.values()) > MOST_BYTES:
-            self._forget_settled()  # the map has become another one while nobody looked at all of it
+            self._forget_settled()  # too much has changed since the last complete view
 
     def _forget_settled(self) -> None:
         self.settled = None
         self._changed, self._before, self._lacking = set(), {}, None
 
     def settle(self, numbers: Sequence[int]) -> None:
-        """Note that a view of these cubes shows the current map."""
+        """Record that a view of these cubes shows the current map."""
         self.settled, self._shown = self._store.stamp, list(numbers)
         self._settled_numbers = self.numbers()
         self._changed, self._before, self._lacking = set(), {}, None
 
     def settle_some(self, most: int) -> bool:
-        """Mesh again a few cubes of the last view. Returns True if the map is then settled."""
-        if self._lacking is None:  # what does not fit into what is kept is made once
+        """Mesh a few cubes of the last view again. Returns True if the map is then settled."""
+        if self._lacking is None:  # a mesh that does not fit into the kept ones is made once
             self._lacking = [number for number in self._shown if self._meshes.get(number) is None]
         for _ in self.meshes(self._lacking[:most]):
             pass
@@ -117,7 +117,7 @@ class SurfaceTiles:
         return is_done
 
     def settled_meshes(self, numbers: Sequence[int]) -> list[Mesh] | None:
-        """Meshes of some cubes of the settled map; None if one is not kept."""
+        """Return the meshes of some cubes of the settled map, or None if a mesh is no longer kept."""
         if self.settled is None:
             return None
         there = set(self._settled_numbers.tolist()).intersection(numbers)
@@ -128,15 +128,15 @@ class SurfaceTiles:
         return [*(self._before[number].mesh for number in sorted(others)), *self.meshes(same)]
 
     def numbers(self) -> NDArray[np.int64]:
-        """(n,) sorted numbers of the cubes with a block of the map."""
-        if self._listed < self._store.count:  # new blocks come last
+        """Return the (n,) sorted numbers of the cubes that contain a block of the map."""
+        if self._listed < self._store.count:  # new blocks have the last slots
             new = _tiles_of(self._store.keys[self._listed :])
             self._numbers = distinct(np.append(self._numbers, new))
             self._listed = self._store.count
         return self._numbers
 
     def affordable(self, keys: NDArray[np.int64], most: int) -> int:
-        """Number of the first blocks that lie in kept cubes and in at most `most` others."""
+        """Return the number of first blocks that lie in kept cubes and in at most `most` other cubes."""
         if self._view is values_of:
             return len(keys)
         numbers, first = np.unique(_tile_of(keys), return_index=True)
@@ -148,7 +148,7 @@ class SurfaceTiles:
         return new[most] if len(new) > most else len(keys)
 
     def meshes(self, numbers: Sequence[int]) -> Iterator[Mesh]:
-        """Meshes of the cells of some cubes; missing ones are made several at a time."""
+        """Yield the meshes of the cells of some cubes; missing meshes are made several at a time."""
         for i in range(0, len(numbers), AT_ONCE):
             some = numbers[i : i + AT_ONCE]
             pieces = {number: self._meshes.get(number) for number in some}
@@ -157,7 +157,7 @@ class SurfaceTiles:
                 yield (pieces[number] or made[number]).mesh
 
     def _made(self, numbers: list[int]) -> dict[int, "_CubeMesh"]:
-        """Meshes of cubes, each as it would be alone: one launch for all costs as much as a small one."""
+        """Return the meshes of cubes, as if made singly: one launch for all costs as much as for one."""
         if not numbers:
             return {}
         keys, cube_of = self._keys(numbers)
@@ -180,7 +180,7 @@ class SurfaceTiles:
         min_weight: float,
         out: NDArray[np.float32] | None = None,
     ) -> NDArray[np.float32]:
-        """A `SurfaceView`; `store` and `min_weight` are those of this object."""
+        """Read values as a `SurfaceView`; `store` and `min_weight` are those of this object."""
         if out is None:
             out = np.empty((len(keys), CUBE), np.float32)
         order = np.argsort(tiles := _tile_of(keys), kind="stable")
@@ -195,7 +195,7 @@ class SurfaceTiles:
         return out[: len(keys)]
 
     def _keys(self, numbers: Sequence[int]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Keys of the map's blocks in some cubes, sorted in each, and the cube of each."""
+        """Return the keys of the map's blocks in some cubes, sorted in each cube, and each key's cube."""
         corners = SIDE * unpack_keys(np.array(numbers))
         keys = pack_keys((corners[:, None] + _INSIDE).reshape(-1, 3))
         there = np.flatnonzero(self._store.slots_of(keys) >= 0)
@@ -212,7 +212,7 @@ class _Values:
         self.nbytes = keys.nbytes + values.nbytes
 
     def of(self, keys: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Rows of some blocks; NaN for an absent one."""
+        """Return the rows of some blocks; NaN for an absent block."""
         if not len(self.keys):
             return np.full((len(keys), CUBE), np.nan, np.float32)
         at = np.minimum(np.searchsorted(self.keys, keys), len(self.keys) - 1)
@@ -232,7 +232,7 @@ Item = TypeVar("Item", bound=_Sized)
 
 
 class _Kept(Generic[Item]):
-    """Items by number; the least recently used go when they are too many."""
+    """Items by number; the least recently used items are removed above a limit of bytes."""
 
     def __init__(self) -> None:
         self._items: OrderedDict[int, Item] = OrderedDict()
@@ -268,10 +268,10 @@ def _tiles_of(keys: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 class KeptValues:
-    """A `SurfaceView` that solves a block once, until `forget` names it.
+    """A `SurfaceView` that solves each block once, until `forget` releases it.
 
     A neighbour of a changed block keeps its old values if they are right to 0.01 voxel;
-    `ReadableMap.cells_to_mesh` lists the neighbours that are not. `view` reads the surface.
+    `ReadableMap.cells_to_mesh` lists the other neighbours. `view` reads the surface.
     """
 
     def __init__(self, store: BlockStore, view: SurfaceView) -> None:
@@ -281,13 +281,13 @@ class KeptValues:
 
     def clear(self) -> None:
         self._drops = self._store.drops
-        self._rows = np.zeros(0, np.int32)  # of each slot of the map
+        self._rows = np.zeros(0, np.int32)  # row for each slot of the map
         self._free = np.arange(MOST_BLOCKS, dtype=np.int32)[::-1]
         self._values = GrowingArray((CUBE,), np.float32, 0)
 
     def forget(self, keys: NDArray[np.int64]) -> None:
-        """Solve these blocks anew at the next question."""
-        if self._drops != self._store.drops:  # blocks have other slots now
+        """Release the values of these blocks: the next question solves them again."""
+        if self._drops != self._store.drops:  # blocks have moved to other slots
             self.clear()
         slots = self._store.slots_of(keys)
         slots = slots[(slots >= 0) & (slots < len(self._rows))]
@@ -318,7 +318,7 @@ class KeptValues:
         return out
 
     def _keep(self, slots: NDArray[np.int32], solved: NDArray[np.float32]) -> None:
-        """Keep values of blocks; without room, all earlier ones go."""
+        """Keep values of blocks; without room, all earlier values are released."""
         count = len(slots)
         if (slots < 0).any() or count > MOST_BLOCKS:
             return

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Images for textures, and the true place and brightness of each, fitted so that they agree on a surface.
+"""Fit the poses and exposures of texture images until the images agree on a surface.
 
 Poses are never exact, and colour and depth are often taken some milliseconds apart: on a wall two metres away
 half a degree is four pixels. Each image is moved until it agrees with the mean of all others on points of the
-surface (Zhou and Koltun 2014, with one pose an image), from coarse to fine. Then one factor an image and
+surface (Zhou and Koltun 2014, with one pose per image), from coarse to fine. Then one factor per image and
 channel makes the exposures equal, by least squares over all points seen twice.
 """
 
@@ -19,35 +19,35 @@ from tsfusion.geometry import se3
 from tsfusion.geometry.keyframe import Keyframe, depth_metres
 from tsfusion.kernels.answers import texture_baking
 
-# Levels: blur in pixels of the halved image, and rounds.
+# Levels: blur in pixels of the halved image, and number of rounds.
 LEVELS = ((3.0, 12), (1.5, 10), (0.75, 8))
-_SIGMA_TURN, _SIGMA_SHIFT = 0.02, 0.02  # radians and metres that an image is usually off
-_STIFFNESS = 100.0  # points of an image that weigh as much as that
-_MAX_TURN, _MAX_SHIFT = 0.08, 0.12  # radians and metres beyond which an image stays where it was
-_SHARED = 1e-3  # weight of the others where a point counts as seen by them
-_MIN_POINTS = 100  # of an image that is moved
-_OUTLIER = 1.5  # robust standard deviations at which a difference counts half
-_FLOOR = 2.0  # grey levels: differences below are noise
-_DARK, _BRIGHT = 8, 245  # grey levels between which brightness is measured
-_LOG_NOISE = 0.1  # of brightness, beyond which a point counts less
+_SIGMA_TURN, _SIGMA_SHIFT = 0.02, 0.02  # usual error of a pose, radians and metres
+_STIFFNESS = 100.0  # points of an image that weigh as much as the pose's prior
+_MAX_TURN, _MAX_SHIFT = 0.08, 0.12  # radians and metres; an image that moves farther keeps its old pose
+_SHARED = 1e-3  # smallest weight of other images for a shared point
+_MIN_POINTS = 100  # smallest number of points for moving an image
+_OUTLIER = 1.5  # robust standard deviations at which a difference gets half its weight
+_FLOOR = 2.0  # grey levels: smaller differences are noise
+_DARK, _BRIGHT = 8, 245  # grey levels; only values between them measure brightness
+_LOG_NOISE = 0.1  # brightness noise above which a point gets less weight
 _EXPOSURE_ROUNDS = 30
-_UNIT = 1e5  # pixels on a square metre that weigh 1
-_SMALLEST = 8  # pixels of an image's side
-_EDGE = 4.0  # pixels from an edge of the depth at which colour is trusted wholly: registration ends there
-_JUMP = 0.05  # of the depth: an edge
-_CLIPPED = 250  # grey levels from which a channel may have been any brightness
+_UNIT = 1e5  # pixels per square metre for a weight of 1
+_SMALLEST = 8  # smallest side of an image, pixels
+_EDGE = 4.0  # distance in pixels from a depth edge for full trust in colour: registration is wrong nearer
+_JUMP = 0.05  # share of the depth that counts as an edge
+_CLIPPED = 250  # grey levels from which a channel may be clipped
 _CLIPPED_TRUST = 0.05
 
 
 class ImageFit(NamedTuple):
-    """Use of an image. `gain`: (3,) float32 factors on its RGB."""
+    """Fitted pose of an image. `gain`: (3,) float32 factors on its RGB."""
 
     T_camera_world: NDArray[np.float64]
     gain: NDArray[np.float32]
 
 
 class Visibility(NamedTuple):
-    """Limits for a seen point: depth error in metres and as a share of the depth, cosine of the slant."""
+    """Limits for a visible point: depth error in metres and as a share of the depth, cosine of the slant."""
 
     tolerance: float
     relative: float = 0.01
@@ -55,7 +55,7 @@ class Visibility(NamedTuple):
 
 
 class Sighting(NamedTuple):
-    """View of the points by an image. `gray` is halved, `color` quartered."""
+    """View of the points by an image. `gray` has half the image's size, `color` a quarter."""
 
     number: int
     start: NDArray[np.float64]  # T_camera_world of its keyframe
@@ -79,21 +79,21 @@ class Look(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """Views of all images, by index of the keyframe; pixels a square metre in the best view of each point."""
+    """Fits of images, by index of the keyframe; pixels per square metre in the best view of each point."""
 
     images: dict[int, ImageFit]
     best: NDArray[np.float32]
 
 
 class TextureImage(NamedTuple):
-    """An image and what is known of its pixels; arrays of H × W.
+    """An image and the quality of its pixels; arrays of H × W.
 
     Attributes:
-        number: of its keyframe.
+        number: index of its keyframe.
         color: (H, W, 3) uint8 RGB.
         depth: float32 metres, 0 = none.
-        clearness: float32 from 0 (no depth, or at its edge) to 1.
-        trust: float32 from 0 to 1; low where the camera's range ended.
+        clearness: float32 from 0 (no depth, or at a depth edge) to 1.
+        trust: float32 from 0 to 1; low where a channel is clipped.
         T_camera_world: (4, 4) float64.
         camera: float32 fx, fy, cx, cy.
     """
@@ -108,7 +108,7 @@ class TextureImage(NamedTuple):
 
 
 class PosedImages(Protocol):
-    """Keyframes that can be read several times, in the same order; None stands for an unusable one."""
+    """Keyframes that can be read several times, in the same order; None is an unusable keyframe."""
 
     def __len__(self) -> int: ...
 
@@ -128,9 +128,9 @@ def fit(
     """Fit the images of keyframes to each other on points of the surface, (n, 3) float32 with unit normals.
 
     Args:
-        align: move them; otherwise they stay at their keyframes' poses.
+        align: move the images; otherwise they keep their keyframes' poses.
         even: make their exposures equal.
-        watch: called with the steps done and in all.
+        watch: called with the finished steps and all steps.
     """
     rounds = sum(rounds for _, rounds in LEVELS) if align else 0
     best = np.zeros(len(points), np.float32)
@@ -163,7 +163,7 @@ def sighting(
     visibility: Visibility,
     best: NDArray[np.float32],
 ) -> Sighting:
-    """View of an image; `best` is raised for points that it sees better than others."""
+    """Return the view of an image. Raises `best` for points that this image sees better than others."""
     found = np.empty((len(points), 3), np.float32)
     T = image.T_camera_world
     texture_baking.look(points, normals, T, T, image.camera, image.depth, image.clearness, *visibility, found)
@@ -187,7 +187,7 @@ def _aligned(
     blurred: list[NDArray[np.float32]],
     poses: list[NDArray[np.float64]],
 ) -> list[NDArray[np.float64]]:
-    """Poses after a step of each image towards the mean of the others."""
+    """Return the poses after one step of each image towards the mean of the others."""
     total, weight = np.zeros(len(points)), np.zeros(len(points))
     looks = []
     for one, image, T in zip(sightings, blurred, poses, strict=True):
@@ -208,7 +208,7 @@ def _aligned(
 def look(
     points: NDArray[np.float32], one: Sighting, image: NDArray[np.float32], T: NDArray[np.float64]
 ) -> Look:
-    """Grey values of a blurred image, of half the size, at points (n, 3) from T_camera_world."""
+    """Return grey values of a blurred image, of half the size, at points (n, 3) from T_camera_world."""
     p = _camera_points(points, one, T)
     u, v = (x / 2 for x in pixels(one, p))  # `pyrDown` keeps the centres of even pixels
     slopes = [sampled(image, u + a, v + b) - sampled(image, u - a, v - b) for a, b in ((1, 0), (0, 1))]
@@ -222,7 +222,7 @@ def stepped(
     target: NDArray[np.float64],
     weight: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """T_camera_world after a Gauss-Newton step that brings the image's levels onto the target."""
+    """Return T_camera_world after a Gauss-Newton step that moves the image's levels towards the target."""
     value, (x, y, z) = seen.level, seen.points.T
     own, other = (np.average(level, weights=weight) for level in (value, target))
     spread = np.sqrt(np.average((target - other) ** 2, weights=weight))
@@ -242,7 +242,7 @@ def stepped(
 def _in_place(
     poses: list[NDArray[np.float64]], start: list[NDArray[np.float64]]
 ) -> list[NDArray[np.float64]]:
-    """Poses without their common motion: a motion of all at once changes nothing that images show."""
+    """Return the poses without their common motion, because a motion of all images at once is not visible."""
     starts, moved = np.stack(start), np.stack(poses)
     about = se3.transform(np.eye(3), se3.inverse(starts)[:, :3, 3].mean(axis=0))
     moves = se3.log(se3.inverse(about) @ se3.inverse(moved) @ starts @ about)
@@ -251,7 +251,7 @@ def _in_place(
 
 
 def _plausible(T: NDArray[np.float64], T0: NDArray[np.float64]) -> NDArray[np.float64]:
-    """New pose, or the old one if the new one is implausibly far from it."""
+    """Return the new pose, or the old pose if the new pose is implausibly far away."""
     twist = se3.log(T @ se3.inverse(T0))
     far = np.linalg.norm(twist[:3]) > _MAX_SHIFT or np.linalg.norm(twist[3:]) > _MAX_TURN
     return T0 if far or not np.isfinite(twist).all() else T
@@ -260,9 +260,9 @@ def _plausible(T: NDArray[np.float64], T0: NDArray[np.float64]) -> NDArray[np.fl
 def _gains(
     points: NDArray[np.float32], sightings: list[Sighting], poses: list[NDArray[np.float64]]
 ) -> NDArray[np.float32]:
-    """(n, 3) float32: factors on RGB that make the images equally bright on the same points.
+    """Return factors on RGB, (n, 3) float32, that make the images equally bright on the same points.
 
-    Logarithms of brightness are the sum of the image's and the point's; both are found in turn, robustly.
+    The logarithm of a brightness is the sum of an image's and a point's term, solved in turn, robustly.
     """
     count, image, point, level = len(sightings), [], [], []
     for number, (one, T) in enumerate(zip(sightings, poses, strict=True)):
@@ -301,7 +301,7 @@ def pixels(one: Sighting, p: NDArray[np.float64]) -> tuple[NDArray[np.float64], 
 def sampled(
     image: NDArray[np.generic], u: NDArray[np.float64], v: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """(k,) float64 values interpolated in an image; beyond its border, those of the border."""
+    """Return the (k,) float64 values interpolated in an image; border values outside the image."""
     height, width = image.shape
     u, v = np.clip(u, 0, width - 1.001), np.clip(v, 0, height - 1.001)
     i, j = u.astype(np.intp), v.astype(np.intp)
@@ -313,7 +313,7 @@ def sampled(
 
 
 def images(keyframes: PosedImages, chosen: Sequence[int] | None = None) -> Iterator[TextureImage]:
-    """Keyframes with depth and colour images, one at a time; `chosen`: their indices, None = all."""
+    """Yield keyframes with depth and colour images, one at a time; `chosen`: their indices, None = all."""
     for index in range(len(keyframes)) if chosen is None else chosen:
         found = image_of(keyframes[index], index)
         if found is not None:
@@ -321,7 +321,7 @@ def images(keyframes: PosedImages, chosen: Sequence[int] | None = None) -> Itera
 
 
 def image_of(keyframe: Keyframe | None, index: int) -> TextureImage | None:
-    """Image of a keyframe; None without one, as for a LiDAR, or for one of a few pixels."""
+    """Return the image of a keyframe, or None without one (LiDAR), or for an image of a few pixels."""
     if keyframe is None or keyframe.color is None or keyframe.intrinsics is None:
         return None
     if min(keyframe.shape) < _SMALLEST:
@@ -342,7 +342,7 @@ def image_of(keyframe: Keyframe | None, index: int) -> TextureImage | None:
 
 
 def clearness_of(depth: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(H, W) float32: 0 without depth or at its edge, 1 some pixels away from it."""
+    """Return (H, W) float32: 0 without depth or at a depth edge, 1 some pixels away from the edge."""
     square = np.ones((3, 3))
     least = cv2.erode(np.where(depth > 0, depth, np.float32(1e9)), square)
     most = cv2.dilate(depth, square)

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""Texture for a mesh from the images that its map was made of: colour as sharp as the cameras saw it.
+"""Texture a mesh with the images that its map was made from: colours as sharp as the cameras saw them.
 
-1. Points are spread over the mesh, and the images are fitted to each other on them (`texture_fitting`).
-2. The mesh is cut into flat charts, which are laid out on pages (`texture_charts`).
+1. Points are spread over the mesh, and the images are fitted to each other on these points
+(`texture_fitting`).
+2. The mesh is cut into flat charts, which are laid out on texture pages (`texture_charts`).
 3. Every texel is looked up in every image that sees it. Its coarse colour is the mean, by quality; its fine
-   detail comes from the best views (two bands of Burt and Adelson's blending 1983). Weights change smoothly
-   over the surface, so there are no seams between views.
+detail comes from the best views (two bands of Burt and Adelson's blending 1983). Weights change smoothly
+over the surface, so there are no seams between views.
 
-Images are read once to fit them and once for each batch of texels; one is in memory at a time.
+Images are read once for the fit and once for each batch of texels; memory holds one image.
 """
 
 from collections.abc import Callable, Iterator
@@ -26,14 +27,14 @@ from tsfusion.kernels.answers import texture_baking
 from tsfusion.tsdf.texture import texture_fitting
 from tsfusion.tsdf.texture.texture_fitting import ImageFit, PosedImages, TextureImage, Visibility, images
 
-_DENSITY = 2500.0  # points on a square metre on which images are fitted, at most; else one a voxel's face
-_FEWEST, _MOST = 20_000, 2_000_000  # such points
-_OFF = 2.0  # voxels that a measured depth may be off the surface which it shows
-_BATCH = 4_000_000  # texels looked up at a time: some 300 MB
-_LAYOUTS = 4  # rounds in which faces that lie below others find a place of their own
-_COARSE = 3.0  # pixels of blur that part coarse colour from fine
-_UNIT = 1e5  # pixels on a square metre that weigh 1
-_FINEST = 0.0005  # metres of a texel
+_DENSITY = 2500.0  # largest number of points per square metre for the fit; else one per voxel face
+_FEWEST, _MOST = 20_000, 2_000_000  # limits of the number of points
+_OFF = 2.0  # voxels that a measured depth may deviate from its surface
+_BATCH = 4_000_000  # texels looked up per step: about 300 MB
+_LAYOUTS = 4  # rounds in which covered faces are moved to free texels
+_COARSE = 3.0  # blur in pixels that separates coarse from fine colour
+_UNIT = 1e5  # pixels per square metre for a weight of 1
+_FINEST = 0.0005  # smallest texel, metres
 _GREY = 128
 
 StageProgress = Callable[[str, int, int], None]
@@ -43,11 +44,11 @@ class TextureSettings(Struct, frozen=True):
     """Settings of a texture.
 
     Attributes:
-        size: greatest side of a page, texels; a texture that needs more has several pages.
-        texel: metres; None = a pixel of the view that sees a place best, as the median over all places.
+        size: largest side of a texture page, texels; a texture that needs more has several pages.
+        texel: metres; None = the median size of a pixel in the best view of each surface point.
         align: fit the poses of the colours to each other.
         even: make the exposures equal.
-        sharpness: power of a view's quality by which the best views prevail in fine detail.
+        sharpness: power of a view's quality; a higher power favours the best views in fine detail.
     """
 
     size: int = 4096
@@ -65,18 +66,18 @@ def textured(
     *,
     watch: StageProgress = lambda _stage, _done, _all: None,
 ) -> TexturedMesh:
-    """Give a mesh a texture from keyframes at their poses; places without an image keep their own colours.
+    """Give a mesh a texture from keyframes at their poses; surface without an image keeps its own colours.
 
     The same mesh and keyframes give the same bytes.
 
     Args:
-        keyframes: of the map; read several times. Keyframes without depth and colour images are left out.
-        voxel_size: metres, of the map.
-        watch: called with the stage, the steps done, and all steps.
+        keyframes: the map's keyframes; read several times. Keyframes without depth and colour are skipped.
+        voxel_size: voxel size of the map, metres.
+        watch: called with the stage, the finished steps, and all steps.
 
     Raises:
         InvalidConfig: for settings out of range.
-        MapError: for an empty mesh, or when no keyframe has a colour image that shows it.
+        MapError: for an empty mesh, or when no keyframe has a colour image that shows the mesh.
         MissingDependency: without xatlas.
     """
     settings = _checked(settings or TextureSettings())
@@ -128,16 +129,16 @@ def _arrays(mesh: Mesh) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray
 def spread(
     vertices: NDArray[np.float32], faces: NDArray[np.int32], normals: NDArray[np.float32], density: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Points on a surface and its normals there, both (n, 3) float32, `density` a square metre, evenly.
+    """Return evenly spread points on a surface, `density` per square metre, and their normals.
 
-    The same surface has the same points.
+    Both are (n, 3) float32. The same surface gets the same points.
     """
     a, b, c = (vertices[faces[:, k]].astype(np.float64) for k in range(3))
     upto = np.cumsum(np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2)
     count = int(np.clip(density * upto[-1], _FEWEST, _MOST))
     step = np.arange(count) + 0.5
     face = np.searchsorted(upto, upto[-1] * step / count).clip(max=len(faces) - 1)
-    # Barycentric weights by a sequence that fills a square evenly (Roberts' R2).
+    # Barycentric weights from a sequence that fills a unit square evenly (Roberts' R2).
     s, t = (step * 0.7548776662466927) % 1, (step * 0.5698402909980532) % 1
     over = s + t > 1
     s, t = np.where(over, 1 - s, s), np.where(over, 1 - t, t)
@@ -148,12 +149,12 @@ def spread(
 
 
 def _texel(best: NDArray[np.float32]) -> float:
-    """Size of a pixel, metres, in the best view of a place, as the median over all places."""
+    """Return the size of a pixel, metres, in the best view of a point, as the median over all points."""
     return max(float(1 / np.sqrt(np.median(best[best > 0]))), _FINEST)
 
 
 def _laid_out(mesh: Mesh, texel: float, size: int) -> tuple[ChartPlacement, list[NDArray[np.int64]]]:
-    """Places of the faces, and the face of each texel; no face covers another."""
+    """Return the texture positions of the faces, and the face of each texel; no face covers another."""
     vertices, faces, normals = _arrays(mesh)
     charts = texture_charts.find(vertices, faces, normals)
     for attempt in range(_LAYOUTS):
@@ -188,14 +189,13 @@ class _Baker:
         self._watch, self._done, self._all = watch, 0, 0
 
     def begin(self, calls: int) -> None:
-        """Announce the number of calls of `colors`."""
         self._all = calls * len(self._fits)
 
     def colors(
         self, points: NDArray[np.float32], normals: NDArray[np.float32]
     ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-        """(n, 3) uint8 RGB of points of the surface, and a mask of those that an image shows; others are
-        grey."""
+        """Return (n, 3) uint8 RGB of points of the surface, and a mask of the points that an image shows.
+        Other points are grey."""
         sums = np.zeros((len(points), 8), np.float32)
         found = np.empty((len(points), 3), np.float32)
         for image in images(self._keyframes, sorted(self._fits)):
@@ -214,7 +214,7 @@ class _Baker:
 
 
 def _bands(image: TextureImage, fit: ImageFit) -> NDArray[np.float32]:
-    """(H, W, 7) float32: the coarse and the fine part of the evened colours, and their trust."""
+    """Return (H, W, 7) float32: coarse and fine part of the exposure-corrected colours, and their trust."""
     color = image.color * fit.gain
     coarse = cv2.GaussianBlur(color, (0, 0), _COARSE)
     return np.concatenate([coarse, color - coarse, image.trust[..., None]], axis=2)
@@ -223,7 +223,7 @@ def _bands(image: TextureImage, fit: ImageFit) -> NDArray[np.float32]:
 def _pages(
     mesh: Mesh, layout: ChartPlacement, owners: list[NDArray[np.int64]], baker: _Baker
 ) -> tuple[list[NDArray[np.uint8]], float]:
-    """Painted pages, and the share of their surface that an image shows."""
+    """Return the painted pages, and the share of their surface that an image shows."""
     pages, shown, all_inside = [np.full((*shape, 3), _GREY, np.uint8) for shape in layout.sizes], 0, 0
     batches = list(_batches(owners))
     baker.begin(len(batches) + 1)
@@ -246,7 +246,7 @@ def _pages(
 
 
 def _batches(owners: list[NDArray[np.int64]]) -> Iterator[tuple[int, NDArray[np.int32]]]:
-    """Page, and row and column of some of its texels, (n, 2) int32."""
+    """Yield a page's index, with row and column of some of its texels, (n, 2) int32."""
     for page, owner in enumerate(owners):
         texels = np.argwhere(owner != texture_baking.NOBODY).astype(np.int32)
         for start in range(0, len(texels), _BATCH):
