@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The other server process, the only one with Taichi: journal positions in, map and mesh out.
+"""Fuse a map in a process of its own: journal positions come in, map and mesh go out.
 
-This file imports nothing: the gateway imports `tsfusion.fuser.fuser_messages`, and must stay without Taichi.
+This file imports nothing: the gateway imports `tsfusion.fuser.fuser_messages`, and must not load Taichi.
 """

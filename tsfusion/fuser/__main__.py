@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The fuser process, `python -m tsfusion.fuser`: a loop over the gateway's messages and the mesh."""
+"""Run the fuser process, `python -m tsfusion.fuser`: a loop over chores and the gateway's messages."""
 
 import logging
 import select
@@ -22,11 +22,11 @@ from tsfusion.fuser.question_answers import Inbox
 from tsfusion.wire.sockets import sockets
 
 _LOCK_WAIT_S = 60.0  # for another fuser to end: it may be reading a large map
-_held = ExitStack()  # the folder of the map
+_held = ExitStack()  # the lock of the map's folder
 
 
 def run(endpoint: str) -> int:
-    """Serve the gateway at `endpoint` until that orders the end, or ends itself; the exit status."""
+    """Serve the gateway at `endpoint` until it orders the end or ends itself; return the exit status."""
     context: zmq.Context[Any] = zmq.Context()
     link = sockets.pair(context)
     try:
@@ -41,7 +41,7 @@ def run(endpoint: str) -> int:
 
 
 def _remove_scratch_folder(endpoint: str) -> None:
-    """Clear up behind a gateway that was killed before it saw `Started`; otherwise it did that itself."""
+    """Remove the socket's folder if the gateway was killed before `Started`; else the gateway did it."""
     socket_file = Path(endpoint.removeprefix("ipc://"))
     with suppress(OSError):
         socket_file.unlink(missing_ok=True)
@@ -74,7 +74,7 @@ def _serve(link: sockets.AnySocket) -> int:
             continue
         message = inbox.orders.popleft()
         if isinstance(message, fuser_messages.Warm | fuser_messages.ReadAhead):
-            fuser = None  # of an empty map that does without this process
+            fuser = None  # its map was empty and does not need this process
             if not ahead.do(message):
                 return 1
         elif isinstance(message, fuser_messages.Begin):
@@ -89,14 +89,14 @@ def _serve(link: sockets.AnySocket) -> int:
 
 
 class _Ahead:
-    """Preparations before there is a map to work at."""
+    """Preparations before this process has a map."""
 
     def __init__(self, link: sockets.AnySocket) -> None:
         self._link = link
         self.opened: OpenedMap | None = None
 
     def do(self, message: fuser_messages.Warm | fuser_messages.ReadAhead) -> bool:
-        """Do it and say so; False where a map cannot be opened, and that is said."""
+        """Do the preparation and report it; return False, after a report, if the map cannot be opened."""
         try:
             if isinstance(message, fuser_messages.Warm):
                 map_checkpoints.warm(message.volume)
@@ -118,7 +118,7 @@ def _open_map(
     inbox: Inbox | None = None,
     opened: OpenedMap | None = None,
 ) -> Fuser | None:
-    """Open the map and report that, or why it cannot be opened; None = it cannot."""
+    """Open the map and report the result; return None if the map cannot be opened."""
     try:
         if opened is None:
             _lock(message)
@@ -131,12 +131,12 @@ def _open_map(
 
 
 def _lock(begin: fuser_messages.Begin) -> None:
-    """Hold the map's folder until this process ends, or has another map."""
+    """Lock the map's folder until this process ends or gets another map."""
     process.end_first()
     _held.close()
     _held.push(lock_folder(
         Path(begin.folder), "map", "fuser", name=LOCK, wait=_LOCK_WAIT_S, error_type=MapError,
-        make=False,  # one that is away must not be made in its place
+        make=False,  # a folder that is missing for now must not be replaced by a new one
     ))  # fmt: skip
 
 
@@ -156,7 +156,7 @@ def main() -> int:
     logs.configure(cast("LogFormat", format_), cast("LogLevel", level), "fuser", map=map_name or None)
     logging.getLogger("tsfusion.tsdf.volume").disabled = True  # the gateway warns, and names the client
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)  # a terminal or supervisor signals all; the gateway decides
+        signal.signal(number, signal.SIG_IGN)  # a terminal signals all processes; the gateway decides
     signal.signal(signal.SIGTTOU, signal.SIG_IGN)  # a line of the log does not stop it (`stty tostop`)
     process.keep_freed_memory()
     return run(endpoint)

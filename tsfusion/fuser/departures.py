@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Keyframes that are to leave a map: those that somebody names, and those beyond its window.
+"""Find the keyframes that must leave a map: those that a command selects, and those outside its window.
 
-Both are looked for a part at a time, so that keyframes are fused between.
+Both searches run a slice at a time, so that keyframes are fused in between.
 """
 
 import time
@@ -28,11 +28,11 @@ from tsfusion.wire.records import codec
 
 _SLICE_S = 0.05  # seconds at a time
 _REST_S = 0.15  # between two slices while keyframes come
-_INSIDE = 0.9  # share of a keyframe's points: noise, or a look out of a window, is not to keep it
+_INSIDE = 0.9  # share of a keyframe's points in the box: noise or a view out of a window is tolerated
 
 
 class KeyframeSearch:
-    """A search for keyframes in the journal. Call `go_on` when `wait` is over, until it gives them."""
+    """A search for keyframes in the journal. Call `go_on` after `wait` seconds until it returns an answer."""
 
     def __init__(
         self, find: Find, folder: Path, poses: KeyframePoses, done: dict[bytes, SessionProgress]
@@ -46,11 +46,11 @@ class KeyframeSearch:
         self._first_ns: int | None = None  # of the first record in the journal
 
     def wait(self, idle: bool) -> float:
-        """Seconds until it is time to go on."""
+        """Return the seconds until the next `go_on`."""
         return 0.0 if idle else max(self._next - time.monotonic(), 0.0)
 
     def go_on(self) -> Found | None:
-        """Search for a while; the answer when all was looked at."""
+        """Search for a while; return the answer once the whole journal is searched, before that None."""
         until = time.monotonic() + _SLICE_S
         try:
             for _ in self._steps:
@@ -87,7 +87,7 @@ class KeyframeSearch:
         ) and (selection.box is None or self._lies_in(np.array(selection.box).reshape(2, 3), record))
 
     def _lies_in(self, corners: NDArray[np.float64], record: Record) -> bool:
-        """True if the sensor was in the box, and so is nearly all that it measured."""
+        """Return True if the sensor is in the box, and so are nearly all its measured points."""
         low, high = corners.min(axis=0), corners.max(axis=0)
         try:
             keyframe = codec.decode_keyframe(record.frames)
@@ -117,9 +117,9 @@ class KeyframeSearch:
         return Found(self._find.number, sessions, tuple(self._unavailable()))
 
     def _unavailable(self) -> Iterator[str]:
-        """The sessions that may have selected keyframes in the map which the journal has no more."""
+        """Yield sessions whose selected keyframes may be in the map but no longer in the journal."""
         if self._first_ns is not None and self._since_ns is not None and self._since_ns >= self._first_ns:
-            return  # those came before
+            return  # those keyframes came before `since`
         for key, seq in self._poses.unknown():
             if key == SERVER_SESSION:
                 continue
@@ -154,15 +154,15 @@ _PATIENCE_S = 5.0  # for that record to come back
 
 
 class KeepWindow:
-    """The bounds of a map in time, number and space, all of them against its newest keyframe.
+    """The bounds of a map in time, number and space, relative to its newest keyframe.
 
-    Call `look` when `wait` is over: what is beyond a bound is told to the gateway, which writes a record that
-    removes it, as for `tsfusion map forget`. The cost of a look is bounded by what the window holds.
+    Call `look` when `wait` is over: it sends the gateway the keyframes beyond a bound. The gateway writes a
+    record that removes them, as for `tsfusion map forget`. The window's size bounds the cost.
 
     Args:
-        seconds: between a keyframe's coming to the server and the newest one's; None = no bound.
-        keyframes: how many, of all sessions together; None = no bound.
-        radius: metres from sensor to sensor; None = no bound.
+        seconds: largest age of a keyframe, by arrival at the server, relative to the newest; None = no bound.
+        keyframes: largest number of keyframes, of all sessions together; None = no bound.
+        radius: largest distance between sensor positions, metres; None = no bound.
     """
 
     def __init__(
@@ -180,7 +180,7 @@ class KeepWindow:
         self._before_segment = 0
         self._is_behind = self.is_set
         self._next = 0.0  # time.monotonic()
-        self._asked: float | None = None  # time.monotonic(), until the record comes
+        self._asked: float | None = None  # time.monotonic() of the request; None once its record has come
 
     @property
     def is_set(self) -> bool:
@@ -189,31 +189,31 @@ class KeepWindow:
 
     @property
     def is_behind(self) -> bool:
-        """True if keyframes came since the last look."""
+        """True if keyframes arrived since the last `look`."""
         return self._is_behind
 
     def note_keyframe(self) -> None:
-        """Note that one more keyframe is in the map, or is elsewhere."""
+        """Record that a keyframe entered the map or moved."""
         self._is_behind = self.is_set
 
     def note_record(self) -> None:
-        """Note that a record came that removes keyframes."""
+        """Record the arrival of a record that removes keyframes."""
         self._asked = None
 
     def expire(self, before_segment: int) -> None:
-        """Let keyframes go whose segments are to be deleted, for the journal is at its limit."""
+        """Remove keyframes of segments below this number: the journal, at its limit, will delete them."""
         self._before_segment = max(before_segment, self._before_segment)
         self._is_behind = self.is_set
 
     def wait(self, idle: bool) -> float | None:
-        """Seconds until it is time for a `look`; None = nothing has come since the last one."""
+        """Return the seconds until the next `look`; None if no keyframe has arrived since the last one."""
         if not self._is_behind:
             return None
         from_s = [0.0 if idle else self._next, 0.0 if self._asked is None else self._asked + _PATIENCE_S]
         return max(max(from_s) - time.monotonic(), 0.0)
 
     def look(self) -> None:
-        """Tell which keyframes are beyond a bound."""
+        """Send the gateway the keyframes that are beyond a bound."""
         self._is_behind = False
         self._next = time.monotonic() + _INTERVAL_S
         kept = self._poses.kept()
@@ -230,8 +230,8 @@ class KeepWindow:
         self._send(Found(EXPIRED, tuple(found)))
 
     def _beyond(self, kept: KeptKeyframes) -> NDArray[np.bool_]:
-        """(n,) whether each is beyond a bound."""
-        order = np.lexsort((kept.offsets, kept.segments))  # as they came
+        """Return an (n,) mask of the keyframes beyond a bound."""
+        order = np.lexsort((kept.offsets, kept.segments))  # in journal order
         beyond = kept.segments < self._before_segment
         if self._keyframes is not None:
             beyond[order[: -self._keyframes]] = True
@@ -242,7 +242,7 @@ class KeepWindow:
         return beyond
 
     def _count_older(self, kept: KeptKeyframes, order: NDArray[np.int64], seconds: float) -> int:
-        """Number of keyframes older than so long before the last: by halving, so that few are looked at."""
+        """Return how many keyframes are `seconds` older than the newest, by binary search."""
         newest = self._logged_ns(kept, int(order[-1]))
         if newest is None:
             return 0
@@ -257,7 +257,7 @@ class KeepWindow:
         return low
 
     def _logged_ns(self, kept: KeptKeyframes, at: int) -> int | None:
-        """Wall clock at which a keyframe was journaled; None = its record cannot be read."""
+        """Return the wall clock time at which a keyframe was journaled; None if its record cannot be read."""
         try:
             return journal.logged_ns(self._folder, Position(int(kept.segments[at]), int(kept.offsets[at])))
         except JournalError:
@@ -265,7 +265,7 @@ class KeepWindow:
 
 
 class Departures:
-    """The searches of one map. Call `look` when `wait` is over: the gateway journals what is found."""
+    """The searches of one map. Call `look` when `wait` is over: the gateway journals the keyframes found."""
 
     def __init__(
         self,
@@ -287,18 +287,18 @@ class Departures:
         )
 
     def ask(self, message: Find | Expire) -> None:
-        """Take what the gateway wants to know, or to let go."""
+        """Take a request of the gateway to find or expire keyframes."""
         if isinstance(message, fuser_messages.Find):
             self._searches.append(KeyframeSearch(message, self._folder, self._poses, self._done))
         else:
             self.window.expire(message.before_segment)
 
     def wait(self, idle: bool) -> float | None:
-        """Seconds until it is time to `look`; None = for ever."""
+        """Return the seconds until the next `look`; None = no search is needed."""
         return self._searches[0].wait(idle) if self._searches else self.window.wait(idle)
 
     def look(self) -> bool:
-        """Look for a moment, and send what was found. Returns True if the window was looked at."""
+        """Search for a moment and send the result; return True if the window was checked."""
         if not self._searches:
             self.window.look()
             return True

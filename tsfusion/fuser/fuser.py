@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""The fuser: reads keyframes from the journal at the positions the gateway sends, and adds them to the map.
+"""Fuse the keyframes of a map: read records from the journal at the gateway's positions and add them.
 
-Its process ends when the gateway does, at whatever moment: the last checkpoint and the journal are enough to
-begin again. While it opens the map or waits, it sees its standard input close and clears up; while it works,
-the system ends it (Linux), however long the work would take.
+The process ends with the gateway, at any moment: the last checkpoint and the journal are enough to restart.
+While it opens the map or waits, it sees its standard input close, and cleans up. While it works, the system
+ends it (Linux).
 """
 
 import errno
@@ -49,12 +49,12 @@ if TYPE_CHECKING:
 
 _JOURNAL = state_folder.JOURNAL_FOLDER
 _FOR_KEYFRAMES = 256 << 20  # bytes of working memory that meshes leave free
-_FOR_A_CHECKPOINT = 64 << 20  # bytes beyond both
+_FOR_A_CHECKPOINT = 64 << 20  # bytes beyond the memory limit
 LOCK = "fuser.lock"  # in the map's folder
-_PATIENCE_S = 10.0  # for a record that the system refuses to read, or whose segment is not there
-_RETRY_S = 0.5  # until it is tried again
+_PATIENCE_S = 10.0  # for an unreadable record or a missing segment
+_RETRY_S = 0.5  # between two attempts to read such a record
 _CARVING = 10  # times `quota_cost` where rays also vote for the free space before them
-# Where keyframes leave as they come, each costs as much as another that comes: half of the time for moves
+# In a map with a window, each new keyframe makes an old one leave at the same cost: half the time for moves
 _WINDOW_REST_FACTOR = 1.0
 _MORE_MS = 50  # milliseconds within which the next record comes, if the gateway said that one waits
 
@@ -65,9 +65,9 @@ class Chore(NamedTuple):
     """Work that no message asks for, done a piece at a time.
 
     Attributes:
-        wait: takes whether nothing else is to be done; seconds until a piece is due, 0 = now, None = never.
-        do: does the piece.
-        when_idle: whether it is done only then.
+        wait: gets True if the fuser is idle; returns seconds until a piece is due, 0 = now, None = never.
+        do: does one piece.
+        when_idle: True if the chore is only done while the fuser is idle.
     """
 
     wait: Callable[[bool], float | None]
@@ -79,8 +79,8 @@ class Fuser:
     """One map, and the work for each message of the gateway.
 
     Args:
-        inbox: where questions to the map come in; None = nobody asks any.
-        opened: the map, where it was read before its folder had this name.
+        inbox: receives questions about the map; None = no questions.
+        opened: the map, if it was read before its folder had this name.
     """
 
     def __init__(
@@ -94,17 +94,17 @@ class Fuser:
         self._begin = begin
         self._folder = Path(begin.folder)
         self._since_checkpoint = 0
-        self._orders: deque[fuser_messages.Fuse] = deque()  # not answered; the first cannot be read for now
+        self._orders: deque[fuser_messages.Fuse] = deque()  # unanswered; the first is unreadable for now
         self._stuck_since: float | None = None  # time.monotonic(); None = nothing is stuck
-        self._retry_at = 0.0  # time.monotonic(), of what is stuck
-        self._answered = 0  # records of this process
-        self._more_waits = False  # at the gateway
-        self._epoch = f"{time.monotonic_ns():x}"  # of the answers of this process
-        self._newest = Position(0, 0)  # of the records that were answered
+        self._retry_at = 0.0  # time.monotonic() of the next attempt to read the stuck record
+        self._answered = 0  # records that this process answered
+        self._more_waits = False  # more records wait at the gateway
+        self._epoch = f"{time.monotonic_ns():x}"  # names this process in its answers
+        self._newest = Position(0, 0)  # position of the newest answered record
         self._hashes: tuple[int, str, str] | None = None  # changes, map hash, colour hash
         self._current = CurrentKeyframe(begin.working)
-        self.exit_status: int | None = None  # of the process, which has to end; None = it goes on
-        self._homes: dict[str, os.stat_result] = {"": os.stat(self._folder)}  # as they were at first
+        self.exit_status: int | None = None  # exit status of the process; None = it continues
+        self._homes: dict[str, os.stat_result] = {"": os.stat(self._folder)}  # at the start
         with suppress(OSError):
             self._homes[_JOURNAL] = os.stat(self._folder / _JOURNAL)
         opened = opened or OpenedMap(begin)
@@ -144,11 +144,11 @@ class Fuser:
 
     @cached_property
     def chores(self) -> dict[str, Chore]:
-        """The chores in the order in which they are looked at.
+        """The chores in the order in which they are checked.
 
-        The process answers questions first, then does a piece of the first chore that is due, and goes round
-        again; with none due it does the work for one message. So those that are done while records wait come
-        from time to time, and the others wait until nothing else is to be done.
+        The process answers questions first, then does a piece of the first due chore, and starts again.
+        Without a due chore it handles one message. So chores with `when_idle` False also run while records
+        wait; all others need an idle fuser.
         """
         mesh, views = self._live_mesh, self._answers.views
         return {
@@ -166,7 +166,7 @@ class Fuser:
         }
 
     def do_chore(self, *, idle: bool) -> float | None:
-        """Do a piece of the first chore that is due: 0. Else seconds until one may be; None = never."""
+        """Do a piece of the first due chore and return 0; else return seconds to wait (None = for ever)."""
         waits = []
         for chore in self.chores.values():
             wait = chore.wait(idle) if idle or not chore.when_idle else None
@@ -177,7 +177,7 @@ class Fuser:
         return None if min(waits) == math.inf else min(waits)
 
     def ready(self) -> fuser_messages.Ready:
-        """The message that the map is open, and how far it is."""
+        """Return the message that the map is open, with the progress of its sessions."""
         stats = self._volume.stats()
         return fuser_messages.Ready(
             self._map.done,
@@ -197,7 +197,7 @@ class Fuser:
         self._answers.slices.note_taken(blocks)
 
     def answer(self) -> None:
-        """Answer the questions that wait, before anything else is done."""
+        """Answer the waiting questions before any other work."""
         self._answers.give()
 
     def handle(self, message: fuser_messages.ToFuser) -> None:
@@ -218,22 +218,22 @@ class Fuser:
 
     @property
     def is_stuck(self) -> bool:
-        """True if records wait for one that cannot be read for now."""
+        """True if the first waiting record cannot be read for now."""
         return bool(self._orders)
 
     def go_on(self) -> None:
-        """Take the records that were ordered, in order, up to one that cannot be read now."""
+        """Fuse the ordered records in order, up to one that cannot be read for now."""
         while self._orders and self.exit_status is None and self._fuse(self._orders[0]):
             self._orders.popleft()
             self._stuck_since = None
 
     @property
     def idle_after_ms(self) -> int:
-        """Milliseconds without a message after which nothing is to be done but to mesh."""
+        """Milliseconds without a message after which the fuser counts as idle."""
         return _MORE_MS if self._more_waits else 0
 
     def _warm(self) -> None:
-        """Compile some kernels that no keyframe needs, which takes a second at the first start."""
+        """Compile some kernels that no keyframe needs; this takes a second at the first start."""
         assert self._warming is not None
         if next(self._warming, True):  # the steps yield None
             self._warming = None
@@ -248,12 +248,12 @@ class Fuser:
             self._note_change()
 
     def _search(self) -> None:
-        """Look for keyframes that are to leave the map, for a moment."""
+        """Search for a moment for keyframes that must leave the map."""
         if self._departures.look():
             self._mover.say()
 
     def _fuse(self, order: fuser_messages.Fuse) -> bool:
-        """Take a record into the map, or reject it; False when it cannot be read for now."""
+        """Fuse or reject a record; return False if it cannot be read for now."""
         start = time.monotonic_ns()
         self._more_waits = order.more
         before = self._map.done.get(order.session)
@@ -283,15 +283,15 @@ class Fuser:
         self._map.done[order.session] = fuser_messages.SessionProgress(order.seq, order.client, order.world)
         self._send(fuser_messages.Done(order.index, start, time.monotonic_ns(), reason, message))
         if self._map.poses.forgotten != forgotten:
-            self._mover.say()  # after the answer, which counts as a keyframe in the map
+            self._mover.say()  # after the answer, because `Done` counts the keyframe as fused
         self._note_change()
         return True
 
     def _take(self, order: fuser_messages.Fuse) -> tuple[str | None, str]:
-        """Take a record of the journal into the map; why not, in a word and a message.
+        """Fuse a journal record; return (None, ""), or the reason and message of a rejection.
 
         Raises:
-            TsfusionError: when it cannot be read or fused.
+            TsfusionError: the record cannot be read or fused.
         """
         record = journal.read(self._folder / _JOURNAL, order.position)
         found, poses = codec.decode(record.frames), self._map.poses
@@ -328,10 +328,10 @@ class Fuser:
             self._checkpoint()
 
     def _hold(self, error: JournalError) -> bool:
-        """True if a record that cannot be read is worth waiting for: its folder, file or disk may come back.
+        """Return True if an unreadable record is worth waiting for: its folder, file or disk may come back.
 
-        When the system refuses to read it for long, another process tries again, and the gateway gives the
-        record up after a few of them. One whose segment alone is missing for long is rejected.
+        If the system refuses to read it for long, another process tries again; the gateway gives the record
+        up after a few processes. A record is rejected if only its segment is missing for long.
         """
         now = time.monotonic()
         if not error.temporary:
@@ -345,7 +345,7 @@ class Fuser:
             return False
         if is_over and not is_away:
             log.error("%s: another process tries again, from the checkpoint", error)
-            self.exit_status = 1  # marked as at work on it
+            self.exit_status = 1  # `working` still names this record, so it is blamed
             return True
         self._retry_at = now + _RETRY_S
         self._current.set(fuser_messages.NOT_WORKING)
@@ -357,7 +357,7 @@ class Fuser:
 
     @contextmanager
     def _memory_beyond(self, nbytes: int) -> Iterator[None]:
-        """The memory limit moved by so many bytes for the block."""
+        """Change the memory limit by so many bytes for the block."""
         process.limit_memory(self._memory_limit + nbytes)
         try:
             yield
@@ -365,7 +365,7 @@ class Fuser:
             process.limit_memory(self._memory_limit)
 
     def _integrate(self, keyframe: Keyframe, client: str) -> "IntegrateStats":
-        """Add a client's keyframe to the map, within its quota. Without keys all clients are one."""
+        """Add a keyframe to the map, within its client's quota. Without keys all clients share one."""
         from tsfusion.tsdf.integration.integrator import KeyframeQuota
 
         taken = self._map.blocks
@@ -397,7 +397,7 @@ class Fuser:
 
     @property
     def _is_home(self) -> bool:
-        """True if the folder is the one that was opened: another may be the place of a disk that is away."""
+        """True if the folder is the opened one: another may be the mount point of a missing disk."""
         try:
             return os.path.samestat(os.stat(self._folder), self._homes[""]) or (self._folder / LOCK).exists()
         except OSError:
@@ -416,7 +416,7 @@ class Fuser:
             why = f"not enough memory for that: {error}; raise fuser_memory_bytes"
             self._send(fuser_messages.FuserReply(query.number, error=why))
         except (TsfusionError, ArithmeticError, ValueError) as error:
-            # The process goes on whatever was asked: a crash would be blamed on the next keyframe.
+            # The process continues after any command: a crash would be blamed on the next keyframe.
             self._send(fuser_messages.FuserReply(query.number, error=str(error) or type(error).__name__))
 
     def _status(self) -> fuser_messages.FuserStatus:
@@ -438,7 +438,7 @@ class Fuser:
         )
 
     def _state(self) -> MapVersion:
-        """The state of the map for whoever asked it something."""
+        """Return the state of the map for an answer."""
         return MapVersion(
             keyframes=self._volume.keyframes,
             changes=self._answered + self._mover.moved,
@@ -454,11 +454,11 @@ class Fuser:
 
 @cache
 def _versions() -> dict[str, str]:
-    """Versions of Python and the libraries, read once: the files take longer than all else of a status."""
+    """Return the versions of Python and the libraries; cached, because reading their files is slow."""
     libraries = {name: version_of(name) for name in ("tsfusion", "taichi", "numpy", "pyzmq")}
     return {"python": platform.python_version(), **libraries}
 
 
 def _reason(error: TsfusionError) -> str:
-    """The word under which a rejected keyframe is counted."""
+    """Return the word under which a rejected keyframe is counted."""
     return error.reason if isinstance(error, Refused) else type(error).__name__

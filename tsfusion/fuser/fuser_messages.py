@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The messages between gateway and fuser (msgpack of tagged structs, over a PAIR socket).
+"""Define the messages between gateway and fuser (msgpack of tagged structs, over a PAIR socket).
 
-The gateway hands out journal positions, a few ahead; the fuser answers each with `Done`. Neither holds
-keyframes for the other: the queue is the journal.
+The gateway sends journal positions, a few ahead; the fuser answers each with `Done`. Neither process stores
+keyframes for the other: the journal is the queue.
 """
 
 import mmap
@@ -24,25 +24,25 @@ from tsfusion.wire.messages.mesh_updates import Meshed
 from tsfusion.wire.messages.messages import Command
 from tsfusion.wire.messages.questions import Answer, Question
 
-NOT_WORKING = -1  # instead of a keyframe's index
-MOVING = -2  # likewise: at a keyframe that a correction moves
-EXPIRED = -1  # instead of the number of a `Find`
+NOT_WORKING = -1  # index while no keyframe is being fused
+MOVING = -2  # index while a corrected keyframe is being moved
+EXPIRED = -1  # number of a `Found` that no `Find` asked for
 
 
 class Begin(Struct, frozen=True, tag="begin"):
-    """Open the map in `folder` and compile the kernels, unless `ReadAhead` or `Warm` did, and work at it.
+    """Open the map in `folder`, compile the kernels (unless `ReadAhead` or `Warm` did), and start work.
 
     Attributes:
-        mesh_interval: seconds between two meshes, at least.
+        mesh_interval: least seconds between two meshes.
         checkpoint_every: keyframes; 0 = only on request and at the end.
-        working: a file of 8 bytes: the index of the keyframe that is being fused, little-endian, or
-            `NOT_WORKING` or `MOVING`. Read when the process has died, so that the right keyframe is blamed.
-        keep_previous: whether to keep the checkpoint before the last, too: the journal may be cut.
-        memory_bytes: that the map's blocks may take.
+        working: a file of 8 bytes: the index of the keyframe being fused, little-endian, or `NOT_WORKING` or
+            `MOVING`. The gateway reads it after the process dies, to blame the right keyframe.
+        keep_previous: also keep the checkpoint before the last, because the journal may be cut.
+        memory_bytes: limit for the map's blocks.
         quota_cost, quota_map: as in the server's settings.
-        moves: whether to fuse keyframes where corrections say; False = others died of that.
+        moves: fuse keyframes at corrected poses; False = earlier processes died of moves.
         keep_seconds, keep_keyframes, keep_radius: as in the server's settings.
-        cache: where blocks beyond `memory_bytes` wait; None = nowhere, the map is full then.
+        cache: where blocks beyond `memory_bytes` are stored; None = without a cache the map is then full.
     """
 
     folder: str
@@ -68,8 +68,7 @@ class Warm(Struct, frozen=True, tag="warm"):
 
 
 class ReadAhead(Struct, frozen=True, tag="open"):
-    """Read the map of a `Begin` that comes later, when its folder may have another name; answered with
-    `Prepared`."""
+    """Read the map of a later `Begin`, whose folder may have another name by then; answer `Prepared`."""
 
     begin: Begin
 
@@ -86,9 +85,9 @@ class SessionProgress(Struct, frozen=True, array_like=True):
 
 
 class Fuse(Struct, frozen=True, tag="fuse"):
-    """Fuse the keyframe, or note the correction, at a journal position, unless the map has it already.
+    """Fuse the keyframe, or record the correction, at a journal position, unless the map already has it.
 
-    `skip`: reject it without a try, for this reason. `more`: another one waits at the gateway.
+    `skip`: reject the record untried, for this reason. `more`: another record waits at the gateway.
     """
 
     index: int
@@ -110,9 +109,9 @@ class FuserQuery(Struct, frozen=True, tag="ask"):
 
 
 class FuserQuestion(Struct, frozen=True, tag="question"):
-    """Answer a question to the map, before everything else; its points follow as frames.
+    """Answer a question about the map before all other work; its points follow as frames.
 
-    `asked_ns`, `deadline_ns`: monotonic, of the machine: when it came, and until when it is worth an answer.
+    `asked_ns`, `deadline_ns`: arrival and deadline by the machine's monotonic clock.
     """
 
     number: int
@@ -130,13 +129,13 @@ class Find(Struct, frozen=True, tag="find"):
 
 
 class Expire(Struct, frozen=True, tag="expire"):
-    """Let keyframes of segments below this number go, for the journal is at its limit."""
+    """Remove keyframes of segments below this number, because the journal is at its limit."""
 
     before_segment: int
 
 
 class Publish(Struct, frozen=True, tag="publish"):
-    """Send the triangles with `Meshed` from now on, or do not: whether the map has viewers."""
+    """Switch the triangles in `Meshed` on or off; `wanted`: the map has viewers."""
 
     wanted: bool
 
@@ -144,7 +143,7 @@ class Publish(Struct, frozen=True, tag="publish"):
 class Save(Struct, frozen=True, tag="save"):
     """Write a checkpoint, so that the journal can be cut.
 
-    `alone`: no older checkpoint may stay beside it: keyframes are to be erased that it still holds.
+    `alone`: delete older checkpoints, which still hold keyframes that are to be erased.
     """
 
     alone: bool = False
@@ -159,11 +158,11 @@ class Started(Struct, frozen=True, tag="started"):
 
 
 class Prepared(Struct, frozen=True, tag="prepared"):
-    """End of the preparations that `Warm` or `ReadAhead` asked for."""
+    """The preparations of `Warm` or `ReadAhead` are complete."""
 
 
 class Ready(Struct, frozen=True, tag="ready"):
-    """Kernels are warm. `done`: how far the map is, by session. `rejected`: keyframes, by reason."""
+    """The kernels are compiled. `done`: progress by session. `rejected`: number of keyframes by reason."""
 
     done: dict[bytes, SessionProgress]
     keyframes: int = 0
@@ -177,14 +176,14 @@ class CorrectionProgress(Struct, frozen=True, tag="corrected"):
     """Progress of the map with corrected poses.
 
     Attributes:
-        keyframes: in the map, now.
-        removed: keyframes that corrections took out of it.
+        keyframes: number in the map now.
+        removed: keyframes that corrections took out of the map.
         waiting: keyframes whose newest pose is not fused yet.
-        unavailable: keyframes that stay where they were fused, because the journal has them no more.
-        moved: keyframes that were fused at another pose, or taken out, by this process.
-        seconds: of work for that.
-        forgotten: of the removed, those that the server was told to forget.
-        first_segment: the oldest segment of the journal with a keyframe of the map; 0 = there is none.
+        unavailable: keyframes that stay at their fused poses, because the journal no longer has them.
+        moved: keyframes that this process fused at another pose or took out.
+        seconds: time spent on these moves.
+        forgotten: removed keyframes that the server was told to forget.
+        first_segment: the oldest segment of the journal with a keyframe of the map; 0 = none.
     """
 
     keyframes: int
@@ -200,8 +199,8 @@ class CorrectionProgress(Struct, frozen=True, tag="corrected"):
 class Saved(Struct, frozen=True, tag="saved"):
     """The checkpoint holds every keyframe that was answered with `Done` before this message.
 
-    `written`: whether it is a new one; otherwise the one before held them all already, unless there is a
-    `problem`: why no checkpoint can be written. `alone`: no older checkpoint is beside it, as `Save` wanted.
+    `written`: this checkpoint is new; otherwise the last one was still complete, or `problem` says why none
+    can be written. `alone`: no older checkpoint remains, as `Save` asked.
     """
 
     written: bool
@@ -213,9 +212,9 @@ class FoundKeyframes(Struct, frozen=True):
     """The keyframes of one session that a `Find` selected, in journal order.
 
     Attributes:
-        seqs: int64 numbers; one comes twice when its record stands in the journal twice.
+        seqs: int64 numbers; a number occurs twice if the journal has its record twice.
         segments, offsets: int64 positions of their records.
-        forgotten: bool, each: whether the map was told to forget it before.
+        forgotten: bool for each keyframe: True if the map was already told to forget it.
     """
 
     session: bytes
@@ -227,9 +226,9 @@ class FoundKeyframes(Struct, frozen=True):
 
 
 class Found(Struct, frozen=True, tag="found"):
-    """The answer to `Find`; `unavailable`: sessions with keyframes that the journal has no more.
+    """The answer to `Find`; `unavailable`: sessions with keyframes that the journal no longer has.
 
-    Number `EXPIRED`: nobody asked, keyframes are too old or too far away by the settings of the map.
+    With number `EXPIRED`, no `Find` asked: by the map's settings, the keyframes are too old or too far away.
     """
 
     number: int
@@ -239,7 +238,7 @@ class Found(Struct, frozen=True, tag="found"):
 
 
 class Held(Struct, frozen=True, tag="held"):
-    """The next record cannot be read for now; it is tried again, and said again at each try."""
+    """The next record cannot be read for now; this message is repeated at each attempt."""
 
     message: str
 
@@ -261,16 +260,16 @@ class Failed(Struct, frozen=True, tag="failed"):
 
     @classmethod
     def of(cls, error: TsfusionError) -> "Failed":
-        """The message about an error."""
+        """Return the message about an error."""
         return cls(next(kind for kind, one in _FAILURES.items() if isinstance(error, one)), str(error))
 
     def error(self) -> TsfusionError:
-        """The error, to be raised in the gateway."""
+        """Return the error for the gateway to raise."""
         return _FAILURES[self.kind](self.message)
 
 
 class Done(Struct, frozen=True, tag="done"):
-    """A keyframe is in the map, or a correction is noted; or `reason` says why it never will be."""
+    """A keyframe is fused or a correction recorded, or `reason` says why it never will be."""
 
     index: int
     fuse_start_ns: int
@@ -304,9 +303,9 @@ class FuserReply(Struct, frozen=True, tag="answer"):
 
 
 class FuserAnswer(Struct, frozen=True, tag="answered"):
-    """The answer to a FuserQuestion, with its arrays as frames; or why there is none.
+    """The answer to a FuserQuestion, with its arrays as frames; or an error.
 
-    `late`: its time was over.
+    `late`: the answer took too long.
     """
 
     number: int
@@ -328,7 +327,7 @@ encode = msgspec.msgpack.encode
 
 
 class CurrentKeyframe:
-    """The file that says which keyframe the process is at, also after its death."""
+    """The file that names the keyframe being fused; the gateway can read it after the process dies."""
 
     def __init__(self, path: str) -> None:
         try:
@@ -343,12 +342,12 @@ class CurrentKeyframe:
 
     @contextmanager
     def aside(self) -> Iterator[None]:
-        """Be at no keyframe for the block: what happens in it is not the keyframe's fault."""
+        """Name no keyframe during the block, so that the keyframe is not blamed for errors in it."""
         (index,) = struct.unpack_from("<q", self._word, 0)
         self.set(NOT_WORKING)
         yield
         self.set(index)
 
     def set(self, index: int) -> None:
-        """Write the index of the keyframe; `messages.NOT_WORKING` = none."""
+        """Write the index of the keyframe; `NOT_WORKING` = none."""
         struct.pack_into("<q", self._word, 0, index)

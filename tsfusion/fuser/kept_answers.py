@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Answers that are kept: a planner asks for the same slice again, and a camera looks where it looked before.
+"""Cache answers of a map: planners ask for the same slice again, and cameras for the same view.
 
-A slice is brought up to date as blocks change; a view is of a state hardly older than the newest.
+A cached slice is updated where blocks changed. A cached view shows a state slightly older than the newest.
 """
 
 import time
@@ -26,7 +26,7 @@ _MOST_KEPT = 2  # slices, of some 52 bytes a cell
 
 
 class KeptSlices:
-    """The slices of one map that were asked for last."""
+    """The most recently requested slices of one map."""
 
     def __init__(self, volume: "Volume") -> None:
         self._volume = volume
@@ -34,15 +34,15 @@ class KeptSlices:
         self._changed: dict[Slice, list[NDArray[np.int32]]] = {}
 
     def note_taken(self, blocks: NDArray[np.int32]) -> None:
-        """Note changed blocks (n, 3) that `Volume.take_dirty` will not show again."""
+        """Add changed blocks (n, 3) that `Volume.take_dirty` will not return again."""
         for changed in self._changed.values():
             changed.append(blocks)
 
     def get(self, question: Slice) -> "CurrentSlice":
-        """The slice as the map is now.
+        """Return the slice at the map's present state.
 
         Raises:
-            InvalidConfig: for too many cells.
+            InvalidConfig: the slice has too many cells.
         """
         from tsfusion.tsdf.store.block_store import distinct_blocks
 
@@ -73,9 +73,9 @@ class KeptSlices:
         )
 
 
-_WANTED_S = 2.0  # after a view that may be behind: for so long the next one is prepared
+_WANTED_S = 2.0  # for so long after a view with `max_age`, the next view is prepared
 _CUBES_AT_ONCE = 4
-_REST_FACTOR = 1.0  # of the time without work, half at most
+_REST_FACTOR = 1.0  # pause per time of work: at most half of the idle time
 
 
 class _How(TypedDict):
@@ -89,21 +89,21 @@ class _ViewOptions(TypedDict):
 
 
 class KeptViews:
-    """Views of one map, each of one state of it."""
+    """Views of one map, each of a single state of the map."""
 
     def __init__(self, volume: "Volume", state: Callable[[], MapVersion]) -> None:
         self._volume, self._state = volume, state
-        self._how = _How(min_weight=None, surface=None)  # of what is kept
-        self._kept: tuple[int, MapVersion] | None = None  # stamp and state of what is kept
+        self._how = _How(min_weight=None, surface=None)  # options of the cached surface
+        self._kept: tuple[int, MapVersion] | None = None  # stamp and state of the cached surface
         self._newest_s = self._wanted_s = self._next_s = 0.0  # time.monotonic()
 
     def note_change(self) -> None:
-        """Note that the map is about to change."""
+        """Record that the map is about to change."""
         if self._is_newest:
             self._newest_s = time.monotonic()
 
     def get(self, question: Raycast) -> tuple[View, MapVersion]:
-        """The view, and the state that it is of."""
+        """Return the view, and the state of the map that it shows."""
         how = _How(min_weight=question.min_weight, surface=question.surface)
         camera = question.intrinsics, question.matrix, question.shape
         shown = _ViewOptions(normals=question.normals, colors=question.colors)
@@ -121,17 +121,17 @@ class KeptViews:
         return view, self._kept[1]
 
     def wait(self) -> float | None:
-        """Seconds until there is something to prepare; None = nothing."""
+        """Return the seconds until `prepare` is due; None if there is nothing to prepare."""
         now = time.monotonic()
         if self._kept is None or self._is_newest or now >= self._wanted_s:
             return None
         return max(self._next_s - now, 0.0)
 
     def prepare(self) -> None:
-        """Mesh a little of what the last view showed and has changed since."""
+        """Mesh some of the cells that the last view showed and that have changed since."""
         began = time.monotonic()
         if self._volume.settled_stamp(**self._how) is None:
-            self._kept = None  # until the next view
+            self._kept = None  # no cache until the next view
             return
         try:
             if self._volume.settle(_CUBES_AT_ONCE, **self._how):

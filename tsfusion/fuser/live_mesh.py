@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The mesh that viewers get: the map's changed part raw at once, and refined when nothing else is to do."""
+"""Mesh the changed cells of a map for viewers: raw at once, and refined while the fuser is idle."""
 
 import logging
 import time
@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from tsfusion.tsdf.volume import Volume
 
 _REFINED_AT_ONCE = 512  # blocks: some 20 ms
-_REFINED_BETWEEN = 128  # likewise, while the next keyframe may be near
-_QUIET_S = 1.0  # without a record: the next one is not near
-_REFINE_REST_FACTOR = 40.0  # else no more for so many times as long as it took: few keyframes wait for it
+_REFINED_BETWEEN = 128  # blocks, while the next keyframe may be near
+_QUIET_S = 1.0  # seconds without a record, after which no record is expected soon
+_REFINE_REST_FACTOR = 40.0  # else pause for this many times the work's duration: few keyframes wait
 _REST_FACTOR = 3  # no mesh for three times as long as the last took: a quarter of a busy fuser's time
 
 log = logging.getLogger(__name__)
@@ -33,18 +33,18 @@ class TouchedBy:
 
     def __init__(self) -> None:
         self._sessions: dict[bytes, int] = {}
-        self._firsts = array("q")  # stamps from which on keyframes are of another session than before
-        self._numbers = array("q")  # of that session
+        self._firsts = array("q")  # stamps at which the session changes
+        self._numbers = array("q")  # number of the session from that stamp on
 
     def note(self, stamp: int, session: bytes) -> None:
-        """Note that keyframes from this stamp on are of a session."""
+        """Record the session of keyframes from this stamp on."""
         number = self._sessions.setdefault(session, len(self._sessions))
         if not self._numbers or self._numbers[-1] != number:
             self._firsts.append(stamp)
             self._numbers.append(number)
 
     def of(self, stamps: NDArray[np.int32]) -> tuple[tuple[bytes, ...], NDArray[np.int32]]:
-        """The sessions of (n,) stamps, and for each the row in them; −1 = not known."""
+        """Return the sessions of (n,) stamps, and for each stamp its index in them; −1 = unknown."""
         if not self._firsts:
             return (), np.full(len(stamps), -1, np.int32)
         run = np.searchsorted(np.array(self._firsts), stamps, side="right") - 1
@@ -59,7 +59,7 @@ class LiveMesh:
     """The mesh of a map for its viewers.
 
     Args:
-        sparing: limits the memory while a mesh is made, so that the next keyframe finds some.
+        sparing: context that limits the memory for a mesh, so that memory is left for the next keyframe.
     """
 
     def __init__(
@@ -75,46 +75,46 @@ class LiveMesh:
     ) -> None:
         self._volume, self._interval, self._sparing, self._send = volume, interval, sparing, send
         self._touched_by, self._epoch, self._on_taken = touched_by, epoch, on_taken
-        self.number = 0  # of the newest update
+        self.number = 0  # number of the newest update
         self._sent_until = volume.stamp, volume.drops
         self._watched = False
-        self._answered = self._meshed = 0  # records of this process
+        self._answered = self._meshed = 0  # records that this process answered, and those that the mesh shows
         self._is_behind = False
         self._next = self._next_refined = 0.0  # time.monotonic()
         self._quiet_from = time.monotonic() + _QUIET_S
-        self._unrefined = np.zeros((0, 3), np.int32)  # cells that viewers have with the raw surface
+        self._unrefined = np.zeros((0, 3), np.int32)  # cells of which viewers have the raw surface
         self._refined = volume.kept_values()
 
     def watch(self, wanted: bool) -> None:
-        """Send the triangles, too, or no more."""
+        """Switch the sending of triangles on or off."""
         self._watched = wanted
         if not wanted:
             self._refined.clear()
         if not wanted and self.refine_waits:
             self._unrefined = self._unrefined[:0]
-            self.number += 1  # who comes back knows that something was missed
+            self.number += 1  # the gap in the numbers tells a returning viewer that it missed an update
 
     def note_answer(self) -> None:
-        """Note that one more record was answered."""
+        """Record that one more record was answered."""
         self._answered += 1
         self._is_behind = True
         self._quiet_from = time.monotonic() + _QUIET_S
 
     def note_move(self) -> None:
-        """Note that a keyframe was moved."""
+        """Record that a keyframe was moved."""
         self._is_behind = True
 
     def wait(self, *, idle: bool) -> float | None:
-        """Seconds until it is time for `update`: at once when idle, otherwise after a pause; None = never."""
+        """Return the seconds until `update`: 0 when idle, otherwise the rest of a pause; None = never."""
         if not self._is_behind:
             return None
         return 0.0 if idle else max(self._next - time.monotonic(), 0.0)
 
     def update(self) -> None:
-        """Bring the mesh up to date with the raw surface: it is fast, and the next keyframe may be near.
+        """Update the mesh with the raw surface, which is fast because the next keyframe may be near.
 
-        Nothing is meshed while nobody watches: a mesh on request is made of the map as it is then.
-        Without enough memory, viewers miss a part; a mesh on request is whole, once there is enough.
+        Without viewers, nothing is meshed: a mesh on request uses the map's state at that time. Without
+        enough memory, viewers miss this update, but a later mesh on request is complete.
         """
         try:
             with self._sparing():
@@ -122,7 +122,7 @@ class LiveMesh:
         except MemoryError as error:
             log.error("no memory to mesh the changed part of the map: %s", error)
             self._note_meshed()
-            self._send(self._message(time.monotonic_ns()))  # with a number, which viewers miss
+            self._send(self._message(time.monotonic_ns()))  # viewers notice the missing update
 
     def _note_meshed(self) -> None:
         self._meshed, self._is_behind = self._answered, False
@@ -132,7 +132,7 @@ class LiveMesh:
         started = time.monotonic()
         blocks = self._volume.take_dirty()
         self._on_taken(blocks)
-        if not self._watched:  # whoever comes gets all of the map's mesh first
+        if not self._watched:  # a new viewer first gets the whole mesh
             self._note_meshed()
             self._next = started + self._interval
             self._send(self._message(time.monotonic_ns()))
@@ -153,24 +153,24 @@ class LiveMesh:
 
     @property
     def refine_waits(self) -> bool:
-        """True if viewers have cells that do not yet show the surface that the settings ask for."""
+        """True if viewers have cells that do not yet show the configured surface."""
         return len(self._unrefined) > 0
 
     @property
     def quiet_wait(self) -> float:
-        """Seconds until no record has come for so long that the next one is not near."""
+        """Seconds until no record is expected soon."""
         return max(self._quiet_from - time.monotonic(), 0.0)
 
     def refine_wait(self) -> float | None:
-        """Seconds until it is time for `refine`, during which a keyframe would have to wait; None = never."""
+        """Return the seconds until `refine`, which makes a new keyframe wait; None = never."""
         if not self.refine_waits:
             return None
         return max(min(self._quiet_from, self._next_refined) - time.monotonic(), 0.0)
 
     def refine(self) -> None:
-        """Mesh some cells again, with the surface that the settings ask for.
+        """Mesh some cells again, with the configured surface.
 
-        Call it only while there is nothing else to do: a keyframe that comes meanwhile waits.
+        Call it only while the fuser is idle: a keyframe that arrives meanwhile waits.
         """
         began = time.monotonic()
         count = _REFINED_AT_ONCE if began >= self._quiet_from else _REFINED_BETWEEN
@@ -218,7 +218,7 @@ class LiveMesh:
 
 
 def mesh_frames(mesh: Mesh) -> tuple[MeshLayout, list[Any]]:
-    """A mesh for the way: its layout, and its arrays as frames."""
+    """Return a mesh's layout, and its arrays as frames of a message."""
     arrays: list[NDArray[Any]] = [mesh.vertices, mesh.faces, mesh.normals]
     if mesh.colors is not None:
         arrays.append(mesh.colors)

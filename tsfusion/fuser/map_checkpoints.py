@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The checkpoints of a map on a server's disk, and a map that one of them opened."""
+"""Write a map's checkpoints to a server's disk, and open a map from its last good checkpoint."""
 
 import logging
 import os
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from tsfusion.tsdf.volume import Volume
 
 
-# Settings that may differ between a checkpoint and the server that goes on with it: none changes the sums.
+# Settings that can differ between a checkpoint and its server, because they do not change the sums.
 _FREE_SETTINGS = (*RUN_SETTINGS, *LIMIT_SETTINGS, *VIEW_SETTINGS)
 _NEW_FILE = "map.new.tsf"
 _PARTS = r"map\.new\.tsf|\.map\.new\.tsf\.partial"
@@ -36,13 +36,13 @@ class MapCheckpoints:
     """The checkpoints in a map's folder.
 
     Args:
-        keep_previous: whether to keep the checkpoint before the last, too: the journal may be cut.
-        kept: where the map's blocks are kept: arguments of `Volume`.
+        keep_previous: also keep the checkpoint before the last, because the journal may be cut.
+        kept: arguments of `Volume` that say where the map's blocks are stored.
 
     Raises:
-        InvalidConfig: when the map was made with other settings.
-        CheckpointError: when it is not a server's, cannot be read now or is of another version. A damaged
-            one is set aside.
+        InvalidConfig: the map was made with other settings.
+        CheckpointError: the checkpoint is not a server's, cannot be read now or is of another version. A
+            damaged checkpoint is set aside instead.
     """
 
     def __init__(
@@ -51,13 +51,13 @@ class MapCheckpoints:
         from tsfusion.tsdf.volume import Volume
 
         self.use_folder(folder)
-        durable_files.sweep(folder, _PARTS)  # of a process that was killed
+        durable_files.sweep(folder, _PARTS)  # left by a killed process
         self._keep_previous = keep_previous
         self.problem = ""  # why the last checkpoint could not be written; empty = it could
-        self.done: dict[bytes, SessionProgress] = {}  # session → how far the map is with it
+        self.done: dict[bytes, SessionProgress] = {}  # session → progress of the map
         self.rejected: dict[str, int] = {}  # reason → number of keyframes that the map could not take
         self.blocks: dict[str, int] = {}  # client with a key → number of blocks that its keyframes added
-        # The map, at first as it was in the last checkpoint
+        # The map, loaded from the last checkpoint
         kept = kept or {}
         found = _resume(self._path, config, kept) or _resume(self._previous, config, kept)
         self.volume = found or Volume(config, **kept)
@@ -70,15 +70,15 @@ class MapCheckpoints:
         self.poses = KeyframePoses(meta.get("poses"), {key: one.seq for key, one in self.done.items()})
 
     def use_folder(self, folder: Path) -> None:
-        """Note that the map's folder has this name now."""
+        """Set the present name of the map's folder."""
         self._path, self._previous = folder / state_folder.MAP_FILE, folder / state_folder.PREVIOUS_FILE
         self._new = folder / _NEW_FILE
 
     def save(self) -> bool:
-        """Write a checkpoint; False when that failed, which is logged.
+        """Write a checkpoint; return False if that failed (the error is logged).
 
-        Nothing is lost then: the next start goes on from the checkpoint before, with the journal. Until the
-        new one is on the disk, the old ones keep their names.
+        A failure loses nothing: the next start uses the older checkpoint and the journal. Old checkpoints
+        keep their names until the new one is on the disk.
         """
         done = {key.hex(): msgspec.structs.astuple(progress) for key, progress in self.done.items()}
         meta = {"done": done, "rejected": self.rejected, "blocks": self.blocks, "poses": self.poses.saved()}
@@ -91,7 +91,7 @@ class MapCheckpoints:
             self._new.replace(self._path)
             durable_files.sync_folder(self._path.parent)
         except (TsfusionError, OSError, MemoryError) as error:
-            if str(error) != self.problem:  # the same one is logged once
+            if str(error) != self.problem:  # an error is logged once, not at each repetition
                 log.error("no checkpoint: %s", error)
             self.problem = str(error) or type(error).__name__
             return False
@@ -101,9 +101,9 @@ class MapCheckpoints:
         return True
 
     def replace_previous(self) -> str:
-        """Let the last checkpoint take the place of the one before it; why that failed, empty = it did not.
+        """Replace the previous checkpoint by the last one; return why that failed, or an empty text.
 
-        Where the disk has no hard links, the one before it is deleted.
+        On a disk without hard links, the previous checkpoint is deleted.
         """
         try:
             if self._previous.exists() and not self._previous.samefile(self._path):
@@ -120,9 +120,9 @@ class MapCheckpoints:
 
 
 def _resume(path: Path, wanted: VolumeConfig, kept: dict[str, Any]) -> "Volume | None":
-    """The volume of a checkpoint; None when there is none, or when it is damaged.
+    """Return the volume of a checkpoint; None if it is missing or damaged.
 
-    All else raises: a checkpoint that cannot be read now may be good, and the map must not begin anew.
+    Any other error is raised: an unreadable checkpoint may be good, and the map must not start empty.
     """
     from tsfusion.tsdf.volume import Volume
 
@@ -151,9 +151,9 @@ def _resume(path: Path, wanted: VolumeConfig, kept: dict[str, Any]) -> "Volume |
 
 
 def check_journal(path: Path, meta: Mapping[str, Any]) -> None:
-    """Raise DamagedCheckpoint where a checkpoint, of this `meta`, is not of the journal beside it.
+    """Raise DamagedCheckpoint if a checkpoint with this `meta` does not belong to the journal beside it.
 
-    CheckpointError where it cannot be looked at.
+    Raise CheckpointError if the checkpoint cannot be read.
     """
     try:
         folder, written_ns = path.parent / state_folder.JOURNAL_FOLDER, path.stat().st_mtime_ns
@@ -171,7 +171,7 @@ def check_journal(path: Path, meta: Mapping[str, Any]) -> None:
 
 
 def _set_aside(path: Path, error: DamagedCheckpoint) -> None:
-    """Rename a damaged checkpoint, and leave those that were renamed before."""
+    """Rename a damaged checkpoint, without overwriting earlier renamed ones."""
     names = (path.with_name(f"{path.stem}.damaged{number}") for number in ("", *range(2, 1_000_000)))
     try:
         aside = next(name for name in names if not os.path.lexists(name))
@@ -189,9 +189,9 @@ class OpenedMap:
     """The map in the folder of a `Begin`.
 
     Attributes:
-        checkpoints: the map, and where it is saved.
-        memory_limit: of the process, bytes.
-        warming: the kernels that no keyframe needs, which are not compiled yet.
+        checkpoints: the map and its checkpoints.
+        memory_limit: memory limit of the process, bytes.
+        warming: compiles the kernels that no keyframe needs, one per step.
 
     Raises:
         TsfusionError, MemoryError: as `MapCheckpoints`.
@@ -203,7 +203,7 @@ class OpenedMap:
         runtime.start(begin.volume.threads)  # it reserves a GB, and more for each thread, and hardly uses it
         self.memory_limit = process.data_bytes() + _WORKING_MEMORY + begin.memory_bytes
         process.limit_memory(self.memory_limit)
-        # A map of any size opens, as long as there is memory; from then on it may not outgrow its own.
+        # A map of any size opens while there is memory; after that, `memory_bytes` limits its growth.
         self.checkpoints = MapCheckpoints(
             Path(begin.folder),
             begin.volume,
@@ -217,7 +217,7 @@ class OpenedMap:
 
 
 def warm(config: VolumeConfig) -> None:
-    """Compile all kernels of maps with these settings: such a map opens at once then."""
+    """Compile all kernels of maps with these settings, so that such a map opens at once."""
     from tsfusion.kernels.base import runtime
     from tsfusion.tsdf.volume import Volume
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Fuse keyframes anew where corrections say that they were taken, between the keyframes that come in."""
+"""Fuse keyframes again at the poses that corrections give, in between new keyframes."""
 
 import errno
 import logging
@@ -21,22 +21,22 @@ from tsfusion.wire.records import codec
 if TYPE_CHECKING:
     from tsfusion.tsdf.volume import Volume
 
-REST_FACTOR = 3.0  # a quarter of a busy fuser's time is for moves
-_RETRY_S = 0.5  # until a record that the system refuses to read, or whose folder is away, is tried again
-_PATIENCE_S = 10.0  # for it; then the keyframe stays where it is
+REST_FACTOR = 3.0  # moves get a quarter of a busy fuser's time
+_RETRY_S = 0.5  # until the next attempt at a record that is unreadable, or whose folder is missing
+_PATIENCE_S = 10.0  # for such a record; then the keyframe stays at its fused pose
 _SAY_INTERVAL = 0.2  # seconds between two messages of progress
 
 log = logging.getLogger(__name__)
 
 
 class PoseMover:
-    """The work that corrections make. Call `move` when `wait` is over.
+    """Moves keyframes after corrections. Call `move` when `wait` is over.
 
     Args:
-        integrate: adds a keyframe of a session to the map, within the bounds of its client.
-        moves: False = none is moved; those that wait for it count as unavailable.
-        expects: how many more will wait in a moment; counted, that nobody takes the map for settled.
-        rest_factor: after a move, so many times as long as it took none is made while keyframes come.
+        integrate: adds a keyframe of a session to the map, within its client's quota.
+        moves: False = move nothing; waiting keyframes count as unavailable.
+        expects: number of moves expected soon; they count as waiting, so that the map is not called settled.
+        rest_factor: after a move, pause for so many times its duration while keyframes arrive.
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class PoseMover:
         return self._poses.waiting if self._moves else 0
 
     def wait(self, idle: bool) -> float | None:
-        """Seconds until there is a move to do: at once when idle, otherwise after a pause; None = never."""
+        """Return the seconds until the next move: 0 when idle, else the rest of a pause; None = never."""
         if not self.waiting:
             return None
         return 0.0 if idle and self._stuck_since is None else max(self._next - time.monotonic(), 0.0)
@@ -89,12 +89,12 @@ class PoseMover:
         )
 
     def say(self) -> None:
-        """Tell how far the map is."""
+        """Send the progress to the gateway."""
         self._said = time.monotonic()
         self._say(self.progress())
 
     def move(self) -> bool:
-        """Do the farthest move, or give it up; False when it is to be tried again later."""
+        """Do the largest move, or give it up; return False if it must be tried again later."""
         move = self._poses.next()
         if move is None:
             return False
@@ -118,7 +118,7 @@ class PoseMover:
         return True
 
     def drop_deleted(self) -> None:
-        """Drop keyframes that were deleted to keep the journal to its limit: it holds them no more."""
+        """Forget keyframes whose segments were deleted to keep the journal within its limit."""
         waiting = self.waiting
         with suppress(JournalError):
             if segments := journal.segments(self._folder):
@@ -127,7 +127,7 @@ class PoseMover:
             self.say()
 
     def _fuse_elsewhere(self, move: Move) -> None:
-        """Add the keyframe where it is wanted and take it away where it was; on an error nothing changes."""
+        """Add the keyframe at its new pose and subtract it at its old one; an error changes nothing."""
         found = codec.decode(journal.read(self._folder, move.position).frames)
         if not isinstance(found, Keyframe):
             raise JournalError(f"{self._folder} holds no keyframe where number {move.seq} was")
@@ -144,7 +144,7 @@ class PoseMover:
                 raise
 
     def _waits_for(self, error: JournalError, move: Move) -> bool:
-        """True if a record that cannot be read may be, later: its folder, file or disk may come back."""
+        """Return True if an unreadable record may come back later, with its folder, file or disk."""
         if not error.temporary:
             return False
         now = time.monotonic()
@@ -159,7 +159,7 @@ class PoseMover:
         return now - self._stuck_since < _PATIENCE_S
 
     def _is_deleted(self, segment: int) -> bool:
-        """True if a segment was deleted to keep the journal to its limit: then a later one is the first."""
+        """Return True if a segment was deleted for the journal's limit: a later one is the first."""
         try:
             return any(number > segment for number in journal.segments(self._folder)[:1])
         except JournalError:

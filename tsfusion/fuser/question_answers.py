@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Answers to questions about the map, between two pieces of the fuser's work.
+"""Answer questions about the map between two pieces of the fuser's work.
 
-A question waits for the piece that is under way: a step of a keyframe before it touches the map, its sums,
-or a step of a long pass that only reads the map (`BlockStore.pause`). It reads the map as it is then, between
-two keyframes. While keyframes wait, questions get a share of the time and no more.
+A question waits only for the current piece: a step of a keyframe before it changes the map, the update of its
+sums, or a step of a long read (`BlockStore.pause`). So it reads the map between two keyframes. While
+keyframes wait, questions get a limited share of the time.
 """
 
 import time
@@ -42,19 +42,19 @@ if TYPE_CHECKING:
 
 
 class Inbox:
-    """Messages of the gateway that were not handled yet; questions apart, for they go before all else.
+    """Unhandled messages of the gateway; questions have a queue of their own because they come first.
 
     Args:
-        link: the socket; None = nobody sends any.
+        link: the socket; None = no messages come.
     """
 
     def __init__(self, link: sockets.AnySocket | None = None) -> None:
-        self.orders: deque[ToFuser] = deque()  # in the order of their coming
+        self.orders: deque[ToFuser] = deque()  # in the order of arrival
         self.questions: deque[tuple[FuserQuestion, Sequence[zmq.Frame]]] = deque()
         self._link = link
 
     def read(self) -> None:
-        """Take all that has come; never waits."""
+        """Receive all messages that have arrived; never waits."""
         while self._link is not None and int(self._link.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
             head, *frames = self._link.recv_multipart(copy=False)
             message = fuser_messages.to_fuser.decode(head.buffer)
@@ -65,21 +65,21 @@ class Inbox:
 
 
 _SHARE = 0.25  # of a busy fuser's time
-_BURST_S = 0.2  # seconds of time whose share may come at once
-# Seconds of processor time of an answer while keyframes wait; and where the share is used up already
+_BURST_S = 0.2  # seconds of the share that can be used at once
+# Most seconds of processor time of an answer while keyframes wait; and once the share is used up
 _LONGEST_S, _SHORTEST_S = 0.4, 0.1
-_LOOK_S = 0.001  # seconds of a long pass until questions are looked for again
+_LOOK_S = 0.001  # seconds between two checks for questions in a long pass
 
 
 class AnswerGivenUp(TsfusionError):
-    """An answer took longer than it may; or what was made ahead of questions gives way to one."""
+    """Raised to stop an answer that takes too long, or preparations when a question arrives."""
 
 
 class QuestionAnswers:
     """Answers the questions of an inbox.
 
     Args:
-        at_work: says whether a keyframe is under way, and hears that a question is no part of it.
+        at_work: the current keyframe; cleared during an answer, so that no keyframe is blamed for a crash.
     """
 
     def __init__(
@@ -97,13 +97,13 @@ class QuestionAnswers:
         self.slices, self.views = KeptSlices(volume), KeptViews(volume, state)
         self._share = Bucket(_SHARE, time.monotonic(), burst=_BURST_S)
         self._is_answering = self._is_preparing = False
-        self._until_s = 0.0  # of the answer that is being made, time.monotonic()
-        self._began_s = 0.0  # likewise, time.process_time()
-        self._is_aside = False  # whether it is made in the middle of a keyframe
+        self._until_s = 0.0  # deadline of the current answer, time.monotonic()
+        self._began_s = 0.0  # start of the current answer, time.process_time()
+        self._is_aside = False  # the current answer interrupts a keyframe
         self._next_look = 0.0  # time.monotonic()
 
     def give(self) -> None:
-        """Answer what waits; with keyframes waiting, too, for a share of the time."""
+        """Answer the waiting questions; while keyframes wait, too, but only for a share of the time."""
         if self._is_answering:
             return
         self._is_answering = True
@@ -124,10 +124,10 @@ class QuestionAnswers:
             self._next_look = time.monotonic() + _LOOK_S
 
     def give_between(self) -> None:
-        """Answer what waits, from the middle of a long pass, which calls this after each little step.
+        """Answer the waiting questions; called by a long pass after each small step.
 
         Raises:
-            AnswerGivenUp: when the pass is an answer itself, and has taken too long.
+            AnswerGivenUp: the pass itself is an answer, and has taken too long.
         """
         if (now := time.monotonic()) < self._next_look:
             return
@@ -138,11 +138,11 @@ class QuestionAnswers:
             self.give()
 
     def prepare(self) -> None:
-        """Work a little ahead of questions that are likely (`KeptViews`), until something comes."""
+        """Prepare answers to likely questions (`KeptViews`) until a message arrives."""
         self._is_answering = self._is_preparing = True
         try:
             self.views.prepare()
-        except (AnswerGivenUp, MemoryError):  # what was made is kept; the question itself says what is wrong
+        except (AnswerGivenUp, MemoryError):  # finished pieces stay; the question reports errors
             pass
         finally:
             self._is_answering = self._is_preparing = False
@@ -167,11 +167,11 @@ class QuestionAnswers:
 
     @property
     def _keyframes_wait(self) -> bool:
-        """True if a keyframe is under way, or something is ordered."""
+        """True if a keyframe is being fused, or a message waits."""
         return bool(self._inbox.orders) or self._at_work.is_set
 
     def _may(self) -> bool:
-        """True if the time of a question has come: keyframes that wait have had theirs."""
+        """Return True if a question can be answered now: no keyframe waits, or the share is not used up."""
         return not self._keyframes_wait or not self._share.wait(1e-6, time.monotonic())
 
     def _answer(self, asked: FuserQuestion, frames: list[memoryview]) -> None:
@@ -196,7 +196,7 @@ class QuestionAnswers:
             why = f"not enough memory for that: {error}; raise fuser_memory_bytes"
             self._send(FuserAnswer(asked.number, error=why), [])
         except (TsfusionError, ArithmeticError, ValueError) as error:
-            # The process goes on whatever was asked: a crash would be blamed on the next keyframe.
+            # The process continues after any question: a crash would be blamed on the next keyframe.
             self._send(FuserAnswer(asked.number, error=str(error) or type(error).__name__), [])
         else:
             now_ns = time.monotonic_ns()
@@ -217,7 +217,7 @@ def answer_of(
     question: Sample | Slice | Field,
     frames: list[memoryview],
 ) -> Arrays:
-    """Answer of a map, by name: the fields of `geometry.map_answers` and `geometry.map_grids`."""
+    """Return the arrays of an answer: fields of `geometry.map_answers` and `geometry.map_grids`."""
     if isinstance(question, Slice):
         return _slice_of(slices.get(question), question.kind)
     if isinstance(question, Field):
@@ -233,7 +233,7 @@ def _slice_of(current: "CurrentSlice", kind: str) -> Arrays:
         occupancy = current.occupancy()
         own = {"cells": occupancy.cells, "knows_free_space": np.asarray(occupancy.knows_free_space)}
         return {**own, **_figures(occupancy.grid)}
-    found = current.distances(unseen_is_free=True)  # who asks decides
+    found = current.distances(unseen_is_free=True)  # the client decides about unseen space
     own = {"cells": found.cells, "distance": found.distance}
     return {**own, "max_distance": np.float64(found.max_distance), **_figures(found.grid)}
 
@@ -255,7 +255,7 @@ def _field_of(volume: "Volume", asked: Field) -> Arrays:
         max_distance=asked.max_distance,
         subvoxel=asked.subvoxel,
         min_weight=asked.min_weight,
-        unseen_is_free=True,  # who asks decides
+        unseen_is_free=True,  # the client decides about unseen space
     )
     arrays = vars(found) | {"voxel_size": np.float64(edge), "max_distance": np.float64(found.max_distance)}
     return {name: np.asarray(array) for name, array in arrays.items()}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Answers to followers of a map: its cells, some at a time, and where its keyframes are."""
+"""Answer viewers of a map: its cells, a batch at a time, and the poses of its keyframes."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +24,7 @@ _SESSION = 16  # bytes
 
 
 class WatchedMap:
-    """A map, and what of it is not in its voxels."""
+    """A map, together with the poses, sessions and updates that its voxels do not contain."""
 
     def __init__(
         self, volume: "Volume", poses: KeyframePoses, touched_by: TouchedBy, live_mesh: LiveMesh
@@ -33,13 +33,13 @@ class WatchedMap:
         self._touched_by, self._live_mesh = touched_by, live_mesh
 
     def answer(self, asked: Cells | Keyframes) -> Arrays:
-        """The arrays of an answer, by name."""
+        """Return the arrays of an answer, by name."""
         return self._cells(asked) if isinstance(asked, Cells) else self._keyframes(asked)
 
     def _cells(self, asked: Cells) -> Arrays:
-        """Arrays as `mesh_updates.MeshUpdate` describes them, and `next`: where the others begin.
+        """Return arrays as in `mesh_updates.MeshUpdate`, and `next`: the first cell of the next batch.
 
-        `state`: stamp, drops, and the number of the newest mesh update: all later changes come in later ones.
+        `state`: stamp, drops, and number of the newest mesh update. All later changes come in later updates.
         """
         volume, own = self._volume, self._volume.model.surface
         is_refined = own in (asked.surface or own, "raw")
@@ -66,7 +66,7 @@ class WatchedMap:
         return {name: np.asarray(array) for name, array in arrays.items()}
 
     def _keyframes(self, asked: Keyframes) -> Arrays:
-        """Arrays as `FusedKeyframes` describes them."""
+        """Return the arrays of `FusedKeyframes`."""
         found = self._poses.fused_after(asked.session, asked.after, KEYFRAMES_AT_ONCE)
         session, number = found.last or (b"", 0)
         return {
