@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Is it the camera? Poses are right, and the frames fit each other better with another camera's intrinsics.
+"""Check the camera: with correct poses, do frames fit each other better with other intrinsics?
 
-The points of a frame depend on the intrinsics, and so does where they fall in another frame. With poses that
-are right, frames fit best with the true focal length; it is searched for (of a stereo camera, it looks like
-another scale of the poses). Principal points far from the centre of the image have usual reasons (images of
-another size, numbers exchanged, a matrix transposed), which are tried.
+The points of a frame depend on the intrinsics, and so do their projections into another frame. With correct
+poses, frames fit best with the true focal length, which is searched. For a stereo camera a wrong focal length
+looks like another scale of the poses. A principal point far from the image's centre has usual causes, which
+are tried: images of another size, exchanged numbers, a transposed matrix.
 """
 
 from collections.abc import Sequence
@@ -17,14 +17,14 @@ from tsfusion.evaluation.frame_pairs import Fits, FramePair, best_fits_near, fit
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.se3 import Transform
 
-MAX_OFF_CENTRE = 0.1  # of the image's side, from its centre: farther principal points are doubted
-MIN_RESIZED = 1.15  # factor between two sizes of an image below which they are the same
-SAME_FACTOR = 0.1  # difference of the factors of width and height that counts as none
+MAX_OFF_CENTRE = 0.1  # of the image's side; a principal point farther from the centre is doubtful
+MIN_RESIZED = 1.15  # two sizes of an image with a smaller ratio count as the same
+SAME_FACTOR = 0.1  # smaller relative difference between the factors of width and height = none
 USUAL_SIZES = (0.25, 1 / 3, 0.5, 2 / 3, 1.5, 2.0, 3.0, 4.0)
-UNEQUAL_FOCAL = 0.03  # difference of fx and fy, of fx, above which they may have been exchanged
-MAX_FOCAL_SIGMA = 0.1  # of the focal length, beyond which nobody can tell it
-MIN_SHARE_OF_BEST = 0.8  # fit over the best fit near it, with the camera found
-OUTSIDE = 0.45  # of the image's side, from its centre: a principal point there belongs to another image
+UNEQUAL_FOCAL = 0.03  # with a larger relative difference, fx and fy may have been exchanged
+MAX_FOCAL_SIGMA = 0.1  # of the focal length; with more, the focal length is not known
+MIN_SHARE_OF_BEST = 0.8  # fit divided by the best fit near it, with the found camera
+OUTSIDE = 0.45  # of the image's side; a principal point farther from the centre is of another image
 _ALONG_RAY = (
     "depth is measured along each pixel's ray instead of z, along the optical axis: give --option "
     "depth_along_ray=true"
@@ -34,13 +34,13 @@ GIVE = "check the intrinsics, or give --intrinsics fx,fy,cx,cy or --calibration 
 
 @dataclass(frozen=True)
 class CameraMistake:
-    """Intrinsics that may be meant instead of those given.
+    """Intrinsics that may be meant instead of the given ones.
 
     Attributes:
         name: short, for programs.
         camera: the intrinsics meant.
-        text: what was wrong and what to do.
-        along_ray: whether depth was measured along each pixel's ray, not along the optical axis.
+        text: the mistake and its remedy.
+        along_ray: True if depth was measured along each pixel's ray, not along the optical axis.
     """
 
     name: str
@@ -50,7 +50,7 @@ class CameraMistake:
 
 
 def centre_doubt(K: Intrinsics | None, shape: tuple[int, ...]) -> str | None:
-    """Sentence on a principal point far from the image's centre, with the likely reason; None without."""
+    """Return a sentence with the likely reason if the principal point is far from the centre, else None."""
     if K is None or not _off_centre(K, shape):
         return None
     place = "outside" if is_outside(K, shape) else "far from the centre of"
@@ -59,12 +59,12 @@ def centre_doubt(K: Intrinsics | None, shape: tuple[int, ...]) -> str | None:
 
 
 def is_outside(K: Intrinsics, shape: tuple[int, ...]) -> bool:
-    """True if the principal point is at the image's border or beyond, which no camera's is."""
+    """Return True if the principal point is at the image's border or outside, as with no real camera."""
     return _off_centre(K, shape, OUTSIDE)
 
 
 def centre_fits(pairs: Sequence[FramePair], motions: Sequence[Transform], given: Fits) -> bool:
-    """True if a principal point far from the centre is confirmed: frames fit worse with the likely ones."""
+    """Return True if frames fit worse with all likely cameras: this confirms the given principal point."""
     view = pairs[0].first_view
     if view.camera is None:
         return True
@@ -73,7 +73,7 @@ def centre_fits(pairs: Sequence[FramePair], motions: Sequence[Transform], given:
 
 
 def likely_cameras(K: Intrinsics, shape: tuple[int, ...]) -> list[CameraMistake]:
-    """The intrinsics that may be meant where the principal point is far from the centre, or fx is not fy."""
+    """Return intrinsics that may be meant, if the principal point is far from the centre, or fx is not fy."""
     found: list[CameraMistake | None] = []
     if _off_centre(K, shape):
         found += [_of_other_size(K, shape), _exchanged_centre(K, shape), _centred(K, shape)]
@@ -89,7 +89,7 @@ def likely_cameras(K: Intrinsics, shape: tuple[int, ...]) -> list[CameraMistake]
 
 
 def _of_other_size(K: Intrinsics, shape: tuple[int, ...]) -> CameraMistake | None:
-    """Intrinsics of a larger or smaller image, brought to this one by the factor that centres them."""
+    """Return intrinsics scaled from another image size, by the factor that centres the principal point."""
     if K.cx <= 0 or K.cy <= 0:
         return None
     factors = shape[1] / (2 * K.cx + 1), shape[0] / (2 * K.cy + 1)
@@ -126,10 +126,10 @@ def _centred(K: Intrinsics, shape: tuple[int, ...]) -> CameraMistake:
 def best_camera(
     pairs: Sequence[FramePair], motions: Sequence[Transform], given: Fits, focal: FittedFactor | None
 ) -> tuple[float, CameraMistake | None, Fits]:
-    """The camera with which frames surely fit better than as given: gain, camera, fits; or 0 and None.
+    """Return gain, camera and fits of the camera with the surely best fits; gain 0 and None if there is none.
 
     Args:
-        focal: the factor on the focal length that fits best; None where it was not searched for.
+        focal: factor on the focal length that fits best; None if it was not searched.
     """
     view = pairs[0].first_view
     K = view.camera

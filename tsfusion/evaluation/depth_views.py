@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A frame's measured surface, the deviation of other frames' points, its unit and its colour's fit."""
+"""Compute the surface that a frame measured, and check its unit of depth and the position of its colour."""
 
 from collections.abc import Mapping, Sequence
 from copy import copy
@@ -17,67 +17,67 @@ from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.sample_ranges import FARTHEST_M, NEAREST_M
 from tsfusion.geometry.stereo_matching import EXCHANGED, Matcher, exchanged
 
-MAX_POINTS = 800  # of a frame that are compared with another
-# Two good measurements may differ by the sum of these three.
+MAX_POINTS = 800  # points of a frame that are compared with another frame
+# Two correct measurements may differ by the sum of these three.
 MIN_TOLERANCE = 0.004  # metres
 DEPTH_TOLERANCE = 0.02  # of the depth
 DISPARITY_TOLERANCE = 1.0  # pixels
-EDGE_JUMP = 0.05  # of the depth, between neighbouring pixels: an edge, which no two cameras see alike
-MAX_STEREO_WIDTH = 500  # pixels; a wider pair is scaled before it is matched
+EDGE_JUMP = 0.05  # of the depth, between neighbouring pixels: an edge, which looks different in each frame
+MAX_STEREO_WIDTH = 500  # pixels; a wider pair is scaled down before the matching
 STEREO_SCALE = 0.5
 LIDAR_TOLERANCE = 0.04  # metres
-SCAN_CELL = 0.01  # of the range: side of the cells in which one point of a scan is kept
-GROUND_SLICE = 0.03  # of the range: thickness of the slice that holds the ground
-MIN_GROUND_SHARE = 0.25  # share of the points in one such slice that makes it the ground
+SCAN_CELL = 0.01  # of the range: side of cells; one point of a scan is kept in each cell
+GROUND_SLICE = 0.03  # of the range: thickness of a horizontal slice
+MIN_GROUND_SHARE = 0.25  # share of the points; a slice with more is the ground
 MAX_DISTANCE = 1e6  # metres; points beyond it are invalid
-MAX_TREE_POINTS = 20_000  # of a scan that others are compared with
-NEIGHBOURS = 12  # of a scan's point that show the plane through it: on its ring and on the next ones
-FLAT = 0.2  # of a neighbourhood's width: its thickness at most, and its breadth at least, to show a plane
+MAX_TREE_POINTS = 20_000  # points of a scan that other points are compared with
+NEIGHBOURS = 12  # points to which a plane is fitted, on the same ring and on the next rings
+FLAT = 0.2  # of the neighbours' width: a plane has less thickness and more breadth
 EXACT_KD_TREE = 4  # FLANN_INDEX_KDTREE_SINGLE
 _CELL_HASH = np.array([0x9E3779B97F4A7C1, 0x2545F4914F6CDD1D, 0x1B873593CC9E2D51])  # wraps at 64 bits
 _MIN_Z = 1e-6  # metres: a point nearer than this is behind the camera
-FARTHEST_OTHERS_M = 1000.0  # median range of stereo and LiDAR above which none measures
-FEW_LEVELS = 24  # different values of an image that holds whole metres
-MIN_SHARE = 0.8  # of the frames
-# What an indoor camera sees, metres: of a room something is farther, and most is nearer.
+FARTHEST_OTHERS_M = 1000.0  # metres; no stereo camera or LiDAR has a larger median range
+FEW_LEVELS = 24  # an image in whole metres has no more different values
+MIN_SHARE = 0.8  # share of the frames that must agree
+# Metres. In a room, an indoor camera sees some depth beyond the first, and most within the second.
 ROOM_M, INDOOR_M = 1.0, 6.0
-COARSE_UNIT_M = 5e-4  # finer units may be millimetres, coarser ones may be finer in truth
-MAX_WIDTH = 320  # pixels of the images compared
+COARSE_UNIT_M = 5e-4  # a finer unit may in truth be millimetres, a coarser unit may be finer
+MAX_WIDTH = 320  # pixels, largest width of the images of edges
 MAX_SHIFT = 12  # of these pixels, in x and y
-SCALES = (0.84, 0.88, 0.92, 0.96, 1.04, 1.08, 1.12, 1.16)  # of the colour image, tried beside 1
+SCALES = (0.84, 0.88, 0.92, 0.96, 1.04, 1.08, 1.12, 1.16)  # of the colour image, tried besides 1
 MAX_FRAMES = 8
-DEPTH_JUMP = 0.1  # of the depth: an edge of a surface
-MIN_EDGES = 0.005  # share of a depth image's pixels on such edges
+DEPTH_JUMP = 0.1  # of the depth; a larger jump is an edge
+MIN_EDGES = 0.005  # share of a depth image's pixels that are on edges
 FLAT_GRADIENT = 8  # grey levels a pixel; weaker gradients count less
-GOOD_AGREEMENT = 1.7  # at least: colour lies on the depth
-MIN_LEAD = 0.3  # by which edges must agree better elsewhere than where they are
-MIN_TIME_LEAD = 0.15  # the same, with the colour of the frame before or after
-MIN_VOTES = 0.8  # share of the frames of which that holds
-MIN_ERRORS = 3.0  # standard errors by which edges must agree better, too
-SAME_SHIFT = 3  # of these pixels: what half of the frames' own shifts may differ from the common one, at most
+GOOD_AGREEMENT = 1.7  # with more, colour is registered to depth
+MIN_LEAD = 0.3  # by which edges must agree better after a shift
+MIN_TIME_LEAD = 0.15  # by which edges must agree better with the colour of a neighbouring frame
+MIN_VOTES = 0.8  # share of the frames that must agree better
+MIN_ERRORS = 3.0  # standard errors by which edges must also agree better
+SAME_SHIFT = 3  # of these pixels: median difference of the frames' own shifts from the common shift, at most
 
 
 class DepthView(Protocol):
-    """The surface that a frame measured."""
+    """Surface that a frame measured."""
 
     @property
     def points(self) -> NDArray[np.float64]:
-        """(3, n) float64, a part of the measured points, in the sensor's axes, metres."""
+        """(3, n) float64, a selection of the measured points, in the sensor's axes, metres."""
         ...
 
     @property
     def range_m(self) -> float:
-        """Their median distance along the axis (of a scan: from the sensor)."""
+        """Median distance of the points along the optical axis (for a scan: from the sensor), metres."""
         ...
 
     @property
     def camera(self) -> Intrinsics | None:
-        """Intrinsics of the image; None of a scan."""
+        """Intrinsics of the image; None for a scan."""
         ...
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """(H, W) of the image, (N,) of a scan."""
+        """(H, W) of the image, or (N,) of a scan."""
         ...
 
     @property
@@ -86,19 +86,19 @@ class DepthView(Protocol):
         ...
 
     def deviation(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(n,) distance of (3, n) points from the measured surface, in units of the tolerance.
+        """Return the distance of (3, n) points from the measured surface, (n,), in units of the tolerance.
 
-        Infinite where a point is out of view, or nothing was measured.
+        It is infinite for a point out of view or without a measurement.
         """
         ...
 
     def seen_by(self, camera: Intrinsics, *, along_ray: bool = False) -> "DepthView":
-        """The surface if another camera had measured it, or along each pixel's ray; a scan is the same."""
+        """Return the surface as measured by another camera, or along each pixel's ray. A scan stays equal."""
         ...
 
 
 def depth_view(frame: Frame) -> DepthView | None:
-    """The view of a frame; None when too little was measured."""
+    """Return the view of a frame, or None if too few pixels or points were measured."""
     made: DepthView
     if frame.points is not None:
         made = _ScanView(frame.keyframe(np.eye(4), frame.motion).measurement)
@@ -132,12 +132,12 @@ def _stereo_view(frame: Frame) -> "_ImageView":
 
 
 class _ImageView:
-    """Depth of a pinhole camera; of a stereo camera, the depth is proportional to its focal length."""
+    """Depth image of a pinhole camera. With a stereo camera, depth is proportional to its focal length."""
 
     def __init__(
         self, depth_m: NDArray[np.float32], camera: Intrinsics, baseline_fx: float | None, scale: float = 1.0
     ) -> None:
-        """Take depth in an image `scale` times the size of the one that `camera` and `baseline_fx` are of."""
+        """Take a depth image of `scale` times the image size that `camera` and `baseline_fx` belong to."""
         self._baseline_fx, self._scale = baseline_fx, scale
         self.stereo = baseline_fx is not None
         self.shape = tuple(round(side / scale) for side in depth_m.shape)
@@ -145,7 +145,7 @@ class _ImageView:
         chosen = np.linspace(0, len(rows) - 1, min(MAX_POINTS, len(rows))).astype(np.intp)
         self._pixels = np.stack([columns[chosen], rows[chosen]]).astype(np.float64)
         self._z = depth_m[rows[chosen], columns[chosen]].astype(np.float64)
-        self._depth = np.pad(depth_m, 1)  # whatever is out of view falls on its border
+        self._depth = np.pad(depth_m, 1)  # points out of view fall on the border
         self.range_m = float(np.median(self._z)) if len(self._z) else 0.0
         self._take(camera)
 
@@ -179,7 +179,7 @@ class _ImageView:
         z = points[2]
         pixels = points[:2] / np.maximum(z, _MIN_Z)
         pixels *= self._focal
-        pixels += self._centre + 1  # of the depth with its border
+        pixels += self._centre + 1  # the depth image has a border of one pixel
         np.rint(pixels, out=pixels)
         np.maximum(pixels, 0, out=pixels)
         np.minimum(pixels, [[width - 1], [height - 1]], out=pixels)
@@ -192,7 +192,7 @@ class _ImageView:
 
 
 def _without_edges(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Pixels with depth whose neighbours have about the same."""
+    """Return True for pixels with depth and with neighbours of similar depth."""
     least, most = cv2.erode(depth, np.ones((3, 3))), cv2.dilate(depth, np.ones((3, 3)))
     smooth: NDArray[np.bool_] = (least > 0) & (most - least < EDGE_JUMP * depth)
     smooth[[0, -1]] = smooth[:, [0, -1]] = False
@@ -200,10 +200,11 @@ def _without_edges(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 
 class _ScanView:
-    """Points of a LiDAR without the ground, which would fit itself under many wrong motions.
+    """Points of a LiDAR without the ground, which would fit itself after many wrong motions.
 
-    Rings go with the sensor, so that with the distance to the nearest point alone scans fit best where it has
-    not moved: the surface is the plane through neighbouring points, and nobody knows it beside a single ring.
+    The rings of a LiDAR move with the sensor. By distances to the nearest points alone, scans would fit best
+    without motion. So the surface is the plane through neighbouring points. Along a single ring it is
+    unknown.
     """
 
     camera: Intrinsics | None = None
@@ -243,9 +244,9 @@ class _ScanView:
 
     @cached_property
     def _planes(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Normal of the plane through each point, and its reach, metres.
+        """Normal of the plane through each point, and reach of the plane, metres.
 
-        Both are zero where points lie in no plane, and NaN along a single ring.
+        Both are zero for points in no plane, and NaN along a single ring.
         """
         assert self._tree is not None
         count = min(NEIGHBOURS, len(self._kept))
@@ -271,7 +272,7 @@ def _kd_tree(points: NDArray[np.float64]) -> Any:
 
 
 def _above_ground(points: NDArray[np.float64], range_m: float) -> NDArray[np.float64]:
-    for axis in (2, 1):  # LiDARs have z up, what was moved to a camera's axes y down
+    for axis in (2, 1):  # a LiDAR has z up; a scan in a camera's axes has y down
         heights = np.round(points[:, axis] / max(GROUND_SLICE * range_m, 1e-9)).astype(np.int64)
         values, counts = np.unique(heights, return_counts=True)
         if len(values) and counts.max() > MIN_GROUND_SHARE * len(points):
@@ -287,17 +288,17 @@ def _one_per_cell(points: NDArray[np.float64], cell: float) -> NDArray[np.float6
 
 @dataclass(frozen=True)
 class UnitEvidence:
-    """Evidence in one frame's depth for its unit.
+    """Evidence from one frame's depth about its unit.
 
     Attributes:
-        typical_m: median depth, of a scan median range; 0 = nothing measured.
-        farthest_m: median beyond which it cannot be.
-        nearest_m: median below which it cannot be.
+        typical_m: median depth (for a scan median range); 0 = nothing measured.
+        farthest_m: a larger median is impossible.
+        nearest_m: a smaller median is impossible.
         levels: number of different values of an integer image; 0 for others.
-        integer: whether depth is in integers of some unit.
-        scale: metres an integer.
+        integer: True if depth is stored as integers of some unit.
+        scale: metres for each integer step.
         far_m: metres within which nearly all integer depth of an indoor camera lies; 0 for others.
-        exchanged: whether a stereo pair's images are each other's.
+        exchanged: True if the left and right image of a stereo pair are exchanged.
     """
 
     typical_m: float
@@ -311,7 +312,7 @@ class UnitEvidence:
 
 
 def unit_evidence(frame: Frame, view: DepthView | None) -> UnitEvidence:
-    """Evidence for its unit in a frame's depth, of which `view` is made."""
+    """Return the evidence about the unit of a frame's depth; `view` is the view of this frame."""
     if frame.left is not None and frame.right is not None and exchanged(frame.left, frame.right):
         return UnitEvidence(1.0, exchanged=True)
     if frame.depth is None:
@@ -332,7 +333,7 @@ def unit_evidence(frame: Frame, view: DepthView | None) -> UnitEvidence:
 
 
 def unusable_depth(frames: Sequence[UnitEvidence]) -> str | None:
-    """One sentence on depth in an impossible unit; None where it is possible."""
+    """Return a sentence if the depth has an impossible unit, or None."""
     seen = [each for each in frames if each.typical_m > 0]
     near = [each for each in seen if each.typical_m < each.nearest_m]
     far = [each for each in seen if each.typical_m > each.farthest_m]
@@ -346,10 +347,10 @@ def unusable_depth(frames: Sequence[UnitEvidence]) -> str | None:
 
 
 def doubtful_depth(frames: Sequence[UnitEvidence], unit: DepthUnit | None) -> str | None:
-    """One sentence on a unit of depth that nobody stated and rooms or sensors contradict; None where it fits.
+    """Return a sentence if the depth's unit is not stated and contradicts rooms or sensors, or None.
 
     Args:
-        unit: that of the recording; None = it has none of its own.
+        unit: unit of the recording's depth; None if it has no unit.
     """
     seen = [each for each in frames if each.far_m > 0]
     if unit is None or unit.is_stated or not seen:
@@ -390,12 +391,12 @@ def _far_text(unit: UnitEvidence) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Outlines:
-    """Edges of one frame's depth and of its image, both (h, w) float32.
+    """Edges in one frame's depth and in its image, both (h, w) float32.
 
     Attributes:
         depth: 0 to 1.
-        image: strength of the image's gradient where the surroundings have mean 1.
-        pixel: pixels of the frame a pixel here.
+        image: strength of the image's gradient; its mean in the surroundings is 1.
+        pixel: width of a pixel of `depth` and `image`, in pixels of the frame.
     """
 
     depth: NDArray[np.float32]
@@ -404,7 +405,7 @@ class Outlines:
 
 
 def outlines(frame: Frame) -> Outlines | None:
-    """Edges of a frame; None without colour or depth image, or where the depth has hardly an edge."""
+    """Return the edges of a frame, or None without colour, without depth, or with few edges in depth."""
     depth, gray = frame.depth_m, frame.gray
     if depth is None or gray is None:
         return None
@@ -443,10 +444,10 @@ def _blurred(image: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
 
 
 def misplaced_color(frames: Mapping[int, Outlines | None]) -> str | None:
-    """One sentence on colour of another time, or elsewhere than the depth; None where nothing is sure.
+    """Return a sentence if colour is surely of another time, or shifted against the depth; else None.
 
     Args:
-        frames: edges by index of the frame.
+        frames: frame's index → its edges.
     """
     seen = {index: each for index, each in frames.items() if each is not None}
     if len({each.depth.shape for each in seen.values()}) != 1:
@@ -456,7 +457,7 @@ def misplaced_color(frames: Mapping[int, Outlines | None]) -> str | None:
 
 
 def _other_time(seen: Mapping[int, Outlines]) -> str | None:
-    """Sentence on colour that lies better on the depth of the frame after, or before; None = it does not."""
+    """Return a sentence if the depth fits the colour of the next or previous frame better, else None."""
     neighbours = [(seen[index], seen[index + 1]) for index in seen if index + 1 in seen]
     if len(neighbours) < 2:
         return None
@@ -474,12 +475,12 @@ def _other_time(seen: Mapping[int, Outlines]) -> str | None:
 
 
 def _agreement(depth: Outlines, color: Outlines) -> float:
-    """Mean gradient of one frame's colour under the depth's edges of another."""
+    """Return the mean gradient of one frame's colour at the depth edges of another frame."""
     return float((depth.depth * color.image).sum() / max(float(depth.depth.sum()), 1e-6))
 
 
 def _other_place(seen: list[Outlines]) -> str | None:
-    """Sentence on colour that lies clearly better on the depth when moved or scaled; None = it does not."""
+    """Return a sentence if colour fits the depth clearly better after a shift or scaling, else None."""
     if len(seen) < 2:
         return None
     unscaled = _agreement_by_shift(seen, 1.0)
@@ -494,7 +495,7 @@ def _other_place(seen: list[Outlines]) -> str | None:
     there = agreement[scale][:, row, column]
     own = np.array([np.unravel_index(int(each.argmax()), each.shape) for each in agreement[scale]])
     stray = np.abs(own - [row, column]).max(axis=1)
-    at_border = {int(row), int(column)} & {0, 2 * MAX_SHIFT}  # and better beyond, perhaps
+    at_border = {int(row), int(column)} & {0, 2 * MAX_SHIFT}  # the best shift may be larger
     if at_border or not _is_sure(there - here, MIN_LEAD) or np.median(stray) > SAME_SHIFT:
         return None
     shift = (int(column) - MAX_SHIFT) * seen[0].pixel, (int(row) - MAX_SHIFT) * seen[0].pixel
@@ -506,14 +507,14 @@ def _other_place(seen: list[Outlines]) -> str | None:
 
 
 def _is_sure(leads: NDArray[np.floating], least: float) -> bool:
-    """True if edges agree better elsewhere in nearly all frames, and by more than chance."""
+    """Return True if edges agree better in nearly all frames, and by more than chance."""
     error = float(leads.std(ddof=1)) / np.sqrt(len(leads))
     mean = float(leads.mean())
     return bool(mean > max(least, MIN_ERRORS * error) and (leads > 0).mean() >= MIN_VOTES)
 
 
 def _agreement_by_shift(seen: list[Outlines], scale: float) -> NDArray[np.float32]:
-    """Agreement of each frame with its image scaled about its centre, then moved: (n, y, x) float32."""
+    """Return each frame's agreement with its image, scaled about the centre and shifted: (n, y, x)."""
     height, width = seen[0].depth.shape
     affine = np.array([[scale, 0, (1 - scale) * width / 2], [0, scale, (1 - scale) * height / 2]])
     inner = (slice(MAX_SHIFT, -MAX_SHIFT),) * 2

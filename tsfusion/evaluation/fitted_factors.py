@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Factors on translations and focal length, and the shift in time, with which frames fit each other best."""
+"""Fit a factor on translations, a factor on the focal length, and a time shift, so that frames fit best."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -12,38 +12,38 @@ from tsfusion.evaluation.frame_pairs import MIN_FIT, Fits, FramePair, fits_of, m
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.se3 import Transform
 
-WIDEST_SCALE = np.log(12)  # logarithm of the largest factor tried beside the usual ones
+WIDEST_SCALE = np.log(12)  # logarithm of the largest factor tried besides the usual factors
 SCALE_STEPS = 61
 WIDEST_FOCAL = np.log(2.5)
 FOCAL_STEPS = 37
 FINE_STEPS = 21
-AS_GOOD = 0.02  # difference of two fits that counts as none
+AS_GOOD = 0.02  # two fits with a smaller difference count as equal
 MIN_PAIRS = 3
-MIN_SCALE_ERROR = 0.05  # smaller errors are left to the sensors' calibration
+MIN_SCALE_ERROR = 0.05  # smaller errors are a matter of the sensors' calibration
 MIN_FOCAL_ERROR = 0.03
-MIN_FOCAL_SIGMA = 0.005  # of the focal length: what pixels and sensors allow
-MIN_SIGMAS = 3.0  # standard errors by which a factor must be off
+MIN_FOCAL_SIGMA = 0.005  # of the focal length: pixels and sensors allow no better
+MIN_SIGMAS = 3.0  # standard errors by which a factor must differ from 1
 MIN_SURE_GAIN = 0.004
 MIN_EXPLAINED = 0.08  # share of the misfit that a factor must explain
 MIN_GAIN_SIGMAS = 2.0
 
 Logs = NDArray[np.float64]
 FitsAt = Callable[[float], Fits]  # the fits of all pairs with a factor
-MAX_SHIFT = 8  # frames, early or late
+MAX_SHIFT = 8  # frames, in both directions
 MIN_SHIFT_PAIRS = 2
 MIN_SHIFT_GAIN = 0.05
-MIN_SHIFT_SHARE = 0.7  # of the gain by small corrections
+MIN_SHIFT_SHARE = 0.7  # share of the gain that small corrections give
 
 
 @dataclass(frozen=True, eq=False)
 class FittedFactor:
-    """A factor that fits best.
+    """Factor that fits best.
 
     Attributes:
-        factor: where the mean fit of the pairs is highest.
-        sigma: its standard error, relative; infinite where nothing shows it.
-        fits: the fits of the pairs with it.
-        gain: over the fits as given; 0 unless it is sure.
+        factor: factor with the highest mean fit of the pairs.
+        sigma: standard error of the factor, relative; infinite if the pairs do not show it.
+        fits: fits of the pairs with the factor.
+        gain: mean gain over the given fits; 0 unless it is sure.
     """
 
     factor: float
@@ -55,9 +55,9 @@ class FittedFactor:
 def fitted_scale(
     pairs: Sequence[FramePair], motions: Sequence[Transform], given: Fits, *, usual: Sequence[float]
 ) -> FittedFactor:
-    """The factor on translations that fits best: a usual one if it is as good.
+    """Return the factor on translations that fits best, preferably a usual one.
 
-    If poses without translations fit as well, nothing shows the scale: the gain is 0.
+    If poses without translations fit as well, the pairs do not show the scale: the gain is 0.
     """
 
     def fits_at(factor: float) -> Fits:
@@ -75,7 +75,7 @@ def fitted_scale(
 def fitted_focal_length(
     pairs: Sequence[FramePair], motions: Sequence[Transform], given: Fits
 ) -> FittedFactor | None:
-    """The factor on `fx` and `fy` that fits best; None of a scan, or of stereo, whose depth it scales."""
+    """Return the factor on `fx` and `fy` that fits best; None for a scan, or stereo (it scales depth)."""
     view = pairs[0].first_view
     K = view.camera
     if K is None or view.stereo:
@@ -90,18 +90,17 @@ def fitted_focal_length(
 
 
 def zoomed(K: Intrinsics, factor: float) -> Intrinsics:
-    """Intrinsics whose focal length is multiplied by a factor."""
     return Intrinsics(K.fx * factor, K.fy * factor, K.cx, K.cy)
 
 
 def sure_gain(fits: Fits, given: Fits) -> float:
-    """Mean gain over the pairs that are evidence; 0 unless it is large, or no accident of a few pairs."""
+    """Return the mean gain over the pairs with evidence; 0 unless it is large, or clearly no accident."""
     evidence = (np.maximum(fits, given) >= MIN_FIT) & (np.minimum(fits, given) > 0)
     if evidence.sum() < MIN_PAIRS or fits[evidence].mean() < MIN_FIT:
         return mean_gain(fits, given)
     gains = (fits - given)[evidence]
     gain, error = float(gains.mean()), float(gains.std() / np.sqrt(len(gains)))
-    # Where the sensor moves little most pairs show nothing: few gain, but none loses.
+    # If the sensor moves little, most pairs show nothing: few pairs gain, but none loses.
     one_sided = (gains > AS_GOOD).sum() >= MIN_PAIRS and gains.min() > -AS_GOOD / 2
     no_accident = gain > MIN_GAIN_SIGMAS * error or (gains > 0).all() or one_sided
     enough = gain > max(MIN_SURE_GAIN, MIN_EXPLAINED * float(1 - given[evidence].mean()))
@@ -113,7 +112,7 @@ def _fitted(fits_at: FitsAt, widest: float, steps: int, given: Fits, *, least: f
     peak = coarse[int(np.argmax([fits_at(float(np.exp(log))).mean() for log in coarse]))]
     logs = peak + np.linspace(-2, 2, FINE_STEPS) * (coarse[1] - coarse[0])
     curves = np.array([fits_at(float(np.exp(log))) for log in logs])  # (steps, pairs)
-    # A pair that overlaps too little with one factor and not with the next would make the curve jump.
+    # A pair may overlap too little with some factors only: it would make the curve jump.
     smooth = (curves.min(axis=0) > 0) & (curves.max(axis=0) >= MIN_FIT)
     log, sigma = _peak_and_error(logs, curves[:, smooth] if smooth.any() else curves)
     if smooth.sum() < MIN_PAIRS or not logs[0] < log < logs[-1]:
@@ -126,7 +125,7 @@ def _fitted(fits_at: FitsAt, widest: float, steps: int, given: Fits, *, least: f
 
 
 def _peak_and_error(logs: Logs, curves: NDArray[np.float64]) -> tuple[float, float]:
-    """Peak of the sum of the pairs' curves, and its standard error by leaving out each pair once."""
+    """Return the peak of the sum of the pairs' curves, and its standard error by leaving out each pair."""
     total, count = curves.sum(axis=1), curves.shape[1]
     left_out = np.array([_peak(logs, total - curve) for curve in curves.T])
     error = np.sqrt((count - 1) / count * ((left_out - left_out.mean()) ** 2).sum())
@@ -134,7 +133,7 @@ def _peak_and_error(logs: Logs, curves: NDArray[np.float64]) -> tuple[float, flo
 
 
 def _peak(at: Logs, values: NDArray[np.float64]) -> float:
-    """Place of a curve's peak, between its samples by a parabola."""
+    """Return the position of a curve's peak, interpolated between the samples by a parabola."""
     top = int(np.argmax(values))
     if not 0 < top < len(at) - 1:
         return float(at[top])
@@ -144,7 +143,7 @@ def _peak(at: Logs, values: NDArray[np.float64]) -> float:
 
 
 def time_shift(dataset: Dataset, pairs: Sequence[FramePair], best: Fits) -> int | None:
-    """Number of frames by which later poses fit clearly better; None where no shift does.
+    """Return the number of frames by which later poses fit clearly better, or None.
 
     Args:
         best: fits of the pairs after small corrections.
@@ -182,7 +181,7 @@ def time_shift(dataset: Dataset, pairs: Sequence[FramePair], best: Fits) -> int 
 
 
 def time_text(dataset: Dataset, late: int) -> str:
-    """Description of poses that are `late` frames late, and what to do."""
+    """Return the mistake and its remedy for poses that are `late` frames late."""
     shift = f"{abs(late)} frame{'s' if abs(late) > 1 else ''}"
     stamps = dataset.timestamps_ns
     if stamps is not None and len(stamps) > 1:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Pairs of a dataset's frames, and how well the points of the first lie on the surface of the second."""
+"""Pair frames of a dataset, and measure how well points of the first fit the surface of the second."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -24,27 +24,27 @@ from tsfusion.geometry.se3 import Transform
 
 Fits = NDArray[np.float64]  # (pairs,), each 0 to 1
 
-FIRST_FRAMES = 5  # spread over the recording, each the first of some pairs
-PAIR_GAPS = (1, 4, 16)  # frames between the two of a pair
-MIN_COMPARED = 0.1  # share of the points that must fall on a measurement, or the fit is 0
-MIN_FIT = 0.5  # below this a pair is no evidence for a pose
-MIN_GAIN = 0.1  # by which a correction must fit better, on average
+FIRST_FRAMES = 5  # first frames of pairs, spread over the recording
+PAIR_GAPS = (1, 4, 16)  # difference between the frame indices of a pair
+MIN_COMPARED = 0.1  # share of the points; if fewer fall on a measurement, the fit is 0
+MIN_FIT = 0.5  # with a smaller fit, a pair is no evidence for a pose
+MIN_GAIN = 0.1  # mean increase of the fit that a correction must give
 MIN_BETTER = 0.7  # share of the pairs that must fit better
-FIRST_STEP = 0.03  # radians, and metres per metre of depth
+FIRST_STEP = 0.03  # radians, and metres for each metre of depth
 STEP_ROUNDS = 8
-STRAY_PRICE = 0.5  # fit that a correction must gain for each metre over the depth, and each radian
+STRAY_PRICE = 0.5  # fit that a correction must gain for each radian, or for a shift as long as the depth
 
 
 @dataclass(frozen=True, eq=False)
 class SeenFrame:
-    """Parts of one frame that the check keeps.
+    """Results from one frame that the check keeps.
 
     Attributes:
         kind: what the sensor measures.
-        depth: its unit, as far as the measurement shows it.
-        view: the measured surface; None when too little was measured.
+        depth: evidence about the unit of depth.
+        view: the measured surface; None if too little was measured.
         outlines: edges of depth and image; None without both.
-        skewed: the surface with the motion left in that the frame's sweep is rid of; None = there is none.
+        skewed: the surface without correction of the motion during the sweep; None if there is no correction.
     """
 
     kind: FrameKind
@@ -57,7 +57,7 @@ class SeenFrame:
 
 @dataclass(frozen=True, eq=False)
 class FramePair:
-    """Two frames with a pose and a view each; `first` and `second` are their indices."""
+    """Two frames with a pose and a view each; `first` and `second` are the frames' indices."""
 
     first: int
     second: int
@@ -66,20 +66,20 @@ class FramePair:
     second_view: DepthView
 
     def motion(self, intended: Callable[[Transform], Transform] = np.asarray) -> Transform:
-        """(4, 4) from the first frame's axes to the second's, by the intended poses."""
+        """Return the (4, 4) transform from the first frame's axes to the second's, by the intended poses."""
         first, second = (intended(T) for T in self.poses)
         return np.asarray(np.linalg.inv(second) @ first, np.float64)
 
     def fit(self, motion: Transform, tolerance: float = 1.0) -> float:
-        """Fit of the first frame's points to the second's surface, 0 to 1; 0 if too few can be compared.
+        """Return how well the first frame's points fit the second's surface, 0 to 1; 0 with too few points.
 
         Args:
-            tolerance: over that of the sensors.
+            tolerance: factor on the tolerance of the sensors.
         """
         return self.fit_of_shared(motion, tolerance) or 0.0
 
     def fit_of_shared(self, motion: Transform, tolerance: float = 1.0) -> float | None:
-        """The fit of the first frame's points to the second's surface; None if too few can be compared."""
+        """Return the same as `fit`, but None if too few points can be compared."""
         points = motion[:3, :3] @ self.first_view.points
         points += motion[:3, 3:]
         deviation = self.second_view.deviation(points)
@@ -90,27 +90,27 @@ class FramePair:
         return float(np.maximum(fits, 0, out=fits).sum()) / compared
 
     def shift(self, motion: Transform, other: Transform) -> float:
-        """Median distance between the first frame's points after one motion and after another, metres."""
+        """Return the median distance between the first frame's points after two motions, metres."""
         points = self.first_view.points
         difference = (motion - other)[:3]
         return float(np.median(np.linalg.norm(difference[:, :3] @ points + difference[:, 3:], axis=0)))
 
     def seen_by(self, camera: Intrinsics, *, along_ray: bool = False) -> "FramePair":
-        """The pair if another camera had measured it, or along each pixel's ray."""
+        """Return the pair as if measured by another camera, or along each pixel's ray."""
         views = self.first_view, self.second_view
         first, second = (view.seen_by(camera, along_ray=along_ray) for view in views)
         return replace(self, first_view=first, second_view=second)
 
 
 def wanted_pairs(count: int) -> list[tuple[int, int]]:
-    """Indices of the frames of each pair of a dataset of `count` frames."""
+    """Return the frame indices of each pair for a dataset of `count` frames."""
     last = max(0, count - 1 - min(PAIR_GAPS[-1], count // 2))
     anchors = sorted({round(index) for index in np.linspace(0, last, FIRST_FRAMES)})
     return [(first, first + gap) for first in anchors for gap in PAIR_GAPS if first + gap < count]
 
 
 def seen_frames(dataset: Dataset, wanted: Sequence[tuple[int, ...]]) -> dict[int, SeenFrame]:
-    """The frames of some pairs by index, each read once, without those that cannot be read.
+    """Read the frames of some pairs, each once. Return index → frame, without unreadable frames.
 
     Raises:
         DatasetError: a frame cannot be read.
@@ -128,7 +128,7 @@ def _seen(dataset: Dataset, index: int) -> SeenFrame:
 
 
 def pairs_of(frames: dict[int, SeenFrame], wanted: Sequence[tuple[int, int]]) -> list[FramePair]:
-    """The pairs whose frames both have a pose and a view."""
+    """Return the pairs whose frames both have a pose and a view."""
     pairs = []
     for i, j in wanted:
         first, second = frames.get(i), frames.get(j)
@@ -141,12 +141,11 @@ def pairs_of(frames: dict[int, SeenFrame], wanted: Sequence[tuple[int, int]]) ->
 
 
 def fits_of(pairs: Sequence[FramePair], motions: Sequence[Transform]) -> Fits:
-    """The fit of each pair after its motion."""
     return np.array([pair.fit(motion) for pair, motion in zip(pairs, motions, strict=True)])
 
 
 def mean_gain(fits: Fits, given: Fits) -> float:
-    """Mean by which fits are better than those given; 0 unless that is beyond doubt."""
+    """Return by how much fits are better than the given fits, on average; 0 unless the gain is sure."""
     evidence = np.maximum(fits, given) >= MIN_FIT
     if not evidence.any() or fits[evidence].mean() < MIN_FIT or (fits > given)[evidence].mean() < MIN_BETTER:
         return 0.0
@@ -155,30 +154,30 @@ def mean_gain(fits: Fits, given: Fits) -> float:
 
 
 def mean_where(values: NDArray[np.float64], where: NDArray[np.bool_]) -> float:
-    """Mean of some values to three decimals; 0 without any."""
+    """Return the mean of selected values to three decimals, 0 without any."""
     return round(float(values[where].mean()), 3) if where.any() else 0.0
 
 
 def scaled_motion(motion: Transform, factor: float) -> Transform:
-    """A motion whose translation is multiplied by a factor."""
     stretched: Transform = np.array(motion)
     stretched[:3, 3] *= factor
     return stretched
 
 
 def best_fits_near(pairs: Sequence[FramePair], motions: Sequence[Transform]) -> Fits:
-    """The best fit of each pair that small corrections of its motion reach."""
+    """Return the best fit of each pair after small corrections of its motion."""
     return np.array([best_near(pair, motion)[0] for pair, motion in zip(pairs, motions, strict=True)])
 
 
 def best_near(pair: FramePair, motion: Transform, *, coarse: Sequence[float] = ()) -> tuple[float, Transform]:
-    """The best fit that small corrections of a motion reach (hill climbing), and that motion.
+    """Return the best fit after small corrections of a motion (hill climbing), and the corrected motion.
 
-    The fit is 0 where it starts from 0.
+    If the fit is 0 at the start, it stays 0.
 
     Args:
-        coarse: tolerances over the sensors' own with which to climb before, from far off; then a correction
-            must be worth its size, or it would slide along a wall that shows nothing of it.
+        coarse: larger tolerances, as factors on the sensors', to climb with first from far away. Then a
+            correction must gain in proportion to its size: otherwise it would slide along a wall, which does
+            not show such a motion.
     """
     given, price = motion, STRAY_PRICE if coarse else 0.0
 
@@ -215,6 +214,6 @@ def _climb(pair: FramePair, motion: Transform, worth: Callable[[Transform], floa
 
 
 def share_of_best(given: Fits, best: Fits) -> float:
-    """Fit as given over the best fit near it, over the pairs that are evidence; 1 without any."""
+    """Return the given fit divided by the best fit near it, over the pairs with evidence; 1 without any."""
     evidence = best >= MIN_FIT
     return float(given[evidence].sum() / best[evidence].sum()) if evidence.any() else 1.0

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Distance of points from the triangles of a mesh.
+"""Measure the distance of points from the triangles of a mesh.
 
-Each triangle is covered by balls of like size, whose centres are in a k-d tree. A triangle is no nearer than
-a centre less its radius: only those are measured that can be the nearest.
+Balls of similar size cover each triangle. Their centres are in a k-d tree. A triangle is never nearer than a
+centre's distance less its radius, so only triangles that can be the nearest are measured.
 """
 
 import numpy as np
@@ -10,29 +10,29 @@ from numpy.typing import NDArray
 
 from tsfusion.core.errors import MissingDependency
 
-MOST_CANDIDATES = 256  # balls a point
-SLACK = 0.02  # of the distance: what it may be too long
+MOST_CANDIDATES = 256  # balls for each point, at most
+SLACK = 0.02  # share of the distance by which it may be too long
 _FIRST_CANDIDATES = 16
-_BALLS = 400_000  # for large triangles, at most
+_BALLS = 400_000  # balls for all large triangles, at most
 
 Triangles = NDArray[np.float64]  # (n, 3, 3)
 
 
 class MeshDistance:
-    """Unsigned distance from a mesh: exact nearby, elsewhere at most `SLACK` of itself too long.
+    """Unsigned distance from a mesh: exact near the mesh, elsewhere too long by `SLACK` of itself at most.
 
-    Distances to more than `MOST_CANDIDATES` balls, as from the centre of a sphere, are at most a `radius`
-    too long.
+    If more than `MOST_CANDIDATES` balls have about the same distance, as from the centre of a sphere, the
+    distance is too long by a `radius` at most.
 
     Args:
         vertices: (n, 3) metres.
-        faces: (m, 3) integers, one at least.
+        faces: (m, 3) integers, at least one triangle.
 
     Attributes:
-        radius: of the largest ball, metres.
+        radius: radius of the largest ball, metres.
 
     Raises:
-        MissingDependency: without scipy.
+        MissingDependency: scipy is not installed.
     """
 
     def __init__(self, vertices: NDArray[np.floating], faces: NDArray[np.integer]) -> None:
@@ -42,7 +42,7 @@ class MeshDistance:
         self._tree = tree_of(centres)
 
     def __call__(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
-        """(n,) metres from (n, 3) points."""
+        """Return the distances of (n, 3) points, (n,) metres."""
         where: NDArray[np.float64] = np.asarray(points, np.float64)
         nearest = np.full(len(points), np.inf)
         left, count = np.arange(len(points)), _FIRST_CANDIDATES
@@ -57,7 +57,7 @@ class MeshDistance:
     def _among(
         self, points: NDArray[np.float64], count: int
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Distances from the triangles of the nearest balls, and whether no other can be much nearer."""
+        """Return distances from the triangles of the nearest balls; and True if no other is much nearer."""
         to_centre, index = self._tree.query(points, k=count)
         to_centre, index = to_centre.reshape(len(points), -1), index.reshape(len(points), -1)
         best = self._measure(points, index[:, 0])
@@ -78,7 +78,7 @@ class MeshDistance:
 
 
 def tree_of(points: NDArray[np.float64]) -> "cKDTree":  # type: ignore[name-defined]  # noqa: F821
-    """A k-d tree of (n, 3) points; raises MissingDependency without scipy."""
+    """Return a k-d tree of (n, 3) points. Raise MissingDependency without scipy."""
     try:
         from scipy.spatial import cKDTree
     except ImportError as error:
@@ -89,7 +89,7 @@ def tree_of(points: NDArray[np.float64]) -> "cKDTree":  # type: ignore[name-defi
 
 
 def _covered(triangles: Triangles) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
-    """Balls that cover triangles: (n, 3) centres, (n,) which triangle each is for, and (n,) radii."""
+    """Cover triangles with balls. Return (n, 3) centres, (n,) triangles that they belong to, (n,) radii."""
     edges = np.linalg.norm(np.roll(triangles, -1, axis=1) - triangles, axis=2)  # a vertex and the next
     longest, base = edges.max(axis=1), edges.argmax(axis=1)
     cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
@@ -106,7 +106,7 @@ def _covered(triangles: Triangles) -> tuple[NDArray[np.float64], NDArray[np.int6
     centres = triangles[small].mean(axis=1)
     radii = np.linalg.norm(triangles[small] - centres[:, None], axis=2).max(axis=1)
     on_large, of_large = _rows_of_points(triangles[large], base[large], rows, columns)
-    reach = np.full(len(of_large), step * np.hypot(1, 0.5))  # up to the next row, half way along this one
+    reach = np.full(len(of_large), step * np.hypot(1, 0.5))  # to the next row, half a step along the row
     return (
         np.concatenate([centres, on_large]),
         np.concatenate([small, large[of_large]]),
@@ -117,9 +117,10 @@ def _covered(triangles: Triangles) -> tuple[NDArray[np.float64], NDArray[np.int6
 def _rows_of_points(
     triangles: Triangles, base: NDArray[np.int64], rows: NDArray[np.int64], columns: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Points in rows parallel to the longest edge of triangles, from it upwards, and whose each is.
+    """Return points in rows parallel to each triangle's longest edge, and the triangle of each point.
 
-    What lies above a row is beside points of it: towards the corner opposite, rows get shorter on both sides.
+    The first row is on that edge. Rows get shorter towards the opposite corner, on both sides. So whatever
+    lies above a row is beside points of the row.
     """
     of = np.repeat(np.arange(len(triangles)), rows * columns)
     index = np.arange(len(of)) - np.repeat(np.cumsum(rows * columns) - rows * columns, rows * columns)

@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Do poses, camera and depth agree? Project frames into their neighbours and see how well they fit.
+"""Check whether poses, camera and depth agree: project frames into their neighbours, and measure the fit.
 
-Where they do not fit, the poses are corrected for each usual mistake (poses inverted, OpenGL axes, wrong
-units, …) and the camera for its own (`camera_check`); what fits clearly better is named. Without such a
-mistake, small corrections of the poses show whether the measurements could fit better; `trajectory_check`
-looks for a jump and for drift. Where the sensor hardly moves, or the frames share no surface, the verdict is
-`cannot tell`.
+If frames do not fit, corrections of the usual mistakes are tried: of poses (inverted, OpenGL axes, wrong
+units, …) and of the camera (`camera_check`). A correction that fits clearly better is named. Otherwise, small
+corrections of the poses show whether the measurements could fit better, and `trajectory_check` looks for a
+jump and for drift. If the sensor hardly moves, or the frames share no surface, the verdict is `cannot tell`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -71,13 +70,13 @@ from tsfusion.geometry.se3 import Transform
 
 PoseVerdict = Literal["agree", "disagree", "cannot tell"]
 
-MIN_LEAD = 0.05  # by which the poses must fit better than the median mistake, or nobody can tell
-MIN_EVIDENCE = 0.2  # share of the pairs that must fit, or nobody can tell
-MIN_UNEXPLAINED_PAIRS = 2  # which small corrections make fit
-MIN_MISFIT_PAIRS, MAX_MISFIT = 3, 0.3  # pairs that see one place, and the fit that none of them reaches
-MIN_SHARE_OF_BEST = 0.8  # fit over the best fit near it: less is a disagreement
-TIME_SHIFT_BELOW = 0.97  # share of the best fit below which shifted times are tried
-AS_LIKELY = 0.8  # of the gain by the best explanation: another one is named too
+MIN_LEAD = 0.05  # by which the poses must fit better than the median mistake, or it is `cannot tell`
+MIN_EVIDENCE = 0.2  # share of the pairs that must fit, or it is `cannot tell`
+MIN_UNEXPLAINED_PAIRS = 2  # pairs that fit after small corrections
+MIN_MISFIT_PAIRS, MAX_MISFIT = 3, 0.3  # pairs that see one scene, and a fit that none of them reaches
+MIN_SHARE_OF_BEST = 0.8  # fit divided by the best fit near it: less is a disagreement
+TIME_SHIFT_BELOW = 0.97  # share of the best fit; with less, shifted times are tried
+AS_LIKELY = 0.8  # of the best explanation's gain; with more, another explanation is named too
 _DISAGREE, _CAMERA = "poses and depth disagree", "camera and depth disagree"
 _PUT_RIGHT = (
     "points and their times disagree: scans fit better where the sensor's motion is left in, as it was taken "
@@ -94,32 +93,32 @@ class PoseCheckReport:
     """Result of `check`."""
 
     verdict: PoseVerdict  # `disagree` only when it is sure
-    text: str  # one or two sentences: what is wrong and what to do
-    # What is wrong: a name in `MISTAKES`, `scale`, `time`, `point times`, `depth unit`, of the camera
+    text: str  # one or two sentences: the mistake and its remedy
+    # The mistake: a name in `MISTAKES`, `scale`, `time`, `point times`, `depth unit`, of the camera
     # (`focal length`, `image size`, `exchanged centre`, `principal point`, `exchanged focal lengths`,
     # `unequal focal lengths`, `depth along rays`), `jump` or `drift` (in a part of the recording), or
-    # `unexplained`; None when they agree
+    # `unexplained`; None if poses and depth agree
     mistake: str | None = None
     alternatives: tuple[str, ...] = ()  # other mistakes whose correction fits as well
-    fitting_camera: tuple[float, float, float, float] | None = None  # that fits, where it is wrong
-    # Focal length used, the one that fits best and its standard error, pixels; None where nobody can tell
+    fitting_camera: tuple[float, float, float, float] | None = None  # fx fy cx cy, if wrong
+    # Focal length used, the best-fitting one and its standard error, pixels; None if not known
     focal_px: tuple[float, float, float] | None = None
-    color: str | None = None  # how the colour lies off the depth; None where it does not, or nobody can tell
-    factor: float | None = None  # for `scale`, what translations must be multiplied by
-    shift: float | None = None  # for `time`, frames later whose pose each frame should have
-    frames: tuple[int, int] | None = None  # for `jump` and `drift`, indices of the frames between which it is
-    metres: float | None = None  # by how much
+    color: str | None = None  # a sentence if colour is misplaced; None if not, or not known
+    factor: float | None = None  # for `scale`, factor for the translations
+    shift: float | None = None  # for `time`, each frame fits the pose so many frames later
+    frames: tuple[int, int] | None = None  # for `jump` and `drift`, indices of the two frames
+    metres: float | None = None  # for `jump` and `drift`, size of the error
     pairs: int = 0  # number of pairs of frames compared
-    fit: float | None = None  # 0 to 1, how well the pairs fit as given; 1 = far within the sensors' tolerance
+    fit: float | None = None  # 0 to 1, fit of the pairs as given; 1 = far within the sensors' tolerance
     best_fit: float | None = None  # the fit after small corrections
     # The fit after the correction of each mistake, by its name
     tried: dict[str, float] = field(default_factory=dict)
 
 
 def check(dataset: Dataset) -> PoseCheckReport:
-    """Compare neighbouring frames of a dataset, as given and corrected for usual mistakes, then distant ones.
+    """Compare neighbouring frames of a dataset, as given and corrected for usual mistakes; then distant ones.
 
-    Takes one or two seconds, of a LiDAR some more; reads 20 to 50 frames.
+    It takes one or two seconds, for a LiDAR some more, and reads 20 to 50 frames.
 
     Raises:
         DatasetError: a frame cannot be read.
@@ -144,9 +143,9 @@ def check(dataset: Dataset) -> PoseCheckReport:
 
 
 def check_frames(dataset: Dataset) -> tuple[str | None, str | None]:
-    """Mistakes that show whatever the poses, of the depth and of the colour: a sentence each; None = none.
+    """Return mistakes that do not depend on poses: a sentence on depth and one on colour, or None for each.
 
-    Reads the frames that `check` does, and keeps of each no more than its edges.
+    It reads the same frames as `check`, and keeps only the edges of each.
 
     Raises:
         DatasetError: a frame cannot be read.
@@ -165,7 +164,7 @@ def check_frames(dataset: Dataset) -> tuple[str | None, str | None]:
 def _with_doubt(
     report: PoseCheckReport, frames: Mapping[int, SeenFrame], pairs: list[FramePair]
 ) -> PoseCheckReport:
-    """The report with what is odd about the camera, where the frames do not confirm it."""
+    """Add a doubt about the camera to the report, unless the frames confirm the camera."""
     view = next((frame.view for frame in frames.values() if frame.view is not None), None)
     doubt = None if view is None else centre_doubt(view.camera, view.shape)
     if doubt is None or view is None or view.camera is None:
@@ -187,7 +186,7 @@ def _with_doubt(
 
 
 def _with_fault(report: PoseCheckReport, dataset: Dataset, frames: dict[int, SeenFrame]) -> PoseCheckReport:
-    """The report with the place where the trajectory is wrong; as it was where none surely is."""
+    """Add the place where the trajectory is surely wrong to the report, if there is any."""
 
     def compare(first: int, second: int) -> FramePair | None:
         unread = [index for index in (first, second) if index not in frames]
@@ -205,7 +204,7 @@ def _with_fault(report: PoseCheckReport, dataset: Dataset, frames: dict[int, See
 
 
 def _of_depth(frames: Mapping[int, SeenFrame]) -> PoseCheckReport | None:
-    """The report where depth alone shows that something is wrong, whatever the poses."""
+    """Return a report if depth alone shows that something is wrong, else None."""
     if (wrong := unusable_depth([frame.depth for frame in frames.values()])) is not None:
         return PoseCheckReport("disagree", wrong, "depth unit")
     if all(frame.view is None for frame in frames.values()):
@@ -218,7 +217,7 @@ def _of_depth(frames: Mapping[int, SeenFrame]) -> PoseCheckReport | None:
 
 @dataclass(frozen=True, eq=False)
 class _Comparison:
-    """The pairs, and how they fit as given and after small corrections of the poses."""
+    """The pairs, with their fits as given and after small corrections of the poses."""
 
     dataset: Dataset
     content: Content
@@ -230,7 +229,6 @@ class _Comparison:
 
     @property
     def known(self) -> NDArray[np.bool_]:
-        """The pairs that are evidence."""
         return self.best >= MIN_FIT
 
 
@@ -294,7 +292,7 @@ def _content(dataset: Dataset, frame: SeenFrame) -> Content:
 def _disagreement(
     seen: _Comparison, tried: Mapping[str, Fits], corrected: Mapping[str, list[Transform]]
 ) -> PoseCheckReport | None:
-    """Mistake in words; None where there is none, or nobody can tell."""
+    """Return the report of a mistake, or None if no mistake is sure."""
     pairs, given, report = seen.pairs, seen.given, partial(PoseCheckReport, "disagree")
     gains = {name: mean_gain(fits, given) for name, fits in tried.items()}
     gain = max(gains.values())
@@ -330,7 +328,7 @@ def _disagreement(
 def _camera_report(
     seen: _Comparison, camera: CameraMistake, fits: Fits, scale: FittedFactor
 ) -> PoseCheckReport:
-    """The report of a wrong camera; of the scale too where it explains the misfit about as well."""
+    """Return the report of a wrong camera; and of the scale too, if it explains the misfit about as well."""
     either = _as_likely(scale.fits, fits, seen.given)
     text = f"{_CAMERA}: {camera.text}"
     return PoseCheckReport(
@@ -344,18 +342,17 @@ def _camera_report(
 
 
 def _as_likely(other: Fits, best: Fits, given: Fits) -> bool:
-    """True if other fits explain what was misfit about as well as the best ones do."""
+    """Return True if other fits explain the misfit about as well as the best fits do."""
     evidence = np.maximum(other, best) >= MIN_FIT
     return bool((other - given)[evidence].mean() > AS_LIKELY * (best - given)[evidence].mean())
 
 
 def _cannot_improve(pairs: Sequence[FramePair], motions: Sequence[Transform]) -> bool:
-    """True if small corrections hardly improve the fit of the motions."""
+    """Return True if small corrections hardly improve the fit of the motions."""
     return share_of_best(fits_of(pairs, motions), best_fits_near(pairs, motions)) >= MIN_SHARE_OF_BEST
 
 
 def _agreement(seen: _Comparison, tried: Mapping[str, Fits]) -> PoseCheckReport:
-    """The report where nothing is surely wrong."""
     given, report = seen.given, partial(PoseCheckReport, "cannot tell")
     fitting = int((given >= MIN_FIT).sum())
     if fitting < MIN_EVIDENCE * len(given):

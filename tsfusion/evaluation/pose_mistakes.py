@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The usual mistakes in poses, each with its correction, which `pose_check` tries against the depth."""
+"""The usual mistakes in poses, each with its correction. `pose_check` tries the corrections."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,13 +18,13 @@ _CAMERA_BODY = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0,
 
 @dataclass(frozen=True)
 class Content:
-    """Contents of a dataset, as far as advice depends on them.
+    """Properties of a dataset that the advice depends on.
 
     Attributes:
         measures: what the sensor measures.
-        integer_depth: whether depth is in integers of some unit.
-        quaternions: whether the rotations were read as quaternions; else as matrices.
-        kitti: whether it is of KITTI.
+        integer_depth: True if depth is stored as integers of some unit.
+        quaternions: True if the rotations were read as quaternions, False for matrices.
+        kitti: True for a dataset of KITTI.
     """
 
     measures: Literal["depth", "disparity", "points"] = "depth"
@@ -33,7 +33,7 @@ class Content:
     kitti: bool = False
 
     def holds(self, mistake: str) -> bool:
-        """True if the dataset holds what a mistake is about."""
+        """Return True if the mistake is possible in the dataset."""
         return self.quaternions or not mistake.startswith("quaternion")
 
 
@@ -43,12 +43,12 @@ class Mistake:
 
     Attributes:
         name: short, for programs.
-        text: what it is and what to do, where the measurement is an image.
-        intended: the intended pose of a given one, up to the choice of the world's axes; may be a reflection:
-            only `inv(intended_j) @ intended_i`, a rigid motion, is used.
-        scan_text: the same where the measurement is of a LiDAR; None = `text`.
-        matrix_text: the same where the rotations are matrices; None = `text`.
-        kitti_text: ending for KITTI.
+        text: the mistake and its remedy, for measurements that are images.
+        intended: function from a given pose to the intended pose, up to the choice of the world's axes. The
+            result may be a reflection: only `inv(intended_j) @ intended_i`, a rigid motion, is used.
+        scan_text: the same as `text` for a LiDAR; None = `text`.
+        matrix_text: the same as `text` for rotations given as matrices; None = `text`.
+        kitti_text: addition to the text for KITTI.
     """
 
     name: str
@@ -59,7 +59,7 @@ class Mistake:
     kitti_text: str = ""
 
     def text_for(self, content: Content) -> str:
-        """Mistake and remedy, in the words of the dataset's contents."""
+        """Return the mistake and its remedy, in words that suit the dataset."""
         text = self.text
         if self.scan_text is not None and content.measures == "points":
             text = self.scan_text
@@ -161,7 +161,7 @@ MISTAKES: tuple[Mistake, ...] = (
     ),
 )
 
-# Factors that correct the translations; dividing the depth by them would do as well.
+# Factors that correct the translations. Dividing the depth by the factor is the same.
 SCALES: tuple[tuple[float, str], ...] = (
     (0.001, "the translations are in millimetres, metres are expected: divide them by 1000"),
     (0.01, "the translations are in centimetres, metres are expected: divide them by 100"),
@@ -176,11 +176,11 @@ SCALES: tuple[tuple[float, str], ...] = (
 )
 
 
-_DEPTH_UNITS = (0.1, 0.2, 1000 / 6553.5, 5.0, 6.5535, 10.0)  # factors that integers of another unit explain
+_DEPTH_UNITS = (0.1, 0.2, 1000 / 6553.5, 5.0, 6.5535, 10.0)  # factors that mean integers in another unit
 
 
 def scale_text(factor: float, content: Content) -> str:
-    """Description of the mistake where translations must be multiplied by a factor, and what to do."""
+    """Return the mistake and its remedy when translations must be multiplied by a factor."""
     known = dict(SCALES)
     units = content.measures == "depth" and content.integer_depth
     if factor in known and (units or factor not in _DEPTH_UNITS):
@@ -202,12 +202,12 @@ _MEASUREMENT = {"depth": "depth", "disparity": "stereo depth", "points": "range"
 
 
 def alternatives_text(alternatives: tuple[str, ...]) -> str:
-    """Ending of a disagreement: the other mistakes that it may come from; empty without any."""
+    """Return the end of a sentence on a disagreement: other possible mistakes; empty without any."""
     return f" (these would fit as well: {', '.join(alternatives)})" if alternatives else ""
 
 
 def not_ruled_out_text(alternatives: tuple[str, ...]) -> str:
-    """Ending of an agreement: the mistakes that it does not rule out; empty without any."""
+    """Return the end of a sentence on an agreement: mistakes that are still possible; empty without any."""
     if not alternatives:
         return ""
     return (

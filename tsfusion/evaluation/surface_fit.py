@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Registration of two surfaces of one place, their fit, and what speaks against it."""
+"""Register two surfaces of one scene, measure how well they fit, and look for evidence against the fit."""
 
 from collections.abc import Sequence
 from importlib.util import find_spec
@@ -16,11 +16,11 @@ from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.se3 import Transform
 
-_AGREE = 0.8  # least cosine between normals of one surface
-_REACH = 2.0  # cells within which the other surface is looked for
-_PARALLEL = 0.95  # least cosine between normals of one surface, of which places are compared
+_AGREE = 0.8  # cosine between two normals of one surface, at least
+_REACH = 2.0  # cells, distance within which the other surface is searched
+_PARALLEL = 0.95  # the same where offsets between the surfaces are compared
 _LEAST_PART, _HALVINGS = 50, 3  # cells
-_DEPTH_MARGIN = 0.02  # of the depth, by which a point lies before a measurement at least to be seen through
+_DEPTH_MARGIN = 0.02  # share of the depth; a camera saw through points nearer than the measurement by more
 _INSTALL = (
     "maps are aligned with Open3D and scipy: pip install '.[align]' in your clone of tsfusion, with a Python "
     "up to 3.12"
@@ -28,23 +28,24 @@ _INSTALL = (
 _SEEDS = 4  # runs of RANSAC
 _FEATURE_RADIUS = 5.0  # cells
 _FEATURE_POINTS = 100
-_NEAREST = 1.5  # cells between points that belong together
-_EDGE_LENGTHS = 0.9  # least ratio of two sides of a triangle that belong together
+_NEAREST = 1.5  # cells between two points that are one, at most
+_EDGE_LENGTHS = 0.9  # smallest ratio of two triangle sides that are one
 _ITERATIONS, _CONFIDENCE = 100_000, 0.999
 _ICP_ITERATIONS = 60
-_LOSS = 0.7  # of the reach: distances beyond it do not pull
-_ICP_REACH = (3.0, 1.5, 0.6)  # cells, one after the other
+_LOSS = 0.7  # share of the reach; larger distances have no effect
+_ICP_REACH = (3.0, 1.5, 0.6)  # cells, for each run of ICP
 
 
 class SurfaceFit(msgspec.Struct, frozen=True):
-    """The fit of a surface to another.
+    """Fit of one surface to another.
 
     Attributes:
-        overlap: share of the smaller surface that lies on the other, 0 to 1.
-        rmse_m: of the distances between the two where they overlap, metres; NaN where they do not.
-        constraint: 0 to 1; how firmly the overlap holds the direction (or turn) in which it could most
-            easily slide. A plane, a ball or a straight corridor has about 0; of three planes, each across
-            the others, it is about 0.1.
+        overlap: share of the smaller surface that lies on the other surface, 0 to 1.
+        rmse_m: root mean square distance between the surfaces where they overlap, metres; NaN without
+            overlap.
+        constraint: 0 to 1, how firmly the overlap holds the surfaces in the direction (or rotation) that is
+            held least. About 0 for a plane, a ball or a straight corridor, about 0.1 for three planes at
+            right angles.
         matches: number of cells that overlap.
     """
 
@@ -57,10 +58,10 @@ class SurfaceFit(msgspec.Struct, frozen=True):
 def nearest(
     points: NDArray[np.floating], targets: NDArray[np.floating]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """(distance, index) of the nearest of `targets` (m, 3) for each of `points` (n, 3); infinite without any.
+    """Return (distance, index) of the nearest of `targets` (m, 3) to `points` (n, 3); inf without targets.
 
     Raises:
-        MissingDependency: without scipy.
+        MissingDependency: scipy is not installed.
     """
     try:
         from scipy.spatial import cKDTree
@@ -73,7 +74,7 @@ def nearest(
 
 
 class SampledSurface:
-    """One point with a normal for each cell of a mesh: (n, 3) each."""
+    """One point with a normal for each cell of a mesh, (n, 3) each."""
 
     def __init__(self, mesh: Mesh, cell: float) -> None:
         self.cell = cell
@@ -85,22 +86,22 @@ class SampledSurface:
             for values in (mesh.vertices, mesh.normals)
         )
         length = np.linalg.norm(normals, axis=1)
-        is_flat = length > _AGREE  # in others there are two sides of something thin
+        is_flat = length > _AGREE  # other cells hold both sides of a thin object
         self.points, self.normals = points[is_flat], normals[is_flat] / length[is_flat, None]
 
     def moved(self, T: Transform) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Points and normals after a (4, 4) transform."""
+        """Return points and normals after a (4, 4) transform."""
         return se3.apply(T, self.points), self.normals @ T[:3, :3].T
 
 
 def fit(a: SampledSurface, b: SampledSurface, T_a_b: Transform, tolerance: float) -> SurfaceFit:
-    """The fit of surface `b`, moved by `T_a_b`, to surface `a`.
+    """Return the fit of surface `b`, moved by `T_a_b`, to surface `a`.
 
     Args:
-        tolerance: metres along the normal within which both are one surface.
+        tolerance: metres along the normal; two points within it are on one surface.
 
     Raises:
-        MissingDependency: without scipy.
+        MissingDependency: scipy is not installed.
     """
     points, normals = b.moved(T_a_b)
     distance, index = nearest(points, a.points)
@@ -116,7 +117,7 @@ def fit(a: SampledSurface, b: SampledSurface, T_a_b: Transform, tolerance: float
 
 
 def _constraint(points: NDArray[np.float64], normals: NDArray[np.float64]) -> float:
-    """The least eigenvalue of the information of point-to-plane distances, for a surface of unit size."""
+    """Return the smallest eigenvalue of the information of point-to-plane distances, at unit size."""
     arms = points - points.mean(axis=0)
     arms /= max(float(np.sqrt((arms**2).sum(axis=1).mean())), 1e-9)
     J = np.hstack([normals, np.cross(arms, normals)])
@@ -124,17 +125,17 @@ def _constraint(points: NDArray[np.float64], normals: NDArray[np.float64]) -> fl
 
 
 def parts_spread(a: SampledSurface, b: SampledSurface, T_a_b: Transform, reach: float) -> float:
-    """Distance between the places at which parts of the common surface want surface `b`, metres.
+    """Return by how many metres parts of the common surface disagree about the position of surface `b`.
 
-    Along each of three directions, parts whose normals lie along it say by the median of their offsets where
-    `b` should be. Parts of a map that has drifted disagree, though the fit's residual is small: a robust fit
-    leaves out what does not fit.
+    Three directions are checked. In each, parts of the surface with normals along the direction give a
+    position of `b`, by the median of their offsets. Parts of a map that has drifted disagree, though the
+    fit's residual is small: a robust fit leaves out what does not fit.
 
     Args:
-        reach: metres within which the other surface is looked for.
+        reach: metres within which the other surface is searched.
 
     Raises:
-        MissingDependency: without scipy.
+        MissingDependency: scipy is not installed.
     """
     points, normals = b.moved(T_a_b)
     distance, index = nearest(points, a.points)
@@ -152,7 +153,7 @@ def parts_spread(a: SampledSurface, b: SampledSurface, T_a_b: Transform, reach: 
 
 
 def _split(points: NDArray[np.float64], part: NDArray[np.intp], halvings: int) -> list[NDArray[np.intp]]:
-    """Split points into parts of equal size, each cut across its longest side; none of fewer than 50."""
+    """Split points into parts of equal size, by cuts across the longest side; drop parts below 50 points."""
     if len(part) < _LEAST_PART:
         return []
     if not halvings or len(part) < 2 * _LEAST_PART:
@@ -162,11 +163,11 @@ def _split(points: NDArray[np.float64], part: NDArray[np.intp], halvings: int) -
 
 
 class SeenDepth:
-    """The depth image of a keyframe, to ask whether its camera looked through a point.
+    """Depth image of a keyframe, which tells whether the camera looked through a point.
 
     Args:
-        keyframe: of depth or disparity.
-        voxel_size: metres; what is nearer than two to a measurement counts as seen.
+        keyframe: with depth or disparity.
+        voxel_size: metres; a point nearer to a measurement than two voxels counts as seen.
     """
 
     def __init__(self, keyframe: Keyframe, voxel_size: float) -> None:
@@ -176,9 +177,9 @@ class SeenDepth:
         self._margin = 2 * voxel_size
 
     def looks(self, points: NDArray[np.float64]) -> tuple[int, int]:
-        """How many of (n, 3) points of the world the camera looked through, and how many it saw.
+        """Return how many of (n, 3) world points the camera looked through, and how many it saw.
 
-        Points out of view, hidden ones and those where it measured nothing are neither.
+        Points out of view, hidden, or without a measured depth are not counted.
         """
         x, y, z = se3.apply(self._T_camera_world, points).T
         K, (height, width) = self._K, self._near.shape
@@ -193,7 +194,7 @@ class SeenDepth:
 
 
 def _depth_range(keyframe: Keyframe) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """The least and the greatest depth around each pixel, metres; NaN where one is not measured."""
+    """Return the smallest and largest depth around each pixel, metres; NaN where one pixel has none."""
     measured = keyframe.measurement.astype(np.float32)
     with np.errstate(all="ignore"):
         if keyframe.kind == "disparity":
@@ -210,28 +211,28 @@ def _depth_range(keyframe: Keyframe) -> tuple[NDArray[np.float32], NDArray[np.fl
 
 
 def open3d() -> Any:
-    """The library.
+    """Import Open3D.
 
     Raises:
-        MissingDependency: without it.
+        MissingDependency: Open3D is not installed.
     """
     try:
         import open3d
     except ImportError as error:
         raise MissingDependency(_INSTALL) from error
-    open3d.utility.set_verbosity_level(open3d.utility.VerbosityLevel.Error)  # it warns of every bad guess
+    open3d.utility.set_verbosity_level(open3d.utility.VerbosityLevel.Error)  # it warns for every bad guess
     return open3d
 
 
 def check_installed() -> None:
-    """Raise MissingDependency where Open3D or scipy is not installed, without loading them."""
+    """Raise MissingDependency if Open3D or scipy is not installed, without importing them."""
     for name in ("open3d", "scipy"):
         if find_spec(name) is None:
             raise MissingDependency(_INSTALL)
 
 
 class SurfaceRegistration:
-    """Two surfaces, of which the second is brought onto the first: two cells, points and features each."""
+    """Registration of surface `b` to surface `a`, with point features by Open3D."""
 
     def __init__(self, a: SampledSurface, b: SampledSurface) -> None:
         self._o3d = open3d()
@@ -240,7 +241,7 @@ class SurfaceRegistration:
         self._cell = a.cell
 
     def candidates(self) -> list[Transform]:
-        """Likely `T_a_b`, (4, 4) each, as RANSAC finds them from several seeds; not refined."""
+        """Return likely `T_a_b`, (4, 4) each, found by RANSAC with several seeds and not refined."""
         found, registration = [], self._registration
         features = [self._features(cloud) for cloud in (self._b, self._a)]
         reach = _NEAREST * self._cell
@@ -260,7 +261,7 @@ class SurfaceRegistration:
         return found
 
     def refined(self, T_a_b: Transform, reaches: Sequence[float] = _ICP_REACH) -> Transform:
-        """The transform after point-to-plane ICP, with a shorter reach each time, in cells."""
+        """Return the transform after runs of point-to-plane ICP, each with its reach in cells."""
         T = T_a_b
         registration = self._registration
         enough = registration.ICPConvergenceCriteria(1e-7, 1e-7, _ICP_ITERATIONS)

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Do the poses hold together? Every step of the trajectory, and frames of one place at distant times.
+"""Check a whole trajectory for jumps between frames, and for drift between distant visits of one scene.
 
-`pose_check` compares neighbours in a few places: a jump lies between two that it may not look at, and drift
-between no two. A step that is unlike those around it is a jump where the frames fit the usual motion, too,
-either clearly better than the given one, or as well while no sensor accelerates like that. Frames of one
-place seen again show drift where they fit only after a shift, and frames beside them after the same.
+`pose_check` compares neighbouring frames at a few times. It may not look at the two frames of a jump, and
+sees no drift. A step unlike the steps around it is a jump in two cases: the frames fit the usual motion
+clearly better, or they fit it equally well and no sensor accelerates like that. Two frames of one scene, seen
+again later, show drift if they fit only after a shift, and the frames beside them fit after the same shift.
 """
 
 from collections.abc import Callable, Iterator
@@ -20,31 +20,31 @@ from tsfusion.evaluation.frame_pairs import MIN_FIT, FramePair, best_near
 from tsfusion.geometry import se3
 from tsfusion.geometry.se3 import Transform
 
-AROUND = 3  # steps before and after one that show the usual motion
-MOST_STEPS = 3  # whose frames are compared
-UNUSUAL = 4.0  # times as far from the usual motion as nine tenths of all steps
-SURE_FIT = 0.6  # that a correction must reach
-SURE_GAIN = 0.15  # by which it must fit better
-AS_GOOD = 0.02  # difference of two fits that counts as none
+AROUND = 3  # steps before and after a step, which show the usual motion
+MOST_STEPS = 3  # steps whose frames are compared
+UNUSUAL = 4.0  # times the distance from the usual motion that nine tenths of all steps have
+SURE_FIT = 0.6  # fit that a correction must reach
+SURE_GAIN = 0.15  # increase of the fit that a correction must give
+AS_GOOD = 0.02  # two fits with a smaller difference count as equal
 STRONGEST = 30.0  # m/s²; no sensor that is carried or driven accelerates more from frame to frame
-VIOLENT = 100.0  # m/s², where the frames show nothing
-COARSE = (16.0, 8.0, 4.0, 2.0)  # tolerances over the sensor's own, to search for a shift from far off
-MOST_POSES = 300  # among which places seen again are searched for
+VIOLENT = 100.0  # m/s²; a jump even if the frames show nothing
+COARSE = (16.0, 8.0, 4.0, 2.0)  # factors on the sensor's tolerance, to find a large shift
+MOST_POSES = 300  # poses among which later visits are searched
 MOST_REVISITS = 8
-MIN_WAY = 1.0  # between two visits: metres over the depth, plus radians
-SAME_VIEW = 0.5  # the same between two views of one place, at most
-SAME_SHIFT = 0.4  # of a shift: its difference from that of the frames beside, at most
-MIN_DRIFTED = 2  # pairs of visits
+MIN_WAY = 1.0  # between two visits: metres divided by the depth, plus radians
+SAME_VIEW = 0.5  # the same measure between two views of one scene, at most
+SAME_SHIFT = 0.4  # of a shift: largest difference from the shift of the frames beside
+MIN_DRIFTED = 2  # pairs of visits that must show drift
 
 
 @dataclass(frozen=True)
 class PoseFault:
-    """A place where poses are surely wrong.
+    """Two frames between which poses are surely wrong.
 
     Attributes:
-        mistake: a step that was not made, or one place that has moved in the meantime.
+        mistake: `jump` = a step that was not made; `drift` = one scene at two positions.
         frames: indices of the two frames.
-        metres: by how much.
+        metres: size of the error.
     """
 
     mistake: Literal["jump", "drift"]
@@ -55,7 +55,7 @@ class PoseFault:
 
 @dataclass(frozen=True, eq=False)
 class _Track:
-    """The frames with a pose: indices, (n, 4, 4) poses, (n,) seconds; not `timed` = at thirty a second."""
+    """Frames with a pose: indices, (n, 4, 4) poses, (n,) seconds. Without `timed`, the times are nominal."""
 
     indices: NDArray[np.intp]
     poses: Transform
@@ -66,10 +66,10 @@ class _Track:
 def find_fault(
     dataset: Dataset, compare: Callable[[int, int], FramePair | None], range_m: float
 ) -> PoseFault | None:
-    """The first fault of a dataset's poses; None where none is sure.
+    """Return the first fault of a dataset's poses, or None if none is sure.
 
     Args:
-        compare: two frames by their indices; None where one has no surface.
+        compare: function from two frame indices to the pair; it returns None if a frame has no surface.
         range_m: typical depth, metres.
 
     Raises:
@@ -82,7 +82,7 @@ def find_fault(
 
 
 def apart(range_m: float) -> float:
-    """Metres between two places of one surface that are more than noise of good poses, at a typical depth."""
+    """Return the metres between two positions of one surface that good poses do not exceed by noise."""
     return 0.02 + 0.03 * range_m
 
 
@@ -121,10 +121,10 @@ def _jump(track: _Track, compare: Callable[[int, int], FramePair | None], range_
 def _jumped(
     pair: FramePair | None, usual: Transform, range_m: float, *, moved: float, force: float, is_timed: bool
 ) -> float:
-    """Distance by which a step surely jumps, metres; 0 = none, or nobody can tell.
+    """Return the metres by which a step surely jumps, or 0 if it does not or is not sure.
 
     Args:
-        usual: motion that the steps around let expect; it is `moved` metres off, and needs a `force` in m/s².
+        usual: motion expected from the steps around. It is `moved` metres off, and needs a `force` in m/s².
     """
     by_force = moved if is_timed and force > VIOLENT else 0.0
     if pair is None:
@@ -149,7 +149,7 @@ def _drift(
             continue
         best, fitting = best_near(pair, pair.motion(), coarse=COARSE)
         given = pair.fit(pair.motion())
-        strange += best < MIN_FIT  # of one place by the poses, and yet they show nothing alike
+        strange += best < MIN_FIT  # of one scene by the poses, but without a fit
         place = np.median(se3.apply(pair.poses[0], pair.first_view.points.T), axis=0)
         far = float(np.linalg.norm(_shift(pair, fitting, place)))
         if best < SURE_FIT or best - given < SURE_GAIN or far <= apart(range_m):
@@ -170,13 +170,13 @@ def _drift(
 
 
 def _shift(pair: FramePair, fitting: Transform, place: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Shift (3,) of a place (3,) that makes the pair fit: both in the world's axes, metres."""
+    """Return the shift (3,) of a point `place` (3,) that makes the pair fit, in the world's axes, metres."""
     T = pair.poses[1] @ fitting @ se3.inverse(pair.poses[0])
     return np.asarray(se3.apply(T, place[None])[0] - place)
 
 
 def _revisits(track: _Track, range_m: float) -> Iterator[tuple[int, int]]:
-    """Places in the track of frames that see one place, with a long way between: the longest first."""
+    """Yield index pairs of the track: frames that see one scene with a long way between, longest first."""
     chosen = np.unique(np.linspace(0, len(track.poses) - 1, MOST_POSES).astype(np.intp))
     poses, steps = track.poses[chosen], np.diff(track.poses, axis=0)[:, :3, 3]
     R, t = poses[:, :3, :3], poses[:, :3, 3] / range_m
@@ -198,7 +198,7 @@ def _revisits(track: _Track, range_m: float) -> Iterator[tuple[int, int]]:
 
 
 def _frames(track: _Track, first: int, second: int) -> str:
-    """Two frames of a track in words, with their times where they are known."""
+    """Return two frames of a track in words, with their times if known."""
     numbers = f"frame {track.indices[first]} to {track.indices[second]}"
     if not track.timed:
         return numbers

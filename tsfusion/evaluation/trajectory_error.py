@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Error of an estimated trajectory (Sturm et al., "A benchmark for RGB-D SLAM systems", 2012)."""
+"""Compute the error of an estimated trajectory (Sturm et al., "A benchmark for RGB-D SLAM systems", 2012)."""
 
 import logging
 from pathlib import Path
@@ -18,13 +18,13 @@ log = logging.getLogger(__name__)
 
 
 class TrajectoryError(msgspec.Struct, frozen=True, kw_only=True):
-    """Absolute trajectory error, metres, over `count` poses, and drift.
+    """Absolute trajectory error over `count` poses, metres, and drift.
 
     Attributes:
-        length: metres of the reference's path.
-        drift_percent: distance between the ends of both paths after their first poses were made equal, in
-            percent of `length`; 0 where `length` is 0.
-        rotation_deg: mean angle between the two orientations after the same alignment.
+        length: length of the reference's path, metres.
+        drift_percent: distance between the ends of both paths in percent of `length`, after their first poses
+            were made equal; 0 if `length` is 0.
+        rotation_deg: mean angle between the two orientations after the alignment of positions.
     """
 
     count: int
@@ -42,7 +42,7 @@ class TrajectoryError(msgspec.Struct, frozen=True, kw_only=True):
 def umeyama(
     source: NDArray[np.floating], target: NDArray[np.floating], *, with_scale: bool = False
 ) -> tuple[NDArray[np.float64], float]:
-    """The rigid motion that brings (n, 3) points nearest to others (Umeyama 1991, eq. 34-43).
+    """Find the rigid motion that brings (n, 3) points nearest to others (Umeyama 1991, eq. 34-43).
 
     Returns:
         (4, 4) rotation and translation, and the scale (1 without `with_scale`): target ≈ scale·R·source + t.
@@ -58,10 +58,10 @@ def umeyama(
 
 
 def absolute_error(estimate: Poses, reference: Poses, *, align: bool = True) -> TrajectoryError:
-    """ATE of poses in pairs, after the best rigid motion (`align`): the paper's table, `evo_ape -a`.
+    """Return the error of paired poses after the best rigid motion (`align`), as `evo_ape -a` does.
 
     Raises:
-        DatasetError: for fewer than 2 pairs, or unequal numbers.
+        DatasetError: there are fewer than 2 pairs, or unequal numbers of poses.
     """
     if len(estimate) != len(reference) or len(estimate) < 2:
         raise DatasetError(
@@ -72,7 +72,7 @@ def absolute_error(estimate: Poses, reference: Poses, *, align: bool = True) -> 
     traces = np.einsum("nij,nij->n", aligned[:, :3, :3], reference[:, :3, :3])
     angles = np.degrees(np.arccos(np.clip((traces - 1) / 2, -1, 1)))
     length = float(np.linalg.norm(np.diff(reference[:, :3, 3], axis=0), axis=1).sum())
-    error = error.round(12)  # picometres: what is less comes of the arithmetic
+    error = error.round(12)  # picometres: smaller differences are rounding errors
     return TrajectoryError(
         count=len(error),
         min=float(error.min()),
@@ -88,14 +88,14 @@ def absolute_error(estimate: Poses, reference: Poses, *, align: bool = True) -> 
 
 
 def aligned_to(estimate: Poses, reference: Poses) -> Poses:
-    """The estimate after the rigid motion that brings its positions nearest to the reference's."""
+    """Return the estimate after the rigid motion that brings its positions nearest to the reference's."""
     T, _ = umeyama(estimate[:, :3, 3], reference[:, :3, 3])
     moved: Poses = T @ estimate
     return moved
 
 
 def _end_error(estimate: Poses, reference: Poses) -> float:
-    """Metres between the last positions, each in the axes of its first pose."""
+    """Return the metres between the last positions, each relative to the first pose of its trajectory."""
     ends = [np.linalg.solve(poses[0], poses[-1]) for poses in (estimate, reference)]
     return float(np.linalg.norm(ends[0][:3, 3] - ends[1][:3, 3]))
 
@@ -103,10 +103,10 @@ def _end_error(estimate: Poses, reference: Poses) -> float:
 def associate(
     first_ns: NDArray[np.int64], second_ns: NDArray[np.int64], max_difference_ns: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Indices of poses that belong together by time: each of the shorter list with the nearest of the other.
+    """Return the indices of poses paired by time: each of the shorter list with the nearest of the other.
 
     Raises:
-        DatasetError: when none are within `max_difference_ns`.
+        DatasetError: no two times are within `max_difference_ns`.
     """
     swapped = len(first_ns) > len(second_ns)
     few, many = (second_ns, first_ns) if swapped else (first_ns, second_ns)
@@ -126,14 +126,15 @@ def _span(stamps_ns: NDArray[np.int64]) -> str:
 
 
 def dataset_trajectory(dataset: Dataset) -> tuple[NDArray[np.int64] | None, Poses]:
-    """The poses of a recording's frames.
+    """Read the poses of a recording's frames.
 
     Returns:
-        (n,) timestamps in nanoseconds, None where none were recorded, and (n, 4, 4) poses, NaN where a frame
-        has none.
+        (n,) timestamps in nanoseconds, or None without timestamps; and (n, 4, 4) poses, NaN for frames
+        without a
+        pose.
 
     Raises:
-        DatasetError: when no frame has.
+        DatasetError: no frame has a pose.
     """
     found = [pose_of(dataset, index) for index in range(len(dataset))]
     if all(T is None for T in found):
@@ -144,13 +145,14 @@ def dataset_trajectory(dataset: Dataset) -> tuple[NDArray[np.int64] | None, Pose
 def paired(
     estimate: Path, reference: Path | Dataset, *, max_difference_s: float = 0.01
 ) -> tuple[Poses, Poses]:
-    """The poses of two files (or a file and a recording) that belong together, and the log says which share.
+    """Pair the poses of two files, or of a file and a recording. The log tells which share has a partner.
 
-    They are paired by time where both have times; frames of a recording without times by the numbers that
-    `tsfusion scan` writes as times; else line by line.
+    Poses are paired by time if both have times. The frames of a recording without times get the times that
+    `tsfusion scan` writes for their numbers. Otherwise poses are paired line by line.
 
     Raises:
-        DatasetError: when less than half of the shorter one is paired, or without times for unequal numbers.
+        DatasetError: less than half of the shorter trajectory is paired, or the numbers of poses differ and
+            there are no times.
     """
     stamps, poses = read_poses(estimate)
     of_reference = read_poses(reference) if isinstance(reference, Path) else dataset_trajectory(reference)
@@ -183,7 +185,7 @@ def _known(poses: Poses) -> Poses:
 
 
 def _tell_share(pairs: int, shorter: int, max_difference_s: float) -> None:
-    """Say how many poses have a partner; raise DatasetError below half."""
+    """Log how many poses have a partner. Raise DatasetError if it is less than half."""
     text = f"{pairs} of {shorter} poses have a partner within {max_difference_s:g} s"
     if 2 * pairs < shorter:
         raise DatasetError(
@@ -194,7 +196,7 @@ def _tell_share(pairs: int, shorter: int, max_difference_s: float) -> None:
         log.warning("%s; the error is of these", text)
 
 
-_NARROWEST = 0.4  # of the view's longer side
+_NARROWEST = 0.4  # of the view's longer side: shorter side, at least
 
 
 def draw(estimate: Poses, reference: Poses, path: Path, *, align: bool = True) -> None:
@@ -232,7 +234,7 @@ def draw(estimate: Poses, reference: Poses, path: Path, *, align: bool = True) -
 
 
 def _limits(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Lower and upper limits, (2, 2), with a margin; a straight way is still seen in a window, not a slit."""
+    """Return lower and upper limits, (2, 2), with a margin. A straight way gets a window, not a slit."""
     extent = high - low
     wanted = np.maximum(1.1 * extent, _NARROWEST * extent.max() or 1.0)
     middle = (low + high) / 2
