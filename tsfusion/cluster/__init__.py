@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Maps fused by many processes, of this machine or of a cluster: parts of a journal, and their sum."""
+"""Fuse parts of journals and datasets by many processes, on one machine or a cluster, and add the parts."""

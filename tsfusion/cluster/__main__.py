@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A worker process: jobs come on stdin, messages leave on stdout; it ends with its stdin."""
+"""Run a worker process: read jobs from stdin, write messages to stdout, and end when stdin closes."""
 
 import os
 import signal
@@ -18,9 +18,9 @@ LENGTH = struct.Struct("<I")  # before each job and each message
 def main() -> None:
     """Do jobs until there are no more."""
     process.on_parent_end(signal.SIGKILL)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for whoever gives the jobs
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that gives the jobs handles Ctrl-C
     answers = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # what libraries print is no message
+    os.dup2(2, 1)  # output of libraries goes to stderr: stdout is for messages
     from tsfusion.cluster import job_runner
 
     while (job := _next(sys.stdin.buffer)) is not None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A map of journals and datasets, fused by many workers: shares of the keyframes, their sum, its surface."""
+"""Fuse journals and datasets into one map by many workers: fuse shares of keyframes, add them, mesh."""
 
 import hashlib
 import os
@@ -29,16 +29,16 @@ from tsfusion.pipelines.runs import run_files
 from tsfusion.tsdf.files import checkpoint
 
 TILES = "tiles"  # folder of a mesh in tiles
-_MOST_KEYFRAMES = 512  # a job: what a lost worker costs
-_FAN_IN = 8  # maps that are added at once: each is read once, and takes memory for one chunk
+_MOST_KEYFRAMES = 512  # of a job: so many are fused again if its worker is lost
+_FAN_IN = 8  # maps added at once: each is read once and needs memory for one chunk
 _PLAN = "plan"
 
 
 class Display(Protocol):
-    """Shows a person how far a run is."""
+    """Shows the user the progress of a run."""
 
     def stage(self, text: str) -> None:
-        """Announce the next part of the run."""
+        """Announce the next stage of the run."""
 
     def show_fused(self, read: int, fused: int, total: int) -> None:
         """Show how many keyframes are read and in a map."""
@@ -49,15 +49,15 @@ class Display(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class Wishes:
-    """Wishes of a person beside the map.
+    """Wishes of the user, apart from the settings of the map.
 
     Attributes:
-        up: away from the ground; None = it is found.
-        keep_islands: as of `mesh_files.write`.
-        worker_memory: bytes that each worker may take; None = no limit.
-        tile_size: metres, edge of a tile of the mesh; None = tiles are made, of a size that suits them, only
-            where the map does not fit into a worker's memory.
-        sensor: preset that all keyframes are taken to be of; None = each as it says.
+        up: up direction; None = it is found.
+        keep_islands: see `mesh_finishing.write`.
+        worker_memory: most bytes for each worker; None = no limit.
+        tile_size: metres, edge of a tile of the mesh. None = tiles of a suitable size, made only if the map
+            does not fit into a worker's memory.
+        sensor: sensor preset for all keyframes; None = the sensor that each keyframe names.
     """
 
     up: Up | None = None
@@ -71,13 +71,13 @@ class FusedRun(msgspec.Struct, frozen=True, kw_only=True):
     """Contents of `run.json`.
 
     Attributes:
-        keyframes: that were read, `keyframes_fused` of them in the map; `keyframes_lost`: at least so many
-            are damaged in the journals.
-        workers, scheduler: how many did it, and whose they were.
-        workers_lost: how often one ended before its job was done.
-        jobs, jobs_found: all of them, and those that an earlier run had done.
-        seconds: of the whole run by step; `worker_seconds`: CPU time that its jobs took.
-        worker_peak_rss: most memory that a worker took, bytes.
+        keyframes: number of keyframes read; `keyframes_fused` of them are in the map.
+        keyframes_lost: number (or more) that damage in the journals has destroyed.
+        workers, scheduler: number of workers, and the name of their scheduler.
+        workers_lost: how often a worker ended before its job was done.
+        jobs, jobs_found: number of all jobs, and of those that an earlier run had done.
+        seconds: wall time by step; `worker_seconds`: CPU time of its jobs.
+        worker_peak_rss: most memory of one worker, bytes.
         tiles: number of tiles of the mesh.
     """
 
@@ -118,7 +118,7 @@ class _Clock:
 
     @contextmanager
     def step(self, name: str) -> Iterator[list[JobDone]]:
-        """Time a step; the block puts there what its jobs said in the end."""
+        """Time a step. The block fills the list with the `JobDone` messages of its jobs."""
         begin, ended = time.monotonic(), list[JobDone]()
         yield ended
         self.seconds[name] = round(time.monotonic() - begin, 3)
@@ -129,7 +129,7 @@ class _Clock:
 
 
 def check(config: VolumeConfig) -> None:
-    """Raise InvalidConfig for settings with which a map is no sum."""
+    """Raise InvalidConfig for settings with which maps of parts do not add up."""
     if config.checked_model().regularizer != "off":
         raise InvalidConfig(
             "smoothing along rays depends on the order of keyframes, so that parts of it do not add up: fuse "
@@ -147,21 +147,20 @@ def fuse(
     wishes: Wishes | None = None,
     overwrite: bool = False,
 ) -> FusedRun:
-    """Fuse keyframes with a scheduler's workers; what it leaves is in the folder of the result.
+    """Fuse keyframes with a scheduler's workers, and leave the results in a folder.
 
-    A run that was interrupted goes on where it was, when it is started again with the same keyframes,
-    settings and folder.
+    An interrupted run goes on when it is started again with the same keyframes, settings and folder.
 
     Args:
         out: folder of `map.tsf`, `mesh.ply`, `mesh.glb`, `run.json`; None = a dated one.
-        make_scheduler: starts it; it is closed at the end.
+        make_scheduler: starts the scheduler, which is closed at the end.
 
     Raises:
-        InvalidConfig: for settings with which a map is no sum.
+        InvalidConfig: for settings with which maps of parts do not add up.
         OutputError: when `out` cannot be written, or holds files already; for a map without a surface.
         MapFull, WeightOverflow: when the sum has no room.
-        WorkerLost: where one worker after the other ends at the same job.
-        TsfusionError: as whatever a job raises.
+        WorkerLost: when one worker after the other ends at the same job.
+        TsfusionError: any error of a job.
     """
     check(config)
     run_files.check_folder(out)
@@ -189,7 +188,7 @@ def _closing(scheduler: Scheduler) -> Iterator[Scheduler]:
 
 @contextmanager
 def _workplace(work: Path, fingerprint: str) -> Iterator[Path]:
-    """The folder of what is half done: empty, or as an earlier run with the same plan left it."""
+    """Yield the folder of unfinished work: empty, or as an earlier run with the same plan left it."""
     try:
         make_folder(work)
         lock = folder_lock.hold(work)
@@ -227,7 +226,7 @@ class _Run:
         self._progress: dict[str, JobProgress] = {}
 
     def carry_out(self, scheduler: Scheduler, results: Path, folder: Path) -> FusedRun:
-        """Do all steps; the files of the results lie in `results` then."""
+        """Do all steps, and put the files of the results into `results`."""
         doing = CarryingOut(scheduler, self._work, self._watch)
         with self._clock.step("fusing") as ended:
             ended.extend(self._fuse(doing, scheduler.workers))
@@ -305,7 +304,7 @@ class _Run:
         self._display.show_fused(read, fused, self._found.count)
 
     def _add(self, doing: CarryingOut, files: list[str]) -> tuple[str, list[JobDone]]:
-        """Add maps as a tree; the file of the whole map, and what the jobs said."""
+        """Add maps as a tree. Return the file of the whole map, and the `JobDone` messages of the jobs."""
         ended: list[JobDone] = []
         if len(files) > 1:
             self._display.stage(f"adding {len(files)} parts of the map")
@@ -318,7 +317,7 @@ class _Run:
         return files[0], ended
 
     def _mesh_runs(self, doing: CarryingOut, file: str, blocks: int, workers: int) -> list[JobDone]:
-        """Parts of the whole mesh by all workers, where the map fits into the memory of one."""
+        """Mesh parts of the whole map by all workers, if the map fits into the memory of one."""
         self._display.stage("meshing")
         if self._wishes.worker_memory is not None:
             return []
@@ -382,7 +381,7 @@ class _Run:
         return {name: getattr(self._config, name) for name in VIEW_SETTINGS}
 
     def _collect(self, results: Path, file: str, mesh: JobDone, tiles: list[JobDone]) -> None:
-        """Move the files of the results out of the folder of what is half done."""
+        """Move the files of the results out of the folder of unfinished work."""
         try:
             os.replace(self._work / file, results / run_files.MAP)
             for name in mesh.files:
@@ -398,5 +397,5 @@ class _Run:
 
 
 def _digest(what: Any) -> str:
-    """A name for a job that is told from others by this."""
+    """Return a hash of `what`, to name a job by its input."""
     return hashlib.blake2b(msgspec.msgpack.encode(what), digest_size=6).hexdigest()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A job, done in this process: Taichi starts here."""
+"""Do a job in this process, which starts Taichi."""
 
 import gc
 import secrets
@@ -46,13 +46,13 @@ from tsfusion.tsdf.volume import Volume
 _PROGRESS_S = 0.2
 _SPARE = 0.15  # share of a worker's memory for rays, chunks and what the allocator keeps
 _LEAST_MAP_BYTES = 32 << 20
-_MESHING = 1.5  # memory of a map that is meshed in one piece, against that of its blocks
-_MESHING_BYTES = 160 << 20  # that meshing part by part takes beside them
-Doing = Generator[JobProgress, None, dict[str, Any]]  # what it gives in the end are fields of `Done`
+_MESHING = 1.5  # memory to mesh a map in one piece, as a multiple of its blocks' memory
+_MESHING_BYTES = 160 << 20  # memory to mesh part by part, beside the blocks
+Doing = Generator[JobProgress, None, dict[str, Any]]  # returns fields of `JobDone`
 
 
 def run(job: AnyJob) -> Iterator[JobMessage]:
-    """Do a job. The last message is its end: `JobDone`, or `JobFailed` where nobody could do it."""
+    """Do a job. The last message is `JobDone`, or `JobFailed` if no worker can do the job."""
     folder = Path(job.folder)
     begin, cpu = time.monotonic(), time.process_time()
     base = process.rss_bytes()
@@ -81,7 +81,7 @@ def run(job: AnyJob) -> Iterator[JobMessage]:
 
 
 def _new(folder: Path, name: str, suffix: str) -> Path:
-    """A name that no attempt at the job has had."""
+    """Return a path that no attempt at the job has used."""
     return folder / f"{name}-{secrets.token_hex(4)}{suffix}"
 
 
@@ -89,7 +89,7 @@ def _new(folder: Path, name: str, suffix: str) -> Path:
 
 
 class _JobParts:
-    """The map of some keyframes, which goes to a file and begins anew when it is as large as it may be."""
+    """Map of some keyframes. At its memory limit it is written to a file, and a new map begins."""
 
     def __init__(self, job: jobs.FuseJob, folder: Path) -> None:
         self._job, self._folder = job, folder
@@ -106,7 +106,7 @@ class _JobParts:
             self._volume.limit_memory(self._budget)
 
     def add(self, keyframe: Any) -> None:
-        """Integrate a keyframe; raises MapError as `Volume.integrate`."""
+        """Integrate a keyframe. Raise MapError as `Volume.integrate` does."""
         if self._job.sensor is not None:
             keyframe = replace(keyframe, sensor=self._job.sensor)
         before = self._volume.keyframes
@@ -124,7 +124,7 @@ class _JobParts:
             self.fused += self._volume.keyframes - before
 
     def save(self, *, is_last: bool = False) -> None:
-        """Write the map to a file of its own; another one begins."""
+        """Write the map to a file of its own, and begin another map unless `is_last`."""
         if not self._volume.stats().blocks and self.files:
             return  # nothing came after the last one
         path = _new(self._folder, self._job.name, ".tsf")
@@ -157,10 +157,10 @@ def _fuse(job: jobs.FuseJob, folder: Path) -> Doing:
 
 
 def _budget(worker_memory: int, working: int = 0) -> int:
-    """Bytes that blocks may take.
+    """Return the number of bytes that blocks may take.
 
     Args:
-        working: bytes that the work takes beside them and what the process has now.
+        working: bytes that the job needs beside the blocks and the present memory of the process.
     """
     rest = int(worker_memory * (1 - _SPARE)) - process.rss_bytes() - working
     if rest < _LEAST_MAP_BYTES:
@@ -220,7 +220,7 @@ def _put_together(job: jobs.MeshMap, folder: Path) -> dict[str, Any]:
 
 
 def _written(job: jobs.MeshMap, folder: Path, mesh: Mesh, origin: Provenance) -> dict[str, Any]:
-    """Write the whole mesh; what the job says in the end."""
+    """Write the whole mesh. Return the fields of the job's `JobDone`."""
     if not len(mesh.faces):
         return {"files": [], "figures": _plain(mesh.figures, is_whole=True)}
     up = up_direction.find(mesh, mesh.held or HeldSensor(), given=job.up)
@@ -234,7 +234,7 @@ def _written(job: jobs.MeshMap, folder: Path, mesh: Mesh, origin: Provenance) ->
 
 
 def _plain(figures: dict[str, Any], **more: Any) -> dict[str, Any]:
-    """Figures that msgpack can hold."""
+    """Return figures as values that msgpack can hold."""
     found: dict[str, Any] = msgspec.to_builtins({**figures, **more})
     return found
 
@@ -260,7 +260,7 @@ def _tile_figures(mesh: Mesh) -> dict[str, Any]:
 
 
 def _at_once(do: Callable[[Any, Path], dict[str, Any]]) -> Callable[[Any, Path], Doing]:
-    """Doing of a job that says nothing until its end."""
+    """Make a doer of a job that sends no progress."""
 
     def doing(job: Any, folder: Path) -> Doing:
         yield from ()

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Jobs that workers do, and what they say meanwhile. A job is files in, files out: it can be done twice.
+"""Define the jobs of workers and their messages. A job reads files and writes files, so it can be repeated.
 
-Whoever does a job writes its files under names that nobody has had before, and `NAME.done`, which lists them,
-last. A worker that was taken for dead and went on does no harm.
+A worker writes a job's files under new names, and last `NAME.done`, which lists them. So a worker that was
+thought dead and goes on does no harm.
 """
 
 import hashlib
@@ -25,9 +25,9 @@ class JournalKeyframes(Struct, tag="journal", frozen=True):
     """Keyframes of a journal at their final poses.
 
     Attributes:
-        files: segments, by path or URL.
-        file: (n,) which of them each is in; `offsets`: where its record begins.
-        poses: (n, 12) float64 as bytes, the upper three rows of T_world_camera.
+        files: segments of the journal, by path or URL.
+        file: (n,) index into `files` for each keyframe; `offsets`: byte at which its record begins.
+        poses: (n, 12) float64 as bytes: the upper three rows of T_world_camera.
     """
 
     files: list[str]
@@ -39,19 +39,19 @@ class JournalKeyframes(Struct, tag="journal", frozen=True):
         return len(self.offsets)
 
     def part(self, first: int, stop: int) -> "JournalKeyframes":
-        """Keyframes first … stop-1."""
+        """Return keyframes first … stop-1."""
         poses = self.rows()[first:stop].tobytes()
         return JournalKeyframes(self.files, self.file[first:stop], self.offsets[first:stop], poses)
 
     def rows(self) -> NDArray[np.float64]:
-        """(n, 12)."""
+        """Return the poses as an (n, 12) array."""
         return np.frombuffer(self.poses, np.float64).reshape(-1, 12)
 
 
 class DatasetKeyframes(Struct, tag="dataset", frozen=True):
     """Keyframes first … stop-1 of a dataset that `open_dataset` opens with these options.
 
-    `state`: digest of its poses, and of which files it has.
+    `state` is a digest of its poses and of its files.
     """
 
     path: str
@@ -64,7 +64,7 @@ class DatasetKeyframes(Struct, tag="dataset", frozen=True):
         return self.stop - self.first
 
     def part(self, first: int, stop: int) -> "DatasetKeyframes":
-        """Keyframes first … stop-1 of these."""
+        """Return keyframes first … stop-1 of these."""
         return msgspec.structs.replace(self, first=self.first + first, stop=self.first + stop)
 
 
@@ -75,10 +75,10 @@ class Job(Struct, frozen=True, kw_only=True):
     """Fields of every job.
 
     Attributes:
-        name: of the job, distinct in its run.
-        folder: where its files go.
-        worker_memory: bytes that the whole process may take; None = no limit.
-        threads: of the kernels.
+        name: name of the job, unique in its run.
+        folder: folder for its files.
+        worker_memory: most bytes for the whole process; None = no limit.
+        threads: number of threads of the kernels.
     """
 
     name: str
@@ -88,16 +88,16 @@ class Job(Struct, frozen=True, kw_only=True):
 
 
 class FuseJob(Job, tag="fuse", frozen=True, kw_only=True):
-    """Make a map of keyframes; one that is larger than memory is left in several files."""
+    """Fuse keyframes into a map. A map larger than memory is written as several files."""
 
     config: VolumeConfig
     keyframes: list[KeyframeList]
-    sensor: str | None = None  # preset that all keyframes are taken to be of; None = each as it says
+    sensor: str | None = None  # sensor preset for all keyframes; None = as each names
     world: str = ""  # name of the keyframes' coordinate frame
 
 
 class Add(Job, tag="add", frozen=True, kw_only=True):
-    """Add saved maps, in one file."""
+    """Add saved maps into one file."""
 
     files: list[str]
 
@@ -115,11 +115,11 @@ class MeshMap(Job, tag="mesh", frozen=True, kw_only=True):
     """Mesh the whole map.
 
     Attributes:
-        file: the map.
-        runs: files of its `MeshRunJob` jobs, in their order; none = they are not made.
+        file: file of the map.
+        runs: files of its `MeshRunJob` jobs, in their order; empty without such jobs.
         view: settings of the surface that differ from the map's.
-        up: away from the ground; None = it is found.
-        keep_islands: as of `mesh_files.write`.
+        up: up direction; None = it is found.
+        keep_islands: see `mesh_finishing.write`.
     """
 
     file: str
@@ -130,7 +130,7 @@ class MeshMap(Job, tag="mesh", frozen=True, kw_only=True):
 
 
 class MeshTile(Job, tag="tile", frozen=True, kw_only=True):
-    """Mesh the cells of blocks low ≤ (x, y, z) < high of a map, with what lies around them."""
+    """Mesh the blocks low ≤ (x, y, z) < high of a map. Blocks around them are read, too."""
 
     file: str
     view: dict[str, Any]
@@ -151,14 +151,14 @@ class JobProgress(Struct, tag="progress", frozen=True):
 
 
 class JobDone(Struct, tag="done", frozen=True, kw_only=True):
-    """A job is done.
+    """Message at the end of a job.
 
     Attributes:
-        files: that it has written, in its folder; `digests` of their contents.
+        files: files written, in the job's folder; `digests` are those of their contents.
         left_out: reason → number of keyframes that the map could not take.
-        seconds, cpu_seconds: that it took.
-        figures: of what it made.
-        base_rss, peak_rss: memory of the process when the job began, and the most so far, bytes.
+        seconds, cpu_seconds: time that the job took.
+        figures: figures of the result.
+        base_rss, peak_rss: memory of the process when the job began, and its maximum so far, bytes.
     """
 
     name: str
@@ -175,7 +175,7 @@ class JobDone(Struct, tag="done", frozen=True, kw_only=True):
 
 
 class JobFailed(Struct, tag="failed", frozen=True):
-    """A job cannot be done, by whomever: `kind` of error, and why."""
+    """No worker can do this job: `kind` of error, and why."""
 
     name: str
     kind: str
@@ -183,7 +183,7 @@ class JobFailed(Struct, tag="failed", frozen=True):
 
 
 class JobLost(Struct, tag="lost", frozen=True):
-    """Whoever did a job has ended before it was done."""
+    """The worker of a job has ended before the job was done."""
 
     name: str
     why: str
@@ -193,7 +193,7 @@ JobMessage = JobProgress | JobDone | JobFailed | JobLost
 
 
 def digests(folder: Path, files: Iterable[str]) -> list[str]:
-    """Digests of the contents of files; raises OSError where one is missing."""
+    """Return digests of the contents of files. Raise OSError if a file is missing."""
     found = []
     for name in files:
         digest = hashlib.blake2b(digest_size=16)
@@ -205,5 +205,5 @@ def digests(folder: Path, files: Iterable[str]) -> list[str]:
 
 
 def done_file(folder: Path, name: str) -> Path:
-    """File in which a job writes that it is done."""
+    """Return the path of the file in which a job writes that it is done."""
     return folder / f"{name}.done"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Sources of a fusion: journals at their final poses, and datasets; listed by one process, read by others."""
+"""List the keyframes of journals (at final poses) and datasets in one process, read them in others."""
 
 import hashlib
 import logging
@@ -36,8 +36,8 @@ from tsfusion.tsdf.files.checkpoint import CheckpointHeader
 from tsfusion.wire.records import codec
 
 SYNTHETIC = "synthetic:"
-WORK = ".fuse"  # folder of a run's unfinished work, in that of its results
-_LISTS = (".log", ".json")  # files that stand for the recording in whose folder they lie
+WORK = ".fuse"  # folder of a run's unfinished work, inside its results' folder
+_LISTS = (".log", ".json")  # a file of this kind means the recording in its folder
 _MEASURED = re.compile(
     r"\.(?:png|jpe?g|tiff?|exr|np[yz]|pgm|bin|pcd|ply|la[sz]|bag|db3|mcap)$", re.IGNORECASE
 )  # fmt: skip
@@ -46,17 +46,17 @@ log = logging.getLogger(__name__)
 
 
 class Listed(msgspec.Struct):
-    """Keyframes that are to be fused.
+    """Keyframes to be fused.
 
     Attributes:
-        keyframes: of each source, in their order.
-        names: of the sources.
-        saved: settings of the saved map beside the first journal; empty = there is none.
-        sensor: of the first dataset; None = there is none.
+        keyframes: keyframes of each source, in order.
+        names: names of the sources.
+        saved: settings of the saved map beside the first journal; empty without such a map.
+        sensor: sensor of the first dataset; None without a dataset.
         usual: settings that are usual for the first dataset.
-        left_out: reason → number of records without a readable header, or of a dataset's frames.
-        lost: number of keyframes that damage in the journals has destroyed, at least.
-        absent: number of those of saved maps that the journals beside these no longer have.
+        left_out: reason → number of records without a readable header, or of frames of a dataset.
+        lost: number of keyframes (or more) that damage in the journals has destroyed.
+        absent: number of keyframes of saved maps that the journals beside them no longer have.
     """
 
     keyframes: list[KeyframeList] = []
@@ -71,7 +71,7 @@ class Listed(msgspec.Struct):
 
     @property
     def world(self) -> str:
-        """Name of the one coordinate frame of all sources; empty = poses were given, or there are several."""
+        """Name of the coordinate frame of all sources; empty for given poses or several frames."""
         return next(iter(self.worlds)) if len(self.worlds) == 1 else ""
 
     @property
@@ -80,7 +80,7 @@ class Listed(msgspec.Struct):
         return sum(map(len, self.keyframes))
 
     def shares(self, count: int) -> list[list[KeyframeList]]:
-        """All of them in `count` runs of about the same length; neighbours see the same blocks."""
+        """Return all keyframes in `count` runs of about the same length: neighbours see the same blocks."""
         ends = np.cumsum([len(one) for one in self.keyframes]).tolist()
         borders = np.linspace(0, self.count, count + 1).round().astype(int).tolist()
         found = []
@@ -94,7 +94,7 @@ class Listed(msgspec.Struct):
         return found
 
     def fingerprint(self, config: VolumeConfig, sensor: str | None) -> str:
-        """Digest of keyframes, their poses, settings and the sensor that they are taken to be of."""
+        """Return a digest of keyframes, their poses, settings and `sensor` (the preset for all)."""
         digest = hashlib.blake2b(digest_size=16)
         digest.update(msgspec.msgpack.encode((config, sensor, self.keyframes)))
         for one in self.keyframes:
@@ -111,18 +111,18 @@ def listed(
     options: dict[str, Any] | None = None,
     watch: OnProgress = lambda _done, _all: None,
 ) -> Listed:
-    """The keyframes of state folders, journals and datasets, which are in one coordinate frame.
+    """List the keyframes of state folders, journals and datasets that are in one coordinate frame.
 
     Args:
-        map_name: which map of a state folder with several.
-        same_frame: they are in one, also where scans found their poses each for itself.
-        options: of the datasets.
-        watch: told the bytes of a journal that are read, and all of them.
+        map_name: name of the map, where a state folder has several.
+        same_frame: the user declares one frame, even if each scan found its poses by itself.
+        options: options of the datasets.
+        watch: gets the number of bytes read of a journal, and of all.
 
     Raises:
-        JournalError, DatasetError: when one cannot be read, or holds no keyframe.
+        JournalError, DatasetError: when a source cannot be read, or has no keyframe.
         InvalidConfig: for options without a dataset.
-        MapError: when keyframes would count twice, or the frames are not known to be one.
+        MapError: when keyframes would count twice, or it is not known that the frames are the same.
     """
     found, left_out = Listed(), Counter[str]()
     seen = dict[tuple[bytes, int], str]()
@@ -183,8 +183,7 @@ def _journal(found: Listed, source: str, map_name: str | None, watch: OnProgress
 
 
 def saved_beside(path: Path, map_name: str | None) -> CheckpointHeader | None:
-    """The header of the saved map beside a journal; None = there is none. One that cannot be read is a
-    warning."""
+    """Return the header of the saved map beside a journal, or None. Warn if the map cannot be read."""
     if locations.is_url(path):
         return None
     folder = state_folder.resolve_map(path, map_name).absolute()
@@ -204,17 +203,16 @@ def saved_beside(path: Path, map_name: str | None) -> CheckpointHeader | None:
 
 
 def settings_of(header: CheckpointHeader | None) -> dict[str, Any]:
-    """The settings of a saved map, without what its sensor's preset says; empty = there is none."""
+    """Return the settings of a saved map without those of its sensor's preset; empty without a map."""
     saved = {} if header is None else msgspec.structs.asdict(header.config)
-    # None = what its preset says; how many threads there were is no property of a map
+    # None = the preset's value; the number of threads is no property of a map
     return {name: value for name, value in saved.items() if value is not None and name != "threads"}
 
 
 def absent(header: CheckpointHeader | None, keyframes: JournaledKeyframes) -> int:
-    """Number of a saved map's keyframes that the journal beside it no longer has, and that damage did not
-    cost.
+    """Return how many of a saved map's keyframes its journal no longer has, without those lost to damage.
 
-    None of one segment's, or of a map that is not known to be the journal's.
+    Return 0 for a single segment, and for a map that may not belong to the journal.
     """
     if header is None or "done" not in header.meta or journal.is_segment(Path(keyframes.name)):
         return 0
@@ -230,9 +228,9 @@ def absent(header: CheckpointHeader | None, keyframes: JournaledKeyframes) -> in
 
 
 def _check_once(sources: Sequence[str]) -> None:
-    """Refuse a source that is given twice: by links, as a URL of this machine, or a dataset's part beside it.
+    """Refuse a source given twice: by a link, as a local URL, or a dataset inside another one.
 
-    Of journals `_check_distinct` asks the records, wherever they lie.
+    Journals are compared by their records in `_check_distinct`, wherever they are stored.
     """
     places = [_place(one) for one in sources]
     for place, times in Counter(places).items():
@@ -253,7 +251,7 @@ def _check_once(sources: Sequence[str]) -> None:
 
 
 def _place(source: str) -> str:
-    """Name that tells a source from others: of this machine an absolute path without links."""
+    """Return a unique name of a source: an absolute path without links for files of this machine."""
     if source.startswith(SYNTHETIC):
         return source
     path = source.removeprefix("file://")
@@ -276,7 +274,7 @@ def _check_distinct(seen: dict[tuple[bytes, int], str], keyframes: JournaledKeyf
 
 
 def _add_dataset(found: Listed, source: str, options: dict[str, Any]) -> tuple[set[str], dict[str, int]]:
-    """Add a dataset; its world, and the frames that it left out, by reason."""
+    """Add a dataset. Return its world, and a dict of reason → number of frames left out."""
     dataset = open_dataset(source, **options)
     path = source if source.startswith(SYNTHETIC) else str(Path(source).expanduser().absolute())
     found.keyframes.append(DatasetKeyframes(path, options, 0, len(dataset), _state(dataset, path, options)))
@@ -289,17 +287,17 @@ def _add_dataset(found: Listed, source: str, options: dict[str, Any]) -> tuple[s
 
 
 def _state(dataset: Dataset, path: str, options: dict[str, Any]) -> str:
-    """Digest of a dataset's poses and camera, and of the files of measurements that it may be made of: names,
-    sizes and times; empty = it is computed."""
+    """Return a digest of a dataset's poses and camera, and of names, sizes and times of its files, or an
+    empty text for a synthetic dataset."""
     if path.startswith(SYNTHETIC):
         return ""
     digest = hashlib.blake2b(str(getattr(dataset, "camera", "")).encode(), digest_size=16)
-    with suppress(DatasetError):  # whoever reads that frame tells
+    with suppress(DatasetError):  # the worker that reads that frame reports it
         first = first_frame(dataset)
         digest.update(f"{first.intrinsics} {first.baseline_fx} {first.depth_scale} {first.motion}".encode())
         if doubt := sweep_doubt(first):
             log.warning("%s: %s", path, doubt)
-    if hasattr(dataset, "pose"):  # else they are part of the frames, and so in the files
+    if hasattr(dataset, "pose"):  # else poses are part of the frames, and so in the files
         for index in range(len(dataset)):
             digest.update(np.asarray(pose_of(dataset, index), np.float64).tobytes())
     for file in _files(dataset, Path(path), options):
@@ -310,8 +308,8 @@ def _state(dataset: Dataset, path: str, options: dict[str, Any]) -> str:
 
 
 def _files(dataset: Dataset, path: Path, options: dict[str, Any]) -> Iterator[Path]:
-    """Files of measurements in a recording and in folders that are linked there, of its camera, and those
-    that options name; no results of runs."""
+    """Yield files of measurements in a recording and its linked folders, of its camera, and of options; none
+    of a run's results."""
     yield from (Path(value) for value in options.values() if isinstance(value, str | Path))
     if path.is_file():
         yield path
@@ -341,10 +339,10 @@ def _children(folder: Path) -> list[Path]:
 
 
 def reading(keyframes: Sequence[KeyframeList]) -> Iterator[Callable[[], Keyframe]]:
-    """Readers of the keyframes, in their order.
+    """Yield a function for each keyframe, in order, that reads it.
 
-    A call raises JournalError or DatasetError when it cannot be read, DecodeError or InvalidKeyframe when it
-    is of no use, to a server neither.
+    The function raises JournalError or DatasetError when the keyframe cannot be read. It raises DecodeError
+    or InvalidKeyframe for a keyframe that a server would not take either.
     """
     for one in keyframes:
         if isinstance(one, JournalKeyframes):

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Jobs done by Ray (extra `ray`): on a cluster, or on one that is started on this machine.
+"""Schedule jobs by Ray (extra `ray`), on an existing cluster or on one started on this machine.
 
-Workers on other machines need tsfusion, and the folder of the results under the same path.
+Workers on other machines need tsfusion, and the results' folder under the same path.
 """
 
 import logging
@@ -19,27 +19,27 @@ from tsfusion.core.errors import MissingDependency, TransportError
 _TICK_S = 1.0
 _CONNECT_S = 10.0
 _QUIET = {
-    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",  # it would warn of GPUs that nobody asked for
-    "RAY_USAGE_STATS_ENABLED": "0",  # it would tell its makers that and where we run
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",  # else Ray warns of GPUs that are not used
+    "RAY_USAGE_STATS_ENABLED": "0",  # else Ray sends usage statistics to its makers
 }
-# Of a cluster that is started here; Ray reads them when it is loaded.
+# For a cluster started here. Ray reads these variables when it is imported.
 OWN = {
     "RAY_AUTH_MODE": "token",
-    "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",  # on Linux, too, it listens on loopback then
+    "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",  # then Ray listens on loopback, on Linux, too
 }
 
 
 class RayCluster:
-    """A scheduler whose engine is Ray: it finds room for a worker, and another one for a worker that dies.
+    """A scheduler with Ray as its engine. Ray finds room for workers, and replaces a worker that dies.
 
     Args:
-        workers: jobs at the same time, at most; Ray gives each a core.
-        address: of a cluster, `auto` or `ray://HOST:PORT`; None = one is started here, and ended with this:
-            it listens on loopback, and asks everybody for a token that only this process and its own know.
+        workers: most jobs at the same time; Ray gives each a core.
+        address: address of a cluster, `auto` or `ray://HOST:PORT`. None = a cluster is started here and ends
+            with this process. It listens on loopback and needs a token that only its own processes know.
 
     Raises:
         MissingDependency: without Ray.
-        TransportError: when there is no such cluster.
+        TransportError: when there is no cluster at `address`.
     """
 
     name = "ray"
@@ -64,7 +64,7 @@ class RayCluster:
             ray.init(address=address or "local", log_to_driver=False, logging_level=logging.ERROR, **own)
         except (OSError, ValueError, RuntimeError) as error:
             raise TransportError(f"there is no Ray cluster at {address}: {error}") from error
-        # One attempt: whoever gives the jobs counts the lost ones, whatever the engine is.
+        # One attempt: `CarryingOut` counts lost jobs and repeats them, for every engine.
         self._do = ray.remote(num_cpus=1, max_retries=0, num_returns="streaming")(_do)
         self._under_way: dict[Any, str] = {}
 
@@ -78,7 +78,7 @@ class RayCluster:
         return [self._next(one) for one in ready]
 
     def _next(self, under_way: Any) -> JobMessage:
-        """The next message of a job."""
+        """Return the next message of a job."""
         try:
             message: JobMessage = msgspec.msgpack.decode(self._ray.get(next(under_way)), type=JobMessage)
         except StopIteration:
@@ -99,14 +99,14 @@ class RayCluster:
 
 
 def _check_reachable(address: str | None) -> None:
-    """Raise OSError where nobody listens at HOST:PORT: Ray itself tries for minutes."""
+    """Raise OSError if nobody listens at HOST:PORT, because Ray itself would try for minutes."""
     host, colon, port = (address or "").removeprefix("ray://").rpartition(":")
     if colon and port.isdigit():
         socket.create_connection((host.strip("[]"), int(port)), _CONNECT_S).close()
 
 
 def _do(encoded: bytes) -> Iterator[bytes]:
-    """Do an encoded job, on whatever machine this runs."""
+    """Do an encoded job, on the machine that Ray chose."""
     from tsfusion.cluster import job_runner
 
     for message in job_runner.run(msgspec.msgpack.decode(encoded, type=AnyJob)):

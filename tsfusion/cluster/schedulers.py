@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Schedulers: jobs carried out, lost ones again and done ones not, and processes of this machine for them."""
+"""Carry out jobs by a scheduler, repeat lost ones, skip done ones; run them in local processes."""
 
 import logging
 import os
@@ -21,33 +21,33 @@ from tsfusion.core import errors, process
 from tsfusion.core.errors import OutputError, TsfusionError, WorkerLost
 
 _END_S = 5.0
-ATTEMPTS = 5  # at a job that takes whoever does it along: then it is the job's own fault
+ATTEMPTS = 5  # at a job whose worker ends each time: then the job itself is at fault
 log = logging.getLogger(__name__)
 
 
 class Scheduler(Protocol):
-    """An engine that does some jobs at the same time.
+    """An engine that does several jobs at the same time.
 
     Attributes:
-        name: of the engine.
-        workers: how many jobs at most.
+        name: name of the engine.
+        workers: most jobs at the same time.
     """
 
     name: str
     workers: int
 
     def start(self, job: AnyJob) -> None:
-        """Begin a job; there are fewer than `workers` under way."""
+        """Begin a job. The caller sees that fewer than `workers` jobs are running."""
 
     def wait(self) -> Sequence[JobMessage]:
-        """Next messages of the jobs under way, at least one. `JobDone`, `JobFailed` or `JobLost` end one."""
+        """Return one or more messages of running jobs. `JobDone`, `JobFailed` and `JobLost` end a job."""
 
     def close(self) -> None:
-        """End all, also what is under way."""
+        """End the engine and its running jobs."""
 
 
 class LocalProcesses:
-    """Jobs in processes of this machine; one that dies is replaced when the next job comes."""
+    """Does jobs in processes of this machine. A process that dies is replaced for the next job."""
 
     name = "processes"
 
@@ -58,7 +58,7 @@ class LocalProcesses:
 
     @property
     def pids(self) -> list[int]:
-        """Pids of the processes that do jobs now."""
+        """Ids of the processes that have a job now."""
         return [key.data.process.pid for key in self._busy.get_map().values()]
 
     def start(self, job: AnyJob) -> None:
@@ -87,7 +87,7 @@ class LocalProcesses:
 
 
 class _Worker:
-    """A process, and the job that it does."""
+    """A process and its job."""
 
     def __init__(self) -> None:
         try:
@@ -109,12 +109,12 @@ class _Worker:
         self.job = job.name
         encoded = msgspec.msgpack.encode(job)
         assert self.process.stdin is not None
-        with suppress(BrokenPipeError):  # its end shows when it is read
+        with suppress(BrokenPipeError):  # `read` finds out that the process has ended
             self.process.stdin.write(LENGTH.pack(len(encoded)) + encoded)
             self.process.stdin.flush()
 
     def read(self) -> list[JobMessage]:
-        """The messages that have come."""
+        """Return the messages received so far."""
         content = os.read(self.output, 1 << 16)
         if not content:
             name, self.job, self.is_over = self.job, None, True
@@ -132,18 +132,18 @@ class _Worker:
         return found
 
     def end(self) -> None:
-        """End the process at once: what it writes appears whole or not at all."""
+        """Kill the process. Its files appear complete or not at all."""
         self.process.kill()
         with suppress(OSError, subprocess.TimeoutExpired), self.process:  # closes its pipes
             self.process.wait(_END_S)
 
 
 class CarryingOut:
-    """Jobs of one run.
+    """Carries out the jobs of one run.
 
     Args:
-        scheduler: who does them.
-        folder: where they write, and where those that are done are found again.
+        scheduler: engine that does the jobs.
+        folder: folder of the jobs' files, also those of an earlier run.
 
     Attributes:
         lost: number of times that a job's worker ended before it was done.
@@ -160,10 +160,10 @@ class CarryingOut:
     def do(
         self, todo: Iterable[AnyJob], finished: Callable[[JobDone], None] = lambda _: None
     ) -> list[JobDone]:
-        """Do all of these jobs, in any order; what they say in the end, in theirs.
+        """Do all these jobs in any order. Return their `JobDone` messages in the order of `todo`.
 
         Raises:
-            TsfusionError: as a job that failed; `WorkerLost` where a job ends one worker after the other.
+            TsfusionError: the error of a failed job; `WorkerLost` when a job ends one worker after the other.
         """
         todo = list(todo)
         ended: dict[str, JobDone] = {}
@@ -216,7 +216,7 @@ class CarryingOut:
                 )
 
     def _done(self, job: AnyJob) -> JobDone | None:
-        """Result of a job in an earlier run, if all of its files are still there, as it wrote them."""
+        """Return the result of a job in an earlier run, if all its files are still there and unchanged."""
         try:
             content = jobs.done_file(self._folder, job.name).read_bytes()
             done = msgspec.msgpack.decode(content, type=JobDone)
@@ -227,6 +227,6 @@ class CarryingOut:
 
 
 def _error(message: JobFailed) -> TsfusionError:
-    """The error of a job, as if it had been raised here."""
+    """Return the error of a job, as if it had been raised in this process."""
     kind: type[Exception] = getattr(errors, message.kind, TsfusionError)
     return kind(message.why) if issubclass(kind, TsfusionError) else TsfusionError(message.why)

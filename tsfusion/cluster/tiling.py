@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Parts of a map's mesh: runs of blocks that workers put together, and tiles with the index of their files.
+"""Divide a map's mesh: into runs of tiles that workers join, and into GLB tiles with an index.
 
-The index is 3D Tiles 1.1 (OGC 22-025r4): a tree of boxes, whose leaves name GLB files. glTF's up is +Y, that
-of 3D Tiles +Z: viewers turn what a GLB holds, (x, y, z) → (x, −z, y).
+The index is 3D Tiles 1.1 (OGC 22-025r4): a tree of boxes, whose leaves name GLB files. Up is +Y in glTF and
++Z in 3D Tiles. So viewers turn the contents of a GLB: (x, y, z) → (x, −z, y).
 """
 
 import json
@@ -24,21 +24,21 @@ from tsfusion.tsdf.surface.mesh_tiles import MeshRun, Numbered
 from tsfusion.tsdf.volume import Volume
 
 USUAL_BLOCKS = 16_384  # of a tile
-_BLOCK_BYTES = 24 << 10  # of a block that is meshed: its sums, values, the field's solution, triangles
-_WORKING_BYTES = 64 << 20  # that meshing takes, however small a tile is
+_BLOCK_BYTES = 24 << 10  # of a block being meshed: its sums, values, the field's solution, triangles
+_WORKING_BYTES = 64 << 20  # that meshing needs for a tile of any size
 _HALO = 4  # blocks around a tile, at most
 _LEAST_SIDE, _MOST_SIDE = 4, 1 << 14  # blocks
 
 BlockBox = tuple[tuple[int, int, int], tuple[int, int, int]]
-LEAST_TILES = 3  # of a run: its neighbours' tiles are solved for it, too
+LEAST_TILES = 3  # of a run, because its neighbours' tiles are solved for it, too
 _FARTHEST = 1 << 18  # beyond every block
 
 
 def most_blocks(worker_memory: int | None, base_rss: int) -> int:
-    """Blocks that a worker can mesh at once, those around a tile among them.
+    """Return how many blocks a worker can mesh at once, those around a tile included.
 
     Args:
-        base_rss: bytes that a worker takes before.
+        base_rss: bytes of memory that a worker has before.
     """
     if worker_memory is None:
         return USUAL_BLOCKS
@@ -46,14 +46,14 @@ def most_blocks(worker_memory: int | None, base_rss: int) -> int:
 
 
 def boxes(file: Path, tile_size: float | None, most: int) -> list[BlockBox]:
-    """The cubes that hold a map's blocks: block coordinates, first and last + 1.
+    """Return the cubes that hold a map's blocks, as block coordinates: first, and last + 1.
 
     Args:
         file: the map.
-        tile_size: metres, edge of a cube; None = the largest with `most` blocks at most, halo included.
+        tile_size: metres, edge of a cube. None = the largest cubes with at most `most` blocks, halo included.
 
     Raises:
-        InvalidConfig: for a size that is none.
+        InvalidConfig: for a `tile_size` below one block.
     """
     header, keys = checkpoint.keys_of(file)
     blocks = unpack_keys(keys).astype(np.int64)
@@ -67,7 +67,7 @@ def boxes(file: Path, tile_size: float | None, most: int) -> list[BlockBox]:
 
 
 def _side(blocks: NDArray[np.int64], most: int) -> int:
-    """Blocks of a cube's edge."""
+    """Return the length of a cube's edge in blocks."""
     side = _MOST_SIDE
     while side > _LEAST_SIDE:
         _, counts = np.unique(blocks // side, axis=0, return_counts=True)
@@ -79,13 +79,13 @@ def _side(blocks: NDArray[np.int64], most: int) -> int:
 
 
 def write_tileset(folder: Path, tiles: list[dict[str, Any]]) -> Path:
-    """Write `tileset.json` for the files 00000.glb and on of a folder.
+    """Write `tileset.json` for the files 00000.glb, 00001.glb, … of a folder.
 
     Args:
-        tiles: `low` and `high` corners of each file's vertices, metres, as they stand in the file.
+        tiles: `low` and `high` corners of each file's vertices, metres, in the file's axes.
 
     Raises:
-        OSError: when the disk refuses.
+        OSError: when the file cannot be written.
     """
     corners = np.array([(tile["low"], tile["high"]) for tile in tiles])  # (n, 2, 3)
     corners = np.stack([corners[..., 0], -corners[..., 2], corners[..., 1]], axis=-1)
@@ -100,7 +100,7 @@ def write_tileset(folder: Path, tiles: list[dict[str, Any]]) -> Path:
 
 
 def _node(which: NDArray[np.int64], corners: NDArray[np.float64]) -> dict[str, Any]:
-    """A node of the tree: one file, or eight boxes or fewer."""
+    """Return a node of the tree: one file, or up to eight child nodes."""
     low, high = corners[which, 0].min(axis=0), corners[which, 1].max(axis=0)
     node: dict[str, Any] = {"boundingVolume": {"box": _box(low, high)}}
     if len(which) == 1:
@@ -115,13 +115,13 @@ def _node(which: NDArray[np.int64], corners: NDArray[np.float64]) -> dict[str, A
 
 
 def _box(low: NDArray[np.float64], high: NDArray[np.float64]) -> list[float]:
-    """Centre and three half axes."""
+    """Return a box as its centre and three half axes."""
     half = np.maximum((high - low) / 2, 1e-3)
     return [*((low + high) / 2).tolist(), *np.diag(half).ravel().tolist()]
 
 
 def shares(blocks: int, workers: int) -> list[range]:
-    """The tiles of a map's mesh in runs, one for each worker; none where a single one does it as fast."""
+    """Return the tiles of a map's mesh in runs, one for each worker; empty if one worker is as fast."""
     tiles = mesh_tiles.tile_count(blocks)
     count = min(workers, tiles // LEAST_TILES)
     if count < 2:
@@ -131,7 +131,7 @@ def shares(blocks: int, workers: int) -> list[range]:
 
 
 def make_run(file: Path, which: range, view: dict[str, Any]) -> MeshRun:
-    """The mesh of some tiles of a saved map, of which no more is loaded than what lies across their x."""
+    """Mesh some tiles of a saved map. Only the blocks in their range of x are loaded."""
     _, keys = checkpoint.keys_of(file, is_checked=True)
     x = unpack_keys(mesh_tiles.blocks_of_run(keys, which))[:, 0]
     low, high = (int(x.min()), -_FARTHEST, -_FARTHEST), (int(x.max()) + 1, _FARTHEST, _FARTHEST)
@@ -139,7 +139,7 @@ def make_run(file: Path, which: range, view: dict[str, Any]) -> MeshRun:
 
 
 def write_run(path: Path, made: MeshRun) -> None:
-    """Keep a run in a file; raises OutputError when the disk refuses."""
+    """Write a run to a file. Raise OutputError if that fails."""
     part, border = made.part, made.border
     arrays: dict[str, Any] = {
         "vertices": part.vertices, "faces": part.faces, "normals": part.normals, "colors": part.colors,
@@ -155,7 +155,7 @@ def write_run(path: Path, made: MeshRun) -> None:
 
 
 def read_run(path: Path) -> MeshRun:
-    """A run that was kept; raises OutputError when it cannot be read."""
+    """Read a run from a file. Raise OutputError if that fails."""
     try:
         with np.load(path) as found:
             colors = found["colors"] if "colors" in found.files else None
