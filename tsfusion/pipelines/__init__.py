@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Whole runs: replay, scan, the server a run sends to, and what it leaves behind.
+"""Carry out whole runs (replay, scan) with their server, write their results, and open saved maps.
 
 Rooms:
-    shown: a saved map in a browser, and its past.
-    runs: scan, replay, their server, and the files they leave.
-    report: a run, or a saved map, as one page: pictures, a 3-D view, charts, tables.
-    maps: saved maps opened, asked, merged, aligned, and their meshes.
+    shown: show a saved map in a browser, also at earlier times.
+    runs: scan and replay, the server that they use, and the files that they leave.
+    report: write one HTML page on a run or a saved map: pictures, a 3-D view, charts, tables.
+    maps: open, ask, merge and align saved maps, and finish their meshes.
 """

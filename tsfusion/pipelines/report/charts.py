@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Charts as SVG, whose colours and fonts are those of the page around them."""
+"""Draw charts as SVG, in the colours and fonts of the page around them."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -27,8 +27,8 @@ class Chart:
     """A plot with two axes.
 
     Args:
-        label: what it shows, for those who cannot see it.
-        square: a metre is as long to the right as upwards; the ranges grow until they fit.
+        label: what the chart shows, for screen readers.
+        square: both axes have the same scale; their ranges are widened to fit.
     """
 
     def __init__(
@@ -43,7 +43,7 @@ class Chart:
         self._parts: list[str] = []
 
     def line(self, xs: NDArray[np.float64], ys: NDArray[np.float64], style: str) -> None:
-        """Draw a line through (n,) points; NaN breaks it. Of very many each k-th is drawn."""
+        """Draw a line through (n,) points. NaN interrupts it. Of many points every k-th is drawn."""
         step = max(1, math.ceil(len(xs) / MOST_POINTS))
         pieces: list[str] = []
         pen_up = True
@@ -69,7 +69,7 @@ class Chart:
         self._parts.append(f'<path class="bar {style}" d="{"".join(boxes)}"/>')
 
     def points(self, xs: NDArray[np.float64], ys: NDArray[np.float64], style: str, size: float = 2.0) -> None:
-        """Draw a dot at each of (n,) places."""
+        """Draw a dot at each of (n,) points."""
         step = max(1, math.ceil(len(xs) / MOST_POINTS))
         places = zip(self._px(xs[::step]), self._py(ys[::step]), strict=True)
         dots = "".join(f"M{x:.1f} {y:.1f}h0" for x, y in places)
@@ -105,7 +105,7 @@ class Chart:
         )
 
     def svg(self) -> str:
-        """The chart as an `<svg>` element."""
+        """Return the chart as an `<svg>` element."""
         return (
             f'<svg viewBox="0 0 {self._width} {self._height}" role="img" aria-label="{escape(self._label)}">'
             f"{self._grid()}{''.join(self._parts)}{self._titles()}</svg>"
@@ -145,7 +145,7 @@ class Chart:
 
 
 def ticks(axis: Axis) -> list[float]:
-    """Round values over the range of an axis."""
+    """Return round values over the range of an axis."""
     raw = (axis.high - axis.low) / max(axis.ticks, 1)
     power = 10.0 ** math.floor(math.log10(raw))
     step = next(factor for factor in _STEPS if factor * power >= raw * 0.999) * power
@@ -154,13 +154,13 @@ def ticks(axis: Axis) -> list[float]:
 
 
 def number(value: float) -> str:
-    """A tick's value in few characters: 0.25, 1 200, 3."""
+    """Return a tick's value in few characters: 0.25, 1 200, 3."""
     text = f"{value:.10g}" if abs(value) < 1e4 else f"{value:,.0f}".replace(",", "\u202f")
     return "0" if text == "-0" else text.replace("-", "\u2212")
 
 
 def legend(entries: Iterable[tuple[str, str]]) -> str:
-    """A legend of (style, text)."""
+    """Return the HTML of a legend of (style, text) pairs."""
     return (
         '<p class="legend">'
         + "".join(f'<span><i class="{style}"></i>{escape(text)}</span>' for style, text in entries)
@@ -169,7 +169,7 @@ def legend(entries: Iterable[tuple[str, str]]) -> str:
 
 
 def span(values: Sequence[NDArray[np.float64]]) -> tuple[float, float]:
-    """Least and largest of all known values; 0 and 1 where there is none."""
+    """Return the smallest and the largest finite value, or 0 and 1 if there is none."""
     known = np.concatenate([np.ravel(each) for each in values]) if values else np.zeros(0)
     known = known[np.isfinite(known)]
     return (float(known.min()), float(known.max())) if len(known) else (0.0, 1.0)

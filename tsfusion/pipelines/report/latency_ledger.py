@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The latency ledger: where the time of every keyframe went, from capture to mesh."""
+"""The latency ledger: how long each keyframe took in each stage from capture to mesh."""
 
 import csv
 import io
@@ -21,7 +21,7 @@ _STAMPS = (
 
 
 class LatencySummary(msgspec.Struct, frozen=True):
-    """The ledger in a few figures. Delay = captured → fused.
+    """Summary of the ledger. The delay is the time from captured to fused.
 
     `clock_bound_ms` bounds the error of every figure that compares the scanner's clock with the server's.
     """
@@ -33,14 +33,14 @@ class LatencySummary(msgspec.Struct, frozen=True):
 
 
 def durations_ms(records: Sequence[KeyframeTimes], start: str, end: str) -> NDArray[np.float64]:
-    """(n,) float64 milliseconds from stamp `start` to stamp `end`; NaN where either is unknown."""
+    """Return (n,) float64 milliseconds from stamp `start` to stamp `end`; NaN where either is unknown."""
     stamps = np.array([(getattr(r, start), getattr(r, end)) for r in records], dtype=np.int64).reshape(-1, 2)
     known = (stamps > 0).all(axis=1)
     return np.where(known, (stamps[:, 1] - stamps[:, 0]) / 1e6, np.nan)
 
 
 def summarise(records: Sequence[KeyframeTimes]) -> LatencySummary:
-    """Mean, percentiles and maximum of the delay and of each stage, and the delay's slope."""
+    """Return mean, percentiles and maximum of the delay and of each stage, and the delay's slope."""
     delay = durations_ms(records, *DELAY)
     return LatencySummary(
         delay_ms=spread(delay),
@@ -51,7 +51,7 @@ def summarise(records: Sequence[KeyframeTimes]) -> LatencySummary:
 
 
 def slope(values_ms: NDArray[np.float64]) -> float:
-    """Least-squares growth in milliseconds per keyframe; 0 with fewer than two known values."""
+    """Return the least-squares growth, milliseconds per keyframe; 0 with fewer than two known values."""
     index = np.flatnonzero(~np.isnan(values_ms))
     if len(index) < 2:
         return 0.0
@@ -59,7 +59,7 @@ def slope(values_ms: NDArray[np.float64]) -> float:
 
 
 def write_csv(records: Sequence[KeyframeTimes], path: Path) -> None:
-    """One line a keyframe: stamps (ns, scanner's clock, 0 = unknown), stages, delay (ms, empty: unknown)."""
+    """Write a line a keyframe: stamps (ns, scanner's clock, 0 = unknown); stages, delay (ms, or empty)."""
     columns = {f"{name}_ms": durations_ms(records, *ends) for name, ends in STAGES.items()}
     columns["delay_ms"] = durations_ms(records, *DELAY)
     text = io.StringIO()
@@ -73,7 +73,7 @@ def write_csv(records: Sequence[KeyframeTimes], path: Path) -> None:
 
 
 def plot(records: Sequence[KeyframeTimes], path: Path, *, target_ms: float = TARGET_MS) -> None:
-    """A PNG: the stages up to `fused` stacked per keyframe, their sum, and the target line."""
+    """Draw a PNG: the stages up to `fused` stacked per keyframe, their sum, and the target line."""
     from matplotlib.figure import Figure  # without pyplot: no global state, no window system
 
     index = np.arange(len(records))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The report of a saved map: its surface, its keyframes, whose they are, and how its journal is."""
+"""Write the report of a saved map: its surface, keyframes and sessions, and the state of its journal."""
 
 import time
 from pathlib import Path
@@ -32,10 +32,10 @@ class AboutMap(NamedTuple):
 
 
 def read(source: Path, name: str | None, watch: OnProgress = lambda _done, _all: None) -> AboutMap:
-    """Read about a saved map; see `saved_maps.find`.
+    """Read the facts of a saved map; see `saved_maps.find`.
 
     Raises:
-        CheckpointError, JournalError: when it cannot be read.
+        CheckpointError, JournalError: when the map or its journal cannot be read.
     """
     saved = saved_maps.find(source, name)
     summary = saved_maps.summarise(saved)
@@ -50,7 +50,7 @@ def write(about: AboutMap, file: Path, out: Path, *, memory_bytes: int | None = 
 
     Args:
         file: the map with all that its journal holds.
-        memory_bytes: that the map may take.
+        memory_bytes: limit of memory for the map.
     """
     volume = Volume.load(file, memory_bytes=memory_bytes)
     mesh, stats = volume.extract_mesh(), volume.stats()

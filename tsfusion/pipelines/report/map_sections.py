@@ -31,7 +31,7 @@ class ShownMap:
 
     Attributes:
         mesh: without its islands.
-        scale: of its error, by vertex; None = no error is known.
+        scale: colours of its error by vertex; None if no error is known.
         pictures: name and RGB of each picture that was drawn, to be written beside the page.
     """
 
@@ -53,7 +53,7 @@ class ShownMap:
         self._sides = Sides(self.mesh)
 
     def sides(self) -> str:
-        """The mesh from four sides."""
+        """Return the HTML of pictures of the mesh from four sides."""
         shown = []
         for side in range(pictures.SIDES):
             rgb = self._sides.picture(side)
@@ -65,7 +65,7 @@ class ShownMap:
         return f'<div class="sides">{"".join(shown)}</div>'
 
     def view(self) -> str:
-        """The 3-D view."""
+        """Return the HTML of the 3-D view."""
         made = pictures.make_scene(self.mesh, None if self.scale is None else self.scale.level)
         up = mesh_preview.up_of(self.mesh)
         low, high = np.percentile(self.mesh.vertices @ up, (1, 98))
@@ -97,7 +97,7 @@ class ShownMap:
         )
 
     def error(self) -> str:
-        """The mesh in the colours of its error, and how often each error is; empty where none is known."""
+        """Return pictures of the mesh coloured by error, and a histogram; no text if no error is known."""
         if self.scale is None or self.whole_error_mm is None:
             return ""
         colors = self.scale.colors()
@@ -113,12 +113,12 @@ class ShownMap:
         return page.pair(*both) + bar + _histogram(self.whole_error_mm, end)
 
     def plan(self) -> str:
-        """The map from above with the sensor's way."""
+        """Return a chart of the map from above, with the sensor's path."""
         return plan(self.mesh, self._found.paths)
 
 
 def plan(mesh: Mesh | None, paths: Paths) -> str:
-    """Trajectories from above, over the mesh's plan; empty where there is none."""
+    """Return a chart of the trajectories over the mesh from above; an empty text without a trajectory."""
     shown = {name: paths[name][1] for name in PATH_STYLES if name in paths and len(paths[name][1])}
     keyframes = paths["keyframes"][1] if "keyframes" in paths else None
     if not shown and keyframes is None:
@@ -168,7 +168,7 @@ def _histogram(error_mm: NDArray[np.float64], end: float) -> str:
 
 
 def _level_axes(up: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(3, 2) axes to the right and upwards in a plan that is seen from above: x and y where up is z."""
+    """Return the (3, 2) axes, right and up, of a plan seen from above; they are x and y if up is z."""
     forward = np.array((0.0, 1, 0) if abs(up[1]) < 0.9 else (0.0, 0, 1))
     north = forward - (forward @ up) * up
     north /= np.linalg.norm(north)

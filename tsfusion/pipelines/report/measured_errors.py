@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""How far points of a map are from the truth, where somebody knows it: a mesh, points, a world, a run."""
+"""Measure the distance of points to a known surface: a mesh, points, a synthetic world or a run's."""
 
 import os
 from collections.abc import Callable
@@ -26,16 +26,16 @@ _TRIED = 1000  # vertices
 
 
 def error_measure(truth: str | os.PathLike[str]) -> Measure:
-    """The function that says how far points are from the truth: (n, 3) metres → (n,) metres, unsigned.
+    """Return a function that takes (n, 3) points and returns (n,) unsigned distances to the truth, metres.
 
     Args:
-        truth: a mesh in the map's frame (PLY, GLB, OBJ, STL), of which the distance is that of the nearest
-            triangle (exact nearby: `evaluation.mesh_distance`); a PLY of points alone, the nearest of which
-            counts; `synthetic:NAME`, the surface of a synthetic world; or the folder of a run whose dataset
-            knows its surface.
+        truth: a mesh in the map's frame (PLY, GLB, OBJ, STL), measured to the nearest triangle (exact nearby:
+            `evaluation.mesh_distance`); a PLY of points alone, measured to the nearest point;
+            `synthetic:NAME`, the surface of a synthetic world; or the folder of a run whose dataset knows its
+            surface.
 
     Raises:
-        DatasetError: when there is no truth in it, or it cannot be read.
+        DatasetError: when `truth` has no known surface, or cannot be read.
         MissingDependency: without scipy.
     """
     kind, _, name = str(truth).partition(":")
@@ -64,7 +64,7 @@ def _of_world(name: str) -> Measure:
 
 
 def _of_run(folder: Path) -> Measure:
-    """A run's error: by its dataset's world, where that still is the same; else at its mesh's vertices."""
+    """Return the error of a run: by its synthetic world if that is the same today, else by its mesh."""
     try:
         record = run_record.read(folder)
         errors = np.load(folder / "error.npy", allow_pickle=False)
@@ -92,7 +92,7 @@ def _of_run(folder: Path) -> Measure:
 
 
 def _read(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """(n, 3) vertices and (m, 3) faces of a file; no faces = it holds points alone."""
+    """Return (n, 3) vertices and (m, 3) faces of a file; (0, 3) faces if it holds points alone."""
     import trimesh
 
     try:
@@ -112,7 +112,7 @@ def _read(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
 
 
 def _merged(path: Path, scene: Any) -> Any:
-    """The objects of a scene as one; those of a GLB of tsfusion in the map's frame, as they are stored."""
+    """Join the objects of a scene. A GLB of tsfusion stays in the map's frame: its nodes do not turn it."""
     import trimesh
 
     notes = [str(one.metadata.get("up", "")) for one in scene.geometry.values()]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The page of a report: one HTML file that asks nothing of the network."""
+"""Build the page of a report: one HTML file that makes no network request."""
 
 import json
 from collections.abc import Iterable, Sequence
@@ -28,13 +28,13 @@ Pictures = dict[str, NDArray[np.uint8]]  # name, (height, width, 3) RGB
 
 @dataclass
 class Page:
-    """A page, as far as it is known.
+    """Contents of a report page.
 
     Attributes:
-        verdict: whether it went well, in a sentence; `level` is its colour.
+        verdict: a sentence that says if all went well; `level` is its colour.
         warnings: a sentence each.
-        tiles: title, figure and note of what is read at a glance.
-        sections: title and HTML.
+        tiles: title, figure and note of each headline figure.
+        sections: title and HTML of each section.
     """
 
     title: str
@@ -47,7 +47,7 @@ class Page:
     footer: str = ""
 
     def html(self) -> str:
-        """The text of the file."""
+        """Return the HTML text."""
         sections = "".join(
             f"<section><h2>{escape(title)}</h2>{body}</section>" for title, body in self.sections if body
         )
@@ -77,10 +77,10 @@ class Page:
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]], *, styles: Sequence[str] = ()) -> str:
-    """A table of texts whose columns, but the first, are numbers.
+    """Return a table of texts. Its columns hold numbers, except the first.
 
     Args:
-        styles: of a swatch before each row.
+        styles: CSS class of the colour sample before each row.
     """
     top = "".join(f"<th>{escape(cell)}</th>" for cell in head)
     lines = []
@@ -94,23 +94,23 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]], *, styles: Sequenc
 
 
 def facts(rows: Iterable[tuple[str, str]]) -> str:
-    """A table of names and texts; those without a text are left out."""
+    """Return a table of names and texts, without rows that have no text."""
     lines = (f"<tr><th>{escape(name)}</th><td>{escape(text)}</td></tr>" for name, text in rows if text)
     return f'<table class="facts"><tbody>{"".join(lines)}</tbody></table>'
 
 
 def folded(title: str, text: str) -> str:
-    """A text that is shown on demand."""
+    """Return a text that is shown on demand."""
     return f"<details><summary>{escape(title)}</summary><pre>{escape(text)}</pre></details>"
 
 
 def note(text: str) -> str:
-    """A sentence that explains."""
+    """Return a sentence that explains something."""
     return f'<p class="note">{escape(text)}</p>'
 
 
 def picture(url: str, caption: str) -> str:
-    """A picture with what it shows."""
+    """Return a picture with a caption."""
     return (
         f'<figure><img src="{url}" alt="{escape(caption)}">'
         f"<figcaption>{escape(caption)}</figcaption></figure>"
@@ -118,13 +118,13 @@ def picture(url: str, caption: str) -> str:
 
 
 def chart(svg: str, caption: str, *, legend: str = "", is_wide: bool = False) -> str:
-    """A chart with its title above."""
+    """Return a chart with its title above."""
     inner = f'<div class="scroll">{svg}</div>' if is_wide else svg
     return f"<figure><h3>{escape(caption)}</h3>{legend}{inner}</figure>"
 
 
 def pair(*parts: str) -> str:
-    """Figures beside each other, where there is room."""
+    """Return figures side by side, if there is room."""
     return f'<div class="pair">{"".join(parts)}</div>'
 
 
@@ -133,7 +133,7 @@ def _resource(name: str) -> str:
 
 
 def write(html: str, drawn: Pictures, out: Path) -> list[Path]:
-    """Write a page as `out`, and its pictures as `OUT-NAME.png` beside it; the files, the page last.
+    """Write a page as `out` and its pictures as `OUT-NAME.png` beside it. Return the files, the page last.
 
     Raises:
         OutputError: when they cannot be written.

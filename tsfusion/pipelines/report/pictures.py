@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Pictures of a mesh for a report: from four sides, its error, its plan from above, and its 3-D view."""
+"""Draw a mesh for a report: from four sides, by error, from above, and as data of a 3-D view."""
 
 import base64
 import dataclasses
@@ -26,10 +26,10 @@ _ROUNDS = 6
 
 
 class ErrorScale(NamedTuple):
-    """Colours of an error.
+    """Colour scale of an error.
 
     Attributes:
-        end_mm: the error that has the last colour, a round number.
+        end_mm: the error of the last colour, a round number.
         level: (n,) uint8 of each vertex, 255 = `end_mm` or more.
     """
 
@@ -42,7 +42,7 @@ class ErrorScale(NamedTuple):
 
 
 class Sides:
-    """Pictures of a mesh from the side that shows most of it, and from the three others."""
+    """Pictures of a mesh from the side that shows most of it, and from the three other sides."""
 
     def __init__(self, mesh: Mesh) -> None:
         self._mesh = mesh
@@ -64,14 +64,14 @@ class Sides:
 
 
 def error_scale(error_mm: NDArray[np.float64]) -> ErrorScale:
-    """Colours for (n,) errors in millimetres, nearly all of which fit into the scale."""
+    """Return a colour scale for (n,) errors in millimetres. Nearly all of them lie within the scale."""
     end = rounded_up(float(np.percentile(np.abs(error_mm), _ERROR_SHARE)))
     level = np.minimum(np.abs(error_mm) / end, 1.0)
     return ErrorScale(end, np.round(255 * level).astype(np.uint8))
 
 
 def plan(places: NDArray[np.float64]) -> tuple[str, NDArray[np.float64]]:
-    """How many of (n, 2) places are in each cell, as a picture's URL, and its (2, 2) corners, metres."""
+    """Return the density of (n, 2) points as a picture's URL, and the picture's (2, 2) corners, metres."""
     low, high = np.percentile(places, (0.2, 99.8), axis=0)
     cell = max(float((high - low).max()), 1e-3) / _CELLS
     bins = np.maximum(np.ceil((high - low) / cell), 1).astype(int)
@@ -88,7 +88,7 @@ def plan(places: NDArray[np.float64]) -> tuple[str, NDArray[np.float64]]:
 
 
 def jpeg_url(rgb: NDArray[np.uint8]) -> str:
-    """A picture as the URL that holds it."""
+    """Return a picture as a `data:` URL of a JPEG."""
     import cv2
 
     content = _encoded(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
@@ -110,8 +110,8 @@ class Scene:
 
     Attributes:
         mesh: with at most `MOST_TRIANGLES` triangles.
-        level: (n,) uint8 of its vertices, a colour of the error's scale; None = no error is known.
-        full: triangles before.
+        level: (n,) uint8 error of its vertices on the colour scale; None if no error is known.
+        full: number of triangles before it was simplified.
     """
 
     mesh: Mesh
@@ -119,7 +119,7 @@ class Scene:
     full: int
 
     def header(self, up: NDArray[np.float64]) -> dict[str, object]:
-        """Layout that the page needs to unpack `packed`, as JSON can hold it."""
+        """Return the layout of `packed` as JSON values: the script of the page needs it to unpack."""
         low, size = _box(self.mesh.vertices)
         return {
             "vertices": len(self.mesh.vertices),
@@ -132,10 +132,10 @@ class Scene:
         }
 
     def packed(self) -> str:
-        """Base64 of zlib: uint16 positions, uint32 faces, int8 normals, uint8 colours, uint8 levels.
+        """Return base64 of zlib of uint16 positions, uint32 faces, int8 normals, uint8 colours, uint8 levels.
 
-        Axis by axis. Positions are in 65535ths of the box; they and the faces are differences from the number
-        before, and faces are planes of bytes: that packs small.
+        Arrays are stored axis by axis. Positions are in 65535ths of the bounding box. Positions and faces are
+        differences from the number before, and faces are split into byte planes: so they compress better.
         """
         low, size = _box(self.mesh.vertices)
         position = np.round((self.mesh.vertices - low) / size * 65535).astype(np.int64)
@@ -154,7 +154,7 @@ class Scene:
 
 
 def make_scene(mesh: Mesh, level: NDArray[np.uint8] | None = None, most: int = MOST_TRIANGLES) -> Scene:
-    """A scene of a mesh: vertices in one cell of a grid become one, as fine as leaves `most` triangles."""
+    """Return a scene of a mesh. A grid merges vertices until at most `most` triangles are left."""
     small, small_level = mesh, level
     if len(mesh.faces) > most:
         edges = mesh.vertices[mesh.faces[::97, 0]] - mesh.vertices[mesh.faces[::97, 1]]
@@ -170,7 +170,7 @@ def make_scene(mesh: Mesh, level: NDArray[np.uint8] | None = None, most: int = M
 def _clustered(
     mesh: Mesh, level: NDArray[np.uint8] | None, size: float
 ) -> tuple[Mesh, NDArray[np.uint8] | None]:
-    """The mesh with one vertex a cell of `size` metres, the mean of those in it (Rossignac, Borrel 1993)."""
+    """Merge the vertices in each cell of `size` metres into their mean (Rossignac, Borrel 1993)."""
     cell = np.floor((mesh.vertices - mesh.vertices.min(axis=0)) / size).astype(np.int64)
     extent = cell.max(axis=0) + 1
     key = (cell[:, 0] * extent[1] + cell[:, 1]) * extent[2] + cell[:, 2]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The record of a run, `run.json`, as one type for writers and readers; and the files beside it, read."""
+"""Write and read the record of a run, `run.json`; read the other files of a run's folder."""
 
 import csv
 import os
@@ -40,10 +40,10 @@ PATHS = ("trajectory", "trajectory-corrected", "reference", "keyframes")
 
 
 class Verdict(Struct, frozen=True):
-    """A run in one sentence: as good as its worst finding.
+    """Judgement on a run in one sentence, by its worst finding.
 
     Attributes:
-        level: of its worst finding; `bad` = the command ends with status 1.
+        level: severity of the worst finding. With `bad` the command ends with status 1.
         text: without a full stop.
     """
 
@@ -52,13 +52,13 @@ class Verdict(Struct, frozen=True):
 
     @property
     def headline(self) -> str:
-        """The sentence as it stands at the top of a page."""
+        """The sentence with a capital and a full stop, for the top of a page."""
         end = "" if self.text.endswith((".", ")")) else "."
         return f"{self.text[:1].upper()}{self.text[1:]}{end if self.level != 'bad' else ''}"
 
 
 class Circumstances(Struct, frozen=True, kw_only=True):
-    """Time and place of a run's end, and its command. `finished` is local time."""
+    """Time and machine of a run's end, and its command. `finished` is local time."""
 
     finished: str = ""
     command: str = ""  # empty = it was not started by the `tsfusion` command
@@ -80,7 +80,7 @@ class Accuracy(Struct, frozen=True):
 
     @classmethod
     def of(cls, error_mm: NDArray[np.float64]) -> "Accuracy":
-        """Figures of (n,) distances, millimetres."""
+        """Return the figures of (n,) distances, millimetres."""
         p50, p95 = np.percentile(error_mm, (50, 95))
         rmse = np.sqrt(np.mean(error_mm**2))
         figures = (error_mm.mean(), p50, p95, rmse, error_mm.max())
@@ -88,7 +88,7 @@ class Accuracy(Struct, frozen=True):
 
 
 class MapResult(Struct, frozen=True, kw_only=True):
-    """One submap in figures. A scan knows nothing of a map that is on a server elsewhere."""
+    """Figures of one submap. Those of the map are empty if a scan sends to a server elsewhere."""
 
     name: str = ""
     frames: int = 0  # that have a pose
@@ -122,7 +122,7 @@ class RunRecord(Struct, frozen=True, kw_only=True):
     keyframes_rejected: dict[str, int] = {}
     keyframes_by_rule: dict[str, int] = {}
     warnings: list[str] = []  # what is odd about the recording, a sentence each
-    missed: str = ""  # what the run was for and did not reach; empty = it did
+    missed: str = ""  # how the run fell short of its goal; empty = it did not
     verdict: Verdict | None = None  # the headline; None = not known yet
     left: int = 0  # keyframes still in the spool at the end
     link: str = ""  # why the server took nothing at the end; empty = it did
@@ -134,7 +134,7 @@ class RunRecord(Struct, frozen=True, kw_only=True):
     mesh: dict[str, Any] = {}
     accuracy: Accuracy | None = None  # of the first map's mesh; None = the true surface is not known
     maps: list[MapResult] = []
-    origin_m: tuple[int, int, int] | None = None  # what was taken off given positions; None = nothing
+    origin_m: tuple[int, int, int] | None = None  # subtracted from given positions; None = nothing
     delay_ms: Spread = Spread()
     delay_slope_ms_per_keyframe: float = 0.0
     stages_ms: dict[str, Spread] = {}
@@ -146,7 +146,7 @@ class RunRecord(Struct, frozen=True, kw_only=True):
 
 
 def verdict(record: RunRecord) -> Verdict:
-    """The verdict on a run by its record."""
+    """Judge a run by its record."""
     if record.missed:
         return Verdict("bad", record.missed)
     sent, fused, rejected = record.keyframes_sent, record.keyframes_fused, record.keyframes_rejected
@@ -168,10 +168,10 @@ def verdict(record: RunRecord) -> Verdict:
 
 
 def read(folder: Path) -> RunRecord:
-    """Read the record in a run's folder, also of an older version.
+    """Read the record in a run's folder, also one of an older version.
 
     Raises:
-        OutputError: when it cannot be read, or is of no run.
+        OutputError: when it cannot be read, or is not the record of a run.
     """
     path = folder / RECORD
     try:
@@ -184,7 +184,7 @@ def read(folder: Path) -> RunRecord:
 
 
 def _of_today(found: dict[str, Any]) -> dict[str, Any]:
-    """A record with the names of today. A replay of earlier had its one map's figures beside its own."""
+    """Return a record with today's names. An old replay had the figures of its only map at the top level."""
     kind = "replay" if "dataset" in found else "scan"
     renamed = {"kind": kind} | {_EARLIER.get(name, name): value for name, value in found.items()}
     own = {name: renamed[name] for name in ("map_hash", "blocks", "mesh") if name in renamed}
@@ -198,7 +198,7 @@ def write(work: Path, record: Struct) -> None:
 
 
 def circumstances() -> Circumstances:
-    """Circumstances of this process: when, where and by which command."""
+    """Return when, where and by which command this process runs."""
     started = Path(sys.argv[0])
     is_command = started.stem == "tsfusion" or (
         started.name == "__main__.py" and started.parent.name == "tsfusion"
@@ -214,7 +214,7 @@ def circumstances() -> Circumstances:
 
 
 def _cpu() -> str:
-    """Name of the processor; where the system does not tell, its architecture."""
+    """Return the name of the processor, or the architecture if the system does not tell the name."""
     with suppress(OSError):
         for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
             if line.startswith("model name"):
@@ -223,7 +223,7 @@ def _cpu() -> str:
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python, the platform, tsfusion and the packages it stands on."""
+    """Return the versions of Python, the platform, tsfusion and its main packages."""
     packages = "tsfusion taichi numpy opencv-python-headless pyzmq trimesh mcap msgspec zstandard"
     found = {"python": platform.python_version(), "platform": platform.platform()}
     return found | {name: version_of(name) for name in packages.split()}
@@ -231,11 +231,11 @@ def versions() -> dict[str, str]:
 
 @dataclass
 class MapFindings:
-    """A map of a run.
+    """Results of one map of a run.
 
     Attributes:
-        mesh: None = the run has none, as it is on a server.
-        error_m: (n,) signed metres of the vertices from the true surface; None = nobody knows it.
+        mesh: None if the run has no mesh, because the map is on a server.
+        error_m: (n,) signed metres of the vertices from the true surface; None if that is unknown.
         paths: trajectories by the name of their file without its ending.
     """
 
@@ -247,13 +247,13 @@ class MapFindings:
 
 @dataclass
 class RunFindings:
-    """A run.
+    """Results of a run.
 
     Attributes:
         record: its `run.json`.
-        times: of its keyframes; empty = not known.
-        growth: columns of `growth.csv`; empty = not known.
-        files: name and bytes of what is in its folder.
+        times: stamps of its keyframes; empty if unknown.
+        growth: columns of `growth.csv`; empty if unknown.
+        files: name and bytes of each file in its folder.
     """
 
     record: RunRecord
@@ -271,10 +271,10 @@ def read_findings(folder: Path, meshes: dict[str, Mesh] | None = None) -> RunFin
     """Read the folder of a run.
 
     Args:
-        meshes: those that were just written, by the name of their file; others are read.
+        meshes: meshes just written, by file name; the others are read.
 
     Raises:
-        OutputError: when its `run.json` cannot be read or is of no run.
+        OutputError: when a file cannot be read, or `run.json` is not the record of a run.
     """
     record = read(folder)
     maps = []
@@ -358,7 +358,7 @@ def _rows(path: Path) -> list[dict[str, str]]:
 
 
 def date_of(record: RunRecord, path: Path) -> str:
-    """Time at which a run ended: as it wrote down, or by its folder's name, or by its file."""
+    """Return the time of a run's end: from its record, else its folder's name, else its file's time."""
     if record.made is not None and record.made.finished:
         return record.made.finished
     named = re.search(r"(\d{4}-\d{2}-\d{2})_(\d{2})-(\d{2})-\d{2}", path.absolute().name)

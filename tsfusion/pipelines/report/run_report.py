@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The report of a run: what it reached, at a glance and in detail."""
+"""Write the report of a run: one HTML page with its results, first in short, then in detail."""
 
 from pathlib import Path
 
@@ -19,8 +19,8 @@ def write(folder: Path, out: Path, *, meshes: dict[str, Mesh] | None = None) -> 
     """Write the report of a run: one page, and its pictures as PNG beside it.
 
     Args:
-        folder: of the run's results.
-        meshes: that were just written there, by the name of their file; others are read.
+        folder: folder of the run's results.
+        meshes: meshes just written there, by file name; the others are read.
 
     Returns:
         The files written, the page last.
@@ -65,7 +65,7 @@ def _page(found: RunFindings, date: str) -> tuple[Page, Pictures]:
 
 
 def _add_map(made: Page, one: MapFindings, found: RunFindings, *, suffix: str, prefix: str) -> Pictures:
-    """Add the sections of a map; its pictures."""
+    """Add the sections of a map to the page. Return the map's pictures."""
     errors = run_sections.trajectory_errors(one, is_given=found.record.localizer == "given")
     if one.mesh is None:
         why = _GONE if one.figures.mesh else _ELSEWHERE
@@ -85,7 +85,7 @@ def _add_map(made: Page, one: MapFindings, found: RunFindings, *, suffix: str, p
 
 
 def _accuracy(known: Accuracy | None) -> str:
-    """The table of the error where the true surface is known; else a word."""
+    """Return a table of the surface's error, or a note that the true surface is not known."""
     if known is None:
         return page.note("The true surface is not known, so there is nothing to compare the mesh with.")
     head = ("distance from the true surface", "mean", "p50", "p95", "RMSE", "max")

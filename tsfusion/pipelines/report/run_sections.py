@@ -18,7 +18,7 @@ from tsfusion.pipelines.report.run_record import Circumstances, MapFindings, Map
 from tsfusion.wire.messages.health import Spread, spread
 from tsfusion.wire.messages.messages import DELAY, SKIP_REASONS, STAGES, KeyframeTimes
 
-_COLUMNS = 200  # of a chart by keyframe: more keyframes are drawn together
+_COLUMNS = 200  # of a chart by keyframe: if there are more keyframes, a column shows several
 _BINS = 50
 _STYLES = dict(zip(STAGES, ("k1", "k2", "k3", "k4", "k5", "k6"), strict=True))
 _WAY = ("encode", "wire", "journal", "queue", "fuse")  # the stages whose sum is the delay
@@ -30,7 +30,7 @@ _MEANING = {
 
 
 def delay(found: RunFindings) -> str:
-    """Delay of each keyframe by stage, its distribution, and a table."""
+    """Return charts and a table of the keyframes' delay, by stage."""
     record, times = found.record, found.times
     total, figures = record.delay_ms, {name: record.stages_ms.get(name, Spread()) for name in STAGES}
     if not total.count:
@@ -109,14 +109,14 @@ def _mean(values: NDArray[np.float64], which: NDArray[np.int64], columns: int) -
 
 
 def growth(found: RunFindings) -> str:
-    """Blocks, memory and waiting keyframes over time."""
+    """Return charts of blocks, memory and waiting keyframes over time."""
     columns = found.growth
     seconds = columns.get("seconds", np.zeros(0))
     if len(seconds) < 2:
         return page.note("Not known: the run was too short, or is of a version that did not write it down.")
     end = float(seconds.max())
     shown = []
-    memory = [  # of a server that is not the run's own, 0 stands for what is not known
+    memory = [  # all zeros if unknown: the server is not the run's own
         (columns[name] / 1e6, style, text)
         for name, style, text in _MEMORY
         if name in columns and columns[name].any()
@@ -150,7 +150,7 @@ def _over_time(
 
 
 def trajectory_errors(found: MapFindings, *, is_given: bool) -> str:
-    """The table of trajectory errors, and the error along the way; empty where there is no reference."""
+    """Return a table of trajectory errors and a chart along the way; an empty text without a reference."""
     rows, lines = [], []
     for key, name, text in _ERRORS:
         error: TrajectoryError | None = getattr(found.figures, key)
@@ -187,7 +187,7 @@ _ERRORS = (
 
 
 def _error_along(found: MapFindings, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """Metres of way, and metres of error after alignment, of the frames with a reference."""
+    """Return path lengths and errors after alignment, metres, of frames with a reference, or None."""
     if name not in found.paths or "reference" not in found.paths:
         return None
     (stamps, poses), (stamps_true, truth) = found.paths[name], found.paths["reference"]
@@ -203,7 +203,7 @@ def _error_along(found: MapFindings, name: str) -> tuple[NDArray[np.float64], ND
 
 
 def keyframes(record: RunRecord) -> str:
-    """Fates of frames and keyframes."""
+    """Return a table of what became of frames and keyframes."""
     rejected = {
         f"{name} ({SKIP_REASONS[name]})" if name in SKIP_REASONS else name: n
         for name, n in record.keyframes_rejected.items()
@@ -225,7 +225,7 @@ def keyframes(record: RunRecord) -> str:
 
 
 def setting(record: RunRecord) -> str:
-    """Where it ran, with what, and its settings."""
+    """Return a table of the machine and software of a run, and its settings."""
     made = record.made or Circumstances()
     machine = [made.cpu, f"{made.cores} cores" if made.cores else "",
                size(made.memory_bytes) if made.memory_bytes else ""]  # fmt: skip
@@ -243,12 +243,12 @@ def setting(record: RunRecord) -> str:
 
 
 def files(found: RunFindings) -> str:
-    """Files of the folder with their sizes."""
+    """Return a table of the folder's files and their sizes."""
     return page.facts((name, size(nbytes)) for name, nbytes in found.files.items())
 
 
 def map_facts(figures: MapResult) -> str:
-    """Figures of a map."""
+    """Return a table of a map's figures."""
     mesh = figures.mesh
     size_m = " × ".join(f"{length:.2f}" for length in mesh.get("extent_m", ()))
     up = mesh.get("up")
@@ -269,7 +269,7 @@ def map_facts(figures: MapResult) -> str:
 
 
 def extent(mesh: dict[str, Any]) -> str:
-    """Extent of a mesh in a few characters."""
+    """Return the extent of a mesh in a few characters."""
     lengths = (f"{length:.{0 if length >= 10 else 1}f}" for length in mesh["extent_m"])
     return "\u2009×\u2009".join(lengths) + " m"
 

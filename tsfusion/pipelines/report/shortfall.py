@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Shortfalls of a run: what it was for and did not reach, in one line that says what to do.
+"""Say in one line how a run fell short of its goal, and what to do about it.
 
-One rule for all runs. A run reached its purpose when each keyframe that it sent is on the server's disk and
-in one map (half of them, where the others have no sample in range), and nearly all frames have a pose. What
-falls short of that still leaves its results; the command ends with the line, and with status 1.
+One rule holds for all runs. Each keyframe sent must be on the server's disk and in one map; half of them are
+enough if the others have no sample in range. Nearly all frames must have a pose. A run that falls short keeps
+its results, but the command prints the line and ends with status 1.
 """
 
 import os
@@ -15,18 +15,18 @@ from tsfusion.datasets.dataset import CLOCK, UNREADABLE, WITHOUT_POSE
 from tsfusion.geometry.sample_ranges import NO_SAMPLES
 from tsfusion.geometry.sweeps import skewed
 
-FEW = 0.05  # share of the frames that may be without a pose: more are a part of the scene
-_LOST = ("spool", "disk")  # reasons of skipping that no policy asks for
+FEW = 0.05  # share of frames that may lack a pose: more would leave out a part of the scene
+_LOST = ("spool", "disk")  # reasons for skipping a keyframe that no policy asks for
 
 
 def of_delivery(stats: ClientStats, *, spool: str | os.PathLike[str], link: str, rejection: str) -> str:
-    """Say which keyframes are not at the server, or not in its map; empty = enough are.
+    """Return a line on keyframes that the server or its map lacks, or an empty text if it has enough.
 
     Args:
         stats: sums over all clients of the run.
-        spool: where keyframes wait for the server.
-        link: why the server takes nothing; empty = it does.
-        rejection: why the map did not take the first keyframe that it rejected.
+        spool: folder where keyframes wait for the server.
+        link: why the server takes nothing; empty if it does.
+        rejection: why the map rejected the first keyframe that it rejected.
     """
     rejected = sum(stats.rejected.values())
     if stats.waiting:
@@ -50,14 +50,14 @@ def of_delivery(stats: ClientStats, *, spool: str | os.PathLike[str], link: str,
 
 
 def of_sweeps(clients: Iterable[Client]) -> list[str]:
-    """Say in how many keyframes the motion within the sweep stays; empty = in none."""
+    """Return a line on keyframes whose motion within a sweep is not corrected, or an empty list."""
     count = sum(client.skewed for client in clients)
     text = skewed(f"{count_of(count, 'keyframe has', 'keyframes have')} point times without a motion")
     return [text] if count else []
 
 
 def of_disk(stats: ClientStats) -> str:
-    """Say which keyframes this machine's disk could not keep; empty = it kept all."""
+    """Return a line on keyframes that this machine's disk could not keep, or an empty text if it kept all."""
     lost = {reason: count for reason, count in stats.skipped.items() if reason in _LOST}
     if damaged := stats.skipped.get("damaged", 0):
         spool = "an earlier scan's spool"
@@ -71,7 +71,7 @@ def of_disk(stats: ClientStats) -> str:
 
 
 def of_damage(lost: int) -> str:
-    """Say that damage in journals has cost so many keyframes, or more; empty = none."""
+    """Return a line on keyframes that damage in journals has cost, or an empty text if `lost` is 0."""
     if not lost:
         return ""
     return (
@@ -81,7 +81,7 @@ def of_damage(lost: int) -> str:
 
 
 def of_absence(absent: int) -> str:
-    """Say that journals no longer have so many keyframes of the maps saved beside them; empty = none."""
+    """Return a line on keyframes of saved maps that the journals lack, or an empty text if `absent` is 0."""
     if not absent:
         return ""
     return (
@@ -92,7 +92,7 @@ def of_absence(absent: int) -> str:
 
 
 def cure_of_tracking(localizer: str) -> str:
-    """Advice when frames are lost, by the name of the localizer."""
+    """Return advice against lost frames, by the name of the localizer."""
     if localizer == "trajectory":
         return (
             "give the trajectory of this recording, in its clock (--time-offset SECONDS is added to the "
@@ -106,17 +106,17 @@ def cure_of_tracking(localizer: str) -> str:
 
 
 def of_clock(left_out: Mapping[str, int]) -> str:
-    """Say which frames came when their clock had stepped back; empty = none. `left_out` as of `of_poses`."""
+    """Return a line on frames whose clock stepped back, or an empty text. `left_out`: see `of_poses`."""
     late = ((reason, count) for reason, count in left_out.items() if reason.startswith(CLOCK))
     return together(f"{count_of(n, 'frame is', 'frames are')} not in the map: {reason}" for reason, n in late)
 
 
 def of_poses(frames: int, left_out: Mapping[str, int]) -> str:
-    """Say that many frames of a recording have no pose; empty = nearly all have.
+    """Return a line if many frames of a recording have no pose, else an empty text.
 
     Args:
-        frames: that are left.
-        left_out: number of others by reason, as `Dataset.skipped` has them.
+        frames: number of frames with a pose.
+        left_out: reason → number of frames left out, see `Dataset.skipped`.
     """
     without = sum(count for reason, count in left_out.items() if reason.startswith(WITHOUT_POSE))
     if without <= FEW * (frames + without):
@@ -129,7 +129,7 @@ def of_poses(frames: int, left_out: Mapping[str, int]) -> str:
 
 
 def of_unreadable(frames: int, left_out: Mapping[str, int]) -> str:
-    """Say that many of a recording's frames cannot be read; empty = nearly all can."""
+    """Return a line if many frames of a recording cannot be read, else an empty text."""
     bad = left_out.get(UNREADABLE, 0)
     if bad <= FEW * frames:
         return ""
@@ -137,11 +137,11 @@ def of_unreadable(frames: int, left_out: Mapping[str, int]) -> str:
 
 
 def of_tracking(frames: int, tracked: int, why: str, *, localizer: str = "rgbd", maps: int = 1) -> str:
-    """Say that frames were lost; empty = nearly all have a pose, in one map.
+    """Return a line if frames were lost; an empty text if nearly all have a pose in one map.
 
     Args:
-        why: the sensor was lost the last time.
-        maps: number of maps that the scan is in.
+        why: why the sensor was lost the last time.
+        maps: number of maps of the scan.
     """
     if frames - tracked <= FEW * frames and maps < 2:
         return ""
@@ -151,7 +151,7 @@ def of_tracking(frames: int, tracked: int, why: str, *, localizer: str = "rgbd",
 
 
 def together(shortfalls: Iterable[str]) -> str:
-    """All shortfalls in one line; empty = there are none."""
+    """Join all shortfalls in one line; empty if there are none."""
     return "; ".join(filter(None, shortfalls))
 
 

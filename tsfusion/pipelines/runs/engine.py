@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Steps that replay and scan share: the pace of sending, the wait for the map, and progress.
 
-A replay has its poses already and sends every keyframe; a scan finds poses and chooses among frames. From the
-client on they are the same: each hands keyframes to the clients of one `Target` and asks this engine when the
-next one may go and when all of them are in the map.
+A replay knows its poses and sends every keyframe. A scan finds poses and chooses among frames. All that comes
+after is the same. Both hand keyframes to the clients of one `Target`, and ask this engine when the next one
+may go and when all are in the map.
 """
 
 import logging
@@ -17,12 +17,12 @@ from tsfusion.core.errors import FlushTimeout, KeyframeRefused, TransportError
 from tsfusion.pipelines.runs.target_server import Target
 from tsfusion.scanner.scanner import ScanState
 
-AHEAD = 3  # keyframes of a recording under way: fusing, waiting, travelling
+AHEAD = 3  # keyframes of a recording that are sent and not yet fused
 # Seconds without progress before a run that needs the map gives up: a server restarts a stuck fuser after 60.
 STALL_TIMEOUT = 120.0
 _PATIENCE = 5.0  # seconds without progress before the reason is logged
-LINGER = 10.0  # seconds without progress before what a distant server does not take is left in the spool
-_STAMPS_TIMEOUT = 5.0  # seconds for a distant server to say when it fused the last ones: for the figures only
+LINGER = 10.0  # seconds without progress until keyframes for a distant server are left in the spool
+_STAMPS_TIMEOUT = 5.0  # seconds for a distant server to send its last stamps: for the figures only
 _POLL = 0.01  # seconds
 
 log = logging.getLogger(__name__)
@@ -31,31 +31,31 @@ STARTING = "starting a server (the first start compiles kernels)"
 
 
 class Progress(Protocol):
-    """Shows a person how far a run is."""
+    """Shows the user the progress of a run."""
 
     def stage(self, text: str) -> None:
-        """Announce the next part of the run."""
+        """Announce the next stage of the run."""
 
     def update(
         self, total: int | None, stats: ClientStats, *, link: str = "", scan: ScanState | None = None
     ) -> None:
-        """Show the counts; called often.
+        """Show the counts. The method is called often.
 
         Args:
-            total: frames of the source, without `scan` keyframes; None = nobody knows.
-            stats: of all clients together.
-            link: why the server takes no keyframes at the moment; empty = it does.
-            scan: of a scan: the sensor and its frames.
+            total: number of frames of the source, or of keyframes without `scan`; None if nobody knows.
+            stats: sums over all clients.
+            link: why the server takes no keyframes at the moment; empty if it does.
+            scan: state of the sensor and its frames, for a scan.
         """
 
 
 class Engine:
-    """Watches keyframes on their way into the maps of a target.
+    """Watches the keyframes on their way into the maps of a target.
 
     Args:
-        target: where they go.
-        observe: shows how far the run is, and returns the counts of all its clients together.
-        problem: why the server takes nothing at the moment; empty = it does.
+        target: server that they go to.
+        observe: shows the progress of the run, and returns the sums of counts over its clients.
+        problem: returns why the server takes nothing at the moment; an empty text if it does.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class Engine:
         self._target, self._observe, self._problem = target, observe, problem
 
     def check(self) -> ClientStats:
-        """Show how far the run is; raise TransportError when its own server has ended."""
+        """Show the progress and return the counts. Raise TransportError if the run's own server has ended."""
         self._target.check()
         return self._observe()
 
@@ -76,26 +76,26 @@ class Engine:
             self.check()
 
     def wait_turn(self, ahead: int = AHEAD) -> None:
-        """Wait until fewer than `ahead` keyframes are under way; raise TransportError when nothing moves."""
+        """Wait until fewer than `ahead` keyframes are unfused. Raise TransportError if nothing moves."""
         self._wait_map(lambda stats: stats.sent - stats.settled < ahead)
 
     def wait_fused(self) -> None:
-        """Wait until each keyframe is in the map or turned away; raise TransportError when nothing moves."""
+        """Wait until each keyframe is in the map or rejected. Raise TransportError if nothing moves."""
         self._wait_map(lambda stats: not stats.waiting and stats.settled >= stats.sent)
 
     def wait_settled(self, clients: Iterable[Client]) -> None:
-        """Wait until each keyframe is at its newest pose; raise TransportError when nothing moves."""
+        """Wait until each keyframe is at its newest pose. Raise TransportError if nothing moves."""
         for client in clients:
             self._wait_map(lambda _, client=client: client.is_settled)  # type: ignore[misc]
 
     def wait_meshed(self, clients: Iterable[Client]) -> None:
-        """Wait until meshes show every keyframe: the last stamp of the ledger, which may be missing."""
+        """Wait until meshes show every keyframe. This gives the ledger's last stamp, which may be missing."""
         for client in clients:
             with suppress(FlushTimeout):
                 client.wait_meshed()
 
     def wait_acknowledged(self, clients: Iterable[Client]) -> None:
-        """Wait until the server has every keyframe on its disk, or takes none any more."""
+        """Wait until the server has every keyframe on its disk, or takes no more."""
         clients = [client for client in clients if not client.is_of_other_world]
         if self._wait(lambda _: not any(client.stats.waiting for client in clients), LINGER):
             for client in clients:
@@ -112,7 +112,7 @@ class Engine:
             )
 
     def _wait(self, reached: Callable[[ClientStats], bool], timeout: float) -> bool:
-        """Wait for `reached`. Returns False if nothing has moved for `timeout` seconds. Logs why, once."""
+        """Wait for `reached`. Return False if nothing moved for `timeout` seconds. Log the reason once."""
         last, moved, logged = (-1, -1, -1), time.monotonic(), False
         while True:
             stats = self.check()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Keyframes that earlier scans left in their spools: sent along with a scan to their own maps, or named."""
+"""Send the keyframes that earlier scans left in their spools, or log that they still wait."""
 
 import datetime
 import logging
@@ -12,9 +12,9 @@ from tsfusion.delivery import left_spools
 from tsfusion.delivery.left_spools import LeftSpool
 from tsfusion.pipelines.runs.target_server import Target
 
-ANSWER_SECONDS = 2.0  # for a server to say whether it takes a client: a scan begins without knowing
-_FIRST_SECONDS = 10.0  # for it to open a map and take the first keyframe
-_LAST_SECONDS = 10.0  # after a scan for the rest; more of it goes with the next one
+ANSWER_SECONDS = 2.0  # wait for a server's answer to a client; then a scan begins without it
+_FIRST_SECONDS = 10.0  # wait for a server to open a map and take the first keyframe
+_LAST_SECONDS = 10.0  # wait after a scan; what is left then goes with the next scan
 _SENDING = ("connected", "held", "opening")  # states in which the server takes keyframes, or will soon
 _POLL = 0.01  # seconds
 
@@ -22,27 +22,27 @@ log = logging.getLogger(__name__)
 
 
 class Leftovers:
-    """The spools of earlier scans, each with a client that sends it.
+    """The spools of earlier scans, each with a client that sends its records.
 
-    The server's word decides: a spool goes into its own map when that has its world or is new, and waits when
-    the map has keyframes of another one.
+    The server decides: a spool goes into its own map if this map is new or has the spool's world. It waits if
+    the map has keyframes of another world.
 
     Args:
-        given: poses of scans with this spool folder come from elsewhere, so that a spool which names no world
-            is not taken for one of a scan that localised itself.
+        given: True if poses of scans in this spool folder come from elsewhere. Then a spool without a world
+            is not taken for a scan that localised itself.
     """
 
     def __init__(self, target: Target, *, given: bool) -> None:
         self._target, self._given = target, given
         self._clients: list[tuple[LeftSpool, Client]] = []
         self._refused: set[LeftSpool] = set()
-        self.maps: set[str] = set()  # for which keyframes wait
+        self.maps: set[str] = set()  # maps that have keyframes waiting
 
     def begin(self) -> None:
-        """Open a client for each spool, oldest first, wait for the server's answer, and name it in a line.
+        """Open a client for each spool, oldest first, wait for the server's answer, and log a line about it.
 
-        Of several that wait for one map the oldest has it, and all of them come before the scan itself: who
-        is refused is refused now, and not in the middle of a scan.
+        If several spools wait for one map, the oldest gets it. All come before the scan itself, so that a
+        refusal comes now and not during the scan.
         """
         for left in left_spools.find(self._target.spools):
             client = self._open(left)
@@ -51,7 +51,7 @@ class Leftovers:
                 self._name(left, client)
 
     def finish(self) -> None:
-        """Wait a moment for those that the server takes, and name those that still wait."""
+        """Wait some seconds for spools that the server takes, and log those that still wait."""
         sent = [client for _, client in self._clients if client.link_state.kind in _SENDING]
         _wait(lambda: not any(client.stats.waiting for client in sent), _LAST_SECONDS)
         for left, client in self._clients:
@@ -73,7 +73,7 @@ class Leftovers:
         return client
 
     def _name(self, left: LeftSpool, client: Client, *, is_over: bool = False) -> None:
-        """Log a line: how many keyframes wait, for which map, since when, and what becomes of them."""
+        """Log how many keyframes wait, for which map, since when, and what becomes of them."""
         count = client.stats.waiting + client.stats.durable
         what = f"{count} keyframes that a scan of {_clock(left.since_ns)} left for the map {left.map}"
         if client.is_of_other_world:

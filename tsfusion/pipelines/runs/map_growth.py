@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""How a map and its server grow during a run, and whether a first keyframe fits into the memory."""
+"""Record how a map and its server grow during a run; check that a first keyframe fits into memory."""
 
 import csv
 import io
@@ -22,14 +22,14 @@ from tsfusion.pipelines.runs.target_server import Target
 
 _EVERY_S = 0.5
 _TIMEOUT_S = 1.0
-MOST_ROWS = 2000  # of a long run every second one goes, again and again
+MOST_ROWS = 2000  # then every second row is removed
 _BLOCK = 8  # voxels, edge of a block
 _VOXEL_BYTES = 20  # sums and colour
 _SIZES = tuple(digit * 10.0**power for power in range(-4, 1) for digit in (1, 2, 3, 5))  # metres
 
 
 class GrowthRow(NamedTuple):
-    """A map and its server at a moment. `server_bytes`: resident memory of a run's own server's processes."""
+    """State of a map and its server at a moment. `server_bytes`: resident memory of the run's own server."""
 
     seconds: float
     fused: int
@@ -40,7 +40,7 @@ class GrowthRow(NamedTuple):
 
 
 class MapGrowth:
-    """Rows of a map's growth, taken by a thread of their own."""
+    """Rows of a map's growth, recorded by a thread of its own."""
 
     def __init__(self, target: Target, map_name: str) -> None:
         self._target, self._map = target, map_name
@@ -50,16 +50,16 @@ class MapGrowth:
         self.rows: list[GrowthRow] = []
 
     def start(self) -> None:
-        """Begin to take rows."""
+        """Begin to record rows."""
         self._thread.start()
 
     def stop(self) -> None:
-        """Take no more rows; again does nothing."""
+        """Record no more rows. A second call does nothing."""
         self._ended.set()
         self._thread.join(2 * _TIMEOUT_S)
 
     def write_csv(self, path: Path) -> None:
-        """Write a line a row, below the names of the columns."""
+        """Write the rows as CSV, below a line with the names of the columns."""
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
         writer.writerow(GrowthRow._fields)
@@ -67,7 +67,7 @@ class MapGrowth:
         path.write_text(text.getvalue(), encoding="utf-8")
 
     def add(self, row: GrowthRow) -> None:
-        """Append a row; of too many every second one goes."""
+        """Append a row. If there are too many, remove every second row."""
         self.rows.append(row)
         if len(self.rows) >= MOST_ROWS:
             self.rows = self.rows[::2]
@@ -93,7 +93,7 @@ class MapGrowth:
 
 @contextmanager
 def watch(target: Target, map_name: str) -> Iterator[MapGrowth]:
-    """The growth of a map during the block."""
+    """Record the growth of a map during the block."""
     growth = MapGrowth(target, map_name)
     growth.start()
     try:
@@ -122,7 +122,7 @@ def check_fits(keyframe: Keyframe, config: VolumeConfig) -> None:
 
 
 def _within_range(keyframe: Keyframe, config: VolumeConfig) -> NDArray[np.float64]:
-    """(n, 3) metres in the sensor's frame."""
+    """Return the (n, 3) points within the sensor's range, metres in its frame."""
     model, points = config.model(keyframe.sensor), points_camera(keyframe)
     points = points[np.isfinite(points).all(axis=1)]
     ranges = np.linalg.norm(points, axis=1) if keyframe.kind == "points" else points[:, 2]
@@ -130,7 +130,7 @@ def _within_range(keyframe: Keyframe, config: VolumeConfig) -> NDArray[np.float6
 
 
 def _blocks(points: NDArray[np.float64], voxel_size: float, model: SensorModel) -> int:
-    """Number of blocks that hold points, times those that a ray's band crosses: an estimate."""
+    """Estimate the number of blocks touched: blocks that hold points, times those crossed by a ray's band."""
     if not len(points):
         return 0
     x, y, z = np.floor(points / (_BLOCK * voxel_size)).astype(np.int64).T

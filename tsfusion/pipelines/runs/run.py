@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""A whole run: a source's frames localised, chosen, sent and fused, and its results left in a folder.
+"""Carry out a whole run: localise, choose, send and fuse a source's frames; leave results in a folder.
 
-A replay is a scan whose poses are given and which takes every frame.
+A replay is a scan with given poses that takes every frame.
 """
 
 import dataclasses
@@ -68,27 +68,27 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, kw_only=True)
 class RunPlan:
-    """Frames of a run, how their poses are found, where keyframes go, and what is made of the map.
+    """Plan of a run: its frames, how poses are found, where keyframes go, and what is made of the map.
 
     Attributes:
-        kind: `scan` localises frames and chooses keyframes; a server elsewhere may take them later. `replay`
-            takes every frame at its given pose, and waits for the map and its mesh wherever they are.
-        scan: of a scan: settings of its localizer and its selection.
+        kind: `scan` localises frames and chooses keyframes; a distant server may fuse them later. `replay`
+            takes every frame at its given pose, and always waits for the map and its mesh.
+        scan: settings of a scan's localizer and selection of keyframes.
         volume: the map of the own server; a server at `connect` has its own.
         connect: data address of a running server; None starts one for this run.
-        server: settings of the own server; None = a free port, and a state folder that is thrown away.
-        spool: of a scan with `connect`: the folder where keyframes wait until they are acknowledged; what
-            earlier scans left there goes to its own maps, or waits on.
-        same_frame: the frame of the poses is declared to be that of the map, whatever worlds it has.
-        align: with `connect`: find the scan's place in the map, if that has a surface, before anything is
-            sent. Where that fails the scan goes into a free map.
+        server: settings of the own server; None = a free port, and a temporary state folder.
+        spool: for a scan with `connect`: folder where keyframes wait for acknowledgement. What earlier scans
+            left there is sent to its own maps, or waits on.
+        same_frame: the user declares that the poses are in the map's frame, whatever worlds the map has.
+        align: with `connect`: find the scan's pose in the map, if the map has a surface, before anything is
+            sent. If that fails, the scan goes into a free map.
         rate: frames a second that a recording is played at; None = as fast as keyframes are fused.
-        sensor: preset that all frames are taken to be of; None = each as it says.
+        sensor: sensor preset for all frames; None = the sensor that each frame names.
         min_weight: full-confidence samples a voxel needs to be meshed; None = the sensor's.
-        up: away from the ground, in the map's frame; None = it is found.
+        up: up direction in the map's frame; None = it is found.
         keep_islands: see `mesh_finishing.write`.
         distance: (n,) signed metres from (n, 3) points to the true surface, in the frame of given poses;
-            None = nobody knows it.
+            None = the surface is unknown.
         warnings: oddities of the frames, a sentence each.
         missed: reasons why the map is wrong or incomplete, a sentence each.
     """
@@ -122,7 +122,7 @@ class RunPlan:
 
     @property
     def waits_for_map(self) -> bool:
-        """True if the run ends when the map has its keyframes; else when the server has them."""
+        """True if the run ends when the map has its keyframes, False if it ends when the server has them."""
         return self.connect is None or self.is_replay
 
     @property
@@ -140,33 +140,33 @@ def run(
     overwrite: bool = False,
     viewer: ViewerChild | None = None,
 ) -> RunRecord:
-    """Take a source's frames to its end, or until it is closed, and leave the results in the folder `out`.
+    """Take a source's frames to its end, or until it is closed. Leave the results in the folder `out`.
 
-    `keyframes.txt`, `delay.csv`, `delay.png`, `growth.csv`, `run.json`, and `report.html` with its pictures;
-    of a scan `trajectory.txt` (and `trajectory-corrected.txt` where loops were closed, `reference.txt` where
-    the source has other poses); with a server of its own `map.tsf`; where the run waits for its map
-    `mesh.ply`, `mesh.glb` and `preview.png`; where the true surface is known `error.npy`. A second submap's
+    Each run leaves `keyframes.txt`, `delay.csv`, `delay.png`, `growth.csv`, `run.json` and `report.html` with
+    pictures. A scan adds `trajectory.txt`, after loop closures `trajectory-corrected.txt`, and
+    `reference.txt` if the source has other poses. An own server adds `map.tsf`. A run that waits for its map
+    adds `mesh.ply`, `mesh.glb` and `preview.png`; a known true surface `error.npy`. Files of a second submap
     have `-2` before the ending, and so on. What came before a failure is kept.
 
     Args:
         out: None = a new folder `out/DATE_TIME`; see `output_folder.results`.
-        overwrite: `out` may hold files, of which those of the same name are replaced.
+        overwrite: `out` may hold files. Those of the same name are replaced.
         viewer: shows the map while the run lasts.
 
     Raises:
         SourceError: the sensor failed; what came before is in `out`.
-        DatasetError, JournalError: a recording cannot be read from its first frame on, or in a scan later
-            (a replay's record says so); likewise.
-        InvalidKeyframe: a frame lacks what the localizer needs; likewise.
-        OutputError: `out` cannot be written, or no frame could be localised; or the own map has no surface,
-            when all else is in `out`.
+        DatasetError, JournalError: the recording's first frame cannot be read; in a scan also a later one,
+            with what came before in `out`. A replay only notes this in its record.
+        InvalidKeyframe: a frame lacks what the localizer needs; what came before is in `out`.
+        OutputError: `out` cannot be written, or no frame could be localised. Or the own map has no surface;
+            then all else is in `out`.
         TransportError: the server cannot be reached or stopped fusing.
-        AlignmentRefused: the place was not found; the scan is in a map of its own.
-        WorldRefused: the map has keyframes of another session; those of a scan are in the spool.
+        AlignmentRefused: the scan's pose in the map was not found; the scan is in a map of its own.
+        WorldRefused: the map has keyframes of another session; keyframes of a scan are in the spool.
     """
     run_files.check_folder(out)
     with results(out, overwrite=overwrite) as (work, folder), ExitStack() as stack:
-        frames = _PlannedFrames(plan)  # one that cannot be read is an error before a server starts
+        frames = _PlannedFrames(plan)  # an unreadable source fails before a server starts
         localizer = localizers.create_localizer(frames.scan, frames.first)
         stack.callback(getattr(localizer, "close", lambda: None))
         if plan.waits_for_map:
@@ -198,15 +198,15 @@ def run(
 
 
 class _PlannedFrames:
-    """Frames of a plan up to a failure of their source, which is kept.
+    """Frames of a plan, until their source fails. The failure is kept.
 
     Attributes:
-        scan: settings of their localizer.
-        first: read ahead.
-        failure: of the source; None = it has had none so far.
+        scan: settings of the localizer.
+        first: the first frame, read ahead.
+        failure: error of the source; None so far.
 
     Raises:
-        SourceError: it gives none, or its left and right are exchanged.
+        SourceError: the source gives no frame, or its left and right images are exchanged.
     """
 
     def __init__(self, plan: RunPlan) -> None:
@@ -225,19 +225,19 @@ class _PlannedFrames:
 
     @property
     def localizer(self) -> str:
-        """Name of their localizer."""
+        """Name of the frames' localizer."""
         return localizers.localizer_name(self.scan, self.first)
 
     @property
     def camera(self) -> str:
-        """The source's camera in one line; empty = it gives points."""
+        """The source's camera in one line; empty if the source gives points."""
         own: str = getattr(self._source, "camera", "")
         if own or self.first.intrinsics is None:
             return own
         return f"{described(self.first.intrinsics, self.first.shape)}, from its frames"
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yield all frames, but not the first of a live source if it grew old while the server started."""
+        """Yield all frames. Skip the first of a live source if it grew old while the server started."""
         if not self._source.live:
             yield dataclasses.replace(self.first, captured_ns=time.monotonic_ns())
         else:
@@ -261,22 +261,22 @@ class _PlannedFrames:
 
 
 class _PlacedFrames(NamedTuple):
-    """Coordinate frame and map of a run: those asked for, or where a scan's place was not found others."""
+    """Coordinate frame and map of a run: as asked for, or others if a scan's pose was not found."""
 
     localizer: Localizer
-    frames: Iterator[Frame]  # from the first that is not sent yet
+    frames: Iterator[Frame]  # from the first frame not sent yet
     map_name: str
     same_frame: bool
-    unplaced: str = ""  # why the place was not found
+    unplaced: str = ""  # why the pose in the map was not found
 
 
 def _place(
     plan: RunPlan, frames: _PlannedFrames, localizer: Localizer, target: Target, tell: Callable[[str], None]
 ) -> _PlacedFrames:
-    """Find the place of a scan in the map, if it is to be found and the map has a surface.
+    """Find the pose of a scan in the map, if the plan asks for it and the map has a surface.
 
     Raises:
-        AlignmentRefused: it was not found, and no other map is free.
+        AlignmentRefused: the pose was not found, and no other map is free.
     """
     name, taken = target.link.map, iter(frames)
     existing = _existing_map(target) if plan.align else None
@@ -295,7 +295,7 @@ def _place(
 
 
 def _existing_map(target: Target) -> ExistingMap | None:
-    """The map to scan into as the server has it now; None = it has no surface yet, and may begin here."""
+    """Return the map to scan into as it is now, or None if it has no surface and the scan may begin it."""
     name = target.link.map
     if name not in target.health().maps:
         return None
@@ -306,7 +306,7 @@ def _existing_map(target: Target) -> ExistingMap | None:
 
 
 def _other_map(target: Target, why: str) -> str:
-    """The name of a free map, for a scan whose place was not found."""
+    """Return the name of a free map, for a scan whose pose was not found."""
     name = target.free_map_name()
     if name is None:
         raise AlignmentRefused(f"{why}; nothing was sent, as the server names no free map")
@@ -315,15 +315,15 @@ def _other_map(target: Target, why: str) -> str:
 
 
 class _ActiveRun:
-    """A run whose server is there: it sends, waits, writes what came of it, and says what it missed.
+    """A run whose server is ready: sends keyframes, waits, writes results, and reports what was missed.
 
     Args:
-        frames: of the plan's source.
-        target: where keyframes go.
+        frames: frames of the plan's source.
+        target: server that keyframes go to.
 
     Raises:
-        WorldRefused: at once when the map is of another world.
-        TransportError: a replay's server cannot be reached.
+        WorldRefused: when the map is of another world.
+        TransportError: when a replay's server cannot be reached.
     """
 
     def __init__(
@@ -341,7 +341,7 @@ class _ActiveRun:
         self._begun, self._seconds, self._peak_rss = time.monotonic(), 0.0, 0
 
     def carry_out(self) -> None:
-        """Send all, and wait until the map, or a server elsewhere, has it."""
+        """Send all keyframes. Wait until they are in the map, or on the disk of a distant server."""
         into = "" if self._plan.connect is None else f" into the map {self._place.map_name}"
         self._progress.stage(f"scanning {self._plan.source.name}{into}")
         try:
@@ -373,7 +373,7 @@ class _ActiveRun:
         return written
 
     def raise_failure(self, folder: Path) -> None:
-        """Raise what ended the run early; what makes a replay incomplete is in its record."""
+        """Raise the error that ended the run early. That a replay's source failed is only in its record."""
         if self._failures:
             log.warning("the %s ended early: what came before is in %s", self._plan.kind, folder)
             raise self._failures[0]
@@ -412,7 +412,7 @@ class _ActiveRun:
         return scanner
 
     def _warn_of_keyframes_there(self) -> None:
-        """Warn that given poses are taken for poses in the frame of a map that has keyframes."""
+        """Warn that given poses are taken to be in the frame of a map that has keyframes already."""
         target, name = self._target, self._place.map_name
         there = target.status(name).keyframes_durable if target.has_map(name) else 0
         if there and not self._place.same_frame:
@@ -423,7 +423,7 @@ class _ActiveRun:
             )  # fmt: skip
 
     def _say_what_stays(self) -> None:
-        """Warn of what an incomplete replay leaves in a map that outlives it."""
+        """Warn that an incomplete replay leaves keyframes in a map that outlives the run."""
         there = self._scanner.state().stats.durable
         if there and self._plan.is_replay and self._plan.outlives:
             log.warning(
@@ -433,7 +433,7 @@ class _ActiveRun:
             )  # fmt: skip
 
     def _send(self) -> None:
-        """Localise and send frame by frame. An error ends that; what was localised before is not lost."""
+        """Localise and send frame by frame. An error ends this, but what was localised before is kept."""
         try:
             self._scanner.run(self._place.frames, self._wait_turn)
         except TsfusionError as error:
@@ -450,7 +450,7 @@ class _ActiveRun:
         self._scanner.finish()
 
     def _wait_turn(self, scanner: Scanner) -> None:
-        """Wait until the next frame of a recording may go; a sensor does not wait."""
+        """Wait until the next frame of a recording may go. A live sensor does not wait."""
         if self._plan.waits_for_map and not self._plan.source.live:
             self._engine.wait_turn(AHEAD if self._plan.rate is None else self._target.link.backlog)
         else:
@@ -459,14 +459,14 @@ class _ActiveRun:
             submap.client.check_world()
 
     def _observe(self) -> ClientStats:
-        """Show how far the run is; the counts of all its clients."""
+        """Show the progress of the run. Return the counts of all its clients."""
         state = self._scanner.state()
         scan = None if self._plan.is_replay else state
         self._progress.update(self._plan.source.length, state.stats, link=state.link, scan=scan)
         return state.stats
 
     def _settle(self) -> None:
-        """Wait for all keyframes under way."""
+        """Wait for all keyframes that are not yet in the map, or on a distant server's disk."""
         clients = [submap.client for submap in self._scanner.submaps]
         if not self._plan.waits_for_map:
             self._progress.stage("sending what is on its way")
@@ -511,7 +511,7 @@ class _ActiveRun:
         return [record for submap in self._scanner.submaps for record in submap.client.records]
 
     def record(self, folder: Path, written: list[WrittenSubmap], accuracy: Accuracy | None) -> RunRecord:
-        """The run in figures."""
+        """Return the record of the run."""
         plan, scanner, source, first = self._plan, self._scanner, self._plan.source, written[0]
         state, delays = scanner.state(), latency_ledger.summarise(self._times)
         stats, child = state.stats, self._target.child
@@ -556,7 +556,7 @@ class _ActiveRun:
         return structs.replace(made, verdict=run_record.verdict(made))
 
     def _missed(self) -> str:
-        """What the run was for and did not reach, in a line; empty = it did."""
+        """Return in one line how the run fell short of its goal; an empty text if it did not."""
         plan, source, state = self._plan, self._plan.source, self._scanner.state()
         length, unread = source.length or state.frames, self._frames.failure
         ended = f"the replay ended after {state.frames} of {length} keyframes: {unread}"
@@ -585,12 +585,12 @@ class _ActiveRun:
 
 
 def _given_world(place: _PlacedFrames, plan: RunPlan) -> str:
-    """The world of poses that a localizer with its own origin, or the source, gives."""
+    """Return the world of given poses: of a localizer with an origin of its own, else of the source."""
     return world_of(place.localizer if hasattr(place.localizer, "origin") else plan.source)
 
 
 def _refused_worlds(clients: list[Client]) -> list[Exception]:
-    """The refusal of a map of another world, with the number of keyframes that wait, and where."""
+    """Return the refusal of a map of another world in a list, with the number of waiting keyframes."""
     for client in clients:
         try:
             client.check_world()
@@ -602,7 +602,7 @@ def _refused_worlds(clients: list[Client]) -> list[Exception]:
 
 
 def _server_rss(in_map: WrittenMap | None) -> dict[str, int]:
-    """Peak memory in bytes of gateway and fuser, and as `server` their sum; empty = not known."""
+    """Return peak memory in bytes of `gateway`, `fuser`, and `server` (their sum); empty if unknown."""
     if in_map is None:
         return {}
     gateway, fuser = (in_map.status.peak_rss_bytes[name] for name in ("server", "fuser"))
@@ -610,14 +610,14 @@ def _server_rss(in_map: WrittenMap | None) -> dict[str, int]:
 
 
 def _settings(plan: RunPlan, in_map: WrittenMap | None) -> dict[str, Any]:
-    """Settings of a run: those of its scan, and of the map as its server has it."""
+    """Return the settings of a run: those of its scan, and of the map as its server has it."""
     scan = {} if plan.is_replay else {"scan": msgspec.to_builtins(plan.scan)}
     asked = {"volume": msgspec.to_builtins(plan.volume)} if plan.connect is None else {}
     return {**scan, **asked, **(in_map.status.config if in_map else {}), "rate": plan.rate}
 
 
 def _error_mm(plan: RunPlan, in_map: WrittenMap | None) -> NDArray[np.float64] | None:
-    """(n,) millimetres from the mesh's vertices to the true surface; None = it is not known."""
+    """Return (n,) millimetres from the mesh's vertices to the true surface; None if it is unknown."""
     if plan.distance is None or in_map is None or not len(in_map.mesh.faces):
         return None
     return 1000 * np.abs(plan.distance(in_map.mesh.vertices.astype(np.float64)))

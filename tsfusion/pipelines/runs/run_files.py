@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The files that every whole run leaves: meshes with their pictures, trajectories, the latency ledger."""
+"""Write the files that every run leaves: meshes, pictures, trajectories, the latency ledger, a report."""
 
 import dataclasses
 import logging
@@ -41,7 +41,7 @@ _MESH_FILES = (("mesh", ".ply"), ("mesh", ".glb"), ("preview", ".png"))
 
 
 def check_folder(out: str | os.PathLike[str] | None) -> None:
-    """Raise OutputError where a run's `map.tsf` would take the place of a server's."""
+    """Raise OutputError if a run's `map.tsf` would replace the map of a server."""
     if out is not None:
         check_no_map_of_a_server(Path(out).expanduser() / MAP)
 
@@ -55,7 +55,7 @@ class WrittenMap(NamedTuple):
 
 
 class WrittenSubmap(NamedTuple):
-    """A submap whose files were written. `in_map` is its map; None = its server was not asked."""
+    """A submap whose files were written. `in_map` is its map, or None if its server was not asked."""
 
     figures: MapResult
     in_map: WrittenMap | None
@@ -79,11 +79,11 @@ def write_submap(
     """Write the trajectories of a submap, and its mesh; keep its map.
 
     Args:
-        target: has its map; None = that is not asked.
-        suffix: stands before the endings.
-        sensor: of its frames.
+        target: server that has the map; None if it is not to be asked.
+        suffix: text before the endings of the files.
+        sensor: sensor of its frames.
         is_given: see `write_trajectory`.
-        more: of `write_map`.
+        more: arguments of `write_map`.
     """
     if not submap.located:
         return WrittenSubmap(_describe(submap, None), None, suffix)
@@ -100,7 +100,7 @@ def write_submap(
 
 
 def _describe(submap: Submap, in_map: WrittenMap | None) -> MapResult:
-    """A submap in figures."""
+    """Return the figures of a submap."""
     figures: dict[str, Any] = {}
     if in_map is not None:
         names = ("map_hash", "keyframes_moved", "moving_s", "corrections_unavailable", "blocks")
@@ -118,7 +118,7 @@ def _describe(submap: Submap, in_map: WrittenMap | None) -> MapResult:
 
 
 def _error(submap: Submap, corrections: PoseCorrections | None) -> TrajectoryError | None:
-    """Error against the source's own poses, over the frames that have one; None = fewer than two have."""
+    """Return the error against the source's poses, or None if fewer than two frames have such a pose."""
     which, references = submap.located.with_reference()
     if len(which) < 2:
         return None
@@ -140,10 +140,10 @@ def write_map(
     """Fetch a map's status and mesh; write `mesh.ply`, `mesh.glb` and `preview.png` unless it is empty.
 
     Args:
-        held: how the sensor was held.
-        suffix: stands before the endings.
+        held: poses and forces of the sensor, to find the up direction.
+        suffix: text before the endings of the files.
         world: name of the coordinate frame of the poses; empty = that of poses given from elsewhere.
-        up: away from the ground, in the map's frame; None = it is found.
+        up: up direction in the map's frame; None = it is found.
         min_weight: full-confidence samples a voxel needs to be meshed; None = the sensor's.
         keep_islands: see `mesh_finishing.write`.
     """
@@ -162,7 +162,7 @@ def write_map(
 
 
 def _provenance(status: Status, target: Target, world: str) -> Provenance:
-    """Provenance of a run's meshes; without a hash where others may have changed the map since."""
+    """Return the provenance of a run's mesh. It has no hash if others may have changed the map since."""
     is_own = target.child is not None
     return Provenance(
         source=f"map {status.map}",
@@ -183,11 +183,11 @@ def write_ledger(work: Path, records: list[KeyframeTimes]) -> None:
 def write_trajectory(work: Path, submap: Submap, suffix: str, *, is_given: bool) -> None:
     """Write poses in the TUM format: `keyframes.txt` of those in the map, `trajectory.txt` of all frames.
 
-    Where loops were closed, `trajectory-corrected.txt` too; where the source has poses of its own that are
-    not these, `reference.txt`.
+    After loop closures, also write `trajectory-corrected.txt`. If the source has other poses of its own, also
+    write `reference.txt`.
 
     Args:
-        is_given: every frame is a keyframe at the source's own pose, so that one file says all.
+        is_given: every frame is a keyframe at the source's pose. Then `keyframes.txt` says all.
     """
     track = submap.located
     poses, chosen = track.poses(), np.flatnonzero(track.seqs >= 0)
@@ -210,10 +210,10 @@ def _write_tum(path: Path, stamps_ns: NDArray[np.int64], poses: NDArray[np.float
 
 
 def write_report(work: Path, meshes: dict[str, Mesh]) -> None:
-    """Write `report.html` and its pictures. A failure of that is logged: it costs no results.
+    """Write `report.html` and its pictures. A failure is only logged, because the results are complete.
 
     Args:
-        meshes: that were just written to `work`, by the name of their file.
+        meshes: meshes just written to `work`, by file name.
     """
     from tsfusion.pipelines.report import run_report
 
@@ -224,10 +224,10 @@ def write_report(work: Path, meshes: dict[str, Mesh]) -> None:
 
 
 def no_surface(stats: ClientStats, rejection: str) -> str:
-    """The error of a run whose map has no triangles.
+    """Return the error message of a run whose map has no triangles.
 
     Args:
-        rejection: why the map did not take the first keyframe that it rejected; empty = it took all.
+        rejection: why the map rejected the first keyframe that it rejected; empty if it took all.
     """
     if lost := shortfall.of_disk(stats):
         return f"{NO_SURFACE}: {lost}"

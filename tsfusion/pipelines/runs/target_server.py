@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The server that a run sends its keyframes to: one started for this run, or one that runs elsewhere."""
+"""Open the server that a run sends its keyframes to: start one for this run, or connect to another."""
 
 import json
 import logging
@@ -47,15 +47,15 @@ from tsfusion.wire.sockets.curve import ClientKeys, client_keys
 
 START_DEADLINE = 180.0  # seconds; a cold kernel compilation on a slow machine
 STOP_DEADLINE = 60.0  # seconds; draining and the checkpoint
-_ROUTINE = re.compile("tsfusion: (DEBUG|INFO|WARNING): ")  # lines of a server's log that are no error
+_ROUTINE = re.compile("tsfusion: (DEBUG|INFO|WARNING): ")  # log lines of a server that are no error
 _WARNING = re.compile("tsfusion(?: fuser)?: WARNING: (.*)")
 _ERROR = re.compile("tsfusion(?: fuser)?: ERROR: (.*)|(Fatal Python error: .*)")
 _ERRORS_TOLD = 3
 _NAME_TIMEOUT = 1.0  # seconds for a server to name a free map: a sensor waits
-NEW_MAP = "auto"  # as the name of a map: the next one that nobody has
+NEW_MAP = "auto"  # as a map's name: the next free name
 log = logging.getLogger(__name__)
-THROWN_AWAY = ""  # instead of a state folder: one in the run's scratch folder
-MAPS = 16  # that a run's own server may have open: its default one, and one for each submap
+THROWN_AWAY = ""  # as a state folder: a temporary one in the run's scratch folder
+MAPS = 16  # open maps of a run's own server: the default one, and one for each submap
 
 
 class ServerChild:
@@ -70,14 +70,14 @@ class ServerChild:
 
     @property
     def pid(self) -> int:
-        """Number of its process."""
+        """Id of its process."""
         return self._process.pid
 
     def wait_ready(self) -> None:
-        """Read the line that says the server is ready, and repeat its warnings.
+        """Wait for the line that says the server is ready, and log its warnings again.
 
         Raises:
-            TransportError: when it ends or stays silent.
+            TransportError: when the server ends or stays silent.
         """
         started = time.monotonic()
         stdout = self._process.stdout
@@ -106,7 +106,7 @@ class ServerChild:
             raise TransportError(f"the server ended with status {self._process.returncode}{reason}")
 
     def tell_errors(self) -> None:
-        """Repeat the last errors of its log: why it did not do what it was asked for."""
+        """Log the last errors in the server's log again: they say why it failed."""
         found = map(_ERROR.match, self._log.read_text(encoding="utf-8", errors="replace").splitlines())
         for error in [one[1] or one[2] for one in found if one][-_ERRORS_TOLD:]:
             log.error("the server says: %s", error)
@@ -123,24 +123,24 @@ class ServerChild:
 
     @property
     def status(self) -> int | None:
-        """Exit status of its process; None = it runs."""
+        """Exit status of its process; None while it runs."""
         return self._process.returncode
 
     def kill(self) -> None:
-        """End the server and its fuser at once, if they run; what they wrote is thrown away."""
+        """Kill the server and its fuser, if they run. What they wrote is thrown away."""
         with self._process, suppress(ProcessLookupError):  # closes its pipes and waits for it
             os.killpg(self._process.pid, signal.SIGKILL)
 
 
 @contextmanager
 def serving(server: ServerConfig, volume: VolumeConfig, scratch: Path) -> Iterator[ServerChild]:
-    """Run a server; it drains and checkpoints when the block ends well, and is killed when it does not.
+    """Run a server. At the end of the block it drains and checkpoints; after an error it is killed.
 
     Args:
         scratch: an existing folder for its configuration and log.
 
     Raises:
-        TransportError: when it does not get ready.
+        TransportError: when the server does not get ready.
     """
     settings = scratch / "server.toml"
     settings.write_text(config.to_toml(Config(server=server, volume=volume)), encoding="utf-8")
@@ -164,7 +164,7 @@ def _start(settings: Path, stderr: IO[str]) -> subprocess.Popen[str]:
     environment = {key: value for key, value in os.environ.items() if not key.startswith("TSFUSION_")}
     return subprocess.Popen(
         command,
-        stdin=subprocess.PIPE,  # closes when we die, however we die: the server then stops by itself
+        stdin=subprocess.PIPE,  # closes when this process dies in any way; then the server stops by itself
         stdout=subprocess.PIPE,
         stderr=stderr,
         text=True,
@@ -175,29 +175,29 @@ def _start(settings: Path, stderr: IO[str]) -> subprocess.Popen[str]:
 
 @dataclass(frozen=True)
 class Target:
-    """The server that a run sends to."""
+    """The server that a run sends keyframes to."""
 
-    link: ClientConfig  # settings of the connection: the server's addresses, and the map to scan into
-    keys: ClientKeys | None  # of the connection; None = it has none
+    link: ClientConfig  # addresses of the server, and the map to scan into
+    keys: ClientKeys | None  # keys of the connection, if it has any
     spools: Path  # folder that holds one spool a map
     child: ServerChild | None  # the server started for this run; None = the server runs elsewhere
     _clients: ExitStack
     _kept: dict[str, Path]  # maps of the server started for this run, and the files that they become
-    _unkept: list[str] = field(default_factory=list)  # why some of these did not become any
+    _unkept: list[str] = field(default_factory=list)  # why some maps were not kept
 
     @property
     def unkept(self) -> str:
-        """Reason why maps could not be kept in files; empty = they were, or the server still runs."""
+        """Why maps could not be kept in files; empty if all were kept, or while the server runs."""
         return "; ".join(self._unkept)
 
     def client(
         self, map_name: str, *, policy: Policy | None = None, world: str = "", same_frame: bool = False
     ) -> Client:
-        """A client that sends to a map, with a spool in which nothing waits; closed with the target.
+        """Return a client for a map, with an empty spool. It is closed with the target.
 
         Args:
-            policy: None = the settings' own.
-            world, same_frame: of its poses; see `Client`.
+            policy: what to do when the spool is full; None = as in the settings.
+            world, same_frame: see `Client`.
         """
         while True:
             folder = left_spools.free_folder(self.spools, map_name)
@@ -208,7 +208,7 @@ class Target:
                     raise
 
     def client_of_left(self, left: left_spools.LeftSpool, world: str) -> Client:
-        """A client that sends what an earlier scan left; closed with the target."""
+        """Return a client that sends what an earlier scan left. It is closed with the target."""
         return self._open(left.folder, left.map, policy="spool_all", world=world)
 
     def _open(self, folder: Path, map_name: str, *, policy: Policy | None, **labels: Any) -> Client:
@@ -219,12 +219,12 @@ class Target:
         return client
 
     def keep_map(self, map_name: str, path: Path) -> None:
-        """Write a map to a file when the server started for this run has stopped."""
+        """Write a map to a file after the server of this run has stopped. Ignore maps of other servers."""
         if self.child is not None:
             self._kept[map_name] = path
 
     def free_map_name(self) -> str | None:
-        """A name like that of the map to scan into, which no map has; None = the server does not say soon."""
+        """Return a free name like that of the map to scan into, or None if the server is slow to answer."""
         link = self.link
         with suppress(TransportError):
             return fetch_new_map(
@@ -233,35 +233,35 @@ class Target:
         return None
 
     def check(self) -> None:
-        """Raise TransportError when the server started for this run has ended."""
+        """Raise TransportError if the server of this run has ended."""
         if self.child is not None:
             self.child.check()
 
     def has_map(self, map_name: str) -> bool:
-        """True if a map is open; a new one is made for its first record."""
+        """True if a map is open. A new map is made for its first record."""
         address, control, keys = self.link.address, self.link.control, self.keys
         return map_name in fetch_health(address, control=control, keys=keys).maps
 
     def status(self, map_name: str, *, timeout: float = 10.0) -> Status:
-        """The status of a map; see `fetch_status`."""
+        """Return the status of a map; see `fetch_status`."""
         address, control, keys = self.link.address, self.link.control, self.keys
         return fetch_status(address, control=control, map_name=map_name, timeout=timeout, keys=keys)
 
     def health(self, *, timeout: float = 10.0) -> Health:
-        """The server's health; see `fetch_health`."""
+        """Return the server's health; see `fetch_health`."""
         return fetch_health(self.link.address, control=self.link.control, timeout=timeout, keys=self.keys)
 
     def mesh(self, map_name: str, *, min_weight: float | None) -> Mesh:
-        """The mesh of a map, as of now; see `fetch_mesh`."""
+        """Return the present mesh of a map; see `fetch_mesh`."""
         address, control, keys = self.link.address, self.link.control, self.keys
         return fetch_mesh(address, control=control, map_name=map_name, min_weight=min_weight, keys=keys)
 
 
 def map_to_send_to(link: ClientConfig, name: str, like: str) -> str:
-    """The map of that name; for `auto` the first of LIKE, LIKE-2, … that no map of the server has.
+    """Return the name, or for `auto` the first of LIKE, LIKE-2, … that no map of the server has.
 
     Raises:
-        TransportError: when the server does not say.
+        TransportError: when the server does not answer.
     """
     if name != NEW_MAP:
         return name
@@ -279,19 +279,19 @@ def opened(
     server: ServerConfig | None = None,
     spools: Path | None = None,
 ) -> Iterator[Target]:
-    """The target of a run; its clients are closed, and its own server is stopped, at the end of the block.
+    """Open the target of a run. At the end of the block its clients close, and its own server stops.
 
     Args:
         connect: data address of a server that runs elsewhere; None starts one.
-        client: settings of the connection; `auto` as its map is the next name that no map of the server has.
+        client: settings of the connection. The map `auto` means a name that no map of the server has.
         scratch: a folder that does not exist yet, removed at the end of the block.
-        volume: the map of the server started here.
+        volume: settings of the map, for a server started here.
         server: settings of the server started here; None = a free port, and `THROWN_AWAY`.
         spools: with `connect`, the folder of spools; None = one in `scratch`.
 
     Raises:
-        TransportError: when the server does not start.
-        InvalidConfig: for keys that are of no use, and where the map is another server's now.
+        TransportError: when the server does not start or answer.
+        InvalidConfig: for unusable keys, or when the map has moved to another server.
     """
     link, child = client or ClientConfig(), None
     kept: dict[str, Path] = {}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A live page beside a run: `tsfusion view` as a child process, which can break nothing."""
+"""Show a live page beside a run: `tsfusion view` in a child process, whose failure does not harm the run."""
 
 import json
 import logging
@@ -20,7 +20,7 @@ from tsfusion.wire.sockets import sockets
 from tsfusion.wire.sockets.curve import ClientKeys
 
 _COMMAND = (sys.executable, "-m", "tsfusion", "view", "--json", "--from-parent")
-_ANYWHERE = {"0.0.0.0": "127.0.0.1", "*": "127.0.0.1", "::": "::1"}  # how it is reached from here
+_ANYWHERE = {"0.0.0.0": "127.0.0.1", "*": "127.0.0.1", "::": "::1"}  # host listened at → host to reach
 _WARNING = "tsfusion view: WARNING: "
 _END_SECONDS = 5.0
 _FOR_THE_VIEWER = ("TSFUSION_TOKEN", "TSFUSION_NO_BROWSER")
@@ -29,16 +29,16 @@ log = logging.getLogger(__name__)
 
 
 class ViewerChild:
-    """A `tsfusion view` that ends with this process, however that ends.
+    """A `tsfusion view` process that ends when this process ends in any way.
 
     Args:
         place: HOST:PORT of the page.
-        tell: called in a thread with the page's address, once it can be opened.
+        tell: called in a thread with the address of the page, when it can be opened.
         truth: known surface of the map, as `tsfusion view --truth` takes it.
 
     Raises:
         MissingDependency: without viser.
-        InvalidConfig: for a bad place.
+        InvalidConfig: for a bad `place`.
         TransportError: when the port is taken.
     """
 
@@ -62,10 +62,10 @@ class ViewerChild:
         keys: ClientKeys | None = None,
         again: str | None = None,
     ) -> None:
-        """Show a map of the server that listens at `address`. What goes wrong is a warning, no error.
+        """Show a map of the server that listens at `address`. Failures are logged as warnings.
 
         Args:
-            again: what `tsfusion view` shows when the run has ended; the page then says so.
+            again: what to give to `tsfusion view` after the run; the page says so at the end.
         """
         given = {
             "--control": control and _reached(control),
@@ -79,7 +79,7 @@ class ViewerChild:
         try:
             self._process = subprocess.Popen(
                 [*_COMMAND, _reached(address), *flags],
-                stdin=subprocess.PIPE,  # closes when we die, however we die: it then ends by itself
+                stdin=subprocess.PIPE,  # closes when this process dies in any way; that ends the viewer
                 stdout=subprocess.PIPE,
                 stderr=subprocess.STDOUT,
                 text=True,
@@ -95,7 +95,7 @@ class ViewerChild:
             self._reader.start()
 
     def close(self) -> None:
-        """End the page."""
+        """End the viewer process."""
         self._is_ending = True
         if self._process is None:
             return
@@ -109,7 +109,7 @@ class ViewerChild:
             pass
 
     def _follow(self) -> None:
-        """Pass on what it says, until it ends."""
+        """Pass on the output of the viewer process, until it ends."""
         child, why = self._process, ""
         assert child is not None
         assert child.stdout is not None
@@ -126,13 +126,13 @@ class ViewerChild:
 
 
 def _reached(address: str) -> str:
-    """The address to connect to, of one that is listened at."""
+    """Return the address to connect to for a listening address such as tcp://0.0.0.0:5555."""
     host, port = sockets.parse_address(address)
     return sockets.format_address(_ANYWHERE.get(host, host), port)
 
 
 def _environment() -> dict[str, str]:
-    """Our environment, without the flags that are meant for the run."""
+    """Return this process's environment, without the flags that are meant for the run."""
     return {
         name: value
         for name, value in os.environ.items()
@@ -142,7 +142,7 @@ def _environment() -> dict[str, str]:
 
 @contextmanager
 def showing(viewer: ViewerChild | None, target: Target, again: str) -> Iterator[None]:
-    """Show the map that a run sends to, until the end of the block; afterwards `again` has it."""
+    """Show the map that a run sends to, until the end of the block. `again`: see `ViewerChild.start`."""
     if viewer is None:
         yield
         return

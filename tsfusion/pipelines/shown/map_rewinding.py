@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""A saved map at any time of its journal: it is a sum, so keyframes are added and taken away to the last bit.
+"""Take a saved map to any time of its journal, by adding and subtracting keyframes exactly.
 
-Its keyframes are in the order of the journal, in which each scanner's are as it captured them, each at its
-final pose. Those that the journal does not have (any more) stay in the map at every time.
+Keyframes are in the order of the journal, which for each scanner is the order of capture. Each is at its
+final pose. Keyframes of the map that the journal no longer has stay in the map at every time.
 """
 
 from collections import Counter
@@ -25,34 +25,34 @@ from tsfusion.tsdf.files import checkpoint, map_history
 from tsfusion.tsdf.volume import Volume
 from tsfusion.wire.records import codec
 
-_READING = 20  # keyframes could be fused in the time that it takes to read a saved map, roughly
-_ABSENT, _THERE, _ELSEWHERE, _LEFT_OUT = 0, 1, 2, 3  # a keyframe; elsewhere = not at its final pose
+_READING = 20  # reading a saved map takes as long as fusing about so many keyframes
+_ABSENT, _THERE, _ELSEWHERE, _LEFT_OUT = 0, 1, 2, 3  # of a keyframe; elsewhere = not at its final pose
 
 
 class _Removed(NamedTuple):
-    """A keyframe in the saved map that its journal says is to leave it, and where it was fused."""
+    """A keyframe in the saved map that the journal's corrections remove, and the pose where it was fused."""
 
     place: KeyframePlace
     T: NDArray[np.float64]
 
 
 class RewoundMap:
-    """A saved map, and the same one after fewer keyframes.
+    """A saved map that can be taken to any number of its keyframes.
 
     Args:
         file: the saved map.
-        journaled: keyframes of its journal; None = there is none, and no time but now.
-        memory_bytes: of `Volume`.
+        journaled: keyframes of its journal; None without a journal: then the map stays as it is.
+        memory_bytes: see `Volume`.
 
     Attributes:
-        sessions: of the keyframes.
-        places, poses: of the n keyframes that can come and go, in order, with their final (n, 4, 4) poses.
-        fixed: likewise poses by session and number of those that cannot.
-        target: so many keyframes are wanted.
-        left_out: reason → number of keyframes that could not be added, or taken away, since it was opened.
+        sessions: sessions of the keyframes.
+        places, poses: the n keyframes that can be added or removed, in order; their final (n, 4, 4) poses.
+        fixed: poses of the other keyframes, by session and number.
+        target: number of keyframes wanted in the map.
+        left_out: reason → number of keyframes that could not be added or removed since the map was opened.
 
     Raises:
-        CheckpointError, JournalError: when they cannot be read.
+        CheckpointError, JournalError: when the map or its journal cannot be read.
     """
 
     def __init__(
@@ -64,9 +64,9 @@ class RewoundMap:
         self.sessions: dict[bytes, JournaledSession] = {} if journaled is None else journaled.sessions
         self.left_out = Counter[str]()
         self._volume: Volume | None = None
-        self._way = "on"  # or the map that `step` begins from: "empty", "saved"
+        self._way = "on"  # go on from the present map; else `step` begins from "empty" or "saved"
         self._touched_by = TouchedBy()
-        self._touched_again: int | None = 0  # keyframes, in order; None = it is known who touched what
+        self._touched_again: int | None = 0  # next for `find_clients`; None = all done
         self._list(journaled)
         self.target = len(self.places)
         self._now = self._saved.copy()
@@ -113,7 +113,7 @@ class RewoundMap:
 
     @property
     def volume(self) -> Volume:
-        """The map; another one after a `step` that returned True. Read at the first use."""
+        """The map, read at the first use. It is another object after a `step` that returned True."""
         if self._volume is None:
             self._volume = self._load()
         return self._volume
@@ -126,7 +126,7 @@ class RewoundMap:
 
     @property
     def seconds(self) -> float | None:
-        """Between the first and the last record of the keyframes' sessions; None = there are none."""
+        """Seconds from the first to the last record of the keyframes' sessions; None without sessions."""
         spans = [(one.first_ns, one.last_ns) for one in self.sessions.values()]
         if not spans:
             return None
@@ -134,21 +134,21 @@ class RewoundMap:
 
     @property
     def place(self) -> int:
-        """Number of the keyframes in the map that can come and go."""
+        """Number of keyframes in the map that can be removed."""
         return int(np.isin(self._now, (_THERE, _ELSEWHERE)).sum())
 
     @property
     def behind(self) -> int:
-        """Number of keyframes that come, go or move between the saved map and the settled one."""
+        """Number of keyframes to add, remove or move from the saved map to the settled one."""
         return _steps(self._saved, len(self._saved)) + len(self._removed)
 
     @property
     def is_there(self) -> bool:
-        """True if the map is the one after `target` keyframes."""
+        """True if the map has exactly the first `target` keyframes at their final poses."""
         return self._way == "on" and not self._to_remove and not _steps(self._now, self.target)
 
     def keyframes_in(self) -> dict[bytes, tuple[NDArray[np.int64], Poses]]:
-        """Numbers and poses of the keyframes in the map, by session."""
+        """Return numbers and poses of the keyframes in the map, by session."""
         poses = np.where((self._now == _ELSEWHERE)[:, None, None], self._saved_poses, self.poses)
         present = dict(self.fixed)
         present.update({one.place[:2]: one.T for one in self._to_remove})
@@ -160,25 +160,25 @@ class RewoundMap:
         return {key: _columns(sorted(each, key=lambda one: one[0])) for key, each in found.items()}
 
     def last_of_sessions(self) -> list[int]:
-        """The last keyframe in the map of each session, in order."""
+        """Return the index of each session's last keyframe in the map, in order."""
         last = {self.places[index].session: index for index in np.flatnonzero(self._now == _THERE).tolist()}
         return sorted(last.values())
 
     def seek(self, keyframes: int) -> None:
-        """Want the map after so many keyframes; `step` goes there, the shortest way."""
+        """Set `target` to this number of keyframes, and choose the fastest way for `step`."""
         self.target = min(max(keyframes, 0), len(self.places))
         costs = {"on": self._cost("on")}
         costs["saved"] = self._cost("saved") + _READING
         if self._begins_empty:
             costs["empty"] = self._cost("empty")
         if self.header.config.checked_model().regularizer != "off":
-            # What is smoothed along rays comes back in the order in which it was, or not at all
+            # A map smoothed along rays depends on the order of keyframes: none can be subtracted
             costs = {way: cost for way, cost in costs.items() if self._only_adds(way)} or costs
         self._way = min(costs, key=costs.__getitem__)
         self._now, self._to_remove = self._contents(self._way)
 
     def _contents(self, way: str) -> tuple[NDArray[np.int8], list[_Removed]]:
-        """Keyframes that are in the map where a way begins, and those to be removed."""
+        """Return the states of keyframes where a way begins, and the keyframes to be removed."""
         if way == "empty":
             return np.full_like(self._saved, _ABSENT), []
         return (self._now, self._to_remove) if way == "on" else (self._saved.copy(), list(self._removed))
@@ -192,13 +192,13 @@ class RewoundMap:
         return not to_remove and not (now == _ELSEWHERE).any() and not (now[self.target :] == _THERE).any()
 
     def step(self) -> bool:
-        """Add or take away one keyframe, or begin from another map; whether it is another one now.
+        """Add or remove one keyframe, or begin from another map. Return True if `volume` is another one now.
 
         Raises:
             CheckpointError: when the saved map cannot be read any more.
         """
         if self._way != "on":
-            self._volume = None  # memory for one
+            self._volume = None  # there is memory for one volume only
             if self._way == "saved":
                 self._volume = self._load()
             else:
@@ -226,12 +226,12 @@ class RewoundMap:
 
     @property
     def knows_clients(self) -> bool:
-        """True if the clients that touched each block last are known, as far as the journal has them."""
+        """True if the client that touched each block last is known, as far as the journal has it."""
         is_smoothed = self.header.config.checked_model().regularizer != "off"  # nothing may be taken away
         return self._touched_again is None or is_smoothed or len(self.sessions) < 2
 
     def find_clients(self) -> None:
-        """Find out whose the blocks of one more keyframe are: it is taken away and added again, in order."""
+        """Find the client that touched one more keyframe's blocks: remove the keyframe, then add it again."""
         index = self._touched_again or 0
         there = np.flatnonzero(self._now[index:] == _THERE)
         if not len(there):
@@ -244,7 +244,7 @@ class RewoundMap:
         self._touched_again = index + 1
 
     def clients_of(self, cells: NDArray[np.int32]) -> tuple[tuple[bytes, ...], NDArray[np.int32]]:
-        """Sessions, and the row in them of who touched each of (n, 3) cells last; −1 = not known."""
+        """Return sessions, and for each of (n, 3) cells the row of its last session in them; −1 = unknown."""
         sessions, rows = self._touched_by.of(self.volume.cell_stamps(cells)[1])
         known = [row for row, session in enumerate(sessions) if session]
         new = np.full(len(sessions) + 1, -1, np.int32)  # the last stands for "not known"
@@ -272,18 +272,18 @@ class RewoundMap:
         return True
 
     def record(self, index: int) -> Record:
-        """The record of a keyframe; raises JournalError when it cannot be read any more."""
+        """Return the record of a keyframe. Raise JournalError if it can no longer be read."""
         place = self.places[index]
         return journal.read_at(place.file, place.offset)
 
 
 def _may_come(history: map_history.SessionHistory | None, seq: int) -> bool:
-    """True if a keyframe that is not in a saved map can come: the map did not refuse it."""
+    """True if a keyframe that is not in a saved map may be added: the map did not reject it."""
     return history is None or seq > history.last or seq in history.taken_out
 
 
 def _steps(now: NDArray[np.int8], target: int) -> int:
-    """Number of keyframes to add or to take away until `target` of them are there."""
+    """Return the number of additions and removals until exactly the first `target` keyframes are in."""
     before, after = now[:target], now[target:]
     return int(
         (before == _ABSENT).sum() + (after == _THERE).sum() + 2 * (before == _ELSEWHERE).sum()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A saved map as events, a piece at a time: the raw surface of all first, then the one that it asks for."""
+"""Send a saved map as events, piece by piece: first all of its raw surface, then its chosen surface."""
 
 import time
 from collections.abc import Callable
@@ -26,20 +26,20 @@ from tsfusion.wire.asking.map_events import (
 )
 from tsfusion.wire.records.record_header import KeyframeHeader, unpack_keyframe
 
-CELLS = 512  # that are meshed at a time
-_MOVING_S = 0.2  # that keyframes come and go before what changed is meshed, and that meshing may take then
+CELLS = 512  # meshed at a time
+_MOVING_S = 0.2  # seconds for adding and removing keyframes, then as long for meshing
 _MEASURED = ("depth", "disparity")
 _NONE = np.zeros(0, np.int64)
 
 
 class PiecewiseMap:
-    """A map that is shown.
+    """A map shown on a page.
 
     Args:
-        name: of the map.
-        note: what a person is to know all the time; empty = nothing.
+        name: name of the map.
+        note: text that the page always shows; empty = none.
         send: takes events.
-        attend: called between the steps of a piece; whether something else is wanted than was.
+        attend: called between the steps of a piece. It returns True if the user wants something else now.
     """
 
     def __init__(
@@ -53,35 +53,35 @@ class PiecewiseMap:
     ) -> None:
         self._name, self._map, self._note, self._send, self._attend = name, rewound, note, send, attend
         self._volume: Volume | None = None
-        self._values: WholeMapValues | None = None  # refined, of the map as it is
+        self._values: WholeMapValues | None = None  # for the refined surface of the present map
         self._is_refining = False
         self._shown = set[int]()  # keys of cells with triangles
         self._stale = self._unrefined = _NONE  # sorted keys of cells
         self._told: str | None = None
         self._is_behind = not rewound.is_there
-        self._place = -1  # that paths and scanner were shown of
+        self._place = -1  # number of keyframes when paths and scanner were sent
         histories = map_history.of_clients(map_history.sessions(rewound.header.meta))
         saved = [bytes.fromhex(one.session) for one in histories]
         self._sessions = tuple(dict.fromkeys([*saved, *rewound.sessions]))
 
     def begin(self) -> None:
-        """Say what is shown."""
+        """Send the name and voxel size of the map, and its notes."""
         self._send([Cleared(self._name, self._map.header.config.voxel_size)])
         self._tell()
 
     def seek(self, keyframes: int) -> None:
-        """Show the map after so many keyframes: the pieces that follow do. Not to be called in `attend`."""
+        """Show the map after this many keyframes; later pieces do it. Do not call this in `attend`."""
         self._map.seek(keyframes)
 
     def weights(self, points: NDArray[np.float32]) -> NDArray[np.float32] | None:
-        """(n,) weights at (n, 3) points; None while there is no map."""
+        """Return (n,) weights at (n, 3) points, or None if the map is not read yet."""
         if self._volume is None:
             return None
         weights: NDArray[np.float32] = self._volume.sample(points, surface="raw").weight
         return weights
 
     def work(self) -> bool:
-        """Do the next piece; whether there was one.
+        """Do the next piece of work. Return False if there was none.
 
         Raises:
             CheckpointError: when the map cannot be read.
@@ -121,7 +121,7 @@ class PiecewiseMap:
             raise _Interrupted
 
     def _move(self) -> None:
-        """Let keyframes come and go for a while, then mesh some of what changed."""
+        """Add and remove keyframes for a while, then mesh some of what changed."""
         self._values = None
         self._tell()
         until = time.monotonic() + _MOVING_S
@@ -138,7 +138,7 @@ class PiecewiseMap:
         self._tell()
 
     def _find_clients(self) -> None:
-        """Find out whose blocks are; then show all cells again. The map stays as it is."""
+        """Find out which client touched each block. Then send all cells again; the map does not change."""
         assert self._volume is not None
         until = time.monotonic() + _MOVING_S
         while not self._map.knows_clients and time.monotonic() < until and not self._attend():
@@ -179,7 +179,7 @@ class PiecewiseMap:
         self._unrefined = self._unrefined[CELLS:]
 
     def _show(self, found: CellMeshes, *, is_refined: bool) -> None:
-        """Send the triangles of some cells; those that have none, and had none, are left out."""
+        """Send the triangles of some cells. Cells that have none and had none are left out."""
         keys, first = pack_keys(found.cells), found.first_face
         has_faces = np.diff(first) > 0
         was_shown = np.fromiter((key in self._shown for key in keys.tolist()), bool, len(keys))
@@ -195,7 +195,7 @@ class PiecewiseMap:
             self._send([update])
 
     def _send_place(self) -> None:
-        """Show where the keyframes are that the map has."""
+        """Send the poses of the keyframes in the map."""
         self._place, self._is_behind = self._map.place, False
         for index in self._map.last_of_sessions():
             self._send_scanner(index)
@@ -203,7 +203,7 @@ class PiecewiseMap:
         self._tell()
 
     def _send_scanner(self, index: int) -> None:
-        """Show a keyframe and its picture."""
+        """Send a keyframe's pose and picture."""
         if 0 <= index < len(self._map.places):
             place = self._map.places[index]
             try:
@@ -218,7 +218,7 @@ class PiecewiseMap:
             self._send([seen])
 
     def _tell(self) -> None:
-        """Say what is not as it should be, once."""
+        """Send a line about problems, if it has changed."""
         lines = [self._note] if self._note else []
         if self._is_behind:
             behind = count_of(self._map.behind, "keyframe")
@@ -231,11 +231,11 @@ class PiecewiseMap:
 
 
 class _Interrupted(Exception):
-    """Something else is wanted than the refined surface of the map as it was."""
+    """Stops the refining of the surface, because the user wants something else now."""
 
 
 def _shape(header: KeyframeHeader) -> tuple[int, int] | None:
-    """Height and width of a keyframe's image; None = it has none."""
+    """Return height and width of a keyframe's image, or None without an image."""
     for buffer in header.buffers:
         if buffer.name in _MEASURED:
             return buffer.shape[0], buffer.shape[1]
@@ -243,7 +243,7 @@ def _shape(header: KeyframeHeader) -> tuple[int, int] | None:
 
 
 def _picture(header: KeyframeHeader, frames: list[memoryview]) -> bytes | None:
-    """The JPEG of a keyframe, if it has one."""
+    """Return the JPEG of a keyframe, or None without one."""
     for number, buffer in enumerate(header.buffers, 1):
         if buffer.name == "color" and buffer.codec == "jpeg":
             return bytes(frames[number])

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""`python -m tsfusion.pipelines.shown.view_process`: the process that reads a saved map for a page.
+"""Read a saved map for a page, in a process of its own: `python -m tsfusion.pipelines.shown.view_process`.
 
-A kernel holds Python's global lock for its whole run, and the page has to answer meanwhile. `viewed_maps`
-starts it and is at the other end of its connection; it ends with that.
+A kernel holds Python's global lock for its whole run, but the page has to answer meanwhile. `viewed_maps`
+starts this process and holds the other end of its connection. The process ends when that end closes.
 """
 
 import signal
@@ -29,11 +29,11 @@ from tsfusion.tsdf.files import checkpoint
 from tsfusion.viewer.map_feed import TimeLine
 from tsfusion.wire.asking.map_events import MapEvent, SurfaceUpdate
 
-_MOST_BYTES = 16 << 20  # of triangles that the page has not taken yet
+_MOST_BYTES = 16 << 20  # of triangles sent and not yet taken by the page
 
 
 class ViewedSource(NamedTuple):
-    """A map that can be shown. `note`: what a person is to know about it; `journaled`: None = no journal."""
+    """A map that can be shown. `note`: text for the user; `journaled`: None without a journal."""
 
     name: str
     file: Path
@@ -42,10 +42,10 @@ class ViewedSource(NamedTuple):
 
 
 def find(path: Path, name: str | None) -> ViewedSource:
-    """The map at a path: a file, a run's folder, a state folder (its map of this name) or a map's in it.
+    """Return the map at a path: a file, a run's folder, a state folder (with `name`), or a map's folder.
 
     Raises:
-        CheckpointError, JournalError: when there is none, or it cannot be read.
+        CheckpointError, JournalError: when there is no map, or it cannot be read.
     """
     if (path / RECORD).is_file():
         file = path / run_files.MAP
@@ -74,21 +74,21 @@ def find(path: Path, name: str | None) -> ViewedSource:
 
 
 def _usual_map(state: Path) -> str | None:
-    """The map `default`, else the first one, of those that have been saved; None = none has."""
+    """Return the name of the saved map `default`, or of the first saved map; None if none was saved."""
     names = sorted(state_folder.map_names(state), key=lambda name: (name != DEFAULT_MAP, name))
     saved = (state_folder.map_folder(state, name) for name in names)
     return next((one.name for one in saved if (one / state_folder.MAP_FILE).is_file()), None)
 
 
 def _running(folder: Path) -> str:
-    """Note that a server has the map; empty = none has it."""
+    """Return a note if a server uses the map, else an empty text."""
     if owner_of(folder, name=state_folder.LOCK_FILE) is None:
         return ""
     return "a server is at work on this map, and what it does from now on is not shown: view its address"
 
 
 class _Viewing:
-    """Main loop of the process: it shows one map after the other, and answers."""
+    """Main loop of the process: shows one map after the other, and answers the page."""
 
     def __init__(self, link: "Connection[object, object]") -> None:
         self._link = link
@@ -100,7 +100,7 @@ class _Viewing:
         self._outstanding = 0  # bytes
 
     def run(self) -> None:
-        """Work until the other end is closed."""
+        """Work until the page closes the connection."""
         is_idle = True
         while not self._ended:
             self._read(wait=is_idle)
@@ -144,7 +144,7 @@ class _Viewing:
         return self._ended or self._open is not None or self._seek is not None
 
     def _send(self, events: list[MapEvent]) -> None:
-        """Send events, when the page has taken most of the earlier ones, or something else is wanted."""
+        """Send events. First wait until the page took most earlier ones, or the user wants something else."""
         while self._outstanding > _MOST_BYTES and not self._attend():
             self._read(wait=True)
         nbytes = sum(_size(one.mesh) for one in events if isinstance(one, SurfaceUpdate))
@@ -177,9 +177,9 @@ def _size(mesh: Mesh) -> int:
 
 
 def main() -> None:
-    """Serve the connection whose file descriptor is the argument."""
+    """Serve the connection whose file descriptor is the first argument."""
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)  # who started it decides
+        signal.signal(number, signal.SIG_IGN)  # the page decides when this process ends
     process.end_first()
     process.lift_memory_limit()  # which is that of the page
     _Viewing(Connection(int(sys.argv[1]))).run()

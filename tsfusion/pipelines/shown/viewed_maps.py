@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Saved maps as feeds of a page: a file, a run's folder, or a state folder with the times of its journals."""
+"""Feed a page with a saved map: a file, a run's folder, or a state folder with its past."""
 
 import os
 import socket
@@ -22,7 +22,7 @@ from tsfusion.journal import state_folder
 from tsfusion.viewer.map_feed import TimeLine
 from tsfusion.wire.asking.map_events import LinkSeen, MapEvent
 
-_ANSWER_S = 5.0  # that `weights` waits: a large map may be being read
+_ANSWER_S = 5.0  # longest wait of `weights`: a large map may still be loading
 _END_S = 3.0
 _COMMAND = (sys.executable, "-m", "tsfusion.pipelines.shown.view_process")
 _GONE = "the process that reads the map has ended: was there memory enough? Start the page again"
@@ -30,7 +30,7 @@ _GONE = "the process that reads the map has ended: was there memory enough? Star
 
 @dataclass(frozen=True)
 class Open:
-    """Show a map. `number`: that all that follows about it has; `name`: in a state folder."""
+    """Show a map. `number`: repeated in all messages about it. `name`: the map in a state folder."""
 
     number: int
     path: Path
@@ -39,7 +39,7 @@ class Open:
 
 @dataclass(frozen=True)
 class Seek:
-    """Show it after so many keyframes."""
+    """Show the map after this many keyframes."""
 
     keyframes: int
 
@@ -54,14 +54,14 @@ class Weigh:
 
 @dataclass(frozen=True)
 class Took:
-    """So many bytes of triangles were taken."""
+    """This many bytes of triangles were taken by the page."""
 
     nbytes: int
 
 
 @dataclass(frozen=True)
 class Opened:
-    """A map is shown; `name` = which."""
+    """A map with this name is shown."""
 
     number: int
     name: str
@@ -94,12 +94,12 @@ class Weighed:
 
 
 def open_feed(path: Path, *, map_name: str | None = None) -> "SavedMapFeed":
-    """The feed of a saved map.
+    """Return the feed of a saved map.
 
     Args:
         path: `MAP.tsf`, the folder of a run, a state folder, or the folder of one of its maps.
-        map_name: of the map, where the state folder has several; None = `default`, else the first, of those
-            that have been saved.
+        map_name: name of the map, where the state folder has several. None = `default`, or the first map if
+            `default` was not saved.
 
     Raises:
         CheckpointError, JournalError: when there is no such map, or it cannot be read.
@@ -108,7 +108,7 @@ def open_feed(path: Path, *, map_name: str | None = None) -> "SavedMapFeed":
 
 
 class SavedMapFeed:
-    """A `MapFeed` of a saved map; a process of its own reads it. All but `events` from any thread."""
+    """A `MapFeed` of a saved map, read by another process. Any thread may call it, except `events`."""
 
     def __init__(self, path: Path, map_name: str | None) -> None:
         self._path = path
@@ -154,7 +154,7 @@ class SavedMapFeed:
         return [self._path.absolute().stem]
 
     def choose(self, map_name: str) -> None:
-        """See `MapFeed`; raises JournalError when the state folder has no such map."""
+        """See `MapFeed`. Raise JournalError if the state folder has no such map."""
         if state_folder.is_state_folder(self._path):
             state_folder.resolve_map(self._path, map_name)
             with self._changed:
@@ -187,7 +187,7 @@ class SavedMapFeed:
         return found
 
     def weights(self, points: NDArray[np.float32]) -> NDArray[np.float32] | None:
-        """See `MapFeed`; waits some seconds at most."""
+        """See `MapFeed`. Wait at most some seconds."""
         with self._changed:
             self._asked += 1
             number = self._asked
@@ -212,11 +212,11 @@ class SavedMapFeed:
         self._socket.close()
 
     def _send(self, message: object) -> None:
-        with self._sending, suppress(OSError):  # one that has ended says so once, among the events
+        with self._sending, suppress(OSError):  # if the process has ended, an event says so once
             self._link.send(message)
 
     def _read(self) -> None:
-        """Take what the process sends, in a thread: it never waits for the page."""
+        """Take the messages of the process, in a thread. So the process never waits for the page."""
         try:
             while True:
                 message = self._link.recv()
@@ -234,7 +234,7 @@ class SavedMapFeed:
 
 
 def _start() -> tuple[socket.socket, "subprocess.Popen[bytes]"]:
-    """The process, and our end of its connection."""
+    """Return this end of the connection, and the process."""
     ours, theirs = socket.socketpair()
     with theirs:
         try:
