@@ -11,7 +11,6 @@ import shutil
 from collections.abc import Callable, Sequence
 from functools import cache, partial
 from hashlib import blake2b
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -26,7 +25,7 @@ from rosbag_writing import OPTICAL, writing
 
 from lab.reliability.fuzz_targets import Broken, Target, scratch
 from tsfusion.core.errors import TsfusionError
-from tsfusion.datasets import Dataset, open_dataset
+from tsfusion.datasets import Dataset, layout_registry, open_dataset
 from tsfusion.datasets.dataset import UnreadableRecording
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
@@ -414,8 +413,7 @@ def run(layout: str, content: bytes) -> str:
     trajectory = whole.with_name("slam.txt")
     _put(trajectory, "".join(map(_tum_line, range(COUNT))))
     options: tuple[dict[str, object], ...] = ({}, {"posed": False}, {"trajectory": trajectory})
-    layouts = import_module("tsfusion.datasets.layouts")  # the package has a function of that name
-    with mock.patch.object(layouts, "_plugins", list):  # looking for them takes longer than the rest
+    with mock.patch.object(layout_registry, "_plugins", list):  # looking for them takes longer than the rest
         return "; ".join(_opened(work, wanted, **each) for each in options)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 from lab.worlds.desk_world import Desk
 from lab.worlds.street_drive import DRIVES, StreetDrive
 from tsfusion.datasets import Dataset, Layout, open_dataset
-from tsfusion.datasets.layouts import open_as
+from tsfusion.datasets.layout_registry import open_as
 
 _NAMES = tuple(f"synthetic:{name}" for name in DRIVES)
 

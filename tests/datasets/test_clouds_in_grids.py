@@ -13,7 +13,7 @@ from small_recordings import one_line
 
 from tsfusion import open_dataset
 from tsfusion.core.errors import DatasetError, InvalidConfig
-from tsfusion.datasets.layouts import describe
+from tsfusion.datasets.layout_registry import describe
 from tsfusion.datasets.trajectory_files import write_tum
 from tsfusion.geometry.origin import Origin
 

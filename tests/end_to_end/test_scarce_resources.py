@@ -93,7 +93,7 @@ import os, resource, signal, sys, zmq
 from tsfusion import Client
 from tsfusion.core.errors import JournalError, ServerUnreachable, TransportError
 from tsfusion.wire.sockets import sockets
-from tsfusion.wire.sockets.connection import Connection
+from tsfusion.wire.sockets.connection import ServerLink
 from tsfusion.wire.asking.queries import fetch_health
 
 def leave(free):
@@ -122,7 +122,7 @@ def connection(free):
     context.socket(zmq.PAIR).close()
     leave(free)
     try:
-        Connection(context, sockets.push, "tcp://127.0.0.1:1", None).close()
+        ServerLink(context, sockets.push, "tcp://127.0.0.1:1", None).close()
     finally:
         context.term()
 

@@ -12,7 +12,7 @@ from repository import ROOT
 from lab.worlds import named_worlds
 from lab.worlds.desk_world import Desk
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets import layouts, open_dataset
+from tsfusion.datasets import layout_registry, layouts, open_dataset
 from tsfusion.datasets.worlds.synthetic import DEPTH_SCALE
 from tsfusion.geometry.keyframe import points_world
 
@@ -26,9 +26,9 @@ else:
 def installed(monkeypatch):
     """The entry points that lab/pyproject.toml names, whatever is installed here."""
     project = tomllib.loads((ROOT / "lab" / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    group = project["entry-points"][layouts.GROUP]
-    points = EntryPoints(EntryPoint(name, value, layouts.GROUP) for name, value in group.items())
-    monkeypatch.setattr(layouts, "entry_points", lambda group: points)
+    group = project["entry-points"][layout_registry.GROUP]
+    points = EntryPoints(EntryPoint(name, value, layout_registry.GROUP) for name, value in group.items())
+    monkeypatch.setattr(layout_registry, "entry_points", lambda group: points)
 
 
 @pytest.mark.usefixtures("installed")
@@ -60,7 +60,7 @@ def test_missing_poses_are_one_clear_line(opened, tmp_path, monkeypatch):
 
 
 def test_measurements_need_no_installed_laboratory(monkeypatch):
-    monkeypatch.setattr(layouts, "entry_points", lambda group: EntryPoints())
+    monkeypatch.setattr(layout_registry, "entry_points", lambda group: EntryPoints())
     with pytest.raises(DatasetError, match="`pip install -e lab` adds kitti06, kitti07 and desk"):
         open_dataset("synthetic:desk")
     assert named_worlds.open_world("synthetic:desk:kinect", count=1).sensor == "kinect"
@@ -68,7 +68,7 @@ def test_measurements_need_no_installed_laboratory(monkeypatch):
 
 
 def test_commands_find_the_worlds_where_the_laboratory_is_installed():
-    if not any(point.value.startswith("lab.") for point in entry_points(group=layouts.GROUP)):
+    if not any(point.value.startswith("lab.") for point in entry_points(group=layout_registry.GROUP)):
         pytest.skip("the laboratory is not installed: pip install -e lab")
     assert "synthetic:kitti06" in tsfusion("datasets").stdout
 

@@ -78,7 +78,7 @@ def _line(
 
 def _layouts() -> list[dict[str, Any]]:
     from tsfusion.datasets import layouts
-    from tsfusion.datasets.layouts import SYNTHETIC
+    from tsfusion.datasets.layout_registry import SYNTHETIC
 
     rows = [(layout.name, layout.description) for layout in layouts()]
     return [{"name": name, "description": description} for name, description in [*rows, SYNTHETIC]]
@@ -87,7 +87,7 @@ def _layouts() -> list[dict[str, Any]]:
 def _is_one(path: Path) -> bool:
     """True if a path has a known layout, or holds a folder with one."""
     from tsfusion.core.errors import DatasetError
-    from tsfusion.datasets.layouts import find
+    from tsfusion.datasets.layout_registry import find
 
     try:
         find(path)

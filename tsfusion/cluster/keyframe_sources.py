@@ -26,7 +26,7 @@ from tsfusion.core.readable_numbers import OnProgress, count_of
 from tsfusion.datasets import open_dataset
 from tsfusion.datasets.cameras import camera_files
 from tsfusion.datasets.dataset import Dataset, first_frame, pose_of
-from tsfusion.datasets.layouts import sweep_doubt
+from tsfusion.datasets.layout_registry import sweep_doubt
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.geometry.origin import world_of
 from tsfusion.journal import locations, state_folder

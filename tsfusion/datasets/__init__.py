@@ -22,7 +22,15 @@ from tsfusion.datasets.formats.nerfstudio import Nerfstudio
 from tsfusion.datasets.formats.scan_folders import LidarDump, ScanFolder
 from tsfusion.datasets.formats.stereo_folders import StereoFolder
 from tsfusion.datasets.formats.tum import TUM
-from tsfusion.datasets.layouts import FoundDataset, Layout, describe, find, layouts, open_as, world_layout
+from tsfusion.datasets.layout_registry import (
+    FoundDataset,
+    Layout,
+    describe,
+    find,
+    layouts,
+    open_as,
+    world_layout,
+)
 from tsfusion.datasets.rosbag.bag import Bag
 from tsfusion.datasets.worlds.synthetic import WORLDS, Synthetic
 
