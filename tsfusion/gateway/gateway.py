@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The gateway: everything that must answer while a kernel runs.
+"""The gateway: the part of the server that must answer while a kernel runs.
 
-A Taichi kernel holds its process for as long as it takes, so the gateway is a process of its own. Each
-message is checked, journaled and acknowledged in one step; a map's fuser gets only its journal position.
+A Taichi kernel blocks its process while it runs, so the gateway is a process of its own. Each message is
+checked, journaled and acknowledged in one step. A map's fuser gets only its position in the journal.
 """
 
 import logging
@@ -46,16 +46,16 @@ log = logging.getLogger(__name__)
 _TICK_MS = 100  # within which a signal or a fuser's death is noticed
 _RENEW_TICK_MS = 10  # while the sockets are made anew
 _REPLIES_SHARE = 4  # one fourth of the memory is for meshes and answers that wait to be read
-_PLACE_KEPT = 0.5  # seconds for which it is known at which server a map is
+_PLACE_KEPT = 0.5  # seconds for which the server of a map is cached
 _MOST_PLACES = 64
 _OF_AN_OPEN_MAP = frozenset({"forget", "ask", "status", "mesh"})
 _MOST_DEFERRED = 32  # commands that wait for their map to open
-_WAIT_SHARE = 0.9  # of a command's time: the answer is to come within it
+_WAIT_SHARE = 0.9  # share of a command's time that it waits for its map
 Handlers = dict[sockets.AnySocket, Callable[[list[zmq.Frame]], None]]
 
 
 class Gateway:
-    """One server's state between clients, journals and fusers. Call `step` again and again."""
+    """State of one server between clients, journals and fusers. Call `step` again and again."""
 
     def __init__(
         self,
@@ -95,9 +95,9 @@ class Gateway:
         self._questions = MapQuestions(
             ports, metrics, self._refused, unread=unread, max_bytes=most_unread, rate=server.quota_questions
         )
-        self._places: dict[str, tuple[tuple[str, str] | None, float]] = {}  # map → where it is, until when
-        self._deferred: list[tuple[str, float, Callable[[], None]]] = []  # map, until when, what is done then
-        self._publishing: dict[str, bool] = {}  # map → whether its fuser was told to send triangles
+        self._places: dict[str, tuple[tuple[str, str] | None, float]] = {}  # map → server, cached until
+        self._deferred: list[tuple[str, float, Callable[[], None]]] = []  # map, deadline, command to run
+        self._publishing: dict[str, bool] = {}  # map → True if its fuser was told to send triangles
         self._limits = ConnectionLimits(ports, access, self._refused, server.memory_bytes)
         self._condition = ServerCondition(
             ports, access, self.maps, self._routes, metrics, on_health=on_health
@@ -106,24 +106,24 @@ class Gateway:
         self._new_epoch()
 
     def _new_epoch(self) -> None:
-        self.epoch = f"{time.monotonic_ns():x}"  # tells clients that the messages under way are lost
+        self.epoch = f"{time.monotonic_ns():x}"  # a new one tells clients that unanswered messages are lost
 
     def accept(self, addresses: sockets.Addresses) -> None:
-        """Begin to take keyframes, of clients that reach this server at these addresses."""
+        """Start to take keyframes. `addresses`: those by which clients reach this server."""
         self._accepting = True
         self.maps.end_start((addresses.data, addresses.control))
         self.moves.resume()
-        self._condition.next_look = 0.0  # health checks are to see it at once
+        self._condition.next_look = 0.0  # health checks see the change at once
 
     def stop_accepting(self) -> None:
-        """Take no more keyframes; clients keep those that are not acknowledged."""
+        """Take no more keyframes. Clients keep the keyframes that are not acknowledged."""
         self._accepting, self._stopped, self.maps.is_ending = False, True, True
 
     def step(self) -> None:
-        """Wait a moment for messages, and handle those that came.
+        """Wait a moment for messages, and handle them.
 
         Raises:
-            TsfusionError: when a map that was to be opened at the start cannot be.
+            TsfusionError: when a map of the start cannot be opened.
         """
         handlers = self._handlers()
         fusers = [hosted.fuser.socket for hosted in self.maps]
@@ -150,7 +150,7 @@ class Gateway:
         self._condition.step(self.health)
 
     def _handlers(self) -> Handlers:
-        """The handler of each socket's messages; none of a socket that is made anew."""
+        """Return the handler of each socket's messages, without sockets that are being made anew."""
         ports = self.ports
         handlers: Handlers = {ports.control: self._on_control, ports.viewers: self._on_subscription}
         if self._accepting:
@@ -167,7 +167,7 @@ class Gateway:
             self.ports.knows_viewer(after_rubbish=True)
 
     def _drop_connections(self) -> bool:
-        """Drop all connections if that has to be. Returns True if it was done."""
+        """Drop all connections if that is necessary. Return True if they were dropped."""
         if not self._limits.all_must_go(self._queries.nbytes):
             return False
         self.ports.renew()
@@ -179,7 +179,7 @@ class Gateway:
     # --- maps ---
 
     def _update_fusers(self) -> None:
-        """Tell each fuser whether its map has viewers; refuse the queries that a dead one will not answer."""
+        """Tell each fuser if its map has viewers. Refuse queries to fusers that are not ready."""
         for hosted in self.maps:
             if not hosted.fuser.ready:
                 self._on_left(hosted.name)
@@ -190,7 +190,7 @@ class Gateway:
                 self._publishing[hosted.name] = watched
 
     def _pass_on(self, hosted: HostedMap, message: ForPeople, frames: Sequence[zmq.Frame]) -> None:
-        """Pass a fuser's message to its map's viewers, or to whoever asked."""
+        """Pass a fuser's message on to its map's viewers, or to the client that asked."""
         if isinstance(message, fuser_messages.FuserReply):
             own = message.status
             status = fuser_queries.status(hosted, own, self.health(), self._server) if own else None
@@ -201,7 +201,7 @@ class Gateway:
             self.ports.publish(mesh_topic(hosted.name), fuser_messages.encode(message), frames)
 
     def _on_left(self, name: str) -> None:
-        """Refuse the queries to the fuser of a map that was closed."""
+        """Refuse the open queries to a map that was closed."""
         self._publishing.pop(name, None)
         self._queries.give_up(name)
         self._questions.give_up(name)
@@ -229,7 +229,7 @@ class Gateway:
             self._greetings.on_ping(identity.bytes, message, client, self.epoch)
 
     def _opens(self, name: str) -> bool:
-        """True if a map is here and its fuser will soon be ready."""
+        """True if a map is on this server and its fuser will soon be ready."""
         hosted = self.maps.get(name)
         return hosted is not None and not hosted.fuser.ready and not hosted.fuser.failed
 
@@ -282,12 +282,12 @@ class Gateway:
             self._queries.submit(identity, command, self.maps.get(command.map), client)
 
     def _elsewhere(self, name: str) -> messages.Elsewhere | None:
-        """The other server that has a map; None = none is known, or the map is open here."""
+        """Return the other server that has a map, or None if none is known or the map is open here."""
         if self.maps.has(name):
             return None
         now = time.monotonic()
         place, until = self._places.get(name, (None, 0.0))
-        if now >= until:  # it is read from disks, and anybody may ask without end
+        if now >= until:  # cached: it is read from disks, and clients can ask without limit
             try:
                 place = self.maps.elsewhere(name)
             except JournalError as error:
@@ -322,9 +322,9 @@ class Gateway:
             )
 
     def _on_subscription(self, frames: list[zmq.Frame]) -> None:
-        """Let a viewer have the updates that it asks for, before the next message is read.
+        """Grant a viewer's subscription, if it has the right, before the next message is read.
 
-        Until then ZeroMQ knows whose message it was.
+        Only until then ZeroMQ knows the sender of the message.
         """
         change, topic = frames[0].bytes[:1], frames[0].bytes[1:]
         if len(frames) > 1 or change not in (b"\x00", b"\x01"):
@@ -333,10 +333,10 @@ class Gateway:
             if self.ports.grants_topics:
                 self._limits.on_rubbish(frames[0])
             return
-        client = self._access.client_of(frames[0])  # None also where it ends with its connection
+        client = self._access.client_of(frames[0])  # None also for a connection that has ended
         allowed = [] if client is None else self._admission.maps_of(client).topics(topic)
         is_known = self.ports.knows_viewer()
-        if not is_known:  # it connects again, and subscribes anew
+        if not is_known:  # a viewer that is cut off connects and subscribes again
             self.ports.cut_off(frames[0])
         if change == b"\x00":
             self._subscriptions.discard(topic, granted=None if client is None else bool(allowed))
@@ -353,7 +353,7 @@ class Gateway:
     # --- health ---
 
     def health(self, shown: AllowedMaps = ALL_MAPS) -> Health:
-        """Health of the server.
+        """Return the health of the server.
 
         Args:
             shown: only these maps, their clients, and their problems; `ready` is the whole server's.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Lines of the server's log about what happens: who comes and goes, and one a minute while keyframes come."""
+"""Lines of the server's log about its clients, and one summary a minute while keyframes come."""
 
 import logging
 import time
@@ -17,23 +17,23 @@ _INTERVAL = 60.0  # seconds between two summaries
 
 
 class ActivityLog:
-    """Compares health snapshots, and logs what changed. A server at which nothing happens logs nothing."""
+    """Compares health snapshots, and logs the changes. A server without activity logs nothing."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self._clients: dict[tuple[str, str], ClientHealth] = {}  # by session and map, as last seen
-        self._skipping: set[tuple[str, str]] = set()  # clients of which it was said that they skip
+        self._skipping: set[tuple[str, str]] = set()  # clients whose skipped keyframes were logged
         self._counted: dict[str, MapHealth] = {}  # at the last summary
         self._counted_at = clock()
 
     def note(self, health: Health) -> None:
-        """Log what is new in a snapshot. Call it about once a second."""
+        """Log the changes of a snapshot. Call it about once a second."""
         before, self._clients = self._clients, {(one.session, one.map): one for one in health.clients}
         self._skipping &= self._clients.keys()
         for key, one in self._clients.items():
             self._note_client(key, one, before.get(key))
         for name, found in health.maps.items():
-            if found.state != "opening" or not found.keyframes_durable:  # else nobody knows yet what it has
+            if found.state != "opening" or not found.keyframes_durable:  # else its counts are not known yet
                 self._counted.setdefault(name, found)
         if self._clock() - self._counted_at >= _INTERVAL:
             self._summarise(health)
@@ -74,7 +74,7 @@ class ActivityLog:
 
 
 def _progress(name: str, one: MapHealth, before: MapHealth, seconds: float) -> str:
-    """Keyframes that came into a map and were fused, in words; empty = none."""
+    """Return in words the keyframes that a map received and fused since `before`; empty without any."""
     received = one.keyframes_durable - before.keyframes_durable
     fused = max(one.keyframes_fused - before.keyframes_fused, 0)
     if received <= 0 and not fused:
@@ -89,7 +89,7 @@ def _progress(name: str, one: MapHealth, before: MapHealth, seconds: float) -> s
 
 
 def _balance(one: ClientHealth) -> str:
-    """The fates of a client's keyframes."""
+    """Return in words the counts of a client's keyframes by outcome."""
     words = [f"{count_of(one.durable, 'keyframe')} received, {one.fused} of them in the map"]
     counts = {"rejected by it": one.rejected, "refused": one.refused, "still in its spool": one.waiting}
     words += [f"{count} {what}" for what, count in counts.items() if count]
@@ -99,5 +99,5 @@ def _balance(one: ClientHealth) -> str:
 
 
 def _counted(counts: dict[str, int]) -> str:
-    """{"thinned": 22} → 22 × thinned."""
+    """Return counts in words: {"thinned": 22} → 22 × thinned."""
     return ", ".join(f"{count} × {reason}" for reason, count in sorted(counts.items()))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""One fuser process: its socket, and the file that says which keyframe it is at."""
+"""One fuser process: its socket, and the file that tells which keyframe it works at."""
 
 import os
 import shutil
@@ -20,21 +20,21 @@ from tsfusion.fuser import fuser_messages
 from tsfusion.wire.sockets import sockets
 
 _KILL_DEADLINE = 5.0  # seconds
-_SOCKET = "0"  # name of the file
+_SOCKET = "0"  # name of the socket's file
 COMMAND = (sys.executable, "-m", "tsfusion.fuser")
 
 
 class FuserProcess:
-    """A process that is started at once, or by `start`. Call `close` when it has ended, or to end it.
+    """A process that is started at once, or with `waits` by `start`. Call `close` also after its end.
 
     Args:
-        name: of the map, for the log lines; empty = that of a `Begin` that comes later.
+        name: name of the map for log lines; empty takes the name in a later `Begin`.
 
     Attributes:
-        has_started: whether it has said so, and takes messages.
+        has_started: True once the process has reported its start, and takes messages.
 
     Raises:
-        OSError, zmq.ZMQError: when the system cannot start it.
+        OSError, zmq.ZMQError: when the system cannot start the process.
     """
 
     def __init__(
@@ -63,7 +63,7 @@ class FuserProcess:
             raise
 
     def start(self) -> None:
-        """Start it; raises OSError."""
+        """Start the process. Raise OSError if the system cannot."""
         self._process = subprocess.Popen(
             self._command,
             stdin=subprocess.PIPE,  # closes when the gateway dies, however it dies
@@ -74,22 +74,22 @@ class FuserProcess:
 
     @property
     def working_file(self) -> str:
-        """The path by which the process opens it; see `fuser.fuser_messages.Begin`."""
+        """Path by which the process opens the file of its keyframe; see `fuser.fuser_messages.Begin`."""
         return f"/dev/fd/{self._working.fileno()}"
 
     @property
     def pid(self) -> int:
-        """The number of the process; 0 = it was not started."""
+        """Process id; 0 before the start."""
         return self._process.pid if self._process else 0
 
     @property
     def status(self) -> int | None:
-        """The exit status; None = it runs, or was not started."""
+        """Exit status; None while it runs, and before its start."""
         return self._process.poll() if self._process else None
 
     @property
     def current_keyframe(self) -> int:
-        """The index of the keyframe that it is at, or `fuser.fuser_messages.NOT_WORKING`."""
+        """Index of the keyframe that the process works at, or `fuser.fuser_messages.NOT_WORKING`."""
         try:
             (index,) = struct.unpack("<q", os.pread(self._working.fileno(), 8, 0))
         except (OSError, struct.error):
@@ -97,28 +97,27 @@ class FuserProcess:
         return int(index)
 
     def clear_current_keyframe(self) -> None:
-        """Write that it is at no keyframe."""
+        """Write to the file that the process works at no keyframe."""
         os.pwrite(self._working.fileno(), struct.pack("<q", fuser_messages.NOT_WORKING), 0)
 
     def note_start(self) -> None:
-        """Note that it has connected: the file by which it did must not stay behind a killed gateway."""
+        """Record that the process has connected. Remove its socket file: a killed gateway would leave it."""
         self.has_started = True
         self.remove_socket_file()
 
     def remove_socket_file(self) -> None:
-        """Remove the file by which the process has connected."""
         shutil.rmtree(self._scratch, ignore_errors=True)
 
     def kill(self) -> None:
-        """Kill the process: it ends at once, or, where it waits for a disk, when that answers."""
+        """Kill the process. It ends at once, or, while it waits for a disk, once the disk answers."""
         if self._process:
             self._process.kill()
 
     def close(self, timeout: float = 0.0, *, wait: bool = True) -> None:
-        """End the process and clear up. It may end by itself within so many seconds; then it is killed.
+        """End the process and clear up. It has `timeout` seconds to end by itself; then it is killed.
 
         Args:
-            wait: some seconds until a killed one has ended. It is reaped in any case.
+            wait: wait some seconds for the end of a killed process. A thread reaps it in any case.
         """
         if self._process is None:
             self._clear_up()
@@ -142,7 +141,7 @@ class FuserProcess:
 
 
 def _socket_folder() -> Path:
-    """A new folder of this user's alone, whose path is short enough for a socket's."""
+    """Make a folder for this user alone, whose path is short enough for a socket's path."""
     folder = tempfile.mkdtemp(prefix="tsfusion-")
     if len(os.fsencode(f"{folder}/{_SOCKET}")) > zmq.IPC_PATH_MAX_LEN:
         os.rmdir(folder)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The fuser process of a map, seen from the gateway: started, given work, replaced when it dies or hangs."""
+"""Supervisor of a map's fuser process: starts the process, gives it work, and replaces it after failures."""
 
 import logging
 import signal
@@ -23,27 +23,27 @@ from tsfusion.wire.sockets import sockets
 
 log = logging.getLogger(__name__)
 
-_MAX_IN_FLIGHT = 4  # keyframes handed out before their answers: hides the gateway's disk waits
+_MAX_IN_FLIGHT = 4  # records handed out without an answer: this hides the gateway's disk waits
 _MAX_EARLY_DEATHS = 3  # in a row, before the map counts as failed
 _LONGEST_PAUSE = 60.0  # seconds between one start and the next
 _END_DEADLINE = 5.0  # seconds
-# A keyframe is given up after two crashes of the process that works at it, or six kills from outside: so many
+# A keyframe is given up after two crashes of the process that works at it, or six kills from outside. So many
 # kills do not hit the same keyframe by chance.
 GIVE_UP_AT = 6
 CRASH_WEIGHT = 3
 KILL_WEIGHT = 1
 _STEADY_AFTER = 60.0  # seconds of fusing, after which earlier deaths no longer count
 _BETWEEN_KEYFRAMES = 10  # times `fuser_timeout` for a mesh or a checkpoint, which may take longer
-STANDS_STILL_AFTER = 5.0  # seconds at one keyframe, stopped, or waiting for a disk, before that is a problem
-_INTERVAL = 0.25  # seconds between two looks
-_LONGEST_STEP = 1.0  # seconds that one look counts: what is beyond them, the gateway itself stood still
+STANDS_STILL_AFTER = 5.0  # seconds at one keyframe, stopped, or waiting for a disk: more is a problem
+_INTERVAL = 0.25  # seconds between two checks
+_LONGEST_STEP = 1.0  # most seconds that one check counts: for the rest, the gateway itself was suspended
 
 
 class FuserSilence:
-    """Seconds since a process answered, by what it could do in them. Call `look` again and again.
+    """Seconds since a process answered, split by the state of the process. Call `look` again and again.
 
-    A process that is stopped (SIGSTOP, a debugger) or that waits for a disk does nothing, so that no keyframe
-    is to blame. Nor is one while the gateway stands still, too: the machine or the container was suspended.
+    A process that is stopped (SIGSTOP, a debugger), or that waits for a disk, does no work: its keyframe is
+    not to blame. The same holds while the gateway is suspended, too, with the machine or the container.
     """
 
     def __init__(self, pid: int) -> None:
@@ -52,14 +52,14 @@ class FuserSilence:
         self.answered()
 
     def answered(self) -> None:
-        """Begin anew: the process has said something, or owes nothing."""
+        """Reset all counts: the process has answered, or has nothing to answer."""
         self.working = self.stopped = self.disk = 0.0
 
     def look(self, *, owes: bool) -> None:
-        """Count the seconds since the last look.
+        """Count the seconds since the last call.
 
         Args:
-            owes: whether the process has to answer something. One that is stopped is noticed anyway.
+            owes: True if the process has something to answer. `stopped` counts in any case.
         """
         now = time.monotonic()
         if now - self._looked < _INTERVAL:
@@ -79,14 +79,14 @@ class FuserSilence:
 
 
 class FuserSupervisor:
-    """One fuser process after another, all at work on the same map.
+    """One fuser process after another, all for the same map.
 
     Args:
-        ahead: another folder, in which the map is read until `begin_work` says that it lies in its own.
+        ahead: folder in which the map is read first; `begin_work` ends that, once the map is in `folder`.
 
     Attributes:
-        is_prepared: whether the map was read ahead.
-        waits: whether no process was started yet.
+        is_prepared: True if the map was read ahead.
+        waits: True if no process was started yet.
     """
 
     def __init__(
@@ -123,8 +123,8 @@ class FuserSupervisor:
         self._blame: dict[int, int] = {}  # index of a keyframe → weight of the deaths at it
         self.finishing = self._finish_sent = False
         self.restarts = 0
-        self.failed = ""  # why no process stays alive; empty = one does; tried again, ever more rarely
-        self.stuck = ""  # why its next record cannot be read for now; empty = it can
+        self.failed = ""  # why no process stays alive; empty if one does. Starts are tried ever more rarely
+        self.stuck = ""  # why its next record cannot be read for now; empty if it can
         self._was_ready = False
         try:
             self._start()
@@ -134,18 +134,18 @@ class FuserSupervisor:
     def _start(self) -> None:
         self._process = self._spares.take(self._map, self._begin.volume, waits=self.waits)
         self.is_prepared = False
-        self.ready = False  # it has opened the map and compiled the kernels
+        self.ready = False  # True once the process has opened the map and compiled the kernels
         self.stuck = ""
         self._restart_at = 0.0
         self._silence = FuserSilence(self._process.pid)
         self._last_message = self._ready_since = time.monotonic()
         self._oom_kills = process.oom_kills()
-        self.in_flight: deque[int] = deque()  # indices that it has not answered, oldest first
+        self.in_flight: deque[int] = deque()  # indices of records without an answer, oldest first
         if self._process.has_started:
             self._send_begin()
 
     def begin(self) -> None:
-        """Start the process that waits, if it does; it is tried again a second after it could not be."""
+        """Start a process that waits for its start. After a failure this tries again a second later."""
         if not self.waits or time.monotonic() < self._restart_at:
             return
         try:
@@ -157,7 +157,7 @@ class FuserSupervisor:
         self._silence = FuserSilence(self._process.pid)
 
     def give_process(self) -> FuserProcess:
-        """The process, which another map is to have; the next one waits for `begin`."""
+        """Return the process, for another map. The next process waits for `begin`."""
         given, self.waits = self._process, True
         self._start()
         return given
@@ -167,14 +167,14 @@ class FuserSupervisor:
         self._restart_at = time.monotonic() + 1.0
 
     def _send_begin(self) -> None:
-        """Give the process its map. It takes messages, and none was sent: there is room for this one."""
+        """Give the process its map. Its queue is empty, so there is room for this message."""
         if self._ahead is None:
             self.send(msgspec.structs.replace(self._begin, working=self._process.working_file))
         else:
             self.send(fuser_messages.ReadAhead(msgspec.structs.replace(self._begin, folder=str(self._ahead))))
 
     def begin_work(self) -> None:
-        """Have the map, which lies in its own folder now, worked at."""
+        """Start work at the map, now that it is in its own folder."""
         self._ahead = None
         if self._process.has_started:
             self._send_begin()
@@ -186,12 +186,10 @@ class FuserSupervisor:
 
     @property
     def pid(self) -> int:
-        """The number of the process."""
         return self._process.pid
 
     @property
     def volume(self) -> VolumeConfig:
-        """The settings of the map."""
         return self._begin.volume
 
     @property
@@ -202,7 +200,7 @@ class FuserSupervisor:
 
     @property
     def problem(self) -> str:
-        """Reason why no keyframe is fused now, and what to do; empty = they are."""
+        """Reason why no keyframe is fused now, and what to do; empty without a problem."""
         if self.failed or self._restart_at:
             return self.failed
         if self.stuck:
@@ -226,21 +224,21 @@ class FuserSupervisor:
 
     @property
     def idle(self) -> bool:
-        """True if the process is ready and has answered every keyframe that was handed out."""
+        """True if the process is ready and has answered all records handed out."""
         return self.ready and not self.in_flight
 
     @property
     def seconds_at_work(self) -> float:
-        """Seconds since its last answer, while it has a keyframe to answer; 0 = it has none."""
+        """Seconds since its last answer while it has records to answer; else 0."""
         return time.monotonic() - self._last_message if self.ready and self.in_flight else 0.0
 
     @property
     def wants_work(self) -> bool:
-        """True if another keyframe may be handed out."""
+        """True if another record can be handed out."""
         return self.ready and not self.finishing and len(self.in_flight) < _MAX_IN_FLIGHT
 
     def send(self, message: fuser_messages.ToFuser, frames: Sequence[zmq.Frame] = ()) -> bool:
-        """Send a message; False when its queue is full now. What a dead fuser has not read is lost."""
+        """Send a message. Return False if the queue is full. A dead fuser loses messages it has not read."""
         try:
             self.socket.send_multipart([fuser_messages.encode(message), *frames], zmq.NOBLOCK)
         except zmq.Again:
@@ -248,7 +246,7 @@ class FuserSupervisor:
         return True
 
     def fuse(self, order: fuser_messages.Fuse) -> bool:
-        """Hand out a keyframe; False when it has to be tried again."""
+        """Hand out a record. Return False if it has to be tried again."""
         if self._blame.get(order.index, 0) >= GIVE_UP_AT:
             order = msgspec.structs.replace(order, skip="crash")
         if not self.send(order):
@@ -259,12 +257,12 @@ class FuserSupervisor:
         return True
 
     def receive(self) -> tuple[fuser_messages.ToGateway, Sequence[zmq.Frame]] | None:
-        """The next message and its frames, or None.
+        """Return the next message and its frames, or None.
 
         Raises:
             TsfusionError: when the fuser cannot open the map.
         """
-        if self._restart_at:  # the process is dead: the keyframes it answered late are fused once more
+        if self._restart_at:  # the process is dead: keyframes of unread answers are fused once more
             return None
         try:
             head, *frames = self.socket.recv_multipart(zmq.NOBLOCK, copy=False)
@@ -287,7 +285,7 @@ class FuserSupervisor:
             self._ready_since = self._last_message
         elif isinstance(message, fuser_messages.Done):
             self.in_flight.popleft()
-            if self._blame.get(message.index, 0) < GIVE_UP_AT:  # one that is given up stays so
+            if self._blame.get(message.index, 0) < GIVE_UP_AT:  # a keyframe that is given up stays so
                 self._blame.pop(message.index, None)
             self.failed = self.stuck = ""
             if self._last_message - self._ready_since > _STEADY_AFTER:
@@ -300,7 +298,7 @@ class FuserSupervisor:
         return message, frames
 
     def ended(self) -> bool:
-        """Kill a process that hangs. Returns True once the process has ended."""
+        """Kill a process that hangs. Return True once the process has ended."""
         if self._process.status is not None:
             return True
         busy = bool(self.in_flight) or self._finish_sent
@@ -315,7 +313,7 @@ class FuserSupervisor:
         return False
 
     def _replace(self, why: str, *, blame: int) -> bool:
-        """Kill a process that hangs. Returns True once it has ended: the next one begins only then."""
+        """Kill a process that hangs. Return True once it has ended: only then the next one starts."""
         log.error("%s: it is killed", why, extra=logs.about(map=self._map))
         self._blame_current_keyframe(blame)
         self._silence.answered()
@@ -323,12 +321,12 @@ class FuserSupervisor:
         return self._process.status is not None
 
     def restart(self) -> None:
-        """Start a new process in the place of a dead one, after a pause when that happens again and again.
+        """Start a new process after the end of one. After repeated deaths, wait before the start.
 
-        It begins at the last checkpoint. Call it until `ended` is no longer true.
+        The new process begins at the last checkpoint. Call this until `ended` returns False.
 
         Raises:
-            MapError: when the first process of all died before it was ready.
+            MapError: when the very first process died before it was ready.
         """
         if not self._restart_at:
             self._on_death()
@@ -344,7 +342,7 @@ class FuserSupervisor:
         self.restarts += 1
 
     def _on_death(self) -> None:
-        """Find out what the process died of, and set the time of the next start."""
+        """Find the reason of the process's death, and set the time of the next start."""
         status = self._process.status
         killed = status == -signal.SIGKILL and process.oom_kills() == self._oom_kills
         if not self.ready and self.restarts == 0 and not killed:
@@ -370,7 +368,7 @@ class FuserSupervisor:
         )
 
     def _blame_current_keyframe(self, weight: int) -> bool:
-        """Put a death down to the keyframe that the process was at; False when it was at none."""
+        """Blame the death on the keyframe that the process worked at. Return False without a keyframe."""
         index = self._process.current_keyframe
         if index == fuser_messages.NOT_WORKING:
             return False
@@ -387,7 +385,7 @@ class FuserSupervisor:
         return True
 
     def finish(self) -> None:
-        """Ask for a checkpoint and the end of the process. Call it until `ended`: the queue may be full."""
+        """Order a checkpoint and the end of the process. Call it until `ended`: the queue may be full."""
         if not self._finish_sent:
             self._finish_sent = self.send(fuser_messages.Finish())
             self._silence.answered()
@@ -399,16 +397,16 @@ class FuserSupervisor:
         return self.finishing and self._process.status == 0
 
     def close(self, *, wait: bool = True) -> None:
-        """End the process. The next one fuses what it had not saved from the journal.
+        """End the process. The next one fuses again from the journal what the checkpoint lacks.
 
         Args:
-            wait: some seconds until it has ended; else the next one waits for the lock of the map's folder.
+            wait: wait some seconds for its end; else the next process waits for the lock of the map's folder.
         """
         self._process.close(_END_DEADLINE if self.ready and wait else 0.0, wait=wait)
 
 
 def _cache(server: ServerConfig, folder: Path) -> CacheConfig | None:
-    """Where a map's blocks wait that are not in memory."""
+    """Return the settings of the disk cache for a map's blocks, or None without one."""
     if server.fuser_disk_bytes is None:
         return None
     return CacheConfig(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Fuser processes that wait for a map: started, with their kernels compiled, so that it opens at once."""
+"""Spare fuser processes with compiled kernels, so that a map opens at once."""
 
 import logging
 import time
@@ -19,19 +19,18 @@ _LONGEST_PAUSE = 60.0  # seconds between one start and the next, where they fail
 
 
 class _Spare:
-    """A process, and the settings that it is for."""
+    """A spare process, and the map settings that it is for."""
 
     def __init__(self, process: FuserProcess, volume: VolumeConfig) -> None:
         self.process, self.volume = process, volume
         self.is_warm = False
-        self.problem = ""  # why it cannot be of use; empty = it can
+        self.problem = ""  # why it cannot be used; empty if it can
 
     def fits(self, volume: VolumeConfig) -> bool:
         """True if a map with these settings can have the process now."""
         return self.is_warm and self.volume == volume and self.process.status is None
 
     def receive(self) -> None:
-        """Take its messages."""
         with suppress(zmq.Again):
             while True:
                 message = fuser_messages.to_gateway.decode(self.process.socket.recv(zmq.NOBLOCK))
@@ -44,17 +43,17 @@ class _Spare:
 
 
 class SpareFusers:
-    """Up to `spare_fusers` processes for maps with the same settings. Call `step` again and again."""
+    """Up to `spare_fusers` spare processes for maps with the same settings. Call `step` again and again."""
 
     def __init__(self, context: "zmq.Context[Any]", server: ServerConfig) -> None:
         self._context, self._server = context, server
         self._spares: list[_Spare] = []
         self._was_full = self._is_closed = False
-        self._failures = 0  # in a row, of those that never became ready
+        self._failures = 0  # processes in a row that never became ready
         self._start_at = 0.0  # time.monotonic()
 
     def take(self, name: str, volume: VolumeConfig, *, waits: bool = False) -> FuserProcess:
-        """A process for a map: a spare one, or another that begins now, or that `waits`.
+        """Return a process for a map: a spare one, or a new one. With `waits`, a new one is not started yet.
 
         Raises:
             OSError, zmq.ZMQError: when the system cannot start it.
@@ -66,7 +65,7 @@ class SpareFusers:
         return self._start(name, waits=waits)
 
     def add(self, process: FuserProcess, volume: VolumeConfig) -> None:
-        """Take a process that has its kernels, from a map that has nothing."""
+        """Take a process with compiled kernels from a map that is empty."""
         self._spares.append(_Spare(process, volume))
         self._spares[-1].is_warm = True
 
@@ -74,10 +73,10 @@ class SpareFusers:
         return any(one.fits(volume) for one in self._spares)
 
     def step(self, volume: VolumeConfig, *, may_start: bool) -> None:
-        """Have as many as there are to be, for these settings, one after the other; after `close` none.
+        """Keep the wanted number of spare processes for these settings. After `close` do nothing.
 
         Args:
-            may_start: nobody waits for the processor time that it takes.
+            may_start: True if no map needs the processor time of a start now.
         """
         if self._is_closed:
             return
@@ -103,7 +102,7 @@ class SpareFusers:
         self._was_full = is_full
 
     def _on_failure(self, why: str) -> None:
-        """Log it, and wait with the next one: its start takes a second of processor time."""
+        """Log a failed start, and delay the next one: it costs a second of processor time."""
         pause = min(2.0**self._failures, _LONGEST_PAUSE)
         self._failures += 1
         self._start_at = time.monotonic() + pause
@@ -114,7 +113,7 @@ class SpareFusers:
         return FuserProcess(self._context, name, log_format, log_level, waits=waits)
 
     def close(self) -> None:
-        """End them; no other begins: the server ends, and steps on until its maps are saved."""
+        """End all spare processes, and start no others: the server ends, but still calls `step`."""
         self._is_closed = True
         for one in self._spares:
             one.process.close()

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""A server's figures for Prometheus, and its health checks.
+"""A server's figures for Prometheus, and its health checks over HTTP.
 
-The gateway's thread writes (`observe`, `health`), another thread answers HTTP; neither waits for the other.
+The gateway's thread writes (`observe`, `health`), another thread answers HTTP. Neither waits for the other.
 """
 
 import platform
@@ -24,16 +24,16 @@ from tsfusion.wire.messages.messages import STAGES as LEDGER_STAGES
 STAGES = (*LEDGER_STAGES, "total")
 BUCKETS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)  # seconds
 FRESH = 10.0  # seconds; a gateway renews its snapshot every second
-FRESH_START = 60.0  # seconds; while it reads a journal a slow disk may keep it from reporting for a while
+FRESH_START = 60.0  # seconds; at the start a slow disk may delay the report about a journal
 _TEXT_FORMAT = "text/plain; version=0.0.4; charset=utf-8"
-_MAX_MAPS = 256  # with a label of their own; the others share `metrics_families.OTHERS`
+_MAX_MAPS = 256  # maps with a label of their own; further maps share `metrics_families.OTHERS`
 
 
 class Metrics(Collector):
     """The figures of one server.
 
     Args:
-        server: None = without the limits of the disk and what is free on it.
+        server: None leaves out the limits and the free space of the disk.
     """
 
     def __init__(
@@ -42,7 +42,7 @@ class Metrics(Collector):
         self._server = server
         self._clock = clock
         self._seen: tuple[Health, float] | None = None
-        self._starting = ("the gateway is starting", clock())  # what it does instead of its rounds, and when
+        self._starting = ("the gateway is starting", clock())  # long work outside its loop, and its time
         self._maps: set[str] = set()
         self._page: MetricsPage | None = None
         self._registry = CollectorRegistry()
@@ -87,14 +87,14 @@ class Metrics(Collector):
         self._seen = (snapshot, self._clock())
 
     def report_start(self, progress: str) -> None:
-        """Note that the gateway is alive, though it does something long instead of its rounds."""
+        """Record that the gateway is alive, though long work (`progress`) keeps it from its loop."""
         self._starting = (progress, self._clock())
 
     def serve(self, address: str) -> str:
-        """Answer HTTP at HOST:PORT (port 0 = a random one) until `close`; the real address.
+        """Answer HTTP at HOST:PORT (port 0 = a random one) until `close`. Return the real address.
 
         Raises:
-            InvalidConfig: when others than this machine could reach it.
+            InvalidConfig: when other machines could reach the address.
             TransportError: when the port is taken.
         """
         self._page = MetricsPage(
@@ -130,7 +130,10 @@ class Metrics(Collector):
         return HttpResponse(503, "\n".join(map(printable, lines)) or "not ready")
 
     def _look(self) -> tuple[Health | None, str, str]:
-        """The snapshot; or what the gateway does at its start; or for how long it has done nothing."""
+        """Return the snapshot, the long work at present, and the reason why the gateway counts as dead.
+
+        Two of the three are empty.
+        """
         now, (progress, told) = self._clock(), self._starting
         if self._seen is None or self._seen[1] < told:
             age, most = now - told, FRESH_START
@@ -143,11 +146,11 @@ class Metrics(Collector):
     # --- figures ---
 
     def describe(self) -> list[Metric]:
-        """An empty list: the figures depend on the snapshot."""
+        """Return an empty list: the figures depend on the snapshot."""
         return []
 
     def collect(self) -> Iterator[Metric]:
-        """The figures of the last snapshot: all but the delays."""
+        """Yield the figures of the last snapshot, all but the delays."""
         build = GaugeMetricFamily("tsfusion_build_info", "Versions.", labels=("version", "python"))
         build.add_metric((version_of("tsfusion"), platform.python_version()), 1)
         yield build

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""A health snapshot as Prometheus figures.
+"""Conversion of a health snapshot into Prometheus figures.
 
-A figure that can fall (a fuser that restarts goes back to its checkpoint, a session is forgotten) is a
-gauge. Labels are names of maps and clients, or reasons from the server's own lists, never a random session or
-a word that a peer chose: their number is bounded.
+A figure that can fall is a gauge: a restarted fuser goes back to its checkpoint, and a session is forgotten.
+Labels are names of maps and clients, or reasons from the server's own lists. They are never a random session
+or a word that a peer chose, so their number is bounded.
 """
 
 import os
@@ -18,8 +18,8 @@ from tsfusion.core.config import ServerConfig
 from tsfusion.wire.messages.health import ClientHealth, Figure, Health, MapHealth, MapState
 from tsfusion.wire.messages.messages import SKIP_REASONS
 
-NAMELESS = "-"  # clients without keys; no name looks like this
-OTHERS = "+"  # the label that all names beyond a limit share
+NAMELESS = "-"  # label of clients without keys; no name looks like this
+OTHERS = "+"  # shared label of all names beyond a limit
 MAX_CLIENTS = 100
 RECENT = 30.0  # seconds; older figures of a session do not count: its client may have ended
 
@@ -48,7 +48,7 @@ _OF_CLIENTS: tuple[tuple[str, str, Callable[[list[ClientHealth]], float]], ...] 
 
 
 def of_health(health: Health, age: float) -> Iterator[Metric]:
-    """The figures of a snapshot that is `age` seconds old."""
+    """Yield the figures of a snapshot that is `age` seconds old."""
     yield _gauge("snapshot_age_seconds", "Seconds since these figures were taken.", (), [((), age)])
     yield _gauge("uptime_seconds", "Seconds since the server started.", (), [((), health.uptime_s + age)])
     yield _gauge("problems", "Problems that need a person.", (), [((), len(health.problems))])
@@ -60,14 +60,14 @@ def of_health(health: Health, age: float) -> Iterator[Metric]:
 
 
 def of_disk(state: Path, server: ServerConfig) -> Iterator[Metric]:
-    """The limits of a server's disk, and what is free on it."""
+    """Yield the limits of a server's disk, and its free space."""
     if server.journal_bytes is not None:
         limit = [((), server.journal_bytes)]
         yield _gauge("journal_limit_bytes", "A journal with more loses its oldest segments.", (), limit)
     yield _gauge("disk_reserve_bytes", "With less free, keyframes wait.", (), [((), server.min_free_bytes)])
     try:
         found = os.statvfs(state)
-    except OSError:  # the folder is not there: its figure is left out
+    except OSError:  # without the folder, its figure is left out
         return
     yield _gauge("disk_free_bytes", "Free for the state folder.", (), [((), found.f_bavail * found.f_frsize)])
 
@@ -89,7 +89,7 @@ def _of_maps(maps: dict[str, MapHealth], age: float) -> Iterator[Metric]:
 
 
 def _rows(key: str, found: Any, unit: float) -> LabelledRows:
-    """Rows of one map: of a count, of whether there is a text, or of counts by reason."""
+    """Return the rows of one map: a count, 1 for a text that is not empty, or counts by reason."""
     if isinstance(found, dict):
         return [((key, reason), count) for reason, count in found.items()]
     return [((key,), (bool(found) if isinstance(found, str) else found) * unit)]
@@ -109,7 +109,7 @@ def _of_clients(clients: Iterable[ClientHealth], age: float) -> Iterator[Metric]
 
 
 def _grouped(clients: Iterable[ClientHealth]) -> dict[str, list[ClientHealth]]:
-    """Sessions by client; clients without keys share one label, and so do those beyond the limit."""
+    """Return sessions by client. Clients without keys share one label, and so do clients beyond the limit."""
     found: dict[str, list[ClientHealth]] = {}
     for session in sorted(clients, key=lambda one: one.client):
         name = session.client or NAMELESS

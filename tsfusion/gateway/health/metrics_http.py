@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""A few pages over HTTP for programs on this machine, from one thread.
+"""A small HTTP server for programs on this machine, in one thread.
 
-A foreign page can make a browser on this machine send requests here: so they must name this machine as their
-host, and no page changes anything. A connection that is slow or idle, or sends too much, is cut off.
+A foreign web page can make a browser on this machine send requests. So a request must name this machine as
+its host, and no request changes anything. A connection that is slow or idle, or sends too much, is cut off.
 """
 
 import asyncio
@@ -41,11 +41,11 @@ class MetricsPage:
     """An HTTP server in a thread, for GET and HEAD of a few pages, until `close`.
 
     Args:
-        address: HOST:PORT on this machine; port 0 = a random one.
+        address: HOST:PORT on this machine; port 0 draws a random one.
         pages: path → function that makes its answer, called in the thread.
 
     Raises:
-        InvalidConfig: when others than this machine could reach it.
+        InvalidConfig: when other machines could reach the address.
         TransportError: when the port is taken.
     """
 
@@ -98,10 +98,10 @@ class MetricsPage:
     def _ended(self, task: "asyncio.Task[None]") -> None:
         writer = self._open.pop(task, None)
         if writer is not None:
-            writer.transport.abort()  # by now all is sent, or nobody reads it
+            writer.transport.abort()  # by now all bytes are sent, or the peer does not read
 
     async def _converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        # The peer's own fault, and it does not read any more.
+        # These errors are the peer's own fault: it gets no answer.
         with suppress(OSError, EOFError, asyncio.TimeoutError, asyncio.LimitOverrunError):
             await asyncio.wait_for(self._exchange(reader, writer), DEADLINE)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Problems as a person would name them: one plain line each, and since when each is there."""
+"""Problems in plain words: one line for each, and how long it has lasted."""
 
 import logging
 import re
@@ -18,10 +18,10 @@ class Problem(Struct, frozen=True):
     """Something that is wrong now, and what to do about it.
 
     Attributes:
-        text: without the map's and the client's name.
-        map: that it is about; empty = the whole server.
-        client: a client and its session, in words; empty = it is no single client's.
-        is_logged: whether who found it logs its begin and its end.
+        text: without the names of map and client.
+        map: map with the problem; empty for the whole server.
+        client: a client and its session, in words; empty if the problem is not about one client.
+        is_logged: True if the finder logs its start and end.
     """
 
     text: str
@@ -31,7 +31,7 @@ class Problem(Struct, frozen=True):
 
     @property
     def key(self) -> tuple[str, str, str]:
-        """Name of the problem while it lasts: figures in its words may change."""
+        """Identity of the problem while it lasts: numbers in its text may change."""
         return self.map, self.client, re.sub(r"[0-9]+", "#", self.text)
 
     @property
@@ -46,14 +46,14 @@ class Problem(Struct, frozen=True):
 
 
 class ProblemTimes:
-    """Since when each problem is there; a line in the log when one begins, and when it ends."""
+    """Start time of each problem. Logs a line when a problem begins, and when it ends."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self._began: dict[tuple[str, str, str], tuple[Problem, float]] = {}
 
     def note(self, problems: Iterable[Problem]) -> None:
-        """Log what began and what ended. Call it about once a second."""
+        """Log new problems and ended ones. Call it about once a second."""
         now = self._clock()
         present = {one.key: one for one in problems}
         for key in self._began.keys() - present.keys():
@@ -67,7 +67,7 @@ class ProblemTimes:
             self._began[key] = (one, self._began[key][1] if key in self._began else now)
 
     def lines(self, problems: Iterable[Problem]) -> tuple[str, ...]:
-        """The problems in words, each with how long it has been there."""
+        """Return the problems in words, each with its duration."""
         now = self._clock()
         return tuple(f"{one.line} (for {span(now - self._since(one, now))})" for one in problems)
 

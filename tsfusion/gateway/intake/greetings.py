@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Sessions of clients: how they begin, and the signs of life between records."""
+"""Answers to clients' greetings, which open sessions, and to their pings."""
 
 import logging
 import time
@@ -19,7 +19,7 @@ log = logging.getLogger(__name__)
 
 
 class Greetings:
-    """Answer greetings and pings, each with the server's epoch: it tells clients that messages were lost."""
+    """Answers greetings and pings with the server's epoch. A new epoch tells clients of lost messages."""
 
     def __init__(
         self,
@@ -33,7 +33,7 @@ class Greetings:
         self._admission, self._routes = admission, routes
 
     def on_hello(self, frame: zmq.Frame, hello: messages.Hello, client: str, epoch: str) -> None:
-        """Open a session, or say why not."""
+        """Open a session, or deny it with a reason."""
         identity = frame.bytes
         if denied := self._denial(identity, hello, client):
             self._ports.reply(identity, messages.Denied(hello.session, *denied))
@@ -51,11 +51,11 @@ class Greetings:
             max_frame_bytes=self._server.max_frame_bytes,
         )
         if (hosted := self._maps.get(hello.map)) is not None:
-            hosted.outcomes.tell_untold(hello.session)  # before it is told that these are answered
+            hosted.outcomes.tell_untold(hello.session)  # rejections go out before the progress counts them
         self._ports.reply(identity, welcome)
 
     def _denial(self, identity: bytes, hello: messages.Hello, client: str) -> tuple[str, ...] | None:
-        """The fields of the answer to a session that is not opened; None = it is, and its route is made."""
+        """Return the fields of a denial. If the session opens, make its route and return None."""
         if version := messages.other_version(server=messages.PROTOCOL_VERSION, client=hello.version):
             return "version", version
         if forbidden := self._admission.denial_of_map(client, hello.map, sends=True):
@@ -89,13 +89,13 @@ class Greetings:
         return None
 
     def on_ping(self, identity: bytes, ping: messages.Ping, client: str, epoch: str) -> None:
-        """Answer a sign of life, which says how a client is doing."""
+        """Answer a ping, and take the figures in it."""
         received_ns = time.monotonic_ns()
         progress: tuple[int, int] = (0, 0)
         waiting = None
         route = self._routes.mark_alive(ping.session, client)
         if route is not None:
-            route.identity = identity  # of several connections the one that is heard is the one that stands
+            route.identity = identity  # of several connections, this one is alive
             route.update(ping)
             progress = self._maps.progress(route.map, ping.session)
             if (hosted := self._maps.get(route.map)) is not None:

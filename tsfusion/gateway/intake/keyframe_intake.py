@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Keyframes and corrections from the data socket: checked, then journaled, held off, or refused.
+"""Intake of keyframes and corrections from the data socket: each is checked, then journaled, held or refused.
 
-Records that came together are journaled together: a disk takes many by one wait about as fast as one.
-The cheapest checks come first, and nothing is answered before the message is known to be from the session's
+Records that came together are journaled together: one wait for the disk costs about the same for many
+records. The cheapest checks come first. Nothing is answered before the sender is known to be the session's
 own client: a forged message must not make a client give up a good keyframe.
 """
 
@@ -38,15 +38,15 @@ from tsfusion.wire.records.record_header import (
 from tsfusion.wire.sockets import sockets
 
 _MAX_CLIENTS = 4096
-# Without keys all share one quota, and each of so many connections has at least one part in so many of it,
-# whatever others send. A connection that is silent for so long loses it.
+# Without keys all clients share one quota. Up to _SHARES connections have one part in _SHARES of it each,
+# whatever others send. A connection loses its part after _SHARE_KEPT_S of silence.
 _SHARES = 16
 _SHARE_KEPT_S = 10.0
 _ANY_MAP = VolumeConfig()
 
 
 class Allowance:
-    """The keyframes and bytes that may come in a second."""
+    """Allowed keyframes and bytes a second."""
 
     def __init__(self, server: ServerConfig, now: float, part: int = 1) -> None:
         self._keyframes = Bucket(server.quota_keyframes / part, now)
@@ -54,7 +54,7 @@ class Allowance:
         self.asked = now
 
     def wait(self, nbytes: int, now: float) -> float:
-        """Seconds until a message may pass; 0 = it does, and is counted."""
+        """Return the seconds until a message can pass, or 0 if it passes now and is counted."""
         self.asked = now
         seconds = max(self._keyframes.wait(1.0, now), self._bytes.wait(nbytes, now))
         if not seconds:
@@ -72,11 +72,11 @@ class Quotas:
         self._shares: dict[int, Allowance] = {}  # by connection, where there are no keys
 
     def wait(self, owner: str, nbytes: int, now: float, connection: int | None = None) -> float:
-        """Seconds that a client has to wait before it may send a message; 0 = it passes, and is counted.
+        """Return the seconds until a client can send a message, or 0 if it passes now and is counted.
 
         Args:
-            owner: the client's name. Without keys all clients are one: new sessions cost nothing.
-            connection: over which the message came; None = that is not known.
+            owner: name of the client. Without keys all clients are one: new sessions cost nothing.
+            connection: file number of the message's connection; None if not known.
         """
         allowance = self._clients.get(owner)
         if allowance is None:
@@ -89,7 +89,7 @@ class Quotas:
         return 0.0 if seconds and share is not None and not share.wait(nbytes, now) else seconds
 
     def _share_of(self, connection: int, now: float) -> Allowance | None:
-        """The part of the quota that nobody else may use up; None = others have all parts."""
+        """Return a connection's own part of the quota, or None if other connections have all parts."""
         share = self._shares.get(connection)
         if share is None and len(self._shares) >= _SHARES:
             self._shares = {fd: one for fd, one in self._shares.items() if now - one.asked < _SHARE_KEPT_S}
@@ -103,8 +103,8 @@ class Quotas:
         """Raise Refused for a checked record that asks too much.
 
         Raises:
-            Refused: `quota` for too many points or a place too far away, `values` for a sensor that no
-                map knows, and a correction of keyframes that cannot have come before it.
+            Refused: `quota` for too many points, or a sensor too far from the origin. `values` for a sensor
+                model that no map knows, or a correction that names its own number or a higher one.
         """
         if isinstance(header, CorrectionHeader):
             self._check_correction(header, frames[1])
@@ -140,18 +140,18 @@ class Quotas:
 
 log = logging.getLogger(__name__)
 
-# Seconds for which a client is held off: the keyframes that were under way have to be sent again.
+# Seconds for which a client is held: it then sends again the keyframes that were under way.
 _SHORTEST_HOLD = 0.25
 _LONGEST_HOLD = 10.0
-_MOST_DAMAGED = 8  # times that a record may come damaged before it is refused for good
-_BATCH_BYTES = 4 << 20  # of records that are journaled together; one that is larger goes alone
+_MOST_DAMAGED = 8  # a record that came damaged so often is refused for good
+_BATCH_BYTES = 4 << 20  # limit for records journaled together; a larger record is journaled alone
 
 
 class KeyframeIntake:
-    """The way from the data socket into the journals. Call `finish` when some messages were handled.
+    """The way from the data socket into the journals. Call `finish` after some messages.
 
     Args:
-        on_keyframe: told of each keyframe that was journaled: its map, header, frames, and client.
+        on_keyframe: called for each journaled keyframe with its map, header, frames, and client.
     """
 
     def __init__(
@@ -176,7 +176,7 @@ class KeyframeIntake:
         self._taken: dict[tuple[str, bytes], int] = {}  # map, session → the highest number among them
 
     def handle(self, frames: list[zmq.Frame]) -> None:
-        """Check one message, and take its record to be journaled or answer why not."""
+        """Check one message. Take its record for the journal, or answer why not."""
         received_ns = time.monotonic_ns()
         client = self._admission.client_of(frames[0])
         if client is None:
@@ -196,9 +196,9 @@ class KeyframeIntake:
             self._turn_away(record, "map", forbidden)
             return
         hosted = self._maps.get(header.map) or self._make_map(record)
-        if hosted is None or not hosted.takes_records:  # its client will say hello, and send it again
+        if hosted is None or not hosted.takes_records:  # the client will greet, and send the record again
             self._turn_away(record, "map")
-        elif not hosted.records.sessions.room_for(header.session):  # its client is told when it says hello
+        elif not hosted.records.sessions.room_for(header.session):  # the answer to its Hello says so
             self._turn_away(record, "session")
         elif not self._admission.owns(hosted.records.sessions, header.session, client):
             self._turn_away(record, "session", "its session is another client's")
@@ -212,7 +212,7 @@ class KeyframeIntake:
     def _turn_away(
         self, record: IncomingRecord, reason: str, why: str = "", answer: messages.Denied | None = None
     ) -> None:
-        """Count a record that its client keeps; log why (empty = nothing is wrong with it), and answer."""
+        """Count a record that its client keeps. Log `why`, if the record is wrong, and send `answer`."""
         self._refused[reason] += 1
         if why:
             log.warning("a %s is refused: %s", record.header.kind, why, extra=record.about(reason))
@@ -220,7 +220,7 @@ class KeyframeIntake:
             self._routes.send(record.header.session, answer)
 
     def _claimed_elsewhere(self, header: RecordHeader) -> messages.Denied | None:
-        """The answer to the first record of a map that another server has; None = it begins here."""
+        """Return the denial of a map's first record if another server has the map, else None."""
         try:
             place = self._maps.claim(header.map)
         except JournalError as error:
@@ -231,7 +231,7 @@ class KeyframeIntake:
         return messages.Denied(header.session, "moved", why, address=place[0], control=place[1])
 
     def _make_map(self, record: IncomingRecord) -> HostedMap | None:
-        """The map that a client was let into, made for its first record; None = it is not, or cannot be."""
+        """Make the map for the first record of a client with a route to it. Return None if that fails."""
         header, route = record.header, record.route
         if route is None or (route.client, route.map) != (record.client, header.map):
             return None
@@ -282,12 +282,12 @@ class KeyframeIntake:
         self._routes.send(session, messages.Hold(session, seconds, reason, message))
 
     def _on_admitted(self, hosted: HostedMap, record: IncomingRecord) -> None:
-        # Duplicates come first: a keyframe that is journaled must not be refused when it is sent again.
+        # Duplicates are found first: a journaled keyframe must not be refused when it comes again.
         header = record.header
         taken = self._taken.get((header.map, header.session), 0)
         verdict = hosted.records.sessions.admit(header.session, header.seq, header.previous, taken)
         if verdict != "next":
-            self.finish()  # so that the answer says how far the session is
+            self.finish()  # so the answer has the session's newest progress
             self.duplicates += verdict == "duplicate"
             self._refused["gap"] += verdict == "gap"
             self._routes.mark_alive(header.session, record.client, scans=verdict == "duplicate")
@@ -310,7 +310,7 @@ class KeyframeIntake:
         self._take(hosted, record)
 
     def _take(self, hosted: HostedMap, record: IncomingRecord) -> None:
-        """Put a record into the batch. What a new session may do is known when its first one is journaled."""
+        """Put a record into the batch. Journal a new session's first record at once: it sets the rights."""
         header = record.header
         if self._batch_bytes + record.nbytes > min(_BATCH_BYTES, self._server.segment_bytes):
             self.finish()
@@ -321,7 +321,7 @@ class KeyframeIntake:
             self.finish()
 
     def finish(self) -> None:
-        """Journal the records of the batch, each map's by one wait for the disk, and answer their clients."""
+        """Journal the records of the batch, with one wait for the disk a map, and answer their clients."""
         if not self._batch:
             return
         batch, self._batch, self._batch_bytes = self._batch, {}, 0
@@ -351,7 +351,7 @@ class KeyframeIntake:
 
 
 def _comes_again(record: IncomingRecord) -> bool:
-    """Count a damaged record. Returns True if its client, whose copy may be well, sends it again."""
+    """Count a damaged record. Return True if its client will send its copy, which may be good."""
     if (route := record.route) is None:
         return False
     seq, times = route.damaged

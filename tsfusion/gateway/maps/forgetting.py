@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Requests to forget keyframes of one map: found, written to the journal, and if wanted erased.
+"""Requests to forget keyframes of one map: find them, journal their removal and, if wanted, erase them.
 
-The fuser finds the keyframes of a selection. A record that removes them is journaled like any other, so that
-every fuser, at any time, leaves them out. To erase them, the map must have let them go first, and so must
-its checkpoints: a keyframe is subtracted from the map by what the journal holds of it.
+The fuser finds the keyframes of a selection. A record that removes them is journaled like any other, so every
+later fuser leaves them out. Before they are erased, the map and its checkpoints must have let them go: to
+subtract a keyframe from the map, the fuser needs its record in the journal.
 """
 
 import logging
@@ -31,7 +31,7 @@ from tsfusion.wire.records.corrections import MAX_KEYFRAMES
 
 log = logging.getLogger(__name__)
 
-MOST_REQUESTS = 8  # that wait
+MOST_REQUESTS = 8  # requests that can wait
 _STEP_S = 0.1  # seconds of erasing in a step
 _LEFT_FILES = ("*.damaged*", "journal/*.replaced", "journal/*.damaged*")
 
@@ -42,7 +42,7 @@ _Stage = Literal["ask", "find", "leave", "save", "erase"]
 
 
 class ForgetRequest:
-    """One request, and how far it is."""
+    """One request and its progress."""
 
     def __init__(
         self, selection: Selection, on_answer: OnAnswer, *, erase: bool = False, dry_run: bool = False
@@ -51,12 +51,12 @@ class ForgetRequest:
         self.erase, self.dry_run = erase, dry_run
         self.stage: _Stage = "ask"
         self.found = Found(0)
-        self.unavailable = 0  # keyframes that corrections could not move, before
+        self.unavailable = 0  # keyframes that corrections could not move before the request
         self.erasing: Iterator[int] | None = None
         self.erased = self.quarantined = 0
 
     def is_answered(self, in_map: Callable[[bytes], int]) -> bool:
-        """True if the fuser has answered every record that was found; `in_map` as of `Forgetting.step`."""
+        """True if the fuser has answered every found record. `in_map`: see `Forgetting.step`."""
         return all(
             in_map(one.session) >= max(np.frombuffer(one.seqs, np.int64), default=0)
             for one in self.found.sessions
@@ -68,7 +68,7 @@ class Forgetting:
 
     Args:
         append: journals the record that removes keyframes of a session.
-        send: passes a message to the fuser; False when it cannot take one now.
+        send: passes a message to the fuser; returns False if the fuser's queue is full.
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class Forgetting:
         return not self._requests
 
     def add(self, request: ForgetRequest) -> None:
-        """Take a request; it is answered at once when too many wait."""
+        """Take a request. If too many wait, refuse it at once."""
         if len(self._requests) >= MOST_REQUESTS:
             request.on_answer("too many requests to forget wait: ask again")
         else:
@@ -97,7 +97,7 @@ class Forgetting:
             self._answer(why)
 
     def on_ready(self) -> None:
-        """Begin again with a new fuser: it knows nothing of what the one before was asked."""
+        """Ask a new fuser again: it does not know the questions to the old one."""
         if self._requests:
             request = self._requests[0]
             request.stage = {"find": "ask", "save": "leave"}.get(request.stage, request.stage)  # type: ignore[assignment]
@@ -106,10 +106,10 @@ class Forgetting:
         """Do the next piece of work of the first request.
 
         Args:
-            is_server_answered: whether the map has done all that the server's own records ask.
-            in_map: the highest number of a session that the fuser has answered. What it has not cannot be
-                erased: after a crash nobody would hand it out, and it would count as lost.
-            unavailable: keyframes that stay where they were fused though they should not.
+            is_server_answered: True if the map has applied all of the server's own records.
+            in_map: returns the highest number of a session that the fuser has answered. Records after it are
+                not erased: after a crash they would be missing, and count as lost.
+            unavailable: number of keyframes that should leave or move, but stay where they were fused.
         """
         if not self._requests:
             return
@@ -132,9 +132,9 @@ class Forgetting:
     # --- answers of the fuser ---
 
     def on_found(self, found: Found) -> None:
-        """Take the keyframes that the fuser found, or those that are too old or too far away."""
+        """Take the keyframes that the fuser found for a request, or those outside the map's window."""
         if found.number == EXPIRED:
-            with suppress(JournalError):  # they are found again, when the disk takes records
+            with suppress(JournalError):  # the fuser finds them again once the disk takes records
                 self._remove(found)
             return
         if not self._requests or found.number != self._number or self._requests[0].stage != "find":
@@ -156,14 +156,14 @@ class Forgetting:
             self._answer(self._result(request))
 
     def on_saved(self, saved: Saved) -> None:
-        """Note that a checkpoint without the keyframes was written, or why not."""
+        """Take the result of the checkpoint without the keyframes. Start to erase after a success."""
         if not saved.alone or not self._requests or self._requests[0].stage != "save":
             return
         request = self._requests[0]
         if saved.problem:
             self._answer(f"nothing was erased: {saved.problem}")
             return
-        # Before the records: while one of them is left, the same request finds it after a crash, and goes on.
+        # Before the records: after a crash, the same request finds records that are left, and goes on.
         request.quarantined = sum(
             self._quarantine.drop(session.session, NumberRanges(_ranges(session)))
             for session in request.found.sessions
@@ -204,7 +204,7 @@ class Forgetting:
         )
 
     def _left_files(self) -> Iterator[str]:
-        """Files of the map that may hold something of any keyframe, and that nothing deletes."""
+        """Yield files that may hold bytes of any keyframe of the map, and that nothing deletes."""
         for pattern in _LEFT_FILES:
             yield from (str(path) for path in sorted(self._folder.glob(pattern)))
         yield from map(str, moved_maps.left_behind(self._folder))

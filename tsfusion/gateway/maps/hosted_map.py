@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""One map of a server: its journal, its sessions, and the fuser that works through the journal."""
+"""One open map of a server: its journal, its sessions, and the fuser that turns the journal into the map."""
 
 import logging
 import time
@@ -36,18 +36,18 @@ PassOn = Callable[[ForPeople, Sequence[zmq.Frame]], None]
 
 
 class HostedMap:
-    """An open map. Call `step` again and again, and `accept` with the records that came.
+    """An open map. Call `step` again and again, and `accept` with records that came.
 
     Args:
-        watch: told how far the journal is read: that may take minutes, in which nothing else is done.
-        fuser: that read the map ahead; None = one begins now.
-        waits: for `fuser.begin`, until when nothing is fused.
+        watch: called with the progress of reading the journal, which may take minutes and blocks all else.
+        fuser: supervisor that read the map ahead; None starts a new one.
+        waits: do not start the fuser before `fuser.begin`.
 
     Attributes:
-        records: what came, on the disk.
+        records: the map's records on disk.
         backlog: the records that the fuser has yet to answer.
-        outcomes: what became of the others, and how clients are told.
-        warm: the fuser has been ready once: from then on it is known what the map has.
+        outcomes: outcomes of the answered records, which clients are told.
+        warm: True once the fuser has been ready: from then on the map's content is known.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class HostedMap:
         self.name = name
         self.records = records = MapRecords(name, server, watch)
         self.questions = QuestionCounts()
-        self.is_leaving = self.is_frozen = False  # to another server; it takes no records any more
+        self.is_leaving = self.is_frozen = False  # on its way to another server; takes no more records
         self.warm = False
         self.backlog = FuserBacklog(records.index, records.sessions)
         self.outcomes = KeyframeOutcomes(name, records, routes, metrics)
@@ -88,26 +88,25 @@ class HostedMap:
 
     @property
     def is_saved(self) -> bool:
-        """True if the checkpoint for the map's departure is written, or cannot be."""
+        """True if the checkpoint for the map's departure is written, or failed."""
         return self.checkpoints.is_answered
 
     @property
     def takes_records(self) -> bool:
-        """True if the content of the map is known, and the map stays here.
+        """True if the map's content is known, and the map stays on this server.
 
-        Its fuser has read that, or there was nothing, or the server from which it came said it.
+        The fuser has read the content, or there was none, or the server that had the map sent it.
         """
         return (self.warm or self.records.is_new or self.records.has_arrived) and not self.is_frozen
 
     @property
     def is_empty(self) -> bool:
-        """True if the map is known to have nothing, and never to have had any."""
+        """True if the map certainly has no record and never had one."""
         is_known = self.warm or self.records.is_new
         return is_known and not (len(self.records.sessions) or self.outcomes.blocks or self.outcomes.taken)
 
     @property
     def keyframes_durable(self) -> int:
-        """Number of keyframes that were journaled."""
         return self.outcomes.taken + self.outcomes.rejected.total() + self.backlog.keyframes
 
     @property
@@ -117,21 +116,21 @@ class HostedMap:
 
     @property
     def corrections_waiting(self) -> int:
-        """Number of keyframes whose newest pose is not fused, or that are to be forgotten and are not yet."""
+        """Number of keyframes whose newest pose is not fused yet, or that are not yet forgotten."""
         return self.outcomes.moves.waiting + sum(self.backlog.leaving.values())
 
     @property
     def ended(self) -> bool:
-        """True if the map is drained, or will not be soon: its fuser cannot be kept alive, or read."""
+        """True if the map is drained, or cannot be now: the fuser fails, or the disk does."""
         return self.drained or bool(self.fuser.failed or self.fuser.stuck) or self.records.disk.is_away
 
     def idle_since(self, since: float) -> bool:
-        """True if no keyframe waits, nor came after `since` (`time.monotonic()`)."""
+        """True if no keyframe waits, and none came after `since` (`time.monotonic()`)."""
         last = self.records.last_keyframe
         return self.drained and (last is None or last < since)
 
     def close(self, *, wait: bool = True) -> None:
-        """End the fuser and finish the journal. A journal that cannot be finished is logged."""
+        """End the fuser and finish the journal. If the journal cannot be finished, log that."""
         self.fuser.close(wait=wait)
         try:
             self.records.journal.close()
@@ -141,7 +140,7 @@ class HostedMap:
     # --- keyframes ---
 
     def _append_forgotten(self, target: bytes, seqs: NDArray[np.int64]) -> None:
-        """Write the record to the journal that removes these keyframes of a session."""
+        """Journal the record that removes these keyframes of a session."""
         if self.is_frozen:
             raise JournalError(f"map {self.name} moves to another server")
         durable, _ = self.records.sessions.progress(SERVER_SESSION)
@@ -155,7 +154,7 @@ class HostedMap:
         self.backlog.leaving[index] = len(seqs)
 
     def accept(self, records: Sequence[IncomingRecord]) -> list[int]:
-        """Write keyframes and corrections to the journal, all or none, and acknowledge them; their indices.
+        """Journal records, all or none, and acknowledge them. Return their indices.
 
         Raises:
             JournalError: when the disk refuses.
@@ -170,31 +169,31 @@ class HostedMap:
     # --- another server ---
 
     def begin_to_leave(self) -> None:
-        """Delete no file of the journal any more, close the open one, and have a checkpoint written.
+        """Prepare the map's departure: keep all journal files, close the open one, and order a checkpoint.
 
         Raises:
             JournalError: when the disk refuses.
         """
         self.records.close_segment()
-        self.is_leaving = True  # not where that fails: nobody would have it stay
+        self.is_leaving = True  # only after success: nobody would call `stay` after an error
         self.checkpoints.ask()
 
     def freeze(self) -> None:
-        """Take no records any more, and close the journal's last file; raises JournalError."""
+        """Take no more records, and close the journal's last file. Raise JournalError if the disk refuses."""
         self.is_frozen = True
         self.records.close_segment()
 
     def stay(self) -> None:
-        """Go on as before."""
+        """End a departure: the map stays on this server."""
         self.is_leaving = self.is_frozen = False
 
     # --- fuser ---
 
     def step(self, pass_on: PassOn) -> None:
-        """Read the fuser's messages, replace it if it died, give it work, keep the journal to its limit.
+        """Read the fuser's messages, replace it after its death, give it work, keep the journal to its limit.
 
-        In this order: whether it has ended is asked before its last messages are read, and what it answered
-        is out of the way before the next one begins, or work is handed out.
+        The order matters. `ended` is asked before the last messages are read. All answers of an old fuser are
+        handled before the next one begins, or work is handed out.
 
         Raises:
             TsfusionError: when the map cannot be opened.
@@ -204,7 +203,7 @@ class HostedMap:
             self._dispatch(*received, pass_on)
         if ended and not self.fuser.finishing:
             self.records.disk.look()
-            if not self.records.disk.is_away:  # another one would find an empty map
+            if not self.records.disk.is_away:  # without its folder, a new fuser would find an empty map
                 self.fuser.restart()
         self.backlog.hand_out(self.fuser)
         self.records.disk.step()
@@ -217,9 +216,9 @@ class HostedMap:
     def _dispatch(
         self, message: fuser_messages.ToGateway, frames: Sequence[zmq.Frame], pass_on: PassOn
     ) -> None:
-        """Give a fuser's message to all whom it concerns, after `FuserSupervisor.receive` had it.
+        """Pass a fuser's message, after `FuserSupervisor.receive`, to all objects that need it.
 
-        An answer is passed on here, before what was fused after it is counted.
+        An answer goes out here, before keyframes fused after it are counted.
         """
         match message:
             case fuser_messages.Done():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The outcome of each keyframe of a map: counted, reported to its client, kept aside when it was rejected."""
+"""Outcome of each keyframe of a map: counted, reported to its client, and quarantined if it was rejected."""
 
 import logging
 import time
@@ -26,47 +26,47 @@ from tsfusion.wire.messages.mesh_updates import Meshed, MeshUpdate
 log = logging.getLogger(__name__)
 
 _FULL = ("memory", "MapFull")  # reasons of a fuser: the map has no room for a keyframe
-_OVER_QUOTA = "MapQuota"  # or its client has had its share
-_MAX_UNTOLD = 64  # rejections of a session while it is away, and sessions with some
+_OVER_QUOTA = "MapQuota"  # reason of a fuser: the client has used up its share
+_MAX_UNTOLD = 64  # most unsent rejections of a session, and most sessions with some
 
 
 _NO_MOVES = fuser_messages.CorrectionProgress(0, 0, 0, 0, 0, 0.0)
 
 
 class KeyframeOutcomes:
-    """The outcomes of one map's keyframes, over all its fuser processes."""
+    """Outcomes of one map's keyframes, over all its fuser processes."""
 
     def __init__(self, name: str, records: MapRecords, routes: ClientRoutes, metrics: Metrics) -> None:
         self.fused = 0  # keyframes in the map
-        self.moves = _NO_MOVES  # what corrections make of them
+        self.moves = _NO_MOVES  # progress of corrections
         self.rejected: Counter[str] = Counter()  # by reason
         self.unmeshed: deque[int] = deque()  # indices; answered by the present fuser, oldest first
-        self.blocks = self.map_bytes = 0  # at the fuser's last message about them
-        self.newest_mesh: MeshUpdate | None = None  # that viewers were told of; None = there is none
+        self.blocks = self.map_bytes = 0  # from the fuser's last message about them
+        self.newest_mesh: MeshUpdate | None = None  # newest one sent to viewers; None before it
         self.delays = DelayStatistics()
         self._name = name
         self._records = records
         self._routes = routes
         self._metrics = metrics
-        # Indices of rejected records that were reported: before the last checkpoint, and since then. What a
-        # checkpoint holds is never fused again, but a damaged one makes way for that before it.
+        # Indices of rejected records that were reported: before the last checkpoint, and since then. Records
+        # in a checkpoint are never fused again, but if it is damaged, the one before is used.
         self._rejected_before: set[int] = set()
         self._rejected_since: set[int] = set()
-        self.notices: dict[str, str] = {}  # what a person must do, by reason and client
-        self._untold: OrderedDict[bytes, deque[messages.Nack]] = OrderedDict()  # session → while it was away
-        self._without_samples: set[bytes] = set()  # sessions that have been named for a keyframe of that kind
+        self.notices: dict[str, str] = {}  # instructions for a person, by reason and client
+        self._untold: OrderedDict[bytes, deque[messages.Nack]] = OrderedDict()  # session → unsent rejections
+        self._without_samples: set[bytes] = set()  # sessions with a logged keyframe without samples
         self._meshed = 0  # keyframes that the present fuser answered and meshed
 
     def acknowledge(
         self, key: bytes, stamps: Sequence[messages.Stamps] = (), *, resend: bool = False
     ) -> None:
-        """Tell a client how far its session is."""
+        """Tell a client the progress of its session."""
         self._routes.send(
             key, messages.Ack(key, *self._records.sessions.progress(key), tuple(stamps), resend)
         )
 
     def on_durable(self, record: IncomingRecord, durable_ns: int) -> None:
-        """Acknowledge a record that was journaled."""
+        """Acknowledge a journaled record."""
         header, received_ns = record.header, record.received_ns
         if not record.is_correction:
             self._metrics.observe(self._name, "journal", (durable_ns - received_ns) / 1e9)
@@ -76,12 +76,12 @@ class KeyframeOutcomes:
         """Go back to the counts of the checkpoint that a new fuser began with."""
         self.fused, self.rejected = ready.keyframes, Counter(ready.rejected)
         self.blocks, self.map_bytes = ready.blocks, ready.map_bytes
-        self.notices.clear()  # it may have more room now
+        self.notices.clear()  # the new fuser may have more room
         self.on_moves(ready.moves or msgspec.structs.replace(_NO_MOVES, keyframes=ready.keyframes))
         self._settle_unmeshed()
 
     def _settle_unmeshed(self) -> None:
-        """Count keyframes that an earlier fuser did not mesh as meshed, unless they are fused once more."""
+        """Count keyframes that an earlier fuser did not mesh as meshed, unless they are fused again."""
         now = time.monotonic_ns()
         for index in self.unmeshed:
             session = self._records.sessions.numbered(self._records.index[index].session)
@@ -91,7 +91,7 @@ class KeyframeOutcomes:
         self._meshed = 0
 
     def on_done(self, done: fuser_messages.Done) -> None:
-        """Note the fuser's answer to a record, and report it to the client."""
+        """Take the fuser's answer to a record, and report it to the client."""
         entry = self._records.index[done.index]
         session = self._records.sessions.numbered(entry.session)
         session.in_map = entry.stamps.seq
@@ -104,7 +104,7 @@ class KeyframeOutcomes:
         else:
             reported = done.index in self._rejected_since or done.index in self._rejected_before
         if reported:
-            return  # by a fuser that died before it wrote a checkpoint
+            return  # an earlier fuser answered it, and died before its checkpoint
         if not entry.is_correction:
             session.answered += 1
             session.rejected += done.reason is not None
@@ -152,7 +152,7 @@ class KeyframeOutcomes:
             return
         try:
             frames = read(self._records.journal.folder, entry.position).frames
-        except JournalError:  # which is why it was rejected
+        except JournalError:  # unreadable in the journal: the reason of the rejection
             return
         self._records.quarantine.keep(
             frames, session=session.key, seq=seq, client=session.client, reason=done.reason
@@ -160,11 +160,11 @@ class KeyframeOutcomes:
 
     @property
     def taken(self) -> int:
-        """Number of keyframes that the map took, those that a correction took out of it included."""
+        """Number of keyframes that the map took, including those that a correction removed later."""
         return self.fused + self.moves.removed
 
     def on_moves(self, moves: fuser_messages.CorrectionProgress) -> None:
-        """Note how far the map is with corrected poses."""
+        """Take the map's progress with corrected poses."""
         self.moves, self.fused = moves, moves.keyframes
         self.notices.pop("unmoved", None)
         if moves.unavailable:
@@ -172,11 +172,11 @@ class KeyframeOutcomes:
             self.notices["unmoved"] = f"{stay} cannot be moved and left where fused: the log says why"
 
     def on_checkpoint(self) -> None:
-        """Note that a new checkpoint holds everything that was answered."""
+        """Record that a new checkpoint holds all answered records."""
         self._rejected_before, self._rejected_since = self._rejected_since, set()
 
     def _tell(self, nack: messages.Nack) -> None:
-        """Tell a client at once that the map did not take its record, and one that was not heard again."""
+        """Tell a client that the map rejected its record. Keep the message if the client may not get it."""
         route = self._routes.get(nack.session)
         if route is not None and not route.left:
             self._routes.send(nack.session, nack)
@@ -187,7 +187,7 @@ class KeyframeOutcomes:
             self._untold.popitem(last=False)
 
     def tell_untold(self, key: bytes) -> None:
-        """Tell a client that is back what the map did not take while it was away."""
+        """Tell a returned client which records the map rejected while it was away."""
         for nack in self._untold.pop(key, ()):
             self._routes.send(key, nack)
 
@@ -204,7 +204,7 @@ class KeyframeOutcomes:
             )
 
     def on_meshed(self, meshed: Meshed) -> None:
-        """Note that the fuser brought the mesh up to date."""
+        """Record that the fuser brought the mesh up to date."""
         self.blocks, self.map_bytes = meshed.map_blocks, meshed.map_bytes
         self.newest_mesh = meshed.update or self.newest_mesh
         for _ in range(meshed.count - self._meshed):
@@ -230,7 +230,7 @@ class DelayStatistics:
         self._recent_ms: deque[tuple[float, float]] = deque(maxlen=_DELAYS)
 
     def add(self, delay_ns: int, bound_ns: int) -> bool:
-        """Count a keyframe's delay, right to within ± a bound; False when it is impossible and left out."""
+        """Count a keyframe's delay, with its error bound. Return False for an impossible delay."""
         if not -bound_ns <= delay_ns <= _LONGEST_DELAY_NS:
             return False
         self._recent_ms.append((delay_ns / 1e6, bound_ns / 1e6))
@@ -238,32 +238,32 @@ class DelayStatistics:
 
     @property
     def bound_ms(self) -> float:
-        """The largest error that any of the delays may have."""
+        """Largest error bound of the delays."""
         return max((bound for _, bound in self._recent_ms), default=0.0)
 
     def summary(self) -> Spread:
-        """Mean, percentiles and maximum of the delays, milliseconds."""
+        """Return mean, percentiles and maximum of the delays, in milliseconds."""
         return health.spread(np.array([delay for delay, _ in self._recent_ms]))
 
 
-# refused: not passed on to the fuser; late: their time was over; failed: the fuser could not
+# refused: not passed on to the fuser; late: its time was over; failed: the fuser could not answer
 Outcome = Literal["answered", "refused", "late", "failed"]
 
 
 class QuestionCounts:
-    """Questions that a map was asked, what became of them, and how long the answers took."""
+    """Counts of a map's questions by outcome, and the delays of its answers."""
 
     def __init__(self) -> None:
         self.by_outcome: Counter[str] = Counter()
         self._delays_ms: deque[float] = deque(maxlen=_DELAYS)
 
     def add(self, outcome: Outcome, seconds: float | None = None) -> None:
-        """Count a question; with the seconds that its answer took."""
+        """Count a question. `seconds`: delay of its answer."""
         self.by_outcome[outcome] += 1
         if seconds is not None:
             self._delays_ms.append(1e3 * seconds)
 
     @property
     def delay_ms(self) -> Spread:
-        """From when the newest questions came to when their answers left, milliseconds."""
+        """Delays from question to answer of the newest questions, in milliseconds."""
         return health.spread(np.array(self._delays_ms))

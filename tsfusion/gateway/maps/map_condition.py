@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Condition of a map and of a server: in a word, in lines for a person, and in numbers."""
+"""Condition of a map and of a server: as a state, as problems in words, and as numbers."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -18,13 +18,12 @@ from tsfusion.wire.keys.key_folder import ALL_MAPS, AllowedMaps
 from tsfusion.wire.messages.health import Health, MapHealth, MapState
 
 _FOR_GONE = "what no checkpoint holds of them is lost, unless they are put back"
-_INTERVAL = 1.0  # seconds between two looks
+_INTERVAL = 1.0  # seconds between two checks
 _CLIENT_PROBLEMS = 10  # lines about single clients
 _STALLED_AFTER = 10.0  # seconds in which keyframes wait and none is fused
 
 
 def state_of(hosted: HostedMap) -> MapState:
-    """The state in a word."""
     if hosted.fuser.failed:
         return "failed"
     if not hosted.warm or hosted.fuser.waits:
@@ -35,7 +34,7 @@ def state_of(hosted: HostedMap) -> MapState:
 
 
 def problem_of(hosted: HostedMap) -> str:
-    """Reason why keyframes are not accepted or not fused, and what to do; empty = they are."""
+    """Return why keyframes are not accepted or not fused, and what to do; empty without a problem."""
     if problem := hosted.records.disk.problem or hosted.fuser.problem:
         return problem
     backlog = hosted.backlog
@@ -47,7 +46,7 @@ def problem_of(hosted: HostedMap) -> str:
 
 
 def notices_of(hosted: HostedMap) -> list[str]:
-    """Problems that a person should know of, though keyframes are taken and will be fused."""
+    """Return problems that a person should know, though keyframes are accepted and will be fused."""
     journal = hosted.records.journal
     damaged, put_back = journal.damaged, journal.put_back
     lost = count_of(damaged, "keyframe of its journal is", "keyframes of its journal are")
@@ -73,7 +72,7 @@ def notices_of(hosted: HostedMap) -> list[str]:
 
 
 def health_of(hosted: HostedMap) -> MapHealth:
-    """Health of a map, as far as it is known without asking the fuser."""
+    """Return the health of a map, from what is known without asking the fuser."""
     now, outcomes, records = time.monotonic(), hosted.outcomes, hosted.records
     return MapHealth(
         state=state_of(hosted),
@@ -110,12 +109,12 @@ def health_of(hosted: HostedMap) -> MapHealth:
 
 
 def all_blocked(maps: dict[str, MapHealth]) -> bool:
-    """True if no map takes and fuses keyframes: one that does is a reason to go on sending to this server."""
+    """True if no map takes and fuses keyframes. One good map is a reason to keep sending to this server."""
     return bool(maps) and all(one.problem for one in maps.values())
 
 
 class ServerCondition:
-    """The condition of a server, of which the log and the metrics hear about once a second."""
+    """Condition of a server. The log and the metrics get it about once a second."""
 
     def __init__(
         self,
@@ -134,7 +133,7 @@ class ServerCondition:
         self.next_look = 0.0
 
     def step(self, health: Callable[[], Health]) -> None:
-        """Note the health, about once a second."""
+        """Give the health to the log and the metrics, about once a second."""
         now = time.monotonic()
         if now < self.next_look:
             return
@@ -154,7 +153,7 @@ class ServerCondition:
         refused: dict[str, int],
         duplicates: int,
     ) -> Health:
-        """Health of the server; see `Gateway.health`."""
+        """Return the health of the server; see `Gateway.health`."""
         now = time.monotonic()
         maps = {hosted.name: health_of(hosted) for hosted in self._maps}
         blocked = self._ports.problem or self._access.problem or all_blocked(maps)
@@ -175,7 +174,7 @@ class ServerCondition:
         )
 
     def _find_problems(self, shown: AllowedMaps = ALL_MAPS) -> list[Problem]:
-        """Present problems: of the whole server first, then of its maps, then of clients."""
+        """Return present problems: of the server first, then of its maps, then of clients."""
         found = [Problem(self._ports.problem, is_logged=True)] if self._ports.problem else []
         if self._access.problem:
             found.append(Problem(f"nobody may connect: {self._access.problem}", is_logged=True))
@@ -187,7 +186,7 @@ class ServerCondition:
         return found + of_clients
 
     def _of_maps(self) -> Iterator[Problem]:
-        """Problems of the maps; those that keep them from taking or fusing keyframes come first."""
+        """Yield the problems of the maps, first those that keep a map from taking or fusing keyframes."""
         for hosted in self._maps:
             if problem := problem_of(hosted):
                 yield Problem(problem, hosted.name, is_logged=bool(hosted.records.disk.problem))

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""The journal of a map: opened, compared with the checkpoint, kept to its limit by checkpoints.
+"""The journal of a map: opened, compared with the checkpoint, and kept to its size limit.
 
-Segments that two checkpoints hold are deleted, oldest first. A fuser writes most checkpoints by itself.
+Segments are deleted, oldest first, once two checkpoints hold them. A fuser writes most checkpoints by itself.
 """
 
 import glob
@@ -21,12 +21,12 @@ from tsfusion.gateway.fusers.fuser_supervisor import FuserSupervisor
 from tsfusion.gateway.records.journaled_records import KeyframeIndex
 from tsfusion.journal import Journal, ReadingWatcher, state_folder
 
-_SEGMENTS_KEPT = 4  # a journal with a limit is deleted in quarters of that limit
-_LONGEST_WAIT = 0.2  # seconds of a step, for a segment of the journal that is put back
+_SEGMENTS_KEPT = 4  # segments of a journal with a limit are at most a quarter of that limit
+_LONGEST_WAIT = 0.2  # most seconds of a step for a lost segment that is written again
 
 
 def open_journal(folder: Path, server: ServerConfig, watch: ReadingWatcher) -> Journal:
-    """The map's journal, in segments small enough to keep it to its limit."""
+    """Open the map's journal, with segments small enough to keep it to its limit."""
     segment_bytes = server.segment_bytes
     if server.journal_bytes is not None:
         segment_bytes = min(segment_bytes, server.journal_bytes // _SEGMENTS_KEPT)
@@ -42,7 +42,7 @@ def open_journal(folder: Path, server: ServerConfig, watch: ReadingWatcher) -> J
 def warn_of_old_corrections(folder: Path) -> None:
     """Log that corrections of an early version are not read."""
     old = folder / "corrections"
-    if glob.glob("*.tsc", root_dir=old):  # nothing where the disk does not say
+    if glob.glob("*.tsc", root_dir=old):  # empty also for a folder that cannot be read
         log.warning(
             "%s holds corrected poses as an earlier development version kept them: they are not read; "
             "delete the folder to silence this",
@@ -51,7 +51,7 @@ def warn_of_old_corrections(folder: Path) -> None:
 
 
 def warn_of_shorter_journal(name: str, journal: Journal, sessions: Sessions, ready: Ready) -> None:
-    """Log that a journal, of which nothing was deleted on purpose, ends before the checkpoint does."""
+    """Log that a complete journal ends before the checkpoint does."""
     shorter = [key for key, done in ready.done.items() if sessions.progress(key)[0] < done.seq]
     if shorter and journal.first == 1:
         log.warning(
@@ -64,10 +64,10 @@ def warn_of_shorter_journal(name: str, journal: Journal, sessions: Sessions, rea
 
 
 def describe_contents(ready: Ready, waiting: int) -> str:
-    """Contents of a map, for the log.
+    """Return the contents of a map in words, for the log.
 
     Args:
-        waiting: keyframes of its journal that are not in it.
+        waiting: number of keyframes of its journal that are not in the map yet.
     """
     if not ready.done and not waiting:
         return "a new map is open"
@@ -76,7 +76,7 @@ def describe_contents(ready: Ready, waiting: int) -> str:
 
 
 def find_loss(name: str, journal: Journal, ready: Ready) -> str:
-    """Loss of records that neither a checkpoint nor the journal has, which is logged; empty = none."""
+    """Log records that no checkpoint and no journal has. Return the text; empty without a loss."""
     if ready.done or journal.first <= 1:
         return ""
     found = f"its checkpoints are lost, and with them what was journaled before segment {journal.first}"
@@ -86,12 +86,12 @@ def find_loss(name: str, journal: Journal, ready: Ready) -> str:
 
 log = logging.getLogger(__name__)
 
-_SAVE_PAUSE = 10.0  # seconds until a checkpoint is tried again that could not be written
-_SAVE_INTERVAL = 10.0  # seconds between checkpoints that are made only for the journal's sake
+_SAVE_PAUSE = 10.0  # seconds before a failed checkpoint is tried again
+_SAVE_INTERVAL = 10.0  # shortest time between checkpoints ordered only to shorten the journal
 
 
 class JournalRetention:
-    """Keep a journal to its limit. It holds more only while two checkpoints do not have its keyframes."""
+    """Keeps a journal to its size limit, but never deletes keyframes that two checkpoints do not hold yet."""
 
     def __init__(
         self, journal: Journal, index: KeyframeIndex, sessions: Sessions, max_bytes: int | None
@@ -100,23 +100,23 @@ class JournalRetention:
         self._index = index
         self._sessions = sessions
         self._max_bytes = max_bytes
-        # All segments below these numbers are in the last checkpoint, and in the one before it.
+        # All segments below these numbers are in the last checkpoint, and in the checkpoint before it.
         self._in_last = self._in_previous = 0
         self._saving = False
         self._saved_at = float("-inf")  # time.monotonic()
-        self._expired = 0  # keyframes of lower segments were let go
+        self._expired = 0  # the fuser was told to forget keyframes of lower segments
         self._window_from: int | None = None
-        # Segments below these have no keyframe that the last two checkpoints hold and that is to leave
+        # Segments below these have no keyframe that must still leave the last two checkpoints
         self._window = (0, 0)
 
     def on_ready(self) -> None:
-        """Note that a fuser began with the last checkpoint."""
+        """Record that a fuser began with the last checkpoint."""
         self._expired = 0
         self._saving = False
         self._in_last = self._first_needed()
 
     def on_saved(self, saved: fuser_messages.Saved) -> None:
-        """Note the end of a checkpoint, which was written only if there was something new."""
+        """Take the end of a checkpoint. It was written only if there was something new."""
         self._saving = False
         self._saved_at = time.monotonic()
         if saved.written:
@@ -124,7 +124,7 @@ class JournalRetention:
             self._window = (self._window[1], self._window_from or 0)
 
     def _first_needed(self) -> int:
-        """The number of the oldest segment with a keyframe that the map does not have."""
+        """Return the number of the oldest segment with a keyframe that the map does not have."""
         unfused = (
             self._index.segment(session.entries[done])
             for session in self._sessions
@@ -133,12 +133,13 @@ class JournalRetention:
         return min(unfused, default=self._journal.segment)
 
     def step(self, fuser: FuserSupervisor, needed: Iterable[int], *, window_from: int | None = None) -> None:
-        """Delete segments if the journal is too large, and ask for a checkpoint if that is not enough.
+        """Delete segments if the journal is too large. If that is not enough, order a checkpoint.
 
         Args:
             needed: indices of keyframes that must stay in the index.
-            window_from: the oldest segment with a keyframe of a map that is to forget old ones, which takes
-                their records: it lets them go before their segment does. None = none is forgotten.
+            window_from: oldest segment with a keyframe in a map that forgets old keyframes; None for other
+                maps. Such a map needs the record of a keyframe to forget it, so it forgets before the segment
+                is deleted.
         """
         self._window_from = None if window_from is None else window_from or self._journal.segment
         if self._max_bytes is None or self._journal.nbytes <= self._max_bytes:
@@ -157,7 +158,7 @@ class JournalRetention:
             self._saving = fuser.send(fuser_messages.Save())
 
     def _expire(self, fuser: FuserSupervisor, window_from: int) -> None:
-        """Have the keyframes of the oldest segment forgotten, so that it can be deleted."""
+        """Order the fuser to forget the keyframes of the oldest segment, so that it can be deleted."""
         before = window_from + 1
         is_due = window_from < self._journal.segment and before > self._expired
         if is_due and fuser.ready and fuser.send(fuser_messages.Expire(before)):
@@ -165,12 +166,12 @@ class JournalRetention:
 
 
 class CheckpointOrders:
-    """Ask again where a checkpoint failed, where segments of the journal have gone, and before a map leaves.
+    """Orders checkpoints: again after a failure, after segments were lost, and before a map leaves.
 
     Attributes:
         written: number of checkpoints since the map was opened.
-        problem: why none can be written; empty = one can.
-        is_answered: nothing that `ask` asked for is to come any more.
+        problem: why no checkpoint can be written; empty without a problem.
+        is_answered: True if no checkpoint of `ask` is still to come.
     """
 
     def __init__(self, fuser: FuserSupervisor, journal: Journal) -> None:
@@ -179,21 +180,21 @@ class CheckpointOrders:
         self.problem = ""
         self.is_answered = True
         self._ask_at = 0.0  # time.monotonic()
-        self._missing = 0  # segments of the journal that were missing when one was asked for
+        self._missing = 0  # lost segments of the journal at the last order
 
     def ask(self) -> None:
-        """Have one written now, if there is a fuser."""
+        """Order a checkpoint now, if the fuser is ready."""
         self.is_answered = not (self._fuser.ready and self._fuser.send(fuser_messages.Save()))
 
     def on_saved(self, saved: fuser_messages.Saved) -> None:
-        """Take what the fuser says of one."""
+        """Take the fuser's answer about a checkpoint."""
         self.is_answered = True
         self.written += saved.written
         self.problem = saved.problem
         self._ask_at = time.monotonic() + _SAVE_PAUSE
 
     def step(self) -> None:
-        """Ask for one where that is due."""
+        """Order a checkpoint if one is due."""
         now, missing = time.monotonic(), len(self._journal.missing)
         is_due = self.problem and now >= self._ask_at
         if (

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The records of a map on the server's disk: the journal, whose they are, and where each one lies."""
+"""The records of a map on the server's disk: the journal, its sessions, and the index of records."""
 
 import logging
 import time
@@ -20,17 +20,17 @@ from tsfusion.wire.records.record_header import CorrectionHeader, RecordHeader
 
 log = logging.getLogger(__name__)
 
-_DISK_PAUSE = 1.0  # seconds without keyframes after the disk refused one, and between two looks at it
+_DISK_PAUSE = 1.0  # seconds without keyframes after the disk refused one, and between two checks of it
 
 
 class IncomingRecord(NamedTuple):
-    """A record that came, whose it is, and when."""
+    """A received record, with its sender and time."""
 
     header: RecordHeader
     frames: Sequence[Any]
-    client: str  # name that its sender's key is allowed under
+    client: str  # name under which its sender's key is allowed
     received_ns: int
-    route: ClientRoute | None = None  # to its client; None = it is not connected
+    route: ClientRoute | None = None  # route to its client; None if it is not connected
 
     @property
     def is_correction(self) -> bool:
@@ -41,7 +41,7 @@ class IncomingRecord(NamedTuple):
         return sum(frame.nbytes for frame in self.frames)
 
     def about(self, reason: str = "") -> dict[str, Any]:
-        """The subject of a line of the log."""
+        """Return the subject of a log line about the record."""
         header = self.header
         return logs.about(
             map=header.map, session=header.session, seq=header.seq, client=self.client, reason=reason
@@ -49,14 +49,14 @@ class IncomingRecord(NamedTuple):
 
 
 class MapRecords:
-    """The records of one map, those in the journal and those kept aside.
+    """The records of one map: those in the journal, and those in quarantine.
 
     Attributes:
-        is_new: whether there was nothing of the map.
-        has_arrived: whether the server from which it came has said what it has.
-        corrections: number of those in the journal.
-        last_keyframe: when the last one came (`time.monotonic()`); None = none did.
-        loss: what is neither in a checkpoint nor in the journal; empty = nothing.
+        is_new: True if there was nothing of the map on disk.
+        has_arrived: True if the map came from another server, with its sessions' progress.
+        corrections: number of corrections in the journal.
+        last_keyframe: time of the last keyframe (`time.monotonic()`); None before the first.
+        loss: records that no checkpoint and no journal has, in words; empty without a loss.
     """
 
     def __init__(self, name: str, server: ServerConfig, watch: ReadingWatcher) -> None:
@@ -80,7 +80,7 @@ class MapRecords:
             session.durable = max(session.durable, known.durable)
 
     def append(self, records: Sequence[IncomingRecord]) -> tuple[list[int], int]:
-        """Write records to the journal, all or none; their indices, and when that was done.
+        """Journal records, all or none. Return their indices, and the time when they were on disk.
 
         Raises:
             JournalError: when the disk refuses.
@@ -114,7 +114,7 @@ class MapRecords:
         )
 
     def close_segment(self) -> None:
-        """Close the journal's last file; raises JournalError."""
+        """Close the journal's last file. Raise JournalError if the disk refuses."""
         try:
             self.journal.rotate()
         except OSError as error:
@@ -122,23 +122,23 @@ class MapRecords:
 
 
 class DiskPause:
-    """The time after the disk refused a keyframe, in which no other is tried."""
+    """Pause after the disk refused a keyframe: no other keyframe is tried in it."""
 
     def __init__(self, journal: Journal, map_name: str) -> None:
-        self.problem = ""  # why no keyframe is taken; empty = they are
-        self.is_away = False  # the journal's folder is not to be found
+        self.problem = ""  # why no keyframe is taken; empty if they are
+        self.is_away = False  # True if the journal's folder is not found
         self._journal = journal
         self._map = map_name
         self._until = self._look_at = 0.0  # time.monotonic()
-        self._shows = False  # whether a look at the disk shows the problem, and so its end
+        self._shows = False  # True if a check of the disk can see the problem, and so its end
 
     def seconds_left(self, now: float) -> float:
-        """Seconds until a keyframe is tried again; 0 = none has to wait."""
+        """Return the seconds until a keyframe is tried again, or 0."""
         return max(self._until - now, 0.0)
 
     def begin(self, error: JournalError) -> None:
         """Pause because of an error."""
-        if Problem(str(error)).key != Problem(self.problem).key:  # the same one is logged once
+        if Problem(str(error)).key != Problem(self.problem).key:  # log each problem only once
             log.error("no keyframes are taken: %s", error, extra=logs.about(map=self._map))
         self.problem = str(error)
         self.is_away = error.errno in MISSING
@@ -152,15 +152,15 @@ class DiskPause:
             self.problem, self.is_away, self._shows = "", False, False
 
     def step(self) -> None:
-        """Look once a second whether the disk would take a keyframe, though none comes.
+        """Check the disk once a second, also while no keyframe comes.
 
-        Clients may wait for the end of a pause, and a person is to be told before the next scan.
+        Clients may wait for the end of a pause, and a person should know of it before the next scan.
         """
         if time.monotonic() >= self._look_at:
             self.look()
 
     def look(self) -> None:
-        """Look now whether the disk would take a keyframe."""
+        """Check now if the disk would take a keyframe."""
         self._look_at = time.monotonic() + _DISK_PAUSE
         try:
             self._journal.check()
@@ -169,5 +169,5 @@ class DiskPause:
             self._shows = True
         else:
             self._until = 0.0
-            if self._shows:  # else only the next keyframe can tell
+            if self._shows:  # otherwise only the next keyframe shows the end of the problem
                 self.end()

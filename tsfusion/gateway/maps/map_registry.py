@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The maps of a server: the open ones, and why others could not be opened."""
+"""Registry of a server's maps: the open ones, and the reasons why others could not be opened."""
 
 import logging
 import re
@@ -30,13 +30,13 @@ from tsfusion.wire.records.record_header import RecordHeader
 
 log = logging.getLogger(__name__)
 
-# A map whose journal is read: bytes that were read, bytes of all, and records so far
+# Called while a journal is read: name of the map, bytes read, all bytes, and records so far
 MapWatcher = Callable[[str, int, int, int], None]
 _MAX_UNOPENED = 64
 _RETRY_INTERVAL = 10.0  # seconds before a map that could not be opened is tried again
-_UNOPENED_KEPT = 600.0  # seconds after which nobody misses a map that could not be opened
+_UNOPENED_KEPT = 600.0  # seconds for which a map that could not be opened is a problem
 _KEPT_NAMES = 64  # free names that were given out
-_KEPT_SECONDS = 300.0  # until then nobody else is given them: a map takes a while to be opened
+_KEPT_SECONDS = 300.0  # seconds for which a name is given to nobody else: a map takes a while to open
 
 
 class MapRegistry:
@@ -60,25 +60,25 @@ class MapRegistry:
         self._directory = MapDirectory(server.directory) if server.directory else None
         if self._directory is not None:
             self._directory.check()
-        self._started = self.is_ending = False  # when it ends, no map begins that waits
+        self._started = self.is_ending = False  # while the server ends, no waiting fuser is started
 
     def __iter__(self) -> Iterator[HostedMap]:
         return iter(self._open.values())
 
     def get(self, name: str) -> HostedMap | None:
-        """An open map, by name; its fuser begins."""
+        """Return an open map by name, or None. Start its fuser if that waits."""
         hosted = self._open.get(name)
         if hosted is not None:
             hosted.fuser.begin()
         return hosted
 
     def progress(self, name: str, session: bytes) -> tuple[int, int]:
-        """The highest seq of a session that is durable, and that is fused."""
+        """Return the highest durable seq and the highest fused seq of a session."""
         hosted = self.get(name)
         return hosted.records.sessions.progress(session) if hosted else (0, 0)
 
     def session(self, name: str, key: bytes) -> Session | None:
-        """A session of a map; None = it has nothing in the journal."""
+        """Return a session of a map, or None if it has no record in the journal."""
         hosted = self.get(name)
         return hosted.records.sessions.get(key) if hosted else None
 
@@ -89,12 +89,12 @@ class MapRegistry:
         *,
         later: Collection[str] = (),
     ) -> None:
-        """Open maps by name with their settings; those that clients ask for get those of the default map.
+        """Open maps by name with their settings. Maps of later clients get the default map's settings.
 
         Args:
-            later: maps whose fusers begin when somebody asks for them, or else one after the other.
-            watch: told how far the journal of a map is read, also of a map that is opened later. What it
-                raises ends the start.
+            later: maps whose fusers start when a client asks for them, or else one after the other.
+            watch: called with the progress of reading a map's journal, also of maps opened later. An error
+                from it ends the start.
 
         Raises:
             TsfusionError: when a journal cannot be opened.
@@ -104,7 +104,7 @@ class MapRegistry:
             self._open_map(name, waits=name in later)
 
     def end_start(self, place: AddressPair) -> None:
-        """Go on when a map cannot be opened, from here on; before, that is an error of the server."""
+        """End the start: from here on, a map that cannot be opened does not end the server."""
         self._started, self.place = True, place
         for hosted in self:
             if not hosted.is_empty:
@@ -118,10 +118,10 @@ class MapRegistry:
         return hosted is not None and not hosted.is_empty
 
     def elsewhere(self, name: str) -> AddressPair | None:
-        """The server that has a map of which this one has nothing; None = no other has it.
+        """Return the server that has a map which is empty or absent here, or None without one.
 
         Raises:
-            JournalError: when that cannot be read.
+            JournalError: when the directory or the files of moved maps cannot be read.
         """
         if self.has(name) or name in self.arriving:
             return None
@@ -132,7 +132,7 @@ class MapRegistry:
         return None if left is None else (left.address, left.control)
 
     def claim(self, name: str) -> AddressPair | None:
-        """Enter a map that is about to begin here; the other server that has it, None = it may begin.
+        """Enter a new map of this server into the directory. Return the other server that has it, or None.
 
         Raises:
             JournalError: when the directory cannot be written.
@@ -143,7 +143,7 @@ class MapRegistry:
         return None if found == self.place else found
 
     def _enter(self, name: str) -> None:
-        """Enter a map that is here, whatever the directory says."""
+        """Enter a map of this server into the directory, whatever the directory says."""
         if self._directory is None:
             return
         try:
@@ -152,7 +152,7 @@ class MapRegistry:
             log.error("%s", error, extra=logs.about(map=name))
 
     def why_not_take(self, name: str) -> str:
-        """Reason why a map of this name cannot come from another server; empty = it can."""
+        """Return the reason why a map of this name cannot come from another server; empty if it can."""
         if name in self.arriving:
             return f"map {name} is coming already"
         if self._has_own(name):
@@ -164,24 +164,24 @@ class MapRegistry:
         return state_folder.holds_records(self._folder(name)) if hosted is None else not hosted.is_empty
 
     def begin_to_take(self, name: str) -> None:
-        """Let nothing begin under the name of a map that is coming."""
+        """Reserve the name of a map that is coming: no map begins under it."""
         self.arriving.add(name)
         if (hosted := self.get(name)) is not None:
             hosted.freeze()
 
     def end_to_take(self, name: str) -> None:
-        """Note that a map has come, or will not come."""
+        """Release the name of a map that has come, or will not come."""
         self.arriving.discard(name)
         if (hosted := self._open.get(name)) is not None:
             hosted.stay()
 
     def open_ahead(self, name: str, folder: Path, volume: VolumeConfig) -> FuserSupervisor:
-        """A fuser that reads a map in a folder where it waits, for `take_in` to go on with.
+        """Return a supervisor whose fuser reads a map ahead in `folder`. `take_in` continues with it.
 
-        Where no spare process has these settings, that of an empty map is taken: a start takes seconds.
+        If no spare process has these settings, the process of an empty map is used: a start takes seconds.
 
         Raises:
-            MapError: when the system cannot start it.
+            MapError: when the system cannot start the process.
         """
         in_use = {route.map for route in self._routes}
         idle = (one for one in self if one.is_empty and one.fuser.idle and one.fuser.volume == volume)
@@ -193,7 +193,7 @@ class MapRegistry:
         return FuserSupervisor(self._context, place, self._server, volume, ahead=folder, spares=self._spares)
 
     def give_away(self, name: str) -> None:
-        """Close a map that another server has from now on, or that makes room for one that came."""
+        """Close a map that another server has from now on, or an empty map that makes room for one."""
         hosted = self._open.pop(name, None)
         if hosted is not None:
             hosted.close(wait=False)
@@ -202,7 +202,7 @@ class MapRegistry:
         """Open a map that has come from another server.
 
         Raises:
-            TsfusionError: when it cannot be opened; its files are here then, and the next start tries again.
+            TsfusionError: when it cannot be opened. Its files are then here, and the next start tries again.
         """
         if self._has_own(name):
             raise JournalError(f"this server has a map {name} of its own")
@@ -212,7 +212,7 @@ class MapRegistry:
         self._open_map(name, fuser)
 
     def greet(self, name: str) -> HostedMap | None:
-        """A map by name, opened when it is on the disk; None = there is none, or `why_not` says why.
+        """Return a map by name, opened if it is on the disk, or None; `why_not` may have a reason.
 
         A greeting alone makes no map: the first record does.
         """
@@ -224,7 +224,7 @@ class MapRegistry:
         return self.open_for_client(name) if is_there else None
 
     def open_for_client(self, name: str) -> HostedMap | None:
-        """A map by name, opened or made when need be; None when it cannot be, and `why_not` says why."""
+        """Return a map by name, opened or made if necessary. Return None if that fails: see `why_not`."""
         if self.why_not(name) and name not in self._open:
             return None
         try:
@@ -234,7 +234,7 @@ class MapRegistry:
             return None
 
     def why_not(self, name: str) -> str:
-        """Reason why a map that is not open cannot be opened now; empty = it can be."""
+        """Return the reason why a closed map cannot be opened now; empty if it can."""
         if name in self.arriving:
             return "it is coming from another server"
         why, failed = self._unopened.get(name, ("", -_RETRY_INTERVAL))
@@ -244,7 +244,7 @@ class MapRegistry:
 
     @property
     def why_full(self) -> str:
-        """Reason why there is no room for another map, and what makes some."""
+        """Reason why there is no room for another map, and how to make room."""
         most = self._server.max_maps
         return (
             f"{most} are open; use one of them (`tsfusion status` lists them), or restart the server with a "
@@ -252,7 +252,7 @@ class MapRegistry:
         )
 
     def why_none_free(self, like: str, maps: AllowedMaps) -> str:
-        """Reason why `keep_free_name` has no name for a client."""
+        """Return the reason why `keep_free_name` has no name for a client."""
         if self.free_name(like, maps) is None:
             return f"no name is free of the maps that this key may use: {maps}"
         return f"no room for another map: {self.why_full}"
@@ -260,12 +260,12 @@ class MapRegistry:
     def denial_of_world(
         self, hosted: HostedMap, record: Hello | RecordHeader, maps: AllowedMaps = ALL_MAPS
     ) -> Denied | None:
-        """The answer to a session that does not share a map's coordinate frame; None = it may go on.
+        """Return the denial of a session that does not share a map's coordinate frame, or None.
 
-        `maps`: that its client may use, of which a free one is named.
+        `maps`: maps that the client can use, from which a free name is offered.
 
-        Every record is asked this, not its session's greeting alone: of two that greet a map nobody has yet,
-        the one whose record comes first has it.
+        Every record is checked, not only the session's greeting: two sessions may greet a map that does not
+        exist yet. The map then has the world of the first record.
         """
         if hosted.records.sessions.shares_frame(record.session, record):
             return None
@@ -278,12 +278,12 @@ class MapRegistry:
         return Denied(record.session, "world", why, free or "")
 
     def free_name(self, like: str, maps: AllowedMaps = ALL_MAPS) -> str | None:
-        """The first of NAME, NAME-2, NAME-3, … that is no map's yet and was given to nobody just now.
+        """Return the first of NAME, NAME-2, NAME-3, … that no map has and nobody was given recently.
 
-        Where a client may not use that name: the first such name that is like one that it may use.
+        If a client cannot use that name, return such a name like one that it can use, or None.
 
         Args:
-            maps: that the client may use; None of their names may be free.
+            maps: maps that the client can use.
 
         Raises:
             JournalError: when the state folder cannot be listed.
@@ -298,12 +298,12 @@ class MapRegistry:
         stem = re.sub(r"-[0-9]+$", "", like)
         stems = [stem if stem in taken else like]
         stems += [one.rstrip("*").rstrip("-_") for one in maps.patterns or ()]
-        # Of so many names one is not taken.
+        # More names than are taken: at least one of them is free.
         numbered = (_numbered(one, number) for one in stems if one for number in range(1, len(taken) + 3))
         return next((name for name in numbered if name not in taken and name in maps), None)
 
     def keep_free_name(self, like: str, maps: AllowedMaps = ALL_MAPS) -> str | None:
-        """A free name that nobody else is given; None = there is none, or no room for another map.
+        """Return a free name, given to nobody else for a while, or None without a name or without room.
 
         Raises:
             JournalError: as `free_name`.
@@ -356,7 +356,7 @@ class MapRegistry:
         """Step every map.
 
         Raises:
-            TsfusionError: when a map that was to be opened at the start cannot be.
+            TsfusionError: when a map of the start cannot be opened.
         """
         for hosted in list(self):
             try:
@@ -373,26 +373,26 @@ class MapRegistry:
 
     @property
     def warm(self) -> bool:
-        """True if every open map can take keyframes, but for those whose fusers wait."""
+        """True if every open map can take keyframes, except those whose fusers wait."""
         return all(hosted.warm for hosted in self._begun)
 
     @property
     def _begun(self) -> list[HostedMap]:
-        """The maps whose fusers do not wait: nobody has asked for the others, and the next start has them."""
+        """The maps whose fusers do not wait. Nobody has asked for the others."""
         return [hosted for hosted in self if not hosted.fuser.waits]
 
     @property
     def drained(self) -> bool:
-        """True if every map that has begun has every keyframe of its journal."""
+        """True if every map with a started fuser has every keyframe of its journal."""
         return all(hosted.drained for hosted in self._begun)
 
     @property
     def ended(self) -> bool:
-        """True if every map that has begun is drained, or never will be."""
+        """True if every map with a started fuser is drained, or cannot be."""
         return all(hosted.ended for hosted in self._begun)
 
     def finish(self) -> bool:
-        """Have every fuser write its checkpoint and end. Call it until all have ended, which it returns."""
+        """Order every fuser to write its checkpoint and end. Return True once all have ended."""
         self._spares.close()
         for hosted in self._begun:
             hosted.fuser.finish()
@@ -410,13 +410,12 @@ class MapRegistry:
             hosted.close()
 
     def unopened(self) -> Iterator[tuple[str, str]]:
-        """Names of maps that could not be opened lately, and why."""
+        """Return names of maps that could not be opened recently, each with the reason."""
         before = time.monotonic() - _UNOPENED_KEPT
         self._unopened = {name: one for name, one in self._unopened.items() if one[1] > before}
         return ((name, why) for name, (why, _) in self._unopened.items())
 
 
 def _numbered(stem: str, number: int) -> str:
-    """NAME, NAME-2, NAME-3, …"""
     suffix = f"-{number}" if number > 1 else ""
     return stem[: MAP_NAME_LENGTH - len(suffix)] + suffix

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""The files that say which maps came from another server, and which ones another server has.
+"""Files and directory that say which maps came from another server, and which maps another server has.
 
-`STATE/maps/NAME/arrived.json` belongs to the map. `STATE/moved/NAME.json` says where it is now; the files
-that it had here when it left are beside it, in `STATE/moved/NAME/` (when it left again in `NAME.2/`, …), and
-nothing reads them any more.
+`STATE/maps/NAME/arrived.json` tells where a map came from. `STATE/moved/NAME.json` tells which server has it
+now. The map's old files are then in `STATE/moved/NAME/` (after a second departure in `NAME.2/`, …), and
+nothing reads them again.
 """
 
 import logging
@@ -29,16 +29,16 @@ from tsfusion.wire.messages.migration_messages import MovedSession
 log = logging.getLogger(__name__)
 
 _SUFFIX = ".json"
-ARRIVING = ".", ".arriving"  # before and after the name of a map whose copy is not whole
+ARRIVING = ".", ".arriving"  # before and after a map's name, in the name of its incomplete copy
 
 
 class Arrival(Struct, frozen=True):
-    """Origin of a map, and what was acknowledged there.
+    """Origin of a map that came from another server, and its sessions' progress.
 
     Attributes:
-        move: of this move, in hexadecimal.
-        source, source_control: addresses of the server that had it.
-        volume: the map's settings.
+        move: id of this move, hexadecimal.
+        source, source_control: addresses of the server that had the map.
+        volume: settings of the map.
     """
 
     move: str
@@ -49,11 +49,11 @@ class Arrival(Struct, frozen=True):
 
 
 class Departed(Struct, frozen=True):
-    """Place of a map that left.
+    """New server of a map that left.
 
     Attributes:
-        move: of this move, in hexadecimal.
-        before: of the move by which it had come here; empty = it began here.
+        move: id of this move, hexadecimal.
+        before: id of the move by which the map had come here; empty if it began here.
     """
 
     move: str
@@ -63,23 +63,23 @@ class Departed(Struct, frozen=True):
 
 
 def arrival_of(folder: Path) -> Arrival | None:
-    """How the map in a folder came here; None = it began here."""
+    """Return the origin of the map in a folder, or None if it began here."""
     return _read(folder / state_folder.ARRIVED_FILE, Arrival)
 
 
 def volume_of(folder: Path) -> VolumeConfig | None:
-    """The settings of a map that came from another server; None = it began here.
+    """Return the settings of a map that came from another server, or None if it began here.
 
     Raises:
         JournalError: when the file cannot be read.
-        InvalidConfig: when they are another version's.
+        InvalidConfig: when the settings are another version's.
     """
     arrival = arrival_of(folder)
     return None if arrival is None else make_settings(VolumeConfig, arrival.volume)
 
 
 def departed(state: str | Path, name: str) -> Departed | None:
-    """Where a map is that left this server; None = it did not, or it came back."""
+    """Return the new server of a map that left this one, or None if it did not, or came back."""
     found = _read(path_of(state, name), Departed)
     if found is None:
         return None
@@ -88,20 +88,20 @@ def departed(state: str | Path, name: str) -> Departed | None:
 
 
 def write_departed(state: str | Path, name: str, where: Departed) -> None:
-    """Write down that another server has a map; raises JournalError when the disk refuses."""
+    """Write to disk that another server has a map. Raise JournalError if the disk refuses."""
     path = path_of(state, name)
     try:
         durable_files.make_folder(path.parent)
         with durable_files.replacing(path) as file:
             file.write(msgspec.json.encode(where))
     except OSError as error:
-        with suppress(OSError):  # nobody may find what was not promised
+        with suppress(OSError):  # a file without a promise must not stay
             path.unlink(missing_ok=True)
         raise journal_error("write", path, error) from error
 
 
 def put_aside(state: str | Path, name: str) -> None:
-    """Move the files of a map that left out of the way. What fails is logged, and tried at a start."""
+    """Move the files of a departed map to `STATE/moved`. Log a failure; the next start tries again."""
     folder = state_folder.map_folder(state, name)
     if departed(state, name) is None or not folder.is_dir() or not state_folder.holds_a_map(folder):
         return
@@ -115,7 +115,7 @@ def put_aside(state: str | Path, name: str) -> None:
 
 
 def left_behind(folder: Path) -> list[Path]:
-    """Folders with the files that a map has left here, one for each time that it moved away."""
+    """Return the folders with a map's old files, one for each time that it left."""
     where = folder.parent.parent / state_folder.MOVED_FOLDER
     return sorted(path for path in where.glob(f"{folder.name}*") if _is_aside(path, folder.name))
 
@@ -125,20 +125,20 @@ def _is_aside(path: Path, name: str) -> bool:
 
 
 def _asides(state: str | Path, name: str) -> Iterator[Path]:
-    """Folders for the files that a map leaves here: NAME, NAME.2, NAME.3, …"""
+    """Yield folders for the files of a departing map: NAME, NAME.2, NAME.3, …"""
     first = path_of(state, name).with_suffix("")
     yield first
     yield from (first.with_name(f"{name}.{number}") for number in count(2))
 
 
 def forget_departed(state: str | Path, name: str) -> None:
-    """Note that a map is back."""
+    """Record that a map is back."""
     with suppress(OSError):
         path_of(state, name).unlink(missing_ok=True)
 
 
 def departed_names(state: str | Path) -> list[str]:
-    """The maps that left this server at some time."""
+    """Return the names of all maps that ever left this server."""
     with suppress(OSError):
         return sorted(
             path.stem
@@ -149,7 +149,7 @@ def departed_names(state: str | Path) -> list[str]:
 
 
 def path_of(state: str | Path, name: str) -> Path:
-    """The file that says where a map is."""
+    """Return the path of the file that names a map's server."""
     return Path(state) / state_folder.MOVED_FOLDER / f"{name}{_SUFFIX}"
 
 
@@ -165,15 +165,15 @@ def _read(path: Path, kind: type[AnyStruct]) -> AnyStruct | None:
 
 
 def arriving_folder(state: str | Path, name: str) -> Path:
-    """The folder in which a map's copy is made."""
+    """Return the folder for the incomplete copy of a map."""
     return Path(state) / state_folder.MAPS_FOLDER / f"{ARRIVING[0]}{name}{ARRIVING[1]}"
 
 
 def install(state: str | Path, name: str) -> None:
-    """Make a map that has come one of this server's; raises JournalError when the disk refuses."""
+    """Make the copy of a map one of this server's maps. Raise JournalError if the disk refuses."""
     folder, arriving = state_folder.map_folder(state, name), arriving_folder(state, name)
     try:
-        if folder.is_dir():  # with a lock, and nothing else that anybody needs
+        if folder.is_dir():  # it has only a lock file, and nothing that is needed
             shutil.rmtree(folder)
         os.replace(arriving, folder)
         durable_files.sync_folder(folder.parent)
@@ -190,31 +190,31 @@ AddressPair = tuple[str, str]  # data and control address of a server
 
 
 class MapDirectory:
-    """The directory of a fleet: which server has which map, in an SQLite file that its servers share.
+    """Directory of a fleet: which server has which map, in an SQLite file that its servers share.
 
-    It is a signpost, not the truth: a server has the maps of its own disk that did not leave it. A wrong
-    entry costs a client a detour, and a directory that cannot be read costs new maps, which nobody may begin
-    then. Each call reads or writes the file.
+    The directory only helps to find a map. The truth is on the servers' disks: a server owns the maps there
+    that did not leave. A wrong entry costs a client a detour. While the directory cannot be read, no new map
+    can begin. Each call reads or writes the file.
 
     Args:
-        path: of the file, made when absent; on a disk that all servers reach and whose locks work.
+        path: path of the file, made if absent, on a disk that all servers reach and whose locks work.
     """
 
     def __init__(self, path: str) -> None:
         self._path = path
 
     def check(self) -> None:
-        """Raise JournalError as `claim`, before clients come."""
+        """Raise JournalError as `claim` does, before clients come."""
         with self._open():
             pass
 
     def place_of(self, name: str) -> AddressPair | None:
-        """The server that has a map; None = no server has it. Raises JournalError as `claim`."""
+        """Return the server that has a map, or None without one. Raise JournalError as `claim`."""
         with self._open() as database:
             return self._find(database, name)
 
     def claim(self, name: str, own: AddressPair) -> AddressPair:
-        """Enter a map as one's own unless another server has it; the place of who has it now.
+        """Enter a map as this server's unless another server has it. Return the addresses of its server.
 
         Raises:
             JournalError: when the file cannot be read or written.
@@ -224,7 +224,7 @@ class MapDirectory:
             return self._find(database, name) or own
 
     def move(self, name: str, own: AddressPair) -> None:
-        """Enter a map as one's own, whoever had it. Raises JournalError as `claim`."""
+        """Enter a map as this server's, whatever the entry was. Raise JournalError as `claim`."""
         with self._open() as database:
             database.execute("INSERT OR REPLACE INTO maps VALUES (?, ?, ?)", (name, *own))
 

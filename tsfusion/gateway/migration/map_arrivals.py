@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Maps that come to this server from another one: copied while they live there, then taken over.
+"""Arrivals: maps that are copied from another server while in use there, then taken over.
 
-Each copy is made by a thread of its own: it waits for the network and the disk, and the gateway must not.
-See `migration_messages` for what is asked, and `moved_maps` for the files that are left.
+One thread makes each copy: it waits for network and disk, and the gateway must not wait. The questions are in
+`migration_messages`, the files in `moved_maps`.
 """
 
 import logging
@@ -39,17 +39,17 @@ from tsfusion.wire.sockets.curve import ClientKeys
 log = logging.getLogger(__name__)
 
 _ANSWER_S = 10.0  # for one answer of the other server
-_LITTLE = 4 << 20  # bytes that were new in a round: the rest is copied while the map stands still
+_LITTLE = 4 << 20  # new bytes of the last round, at most: the rest is copied while the map is frozen
 _MOST_ROUNDS = 30
-_ROUND_S = 0.1  # between two looks while there is little to copy
-_SAVING_S = 60.0  # for the other server to write a checkpoint, without which more is fused anew here
-_RETRY_S = 1.0  # until a question is asked again that was not answered, or too early
+_ROUND_S = 0.1  # between two rounds while there is little to copy
+_SAVING_S = 60.0  # for the other server's checkpoint: without it, this server fuses more records again
+_RETRY_S = 1.0  # before a question without an answer, or one that came too early, is asked again
 _OPENING_S = 120.0  # for the other server to open the map
 OnEnd = Callable[[Moved | str], None]
 
 
 class MoveRequest(Struct, frozen=True):
-    """Request to fetch a map, and the server that has it."""
+    """Request to fetch a map from the server that has it."""
 
     name: str
     source: str
@@ -57,15 +57,15 @@ class MoveRequest(Struct, frozen=True):
 
 
 class MapArrival:
-    """One map that comes. `outcome` is set when the thread has ended.
+    """One map that is coming. `outcome` is set when the thread has ended.
 
-    Before that, `wants_fuser` says that its files can be read; `prepared` is to be set when that was done, or
-    cannot be: only then the map is frozen.
+    Before that, `wants_fuser` is set when the copied files can be read ahead. Set `prepared` when that is
+    done, or cannot be done: only then the map is frozen.
 
     Args:
         own: data and control address of this server, for clients.
-        keys: by which the other server knows this one; None = without.
-        resumed: what an earlier process had copied whole, and not heard the answer about.
+        keys: keys by which the other server knows this one; None without keys.
+        resumed: complete copy of an earlier process, which did not get the answer to `commit`.
     """
 
     def __init__(
@@ -80,21 +80,21 @@ class MapArrival:
     ) -> None:
         self.name = request.name
         self.on_end = [on_end]
-        self.outcome: Moved | str | None = None  # how it went, or why the map did not come
+        self.outcome: Moved | str | None = None  # result, or reason why the map did not come
         self.folder = moved_maps.arriving_folder(state, request.name)
         self.request = request
         self._own, self._keys, self._resumed = own, keys, resumed
         self._move = secrets.token_bytes(16) if resumed is None else bytes.fromhex(resumed.move)
         self._have: dict[str, tuple[int, str]] = {}  # bytes and version, by file
         self._copied = self._number = 0
-        self.volume: dict[str, Any] = {}  # its settings, once they are known
+        self.volume: dict[str, Any] = {}  # the map's settings, once they are known
         self.wants_fuser, self.prepared = threading.Event(), threading.Event()
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"arrival-{self.name}", daemon=True)
         self._thread.start()
 
     def stop(self) -> None:
-        """End the thread soon; what it had copied whole is gone on with at the next start."""
+        """End the thread soon. The next start goes on with a complete copy."""
         self._stopping.set()
         self._thread.join(_ANSWER_S)
 
@@ -126,7 +126,7 @@ class MapArrival:
         return Moved(self._own[0], self._copied, round(now - began, 3), round(now - frozen_at, 3))
 
     def _copy(self, link: Exchange) -> float:
-        """Copy the map while it lives, then freeze it and copy the rest; when it was frozen."""
+        """Copy the map in use, then freeze it and copy the rest. Return the time of the freeze."""
         self._wait_until_it_can_leave(link)
         self._copy_what_is_there(link)
         frozen_at = time.monotonic()
@@ -142,11 +142,11 @@ class MapArrival:
         return frozen_at
 
     def _copy_what_is_there(self, link: Exchange) -> None:
-        """Copy until little is new, and the map was read here: what it takes then is short."""
+        """Copy new bytes in rounds until few are new and the map was read ahead: then the freeze is short."""
         began, rounds = time.monotonic(), 0
         while rounds < _MOST_ROUNDS:
             parcel, before = self._ask(link, "list")[0], self._copied
-            # One file is read while others come: from then on the map's stays as it is.
+            # Once the fuser reads the copied checkpoint, that file must not change any more.
             self._take_files(link, _without_map(parcel) if self.wants_fuser.is_set() else parcel.files)
             rounds += self._copied - before >= _LITTLE
             waited = time.monotonic() - began
@@ -181,7 +181,7 @@ class MapArrival:
                 self._take_file(link, one, have)
 
     def _take_file(self, link: Exchange, one: MapFile, at: int) -> None:
-        """Copy a file from a place on, as far as it goes now; it is on the disk then."""
+        """Copy a file from byte `at` to its present end, and sync it to the disk."""
         path = self.folder / one.name
         path.parent.mkdir(exist_ok=True)
         with open(path, "r+b" if path.exists() else "xb") as file:
@@ -206,9 +206,9 @@ class MapArrival:
         self._have[one.name] = (at, one.version)
 
     def _commit(self, link: Exchange) -> None:
-        """Have the other server write down that the map is here; raises CommandRefused when it stays there.
+        """Have the giver write to disk that the map is here. Raise CommandRefused if the map stays there.
 
-        Without an answer nobody knows: it is asked until there is one.
+        Without an answer the owner is unknown, so the question is repeated until an answer comes.
         """
         while True:
             try:
@@ -255,7 +255,7 @@ def _without_map(parcel: Parcel) -> tuple[MapFile, ...]:
 
 
 def unfinished(state: str | Path) -> list[tuple[str, Arrival]]:
-    """Maps that an earlier process had copied whole. Parts of others are deleted.
+    """Return the maps that an earlier process had copied completely. Delete incomplete copies.
 
     Raises:
         JournalError: when the folder of the maps cannot be listed.

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Maps that leave this server: what the server that is to have one asks, and what it is answered.
+"""Departures: maps that leave this server, and the answers to the server that takes them.
 
-See `migration_messages`. One that falls silent before `commit` loses its claim, and the map goes on here;
-to another server that asks it loses it sooner.
+The questions are in `migration_messages`. A taker that falls silent before `commit` loses its claim, and the
+map stays here. If another server asks for the map, a silent taker loses it sooner.
 """
 
 import errno
@@ -31,10 +31,10 @@ from tsfusion.wire.messages.migration_messages import READ_BYTES, HandOver, MapF
 
 log = logging.getLogger(__name__)
 
-_FROZEN_S = 15.0  # without a question, while the map takes no records
-_LEAVING_S = 120.0  # without a question, before that
-_REPLACED_S = 3.0  # without a question, after which a third server may have the map instead
-_DOUBTED_S = 0.5  # after which that server asks again: one that lives asks ten times a second
+_FROZEN_S = 15.0  # a taker that is silent for so long loses a frozen map
+_LEAVING_S = 120.0  # a taker that is silent for so long loses a map before the freeze
+_REPLACED_S = 3.0  # a taker that is silent for so long can lose the map to a third server
+_DOUBTED_S = 0.5  # a third server is told to ask again after such a silence: takers ask ten times a second
 
 
 class _Departure(Struct, eq=False):
@@ -53,11 +53,11 @@ class _Departure(Struct, eq=False):
 
 
 class MapDepartures:
-    """All maps that are being copied. Call `step` again and again.
+    """All maps that another server is copying. Call `step` again and again.
 
     Args:
-        on_left: told the name of a map that is another server's now, and where it is.
-        on_stay: told the name of a map that was frozen and goes on here.
+        on_left: called with the name of a map that now belongs to another server, and its addresses.
+        on_stay: called with the name of a map that was frozen and stays here.
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class MapDepartures:
         self._leaving: dict[str, _Departure] = {}  # by map
 
     def step(self) -> None:
-        """Give up the moves whose other server has fallen silent."""
+        """Give up the moves whose taker has fallen silent."""
         now = time.monotonic()
         for name, one in list(self._leaving.items()):
             if now - one.asked > (_FROZEN_S if one.hosted.is_frozen else _LEAVING_S):
@@ -89,10 +89,10 @@ class MapDepartures:
             one.close()
 
     def answer(self, name: str, question: HandOver) -> tuple[Parcel, list[zmq.Frame]]:
-        """The answer to a question about a map, and its frames.
+        """Return the answer to a taker's question, and its frames.
 
         Raises:
-            JournalError: when there is no such map here, it cannot leave now, or the disk refuses.
+            JournalError: when the map is not open here, cannot leave now, or the disk refuses.
         """
         if question.step == "commit":
             return self._commit(name, question), []
@@ -165,7 +165,7 @@ class MapDepartures:
         return Parcel(crc32=zlib.crc32(piece)), [zmq.Frame(piece)]
 
     def _commit(self, name: str, question: HandOver) -> Parcel:
-        """Write down that the map is the other server's. The answer to a second question is the same."""
+        """Write to disk that the map belongs to the taker. A repeated question gets the same answer."""
         before = moved_maps.departed(self._state, name)
         if before is not None and before.move == question.move.hex():
             return Parcel()
@@ -186,12 +186,12 @@ class MapDepartures:
 
 
 def _files(folder: Path) -> Iterator[MapFile]:
-    """The files that make a map, as they are now."""
+    """Yield the files that make a map, with their present sizes."""
     paths = [folder / MAP_FILE]
     for kind in (JOURNAL_FOLDER, QUARANTINE_FOLDER):
         paths += (folder / kind).glob("[0-9A-Za-z]*.mcap")
     for path in paths:
-        with suppress(FileNotFoundError):  # no checkpoint yet, or a quarantined record that made room
+        with suppress(FileNotFoundError):  # no checkpoint yet, or a deleted file of the quarantine
             stat = path.stat()
             version = f"{stat.st_ino:x}-{stat.st_mtime_ns:x}" if path.parent == folder else ""
             yield MapFile(str(path.relative_to(folder)), stat.st_size, version)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Moves of maps between servers: those that leave, those that come, and where clients are sent."""
+"""Moves of maps between servers: departures, arrivals, and messages that send clients to the new server."""
 
 import errno
 import logging
@@ -29,15 +29,15 @@ from tsfusion.wire.sockets import sockets
 log = logging.getLogger(__name__)
 
 _MOST_ARRIVALS = 4  # at once
-_MOST_UNREAD = 32  # answers to one server that have not left: of one that was read it is known later
+_MOST_UNREAD = 32  # unread answers to one server: it is known late that an answer was read
 
 
 class MapMoves:
-    """Answer the commands about moves, and call `step` again and again.
+    """Answers the commands about moves. Call `step` again and again.
 
     Args:
-        max_bytes: of these; no piece of a map is added beyond.
-        on_left: told the name of a map that is closed here: nobody answers questions about it any more.
+        max_bytes: limit for unread replies; beyond it no piece of a map is sent.
+        on_left: called with the name of a map that is closed here: its open queries are refused.
     """
 
     def __init__(
@@ -58,17 +58,17 @@ class MapMoves:
         self._maps, self._routes, self._ports, self._access = maps, routes, ports, access
         self._departures = MapDepartures(server, maps, on_left=self._send_away, on_stay=self._call_back)
         self._arrivals: list[MapArrival] = []
-        self._fusers: dict[str, FuserSupervisor] = {}  # of maps that come
+        self._fusers: dict[str, FuserSupervisor] = {}  # supervisors that read arriving maps ahead
 
     def resume(self) -> None:
-        """Go on with what an earlier process had copied whole; the server listens now."""
+        """Go on with the complete copies of an earlier process, now that the server listens."""
         for name, arrival in map_arrivals.unfinished(self._server.state):
             log.info("going on with the move of the map from %s", arrival.source, extra=logs.about(map=name))
             request = MoveRequest(name, arrival.source, arrival.source_control)
             self._begin(request, lambda _: None, arrival)
 
     def step(self) -> None:
-        """Take over the maps that have come, and give up those that will not."""
+        """Take over the maps that have come, and end the arrivals that failed."""
         self._departures.step()
         for one in self._arrivals:
             self._prepare(one)
@@ -95,7 +95,7 @@ class MapMoves:
                 answer(outcome)
 
     def _prepare(self, one: MapArrival) -> None:
-        """Have a map read where it is being copied to; where that fails it is read later."""
+        """Have a fuser read an arriving map ahead. If that fails, the map is read later."""
         if one.prepared.is_set() or not one.wants_fuser.is_set():
             return
         fuser = self._fusers.get(one.name)
@@ -124,7 +124,7 @@ class MapMoves:
         self._departures.close()
 
     def on_command(self, identity: bytes, command: Command, client: str) -> None:
-        """Answer a command `move` or `hand_over`, at once or when the map has come."""
+        """Answer a command `move` or `hand_over`: `move` once the map has come, `hand_over` at once."""
         parcel, error, retry = None, None, False
         frames: list[zmq.Frame] = []
         try:
@@ -158,7 +158,7 @@ class MapMoves:
         request = MoveRequest(command.map, source, control)
         under_way = next((one for one in self._arrivals if one.request == request), None)
         if under_way is not None and len(under_way.on_end) < _MOST_UNREAD:
-            under_way.on_end.append(answer)  # its asker gave up waiting, and asks again
+            under_way.on_end.append(answer)  # the client gave up waiting, and asks again
             return
         if why := self._maps.why_not_take(command.map):
             raise JournalError(why)
@@ -183,7 +183,7 @@ class MapMoves:
             self._routes.send(session, denied)
 
     def _call_back(self, name: str) -> None:
-        """Ask for what came while the map was frozen."""
+        """Tell clients to send again the records that came while the map was frozen."""
         for session in self._sessions(name):
             self._routes.send(session, messages.Ack(session, *self._maps.progress(name, session), (), True))
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Commands for a map's fuser (status, mesh): passed on, answered with its answer, refused when it dies.
+"""Queries (status, mesh) to a map's fuser: passed on, answered, or refused when the fuser dies.
 
-A mesh takes the fuser's time and the gateway's memory, and costs whoever asks nothing: one is made at a time,
-with pauses while keyframes come, and only so many bytes of meshes may wait to be read.
+A mesh costs the fuser's time and the gateway's memory, and costs the client nothing. So one mesh is made at a
+time, with pauses while keyframes come, and the bytes of unread meshes have a limit.
 """
 
 import time
@@ -22,32 +22,32 @@ from tsfusion.wire.messages import health, messages
 from tsfusion.wire.messages.health import Health, MapCounts, Status
 
 _MAX_PENDING = 32
-_REST_FACTOR = 3  # no mesh for three times as long as the last took: a quarter of a busy fuser's time
+_REST_FACTOR = 3  # a pause of three times the last mesh's time: meshes get a quarter of a busy fuser
 _RESTARTS = "the fuser restarts"
 
 
 class PendingQuery(Struct, frozen=True):
-    """A command that a fuser has not answered yet."""
+    """A query that a fuser has not answered yet."""
 
     identity: bytes  # the connection that sent it
-    owner: bytes  # the client, or without keys the connection: each may have one mesh under way
+    owner: bytes  # the client, or without keys the connection: each can have one mesh under way
     command: messages.Command
     asked_at: float  # `time.monotonic()`
 
 
 class LastMesh(Struct, frozen=True):
-    """The last mesh of a map that was made on request."""
+    """The last mesh of a map made on request."""
 
     nbytes: int
     asked_at: float  # `time.monotonic()`
-    rest_until: float  # until then a map that gets keyframes makes no other
+    rest_until: float  # until this time a map that gets keyframes makes no other mesh
 
 
 class FuserQueries:
-    """The commands that wait for a fuser's answer.
+    """The queries that wait for a fuser's answer.
 
     Args:
-        max_bytes: of replies that wait to be read; a single one may be larger.
+        max_bytes: limit for unread replies; a single one can be larger.
     """
 
     def __init__(self, ports: Ports, unread: PendingReplies, max_bytes: int) -> None:
@@ -59,7 +59,7 @@ class FuserQueries:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the replies that wait to be read, up to what may wait."""
+        """Bytes of the unread replies, up to the limit for them."""
         return min(self._unread.nbytes, max(self._max_bytes, self._unread.largest))
 
     def submit(
@@ -79,7 +79,7 @@ class FuserQueries:
         self._ports.reply(query.identity, messages.Reply(name=query.command.name, error=error, retry=retry))
 
     def _pass_on(self, query: PendingQuery, hosted: HostedMap) -> str:
-        """Reason why the fuser cannot be asked now; empty = it was."""
+        """Ask the fuser. Return the reason why it cannot be asked now, or ""."""
         if not hosted.fuser.ready:
             return "the map is being opened, or its fuser restarts"
         if query.command.name == "mesh" and (problem := self._why_no_mesh(query, hosted)):
@@ -93,7 +93,7 @@ class FuserQueries:
         return ""
 
     def _why_no_mesh(self, query: PendingQuery, hosted: HostedMap) -> str:
-        """Reason why this mesh is not to be made now; empty = it may."""
+        """Return the reason why this mesh cannot be made now, or ""."""
         under_way = [one for one in self._pending.values() if one.command.name == "mesh"]
         if any(one.owner == query.owner for one in under_way) or self._unread.pending(query.owner):
             return "the mesh that was asked for before is still on its way"
@@ -108,7 +108,7 @@ class FuserQueries:
         return ""
 
     def _has_memory_for(self, maps: list[str]) -> bool:
-        """True if meshes of these maps, as large as their last, may be added to the unread ones."""
+        """True if new meshes of these maps, as large as their last ones, fit beside the unread replies."""
         waiting = self._unread.nbytes
         if not waiting and len(maps) == 1:
             return True
@@ -132,7 +132,7 @@ class FuserQueries:
         self._ports.reply(query.identity, reply, self._unread.wrap(query.owner, frames) if frames else ())
 
     def give_up(self, map_name: str) -> None:
-        """Refuse what a map's fuser was asked: it has ended."""
+        """Refuse the open queries to a map's fuser: it has ended."""
         self._last_meshes.pop(map_name, None)
         for number, query in list(self._pending.items()):
             if query.command.map == map_name:
@@ -143,10 +143,10 @@ class FuserQueries:
 def status(
     hosted: HostedMap, fuser: fuser_messages.FuserStatus, health: Health, server: ServerConfig
 ) -> Status:
-    """A map's status: what its fuser knows, and what the gateway knows."""
+    """Return a map's status, from the figures of its fuser and of the gateway."""
     own = health.maps[hosted.name]
     counts = {name: getattr(own, name) for name in MapCounts.__struct_fields__}
-    found = counts | structs.asdict(fuser)  # which has the counts of now
+    found = counts | structs.asdict(fuser)  # the fuser's counts are newer
     found |= {
         "peak_rss_bytes": {"server": process.peak_rss_bytes(), "fuser": fuser.peak_rss_bytes},
         "config": {"server": msgspec.to_builtins(server), "volume": fuser.config},

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Questions of clients to the open maps: checked, passed on to a fuser, answered or refused in bounded time.
+"""Questions of clients to the open maps: each is checked, passed on to a fuser, and answered in bounded time.
 
-The fuser answers between two pieces of its work, so a question waits for milliseconds. Each client may have a
-few under way and so many a second; answers that are not read fill no memory; past its deadline a question is
-refused, whatever the fuser does.
+The fuser answers between two pieces of its work, so a question waits for milliseconds. A client has limits:
+questions under way, questions a second, bytes of unread answers. After its deadline a question is refused,
+whatever the fuser does.
 """
 
 import time
@@ -23,11 +23,11 @@ from tsfusion.gateway.ports.connection_limits import PendingReplies
 from tsfusion.gateway.ports.ports import Ports
 from tsfusion.wire.messages import messages, questions
 
-MOST_WAITING = 32  # questions of all clients, of a map: it looks at each of their answers
-MOST_OF_A_CLIENT = 4  # that wait
-# Answers of a client that have not left: ZeroMQ may say late that they have, on a machine with much to do
+MOST_WAITING = 32  # questions of all clients to one map: the gateway checks the size of each answer
+MOST_OF_A_CLIENT = 4  # open questions
+# Unread answers of a client: on a busy machine, ZeroMQ may report late that an answer has left
 MOST_UNREAD = 64
-_UNREAD_SHARE = 1 / 4  # of the memory of all such answers; four of any size may wait
+_UNREAD_SHARE = 1 / 4  # of the memory of all unread answers; four of any size can wait
 _MOST_CLIENTS = 4096
 
 
@@ -43,7 +43,6 @@ class WaitingQuestion(Struct, frozen=True):
 
     @property
     def most_bytes(self) -> int:
-        """Size of its answer, at the most."""
         return self.command.question.most_bytes if self.command.question else 0
 
 
@@ -51,7 +50,7 @@ class MapQuestions:
     """The questions under way. Call `step` again and again.
 
     Args:
-        max_bytes: of those, and of the answers that are still to come; a single one may be larger.
+        max_bytes: limit for unread replies and answers still to come; a single one can be larger.
     """
 
     def __init__(
@@ -99,7 +98,7 @@ class MapQuestions:
 
     @staticmethod
     def _why_none(command: messages.Command, frames: list[memoryview]) -> str:
-        """Reason why nobody may ask this; empty = it may be asked."""
+        """Return the reason why a question is invalid, or ""."""
         if command.question is None:
             return "nothing was asked"
         if not 0 < command.timeout_s <= questions.LONGEST_S:
@@ -107,7 +106,7 @@ class MapQuestions:
         return command.question.problem(frames)
 
     def _pass_on(self, waiting: WaitingQuestion, frames: Sequence[zmq.Frame], hosted: HostedMap) -> str:
-        """Reason why the fuser cannot be asked now; empty = it was."""
+        """Ask the fuser. Return the reason why it cannot be asked now, or ""."""
         command = waiting.command
         if not hosted.fuser.ready:
             return "the map is being opened, or its fuser restarts"
@@ -144,7 +143,7 @@ class MapQuestions:
         return bucket
 
     def on_answer(self, answer: fuser_messages.FuserAnswer, frames: Sequence[zmq.Frame]) -> None:
-        """Send a fuser's answer to the connection that asked, unless it was refused meanwhile."""
+        """Send a fuser's answer to the connection that asked, unless the question was refused before."""
         waiting = self._waiting.pop(answer.number, None)
         if waiting is None:
             return
@@ -169,7 +168,7 @@ class MapQuestions:
                 self._reply_error(waiting, questions.LATE, late=True)
 
     def give_up(self, map_name: str) -> None:
-        """Refuse what a map's fuser was asked: it has ended."""
+        """Refuse the open questions to a map's fuser: it has ended."""
         for number, waiting in list(self._waiting.items()):
             if waiting.command.map == map_name:
                 del self._waiting[number]

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""News of scanners for viewers of a map: where each keyframe was taken, and its picture as it came.
+"""Updates about scanners for viewers of a map: the pose of each keyframe, and its picture as it came.
 
-Nothing is decoded here, and the fuser has no part in it. Pictures may take so many bytes a second; of those
-that had to wait the newest of each scanner is sent as soon as there is room.
+Nothing is decoded here, and the fuser is not involved. Pictures have a limit of bytes a second. Of the
+pictures over it, the newest of each scanner is sent once there is room.
 """
 
 import time
@@ -19,20 +19,20 @@ from tsfusion.wire.messages.mesh_updates import Scanned
 from tsfusion.wire.records.record_header import KeyframeHeader
 from tsfusion.wire.sockets.sockets import scan_topic
 
-PICTURE_BYTES = 2 << 20  # a second, of all maps together
-_LARGEST = 1 << 20  # bytes of a picture; larger ones are not sent
+PICTURE_BYTES = 2 << 20  # bytes a second, for all maps together
+_LARGEST = 1 << 20  # bytes; a larger picture is not sent
 _MOST_WAITING = 16  # pictures
 
 
 class ScanUpdates:
-    """The keyframes that were accepted. Call `step` again and again."""
+    """Updates about accepted keyframes. Call `step` again and again."""
 
     def __init__(self, ports: Ports, subscriptions: Subscriptions) -> None:
         self._ports, self._subscriptions = ports, subscriptions
         self._epoch = f"{time.monotonic_ns():x}"
         self._numbers: Counter[str] = Counter()
         self._room = Bucket(PICTURE_BYTES, time.monotonic(), burst=0.5)
-        self._waiting: dict[tuple[bytes, bytes], tuple[Scanned, Any]] = {}  # topic, session → and its picture
+        self._waiting: dict[tuple[bytes, bytes], tuple[Scanned, Any]] = {}  # topic, session → update, picture
 
     def note(self, map_name: str, header: KeyframeHeader, buffers: Sequence[Any], client: str) -> None:
         """Tell viewers of a keyframe."""
@@ -61,7 +61,7 @@ class ScanUpdates:
         self._publish(topic, scanned, picture)
 
     def step(self) -> None:
-        """Send the pictures that waited, as far as there is room."""
+        """Send the waiting pictures as far as there is room."""
         while self._waiting:
             (topic, session), (scanned, picture) = next(iter(self._waiting.items()))
             if not self._take(picture):
@@ -70,7 +70,7 @@ class ScanUpdates:
             self._publish(topic, msgspec.structs.replace(scanned, late=True), picture)
 
     def _take(self, picture: Any) -> bool:
-        """Take room for a picture. Returns False if there is none."""
+        """Take room for a picture. Return False if there is none."""
         if self._room.wait(len(picture), time.monotonic()):
             return False
         self._room.spend(len(picture))
@@ -82,7 +82,7 @@ class ScanUpdates:
 
 
 def _picture_of(header: KeyframeHeader, buffers: Sequence[Any]) -> Any:
-    """The bytes of a keyframe's JPEG; None = it has none, or a very large one."""
+    """Return the bytes of a keyframe's JPEG, or None without one, or for a very large one."""
     for at, one in enumerate(header.buffers, start=1):
         if one.name == "color" and one.codec == "jpeg" and one.bytes <= _LARGEST:
             return buffers[at]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Keys and allow-list: checked when a connection is made, and again at every message."""
+"""Access control by keys and allow-list, for each new connection and again for each message."""
 
 import logging
 import time
@@ -18,17 +18,17 @@ from tsfusion.wire.sockets.curve import DOMAIN, ServerKeys, server_keys
 log = logging.getLogger(__name__)
 
 
-KEPT_OUT = 60.0  # seconds; then a client that was kept out may try again
-GUEST = "(guest)"  # no client in a list can have this name
-SERVER = "(server)"  # nor this one: another server of the fleet, which has the same pair of keys
+KEPT_OUT = 60.0  # seconds before a client that was cut off can connect again
+GUEST = "(guest)"  # no client in an allow-list can have this name
+SERVER = "(server)"  # likewise; another server of the fleet, with the same pair of keys
 
 
 class AccessControl:
-    """The allow-list of one server; without a folder of keys everybody who can reach the server may connect.
+    """The allow-list of one server. Without a folder of keys, everybody who reaches the server can connect.
 
     Args:
-        folder: the folder that `tsfusion keys` made; None = no keys.
-        guest: public key that may watch every map, and send nothing, as long as this server runs.
+        folder: the folder that `tsfusion keys` made; None without keys.
+        guest: public key with the right to watch every map, and to send nothing, while this server runs.
 
     Raises:
         InvalidConfig: when the folder has no usable keys or allow-list.
@@ -51,16 +51,16 @@ class AccessControl:
 
     @property
     def problem(self) -> str:
-        """Reason why nobody may connect; empty = the allow-list can be read."""
+        """Reason why nobody can connect; empty while the allow-list can be read."""
         return "" if self._allowed is None else self._allowed.problem
 
     @property
     def refused(self) -> Counter[str]:
-        """Connections that were turned away, by reason."""
+        """Refused connections by reason."""
         return Counter() if self._zap is None else self._zap.refused
 
     def step(self) -> bool:
-        """Answer new connections. True when a key was revoked or has other maps: all have to connect anew."""
+        """Answer new connections. Return True if a key was revoked or has other maps: all must reconnect."""
         if self._allowed is None or self._zap is None:
             return False
         self._revoked |= self._allowed.refresh()
@@ -69,7 +69,7 @@ class AccessControl:
         return revoked
 
     def client_of(self, frame: zmq.Frame) -> str | None:
-        """The name that the sender's key is allowed under: empty without keys, None when it is not."""
+        """Return the name of the sender's key: empty without keys, None if it is not allowed."""
         if self._allowed is None:
             return ""
         self._revoked |= self._allowed.refresh()  # the file may have changed since the last step
@@ -77,7 +77,7 @@ class AccessControl:
         return None if key is None else self._name_of(key)
 
     def keep_out(self, frame: zmq.Frame) -> str:
-        """Let the client that sent a frame make no connection for a while; its name, empty without keys."""
+        """Block new connections of a frame's client for a while. Return its name, empty without keys."""
         client = self.client_of(frame) or ""
         if client:
             self._kept_out[client] = time.monotonic() + KEPT_OUT
@@ -104,24 +104,24 @@ class AccessControl:
         return self._allowed is not None and self._allowed.limits_maps
 
     def maps_of(self, client: str) -> AllowedMaps:
-        """The maps that the client of a name may use: without keys every map."""
+        """Return the maps that a client can use: without keys, every map."""
         return (
             ALL_MAPS if self._allowed is None or client in (GUEST, SERVER) else self._allowed.maps_of(client)
         )
 
     def may_forget_all(self, client: str) -> bool:
-        """True if a client may forget keyframes of others, too: without keys everybody may."""
+        """True if a client has the right to forget keyframes of others. Without keys, everybody has it."""
         return self._allowed is None or client == SERVER or self._allowed.may_forget_all(client)
 
     def close(self) -> None:
-        """Stop answering: nobody can connect any more."""
+        """Stop answering. Nobody can connect after that."""
         if self._zap is not None:
             self._zap.close()
 
 
 _ENDPOINT = "inproc://zeromq.zap.01"
 _REQUESTS_A_STEP = 100
-_LOG_EVERY = 60.0  # seconds, in which a refusal is logged once, and few are: keys cost nothing to make
+_LOG_EVERY = 60.0  # seconds in which each refusal is logged once, and only a few: keys cost nothing to make
 _LOGGED_AT_MOST = 20
 _KEY_BYTES = 32
 _KEPT_OUT_WORD = "kept out"
@@ -134,14 +134,14 @@ class ZapHandler:
     Make it before the sockets with keys bind, and close it after them.
 
     Args:
-        allow: the client's name by its public key (40 characters); None = it may not connect.
-        why_not: a word for the reason, for the log and for `refused`.
+        allow: returns the client's name for a public key (40 characters), or None to refuse it.
+        why_not: returns one word for the reason, for the log and for `refused`.
     """
 
     def __init__(
         self, context: "zmq.Context[Any]", allow: Allow, why_not: Callable[[str], str] = lambda _: "unknown"
     ) -> None:
-        self.refused: Counter[str] = Counter()  # connections that were turned away, by reason
+        self.refused: Counter[str] = Counter()  # refused connections by reason
         self._allow = allow
         self._why_not = why_not
         self._logged: set[tuple[str, str]] = set()
@@ -151,7 +151,7 @@ class ZapHandler:
         self.socket.bind(_ENDPOINT)
 
     def answer_all(self) -> None:
-        """Answer the requests that came, up to a limit: other sockets get their turn. Never waits."""
+        """Answer a limited number of requests, so that other sockets get their turn. Never block."""
         for _ in range(_REQUESTS_A_STEP):
             try:
                 frames = self.socket.recv_multipart(zmq.NOBLOCK)
@@ -160,11 +160,11 @@ class ZapHandler:
             self._answer(frames)
 
     def close(self) -> None:
-        """Stop answering: nobody can connect any more."""
+        """Stop answering. Nobody can connect after that."""
         self.socket.close()
 
     def _answer(self, frames: Sequence[bytes]) -> None:
-        """Answer one: peer, nothing, version, request, domain, address, identity, mechanism, credentials."""
+        """Answer a request: peer, "", version, number, domain, address, identity, mechanism, credentials."""
         if len(frames) < 4:  # nothing that an answer could refer to
             self.refused["malformed"] += 1
             return
@@ -175,7 +175,7 @@ class ZapHandler:
             key, reason = self._judge(request)
         if reason:
             self._note(key, reason, request[1] if len(request) > 1 else b"")
-        status = b"300" if reason == _KEPT_OUT_WORD else b"400"  # 300: it may try again, without a word
+        status = b"300" if reason == _KEPT_OUT_WORD else b"400"  # after 300, libzmq tries again
         verdict = [status, reason.encode(), b"", b""] if reason else [b"200", b"OK", key.encode(), b""]
         try:
             self.socket.send_multipart([peer, b"", b"1.0", number, *verdict], zmq.NOBLOCK)
@@ -183,7 +183,7 @@ class ZapHandler:
             log.debug("an answer about a connection was not sent: %s", error)
 
     def _judge(self, request: Sequence[bytes]) -> tuple[str, str]:
-        """The key, and the reason why it may not connect; an empty reason = it may."""
+        """Return a request's key, and the reason why it is refused; an empty reason allows it."""
         domain, _address, _identity, mechanism, *credentials = request
         if domain != DOMAIN:
             return "", "domain"
@@ -207,9 +207,9 @@ class ZapHandler:
 
 
 def sender_of(frame: zmq.Frame) -> str | None:
-    """The public key (40 characters) of the client that sent a frame, received with `copy=False`.
+    """Return the public key (40 characters) of the client that sent a frame, received with `copy=False`.
 
-    Only for a socket with keys: one without takes whatever the other side claims.
+    Use it only for a socket with keys: a socket without keys believes any claim of the other side.
     """
     try:
         return str(frame.get("User-Id"))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Connections that are cut off: they flood, fill the memory, leave replies unread, or are too many."""
+"""Limits for connections: those that flood, fill memory, leave replies unread or are too many are cut."""
 
 import logging
 import time
@@ -18,10 +18,10 @@ _RETURN_INTERVAL = 1.0  # seconds
 
 
 class MemoryGuard:
-    """The check whether connections hold too much memory, so that they have to be dropped.
+    """Detects that connections hold too much memory, and must be dropped.
 
     Dropping them frees memory, but not at once (ZeroMQ's threads do it) and perhaps not all (this process may
-    need some). So after an alarm the bound rises above what is held then; otherwise it would never end.
+    need some). So an alarm raises the limit above the memory in use; otherwise the alarm would never end.
     """
 
     def __init__(self, max_bytes: int) -> None:
@@ -29,10 +29,10 @@ class MemoryGuard:
         self._next_return = 0.0  # time.monotonic()
 
     def excess(self, uncounted: int) -> int:
-        """Bytes that this process holds, when they are too many; otherwise 0."""
+        """Return the bytes that this process holds if they are too many, else 0."""
         held = process.rss_bytes() - uncounted
         now = time.monotonic()
-        # Perhaps freed already, and only kept for later.
+        # The memory may be free already, and only kept by the allocator.
         if held > self._bound or (held > self._max_bytes and now >= self._next_return):
             self._next_return = now + _RETURN_INTERVAL
             process.give_back_memory()
@@ -44,18 +44,18 @@ class MemoryGuard:
 
 
 class PendingReplies:
-    """Large replies that have not left yet, one a reader: one that stops reading must not fill the memory."""
+    """Large replies that have not left yet, one a reader: a reader that stops must not fill the memory."""
 
     def __init__(self) -> None:
         self._trackers: dict[bytes, tuple[zmq.MessageTracker, int]] = {}
 
     def pending(self, reader: bytes) -> bool:
-        """True if an earlier reply still waits for this reader. None waits for a reader that disconnected."""
+        """True if an earlier reply waits for this reader. Replies to disconnected readers do not count."""
         self._forget()
         return reader in self._trackers
 
     def of(self, owner: bytes) -> tuple[int, int]:
-        """Number of replies that wait for readers whose keys begin so, and their bytes."""
+        """Return number and bytes of the replies that wait for readers whose keys begin with `owner`."""
         self._forget()
         own = [nbytes for key, (_, nbytes) in self._trackers.items() if key.startswith(owner)]
         return len(own), sum(own)
@@ -76,7 +76,7 @@ class PendingReplies:
         self._trackers = {key: kept for key, kept in self._trackers.items() if not kept[0].done}
 
     def wrap(self, reader: bytes, frames: Sequence[zmq.Frame]) -> list[zmq.Frame]:
-        """Copies of the frames that share their memory, and show when the last frame has left."""
+        """Return copies of the frames that share their memory. The last one shows when all have left."""
         *others, last = (frame.buffer for frame in frames)
         tracked = zmq.Frame(last, track=True, copy=False, copy_threshold=0)
         nbytes = sum(other.nbytes for other in others) + last.nbytes
@@ -86,12 +86,12 @@ class PendingReplies:
 
 log = logging.getLogger(__name__)
 
-_CUT_HELPS_WITHIN = 1.0  # seconds: more memory after that is a new attack
-_UNNOTICED = 4  # one part in so many of the memory is for what comes in until it is noticed
+_CUT_HELPS_WITHIN = 1.0  # seconds until a cut frees memory: more memory after that is a new attack
+_UNNOTICED = 4  # one quarter of the memory is reserved for messages that arrive before an alarm
 
 
 class ConnectionLimits:
-    """Limits of what connections may do to a gateway. Call `step` and `all_must_go` again and again."""
+    """Limits of a gateway's connections. Call `step` and `all_must_go` again and again."""
 
     def __init__(self, ports: Ports, access: AccessControl, refused: Counter[str], memory_bytes: int) -> None:
         self._ports = ports
@@ -101,19 +101,19 @@ class ConnectionLimits:
         self._hoarders_cut = -_CUT_HELPS_WITHIN  # time.monotonic()
 
     def step(self) -> None:
-        """Cut off some connections where there are too many, and what only says it is a viewer."""
+        """Cut off surplus connections, and viewers that send too much."""
         if surplus := self._ports.connections.step():
             self._refused["connection"] += surplus
             cut = count_of(surplus, "connection is", "connections are")
             log.warning("%s cut off: there are too many, or viewers send messages", cut)
 
     def on_flood(self, socket: sockets.AnySocket, flood: Flood) -> bool:
-        """Cut off who sent a message of frames without end, and with it, where that takes long, its port.
+        """Cut off the sender of a message with endless frames. If the flood goes on, make its port anew.
 
-        The others of the port are back at once; the client, where it has a name, after a while.
+        Other clients of the port are back at once. The sender, if it has a name, is kept out for a while.
 
         Returns:
-            Whether the port is made anew.
+            True if the port is made anew.
         """
         self._refused["frames"] += 1
         client = self._access.keep_out(flood.first)
@@ -130,9 +130,9 @@ class ConnectionLimits:
         return flood.goes_on
 
     def on_rubbish(self, first: zmq.Frame) -> None:
-        """Cut off a viewer that sent what is no subscription; it may connect again after a while."""
+        """Cut off a viewer whose message is no subscription, and keep it out for a while."""
         client = self._access.keep_out(first)
-        if client:  # else it is kept out already
+        if client:  # otherwise it is kept out already
             log.warning(
                 "a viewer sends what is no subscription: it is cut off",
                 extra=logs.about(client=client, reason="subscription"),
@@ -142,10 +142,11 @@ class ConnectionLimits:
     def all_must_go(self, uncounted: int) -> bool:
         """True if every connection must be made anew: a key was revoked, or they hold too much memory.
 
-        ZeroMQ limits a frame and a queue of whole messages, not a message that never ends.
+        ZeroMQ limits the size of a frame and the queue of complete messages, but not a message that never
+        ends.
 
         Args:
-            uncounted: bytes of this process that are no connection's fault.
+            uncounted: bytes of this process that no connection causes.
         """
         if self._access.step():
             log.warning("a key was revoked, or may use other maps: every connection is made anew")
@@ -161,7 +162,7 @@ class ConnectionLimits:
         return True
 
     def _cut_hoarders(self, held: int) -> bool:
-        """Cut off the connections that fill the memory, if they can be told; all go if that does not help."""
+        """Cut off connections that fill the memory. Return False without any, or if a cut did not help."""
         now = time.monotonic()
         if now - self._hoarders_cut < _CUT_HELPS_WITHIN:
             return False

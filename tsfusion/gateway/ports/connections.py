@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The TCP connections of a server's ports, as the system sees them: counted, and single ones cut off (Linux).
+"""TCP connections of a server's ports, from the system's tables: counted, and cut off one by one (Linux).
 
-ZeroMQ accepts as many as come, and says of none what it holds. The system knows of each how many bytes came
-and how long it is silent. Elsewhere than on Linux nothing is found, and the memory guard alone is left.
+ZeroMQ accepts any number of connections, and does not tell their memory. The system knows the received bytes
+and the silence of each. Without Linux nothing is found, and only the memory guard protects the server.
 """
 
 import os
@@ -21,12 +21,12 @@ from tsfusion.wire.sockets import sockets
 
 _MOST = 4096  # connections at once
 _BYTES_EACH = 48 << 10  # of memory, roughly
-_GREETING_BYTES = 64  # of ZMTP; who has sent no more has made no connection yet
-_INTERVAL = 0.1  # seconds between two looks
-_VIEWER_BYTES = 64 << 10  # that a viewer may send in all: its subscriptions are some hundred
+_GREETING_BYTES = 64  # of ZMTP; a peer that has sent no more is not connected yet
+_INTERVAL = 0.1  # seconds between two checks
+_VIEWER_BYTES = 64 << 10  # most bytes that a viewer can send in all: its subscriptions are some hundred
 _LONGEST_INTERVAL = 1.0
-_SHARE = 20  # of the time at most one part in so many goes into looking
-_UNREAD_BYTES = 1 << 20  # that a connection may have under way whatever happens
+_SHARE = 20  # at most 1/20 of the time goes into full checks
+_UNREAD_BYTES = 1 << 20  # incomplete bytes that a connection can always hold
 # linux/tcp.h: tcpi_state, tcpi_last_data_recv, tcpi_bytes_received, tcpi_notsent_bytes
 _TCP_INFO = struct.Struct("=B51xI72xQ8xI")
 _TCP_LISTEN = 10
@@ -34,13 +34,13 @@ _FILES = "/proc/self/fd"
 
 
 class OpenConnection(Struct, frozen=True):
-    """A connection that stands."""
+    """An established connection."""
 
     fd: int
     port: int  # of this process
     silent_ms: int
     received_bytes: int
-    unsent_bytes: int  # that the other end does not read
+    unsent_bytes: int  # bytes that the other end does not read
 
 
 class Connections:
@@ -56,19 +56,19 @@ class Connections:
         self._read: Counter[int] = Counter()  # fd → bytes of the messages that the gateway got
 
     def listen_at(self, data: int, control: int, viewers: int) -> None:
-        """Say which ports are meant."""
+        """Set the ports whose connections are watched."""
         self._ports = {data, control, viewers}
         self._viewers_port = viewers
 
     def note_read(self, fd: int, nbytes: int) -> None:
-        """Note a message that came over a connection."""
+        """Count the bytes of a message that came over a connection."""
         self._read[fd] += nbytes
 
     def step(self) -> int:
-        """Cut off connections where there are too many, and viewers that talk; the number of those.
+        """Cut off surplus connections, and viewers that send too much. Return the number of cut ones.
 
-        Where there are too many, those go first that have not even sent a greeting, then the ones that are
-        silent for longest. What viewers send is read by ZeroMQ at once, however much it is.
+        Of surplus connections, those without a greeting go first, then those that are silent for longest.
+        Viewers have a limit because ZeroMQ reads at once whatever they send.
         """
         now = time.monotonic()
         if now < self._next_look:
@@ -88,10 +88,10 @@ class Connections:
         return sum(self.cut(one.fd) for one in talk)
 
     def cut_hoarders(self) -> list[tuple[str, int]]:
-        """Cut off the connections over which most came that is no whole message yet.
+        """Cut off the connections with the most bytes of incomplete messages.
 
         Returns:
-            For each the address of its other end, and these bytes.
+            Address of the other end, and these bytes, for each connection.
         """
         unread = [(one.fd, one.received_bytes - self._read[one.fd]) for one in self._look()]
         least = max(max((nbytes for _, nbytes in unread), default=0) // 2, _UNREAD_BYTES)
@@ -99,15 +99,15 @@ class Connections:
         return [(peer, nbytes) for fd, peer, nbytes in hoarders if self.cut(fd)]
 
     def cut_deaf_viewers(self) -> int:
-        """Cut off the viewers that do not read what waits for them; how many that were.
+        """Cut off the viewers that do not read waiting messages. Return their number.
 
-        ZeroMQ keeps some messages for each, and others for one that came later.
+        ZeroMQ keeps some messages for each viewer, and others for a viewer that came later.
         """
         deaf = [one.fd for one in self._look() if one.port == self._viewers_port and one.unsent_bytes]
         return sum(map(self.cut, deaf))
 
     def _look(self) -> list[OpenConnection]:
-        """The connections that stand. More than came over one was read over another of its number, before."""
+        """Return the established connections. Correct the counts of file numbers that were used again."""
         found = list(self._all())
         self._read = Counter({one.fd: min(self._read[one.fd], one.received_bytes) for one in found})
         return found
@@ -125,7 +125,7 @@ class Connections:
                         yield OpenConnection(fd, link.getsockname()[1], silent_ms, received, unsent)
 
     def cut(self, fd: int) -> bool:
-        """Cut a connection off; False when it is none (any more)."""
+        """Cut a connection off. Return False if the file is no connection (any more)."""
         with suppress(OSError), _shared(fd) as link:
             if self._is_ours(link):  # one that has ended may have left its number to another file
                 link.shutdown(socket.SHUT_RDWR)
@@ -138,7 +138,7 @@ class Connections:
 
 
 def _files() -> list[str]:
-    """Numbers of the open files of this process; none where the system does not tell."""
+    """Return the numbers of this process's open files, or nothing where the system does not tell."""
     try:
         return os.listdir(_FILES)
     except OSError:
@@ -146,16 +146,16 @@ def _files() -> list[str]:
 
 
 def _peer_of(fd: int) -> str:
-    """Address of a connection's other end; empty where it has none any more."""
+    """Return the address of a connection's other end; empty after its end."""
     with suppress(OSError), socket.socket(fileno=os.dup(fd)) as link:
         return str(link.getpeername()[0]).removeprefix(sockets.MAPPED)
     return ""
 
 
 def _shared(fd: int) -> socket.socket:
-    """The socket of an open file, held open meanwhile; raises OSError where it is none.
+    """Return the socket of an open file, held open by a copy. Raise OSError if it is no socket.
 
-    It is taken for one of IPv4, which is faster than to ask: of others, its ports alone are right.
+    The socket counts as IPv4, which is faster than to ask. For other families only its ports are right.
     """
     copy = os.dup(fd)
     try:

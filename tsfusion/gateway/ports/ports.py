@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The server's three sockets, read and written without ever waiting, and what viewers subscribed to."""
+"""The server's three sockets, read and written without blocking, and the subscriptions of viewers."""
 
 import logging
 import time
@@ -23,27 +23,27 @@ log = logging.getLogger(__name__)
 _MESSAGES_A_STEP = 16
 _SECONDS_A_STEP = 0.05
 _MANY_FRAMES = 1000  # surplus ones, which no mistake explains
-_MOST_DISCARDED = 50_000  # frames of one message that are read and forgotten: some 50 ms
+_MOST_DISCARDED = 50_000  # frames of one message that are read and dropped: some 50 ms
 _REBIND_INTERVAL = 0.01  # seconds
 Handler: TypeAlias = Callable[[list[zmq.Frame]], None]
 
 
 class Flood(NamedTuple):
-    """A message with many more frames than any may have.
+    """A message with many more frames than any valid one.
 
-    ZeroMQ has all of them in memory, and gives what others sent to the socket only behind the last one.
+    ZeroMQ has all frames in memory, and delivers other messages of the socket only after the last frame.
     """
 
     first: zmq.Frame
-    discarded: int  # number of frames that were read and forgotten
-    goes_on: bool  # whether there are more: only a new socket gets rid of them soon
+    discarded: int  # number of frames that were read and dropped
+    goes_on: bool  # True if there are more frames: only a new socket gets rid of them soon
 
 
 class Ports:
-    """The sockets: keyframes in, control both ways, mesh updates and what scanners see out.
+    """The sockets: records come in, control messages go both ways, updates for viewers go out.
 
     Args:
-        grants_topics: asked when sockets are made: whether viewers get only what `grant_topics` says.
+        grants_topics: called when sockets are made; True sends viewers only topics of `grant_topics`.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class Ports:
         self._addresses: dict[str, str] = {}  # of the sockets, once they are bound
         self._unbound: set[str] = set()  # sockets that are being made anew
         self._next_bind = 0.0
-        self.problem = ""  # why nobody can connect; empty = clients can
+        self.problem = ""  # why nobody can connect; empty if clients can
         self.connections = Connections(server.memory_bytes)
         self._sockets = {name: self._make(name) for name in ("keyframes", "control", "viewers")}
 
@@ -94,7 +94,7 @@ class Ports:
         return all(self._sockets[name] is not socket for name in self._unbound)
 
     def bind(self) -> Addresses:
-        """Bind the sockets, so that clients can connect.
+        """Bind the sockets. Clients can connect from then on.
 
         Raises:
             TransportError: when a port is taken.
@@ -107,34 +107,33 @@ class Ports:
         return found
 
     def reply(self, identity: bytes, message: messages.ToClient, frames: Sequence[zmq.Frame] = ()) -> None:
-        """Send a message to a connection of the control socket, or drop it."""
+        """Send a message to a connection of the control socket, or drop the message."""
         send_now(self.control, [identity, messages.encode_sealed(message), *frames])
 
     def publish(self, topic: bytes, message: bytes, frames: Sequence[zmq.Frame]) -> None:
-        """Send a message to the viewers that subscribed to its topic, or drop it."""
+        """Send a message to the viewers that subscribed to its topic, or drop the message."""
         if not self.viewers.closed:
             send_now(self.viewers, [topic, message, *frames])
 
     @property
     def grants_topics(self) -> bool:
-        """True if viewers get only what `grant_topics` says."""
+        """True if viewers get only the topics of `grant_topics`."""
         return self._is_manual
 
     def grant_topics(self, topics: Iterable[bytes]) -> None:
-        """Send these topics' updates to the viewer whose message was received last."""
+        """Send updates of these topics to the viewer whose message was received last."""
         for topic in topics if self._is_manual else ():
             self.viewers.setsockopt(zmq.SUBSCRIBE, topic)
 
     def revoke_topics(self, topics: Iterable[bytes]) -> None:
-        """Send these topics' updates to that viewer no more."""
+        """Stop updates of these topics to that viewer."""
         for topic in topics if self._is_manual else ():
             self.viewers.setsockopt(zmq.UNSUBSCRIBE, topic)
 
     def knows_viewer(self, *, after_rubbish: bool = False) -> bool:
-        """True if topics would be granted to the viewer whose message was received last.
+        """True if `grant_topics` would reach the viewer whose message was received last.
 
-        ZeroMQ takes subscriptions that wait behind rubbish for others' than those that sent them, until none
-        waits.
+        After rubbish, ZeroMQ attributes waiting subscriptions to wrong viewers, until no message waits.
 
         Args:
             after_rubbish: the message is no subscription.
@@ -145,10 +144,10 @@ class Ports:
         return not self._is_mixed_up
 
     def renew(self, only: sockets.AnySocket | None = None) -> None:
-        """Drop every connection, with all that it holds in memory; `step` listens at the same ports again.
+        """Drop every connection, with its memory. `step` then listens at the same ports again.
 
         Args:
-            only: the socket whose connections are meant; None = those of all.
+            only: the socket whose connections are dropped; None drops those of all sockets.
         """
         for name, socket in self._sockets.items():
             if only in (None, socket):
@@ -158,7 +157,7 @@ class Ports:
         self.step()
 
     def step(self) -> None:
-        """Listen again, as soon as ZeroMQ's threads have given the ports back. Never waits."""
+        """Listen again as soon as ZeroMQ's threads have released the ports. Never block."""
         now = time.monotonic()
         if not self._unbound or now < self._next_bind:
             return
@@ -175,12 +174,12 @@ class Ports:
                 self.problem = f"cannot listen any more, and will try again: {error}"
 
     def cut_off(self, frame: zmq.Frame) -> None:
-        """End the connection over which a frame came, if it still stands. Others of the same port stay."""
+        """End the connection over which a frame came, if it still exists. Others of the same port stay."""
         if (fd := sockets.file_of(frame)) is not None:
             self.connections.cut(fd)
 
     def close(self) -> None:
-        """Close the sockets at once, with whatever they have not sent."""
+        """Close the sockets at once. Unsent messages are lost."""
         for socket in self._sockets.values():
             socket.close()
 
@@ -191,21 +190,21 @@ def receive_some(
     on_flood: Callable[[Flood], None],
     note_read: Callable[[int, int], None],
 ) -> None:
-    """Handle the messages that a socket holds, up to a limit: then the other sockets get their turn.
+    """Handle a limited number of messages of a socket, so that the other sockets get their turn.
 
     Args:
-        note_read: told the file number of the connection, and the bytes of a message that is handled.
-        on_flood: told of a message with many more frames than any may have, which is not handled.
+        note_read: called with the connection's file number and the bytes, for each handled message.
+        on_flood: called for a message with many more frames than any valid one. That message is not handled.
     """
     until = time.monotonic() + _SECONDS_A_STEP
     for _ in range(_MESSAGES_A_STEP):
-        if socket.closed or time.monotonic() > until:  # the handler closed it, or the disk is slow
+        if socket.closed or time.monotonic() > until:  # the handler closed the socket, or the disk is slow
             return
         try:
             frames = [socket.recv(zmq.NOBLOCK, copy=False)]
         except zmq.Again:
             return
-        while frames[-1].more and len(frames) <= MAX_FRAMES:  # one too many shows that the message is none
+        while frames[-1].more and len(frames) <= MAX_FRAMES:  # one frame too many marks an invalid message
             frames.append(socket.recv(zmq.NOBLOCK, copy=False))
         discarded = _discard(socket) if frames[-1].more else 0
         if discarded > _MANY_FRAMES:
@@ -217,7 +216,7 @@ def receive_some(
 
 
 def _discard(socket: sockets.AnySocket) -> int:
-    """Read and forget the rest of a message, up to a limit; the number of frames."""
+    """Read and drop the rest of a message, up to a limit. Return the number of frames."""
     discarded, more = 0, True
     while more and discarded < _MOST_DISCARDED:
         socket.recv(zmq.NOBLOCK)
@@ -227,7 +226,7 @@ def _discard(socket: sockets.AnySocket) -> int:
 
 
 def send_now(socket: sockets.AnySocket, frames: list[Any]) -> None:
-    """Send a message, or drop it when it cannot leave at once: whoever needs it will ask again."""
+    """Send a message, or drop it if it cannot leave at once: its receiver will ask again."""
     try:
         socket.send_multipart(frames, zmq.NOBLOCK, copy=False)
     except zmq.ZMQError as error:  # zmq.Again: it is full; or it is being made anew
@@ -238,10 +237,10 @@ _MAX_TOPICS = 256  # of maps that are not open
 
 
 class Subscriptions:
-    """The topics that viewers subscribed to, as far as they can be a map's.
+    """The topics that viewers subscribed to, if they can be a map's.
 
-    A connection that ends takes its subscriptions back, but nobody says then whose they were. So those that
-    were not granted are counted, too: a map may be taken for watched that is not, never the other way round.
+    The end of a connection cancels its subscriptions, but ZeroMQ does not tell whose they were. So refused
+    ones are counted, too. A map may count as watched without viewers, but never the other way round.
     """
 
     def __init__(self) -> None:
@@ -252,11 +251,11 @@ class Subscriptions:
         return len(self._granted.keys() | self._denied.keys())
 
     def add(self, topic: bytes, maps: Iterable[str], *, granted: bool = True) -> bool:
-        """Note a subscription; False when it is not to be granted. Topics of open maps are never too many.
+        """Count a subscription. Return False if it is refused. Topics of open maps have no limit.
 
         Args:
             maps: the names of the open maps.
-            granted: whether its viewer may have any of it.
+            granted: True if the viewer has the right to any part of it.
         """
         wanted = any(own.startswith(topic) for name in maps for own in sockets.topics_of(name))
         new = topic not in self._granted and topic not in self._denied
@@ -266,10 +265,10 @@ class Subscriptions:
         return granted
 
     def discard(self, topic: bytes, *, granted: bool | None = None) -> None:
-        """Note that a subscription to a topic ended.
+        """Remove a subscription that ended.
 
         Args:
-            granted: as in `add`; None = not known.
+            granted: as in `add`; None if not known.
         """
         denied_first = granted is None and self._denied[topic] > 0
         counts = self._denied if denied_first or granted is False else self._granted
@@ -277,10 +276,10 @@ class Subscriptions:
         self._granted, self._denied = +self._granted, +self._denied
 
     def clear(self) -> None:
-        """Forget all subscriptions: every connection was dropped."""
+        """Remove all subscriptions: every connection was dropped."""
         self._granted.clear()
         self._denied.clear()
 
     def watched(self, topic: bytes) -> bool:
-        """True if any viewer gets what is published under a map's topic."""
+        """True if any viewer gets the updates of a map's topic."""
         return any(topic.startswith(wanted) for wanted in self._granted)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Records of a map's journal: place, session and time stamps of each, and which the fuser has yet to answer.
+"""Index of a map's journaled records, and the backlog of records that the fuser has yet to answer.
 
-Those that wait are handed out in a fair order.
+The backlog is handed out in a fair order.
 """
 
 import time
@@ -20,8 +20,6 @@ from tsfusion.wire.messages.messages import Stamps
 
 
 class IndexEntry(Struct, frozen=True):
-    """One journaled keyframe or correction."""
-
     index: int
     position: Position
     session: int  # its number in `Sessions`
@@ -39,21 +37,21 @@ _COLUMNS = (
 class KeyframeIndex:
     """Every record of the journal in order, 80 bytes each. Stamps are 0 for records of earlier runs.
 
-    The index of a record stays the same when those before it are forgotten.
+    The index of a record stays the same when earlier records are removed.
     """
 
     def __init__(self) -> None:
         self._columns = {name: array("q") for name in _COLUMNS}
-        self._first = 0  # the lowest index that is not forgotten
+        self._first = 0  # the lowest index that is still held
 
     def __len__(self) -> int:
         return len(self._columns["seq"])
 
     def recover(self, found: Iterable[RecordEntry], sessions: Sessions) -> None:
-        """Add the records that a scan of the journal found. One that was journaled twice counts once.
+        """Add the records that a scan of the journal found. A record that was journaled twice counts once.
 
-        (The disk refused, the client sent it again, and the first copy had been written after all.) Of one
-        that was erased the number alone counts: it is not taken again.
+        (The disk refused it, the client sent it again, and the first copy was written after all.) The number
+        of an erased record counts, so it is not taken again.
         """
         for record in found:
             world = None if record.is_erased else record.world
@@ -75,7 +73,7 @@ class KeyframeIndex:
         durable_ns: int = 0,
         is_correction: bool = False,
     ) -> int:
-        """Append a record; its index."""
+        """Append a record. Return its index."""
         session.corrections += is_correction
         session.keyframes += not is_correction
         place = (position.segment, position.offset, session.number, seq, captured_ns, is_correction)
@@ -87,10 +85,10 @@ class KeyframeIndex:
         return index
 
     def forget(self, before_segment: int, sessions: Sessions, needed: Iterable[int] = ()) -> None:
-        """Forget the records of deleted segments, up to the first that is still to be handed out.
+        """Remove the records of deleted segments, up to the first one that is still to be handed out.
 
         Args:
-            needed: indices of records that must not be forgotten.
+            needed: indices of records that must stay.
         """
         deleted = bisect_left(self._columns["segment"], before_segment)
         if not deleted:
@@ -107,7 +105,7 @@ class KeyframeIndex:
         self._first = stop
 
     def set_fused(self, index: int, fuse_start_ns: int, fused_ns: int) -> None:
-        """Write down when the fuser took a record."""
+        """Store the times at which the fuser began and finished a record."""
         self._columns["fuse_start_ns"][index - self._first] = fuse_start_ns
         self._columns["fused_ns"][index - self._first] = fused_ns
 
@@ -119,53 +117,53 @@ class KeyframeIndex:
         return IndexEntry(index, place, session, times, captured, bool(is_correction))
 
     def corrections(self, indices: Iterable[int]) -> int:
-        """Number of corrections among these records."""
+        """Return the number of corrections among these records."""
         column, first = self._columns["is_correction"], self._first
         return sum(column[index - first] for index in indices)
 
     def after(self, session: Session, seq: int) -> int:
-        """Number of a session's records up to sequence number `seq`, without forgotten ones."""
+        """Return the number of a session's held records up to sequence number `seq`."""
         seqs, first = self._columns["seq"], self._first
         return bisect_right(session.entries, seq, key=lambda index: seqs[index - first])
 
     def keyframes_up_to(self, session: Session, seq: int) -> int:
-        """Number of a session's keyframes up to sequence number `seq`, without forgotten ones."""
+        """Return the number of a session's held keyframes up to sequence number `seq`."""
         entries = session.entries[: self.after(session, seq)]
         return len(entries) - self.corrections(entries)
 
     def segment(self, index: int) -> int:
-        """The number of the segment that holds a record."""
+        """Return the number of the segment that holds a record."""
         return self._columns["segment"][index - self._first]
 
 
-_AHEAD = 0.1  # seconds of work that the fuser may have in its queue: whoever comes next waits so long
-_FADING = 0.8  # of what records are expected to take, each time that one took less
+_AHEAD = 0.1  # seconds of work in the fuser's queue: the next client waits so long
+_FADING = 0.8  # factor of the expected seconds of a record, after each record that took less
 _MAX_CLIENTS = 4096
 
 
 class _Account(Struct):
-    taken: float  # seconds, as if the client had always been there
-    expected: float = _AHEAD  # seconds that its next record may take
+    taken: float  # seconds of the fuser, counted as if the client had always been there
+    expected: float = _AHEAD  # seconds that its next record is expected to take
 
 
 class FuserTime:
-    """The time of a map's fuser, shared out among clients: who took least of it is next.
+    """The time of a map's fuser, shared among clients: the client that took least time is next.
 
-    Start-time fair queueing (Goyal, Vin and Cheng 1996), in seconds: a record is charged to its client with
-    what it is expected to take, and, when the fuser has answered, with what it took. A client that was away
-    has saved nothing up: it begins where the one that was served last began. A new one begins later by the
-    longest of the last records: without keys each session counts as a client, and who opens many must not go
-    before all others.
+    Start-time fair queueing (Goyal, Vin and Cheng 1996), in seconds. A record is charged to its client with
+    its expected time and, after the fuser's answer, with its true time. A client that was away has saved
+    nothing: it starts where the client that was served last had started. A new client starts later, by the
+    longest of the last records: without keys each session counts as a client, and many new sessions must not
+    go before all others.
     """
 
     def __init__(self) -> None:
         self._accounts: OrderedDict[str, _Account] = OrderedDict()
         self._charged: dict[int, tuple[str, float]] = {}  # index of a record under way → client, seconds
-        self._now = 0.0  # what the client that was served last had taken before
-        self._longest = 0.0  # seconds that one of the last records took
+        self._now = 0.0  # seconds that the client served last had taken before
+        self._longest = 0.0  # seconds of the longest of the last records
 
     def next_of(self, clients: Iterable[str]) -> str:
-        """The client that took least; of equals the one whose record is expected to take least."""
+        """Return the client that took least time; among equals, the one with the shortest expected record."""
         return min(clients, key=self._place_of)
 
     def _place_of(self, client: str) -> tuple[float, float]:
@@ -173,19 +171,19 @@ class FuserTime:
         return max(account.taken, self._now), account.expected
 
     def has_room_for(self, client: str) -> bool:
-        """True if a record of a client may wait in the fuser's queue."""
+        """True if a record of a client can wait in the fuser's queue."""
         ahead = sum(seconds for _, seconds in self._charged.values())
         return not self._charged or ahead + self._account(client).expected <= _AHEAD
 
     def charge(self, client: str, index: int) -> None:
-        """Note that a client's record was handed out."""
+        """Charge a client for a record that was handed out."""
         account = self._account(client)
         self._now = max(account.taken, self._now)
         account.taken = self._now + account.expected
         self._charged[index] = client, account.expected
 
     def settle(self, index: int, seconds: float) -> None:
-        """Note how long the fuser took for a record."""
+        """Correct the charge of a record to the seconds that the fuser took."""
         client, charged = self._charged.pop(index, (None, 0.0))
         if client is not None:
             account = self._account(client)
@@ -194,7 +192,7 @@ class FuserTime:
             self._longest = max(seconds, _FADING * self._longest)
 
     def restart(self) -> None:
-        """Forget what was under way: the fuser has ended. It stays charged."""
+        """Drop the records under way, because the fuser has ended. They stay charged."""
         self._charged.clear()
 
     def _account(self, client: str) -> _Account:
@@ -208,17 +206,17 @@ class FuserTime:
 
 
 class FuserBacklog:
-    """Hand out records of the client that took least of the fuser's time, of each of its sessions in turn.
+    """Hands out records: of the client that took least of the fuser's time, of each of its sessions in turn.
 
     Attributes:
         leaving: number of keyframes that a record forgets, by its index.
-        last_progress: when the fuser answered, or had nothing to answer (`time.monotonic()`).
+        last_progress: last time when the fuser answered, or had nothing to answer (`time.monotonic()`).
     """
 
     def __init__(self, index: KeyframeIndex, sessions: Sessions) -> None:
         self._index = index
         self._sessions = sessions
-        self._queues: OrderedDict[str, deque[Session]] = OrderedDict()  # by owner, the last one served last
+        self._queues: OrderedDict[str, deque[Session]] = OrderedDict()  # by owner; the last served is last
         self._time = FuserTime()
         self.leaving: dict[int, int] = {}
         self.last_progress = 0.0
@@ -229,13 +227,13 @@ class FuserBacklog:
         return not self.keyframes and not self.corrections
 
     def _count(self) -> None:
-        """Count the keyframes and corrections that are not answered."""
+        """Count the keyframes and corrections without an answer."""
         waiting = [session.entries[session.handed :] for session in self._sessions]
         self.corrections = sum(map(self._index.corrections, waiting))
         self.keyframes = sum(map(len, waiting)) - self.corrections
 
     def add(self, session: Session, *, is_correction: bool = False) -> None:
-        """Add the record of a session that was journaled just now."""
+        """Add the newest record of a session, just journaled."""
         if self.is_empty:
             self.last_progress = time.monotonic()
         self.keyframes += not is_correction
@@ -243,7 +241,7 @@ class FuserBacklog:
         self._enqueue(session)
 
     def on_done(self, index: int, seconds: float) -> None:
-        """Take out a record that the fuser answered, after so many seconds of work."""
+        """Remove a record that the fuser answered, after so many seconds of work."""
         self.last_progress = time.monotonic()
         self.leaving.pop(index, None)
         self._time.settle(index, seconds)
@@ -258,7 +256,7 @@ class FuserBacklog:
                 queue.append(session)
 
     def restart(self, done: Mapping[bytes, SessionProgress]) -> None:
-        """Begin where a new fuser begins, with `done` of each session: hand out all the rest again."""
+        """Start again with a new fuser, which has `done` of each session: hand out the rest again."""
         self._queues.clear()
         self._time.restart()
         for session in self._sessions:

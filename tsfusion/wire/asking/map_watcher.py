@@ -102,7 +102,6 @@ class MapWatcher:
         return f"{self._map} at {self.address}"
 
     def close(self) -> None:
-        """Close all connections."""
         with self._weights_lock:
             if self._weights is not None:
                 self._weights.close()

@@ -409,7 +409,6 @@ class AllowList:
         return any(maps.patterns is not None for maps in self._maps.values())
 
     def maps_of(self, name: str) -> AllowedMaps:
-        """Return the maps that a client may use."""
         return self._maps.get(name, AllowedMaps(()))
 
     def may_forget_all(self, name: str) -> bool:

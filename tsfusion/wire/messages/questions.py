@@ -93,7 +93,6 @@ class Raycast(Struct, frozen=True, tag="raycast", omit_defaults=True):
 
     @property
     def most_bytes(self) -> int:
-        """Upper bound of the size of the answer."""
         return (4 + 12 * self.normals + 3 * self.colors) * math.prod(self.shape)
 
     def problem(self, frames: Sequence[Any]) -> str:
@@ -135,7 +134,6 @@ class Slice(Struct, frozen=True, tag="slice", omit_defaults=True):
 
     @property
     def most_bytes(self) -> int:
-        """Upper bound of the size of the answer."""
         return 5 * MOST_CELLS
 
     def problem(self, frames: Sequence[Any]) -> str:
@@ -162,7 +160,6 @@ class Field(Struct, frozen=True, tag="field", omit_defaults=True):
 
     @property
     def most_bytes(self) -> int:
-        """Upper bound of the size of the answer."""
         return 5 * MOST_VOXELS
 
     def problem(self, frames: Sequence[Any]) -> str:
@@ -189,7 +186,6 @@ class Cells(Struct, frozen=True, tag="cells", omit_defaults=True):
 
     @property
     def most_bytes(self) -> int:
-        """Upper bound of the size of the answer."""
         return _CELL_BYTES * CELLS_AT_ONCE
 
     def problem(self, frames: Sequence[Any]) -> str:
@@ -214,7 +210,6 @@ class Keyframes(Struct, frozen=True, tag="keyframes", omit_defaults=True):
 
     @property
     def most_bytes(self) -> int:
-        """Upper bound of the size of the answer."""
         return _KEYFRAME_BYTES * KEYFRAMES_AT_ONCE
 
     def problem(self, frames: Sequence[Any]) -> str:

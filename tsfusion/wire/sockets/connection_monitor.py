@@ -83,7 +83,6 @@ class ConnectionMonitor:
         self.socket.connect(endpoint)
 
     def close(self) -> None:
-        """Stop watching."""
         if not self._watched.closed:
             self._watched.disable_monitor()
         self.socket.close()
