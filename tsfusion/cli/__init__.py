@@ -116,7 +116,7 @@ def _root(
         typer.echo(context.get_help())
 
 
-# A run writes in many places: that a disk refuses is the user's to mend in all of them.
+# A run writes to many folders. If a disk refuses in any of them, the user can help: no traceback.
 _DISK_REFUSES = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
 
 # Packages that a robot's light installation does not have.
@@ -126,8 +126,8 @@ _NOT_OF_THE_CLIENT = ("matplotlib", "prometheus_client", "pykitti", "taichi")
 def main(arguments: list[str] | None = None) -> NoReturn:
     """Run a command line (default: this process's) and exit.
 
-    Every error raised on purpose becomes one line on stderr and status 1; a wrong flag status 2; Ctrl-C 130;
-    SIGTERM 143. A terminal that goes away ends it as SIGTERM does.
+    An error raised on purpose becomes one line on stderr and status 1. A wrong flag gives status 2, Ctrl-C
+    130, SIGTERM 143. A terminal that goes away ends the command as SIGTERM does.
     """
     if signal.getsignal(signal.SIGINT) == signal.SIG_DFL:  # as `__main__` leaves it
         signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -175,7 +175,7 @@ def _fail(message: str, code: int) -> NoReturn:
 
 
 def _variable(error: Exception) -> str:
-    """The environment variable that a wrong value comes from, in words; empty = it was typed."""
+    """Return words that name the environment variable of a wrong value; empty if the value was typed."""
     context, parameter = getattr(error, "ctx", None), getattr(error, "param", None)
     if context is None or parameter is None:
         return ""
@@ -185,14 +185,14 @@ def _variable(error: Exception) -> str:
 
 
 def _terminated(signum: int, frame: FrameType | None) -> NoReturn:
-    """Unwind as Ctrl-C does: half-written results are removed, and child processes end."""
+    """Exit as after Ctrl-C: half-written results are removed, and child processes end."""
     sys.exit(TERMINATED)
 
 
 def _hung_up(signum: int, frame: FrameType | None) -> None:
-    """Nobody reads the terminal any more, and it refuses what is written; all else is as by SIGTERM.
+    """Redirect the streams of a closed terminal to nowhere, and then end as by SIGTERM.
 
-    The shell and the kernel may both say so, and the second SIGTERM would end a scan at once.
+    Both the shell and the kernel may send SIGHUP. Further ones are ignored, as a second SIGTERM ends a scan.
     """
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     nowhere = os.open(os.devnull, os.O_RDWR)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""`tsfusion ask`."""
+"""`tsfusion ask`: ask a map for distances, a view or a slice."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -156,7 +156,7 @@ def _ask_points(
     out: Path | None,
     json: bool,
 ) -> None:
-    """Sample the map at points, and write or print that."""
+    """Sample the map at points, and write or print the result."""
     import numpy as np
 
     from tsfusion.core.errors import InvalidConfig
@@ -186,7 +186,7 @@ def _ask_points(
 
 
 def _in_parts(asked: Any, chosen: "NDArray[np.float64]", how: dict[str, Any]) -> "list[Answered[Samples]]":
-    """The answers to as many questions as so many points take."""
+    """Sample the points in questions of at most `MOST_POINTS` each, and return all answers."""
     from tsfusion.wire.messages.questions import MOST_POINTS
 
     return [asked.sample(chosen[i : i + MOST_POINTS], **how) for i in range(0, len(chosen), MOST_POINTS)]
@@ -204,7 +204,7 @@ def _joined(answers: "list[Answered[Samples]]") -> "Samples":
 
 @contextmanager
 def _map(where: str, map_: str | None, link: dict[str, Any], *, quiet: bool) -> Iterator[Any]:
-    """A live map, or a saved one, to be asked by the same methods."""
+    """Open a live or a saved map. Both have the same methods for questions."""
     if "://" in where:
         from tsfusion.core.config import DEFAULT_MAP
         from tsfusion.wire.asking.map_client import MapClient
@@ -228,7 +228,7 @@ def _map(where: str, map_: str | None, link: dict[str, Any], *, quiet: bool) -> 
 
 
 def _checked(out: Path | None, what: str, suffixes: tuple[str, ...]) -> Path:
-    """The file for an answer that no terminal shows."""
+    """Return the file for an answer that a terminal cannot show. Raise InvalidConfig without one."""
     from tsfusion.core.errors import InvalidConfig
     from tsfusion.core.output_folder import check_writable
 
@@ -239,7 +239,7 @@ def _checked(out: Path | None, what: str, suffixes: tuple[str, ...]) -> Path:
 
 
 def _write_slice(answer: "Answered[Any]", out: Path, *, json: bool) -> None:
-    """Write a slice of either kind, and say what it shows."""
+    """Write a slice of either kind, and print what it shows."""
     from tsfusion.cli import output
     from tsfusion.geometry.map_grids import FREE, OCCUPIED, UNSEEN
 
@@ -266,7 +266,7 @@ def _write_slice(answer: "Answered[Any]", out: Path, *, json: bool) -> None:
 
 
 def _camera(view: PoseFlag, size: str, intrinsics: str | None) -> tuple[Any, Any, tuple[int, int]]:
-    """Intrinsics, pose and (height, width)."""
+    """Return intrinsics, pose and (height, width) of the camera."""
     import re
 
     import numpy as np
@@ -342,7 +342,7 @@ def _reach(found: "Samples") -> str:
 
 
 def _state(answers: "list[Answered[Any]]") -> str:
-    """The state of the map that answered, and how long the answer took."""
+    """Return in words the state of the map that answered, and how long the answer took."""
     last = answers[-1]
     took = sum(one.delay_s for one in answers)
     words = f"a map of {last.state.keyframes} keyframes, answered in {1e3 * took:.1f} ms"
@@ -366,7 +366,7 @@ def _figures(answers: "list[Answered[Any]]") -> dict[str, Any]:
 def _print_json(
     answers: "list[Answered[Samples]]", points: "NDArray[np.float64]", found: "Samples", out: Path | None
 ) -> None:
-    """Print what was found; unseen, and beyond what is known, is null."""
+    """Print the samples as JSON. A distance is null if it is unseen or beyond the known reach."""
     import numpy as np
 
     from tsfusion.cli import output

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A server's state in words on the last line of its terminal, below the log that scrolls."""
+"""Show a server's state on the last line of its terminal, below the scrolling log."""
 
 import os
 import sys
@@ -14,21 +14,21 @@ from tsfusion.core.limits import Rates
 from tsfusion.core.readable_numbers import count_of
 from tsfusion.wire.messages.health import Health, headline
 
-_LEAST_ROWS = 6  # of a terminal that has a line to spare
-_SAVE, _RESTORE = "\x1b7", "\x1b8"  # the cursor's place
+_LEAST_ROWS = 6  # a smaller terminal shows no state
+_SAVE, _RESTORE = "\x1b7", "\x1b8"  # save and restore the cursor's position
 
 
 class BottomLine:
-    """The last line of the terminal at stderr; the others are the only ones that scroll (DECSTBM).
+    """The last line of the terminal at stderr. Only the lines above it scroll (DECSTBM).
 
-    So every process that writes there, a map's fuser too, writes above it. Nothing is shown where stderr is
-    no terminal, or another program is in its foreground.
+    So all processes that write to stderr, such as fusers, write above it. Nothing is shown if stderr is no
+    terminal, or if another program is in its foreground.
     """
 
     def __init__(self) -> None:
         self._console = Console(stderr=True, highlight=False)
         self._rates = Rates()
-        self._rows = 0  # of the terminal when its last line was taken; 0 = it was not
+        self._rows = 0  # of the terminal when its last line was reserved; 0 = it is not
         self._was_ready = False
 
     def __enter__(self) -> "BottomLine":
@@ -59,7 +59,7 @@ class BottomLine:
         self._write(f"{_SAVE}\x1b[{rows};1H\x1b[2K{captured.get()}{_RESTORE}")
 
     def _words(self, health: Health, columns: int) -> Text:
-        """The headline, and as many figures as there is room for."""
+        """Return the headline and as many figures as fit into `columns`."""
         fused = sum(one.keyframes_fused for one in health.maps.values())
         rate, _ = self._rates(fused, 0)
         head = headline(health, rate=max(rate or 0.0, 0.0))
@@ -77,9 +77,9 @@ class BottomLine:
     def _is_ours(self) -> bool:
         try:
             return sys.stderr.isatty() and os.tcgetpgrp(sys.stderr.fileno()) == os.getpgrp()
-        except OSError:  # it has no terminal, or lost it
+        except OSError:  # this process has no terminal, or lost it
             return False
 
     def _write(self, text: str) -> None:
-        sys.stderr.write(text)  # at once: a terminal is not to see the half of it
+        sys.stderr.write(text)  # in one call, so that the terminal never shows half of it
         sys.stderr.flush()

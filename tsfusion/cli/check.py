@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""`tsfusion check`, `ate` and `report`: quality of a recording, of a trajectory, of a run or a map."""
+"""`tsfusion check`, `ate` and `report`: judge a recording, a trajectory, and a run or a map."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -115,7 +115,7 @@ def ate(
 
 
 def _truth(reference: Path, given: dict[str, Any]) -> "Path | Dataset":
-    """A trajectory file as it is, or a dataset with all its frames: those without a pose count too."""
+    """Return a trajectory file, or a dataset with all its frames: those without a pose count, too."""
     if reference.is_file() and not given:
         return reference
     from tsfusion.cli.runs import open_recording
@@ -124,7 +124,7 @@ def _truth(reference: Path, given: dict[str, Any]) -> "Path | Dataset":
 
 
 def table(rows: "list[tuple[str, TrajectoryError]]") -> str:
-    """The usual table of trajectory errors, a line a trajectory."""
+    """Return the usual table of trajectory errors, with a line for each trajectory."""
     head = ("min", "max", "mean", "median", "std", "RMSE")
     width = max(len(name) for name, _ in rows)
     lines = [" " * width + "".join(f"{name:>10}" for name in head) + "   poses      length       drift"]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""`tsfusion datasets` and `tsfusion download`."""
+"""`tsfusion datasets` and `tsfusion download`: list datasets, and fetch public recordings."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from tsfusion.datasets.download.catalogue import PublicRecording
     from tsfusion.datasets.download.download import CheckedFile
 
-_DEPTH = 4  # folders below PATH
+_DEPTH = 4  # levels of folders below PATH that are searched
 
 
 class _ListByDefault(verbs.Group):
@@ -85,7 +85,7 @@ def _layouts() -> list[dict[str, Any]]:
 
 
 def _is_one(path: Path) -> bool:
-    """True if a path has a known layout, or holds a folder with one."""
+    """True if a path has a known layout, or contains a folder with one."""
     from tsfusion.core.errors import DatasetError
     from tsfusion.datasets.layout_registry import find
 
@@ -97,7 +97,7 @@ def _is_one(path: Path) -> bool:
 
 
 def _found(path: Path, depth: int) -> Iterator[dict[str, Any]]:
-    """The datasets in and under a folder; a dataset is not searched for others.
+    """Yield the datasets in and under a folder. Other datasets inside a dataset are not searched.
 
     Raises:
         DatasetError: there is no folder, or it is a dataset that cannot be opened.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""`tsfusion doctor`: check that everything a run needs is here, and say what to do if not."""
+"""`tsfusion doctor`: check the installation, and say what to do about each fault."""
 
 import platform
 import shutil
@@ -31,7 +31,7 @@ _MODULES = {
 }  # fmt: skip
 
 
-# Parts that not everybody needs: name of the extra → its package, and what that is for.
+# Optional parts: name of the extra → its package, and what it is for.
 _EXTRAS = {
     "slam": ("scipy", "loop closure"),
     "lidar": ("kiss-icp", "LiDAR odometry"),
@@ -48,9 +48,9 @@ class Finding:
 
     name: str  # what was checked
     ok: bool
-    found: str  # its version or state, or what is wrong with it
-    advice: str = ""  # what to do; empty = nothing
-    optional: bool = False  # a part that is not installed, and need not be
+    found: str  # version or state, or the fault
+    advice: str = ""  # what to do; empty if nothing
+    optional: bool = False  # an optional part that is not installed
 
 
 def doctor(
@@ -79,7 +79,7 @@ def doctor(
 
 
 def check(path: Path) -> Iterator[Finding]:
-    """Findings, each as soon as it is known."""
+    """Yield each finding as soon as it is known."""
     yield _python()
     yield from _packages()
     yield from map(_extra, _EXTRAS)
@@ -106,7 +106,7 @@ def _python() -> Finding:
 
 
 def _packages() -> Iterator[Finding]:
-    """A finding for each package the installation says it needs on this machine, extras left out."""
+    """Yield a finding for each package that this installation needs, without the extras."""
     try:
         from packaging.requirements import Requirement
 
@@ -128,7 +128,7 @@ def _packages() -> Iterator[Finding]:
 
 
 def _installed() -> str:
-    """Name of the distribution that this installation is of: the whole, or a robot's."""
+    """Return the name of the installed distribution: the whole tsfusion, or a robot's `tsfusion-client`."""
     try:
         metadata.version("tsfusion")
     except metadata.PackageNotFoundError:
@@ -154,7 +154,7 @@ def _package(requirement: "Requirement") -> Finding:
 
 
 def _extra(name: str) -> Finding:
-    """A finding for an optional part: no fault when it is missing, one when it is broken."""
+    """Return a finding for an optional part. A missing part is no fault, a broken one is."""
     package, purpose = _EXTRAS[name]
     install = f"pip install '.[{name}]' in your clone of tsfusion"
     try:
@@ -213,7 +213,7 @@ def _disk(path: Path) -> Finding:
 
 
 def _guarded(check: Callable[[], Finding], name: str, advice: str) -> Finding:
-    """The finding of a check, or the error that it raised."""
+    """Return the finding of a check, or its error as a finding."""
     try:
         return check()
     except Exception as error:  # noqa: BLE001  any error of a check is its finding

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""`tsfusion map forget`."""
+"""`tsfusion map forget`: remove keyframes from a map for good."""
 
 import re
 import sys
@@ -17,7 +17,7 @@ from tsfusion.core.readable_numbers import count_of
 if TYPE_CHECKING:
     from tsfusion.wire.messages.forget_messages import Forgotten, Selection
 
-_MOST_SESSIONS = 20  # printed; --json has all
+_MOST_SESSIONS = 20  # lines printed; --json has all
 _EXAMPLES = (
     "tsfusion map forget my-maps --session 3f2a91bc",
     "tsfusion map forget tcp://server:5555 --client robot1 --since 90 --erase",
@@ -32,7 +32,7 @@ _REMAINS = (
 
 
 def register(app: typer.Typer) -> None:
-    """Make `forget` a verb of `tsfusion map`."""
+    """Add `forget` to the verbs of `tsfusion map`."""
     verbs.verb(app, *_EXAMPLES)(forget)
 
 
@@ -123,7 +123,7 @@ def _selection(
     keyframes: str | None,
     box: tuple[float, ...] | None,
 ) -> "Selection":
-    """The keyframes that the flags name; raises InvalidConfig for nonsense, or when there is no flag."""
+    """Return the selection that the flags name. Raise InvalidConfig for a bad flag, or without any flag."""
     import math
 
     from tsfusion.core import number_ranges
@@ -154,7 +154,7 @@ def _selection(
 
 
 def _moment_ns(text: str) -> int:
-    """A time of the wall clock; below zero, so long before the last record."""
+    """Return a time in ns of the wall clock; a negative number counts back from the last record."""
     import time
 
     from tsfusion.journal import journaled_keyframes
@@ -171,7 +171,7 @@ def _moment_ns(text: str) -> int:
 def _target(
     where: str, map_: str | None, link: dict[str, str | None], *, quiet: bool
 ) -> "Iterator[Callable[..., Forgotten]]":
-    """Forget keyframes of a server's map, or of one that no server uses."""
+    """Yield a function that forgets keyframes, of a server's map or of a map that no server uses."""
     if "://" in where:
         from tsfusion.core.config import DEFAULT_MAP
         from tsfusion.wire.asking import queries
@@ -196,7 +196,7 @@ def _target(
 
 
 def _confirm(found: "Forgotten", *, erase: bool, yes: bool) -> None:
-    """Ask whether to go on; raises InvalidConfig where nobody can be asked."""
+    """Ask the user to confirm. Raise InvalidConfig if there is no terminal to ask at."""
     from tsfusion.core.errors import InvalidConfig
 
     what = f"{count_of(found.selected, 'keyframe')} of {count_of(len(found.sessions), 'session')}"

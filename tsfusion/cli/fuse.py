@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""`tsfusion fuse`."""
+"""`tsfusion fuse`: fuse journals and recordings with many processes, or a cluster."""
 
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any

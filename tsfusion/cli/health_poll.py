@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Ask a server how it is, once or again and again, and judge whether it is well."""
+"""Ask a server for its health, once or repeatedly, and judge if it is well."""
 
 import time
 from typing import Any
@@ -13,30 +13,30 @@ from tsfusion.core.readable_numbers import count_of
 from tsfusion.wire.asking.queries import CommandRefused, fetch_health, fetch_status
 from tsfusion.wire.messages.health import Health, MapHealth, Status
 
-READY, NOT_READY = 0, 3  # exit statuses; 1 is every error's, also that nobody answers
-_RECHECK_INTERVAL = 0.5  # seconds between the checks that tell a stall from a pause
-_MIN_TIMEOUT = 0.2  # seconds for a fuser's answer
+READY, NOT_READY = 0, 3  # exit statuses; 1 is for errors, also if no server answers
+_RECHECK_INTERVAL = 0.5  # seconds between two checks for a stall
+_MIN_TIMEOUT = 0.2  # minimum seconds to wait for a fuser's answer
 _OF_KEYFRAMES = frozenset({"durable", "fused", "waiting", "skipped", "refused", "rejected", "quarantined"})
 
 
 class ServerSnapshot(Struct, frozen=True, kw_only=True):
     """State of a server at one moment."""
 
-    address: str  # of the server, for a person
-    health: Health | None = None  # the gateway's answer; None = it did not answer
+    address: str  # address of the server, for the user
+    health: Health | None = None  # the gateway's answer; None if it did not answer
     error: str = ""  # why it did not answer
-    maps: dict[str, Status] = {}  # map → status of its fuser, where that answered
+    maps: dict[str, Status] = {}  # map → status of its fuser, if the fuser answered
     unavailable: dict[str, str] = {}  # map → why its fuser's status is not known
-    still: dict[str, float] = {}  # map → seconds for which keyframes have waited there and none was fused
-    stalled: dict[str, float] = {}  # the same, of maps where that is too long
-    rate: float = 0.0  # keyframes fused a second in the last seconds; 0 = not known
-    older: dict[str, Status] = {}  # map → last known status of a fuser that has too much to do to be asked
-    missing: str = ""  # the map that was asked for and is not open; empty = it is, or none was asked for
-    only: str = ""  # the map that was asked for; empty = all
+    still: dict[str, float] = {}  # map → seconds in which keyframes waited and none was fused
+    stalled: dict[str, float] = {}  # the same, only of maps in which this is too long
+    rate: float = 0.0  # keyframes a second fused lately; 0 if unknown
+    older: dict[str, Status] = {}  # map → last known status of a fuser that is too busy to be asked
+    missing: str = ""  # map that was asked for and is not open, if any
+    only: str = ""  # map that was asked for; empty for all
 
     @property
     def problems(self) -> list[str]:
-        """Faults of the server, one sentence each; empty = all is well."""
+        """Faults of the server, one sentence each; empty if all is well."""
         if self.health is None:
             return [self.error]
         found = [*self.health.problems]
@@ -51,7 +51,7 @@ class ServerSnapshot(Struct, frozen=True, kw_only=True):
 
     @property
     def exit_status(self) -> int:
-        """0 = ready; 3 = not ready, or a map is blocked or stalled. Counts the map asked for, or all."""
+        """0 if ready; 3 if not ready, or a map is blocked or stalled. Counts the map asked for, or all."""
         assert self.health is not None
         if self.only and not self.missing:
             one = self.health.maps[self.only]
@@ -62,7 +62,7 @@ class ServerSnapshot(Struct, frozen=True, kw_only=True):
         return READY if well and not self.stalled else NOT_READY
 
     def as_json(self) -> dict[str, Any]:
-        """The snapshot as plain values that JSON has."""
+        """Return the snapshot as plain values for JSON."""
         fields = {"health": self.health, "maps": self.maps, "unavailable": self.unavailable,
                   "stalled": list(self.stalled), "exit_status": self.exit_status}  # fmt: skip
         plain: dict[str, Any] = msgspec.to_builtins(fields)
@@ -75,19 +75,19 @@ class ServerSnapshot(Struct, frozen=True, kw_only=True):
 
 
 def _with_units(counts: dict[str, Any]) -> dict[str, Any]:
-    """The fields of a map or client, named for what they count."""
+    """Return the fields of a map or client, with `keyframes_` before the names of counts of keyframes."""
     return {f"keyframes_{name}" if name in _OF_KEYFRAMES else name: one for name, one in counts.items()}
 
 
 class ServerWatcher:
-    """Takes snapshots of a server, and remembers when each map last fused something.
+    """Takes snapshots of a server, and remembers when each map last fused a keyframe.
 
     Args:
         address: the server's data address.
         timeout: seconds to wait for an answer.
-        stall_after: seconds without a keyframe fused, while some wait, that make a stall.
-        only: one map's name; empty = all.
-        connection: `control` and `keys` of `fetch_health`.
+        stall_after: a map stalls if keyframes wait and none is fused for so many seconds.
+        only: name of the only map to ask about; empty for all.
+        connection: arguments `control` and `keys` of `fetch_health`.
     """
 
     def __init__(
@@ -95,13 +95,13 @@ class ServerWatcher:
     ) -> None:
         self._address, self._connection = address, connection
         self._timeout, self._stall_after, self._only = timeout, stall_after, only
-        self._moved: dict[str, tuple[object, float]] = {}  # map → how far it was, since when
-        self._statuses: dict[str, tuple[object, Status]] = {}  # map → how far it was, and its status then
+        self._moved: dict[str, tuple[object, float]] = {}  # map → its last progress, and since when
+        self._statuses: dict[str, tuple[object, Status]] = {}  # map → its progress, and its status then
         self._asked = self._well = time.monotonic()
         self._rates = Rates()
 
     def check_once(self) -> ServerSnapshot:
-        """A snapshot; where keyframes wait, it takes until one is fused or `stall_after` is over.
+        """Return a snapshot. If keyframes wait, first wait until one is fused or `stall_after` is over.
 
         Raises:
             TransportError: when the server does not answer.
@@ -119,7 +119,7 @@ class ServerWatcher:
             time.sleep(_RECHECK_INTERVAL)
 
     def check_again(self) -> ServerSnapshot:
-        """The next snapshot of many: a fuser is asked only when it has nothing else to do.
+        """Return the next snapshot of many. A busy fuser is not asked.
 
         Raises:
             TransportError: when the server does not answer.
@@ -133,7 +133,7 @@ class ServerWatcher:
 
     @property
     def unwell(self) -> bool:
-        """True if no snapshot of the last `stall_after` seconds was ready, the newest included."""
+        """True if no snapshot in the last `stall_after` seconds was ready, not even the newest."""
         return self._asked - self._well >= self._stall_after
 
     def _health(self) -> Health:
@@ -157,7 +157,7 @@ class ServerWatcher:
                 since = now
             self._moved[name] = (progress, since)
             if one.waiting:
-                still[name] = max(now - since, one.fusing_s)  # it may have stood still before we came
+                still[name] = max(now - since, one.fusing_s)  # it may have stalled before the first snapshot
         rate, _ = self._rates(sum(one.keyframes_fused for one in selected.values()), 0)
         missing = self._only if self._only and not selected else ""
         return ServerSnapshot(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""`tsfusion journal`: describe a journal, check it, save its whole keyframes, export it to other tools."""
+"""`tsfusion journal`: describe or check a journal, save its whole keyframes, export it to other tools."""
 
 from collections.abc import Callable
 from functools import partial
@@ -155,7 +155,7 @@ def _run(
     *,
     json: bool,
 ) -> _Returned:
-    """Do one verb's work on a journal, with progress on stderr, and print its result."""
+    """Do the work of a verb on a journal, with progress on stderr, and print its result."""
     from tsfusion.cli import output, progress
     from tsfusion.journal.state_folder import find_journal
 
@@ -171,7 +171,7 @@ def _run(
 
 
 def _check_journal(place: "JournalPlace") -> None:
-    """Raise JournalError where there is nothing to read: no segment, or one file that is no MCAP."""
+    """Raise JournalError if there is no segment, or if a single file is no MCAP."""
     from tsfusion.core.errors import JournalError
     from tsfusion.journal.mcap_layout import MAGIC
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""`tsfusion keys new|list|allow|revoke`, and `tsfusion config dump`."""
+"""`tsfusion keys new|list|allow|revoke`: manage keys; and `tsfusion config dump`."""
 
 import shlex
 from pathlib import Path

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""`tsfusion map`: saved maps, described, compared, put together and taken apart without a server."""
+"""`tsfusion map`: describe, compare, merge, crop, convert and align saved maps; move live ones."""
 
 import shlex
 from pathlib import Path
@@ -353,7 +353,7 @@ def resume(
 
 
 def _load(path: Path, map_name: str | None = None, *, quiet: bool) -> "Volume":
-    """Read a map, with all that a journal holds beyond it."""
+    """Load a map with all that its journal holds beyond the checkpoint."""
     from tsfusion.tsdf.files import map_history
     from tsfusion.tsdf.volume import Volume
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Saved maps and their differences in words, and `tsfusion map convert`."""
+"""Describe saved maps and their differences in words, and write files for `tsfusion map convert`."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -46,17 +46,17 @@ Resolution = Annotated[float | None, typer.Option(metavar="METRES", help="Cell o
 
 
 def figures(volume: "Volume") -> dict[str, Any]:
-    """Figures of a map that was written, for a program."""
+    """Return the figures of a written map, for JSON."""
     stats = volume.stats()
     return {"map_hash": volume.map_hash(), "keyframes": stats.keyframes, "blocks": stats.blocks}
 
 
 def line(out: Path, volume: "Volume") -> str:
-    """A line on a map that was written, for a person."""
+    """Return a line about a written map, for the user."""
     from tsfusion.cli.output import size
 
     stats = volume.stats()
-    nbytes = sum(one.stat().st_size for one in (out, *out.rglob("*")) if one.is_file())  # of a folder, too
+    nbytes = sum(one.stat().st_size for one in (out, *out.rglob("*")) if one.is_file())  # .zarr is a folder
     return (
         f"{out}: {count_of(stats.keyframes, 'keyframe')}, {count_of(stats.blocks, 'block')}, "
         f"{size(nbytes)}, hash {volume.map_hash()}"
@@ -64,7 +64,7 @@ def line(out: Path, volume: "Volume") -> str:
 
 
 def serve_flags(settings: dict[str, Any]) -> list[str]:
-    """Flags of `serve` for settings that are not the usual ones; those without a flag in a comment."""
+    """Return flags of `serve` for unusual settings. Settings without a flag are in a comment at the end."""
     from msgspec import to_builtins
 
     from tsfusion.core.config import LIMIT_SETTINGS, RUN_SETTINGS, VIEW_SETTINGS, VolumeConfig
@@ -86,7 +86,7 @@ def serve_flags(settings: dict[str, Any]) -> list[str]:
 
 
 def difference(found: "MapDifference") -> str:
-    """Describe what is different between two maps."""
+    """Return in words the difference between two maps."""
     from tsfusion.cli.output import grouped
 
     lines = [f"{kind.replace('_', ' '):<15} {area:9.3f} m²" for kind, area in found.area_m2.items()]
@@ -97,7 +97,7 @@ def difference(found: "MapDifference") -> str:
 
 
 def summary(found: "MapSummary") -> str:
-    """Describe a saved map."""
+    """Return a description of a saved map."""
     from msgspec import to_builtins
 
     from tsfusion.cli.output import counted, grouped, size
@@ -130,7 +130,7 @@ def summary(found: "MapSummary") -> str:
 
 
 def _poses(world: str) -> str:
-    """Where a session's poses come from, by its world."""
+    """Return in words where a session's poses come from, by its world."""
     from tsfusion.geometry.origin import Origin
 
     if origin := Origin.of_world(world):
@@ -151,7 +151,7 @@ def _listed(one: "SessionSummary") -> str:
 
 
 def _behind(found: "MapSummary") -> str:
-    """Records of the journal that the map lacks, counted; empty = it has all."""
+    """Return in words how many records of the journal the map lacks; empty if it has all."""
     words = [
         count_of(count, noun)
         for count, noun in (
@@ -178,10 +178,10 @@ def check(
     given: dict[str, Any],
     overwrite: bool,
 ) -> None:
-    """Refuse what cannot be written, and flags without effect, before the map is read.
+    """Refuse files that cannot be written and flags without effect, before the map is read.
 
     Args:
-        given: flags that are of a slice alone, `heights` among them.
+        given: flags that only concern a slice, `heights` included.
     """
     from tsfusion.core.errors import InvalidConfig
     from tsfusion.core.output_folder import check_writable
@@ -214,7 +214,7 @@ def check(
 def write_slice(
     volume: "Volume", out: Path, field: str | None, max_distance: float | None, given: dict[str, Any]
 ) -> list[Path]:
-    """Write a slice; returns the files."""
+    """Write a slice. Return the files."""
     from tsfusion.core.errors import OutputError
 
     how = {name: given[name] for name in ("box", "resolution", "above_floor")}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""`tsfusion mesh`."""
+"""`tsfusion mesh`: write the mesh of a saved map, a live server, or a journal."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -164,7 +164,7 @@ def mesh(
         made = replace(made, known_up=given_up)
     with _stage(f"finishing the mesh of {source}", json or finishing.is_nothing):
         made, dropped = finishing.apply(made)
-    if texture:  # a live server has none
+    if texture:  # with a live server, --texture was refused
         made = _textured(made, Path(source), map_, found, size=texture_size, view=view, quiet=json)
     files = [out] if preview is None else [out, preview]
     left_out = mesh_finishing.write(made, files, keep_islands=keep_islands if min_component is None else True)
@@ -180,7 +180,7 @@ def mesh(
 
 
 def _check(lost: int) -> None:
-    """Raise IncompleteRun where damage has cost keyframes: the last line, and status 1."""
+    """Raise IncompleteRun if damage has cost keyframes. It gives the last line, and status 1."""
     from tsfusion.core.errors import IncompleteRun
     from tsfusion.pipelines.report import shortfall
 
@@ -189,7 +189,7 @@ def _check(lost: int) -> None:
 
 
 def _refuse_for_server(context: typer.Context) -> None:
-    """Raise InvalidConfig for flags that a live server's map does not take."""
+    """Raise InvalidConfig for flags that have no effect on a live server's map."""
     options.refuse(context, _OF_A_JOURNAL, "needs a journal: give the state folder of the server")
     options.refuse(
         context, {*options.MAP_OPTIONS, "config", "memory"} - {"min_weight"},
@@ -199,7 +199,7 @@ def _refuse_for_server(context: typer.Context) -> None:
 
 
 def _refuse_for_files(context: typer.Context, source: str) -> None:
-    """Raise InvalidConfig for flags that a map of files does not take."""
+    """Raise InvalidConfig for flags that have no effect on files."""
     options.refuse(
         context, ("control", "key", "server_key"),
         f"has no effect on {source}: only a live server (tcp://…) has one",
@@ -216,7 +216,7 @@ def _refuse_for_files(context: typer.Context, source: str) -> None:
 
 
 def _saved_settings(source: str, map_: str | None) -> dict[str, Any]:
-    """Settings of the map that a server has saved of a journal; flags and the file are on top of them."""
+    """Return settings of the map that a server saved beside a journal. Flags and a file override them."""
     from tsfusion.cluster.keyframe_sources import saved_beside, settings_of
 
     is_journal = not source.endswith(".tsf") and Path(source).exists()
@@ -231,7 +231,7 @@ def _of_server(
     control: str | None,
     min_weight: float | None,
 ) -> "tuple[Mesh, dict[str, int]]":
-    """The mesh of a live map, and how far that was behind when it was asked for."""
+    """Return the mesh of a live map, and how many keyframes and corrections waited at that time."""
     from dataclasses import replace
 
     from tsfusion.core.config import DEFAULT_MAP
@@ -251,7 +251,7 @@ def _of_server(
 
 
 def _extracted(volume: "Volume", source: str, fill_holes: int | None, json: bool) -> "Mesh":
-    """The mesh of a map in memory, which knows where it comes from."""
+    """Return the mesh of a map in memory, with its provenance."""
     from dataclasses import replace
 
     with _stage(f"closing holes of {source}", json or fill_holes is None):
@@ -278,7 +278,6 @@ def _textured(
     view: dict[str, Any],
     quiet: bool,
 ) -> "Mesh":
-    """The mesh with a texture from the journal's images."""
     from tsfusion.cli import opened_maps, progress
     from tsfusion.journal import state_folder
     from tsfusion.pipelines.maps import journal_fusion
@@ -297,7 +296,7 @@ def _textured(
 def _write_tiles(
     found: "JournalMap", source: str, out: Path, up: "Up | None", *, min_component: float | None, json: bool
 ) -> None:
-    """Write the mesh in bounded memory."""
+    """Write the mesh part by part, in bounded memory."""
     from tsfusion.cli import progress
     from tsfusion.geometry import mesh_parts
 
@@ -332,7 +331,7 @@ def _map(
     quiet: bool,
     view: dict[str, Any],
 ) -> "JournalMap":
-    """The saved map where it is complete; otherwise a new map of every keyframe of the journal."""
+    """Return a saved map, or the map of a state folder or a journal. Print what it lacks on stderr."""
     from tsfusion.cli import opened_maps, progress
     from tsfusion.core.config import VIEW_SETTINGS
     from tsfusion.core.errors import DatasetError

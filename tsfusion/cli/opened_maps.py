@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Maps that a verb reads, with what it shows on stderr meanwhile."""
+"""Open the maps that a verb reads, and show progress on stderr meanwhile."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,15 +14,15 @@ from tsfusion.core.readable_numbers import count_of
 
 JOURNAL = "reading the journal"
 _LARGE_BYTES = 64 << 20  # of a file: reading it takes seconds
-_lost = list[int]()  # to damage: keyframes of the maps that this command has opened
+_lost = list[int]()  # keyframes lost to damage, of each map that this command has opened
 
 
 def memory_for(file: Path, memory_bytes: int | None = None, *, maps: int = 1) -> int | None:
-    """Memory that a saved map may take, the rest waits in files; None = all of it, where it surely fits.
+    """Return the bytes that a saved map may take in memory (the rest stays in files), or None if all fits.
 
     Args:
-        memory_bytes: that a person gave for it.
-        maps: that are open at the same time.
+        memory_bytes: number that the user gave, if any.
+        maps: number of maps that are open at the same time.
     """
     from tsfusion.pipelines.maps import saved_maps
 
@@ -31,9 +31,9 @@ def memory_for(file: Path, memory_bytes: int | None = None, *, maps: int = 1) ->
 
 @contextmanager
 def opened(path: Path, map_name: str | None = None, *, quiet: bool) -> Iterator[Path]:
-    """The file of a map; one of a state folder is brought up to date in a copy, with progress on stderr.
+    """Yield the file of a map. That of a state folder is brought up to date in a copy, with progress shown.
 
-    Where damage in its journal has cost keyframes, the command ends with status 1, after its results.
+    If damage in its journal has cost keyframes, the command ends with status 1, after its results.
     """
     from tsfusion.cli import progress
     from tsfusion.journal.journaled_keyframes import LOST
@@ -57,17 +57,17 @@ def opened(path: Path, map_name: str | None = None, *, quiet: bool) -> Iterator[
 
 
 def note_lost(keyframes: int) -> None:
-    """Note how many keyframes damage has cost a map that this command reads."""
+    """Remember how many keyframes damage has cost a map that this command reads."""
     _lost.append(keyframes)
 
 
 def begin() -> None:
-    """Forget which maps were opened before this command."""
+    """Clear the losses that an earlier command in this process has noted."""
     _lost.clear()
 
 
 def end() -> None:
-    """Raise IncompleteRun where damage has cost maps that the command has opened keyframes: its last line."""
+    """Raise IncompleteRun if damage has cost keyframes of a map that this command opened: its last line."""
     if any(_lost):
         from tsfusion.pipelines.report import shortfall
 

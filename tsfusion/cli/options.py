@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Flags that several verbs share, and the configuration they make.
+"""Define flags that several verbs share, and make the configuration from flags and files.
 
 A flag beats its environment variable, which beats the file, which beats the
 default in `tsfusion.core.config`.
@@ -23,13 +23,13 @@ if TYPE_CHECKING:
 def option(
     flag: str, metavar: str | None, help_: str, *, panel: str | None = None, rare: bool = False, **more: Any
 ) -> Any:
-    """A flag; a rare one is shown by `--help-all` alone."""
+    """Define a flag. Only `--help-all` shows a rare flag."""
     return typer.Option(flag, metavar=metavar, rich_help_panel=panel, help=help_, hidden=rare, **more)
 
 
 _map_option = functools.partial(option, panel="Map")
 
-# By name: a setting of the `volume` table, or one that `configuration` turns into some.
+# By name: a setting of the `volume` table, or a flag that `configuration` turns into such settings.
 MAP_OPTIONS: dict[str, Any] = {
     "voxel_size": Annotated[float | None, _map_option(
         "--voxel-size", "METRES", "Edge of a voxel (0.02; LiDAR, street 0.1).")],
@@ -61,11 +61,11 @@ MAP_OPTIONS: dict[str, Any] = {
         "--threads", "N", "Threads of the kernels; default: all cores. Results do not depend on it.",
         rare=True)],
 }  # fmt: skip
-VIEW_OPTIONS = ("min_weight", "surface", "lambda_", "threads")  # these change nothing that is stored
+VIEW_OPTIONS = ("min_weight", "surface", "lambda_", "threads")  # flags that do not change the stored map
 
 
 def takes_map_settings(verb: Callable[..., Any], also: dict[str, Any] | None = None) -> Callable[..., Any]:
-    """Let Typer see every one of `MAP_OPTIONS` and `also` as a flag of a verb that ends with `**settings`."""
+    """Add each of `MAP_OPTIONS` and `also` as a flag for Typer to a verb that ends with `**settings`."""
     signature = inspect.signature(verb)
     own = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
     added = {**(also or {}), **MAP_OPTIONS, "help_all": verbs.HelpAll}
@@ -173,27 +173,27 @@ _DEFAULTS = dict.fromkeys(("overwrite", "json", "same_frame", "unpack"), False) 
 
 
 def settings(flags: Mapping[str, Any]) -> dict[str, Any]:
-    """Those of a run's flags that are settings of a file, too."""
+    """Return the flags of a run that are also settings of a configuration file."""
     return {name: value for name, value in flags.items() if name not in RUN_OPTIONS or name == "origin"}
 
 
 def recording_options(flags: Mapping[str, Any], **more: Any) -> dict[str, Any]:
-    """Settings of a dataset that flags and `--option` give."""
+    """Return the settings of a dataset that flags and `--option` give."""
     names = ("unpack", "sequence", "modality", "origin")
     given = {name: flags[name] for name in names} | more
     return dataset_options(flags["option"], **given, **camera(flags["intrinsics"], flags["calibration"]))
 
 
 def is_typed(context: typer.Context, name: str) -> bool:
-    """True if a parameter was typed, False if it is its default or set by the environment."""
+    """True if a parameter was typed; False for its default or an environment variable."""
     source = context.get_parameter_source(name)
     return source is not None and source.name == "COMMANDLINE"
 
 
 def refuse(context: typer.Context, names: Collection[str], reason: str) -> None:
-    """Raise InvalidConfig when one of these parameters was typed: it would be ignored.
+    """Raise InvalidConfig if one of these parameters was typed, because it would be ignored.
 
-    One that the environment sets is no error: it may be meant for other commands.
+    A value from an environment variable is no error: it may be meant for other commands.
     """
     from tsfusion.core.errors import InvalidConfig
 
@@ -203,10 +203,10 @@ def refuse(context: typer.Context, names: Collection[str], reason: str) -> None:
 
 
 def configuration(file: Path | None, *, preset: dict[str, Any] | None = None, **flags: Any) -> "Config":
-    """The file's settings (or the defaults) with every flag that was given on top.
+    """Return the file's settings (or the defaults), overridden by the flags that were given.
 
     Args:
-        preset: settings of the `volume` table that beat the defaults, and nothing else.
+        preset: settings of the `volume` table that override only the defaults.
         flags: settings of the `volume`, `server` and `scan` tables by name; None = not given.
 
     Raises:
@@ -223,7 +223,7 @@ def configuration(file: Path | None, *, preset: dict[str, Any] | None = None, **
 
 
 def _with_flags(table: Any, flags: Mapping[str, Any]) -> Any:
-    """A table of settings with the flags on top that are its own; None = not given."""
+    """Return a table of settings, overridden by its own flags; None = not given."""
     from tsfusion.core import config
 
     settings = {**flags, **_band(flags.get("truncation"), flags.get("support"))}
@@ -243,14 +243,15 @@ def configuration_for(
     preset: dict[str, Any] | None = None,
     **flags: Any,
 ) -> "Config":
-    """`configuration` where a recording says its sensor, and maybe other settings that are usual for it; else
-    the voxels that are usual for the sensor that is chosen in the end.
+    """Return the configuration for a recording, which may name its sensor and other usual settings.
+
+    Without such settings the voxel size is the usual one of the sensor.
 
     Args:
-        recorded: name of the recording's sensor; None = it says none.
-        usual: settings of the `volume` table, of the recording; empty or None = it says none.
-        tell: say so where they, or the sensor, decide how large voxels are.
-        preset: as of `configuration`; beats the recording.
+        recorded: name of the recording's sensor; None if the recording names none.
+        usual: the recording's settings for the `volume` table; empty or None without any.
+        tell: print a line if these settings or the sensor decide the voxel size.
+        preset: see `configuration`; overrides the recording.
     """
     from tsfusion.core.config import USUAL_VOXEL_SIZES
 
@@ -268,17 +269,17 @@ def configuration_for(
 
 
 def own_volume(chosen: "Config", client: "ClientConfig", flags: Mapping[str, Any]) -> "VolumeConfig":
-    """Settings of the map of a run with a server of its own: those of `[maps.NAME]`, where it has some.
+    """Return settings of the map of a run's own server: those of `[maps.NAME]`, if there are any.
 
     Args:
-        flags: of the command line, which beat them.
+        flags: flags of the command line, which override them.
     """
     own = chosen.volumes().get(client.map)
     return chosen.volume if own is None else cast("VolumeConfig", _with_flags(own, flags))
 
 
 def byte_count(text: str | None) -> int | None:
-    """Bytes of `2GB`, `512MiB` or a number; None = not given.
+    """Return the number of bytes of `2GB`, `512MiB` or a plain number, or None for None.
 
     Raises:
         InvalidConfig: for anything else.
@@ -298,21 +299,22 @@ def byte_count(text: str | None) -> int | None:
 
 
 def up_direction(text: str | None) -> "Up | None":
-    """Direction of --up; raises InvalidConfig for nonsense."""
+    """Return the direction of --up, or None. Raise InvalidConfig for a bad value."""
     from tsfusion.geometry import up_direction
 
     return None if text is None else up_direction.parse(text)
 
 
 def dataset_options(given: list[str] | None, **flags: Any) -> dict[str, Any]:
-    """`flags`, and on top what `--option` gives: `KEY=VALUE` each; numbers, true, false and lists as in JSON,
-    anything else is text.
+    """Return `flags` together with the `KEY=VALUE` settings of `--option`.
+
+    A VALUE is a number, true, false or a list as in JSON; anything else is text.
 
     Args:
-        flags: what flags of their own give to the same dataset or source; None and False = not given.
+        flags: settings of the same dataset or source from other flags; None and False = not given.
 
     Raises:
-        InvalidConfig: for one that is not `KEY=VALUE`, or is given by its flag, too.
+        InvalidConfig: for a setting that is not `KEY=VALUE`, or is given by its flag, too.
     """
     import json
 
@@ -333,10 +335,10 @@ def dataset_options(given: list[str] | None, **flags: Any) -> dict[str, Any]:
 
 
 def camera(intrinsics: str | None, calibration: Path | None) -> dict[str, Any]:
-    """The camera's options of a dataset or a live source; None = not given.
+    """Return the camera's options of a dataset or a live source; None = not given.
 
     Raises:
-        InvalidConfig: not four numbers, or both given.
+        InvalidConfig: when these are not four numbers, or both are given.
     """
     from tsfusion.core.errors import InvalidConfig, InvalidKeyframe
     from tsfusion.geometry.keyframe import Intrinsics, check_intrinsics
@@ -355,7 +357,7 @@ def camera(intrinsics: str | None, calibration: Path | None) -> dict[str, Any]:
 
 
 def client_settings(config: "Config", connect: str | None = None, **flags: str | None) -> "ClientConfig":
-    """The client's settings with every flag that was given on top; a server of the run's own has no keys."""
+    """Return the client's settings, overridden by flags. They have no keys for a run's own server."""
     from msgspec.structs import replace
 
     from tsfusion.core.config import override
@@ -371,10 +373,10 @@ _OF_KEPT_MAPS = (
 
 
 def own_server(config: "Config", state: Path | None) -> "ServerConfig":
-    """Settings of a run's own server, which only this machine reaches, and whose errors are shown here.
+    """Return settings of a run's own server: only this machine reaches it, and its errors are shown here.
 
     Args:
-        state: where it keeps its journals and maps; None = they are thrown away.
+        state: folder for its journals and maps; None = they are thrown away.
     """
     from msgspec.structs import replace
 
@@ -382,7 +384,7 @@ def own_server(config: "Config", state: Path | None) -> "ServerConfig":
     from tsfusion.pipelines.runs.target_server import MAPS, THROWN_AWAY
 
     server = config.server
-    if state is None:  # all of the recording is to be in a map that is made for it
+    if state is None:  # a map made for this run keeps all of the recording
         usual = ServerConfig()
         server = replace(server, **{name: getattr(usual, name) for name in _OF_KEPT_MAPS})
     return replace(
@@ -393,7 +395,7 @@ def own_server(config: "Config", state: Path | None) -> "ServerConfig":
 
 
 def only_for_kept_maps(state: Path | None) -> set[str]:
-    """The parameters that mean nothing to a server of the run's own whose maps are new."""
+    """Return the parameters that have no effect on a run's own server if its maps are new."""
     return set() if state is not None else {"same_frame"}
 
 
@@ -403,9 +405,9 @@ def check_target_flags(
     """Raise InvalidConfig for a typed flag that would be ignored.
 
     Args:
-        connect: address of a server elsewhere; None = the run starts its own.
-        own: parameters for a server of the run's own.
-        remote: parameters, besides the connection's, for a server elsewhere.
+        connect: address of a server elsewhere; None if the run starts its own.
+        own: parameters for a run's own server.
+        remote: parameters for a server elsewhere, besides those of the connection.
     """
     if connect is None:
         refuse(context, {"control", "key", "server_key", *remote}, "has no effect without --connect")
@@ -415,7 +417,7 @@ def check_target_flags(
 
 
 def _band(truncation: float | None, support: str | None) -> dict[str, float]:
-    """The settings that --truncation or --support stand for."""
+    """Return the settings that --truncation or --support set."""
     from tsfusion.core.errors import InvalidConfig
 
     if truncation is not None and support is not None:
@@ -431,7 +433,7 @@ def _band(truncation: float | None, support: str | None) -> dict[str, float]:
     names = "min_support", "max_support", "min_behind"
     try:
         numbers = support.split(":")
-        if len(numbers) == 3 and any(numbers):  # of three, those that are left out stay as they are
+        if len(numbers) == 3 and any(numbers):  # an empty one of three numbers leaves its setting unchanged
             return {name: float(number) for name, number in zip(names, numbers, strict=True) if number}
         return dict(zip(names[:2], map(float, numbers), strict=True))
     except ValueError as error:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Results on stdout."""
+"""Print results on stdout."""
 
 import json
 import sys
@@ -13,16 +13,16 @@ __all__ = ["as_json", "counted", "grouped", "size", "text"]
 
 
 def text(text: str, *, err: bool = False, indent: int = 2) -> None:
-    """Print text on stdout or stderr, broken between words where a terminal is narrower.
+    """Print text on stdout or stderr, with long lines broken between words on a narrow terminal.
 
     Args:
-        indent: columns before what follows the first part of a line.
+        indent: columns before the broken-off parts of a line.
     """
     typer.echo(fitted(text, sys.stderr if err else sys.stdout, indent=indent), err=err)
 
 
 def as_json(value: Any, *, indent: int | None = 2) -> None:
-    """Print a struct or dict as JSON on stdout; on one line where `indent` is None."""
+    """Print a struct or dict as JSON on stdout, on one line if `indent` is None."""
     from msgspec import to_builtins
 
     typer.echo(json.dumps(to_builtins(value), indent=indent, ensure_ascii=False))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Progress of a run on stderr: a table that moves on a terminal, plain lines elsewhere, or nothing."""
+"""Show the progress of a run on stderr: a live table on a terminal, plain lines elsewhere, or nothing."""
 
 import logging
 import os
@@ -30,16 +30,16 @@ if TYPE_CHECKING:
     from tsfusion.scanner.scanner import ScanState
 
 _LINE_INTERVAL = 2.0  # seconds between plain lines
-_DRAWINGS = 5  # of a table, a second
+_DRAWINGS = 5  # redraws of a table per second
 _ENDING = b"\nending: what is on its way is finished (press Ctrl-C again to end at once)\n"
-STILL = 5.0  # seconds in which nothing comes, or is fused, until that is said
-_WIDTHS = (9, 13, 8, 18)  # columns at least: name, amount, rate, note
-_BAR_WIDTHS = (8, 26)  # columns at least and at most
+STILL = 5.0  # seconds without new counts, or without a keyframe fused, until this is shown
+_WIDTHS = (9, 13, 8, 18)  # minimum columns of name, amount, rate and note
+_BAR_WIDTHS = (8, 26)  # minimum and maximum columns
 _STYLES = {"good": "green", "notice": "yellow", "bad": "bold red"}
 
 
 class ScreenRow(NamedTuple):
-    """A name and figures; `share`: 0 to 1 of a bar, None = no bar."""
+    """A name with figures. `share` is the filled part of a bar, 0 to 1, or None without a bar."""
 
     name: str
     amount: str
@@ -52,7 +52,7 @@ class ScreenRow(NamedTuple):
 
 
 class Note(NamedTuple):
-    """A name and words."""
+    """A name with words."""
 
     name: str
     text: str
@@ -63,19 +63,19 @@ class Note(NamedTuple):
 
 
 class Screen(NamedTuple):
-    """Rows of one moment; `headline` None = there are no keyframes."""
+    """Rows to show at one moment. `headline` is None if there are no keyframes."""
 
     rows: list[ScreenRow] = []
     notes: list[Note] = []
     headline: Headline | None = None
 
     def line(self) -> str:
-        """All of it on one line."""
+        """Return all rows and notes on one line."""
         begin = "  " if self.headline is None else f"{self.headline}; "
         return begin + "; ".join(map(str, [*self.rows, *self.notes]))
 
     def table(self, width: int, *, trouble: str = "") -> "RenderableType":
-        """All of it for a terminal of so many columns; `trouble`: what the headline does not know yet."""
+        """Return all rows for a terminal of `width` columns. `trouble` is shown if the headline has none."""
         from msgspec.structs import replace
         from rich.console import Group
 
@@ -87,7 +87,7 @@ class Screen(NamedTuple):
 
 
 def styled(headline: Headline) -> "Text":
-    """A headline in colours, which only support its words."""
+    """Return a headline in colours. The words alone say the same."""
     from rich.text import Text
 
     mark, level = headline.mark
@@ -98,15 +98,15 @@ def styled(headline: Headline) -> "Text":
 
 
 class RunProgress:
-    """Turns the counts of a run into what is shown of it."""
+    """Turns the counts of a run into rows to show."""
 
     def __init__(self) -> None:
         self._rates = Rates()
         self._step: object = None
-        self._moved = 0.0  # time.monotonic(): a keyframe went a step further, or none was under way
+        self._moved = 0.0  # time.monotonic() of the last progress, or of no keyframe under way
 
     def screen(self, total: int | None, stats: "ClientStats", link: str, scan: "ScanState | None") -> Screen:
-        """Rows to show; arguments as of `Progress.update`."""
+        """Return the rows to show; for the arguments see `Progress.update`."""
         taken = stats.sent if scan is None else scan.frames
         taking, fusing = self._rates(taken, stats.fused)
         headline = Headline(
@@ -133,7 +133,7 @@ class RunProgress:
         )
 
     def _standstill(self, stats: "ClientStats") -> str:
-        """For how long keyframes have waited and none was fused; empty = they move, or none waits."""
+        """Return in words how long keyframes wait and none is fused; empty if they move, or none waits."""
         now, step = time.monotonic(), (stats.settled, stats.durable, stats.corrections_waiting)
         if step != self._step or not stats.under_way:
             self._step, self._moved = step, now
@@ -141,7 +141,7 @@ class RunProgress:
 
 
 def fused_rows(read: int, fused: int, total: int, rates: Rates) -> list[ScreenRow]:
-    """Share of a journal that is read, and fused."""
+    """Return rows for the shares of a journal that are read and fused."""
     reading, fusing = rates(read, fused)
     return [
         ScreenRow(
@@ -152,19 +152,19 @@ def fused_rows(read: int, fused: int, total: int, rates: Rates) -> list[ScreenRo
 
 
 def byte_row(text: str, done: int, total: int, rates: Rates) -> ScreenRow:
-    """Bytes that are read, after `text`."""
+    """Return a row with the bytes read, after `text`."""
     rate, _ = rates(done, 0)
     shown = "" if rate is None else f"{size(rate)}/s"
     return ScreenRow(text, f"{size(done)} of {size(total)}", shown, "", _share(done, total))
 
 
 def step_row(text: str, done: int, total: int) -> ScreenRow:
-    """Number of steps done, after `text`."""
+    """Return a row with the number of steps done, after `text`."""
     return ScreenRow(text, f"{done}{_of(total)}", share=_share(done, total))
 
 
 def _trouble(link: str, scan: "ScanState | None") -> str:
-    """Reason why a run does not go on, in two or three words; the notes have the rest."""
+    """Return in two or three words why a run does not go on; the notes say more."""
     if scan is not None and scan.state == "lost":
         return "sensor lost"
     if scan is not None and scan.state == "starting" and scan.why:
@@ -210,7 +210,7 @@ def _delay(scan: "ScanState") -> str:
 
 
 def _grid(rows: list[ScreenRow], width: int) -> "RenderableType":
-    """The rows in columns that do not move while the figures grow."""
+    """Return the rows in columns that do not move while the figures grow."""
     from rich.progress_bar import ProgressBar
     from rich.table import Table
     from rich.text import Text
@@ -234,7 +234,7 @@ def _grid(rows: list[ScreenRow], width: int) -> "RenderableType":
 
 
 def _in_words(note: Note) -> "RenderableType":
-    """A name, and words beside it that begin below each other."""
+    """Return a name with its words in a column beside it."""
     from rich.table import Table
     from rich.text import Text
 
@@ -247,7 +247,7 @@ def _in_words(note: Note) -> "RenderableType":
 
 
 def shown(*, quiet: bool) -> "Quiet":
-    """The progress of a run, to be entered: nothing is shown when `quiet`."""
+    """Return a context manager that shows the progress of a run, or nothing if `quiet`."""
     if quiet:
         return Quiet()
     return Table() if sys.stderr.isatty() else Lines()
@@ -255,16 +255,16 @@ def shown(*, quiet: bool) -> "Quiet":
 
 @contextmanager
 def reading(text: str, *, quiet: bool) -> Iterator[Callable[[int, int], None]]:
-    """A function that takes the bytes read and all bytes, and shows them after `text`."""
+    """Yield a function that gets the bytes read and all bytes, and shows them after `text`."""
     with shown(quiet=quiet) as display:
         yield partial(display.show_bytes, text)
 
 
 @contextmanager
 def ended_by_signals(end: Callable[[], object]) -> Iterator[None]:
-    """Call `end` at the first Ctrl-C or SIGTERM: the run ends as at the end of a recording.
+    """Call `end` at the first Ctrl-C or SIGTERM. Then the run ends as at the end of a recording.
 
-    The second one interrupts as usual.
+    The second signal interrupts as usual.
     """
     before = {signum: signal.getsignal(signum) for signum in (signal.SIGINT, signal.SIGTERM)}
 
@@ -272,8 +272,8 @@ def ended_by_signals(end: Callable[[], object]) -> Iterator[None]:
         for each, handler in before.items():
             signal.signal(each, handler)
         end()
-        with suppress(OSError):  # of a reader that went away
-            os.write(2, _ENDING)  # safe inside a handler, which `print` is not
+        with suppress(OSError):  # the reader of stderr may have gone away
+            os.write(2, _ENDING)  # safe in a signal handler, unlike `print`
 
     for signum in before:
         signal.signal(signum, stop)
@@ -285,7 +285,7 @@ def ended_by_signals(end: Callable[[], object]) -> Iterator[None]:
 
 
 class Quiet:
-    """Progress that is not shown."""
+    """Takes progress and shows nothing. Base class of the displays."""
 
     def __init__(self) -> None:
         self._run = RunProgress()
@@ -298,10 +298,10 @@ class Quiet:
         pass
 
     def stage(self, text: str) -> None:
-        """Show which part of the run begins."""
+        """Show which stage of the run begins."""
 
     def say(self, text: str) -> None:
-        """Show a line that matters even to who wants no progress."""
+        """Show an important line, also if the user wants no progress."""
         typer.echo(text, err=True)
 
     def update(
@@ -311,11 +311,11 @@ class Quiet:
         self.show(self._run.screen(total, stats, link, scan))
 
     def show_fused(self, read: int, fused: int, total: int) -> None:
-        """Show how many keyframes of a journal are read, and how many of those are in the map."""
+        """Show how many keyframes of a journal are read, and how many of these are in the map."""
         self.show(Screen(fused_rows(read, fused, total, self._fusing)))
 
     def show_bytes(self, text: str, done: int, total: int) -> None:
-        """Show how much is read, after `text`."""
+        """Show how many bytes are read, after `text`."""
         self.show(Screen([byte_row(text, done, total, self._reading)]))
 
     def show_steps(self, text: str, done: int, total: int) -> None:
@@ -323,11 +323,11 @@ class Quiet:
         self.show(Screen([step_row(text, done, total)]))
 
     def show(self, screen: Screen) -> None:
-        """Show this in place of what was shown last."""
+        """Show a screen in place of the last one."""
 
 
 class Lines(Quiet):
-    """A line for each stage, and one for the counts every few seconds."""
+    """Shows a line for each stage, and one for the counts every few seconds."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -344,7 +344,7 @@ class Lines(Quiet):
 
 
 class Table(Quiet):
-    """A line for each stage, and below a table with bars, drawn again a few times a second."""
+    """Shows a line for each stage, and below a table with bars, redrawn a few times a second."""
 
     def __init__(self) -> None:
         from rich.console import Console
@@ -353,13 +353,13 @@ class Table(Quiet):
         super().__init__()
         self._console = Console(stderr=True, highlight=False)
         self._screen = Screen()
-        self._shown_at: float | None = None  # time.monotonic(); None = no counts are to come now
+        self._shown_at: float | None = None  # time.monotonic(); None while no counts are expected
         self._live = Live(
             console=self._console,
             get_renderable=self._table,
             refresh_per_second=_DRAWINGS,
             transient=True,
-            redirect_stdout=False,  # Taichi takes a wrapped stdout for a notebook, and says so
+            redirect_stdout=False,  # Taichi would take a wrapped stdout for a notebook, and print so
             redirect_stderr=False,
         )
         self._warnings = _Warnings(self._console)
@@ -384,14 +384,14 @@ class Table(Quiet):
         self._screen, self._shown_at = screen, time.monotonic()
 
     def _table(self) -> "RenderableType":
-        """The table now. A thread draws it, so that it also says when nothing comes any more."""
+        """Return the present table. A thread draws it, so that it can also say that no counts come."""
         still = 0.0 if self._shown_at is None else time.monotonic() - self._shown_at
         trouble = f"nothing came for {span(still)}" if still > STILL else ""
         return self._screen.table(self._console.width, trouble=trouble)
 
 
 class _Warnings(logging.Handler):
-    """Warnings go above the table, which would be drawn over them."""
+    """Prints warnings above the table. Otherwise the table would be drawn over them."""
 
     def __init__(self, console: "Console") -> None:
         super().__init__(logging.WARNING)
@@ -403,14 +403,14 @@ class _Warnings(logging.Handler):
 
 
 def page_beside(view: str | None, display: "Quiet", *, truth: str | None = None) -> "ViewerChild | None":
-    """The page, whose address is shown where the run's progress is.
+    """Return the page beside a run. Its address is shown with the run's progress.
 
     Args:
         view: HOST:PORT; None = no page.
         truth: known surface of the map; see `ViewerChild`.
 
     Raises:
-        MissingDependency, InvalidConfig, TransportError: when it cannot be shown.
+        MissingDependency, InvalidConfig, TransportError: when the page cannot be shown.
     """
     if view is None:
         return None
@@ -420,11 +420,11 @@ def page_beside(view: str | None, display: "Quiet", *, truth: str | None = None)
 
 
 def print_page_again(view: str | None, folder: str, connect: str | None) -> None:
-    """Say how the map of a run that had a page is seen again.
+    """Print how to see the map again, after a run with a page.
 
     Args:
-        folder: of the run's results.
-        connect: address of the server elsewhere that has the map; None = the folder has it.
+        folder: folder of the run's results.
+        connect: address of the server elsewhere that has the map; None if the folder has the map.
     """
     if view is not None:
         typer.echo(f"page       tsfusion view {connect or folder}")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Summary of a replay or a scan, printed at its end: the run in a few lines."""
+"""Print the summary of a replay or a scan at its end, in a few lines."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,8 +19,8 @@ def print_run(run: "RunRecord", spool: Path | None, connect: str | None) -> None
     """Print a run in a few lines.
 
     Args:
-        spool: where a scan's keyframes wait for a server.
-        connect: address of the server elsewhere that has the map; None = it was the run's own.
+        spool: folder where a scan's keyframes wait for a server.
+        connect: address of the server elsewhere that has the map; None for the run's own server.
     """
     lines = _replay_lines(run) if run.kind == "replay" else _scan_lines(run, spool, connect)
     output.text("\n".join([*_head(run), *lines, _results(run.folder)]), indent=11)
@@ -78,13 +78,13 @@ def _scan_lines(run: "RunRecord", spool: Path | None, connect: str | None) -> li
 
 
 def _left_out(run: "RunRecord") -> list[str]:
-    """Frames and keyframes that are not in the map: a line each."""
+    """Return lines about frames and keyframes that are not in the map."""
     frames, keyframes = counted(run.frames_skipped), explained(run.keyframes_rejected)
     return [f"left out   {frames}"] * bool(frames) + [f"not in map {keyframes}"] * bool(keyframes)
 
 
 def _results(folder: str) -> str:
-    """The files of a run; what to look at comes last, on its own line."""
+    """Return lines with the files of a run. The report comes last, on its own line."""
     files = sorted(path.name for path in Path(folder).iterdir() if path.is_file())
     rest = " ".join(name for name in files if not name.startswith("report"))
     report = f"\nreport     {folder}/report.html" if "report.html" in files else ""
@@ -92,7 +92,7 @@ def _results(folder: str) -> str:
 
 
 def mesh_lines(figures: dict[str, Any]) -> list[str]:
-    """A mesh in a line, and its notes."""
+    """Return a line about a mesh, and its notes."""
     from tsfusion.geometry.mesh import summarise
 
     notes = [f"           {note}" for note in mesh_notes(figures)]
@@ -100,7 +100,7 @@ def mesh_lines(figures: dict[str, Any]) -> list[str]:
 
 
 def mesh_notes(figures: dict[str, Any]) -> list[str]:
-    """Hints about a mesh that a person may want to change: a line each."""
+    """Return hints, a line each, about properties of a mesh that the user may want to change."""
     notes = []
     if left_out := figures["left_out"].get("islands"):
         files = " and ".join(figures["left_out"]["files"])
@@ -119,7 +119,7 @@ def mesh_notes(figures: dict[str, Any]) -> list[str]:
 
 
 def check(run: "RunRecord") -> None:
-    """Raise IncompleteRun when the run has missed what it was for: the last line, and status 1."""
+    """Raise IncompleteRun if the run fell short of its goal. It gives the last line, and status 1."""
     from tsfusion.core.errors import IncompleteRun
 
     if run.verdict is not None and run.verdict.level == "bad":
@@ -127,7 +127,7 @@ def check(run: "RunRecord") -> None:
 
 
 def _head(run: "RunRecord") -> list[str]:
-    """The verdict with its sign, unless `check` is to say it, and the camera: a line each."""
+    """Return lines with the camera and the verdict. A bad verdict is left to `check`."""
     camera, verdict = [f"camera     {run.camera}"] if run.camera else [], run.verdict
     if verdict is None or verdict.level == "bad":
         return camera
@@ -135,7 +135,7 @@ def _head(run: "RunRecord") -> list[str]:
 
 
 def _map_lines(found: "MapResult", *, given: bool) -> list[str]:
-    """A map in a few lines; poses that were given have no error against themselves."""
+    """Return lines about a map. Given poses have no error against themselves."""
     lines = [f"map        {found.name}: {found.frames} frames, {found.keyframes} keyframes"]
     if found.mesh:
         lines += mesh_lines(found.mesh)
@@ -153,7 +153,7 @@ def _map_lines(found: "MapResult", *, given: bool) -> list[str]:
 
 
 def _ate(error: "TrajectoryError") -> str:
-    """The field's table of trajectory error as one line, in millimetres below a metre."""
+    """Return the usual figures of trajectory error on one line, in millimetres below a metre."""
     unit, factor = ("mm", 1000.0) if error.rmse < 1 else ("m", 1.0)
     figures: list[tuple[str, Any]] = [
         (name, factor * getattr(error, name)) for name in ("rmse", "mean", "median", "std", "min", "max")

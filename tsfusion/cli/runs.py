@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""`tsfusion scan`, `replay` and `demo`: one run each, and how its recording is opened."""
+"""`tsfusion scan`, `replay` and `demo`: open a recording or a sensor, and carry out a run."""
 
 from functools import partial
 from pathlib import Path
@@ -181,11 +181,11 @@ def _run(
     truth: str | None = None,
     **plan: Any,
 ) -> None:
-    """Carry out a run, and print what came of it.
+    """Carry out a run, and print its results.
 
     Args:
         truth: known surface of the world, for the page.
-        plan: more of the `RunPlan` than the flags say.
+        plan: arguments of `RunPlan` that the flags do not give.
     """
     from tsfusion.cli import progress, run_summary
     from tsfusion.pipelines.runs.run import RunPlan, run
@@ -210,12 +210,12 @@ def _run(
     run_summary.check(result)
 
 
-# Flags that are settings of a `RunPlan` of the same name
+# Flags that are settings of a `RunPlan` with the same name
 RUN_SETTINGS = ("same_frame", "rate", "min_weight", "keep_islands", "sensor")
 
 
 def _configuration(recording: Any, flags: dict[str, Any]) -> "Config":
-    """Settings of a run: those usual for the recording, the file's, and the flags."""
+    """Return the usual settings of the recording, overridden by those of the file and by the flags."""
     return options.configuration_for(
         recording.sensor, flags["config"], usual=getattr(recording, "usual", None),
         tell=flags["connect"] is None, **options.settings(flags),
@@ -223,7 +223,6 @@ def _configuration(recording: Any, flags: dict[str, Any]) -> "Config":
 
 
 def _part(dataset: "Dataset", flags: dict[str, Any]) -> "Dataset":
-    """The part of a recording that is asked for."""
     from tsfusion.datasets import select
 
     start, stride, limit = flags["start"], flags["stride"], flags["max_frames"]
@@ -233,10 +232,10 @@ def _part(dataset: "Dataset", flags: dict[str, Any]) -> "Dataset":
 
 
 def _choose_poses(context: typer.Context, settings: dict[str, Any]) -> None:
-    """Leave one source of poses in the flags; what was typed beats the environment.
+    """Leave only one source of poses in the flags. A typed flag beats an environment variable.
 
     Raises:
-        InvalidConfig: where two are left, or a typed one has no effect.
+        InvalidConfig: when two sources are left, or a typed one has no effect.
     """
     from tsfusion.core.errors import InvalidConfig
 
@@ -259,13 +258,13 @@ def _choose_poses(context: typer.Context, settings: dict[str, Any]) -> None:
 def _check_poses(
     context: typer.Context, config: "ScanConfig", sensor: str, *, is_given_late: bool
 ) -> "ScanConfig":
-    """The settings without a source of poses that a flag beats.
+    """Return the settings without a source of poses that a flag overrides.
 
     Args:
-        is_given_late: the flag's trajectory is the recording's own by now, one pose a frame.
+        is_given_late: the poses of --trajectory have become the recording's own, one for each frame.
 
     Raises:
-        InvalidConfig: for flags about poses that the localizer does not ask for.
+        InvalidConfig: for flags about poses that the localizer does not use.
     """
     from msgspec.structs import replace
 
@@ -286,10 +285,10 @@ def _check_poses(
 
 
 def _open(context: typer.Context, spec: str, flags: dict[str, Any]) -> "tuple[Source, list[str]]":
-    """The source of that name as the flags want it, of a recording the part that is asked for; and oddities
-    of its frames.
+    """Open the source that the flags describe. Return it with the oddities of its frames.
 
-    Where the recording or the trajectory in `flags` has no times, its poses are made the recording's own.
+    Of a recording it is the selected part. If the recording or the trajectory in `flags` has no times, the
+    trajectory's poses become the recording's own.
     """
     from tsfusion.scanner.sources.named_sources import is_live, open_source
     from tsfusion.scanner.sources.source import LimitedSource, RecordedSource
@@ -326,7 +325,7 @@ def _open(context: typer.Context, spec: str, flags: dict[str, Any]) -> "tuple[So
 
 
 def refuse_live(source: str) -> None:
-    """Raise DatasetError for a live source: nothing but a scan finds its poses."""
+    """Raise DatasetError for a live source, because only a scan finds its poses."""
     from tsfusion.core.errors import DatasetError
     from tsfusion.scanner.sources.named_sources import is_live
 
@@ -338,7 +337,7 @@ def open_recording(path: Path, /, *, unpack: bool = False, **given: Any) -> "Dat
     """Open a dataset or a journal.
 
     Args:
-        unpack: whether to unpack an archive beside itself.
+        unpack: True to unpack an archive beside itself.
         given: settings of the dataset; None = not given.
     """
     from tsfusion.core.errors import DatasetError
@@ -366,7 +365,7 @@ def open_recording(path: Path, /, *, unpack: bool = False, **given: Any) -> "Dat
 
 
 def _refuse_own_journal(dataset: "Dataset", state: Path, map_name: str) -> None:
-    """Raise InvalidConfig where a journal would be replayed into the map that it is of."""
+    """Raise InvalidConfig if a journal would be replayed into the map that it belongs to."""
     from tsfusion.core.errors import InvalidConfig
     from tsfusion.journal import state_folder
     from tsfusion.journal.journaled_keyframes import JournalRecording
@@ -380,17 +379,17 @@ def _refuse_own_journal(dataset: "Dataset", state: Path, map_name: str) -> None:
 
 
 def _is_synthetic(path: Path) -> bool:
-    """True for a synthetic dataset, which would have to be rendered before it can be described."""
+    """True for a synthetic dataset. It is not described, because it would have to be rendered first."""
     return str(path).startswith("synthetic:")
 
 
 def _checked(dataset: "Dataset") -> tuple[str, list[str]]:
-    """Mistake in a part of the poses, empty = none; and other oddities.
+    """Return a mistake in part of the poses (empty if none), and other oddities of a recording.
 
-    What was not said when the recording was found is printed on stderr.
+    Findings that were not printed when the recording was found are printed on stderr.
 
     Raises:
-        IncompleteRun: where poses, camera or depth are wrong in the whole recording.
+        IncompleteRun: when poses, camera or depth are wrong in the whole recording.
     """
     from tsfusion.core.errors import DatasetError, IncompleteRun, JournalError
     from tsfusion.datasets.dataset import first_frame
@@ -398,7 +397,7 @@ def _checked(dataset: "Dataset") -> tuple[str, list[str]]:
 
     try:
         report, untimed = pose_check.check(dataset), first_frame(dataset).untimed
-    except (DatasetError, JournalError):  # the replay comes to that frame, and tells
+    except (DatasetError, JournalError):  # the replay reports it when it reaches that frame
         return "", []
     doubt = report.text if report.verdict == "disagree" else ""
     if doubt and report.frames is None:
@@ -410,10 +409,10 @@ def _checked(dataset: "Dataset") -> tuple[str, list[str]]:
 
 
 def _warnings(dataset: "Dataset") -> list[str]:
-    """Oddities of a recording's frames, a sentence each; new ones are printed on stderr, too.
+    """Return oddities of a recording's frames, a sentence each, and print new ones on stderr.
 
     Raises:
-        DatasetError: their depth cannot be used, or nobody knows its unit.
+        DatasetError: when their depth cannot be used, or its unit is unknown.
     """
     from tsfusion.core import process
     from tsfusion.core.errors import DatasetError
@@ -422,7 +421,7 @@ def _warnings(dataset: "Dataset") -> list[str]:
 
     try:
         (depth, color), untimed = pose_check.check_frames(dataset), first_frame(dataset).untimed
-    except DatasetError:  # the scan comes to that frame, and tells
+    except DatasetError:  # the scan reports it when it reaches that frame
         return []
     process.give_back_memory()
     if depth is not None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""`tsfusion serve`."""
+"""`tsfusion serve`: run a server that fuses what scanners send."""
 
 import logging
 import os
@@ -112,7 +112,7 @@ def serve(
 
 @contextmanager
 def _shown_state(log_format: str) -> "Iterator[Callable[[Health], None]]":
-    """A function that shows the server's state on the last line of the terminal, where there is one."""
+    """Yield a function that shows the server's state on the last line of the terminal, if there is one."""
     if log_format != "text" or not sys.stderr.isatty():
         yield lambda _: None
         return
@@ -123,7 +123,7 @@ def _shown_state(log_format: str) -> "Iterator[Callable[[Health], None]]":
 
 
 def _configuration(file: Path | None, settings: dict[str, Any]) -> "Config":
-    """All settings; where a flag bounds the memory, the disk takes the rest of a map."""
+    """Return all settings. If a flag limits the memory, the rest of a map goes to the disk."""
     from msgspec.structs import replace
 
     from tsfusion.core.config import CacheConfig, override
@@ -132,7 +132,7 @@ def _configuration(file: Path | None, settings: dict[str, Any]) -> "Config":
     sizes = {name: options.byte_count(settings[name]) for name in ("fuser_memory_bytes", "fuser_disk_bytes")}
     try:
         chosen = options.configuration_for(None, file, **{**settings, **sizes})
-    except InvalidConfig as error:  # of a setting that has not its flag's name
+    except InvalidConfig as error:  # the message names the setting, not the flag
         flags = {"fuser_memory_bytes must": "--memory", "fuser_disk_bytes must": "--disk"}
         flag = next((flag for begin, flag in flags.items() if str(error).startswith(begin)), None)
         raise error if flag is None else InvalidConfig(f"{flag}: {error}") from error
@@ -163,7 +163,7 @@ def _announce(addresses: "Addresses", state: str, seconds: float, json: bool) ->
 
 
 def _page(place: str, folder: str | None, json: bool) -> "tuple[ViewerChild, ClientKeys | None]":
-    """The live page of a server, and where that has a folder of keys, a pair that is the page's alone."""
+    """Return the live page of a server, and keys for this page alone if the server has a folder of keys."""
     from tsfusion.pipelines.runs.viewer_child import ViewerChild
     from tsfusion.wire.sockets.curve import ClientKeys, server_keys
 
@@ -181,7 +181,7 @@ def _page(place: str, folder: str | None, json: bool) -> "tuple[ViewerChild, Cli
 
 
 def _stop_at_eof() -> None:
-    """End as by SIGTERM when the parent closes stdin, which happens also when it is killed."""
+    """End as by SIGTERM when stdin closes: the parent closed it, or was killed."""
     while os.read(sys.stdin.fileno(), 4096):  # unbuffered: no lock is held when the interpreter ends
         pass
     os.kill(os.getpid(), signal.SIGTERM)

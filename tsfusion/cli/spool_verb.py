@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""`tsfusion spool list|send|drop`."""
+"""`tsfusion spool list|send|drop`: list, send or delete keyframes that wait for a server."""
 
 import sys
 import time
@@ -127,7 +127,7 @@ def send(
         spool, names = Path(names[0]), names[1:]
     chosen = _choose(spool, names)
     folders = {one.folder for one in chosen}
-    damaged = {  # counted before: a file goes when the rest of it is sent
+    damaged = {  # counted first: a file is deleted when the rest of it is sent
         folder: count
         for folder, count in left_spools.damaged(spool).items()
         if folder in folders or not names
@@ -157,7 +157,7 @@ def send(
 
 
 def _check_there(spool: Path) -> None:
-    """Raise JournalError for a folder that somebody named and that does not exist."""
+    """Raise JournalError for a folder that the user named and that does not exist."""
     from tsfusion.core.errors import JournalError
 
     if spool != _FOLDER and not spool.is_dir():
@@ -165,7 +165,7 @@ def _check_there(spool: Path) -> None:
 
 
 def _choose(root: Path, names: list[str] | None) -> "list[LeftSpool]":
-    """The spools of these names; raises JournalError for one that is not there."""
+    """Return the spools with these names. Raise JournalError for a name without a spool."""
     from tsfusion.core.errors import JournalError
     from tsfusion.delivery import left_spools
 
@@ -180,7 +180,7 @@ def _choose(root: Path, names: list[str] | None) -> "list[LeftSpool]":
 def _send(
     left: "LeftSpool", link: "ClientConfig", map_: str | None, *, same_frame: bool, quiet: bool
 ) -> tuple[str, int, str]:
-    """The map, how many keyframes did not get through, and why; empty = all did."""
+    """Send a spool. Return the map, the number of records not sent, and why (empty if all were sent)."""
     from tsfusion.cli import progress
     from tsfusion.client import Client
     from tsfusion.core.errors import TsfusionError
@@ -211,7 +211,7 @@ def _send(
 
 
 def _wait(client: "Client", watch: "Callable[[int, int], None]", address: str, patience: float) -> str:
-    """Wait until the spool is empty; the reason why it is not, once nothing moved for `patience` seconds."""
+    """Wait until the spool is empty. Return why not, if nothing moved for `patience` seconds."""
     total = client.stats.waiting_bytes
     last, moved = total, time.monotonic()
     while client.stats.waiting and not client.is_of_other_world:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""`tsfusion status`."""
+"""`tsfusion status`: show the health of a server, once or repeatedly."""
 
 import sys
 import time
@@ -12,7 +12,7 @@ from tsfusion.cli import options, verbs
 if TYPE_CHECKING:
     from tsfusion.cli.health_poll import ServerSnapshot, ServerWatcher
 
-PLAIN_WIDTH = 160  # columns where there is no terminal
+PLAIN_WIDTH = 160  # columns if there is no terminal
 
 
 def status(
@@ -77,9 +77,9 @@ def _repeat(watcher: "ServerWatcher", seconds: float, *, json: bool) -> int:
 
 
 def _redraw(watcher: "ServerWatcher", address: str, seconds: float) -> NoReturn:
-    """Draw the screen again and again until Ctrl-C, whatever becomes of the server; leave its last state.
+    """Redraw the screen until Ctrl-C, whatever happens to the server. Leave its last state.
 
-    Lines are written over each other on the terminal's other screen, so that nothing flickers.
+    Lines are overwritten on the terminal's alternate screen, so that nothing flickers.
     """
     from rich.console import Console
     from rich.live import Live
@@ -116,7 +116,7 @@ def _print(snapshot: "ServerSnapshot", *, json: bool, line: bool) -> None:
 
 
 def _text(snapshot: "ServerSnapshot") -> str:
-    """The screen as text for this terminal; without colours and wide where there is none."""
+    """Return the screen as text for this terminal. Without a terminal it is wide and has no colours."""
     from rich.console import Console
 
     from tsfusion.cli.status_view import render

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A server's health on one screen, for a person."""
+"""Draw a server's health on one screen."""
 
 import time
 
@@ -24,18 +24,18 @@ from tsfusion.wire.messages.health import (
     lost_of_map,
 )
 
-MAX_CLIENTS = 40  # rows: the clients with the newest messages
-WIDE = 110  # columns from which on all figures are shown
+MAX_CLIENTS = 40  # rows, for the clients with the newest messages
+WIDE = 110  # minimum columns to show all figures
 _STATE_STYLES = {"idle": "green", "busy": "green", "failed": "bold red"}
-_PROMPT = 1.0  # seconds: an answer that takes longer is missed
+_PROMPT = 1.0  # seconds until an answer counts as missing
 
 
 def render(snapshot: ServerSnapshot, width: int, *, silent: float = 0.0) -> RenderableType:
-    """The whole in one line, then problems, the server, its maps, its clients, and what it refused.
+    """Return a headline, then problems, the server, its maps, its clients, and refused messages.
 
     Args:
         width: columns of the terminal; below `WIDE` some figures are left out.
-        silent: seconds since the server's last answer, where one is missing; 0 = it answers.
+        silent: seconds since the server's last answer, if one is missing; 0 if the server answers.
     """
     parts: list[RenderableType] = []
     if silent:
@@ -117,7 +117,7 @@ def _clients(clients: list[ClientHealth], *, is_wide: bool) -> list[RenderableTy
 
 
 def _remarks(one: ClientHealth) -> Text:
-    """Counts that are zero for a client that is well, and why nothing of it is taken."""
+    """Return counts that are zero for a healthy client, and why the server takes nothing of it."""
     turned_away = {"refused": one.refused, "rejected": one.rejected}
     words = [_reasons(one.skipped), _reasons({name: count for name, count in turned_away.items() if count})]
     line = _plain("; ".join(filter(None, [*words, one.held and f"held: {one.held}"])), style="yellow")
@@ -127,14 +127,14 @@ def _remarks(one: ClientHealth) -> Text:
 
 
 def _presence(one: ClientHealth) -> Text:
-    """State of a client; unless it is connected, also the time since it was last heard."""
+    """Return the state of a client; unless it is connected, also the time since its last message."""
     if one.state == "connected":
         return Text(one.state, style="green")
     return Text(f"{one.state} {span(one.heard_s)}", style="yellow" if one.state == "silent" else "")
 
 
 def _settings(snapshot: ServerSnapshot, *, is_wide: bool) -> RenderableType:
-    """The settings, memory and hash of each map, which only its fuser knows; no hash while it is busy."""
+    """Return settings, memory and hash of each map, which only its fuser knows. A busy one has no hash."""
     table = _table(
         "map", ">voxel size", "sensor", ">fuser's memory", "hash", *(["folder"] if is_wide else [])
     )
@@ -158,7 +158,7 @@ def _delay(delay: Spread, bound_ms: float, *, is_wide: bool) -> str:
 
 
 def _notes(name: str, one: MapHealth) -> list[Text]:
-    """Counts that are zero for a map that is well."""
+    """Return counts that are zero for a healthy map, and figures of its questions."""
     counts = {
         "quarantined": one.quarantined, "× the fuser restarted": one.fuser_restarts,
         "damaged records": one.journal_damaged,
@@ -198,7 +198,7 @@ def _span(seconds: float | None) -> str:
 
 
 def _table(*titles: str) -> Table:
-    """A table. A title that begins with `>` stands over figures; `:7` = at least so many columns."""
+    """Return a table. A title with `>` is for a column of figures; `:7` = at least 7 columns wide."""
     table = Table(box=None, pad_edge=False, header_style="dim", padding=(0, 1, 0, 0))
     for title in titles:
         words, _, least = title.removeprefix(">").partition(":")
@@ -211,42 +211,42 @@ def _table(*titles: str) -> Table:
 
 
 def _plain(text: str, *, style: str = "") -> Text:
-    """Text that clients or files may have chosen: no terminal commands, no markup."""
+    """Return safe text from clients or files: without terminal commands and markup."""
     return Text(printable(text), style=style)
 
 
 class StatusScreen:
-    """Screen of a server's state. One thread brings its answers, another draws."""
+    """Screen of a server's state. One thread brings the server's answers, another draws."""
 
     def __init__(self, console: Console, address: str) -> None:
         self._console = console
         self._snapshot = ServerSnapshot(address=address, error=f"no answer yet from {address}")
-        self._asked: float | None = None  # time.monotonic(); None = the last question is answered
-        self._failed = False  # whether the last question was not
+        self._asked: float | None = None  # time.monotonic() of a question without an answer so far
+        self._failed = False  # True if the last question got no answer
         self._answered = time.monotonic()
 
     def ask(self) -> None:
-        """Note that the server is asked now."""
+        """Remember that the server is asked now."""
         self._asked = time.monotonic()
 
     def answer(self, snapshot: ServerSnapshot) -> None:
-        """Note an answer."""
+        """Remember an answer."""
         self._snapshot, self._failed, self._asked = snapshot, False, None
         self._answered = time.monotonic()
 
     def fail(self, error: str) -> None:
-        """Note that there was none, and why."""
+        """Remember that no answer came, and why."""
         self._snapshot = replace(self._snapshot, error=error)
         self._failed, self._asked = True, None
 
     def whole(self) -> RenderableType:
-        """The state now; where no answer comes, the last one and how old it is."""
+        """Return the present state. If an answer is missing, return the last state and its age."""
         now, asked = time.monotonic(), self._asked
         is_missing = self._failed or (asked is not None and now - asked > _PROMPT)
         return render(self._snapshot, self._console.width, silent=now - self._answered if is_missing else 0.0)
 
     def cut(self) -> RenderableType:
-        """The lines that the terminal has room for, and the number of the others."""
+        """Return the lines that fit on the terminal, and the number of the others."""
         height, whole = self._console.height, self.whole()
         lines = self._console.render_lines(whole, pad=False)
         if len(lines) <= height:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Parts that all verbs have in common: short help, examples, environment variables, renamed flags."""
+"""Define what all verbs share: short help, examples, environment variables, renamed flags."""
 
 import math
 import re
@@ -13,20 +13,20 @@ from tsfusion.viewer import LISTEN
 
 PREFIX = "TSFUSION_"
 RENAMED = {"--max-keyframes": "--max-frames", "--poses": "--trajectory"}  # understood until version 0.3
-LOCAL = "local"  # of --ray: a cluster of the run's own
+LOCAL = "local"  # value of --ray: a cluster of the run's own
 _HOST_PORT = r"(?:\[[\da-fA-F:.]+\]|localhost|\*|[\w-]+(?:\.[\w-]+)+):\d{1,5}"
-_PLACES = {  # flags that may go without their place: what one looks like, and the usual one
+_PLACES = {  # flags whose address may be left out: its pattern, and the default
     "--view": (re.compile(_HOST_PORT, re.ASCII), LISTEN),
     "--ray": (re.compile(rf"auto|local|ray://\S+|{_HOST_PORT}", re.ASCII), LOCAL),
 }
 _SHORTER = {"--show-completion": "Print what that would install."}  # Typer's own takes two lines
-_ALL = "tsfusion.help_all"  # in a context's notes: --help-all was asked for
+_ALL = "tsfusion.help_all"  # key in `context.meta`: --help-all was given
 
 _Verb = TypeVar("_Verb", bound=Callable[..., Any])
 
 
 class _ShortHelp:
-    """Help in few lines: no type of a switch, no second name of a flag, no environment variable."""
+    """Help in few lines: without types of switches, second names of flags, environment variables."""
 
     def get_params(self, ctx: Any) -> Any:
         params = super().get_params(ctx)  # type: ignore[misc]
@@ -39,7 +39,7 @@ class _ShortHelp:
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         if _ALL not in ctx.meta:
-            for param in self.get_params(ctx):  # a column of second names takes room from every line
+            for param in self.get_params(ctx):  # a column of second names would take room from every line
                 param.opts, param.secondary_opts = [max(param.opts, key=len)], []
         super().format_help(ctx, formatter)  # type: ignore[misc]
 
@@ -71,7 +71,7 @@ class Verb(_ShortHelp, TyperCommand):
             if any(param.opts == [flag] and param.nargs == 1 for param in self.params):
                 words = _with_places(words, flag, place, usual)
         rest = super().parse_args(ctx, words)
-        for param in self.params:  # a range lets nan through, which is neither below nor above
+        for param in self.params:  # a range accepts nan, which is neither below nor above
             value = ctx.params.get(param.name)
             is_ranged = hasattr(param.type, "min") or hasattr(param.type, "max")
             if is_ranged and isinstance(value, float) and math.isnan(value):
@@ -80,12 +80,12 @@ class Verb(_ShortHelp, TyperCommand):
 
 
 def variable(flag: str) -> str:
-    """The environment variable of a flag."""
+    """Return the name of a flag's environment variable."""
     return PREFIX + flag.strip("-").replace("-", "_").upper()
 
 
 def examples(*lines: str) -> str:
-    """The end of a verb's help."""
+    """Return the examples at the end of a verb's help."""
     return "\n".join(["Examples:", *(f"$ {line}" for line in lines)])
 
 
@@ -112,7 +112,7 @@ def _show_all(context: typer.Context, wanted: bool) -> None:
     raise typer.Exit
 
 
-# Flag of the verbs with rare flags: those that are hidden and have a help text.
+# Flag of verbs with rare flags: hidden ones that have a help text.
 HelpAll = Annotated[
     bool | None,
     typer.Option("--help-all", is_eager=True, callback=_show_all, help="Show the rare flags, too, and exit."),
@@ -120,7 +120,7 @@ HelpAll = Annotated[
 
 
 def _refuse_empty(context: Any, words: list[str]) -> None:
-    """Refuse a word without content, which as a path would be the current folder."""
+    """Refuse an empty word: as a path it would mean the current folder."""
     for word in words:
         flag, equals, value = word.partition("=")
         if not word or (flag.startswith("--") and equals and not value):
@@ -129,9 +129,9 @@ def _refuse_empty(context: Any, words: list[str]) -> None:
 
 
 def _with_places(words: list[str], flag: str, place: re.Pattern[str], usual: str) -> list[str]:
-    """A command line in which each such flag has a place: its next word, if that is one, else the usual one.
+    """Give each `flag` of a command line its address: the next word if it is an address, else the default.
 
-    `--view PATH` means a PATH, and `--view camera:0` a camera.
+    In `--view PATH` the word is a path, and in `--view camera:0` a camera.
     """
     found: list[str] = []
     for word in words:
@@ -143,7 +143,7 @@ def _with_places(words: list[str], flag: str, place: re.Pattern[str], usual: str
 
 
 def _renamed(word: str) -> list[str]:
-    """A word of the command line, with the flag's name of today; `scan --source X` is `scan X`."""
+    """Replace old names of flags in a word of the command line; `scan --source X` becomes `scan X`."""
     flag, equals, value = word.partition("=")
     if flag == "--source":
         return [value] if equals else []

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""`tsfusion view`."""
+"""`tsfusion view`: show a live or a saved map in a browser."""
 
 import logging
 import os
@@ -29,13 +29,13 @@ if TYPE_CHECKING:
     from tsfusion.viewer.map_feed import MapFeed
     from tsfusion.wire.sockets.curve import ClientKeys
 
-_ANSWER_SECONDS = 1.0  # for a server to say that it is there
+_ANSWER_SECONDS = 1.0  # wait for a server's answer
 _SERVER = re.compile(r"[\w.-]+:\d{1,5}|\[[\da-fA-F:.]+\]:\d{1,5}", re.ASCII)
-_ERROR = "Error [m]"  # as the page names it
+_ERROR = "Error [m]"  # name on the page
 _NICENESS = 10  # of a page beside a run
-_MEMORY_SHARE, _LEAST_MEMORY = 4, 2 << 30  # of the machine's that a page may take; bytes
+_MEMORY_SHARE, _LEAST_MEMORY = 4, 2 << 30  # a page may take 1/4 of the memory, but always 2 GiB
 _AGAIN = "its map is seen again with: tsfusion view"
-_LEAST_SECONDS = 60.0  # that a page lasts which may begin again
+_LEAST_SECONDS = 60.0  # a page that lasted so long may begin again
 
 log = logging.getLogger(__name__)
 
@@ -121,7 +121,7 @@ def view(
 
 
 def _target(where: str | None, keys: "ClientKeys | None") -> str | Path:
-    """The address of a server, or a path that exists."""
+    """Return the address of a server, or a path that exists."""
     from tsfusion.core.errors import InvalidConfig
     from tsfusion.core.output_folder import DEFAULT, LATEST
     from tsfusion.wire.sockets.sockets import connect_address
@@ -142,7 +142,7 @@ def _target(where: str | None, keys: "ClientKeys | None") -> str | Path:
 
 
 def _usual_target(keys: "ClientKeys | None", latest: Path) -> str | Path:
-    """The server on this machine, or the newest run."""
+    """Return the address of the server on this machine, or the folder of the newest run."""
     from tsfusion.core.config import ClientConfig
     from tsfusion.core.errors import InvalidConfig, ServerUnreachable
     from tsfusion.wire.asking.queries import fetch_health
@@ -172,7 +172,7 @@ def _feed(target: str | Path, map_: str | None, link: dict[str, Any]) -> "MapFee
 
 
 def _measures(target: str | Path, truth: str | None) -> "dict[str, Measure]":
-    """Further colours of a map: its error, where the truth is given, or a run has measured it."""
+    """Return further colours of a map: its error, if the truth is given or a run has measured it."""
     if truth is not None:
         from tsfusion.pipelines.report.measured_errors import error_measure
 
@@ -190,7 +190,7 @@ def _measure_of_run(folder: Path) -> "Measure":
 
 
 def _error_of_run(folder: Path, points: "NDArray[np.float32]") -> "NDArray[np.float32]":
-    """The error of a run, whose mesh is read when it is asked for: that takes a while."""
+    """Return the error of a run at points. The run's mesh is read at the first call, which is slow."""
     return _measure_of_run(folder)(points)
 
 
@@ -205,7 +205,7 @@ def _announce(url: str, title: str, *, json: bool) -> None:
 
 
 def _open_browser(url: str) -> None:
-    """Open a browser where there is a screen; what it prints is not ours."""
+    """Open a browser if there is a screen. The browser's output is dropped."""
     has_screen = sys.platform == "darwin" or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))
     if has_screen:
         with suppress(OSError):
@@ -218,7 +218,7 @@ def _open_browser(url: str) -> None:
 
 @contextmanager
 def _stopped_by_signals() -> Iterator[threading.Event]:
-    """An event that Ctrl-C and SIGTERM set; the second Ctrl-C interrupts as usual."""
+    """Yield an event that Ctrl-C or SIGTERM sets. The second signal interrupts as usual."""
     stop = threading.Event()
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
@@ -237,7 +237,7 @@ def _stopped_by_signals() -> Iterator[threading.Event]:
 
 
 def _keys_from_parent() -> "ClientKeys | None":
-    """The keys that our parent writes; when it ends, so do we. What it does comes before what we do."""
+    """Return the keys that the parent process writes. End with the parent, and take a lower priority."""
     import msgspec
 
     from tsfusion.wire.sockets.curve import ClientKeys

@@ -78,7 +78,6 @@ class RayCluster:
         return [self._next(one) for one in ready]
 
     def _next(self, under_way: Any) -> JobMessage:
-        """Return the next message of a job."""
         try:
             message: JobMessage = msgspec.msgpack.decode(self._ray.get(next(under_way)), type=JobMessage)
         except StopIteration:
