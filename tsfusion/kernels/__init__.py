@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""Taichi kernels: free functions over NumPy arrays; the state they work on lives in their callers.
+"""Taichi kernels: free functions over NumPy arrays; their callers keep all state.
 
 Rooms:
-    device: rays and additions on a GPU.
-    worlds: synthetic scenes, cast and painted.
-    answers: samples, slices, distances, views and textures.
-    surface: field smoothing, marching cubes, holes.
-    integration: rays of images and points, and their votes.
-    base: Taichi's start, fast launches, block keys, noise models.
+    device: makes and adds rays on a GPU.
+    worlds: renders synthetic scenes with colours.
+    answers: computes samples, slices, distances, views and textures.
+    surface: smooths the field, meshes by marching cubes, and fills holes.
+    integration: turns images and points into rays, and adds their votes.
+    base: starts Taichi, launches kernels fast, and holds block keys and noise models.
 """
 
 import inspect
@@ -17,9 +17,9 @@ from tsfusion.core.errors import MissingDependency
 
 os.environ.setdefault("HOME", os.path.expanduser("~"))  # without it (a daemon's environment) taichi aborts
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # the banner goes to stdout
-os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")  # it would tell its makers that and where we run
-# At each decorator Taichi asks `inspect` who imports the module: a class? `inspect` knows no such file and
-# looks through all modules for it, each time. Here is its answer.
+os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")  # the check would tell Taichi's makers where we run
+# At each decorator Taichi asks `inspect` for the file of the importing module. `inspect` knows no such file
+# and searches all modules each time. This entry is the answer.
 getattr(inspect, "modulesbyfile", {})["<frozen importlib._bootstrap>"] = "importlib._bootstrap"
 try:
     import taichi as taichi
@@ -28,7 +28,7 @@ except ModuleNotFoundError as error:
         "fusing needs taichi, which is not installed here or has no build for this platform; "
         "run `tsfusion serve` on an x86-64 machine and send keyframes to it from here"
     ) from error
-except ImportError as error:  # a library of the system, which small containers do not have
+except ImportError as error:  # a missing system library, as in small containers
     raise MissingDependency(
         f"taichi does not load ({error}); where there is no desktop, install libx11-6 (Debian, Ubuntu) or "
         "libX11 (Fedora)"

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Exact Euclidean distance transform of a box of voxels, one axis at a time.
+"""Compute the exact Euclidean distance transform of a box of voxels, one axis at a time.
 
-Felzenszwalb and Huttenlocher, "Distance transforms of sampled functions" (2012), in integers: along each line
-of voxels the lower envelope of one parabola a site. The number of the nearest site goes with the smallest
-squared distance; of sites equally far, the smallest number counts. So the result depends neither on the order
-of the axes nor on the surroundings of a box.
+The algorithm is that of Felzenszwalb and Huttenlocher, "Distance transforms of sampled functions" (2012), in
+integers. Each line of voxels gets the lower envelope of one parabola per site. The number of the nearest site
+is kept with the smallest squared distance; among equally far sites the smallest number counts. Hence neither
+the order of the axes nor the surroundings of a box change the result.
 
 Grids are flat arrays of (X, Y, Z), z fastest. A site is a voxel at the surface.
 """
@@ -15,10 +15,10 @@ from tsfusion.kernels import F32, I32, F32x2, I32x3
 from tsfusion.kernels.base.quick_launch import QuickLaunch, runs, unit_of
 from tsfusion.kernels.base.voxel_traversal import vec3i
 
-BANDS = 64  # units of parallel work; fixed, so that nothing depends on the thread count
-FAR = 1 << 30  # squared distance where no site is near
-NONE = -1  # number of no site
-_LEAD = 0.5  # gain of the distance a voxel, by which a surface lies beside
+BANDS = 64  # units of parallel work; fixed, so that no result depends on the thread count
+FAR = 1 << 30  # squared distance without a site in reach
+NONE = -1  # number of a missing site
+_LEAD = 0.5  # gain of the distance per voxel towards a neighbouring surface
 
 vec2i = ti.types.vector(2, ti.i32)
 vec3f = ti.types.vector(3, ti.f32)
@@ -26,7 +26,7 @@ vec3f = ti.types.vector(3, ti.f32)
 
 @ti.func
 def value_at(values: ti.template(), shape, at):
-    """Signed distance of a voxel in voxels; NaN outside the grid."""
+    """Return the signed distance of a voxel in voxels; NaN outside the grid."""
     value = ti.math.nan
     if (
         at[0] >= 0 and at[1] >= 0 and at[2] >= 0
@@ -38,7 +38,7 @@ def value_at(values: ti.template(), shape, at):
 
 @ti.func
 def is_site(values: ti.template(), shape, at, own):
-    """True if a surface is within half a voxel, or between the voxel and a neighbour no nearer to it."""
+    """Return 1 if a surface is within half a voxel, or between the voxel and a neighbour no nearer to it."""
     found = 0
     if ti.abs(own) <= 0.5:
         found = 1
@@ -55,9 +55,9 @@ def is_site(values: ti.template(), shape, at, own):
 
 @ti.func
 def is_rim(values: ti.template(), shape, at, own):
-    """True if a body ends at a voxel with nothing seen beside it, and no neighbour leads to a surface.
+    """Return True if a body ends at a voxel beside an unseen voxel, and no neighbour leads to a surface.
 
-    Example: the edge of a table in a slice through its top; its surface is above, not beside.
+    Example: the edge of a table in a slice through its top; its surface is above, not at the side.
     """
     beside, lead = 0, 0.0
     if own < -0.5:
@@ -78,8 +78,8 @@ def is_rim(values: ti.template(), shape, at, own):
 
 @ti.func
 def slope(values: ti.template(), shape, at, own):
-    """Gain of the distance with a voxel along each axis: towards a surface between the voxel and its
-    neighbour, else from both seen neighbours."""
+    """Return the change of the distance per voxel along each axis: towards a surface between the voxel and
+    its neighbour, else from both seen neighbours."""
     gradient = vec3f(0.0)
     for a in ti.static(range(3)):
         step = vec3i(0)
@@ -101,7 +101,7 @@ def slope(values: ti.template(), shape, at, own):
 
 @ti.func
 def surface_offset(values: ti.template(), shape, at):
-    """Vector from a site's centre to the surface, voxels: one Newton step, held within a voxel."""
+    """Return the vector from a site's centre to the surface, voxels: one Newton step of at most a voxel."""
     own = value_at(values, shape, at)
     gradient = slope(values, shape, at, own)
     offset = gradient * (-own / ti.max(gradient.norm_sqr(), 1e-6))
@@ -114,9 +114,9 @@ def mark_sites(
     values: F32, X: ti.i32, Y: ti.i32, Z: ti.i32, first: ti.i32, end: ti.i32, rims: ti.i32, squared: I32,
     nearest: I32,
 ):  # fmt: skip
-    """Begin a transform in the rows `first` ≤ x < `end`: sites are 0 from themselves, all else is far.
+    """Start a transform in the rows `first` ≤ x < `end`: sites have distance 0, all other voxels are far.
 
-    With `rims`, the rims of bodies are sites, too.
+    With `rims`, the rims of solid bodies are sites, too.
     """
     for row in range((end - first) * Y):
         x, y = first + row // Y, row % Y
@@ -130,7 +130,7 @@ def mark_sites(
 
 @ti.func
 def last_place(p, g_p, site_p, q, g_q, site_q):
-    """Last place on a line where the parabola at `p` counts, before that at `q` > `p` does."""
+    """Return the last index on a line at which the parabola at `p` counts, before the one at `q` > `p`."""
     num = (g_q + q * q) - (g_p + p * p)
     den = 2 * (q - p)
     last = ti.floor(num / ti.cast(den, ti.f64), ti.i32)
@@ -145,11 +145,11 @@ def spread_along_lines(
     squared: I32, nearest: I32, length: ti.i32, inner: ti.i32, first_line: ti.i32, last_line: ti.i32,
     begin: ti.i32, end: ti.i32, most: ti.i32, stack: I32x3, out_squared: I32, out_nearest: I32,
 ):  # fmt: skip
-    """Smallest squared distance along each line, at its places `begin` … `end` − 1.
+    """Write the smallest squared distance along each line, at its indices `begin` … `end` − 1.
 
-    The grid is (…, `length`, `inner`); in the output a line has `end` − `begin` places. Squared distances
-    above `most` are far. `stack` (bands, length, 2): for each parabola on the envelope, its place and where
-    it begins to count.
+    The grid is (…, `length`, `inner`); in the output a line has `end` − `begin` voxels. Squared distances
+    above `most` are far. `stack` (bands, length, 2) has, for each parabola on the envelope, its index and the
+    first index at which it counts.
     """
     for run in range(runs(BANDS)):  # run loop: kernels/base/quick_launch.py
         band = unit_of(run, BANDS)
@@ -192,8 +192,8 @@ def spread_along_lines(
 
 @ti.kernel
 def place_sites(values: F32, shape: vec3i, squared: I32, rows: vec2i, columns: vec2i, offsets: F32x2):
-    """Write `offsets`, the vectors from the sites (`squared` is 0) to the surface, for `rows` of x and
-    `columns` of y; 0 at a rim."""
+    """Write `offsets`, the vectors from sites (`squared` is 0) to the surface, for `rows` of x and `columns`
+    of y; 0 at a rim."""
     width = columns[1] - columns[0]
     for n in range((rows[1] - rows[0]) * width):
         x, y = rows[0] + n // width, columns[0] + n % width
@@ -214,12 +214,12 @@ def measure(
     columns: vec2i, subvoxel: ti.i32, placed: ti.i32, offsets: F32x2, edge: ti.f32, most: ti.f32,
     distances: F32,
 ):  # fmt: skip
-    """Distances, metres, at most `most`, of the voxels in `rows` of x and `columns` of y (first, end) of the
-    box `begin`, `extent`: to the surface at the nearest site, or to the site's centre. Negative behind the
-    surface.
+    """Write distances of at most `most`, metres, of the voxels in `rows` of x and `columns` of y (first, end)
+    of the box `begin`, `extent`. They lead to the surface at the nearest site, or to the site's centre. They
+    are negative behind the surface.
 
-    `edge` is a voxel's, metres. With `placed` the surface lies at the `offsets` of `place_sites`: many voxels
-    share one site.
+    `edge` is a voxel's edge, metres. With `placed` the surface is at the `offsets` of `place_sites`, which
+    saves work because many voxels share one site.
     """
     width = columns[1] - columns[0]
     for n in range((rows[1] - rows[0]) * width):

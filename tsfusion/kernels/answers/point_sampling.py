@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Signed distance of the map between voxel centres: trilinear interpolation, and its gradient.
+"""Interpolate the map's signed distance between voxel centres (trilinear), with its gradient.
 
-A point is rounded to 2⁻¹⁶ voxel. A point lies between eight voxel centres, of which those with a share in it
-count: at a voxel's centre that voxel alone.
+A point is rounded to 2⁻¹⁶ voxel. It lies between eight voxel centres. Only those with a share in the point
+count: at a voxel's centre that is one voxel.
 
-The map holds distances along rays. Along oblique rays, the gradient is steeper than 1: divided by it,
-the distance is, to first order, that to the surface.
+The map holds distances along rays. Along oblique rays the gradient is steeper than 1. The distance divided by
+it is, to first order, the distance to the surface.
 """
 
 import taichi as ti
@@ -17,14 +17,13 @@ from tsfusion.kernels.base.sensor_noise import WEIGHT_ONE
 from tsfusion.kernels.base.voxel_traversal import VOXEL_LIMIT, offset_in_block, pack, vec3i
 from tsfusion.kernels.integration.integrate import CUBE, QUANTA_PER_VOXEL, lane_distance, lane_weight
 
-ONE = 65536.0  # of a voxel
-UNKNOWN = -2  # slot of a block that was not looked up
+ONE = 65536.0  # units per voxel
+UNKNOWN = -2  # slot of a block that is not looked up yet
 BANDS = 64  # of blocks: units of parallel work
-BAND = 512  # points that one thread takes at a time
+BAND = 512  # points that one thread takes per unit
 BATCH = 64  # points of a band that wait for memory together
 
-# Kinds of values: Σ w·m / Σ w; that, with `correction` added to Σ w·m; or the number that `pair` put beside Σ
-# w
+# Kinds of values: Σ w·m / Σ w; the same with `correction` added to Σ w·m; the values that `pair` stores
 FUSED, CORRECTED, SOLVED = 0, 1, 2
 
 vec3f = ti.types.vector(3, ti.f32)
@@ -37,7 +36,7 @@ corners_f = ti.types.vector(8, ti.f32)
 
 @ti.func
 def place_of(points: ti.template(), n, per_metre):
-    """Point n in 2⁻¹⁶ voxel from the centre of voxel (0, 0, 0), and a flag: within the reach of a map."""
+    """Return point n in 2⁻¹⁶ voxel from the centre of voxel (0, 0, 0), and True if a map can reach it."""
     place = vec3l(0)
     inside = True
     for a in ti.static(range(3)):
@@ -49,7 +48,7 @@ def place_of(points: ti.template(), n, per_metre):
 
 @ti.func
 def find_near(near: ti.template(), voxel, k, map_keys: ti.template(), map_slots: ti.template()):
-    """Slot of the block k away (bits: one on along x, y, z) from that of a voxel; cached in `near`."""
+    """Return the slot of a neighbour of a voxel's block, cached in `near`. Bits of `k`: a step on x, y, z."""
     if near[k] == UNKNOWN:
         key = pack((voxel[0] >> 3) + (k & 1), (voxel[1] >> 3) + (k >> 1 & 1), (voxel[2] >> 3) + (k >> 2))
         near[k] = map_find(map_keys, map_slots, map_keys.shape[0] - 1, key)
@@ -58,7 +57,7 @@ def find_near(near: ti.template(), voxel, k, map_keys: ti.template(), map_slots:
 
 @ti.func
 def crossing(voxel):
-    """Axes (bits) along which the next voxel lies in the next block."""
+    """Return the axes, as bits, along which the next voxel lies in the next block."""
     return (
         ti.cast((voxel[0] & 7) == 7, ti.i32)
         | ti.cast((voxel[1] & 7) == 7, ti.i32) << 1
@@ -68,7 +67,7 @@ def crossing(voxel):
 
 @ti.func
 def corner_offset(voxel, c: ti.template()):
-    """Number, in its block, of corner c (bits: one on along x, y, z) of the cell that begins at a voxel."""
+    """Return the number in its block of corner c of the cell at a voxel. Bits of c: a step on x, y, z."""
     return (
         (((voxel[0] + (c & 1)) & 7) << 6)
         | (((voxel[1] + (c >> 1 & 1)) & 7) << 3)
@@ -78,7 +77,7 @@ def corner_offset(voxel, c: ti.template()):
 
 @ti.func
 def read_voxel(row, o, sums: ti.template(), kind, correction: ti.template()):
-    """Sums of a voxel, and its entry in `correction`."""
+    """Return the sums of a voxel, and its entry in `correction`."""
     held = ti.f32(0.0)
     if kind == CORRECTED:
         held = correction[row, o]
@@ -87,7 +86,7 @@ def read_voxel(row, o, sums: ti.template(), kind, correction: ti.template()):
 
 @ti.func
 def value_of(packed, held, kind, min_weight):
-    """Value of a voxel in quanta, NaN where it is unseen, and its weight."""
+    """Return the value of a voxel in quanta, NaN if unseen, and its weight."""
     w = lane_weight(packed)
     solved = ti.bit_cast(ti.cast(packed >> 32, ti.i32), ti.f32)
     if kind == SOLVED:
@@ -100,7 +99,7 @@ def value_of(packed, held, kind, min_weight):
 
 @ti.func
 def blend(v, f):
-    """Trilinear mean of eight corners at the place f in their cell, and its gradient."""
+    """Return the trilinear mean of eight corners at position f in their cell, and its gradient."""
     x = vec4f(v[1] - v[0], v[3] - v[2], v[5] - v[4], v[7] - v[6])
     along_x = vec4f(v[0], v[2], v[4], v[6]) + f[0] * x
     y0, y1 = along_x[1] - along_x[0], along_x[3] - along_x[2]
@@ -112,7 +111,7 @@ def blend(v, f):
 
 @ti.func
 def blend_shares(v, f):
-    """Trilinear mean of those of eight corners that have a share in it."""
+    """Return the trilinear mean of eight corners, without corners that have no share in it."""
     total = ti.f32(0.0)
     for c in ti.static(range(8)):
         share = ti.f32(1.0)
@@ -128,16 +127,16 @@ def write_sample(
     n, packed, held, f, kind, min_weight, metres, distance: ti.template(), weight: ti.template(),
     gradient: ti.template(),
 ):  # fmt: skip
-    """Write sample n from the sums of its eight corners, at the place f in their cell."""
+    """Write sample n from the sums of its eight corners, at position f in their cell."""
     v = corners_f(0.0)
     w = corners_f(0.0)
     for c in ti.static(range(8)):
         v[c], w[c] = value_of(packed[c], held[c], kind, min_weight)
     total, slope = blend(v, f)
-    if not (total == total):  # Taichi's != is false of NaN
+    if not (total == total):  # Taichi's != is false for NaN
         total = blend_shares(v, f)
     slope *= ti.static(1.0 / QUANTA_PER_VOXEL)
-    # Along oblique rays the distance grows faster than that to the surface
+    # Along oblique rays the distance grows faster than the distance to the surface
     steep = slope.norm()
     shorter = 1.0 / ti.select(steep > 1.0, steep, 1.0)
     distance[n] = total * metres * shorter
@@ -175,9 +174,9 @@ def list_blocks(points: ANYx2, per_metre: ti.f64, map_keys: I64, map_slots: I32,
 @QuickLaunch
 @ti.kernel
 def pair(slots: I32, sums: I64x2, values: F32x2, pairs: I64x2):
-    """Row n of `pairs`: row n of `values`, bits, in the upper halves; in the lower ones Σ w of `slots[n]`.
+    """Write row n of `pairs`: the bits of row n of `values` in the upper halves, Σ w in the lower.
 
-    All that `interpolate` reads of a point then lies together: at points in random order it waits for memory.
+    Then all that `interpolate` reads for a point is together: in random order, points wait for memory.
     """
     for run in range(runs(BANDS)):  # run loop: kernels/base/quick_launch.py
         band = unit_of(run, BANDS)
@@ -196,10 +195,10 @@ def interpolate(
     points: ANYx2, per_metre: ti.f64, map_keys: I64, map_slots: I32,
     sums: I64x2,  # SOLVED: pairs
     min_weight: ti.i32, kind: ti.i32, correction: F32x2,
-    row_of: I32,  # SOLVED: row of a slot
+    row_of: I32,  # SOLVED: row of each slot
     distance: F32, weight: F32, gradient: F32x2,
 ):  # fmt: skip
-    """Distance in metres, weight in full samples, and gradient at every point."""
+    """Write distance in metres, weight in full samples, and gradient at every point."""
     count = points.shape[0]
     metres = ti.cast(1.0 / (per_metre * QUANTA_PER_VOXEL), ti.f32)
     for run in range(runs((count + BAND - 1) // BAND)):  # run loop: kernels/base/quick_launch.py
@@ -217,7 +216,7 @@ def interpolate(
                 across = crossing(voxel)
                 packed = corners_l(0)
                 held = corners_f(0.0)
-                if inside and across == 0:  # two of three: eight corners in one block
+                if inside and across == 0:  # two of three points: eight corners in one block
                     slot = find_near(near, voxel, 0, map_keys, map_slots)
                     if slot >= 0:
                         o, row = offset_in_block(voxel), slot
@@ -244,14 +243,14 @@ def interpolate_within(
     sums: I64x2,  # SOLVED: pairs
     min_weight: ti.i32, kind: ti.i32, correction: F32x2, distance: F32, weight: F32, gradient: F32x2,
 ):  # fmt: skip
-    """As `interpolate`, to the bit, at many points: by a table instead of the hash, and many at once.
+    """Write the same results as `interpolate`, bit by bit, for many points: with a table instead of the hash.
 
-    `rows` has the rows in `sums` of the blocks in a box, which begins at block `begin` and has `size` of them
-    along x, y and z: -1 for an absent block, as in the first two layers along each axis and in the last.
+    `rows` has the rows in `sums` of the blocks in a box of `size` blocks along x, y and z from block `begin`
+    on. An absent block has -1, as all blocks in the first two layers along each axis and in the last.
 
-    Points in random order wait for memory; those of a batch wait together: all are placed, then all their
-    sums are touched, then these are blended. Meanwhile a point's row of the answer has its block (`weight`,
-    bits), its voxel (`distance`, bits) and its place in the cell (`gradient`).
+    Points in random order wait for memory, so the points of a batch wait together: first all positions are
+    computed, then all sums are touched, then blended. Meanwhile a point's row of the answer holds its block
+    (`weight`, bits), its voxel (`distance`, bits) and its position in the cell (`gradient`).
     """
     count = points.shape[0]
     metres = ti.cast(1.0 / (per_metre * QUANTA_PER_VOXEL), ti.f32)
@@ -275,7 +274,7 @@ def interpolate_within(
                     block, o = ti.bit_cast(weight[n], ti.i32), ti.bit_cast(distance[n], ti.i32)
                     voxel = vec3i(o >> 6, o >> 3 & 7, o & 7)
                     touched = ti.i64(0)
-                    for c in ti.static(range(4)):  # eight voxels along z are a line of the cache
+                    for c in ti.static(range(4)):  # eight voxels along z are one cache line
                         k = c & crossing(voxel)
                         row = rows[block + (k & 1) * along[0] + (k >> 1) * along[1]]
                         if row >= 0:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""A z-buffer rasteriser: the triangle that each pixel sees.
+"""Rasterise triangles with a z-buffer: find the triangle that each pixel sees, and shade images.
 
-Vertices come in camera coordinates (x right, y down, z forward). A pixel keeps the smallest `depth bits << 32
-| triangle`, by an atomic minimum: the picture does not depend on thread order. Back faces are not drawn, so a
-room opens like a doll's house.
+Vertices are in camera coordinates (x right, y down, z forward). A pixel keeps the smallest `depth bits << 32
+| triangle`, by an atomic minimum: the image does not depend on thread order. Back faces are not drawn, which
+shows rooms from outside without their near walls.
 """
 
 import taichi as ti
@@ -13,35 +13,35 @@ from tsfusion.kernels import F32x2, F32x3, I32x2, I64x2, U8x2, U8x3
 from tsfusion.kernels.base.quick_launch import runs, unit_of
 
 EMPTY = (1 << 63) - 1
-OVERLAP = 5e-4  # pixels that a triangle is wider by: where neighbours are rounded otherwise there is no gap
+OVERLAP = 5e-4  # pixels added to a triangle's width: rounding leaves no gap between neighbours
 BANDS = 64  # of rows of the image: units of parallel work
-TAPS = 14  # places around a pixel that are looked at for what shades it
-FLAT = 0.08  # sine of the rise that shades nothing: that of noise
+TAPS = 14  # samples around a pixel for its ambient occlusion
+FLAT = 0.08  # sine of a rise, up to noise, that does not darken
 GOLDEN = 2.399963  # angle between taps of a spiral, radians (Vogel 1979)
 
 
 @ti.func
 def corner(vertices: ti.types.ndarray(), i):
-    """Row i of an array as a vector."""
+    """Return row i of an array as a vector."""
     return tm.vec3(vertices[i, 0], vertices[i, 1], vertices[i, 2])
 
 
 @ti.func
 def cut(a, b, near):
-    """Point where the edge from a (in front of the near plane) to b (behind it) meets the plane."""
+    """Return the point where the edge from a (ahead of the near plane) to b (behind it) meets the plane."""
     t = (near - a.z) / (b.z - a.z)
     return tm.vec3(a.x + t * (b.x - a.x), a.y + t * (b.y - a.y), near)
 
 
 @ti.func
 def edge(a, b, p):
-    """Twice the signed area of the triangle a, b, p in the image."""
+    """Return twice the signed area of the triangle a, b, p in the image."""
     return (b.x - a.x) * (p.y - a.y) - (b.y - a.y) * (p.x - a.x)
 
 
 @ti.func
 def fill(seen: ti.types.ndarray(), a, b, c, triangle, focal, width, height):
-    """Draw one triangle that lies wholly in front of the near plane."""
+    """Draw one triangle that lies completely ahead of the near plane."""
     centre = tm.vec2(0.5 * (width - 1), 0.5 * (height - 1))
     pa = centre + focal * a.xy / a.z
     pb = centre + focal * b.xy / b.z
@@ -94,11 +94,11 @@ def rasterise(seen: I64x2, vertices: F32x2, faces: I32x2, focal: ti.f32, near: t
         b = corner(vertices, faces[f, 1])
         c = corner(vertices, faces[f, 2])
         facing = tm.dot(tm.cross(b - a, c - a), a)
-        if facing < 0.0:  # the normal points towards the eye
+        if facing < 0.0:  # the triangle's normal points towards the eye
             in_front = 0
             for k in ti.static(range(3)):
                 in_front += ti.cast(vertices[faces[f, k], 2] >= near, ti.i32)
-            # Turn the triangle until the corner that differs from the others stands first.
+            # Rotate the triangle until the corner that differs from the others is the first.
             for _ in range(2):
                 odd = (a.z >= near) if in_front == 1 else (a.z < near)
                 if (in_front == 1 or in_front == 2) and not odd:
@@ -119,13 +119,13 @@ def rasterise(seen: I64x2, vertices: F32x2, faces: I32x2, focal: ti.f32, near: t
 
 @ti.func
 def opposite(a, b, c):
-    """Rows: normals of the planes through the eye and the side opposite to each corner of a triangle."""
+    """Return normals, as rows, of the planes through the eye and the side opposite each triangle corner."""
     return ti.Matrix.rows([tm.cross(b, c), tm.cross(c, a), tm.cross(a, b)])
 
 
 @ti.func
 def shares(edges, ray):
-    """Shares of the corners where a ray meets the plane of their triangle (Möller and Trumbore 1997)."""
+    """Return the shares of the corners where a ray meets a triangle's plane (Möller and Trumbore 1997)."""
     w = edges @ ray
     total = w.sum()
     if total != 0.0:
@@ -142,7 +142,7 @@ def look_up(
     colors: U8x2,  # likewise
     focal: ti.f32, empty: ti.i64, depth: F32x2, normal: F32x3, color: U8x3,
 ):  # fmt: skip
-    """Depth, unit normal and colour of every pixel that is not EMPTY, from its triangle's corners."""
+    """Write depth, unit normal and colour of every pixel that is not EMPTY, from its triangle's corners."""
     height, width = seen.shape[0], seen.shape[1]
     per_pixel = 1.0 / focal
     is_more = normals.shape[0] + colors.shape[0] > 0
@@ -187,8 +187,8 @@ def shade(
 ):  # fmt: skip
     """Write `image` (H, W, 4): linear RGB in 0…1 and depth in metres, where `seen` is not EMPTY.
 
-    `normals` and `up` are in camera coordinates; `colors` (n, 3) are sRGB. A lamp at the eye gives form,
-    a hemisphere around `up` tells floors from walls.
+    `normals` and `up` are in camera coordinates; `colors` (n, 3) are sRGB. A lamp at the eye shows shapes. A
+    hemisphere around `up` distinguishes floors from walls.
     """
     height, width = seen.shape[0], seen.shape[1]
     for v, u in ti.ndrange(height, width):
@@ -211,7 +211,7 @@ def shade(
 
 @ti.func
 def point_at(image: ti.types.ndarray(), v, u, focal):
-    """Point that a pixel sees, camera coordinates; z = 0 if it sees nothing."""
+    """Return the point that a pixel sees, in camera coordinates; z = 0 if the pixel is empty."""
     x = (u - 0.5 * (image.shape[1] - 1)) / focal
     y = (v - 0.5 * (image.shape[0] - 1)) / focal
     return image[v, u, 3] * tm.vec3(x, y, 1.0)
@@ -219,7 +219,7 @@ def point_at(image: ti.types.ndarray(), v, u, focal):
 
 @ti.func
 def step_between(image: ti.types.ndarray(), v, u, dv, du, focal):
-    """Vector along the surface from pixel (v, u) towards (v + dv, u + du), by the less steep side."""
+    """Return the vector along the surface from pixel (v, u) to (v + dv, u + du), on the less steep side."""
     height, width = image.shape[0], image.shape[1]
     here = point_at(image, v, u, focal)
     ahead = point_at(image, ti.min(v + dv, height - 1), ti.min(u + du, width - 1), focal) - here
@@ -231,10 +231,10 @@ def step_between(image: ti.types.ndarray(), v, u, dv, du, focal):
 
 @ti.kernel
 def occlude(image: F32x3, samples: ti.i32, focal: ti.f32, radius: ti.f32, strength: ti.f32):
-    """Darken `image` (H, W, 4), in place, where surfaces within `radius` metres stand before the sky.
+    """Darken `image` (H, W, 4), in place, where surfaces within `radius` metres hide the sky.
 
-    Ambient occlusion from the depths alone (McGuire et al., "The alchemy screen-space ambient obscurance
-    algorithm", 2011), found once for each square of `samples`² of them.
+    This is ambient occlusion from depths alone (McGuire et al., "The alchemy screen-space ambient obscurance
+    algorithm", 2011), computed once per `samples`² pixels.
     """
     height, width = image.shape[0], image.shape[1]
     for i, j in ti.ndrange(height // samples, width // samples):

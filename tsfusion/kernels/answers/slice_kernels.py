@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A slice of the map: a plane of cells, each a column of samples between two heights."""
+"""Compute a slice of the map: a grid of cells, each a column of samples between two heights."""
 
 import taichi as ti
 
@@ -20,10 +20,10 @@ def read_columns(
     correction: F32x2, corrected: ti.i32, color_rgn: I64x2, hits: I32x2, layers: ti.i32, shows_surface: U8,
     clear_keys: I64, clear_slots: I32, clear_counts: I32, min_weight: ti.i32, values: F32, seen: I32,
 ):  # fmt: skip
-    """Write `values`: the smallest signed distance in voxels (`held`) among the seen samples of each of the
-    `cells`, NaN if none was seen; and `seen`: the number of samples that were seen, or lie in a block that is
-    free as a whole. Cell n is (`row` + n // `width`, `column` + n % `width`). It has `across`² columns of
-    `heights` samples, `along_row`, `along_column`, `along_height` apart, in voxels, from `corner` on."""
+    """Write `values`: the smallest signed distance (`held`), in voxels, among a cell's seen samples, NaN
+    without any. Write `seen`: the number of samples that were seen, or lie in a wholly free block. Cell n of
+    `cells` is (`row` + n // `width`, `column` + n % `width`). It has `across`² columns of `heights` samples,
+    `along_row`, `along_column`, `along_height` apart, in voxels, from `corner` on."""
     mask = map_keys.shape[0] - 1
     for run in range(runs(BANDS)):  # run loop: kernels/base/quick_launch.py
         band = unit_of(run, BANDS)
@@ -62,7 +62,7 @@ def read_columns(
                                     value = distance / ti.cast(w, ti.f32) / QUANTA_PER_VOXEL
                                     value = held(value, slot, o, color_rgn, hits, layers)
                                     is_seen = 1
-                                    if not value >= least:  # also where none was seen before
+                                    if not value >= least:  # also true for NaN: no earlier seen sample
                                         least = value
                             number += is_seen | clear
                 values[cell], seen[cell] = least, number

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Textures: the triangle of each texel, its place in the world, and its colour in the cameras' images.
+"""Bake textures: the triangle and 3-D point of each texel, and its colour in the cameras' images.
 
 Texel (column i, row j) has its centre at (i + 0.5, j + 0.5). A texel keeps the smallest `distance from the
-triangle << 32 | triangle`, by an atomic minimum; every other loop writes to its own texel alone. So nothing
-depends on the order of the threads.
+triangle << 32 | triangle`, by an atomic minimum. Every other loop writes only to its own texel. Hence no
+result depends on the order of threads.
 """
 
 import taichi as ti
@@ -12,38 +12,38 @@ import taichi.math as tm
 from tsfusion.kernels import F32, I32, U8, F32x2, F32x3, F64x2, I32x2, I64x2
 
 NOBODY = (1 << 63) - 1
-SUBTEXEL = 256.0  # units of distance in a texel
-_NEAR = 0.05  # metres in front of a camera where it begins to see
+SUBTEXEL = 256.0  # units of distance per texel
+_NEAR = 0.05  # metres ahead of a camera; nearer points are not visible
 
 
 @ti.func
 def row2(array: ti.template(), i, k):
-    """Corner k of triangle i in the texture."""
+    """Return corner k of triangle i in the texture."""
     return tm.vec2(array[i, k, 0], array[i, k, 1])
 
 
 @ti.func
 def row3(array: ti.template(), i):
-    """Row i of an array as a vector."""
+    """Return row i of an array as a vector."""
     return tm.vec3(array[i, 0], array[i, 1], array[i, 2])
 
 
 @ti.func
 def along_edge(a, b, p):
-    """Share of the way from a to b at which the edge is nearest to p."""
+    """Return the share of the way from a to b at which the edge is nearest to p."""
     d = b - a
     return tm.clamp(tm.dot(p - a, d) / ti.max(tm.dot(d, d), 1e-12), 0.0, 1.0)
 
 
 @ti.func
 def nearest_in_triangle(a, b, c, p):
-    """Barycentric weights of the point of a triangle nearest to p, and its distance (x, y, z, distance)."""
+    """Return barycentric weights of a triangle's point nearest to p, and its distance (x, y, z, distance)."""
     area = (b.x - a.x) * (c.y - a.y) - (b.y - a.y) * (c.x - a.x)
     wa = (b.x - p.x) * (c.y - p.y) - (b.y - p.y) * (c.x - p.x)
     wb = (c.x - p.x) * (a.y - p.y) - (c.y - p.y) * (a.x - p.x)
     wc = area - wa - wb
     found = tm.vec4(0.0, 0.0, 0.0, 0.0)
-    if area < 0:  # a chart may be laid down mirrored
+    if area < 0:  # a chart may be mirrored
         area, wa, wb, wc = -area, -wa, -wb, -wc
     if area > 0 and wa >= 0 and wb >= 0 and wc >= 0:
         found = tm.vec4(wa / area, wb / area, wc / area, 0.0)
@@ -82,7 +82,7 @@ def claim_texels(owner: I64x2, corners: F32x3, chosen: I32, reach: ti.f32):
 
 @ti.kernel
 def mark_covered(owner: I64x2, corners: F32x3, chosen: I32, covered: U8):
-    """Set `covered[f]` of each triangle that has another one's texel well inside it."""
+    """Set `covered[f]` of each triangle that has a texel of another triangle well inside it."""
     height, width = owner.shape[0], owner.shape[1]
     for index in range(chosen.shape[0]):
         f = chosen[index]
@@ -102,7 +102,7 @@ def place_texels(
     texels: I32x2, owner: I64x2, corners: F32x3, vertices: F32x2, normals: F32x2, faces: I32x2, points: F32x2,
     directions: F32x2,
 ):  # fmt: skip
-    """Write the points of the mesh at the texels `texels` (n, 2), row and column, and the normals there."""
+    """Write the points and normals of the mesh at the texels `texels` (n, 2), given as row and column."""
     for r in range(texels.shape[0]):
         j, i = texels[r, 0], texels[r, 1]
         f = ti.cast(owner[j, i], ti.i32)
@@ -121,7 +121,7 @@ def place_texels(
 
 @ti.func
 def bilinear(image: ti.template(), u, v, k):
-    """Channel k of an image between its pixels; (u, v) is inside by a pixel."""
+    """Interpolate channel k of an image between its pixels; (u, v) is at least a pixel inside."""
     i, j = ti.cast(ti.floor(u), ti.i32), ti.cast(ti.floor(v), ti.i32)
     s, t = u - i, v - j
     above = (1.0 - s) * image[j, i, k] + s * image[j, i + 1, k]
@@ -131,7 +131,7 @@ def bilinear(image: ti.template(), u, v, k):
 
 @ti.func
 def moved(T: ti.template(), p):
-    """Point p in the target frame of T (4, 4)."""
+    """Transform point p by T (4, 4)."""
     q = tm.vec3(0.0)
     for k in ti.static(range(3)):
         q[k] = ti.cast(T[k, 0] * p.x + T[k, 1] * p.y + T[k, 2] * p.z + T[k, 3], ti.f32)
@@ -140,13 +140,13 @@ def moved(T: ti.template(), p):
 
 @ti.func
 def pixel(K: ti.template(), p):
-    """Column and row of a point of the camera's frame."""
+    """Return column and row of a point in the camera's frame."""
     return tm.vec2(K[0] * p.x / p.z + K[2], K[1] * p.y / p.z + K[3])
 
 
 @ti.func
 def is_inside(at, height, width):
-    """True if a pixel can be interpolated between its neighbours."""
+    """Return True if a pixel can be interpolated between its neighbours."""
     return at.x >= 1.0 and at.y >= 1.0 and at.x < width - 2.0 and at.y < height - 2.0
 
 
@@ -155,12 +155,12 @@ def look(
     points: F32x2, normals: F32x2, T: F64x2, T_color: F64x2, K: F32, depth: F32x2, clearness: F32x2,
     tolerance: ti.f32, relative: ti.f32, least_cosine: ti.f32, found: F32x2,
 ):  # fmt: skip
-    """Write column, row and quality of each point in an image to `found` (n, 3); quality 0 = not seen.
+    """Write column, row and quality of each point in an image to `found` (n, 3); quality 0 = not visible.
 
-    A point is seen if the image's depth lies within `tolerance + relative · z` of the point's: nothing stands
-    in front of it, and its surface was there. The quality is the number of pixels on a square metre there,
-    times the pixel's clearness. `T` (4, 4) is T_camera_world, `T_color` the same of the colours alone, which
-    may have been taken at another moment than the depth; `K` fx, fy, cx, cy.
+    A point is visible if the image's depth is within `tolerance + relative · z` of the point's depth: nothing
+    occludes the surface, and it existed then. The quality is the number of pixels per square metre of the
+    surface, times the pixel's clearness. `T` (4, 4) is T_camera_world. `T_color` is the same for the colours,
+    which may be from another moment than the depth. `K` is fx, fy, cx, cy.
     """
     height, width = depth.shape[0], depth.shape[1]
     for r in range(points.shape[0]):
@@ -192,9 +192,9 @@ def look(
 def blend(found: F32x2, bands: F32x3, unit: ti.f32, power: ti.f32, sums: F32x2):
     """Add an image to `sums` (n, 8): Σ of weight and coarse colour, Σ of weight and fine colour.
 
-    `bands` (H, W, 7): the image's coarse part, its fine part, and its trust. Coarse colours are mixed by
-    quality, which hides seams; for fine ones the weight is a power of the quality, so that the best views
-    prevail. `unit` is the quality that counts 1.
+    `bands` (H, W, 7) has the image's coarse part, its fine part, and its trust. Coarse colours are mixed by
+    quality, which hides seams. The weight of fine colours is a power of the quality, which favours the best
+    views. `unit` is the quality with weight 1.
     """
     for r in range(found.shape[0]):
         u, v = found[r, 0], found[r, 1]

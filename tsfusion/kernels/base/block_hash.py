@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""The hash from block key to slot of the whole map, and the set of blocks that a keyframe finds missing.
+"""Map block keys to slots by a hash, and collect the blocks that a keyframe finds missing in a set.
 
 The set is the phase-concurrent, history-independent table of Shun and Blelloch (SPAA 2014): a larger key
-displaces a smaller one onward with `atomic_max`, so the table's content, and with it every slot given out
-from it, does not depend on which thread came first. No locks, no compare-and-swap.
+displaces a smaller key to the next entry with `atomic_max`. Hence the table's content, and every slot
+assigned from it, does not depend on the order of threads. It needs no locks and no compare-and-swap.
 """
 
 import taichi as ti
@@ -19,7 +19,7 @@ MAX_PROBES = 256
 def set_insert(table: ti.template(), mask, key):
     """Insert `key` (> 0) into the set. Returns the growth of the set, and a flag: the set is too full.
 
-    If threads insert one key at the same time, one counts it.
+    If several threads insert one key at the same time, one of them counts it.
     """
     full, grown = 0, 0
     carried = key
@@ -45,7 +45,7 @@ def set_insert(table: ti.template(), mask, key):
 
 @ti.func
 def map_find(keys: ti.template(), slots: ti.template(), mask, key):
-    """Slot of block `key` in the map, -1 if absent. The table is never more than half full."""
+    """Return the slot of block `key` in the map, -1 if absent. The table is at most half full."""
     i = hash_key(key) & mask
     slot = -1
     probes = 0
@@ -64,7 +64,7 @@ def map_find(keys: ti.template(), slots: ti.template(), mask, key):
 @QuickLaunch
 @ti.kernel
 def insert_blocks(keys: I64, first: ti.i32, count: ti.i32, first_slot: ti.i32, map_keys: I64, map_slots: I32):
-    """Give `keys[first + i]` the slot `first_slot + i`. Serial; the caller keeps the table half empty and
+    """Assign slot `first_slot + i` to `keys[first + i]`. Serial. The caller keeps the table half empty, and
     the keys distinct and new."""
     mask = map_keys.shape[0] - 1
     ti.loop_config(serialize=True)
@@ -81,7 +81,7 @@ def insert_blocks(keys: I64, first: ti.i32, count: ti.i32, first_slot: ti.i32, m
 @QuickLaunch
 @ti.kernel
 def find_blocks(keys: I64, map_keys: I64, map_slots: I32, slots: I32):
-    """Slots of block keys, -1 where absent."""
+    """Write the slots of block keys, -1 for absent blocks."""
     mask = map_keys.shape[0] - 1
     for i in range(keys.shape[0]):
         slots[i] = map_find(map_keys, map_slots, mask, keys[i])
@@ -90,7 +90,7 @@ def find_blocks(keys: I64, map_keys: I64, map_slots: I32, slots: I32):
 @QuickLaunch
 @ti.kernel
 def find_places(keys: I64, map_keys: I64, places: I32):
-    """Places of blocks in the hash, where they are in it. Serial, as `insert_blocks`."""
+    """Write the indices of blocks in the hash, which must contain them. Serial, as `insert_blocks`."""
     mask = map_keys.shape[0] - 1
     ti.loop_config(serialize=True)
     for n in range(keys.shape[0]):

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Functions that kernels share: products rounded as on every CPU, and a check of devices.
+"""Multiply and divide with the same rounding on every device, and check that a device is exact.
 
-Taichi's CUDA backend and drivers of Vulkan may turn a·b + c into one instruction that rounds once (FMA): its
-last bit differs. There a product passes through `max` with a number below all that occur, which no
-compiler can leave out or fuse. On the CPU, where Taichi does not fuse (`fast_math=False`), it is the bare
-product. `is_exact` checks a device: atomics on int64, and float64 as on the CPU.
+Taichi's CUDA backend and Vulkan drivers may turn a·b + c into one instruction that rounds once (FMA), which
+changes the last bit. There a product passes through `max` with a number below all possible products: no
+compiler can leave out or fuse it. On the CPU, where Taichi does not fuse (`fast_math=False`), it is the plain
+product. `is_exact` checks a device's atomics on int64, and its float64 results.
 """
 
 import numpy as np
@@ -12,7 +12,7 @@ import numpy as np
 from tsfusion.kernels import F64, I64
 from tsfusion.kernels import taichi as ti
 
-LOWEST = -3.0e38  # of float32, too
+LOWEST = -3.0e38  # fits float32, too
 _ADDED = 4096
 _STEP = -(1 << 27) - 3
 
@@ -23,7 +23,7 @@ def _may_fuse() -> bool:
 
 @ti.func
 def product(a, b):
-    """a·b, of numbers or of each component."""
+    """Return a·b, of numbers or of each component."""
     found = a * b
     if ti.static(_may_fuse()):
         found = ti.max(found, LOWEST)
@@ -32,7 +32,7 @@ def product(a, b):
 
 @ti.func
 def quotient(a, b):
-    """a / b of float32, which CUDA else divides only nearly."""
+    """Return a / b of float32, exactly rounded: CUDA's own division is not."""
     found = a / b
     if ti.static(_may_fuse()):
         found = ti.cast(ti.max(ti.cast(a, ti.f64) / ti.cast(b, ti.f64), LOWEST), ti.f32)
@@ -41,19 +41,19 @@ def quotient(a, b):
 
 @ti.func
 def dot(a, b):
-    """a · b of two vectors."""
+    """Return a · b of two vectors."""
     return product(a, b).sum()
 
 
 @ti.func
 def norm(a):
-    """Length of a vector."""
+    """Return the length of a vector."""
     return ti.sqrt(dot(a, a))
 
 
 @ti.func
 def cross(a, b):
-    """a × b of two vectors of three."""
+    """Return a × b of two vectors of three components."""
     left = product(ti.Vector([a[1], a[2], a[0]]), ti.Vector([b[2], b[0], b[1]]))
     return left - product(ti.Vector([a[2], a[0], a[1]]), ti.Vector([b[1], b[2], b[0]]))
 
@@ -72,7 +72,7 @@ def _roots(values: F64):
 
 
 def is_exact() -> bool:
-    """True if sums, the largest of numbers, and rounded quotients of roots come out as NumPy has them."""
+    """Return True if sums, maxima, and rounded quotients of roots equal those of NumPy."""
     sums = ti.ndarray(ti.i64, (2,))
     sums.fill(0)
     _sum_and_largest(sums, _ADDED, _STEP)

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""Launches of a kernel in a tenth of the time that Taichi takes, and loops shared out among threads.
+"""Launch a kernel in a tenth of the time that Taichi takes, and distribute loops over threads.
 
-Taichi 1.7 looks at the type of every argument anew at each launch: 8 µs an argument, 0.14 ms for the sixteen
-of `integrate.add_rays`. A small keyframe's rays take no longer, and the look-up is always one thread's work.
+Taichi 1.7 checks the type of every argument again at each launch: 8 µs per argument, 0.14 ms for the sixteen
+of `integrate.add_rays`. A small keyframe's rays take no longer, and the check runs in a single thread.
 
 A run loop is a parallel loop over heavy units of work (a band of rays, a block). Taichi 1.7's CPU backend
-gives each thread one contiguous piece of a loop, of the same length, at least 512 iterations
-(`make_cpu_multithreaded_range_for.cpp`). Neighbouring units cost alike, and pieces differ: at 1 cm the rays
-of an image's lower half cost 1.7 times those of its upper half, and one thread waited for the other. So
-thread t of T takes units t, t + T, t + 2T, …:
+gives each thread one contiguous piece of a loop, of equal length, at least 512 iterations
+(`make_cpu_multithreaded_range_for.cpp`). Neighbouring units cost the same, pieces do not: at 1 cm the rays of
+an image's lower half cost 1.7 times those of its upper half, and one thread waited for the other. So thread t
+of T takes units t, t + T, t + 2T, …:
 
     for run in range(runs(count)):  # run loop: kernels/base/quick_launch.py
         unit = unit_of(run, count)
@@ -25,16 +25,16 @@ from numpy.typing import NDArray
 from tsfusion.kernels import taichi as ti
 from tsfusion.kernels.base import runtime
 
-_LEAST = 512  # iterations that Taichi gives to one thread
+_LEAST = 512  # least iterations that Taichi gives to one thread
 _INTEGERS, _FLOATS = (int, np.integer), (float, np.floating)
 _INTEGER, _FLOAT, _OF_TAICHI, _OF_NUMPY, _COPIED = -1, -2, -3, -4, -5
-_WHAT: dict[type, int] = {}  # of the types of arguments that were seen: to ask anew takes half of a launch
+_WHAT: dict[type, int] = {}  # kind of each argument type seen so far: a new check takes half of a launch
 
 
 class Copied(NamedTuple):
-    """A NumPy array with a copy on a device: a kernel that only reads it is handed the copy.
+    """A NumPy array with a copy on a device; a kernel that only reads the array gets the copy.
 
-    Its first launch, which is Taichi's own, copies the array itself.
+    The first launch, which Taichi makes, copies the array itself.
     """
 
     array: NDArray[Any]
@@ -42,8 +42,8 @@ class Copied(NamedTuple):
 
 
 class QuickLaunch:
-    """A kernel over arrays of NumPy (contiguous) and of Taichi and numbers, launched as Taichi does once it
-    knows their types.
+    """A kernel over contiguous NumPy arrays, Taichi arrays and numbers, launched without Taichi's checks once
+    the argument types are known.
 
     Taichi itself makes the first launch for each choice of dtypes and dimensions, every launch with other
     arguments, and all launches in another version of Taichi.
@@ -84,7 +84,7 @@ class QuickLaunch:
         self._program.launch_kernel(code, context)
 
     def _begin(self, arguments: tuple[Any, ...], kind: tuple[int, ...] | None) -> None:
-        """Launch the kernel as Taichi does, and keep its compiled form."""
+        """Launch the kernel through Taichi, and keep its compiled form."""
         arguments = tuple(one.array if isinstance(one, Copied) else one for one in arguments)
         self._kernel(*arguments)
         if kind is None:
@@ -107,14 +107,14 @@ class QuickLaunch:
 
 
 def _is_known(argument: Any) -> bool:
-    """True for an array or a number; a vector is made of the numbers of an array."""
+    """Return True for an array or a number; a vector becomes the numbers of an array."""
     annotation = argument.annotation
     numbers = ti.types.primitive_types.type_ids
     return isinstance(annotation, ti.types.ndarray_type.NdarrayType) or id(annotation) in numbers
 
 
 def _kind(arguments: tuple[Any, ...]) -> tuple[int, ...] | None:
-    """Types that a launch depends on, as numbers; None = Taichi has to look."""
+    """Return the argument types as numbers, or None if Taichi must launch."""
     kind = []
     for argument in arguments:
         what = _WHAT.get(type(argument))
@@ -122,7 +122,7 @@ def _kind(arguments: tuple[Any, ...]) -> tuple[int, ...] | None:
             kind.append(-8 - (id(argument.dtype) << 4 | len(argument.shape)))
         elif what == _OF_NUMPY or what == _COPIED:
             array = argument.array if what == _COPIED else argument
-            if not (array.flags.c_contiguous and array.dtype.isnative):  # `num` says nothing of bytes
+            if not (array.flags.c_contiguous and array.dtype.isnative):  # `num` does not show byte order
                 return None
             kind.append(array.dtype.num << 4 | array.ndim)
         elif what is not None:
@@ -136,7 +136,7 @@ def _kind(arguments: tuple[Any, ...]) -> tuple[int, ...] | None:
 
 
 def _what(argument: Any) -> int | None:
-    """Class of an argument, also for a subclass of a usual type; None = Taichi has to look."""
+    """Return the class of an argument, also for a subclass of a usual type, or None if Taichi must launch."""
     for kind, what in (
         (ti.Ndarray, _OF_TAICHI), (np.ndarray, _OF_NUMPY), (Copied, _COPIED), (_INTEGERS, _INTEGER),
         (_FLOATS, _FLOAT),
@@ -154,12 +154,12 @@ def _piece(count):
 
 @ti.func
 def runs(count):
-    """Iterations of a run loop over `count` units."""
+    """Return the number of iterations of a run loop over `count` units."""
     return _piece(count) * ti.static(runtime.threads())
 
 
 @ti.func
 def unit_of(run, count):
-    """Unit of an iteration; `count` or more = none."""
+    """Return the unit of an iteration; `count` or more means none."""
     piece = _piece(count)
     return run % piece * ti.static(runtime.threads()) + run // piece

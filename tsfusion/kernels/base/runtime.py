@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Start of Taichi, once, on the thread that will launch kernels."""
+"""Start Taichi, once per process, on the thread that will launch kernels."""
 
 import ctypes
 import os
@@ -18,15 +18,15 @@ from tsfusion.core.errors import MapError, MissingDependency
 _GRID = 2048  # blocks of 128 threads of a device's task: of four times as many, most only end: 5 µs each task
 
 _started_threads: int | None = None
-_FORKED = -1  # the thread stayed in the parent
-_thread: int | None = None  # the one that kernels run in; None = no one yet
+_FORKED = -1  # marks a forked process; the kernel thread stayed in its parent
+_thread: int | None = None  # the thread that runs kernels; None before the start
 
 
 def check_thread() -> None:
-    """Raise MapError in another thread than the one that started Taichi, and in a process forked from it.
+    """Raise MapError in a thread other than the one that started Taichi, or in a process forked from it.
 
-    Taichi itself checks only a kernel's first launch. Two threads would write to one map at the same time; in
-    a forked process the threads of kernels are missing, and a launch waits for them for ever.
+    Taichi itself checks only a kernel's first launch. Two threads would write to one map at the same time. In
+    a forked process the threads of kernels are missing, and a launch would wait for them for ever.
     """
     if get_ident() == _thread or _thread is None:
         return
@@ -43,13 +43,13 @@ def check_thread() -> None:
 
 
 def _leave_thread() -> None:
-    """Note in a forked process that it lacks the threads of kernels, for which Taichi waits at its end."""
+    """Mark a forked process: it lacks the threads of kernels, for which Taichi would wait at its end."""
     global _thread  # noqa: PLW0603  as below
     if _thread is not None:
         from taichi.lang import impl
 
         _thread = _FORKED
-        ctypes.pythonapi.Py_IncRef(ctypes.py_object(impl.get_runtime().prog))  # so that it has no end
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(impl.get_runtime().prog))  # never destroyed
 
 
 if hasattr(os, "register_at_fork"):
@@ -57,17 +57,17 @@ if hasattr(os, "register_at_fork"):
 
 
 def start(threads: int | None = None) -> None:
-    """Start Taichi's CPU backend, once a process.
+    """Start Taichi's CPU backend, once per process.
 
-    The thread count of the first call stands: a second `ti.init` would tear kernels down. Results never
-    depend on it.
+    The thread count of the first call remains, because a second `ti.init` would destroy kernels. Results
+    never depend on it.
 
     Raises:
         MissingDependency: where taichi has no wheel (Linux aarch64, Intel Macs).
         MapError: in another thread than before, or in a forked process (`check_thread`).
     """
     global _started_threads, _thread  # noqa: PLW0603  the process-wide state: Taichi itself is global
-    from tsfusion.kernels import taichi as ti  # says what to do where there is none
+    from tsfusion.kernels import taichi as ti  # its error says what to do without Taichi
 
     check_thread()
     if _started_threads is None:
@@ -75,22 +75,22 @@ def start(threads: int | None = None) -> None:
         _leave_out_source_lines()
         _started_threads = threads or len(process.cores())
         kept_in()
-        # `ti.init` starts the threads of kernels last, and prints; a program may be reading our stdout
+        # `ti.init` starts the threads of kernels, and prints; a program may be reading our stdout
         with process.cores_of_their_own(_started_threads), redirect_stdout(StringIO()):
             ti.init(
                 arch=ti.cpu,
                 cpu_max_num_threads=_started_threads,
                 fast_math=False,  # a reassociated float would make two kernels disagree
-                cfg_optimization=False,  # LLVM does the same, and Taichi's took three quarters of compiling
+                cfg_optimization=False,  # LLVM does the same; Taichi's took three quarters of compiling
                 offline_cache=True,
                 log_level=ti.ERROR,
             )
 
 
 def start_device(arch: str) -> None:
-    """Start Taichi on a device instead, once a process: `cuda`, `vulkan` or `metal`.
+    """Start Taichi on a device instead, once per process: `cuda`, `vulkan` or `metal`.
 
-    Raises MissingDependency if this machine, or Taichi's build for it, has no such device, or the device
+    Raises MissingDependency if this machine, or Taichi's build for it, has no such device, or if the device
     lacks a feature that the map needs.
     """
     from tsfusion.kernels import taichi as ti
@@ -116,9 +116,9 @@ def start_device(arch: str) -> None:
 
 @cache
 def kept_in() -> tuple[str, str]:
-    """Folder of compiled kernels, and the reason for an unusual one; empty = it is the usual one.
+    """Return the folder of compiled kernels, and the reason for an unusual folder, empty for the usual one.
 
-    Taichi makes the folder when a process ends; if it cannot, that end is a segmentation fault.
+    Taichi creates the folder at a process's end. If it cannot, this end is a segmentation fault.
     """
     from taichi.lang import impl
 
@@ -130,15 +130,15 @@ def kept_in() -> tuple[str, str]:
         with suppress(OSError):
             os.mkdir(other, 0o700)
         found = os.lstat(other)
-        if found.st_uid != os.getuid() or found.st_mode != stat.S_IFDIR | 0o700:  # what runs is read there
+        if found.st_uid != os.getuid() or found.st_mode != stat.S_IFDIR | 0o700:  # its kernels are executed
             other = tempfile.mkdtemp(prefix="tsfusion-kernels-")
-        os.environ["TI_OFFLINE_CACHE_FILE_PATH"] = other  # an argument of `ti.init` would be warned of
+        os.environ["TI_OFFLINE_CACHE_FILE_PATH"] = other  # an argument of `ti.init` would cause a warning
         return other, f"{usual} cannot be made: {error.strerror}"
     return usual, ""
 
 
 def first_line(error: BaseException) -> str:
-    """First line of an error of Taichi; the others are its place in Taichi."""
+    """Return the first line of a Taichi error; the other lines only show positions in Taichi."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return lines[0] if lines else type(error).__name__
 
@@ -147,7 +147,7 @@ def _leave_out_source_lines() -> None:
     """Keep Taichi from formatting the source position of every statement of every kernel.
 
     Only compile errors show these positions. Formatting them took a third of the time in which kernels load
-    from the cache. Nor are a function's lines looked up and wrapped anew wherever it is called: a twelfth.
+    from the cache. A function's lines are also looked up and wrapped only once, which saves a twelfth.
     """
     with suppress(
         ImportError, AttributeError
@@ -161,5 +161,5 @@ def _leave_out_source_lines() -> None:
 
 
 def threads() -> int:
-    """Number of threads that kernels run on; 1 before `start`."""
+    """Return the number of threads that kernels run on; 1 before `start`."""
     return _started_threads or 1

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Integer geometry shared by all kernels: voxel keys, and the traversal of the voxels a ray crosses.
+"""Integer geometry for all kernels: voxel keys, and the traversal of the voxels that a ray crosses.
 
 A ray is `RAY_FIELDS` int32, made once per keyframe: the start of its band and its steps. All later arithmetic
 is in integers, so every kernel visits the same voxels.
-
 Units: position 2⁻¹⁰ voxel, direction 2⁻¹⁶, distance along the ray 2⁻¹⁶ voxel.
 """
 
@@ -11,11 +10,11 @@ import taichi as ti
 
 from tsfusion.kernels.base.kernel_functions import dot, norm, product
 
-# First voxel of the band (3), next crossing an axis (3), crossing interval an axis (3), loss of the distance
-# with a step an axis (3), signed distance of the first voxel's centre to the surface along the ray (positive
-# before it), length of the ray, place of the end point in it, weight << 24 | 0xRRGGBB. The band is as wide
-# before the end point as behind it. The low 3 bits of `END` are the axes that go down; the next 5, above the
-# low 8 of `LENGTH`, are the support, 2⁻⁸ voxel.
+# First voxel of the band (3), next crossing per axis (3), crossing interval per axis (3), loss of the
+# distance per step on each axis (3), signed distance of the first voxel's centre to the surface along the ray
+# (positive before it), length of the ray, position of the end point along it, weight << 24 | 0xRRGGBB. The
+# band is as wide before the end point as behind it. The low 3 bits of `END` are the axes that decrease; the
+# next 5, above the low 8 of `LENGTH`, are the support, 2⁻⁸ voxel.
 RAY_FIELDS = 16
 VOXEL, CROSSING, INTERVAL, LOSS = 0, 3, 6, 9
 DISTANCE, LENGTH, END, WEIGHT_COLOR = 12, 13, 14, 15
@@ -29,16 +28,16 @@ VOXEL_LIMIT = 1 << 20  # |voxel coordinate| < VOXEL_LIMIT − 64, so that a band
 
 
 DIRECTION_ONE = 1 << 16
-FAR_COST = 5  # measured: 100 ns instead of 20 a voxel
-NEVER = 1 << 30  # a crossing far behind the longest band
-LEAST_DIRECTION = 8  # an axis slower than this is not crossed: 2⁻¹³, one voxel in 8192
+FAR_COST = 5  # factor on the cost of far voxels; measured: 100 ns instead of 20
+NEVER = 1 << 30  # a crossing far behind the end of the longest band
+LEAST_DIRECTION = 8  # a slower axis is not crossed: 2⁻¹³, one voxel in 8192
 
 vec3i = ti.types.vector(3, ti.i32)
 
 
 @ti.func
 def pack(x, y, z):
-    """A non-zero int64 key of three coordinates in (−2²⁰, 2²⁰)."""
+    """Return a non-zero int64 key of three coordinates in (−2²⁰, 2²⁰)."""
     return (
         (ti.cast(x + 1048576, ti.i64) << 42)
         | (ti.cast(y + 1048576, ti.i64) << 21)
@@ -48,7 +47,7 @@ def pack(x, y, z):
 
 @ti.func
 def unpack(key):
-    """Three coordinates of a key: the inverse of `pack`."""
+    """Return the three coordinates of a key: the inverse of `pack`."""
     return vec3i(
         ti.cast((key >> 42) & 2097151, ti.i32) - 1048576,
         ti.cast((key >> 21) & 2097151, ti.i32) - 1048576,
@@ -58,7 +57,7 @@ def unpack(key):
 
 @ti.func
 def hash_key(key):
-    """31 well-mixed bits (Fibonacci hashing, twice: neighbouring blocks differ in few bits)."""
+    """Return 31 well-mixed bits (Fibonacci hashing, twice: neighbouring blocks differ in few bits)."""
     h = key * ti.i64(-7046029254386353131)
     h = h ^ (h >> 29)
     h = h * ti.i64(-4658895280553007687)
@@ -69,16 +68,16 @@ def hash_key(key):
 def write_ray(
     rays: ti.template(), r, first, end, direction, gradient, before, support, behind, weight, color
 ):
-    """Write ray `r` of a band that begins with ray `first`. Returns the cost of its addition.
+    """Write ray `r` of a band that starts with ray `first`. Returns the cost of its addition.
 
-    The cost is the most voxels it can cross, times `FAR_COST` if it begins away from the ray before it: then
-    no block that it crosses is in the processor's cache.
+    The cost is the most voxels that the ray can cross. It is multiplied by `FAR_COST` if the ray begins away
+    from the ray before it, because then none of its blocks is in the processor's cache.
 
     `end` int32 2⁻¹⁰ voxel; `direction` float64 of any length; the ray reaches `before` and `behind` the end
-    point, int32 2⁻⁸ voxel. A ray without a direction gets no weight. `support`, in the same unit: the
-    distance written before the band. `gradient`, float64, is the loss of the distance along the ray with a
-    voxel along each axis: n / (n·u) for a plane of normal n; zero stands for the plane across the ray, whose
-    gradient is u.
+    point, int32 2⁻⁸ voxel. A ray without a direction gets no weight. `support`, in the same unit, is the
+    distance written before the band. `gradient`, float64, is the loss of the distance along the ray per voxel
+    on each axis: n / (n·u) for a plane with normal n. Zero means the plane across the ray, whose gradient is
+    u.
     """
     length = norm(direction)
     usable = weight
@@ -128,7 +127,7 @@ def write_ray(
 
 @ti.func
 def is_apart(rays: ti.template(), r, other):
-    """True if two rays begin neither in one block nor in adjacent blocks."""
+    """Return True if two rays begin neither in one block nor in adjacent blocks."""
     step = abs((ray_vector(rays, r, VOXEL) >> 3) - (ray_vector(rays, other, VOXEL) >> 3))
     return ti.max(step[0], step[1], step[2]) > 1
 
@@ -146,27 +145,27 @@ def write_band(bands: ti.template(), band, first, end, samples, weight, cost):
 
 @ti.func
 def ray_weight(rays: ti.template(), r):
-    """Weight of ray `r`, 0 … 255."""
+    """Return the weight of ray `r`, 0 … 255."""
     return (rays[r, WEIGHT_COLOR] >> 24) & 255
 
 
 @ti.func
 def parts_of(rays: ti.template(), r):
-    """Length of ray `r`, place of its end point, and its support, 2⁻¹⁶ voxel."""
+    """Return the length of ray `r`, the position of its end point, and its support, 2⁻¹⁶ voxel."""
     length, end = rays[r, LENGTH], rays[r, END]
     return length & ~255, end & ~255, (end & 248) << 13 | (length & 255) << 8
 
 
 @ti.func
 def ray_vector(rays: ti.template(), r, first: ti.template()):
-    """Three neighbouring fields of ray `r`: `VOXEL`, `CROSSING`, `INTERVAL` or `LOSS`."""
+    """Return three neighbouring fields of ray `r`: `VOXEL`, `CROSSING`, `INTERVAL` or `LOSS`."""
     return vec3i(rays[r, first], rays[r, first + 1], rays[r, first + 2])
 
 
 @ti.func
 def next_step(crossing):
-    """Mask: all bits in the axis that is crossed next (the first of equals), none in the others. No branch: a
-    processor predicts the next axis worst of all."""
+    """Return a mask with all bits in the axis that is crossed next (the first of equals), none in the others,
+    and the nearest crossing. No branch, because a processor predicts the next axis badly."""
     nearest = ti.min(crossing[0], crossing[1], crossing[2])
     x = -ti.cast(crossing[0] == nearest, ti.i32)
     y = -ti.cast(crossing[1] == nearest, ti.i32) & ~x
@@ -175,7 +174,7 @@ def next_step(crossing):
 
 @ti.func
 def steps(end):
-    """+1 or −1 an axis, from a ray's `END`."""
+    """Return +1 or −1 per axis, from a ray's `END`."""
     return vec3i(1 - 2 * (end & 1), 1 - (end & 2), 1 - ((end & 4) >> 1))
 
 
@@ -188,7 +187,7 @@ Walk = ti.types.struct(
 
 @ti.func
 def begin_walk(rays: ti.template(), r):
-    """Ray `r` in the first voxel of its band."""
+    """Return the walk of ray `r` at the first voxel of its band."""
     return Walk(
         ray_vector(rays, r, VOXEL), rays[r, DISTANCE], ray_vector(rays, r, CROSSING), steps(rays[r, END]),
         ray_vector(rays, r, LOSS), ray_vector(rays, r, INTERVAL),
@@ -197,7 +196,7 @@ def begin_walk(rays: ti.template(), r):
 
 @ti.func
 def advance(walk: ti.template(), step):
-    """Step to the next voxel, along the axis that `next_step` found."""
+    """Step to the next voxel, along the axis that `next_step` returned."""
     walk.crossing += walk.interval & step
     walk.voxel += walk.towards & step
     walk.distance -= (walk.loss & step).sum()
@@ -205,17 +204,17 @@ def advance(walk: ti.template(), step):
 
 @ti.func
 def offset_in_block(voxel):
-    """Number of a voxel in its block, 0 … 511: 64 x + 8 y + z."""
+    """Return the number of a voxel in its block, 0 … 511: 64 x + 8 y + z."""
     return ((voxel[0] & 7) << 6) | ((voxel[1] & 7) << 3) | (voxel[2] & 7)
 
 
 @ti.func
 def voxel_of(o):
-    """Place in its block of the voxel of this number."""
+    """Return the position in its block of the voxel with number `o`."""
     return vec3i(o >> 6, (o >> 3) & 7, o & 7)
 
 
 @ti.func
 def block_key(voxel):
-    """Key of the block that holds a voxel."""
+    """Return the key of the block that contains a voxel."""
     return pack(voxel[0] >> 3, voxel[1] >> 3, voxel[2] >> 3)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Copies between a process's memory and a device's.
+"""Copy arrays between the memory of a process and that of a device.
 
-Taichi 1.7 copies a NumPy argument of a kernel into new memory of the device, and back, even if nothing writes
-to it: 0.15 ms for four numbers on a GPU of 2024. On CUDA the driver copies instead.
+Taichi 1.7 copies a NumPy argument of a kernel into new memory of the device, and back, even if no kernel
+writes to it: 0.15 ms for four numbers on a GPU of 2024. On CUDA the driver copies instead.
 """
 
 import ctypes
@@ -38,16 +38,16 @@ def _read_rows(source: I32x2, out: I32x2):
 
 
 class Copies:
-    """Copies by kernels of Taichi, on any device."""
+    """Copies by Taichi kernels, on any device."""
 
     def given(self, *arrays: NDArray[Any]) -> Sequence[Any]:
-        """Arguments for a kernel (`QuickLaunch`) that reads these arrays; valid until the next call."""
+        """Return arguments for a kernel (`QuickLaunch`) that reads these arrays, until the next call."""
         return arrays
 
     def read(self, *wanted: tuple[Any, int]) -> list[NDArray[Any]]:
-        """First items of Taichi's arrays of int32 or int64, valid until the next call.
+        """Return the first items of Taichi arrays of int32 or int64, valid until the next call.
 
-        `wanted`: arrays of one dimension or two, and how many numbers or rows of each.
+        `wanted` has arrays of one or two dimensions, each with its number of items or rows.
         """
         found = []
         for source, count in wanted:
@@ -61,7 +61,7 @@ class Copies:
         """Wait until the `given` arrays are copied and may change. `read` waits, too."""
 
     def pin(self, memory: NDArray[np.uint8]) -> None:
-        """Make copies from this memory faster, instead of any before, where the device can."""
+        """Make copies from this memory faster, where the device can; earlier memory is no longer pinned."""
 
 
 class CudaCopies(Copies):
@@ -87,7 +87,7 @@ class CudaCopies(Copies):
         if end > self._there.shape[0]:
             self._there = self._room(2 * end)
         first = self._address(self._there)
-        small = np.empty(small_end, np.uint8)  # which go together
+        small = np.empty(small_end, np.uint8)  # small arrays are copied together
         for array, begin in zip(arrays, begins, strict=True):
             if array.nbytes <= _SMALL_BYTES:
                 small[begin : begin + array.nbytes] = array.reshape(-1).view(np.uint8)
@@ -105,7 +105,7 @@ class CudaCopies(Copies):
             begin, nbytes = _aligned(end), math.prod(shape) * dtype.itemsize
             end = begin + nbytes
             if end > len(self._here):
-                self._here = self._pinned(2 * end)  # what was read into the other stays there
+                self._here = self._pinned(2 * end)  # earlier results stay in the former memory
             out = self._here[begin:end].view(dtype).reshape(shape)
             if count:
                 address, size = _memory(out)
@@ -121,7 +121,7 @@ class CudaCopies(Copies):
         if self._registered is not None:
             self._cuda.cuMemHostUnregister(_memory(self._registered)[0])
         failed = self._cuda.cuMemHostRegister_v2(*_memory(memory), 0)
-        self._registered = None if failed else memory  # it stays mapped until then
+        self._registered = None if failed else memory  # the reference keeps it mapped until then
 
     def _address(self, array: Any) -> int:
         found: int = self._program.get_ndarray_data_ptr_as_int(array.arr)
@@ -131,7 +131,7 @@ class CudaCopies(Copies):
         return ti.ndarray(ti.u8, (nbytes,))
 
     def _pinned(self, nbytes: int) -> NDArray[np.uint8]:
-        """Memory for faster copies; it is kept until the process ends."""
+        """Return memory for faster copies, kept until the process ends."""
         address = ctypes.c_void_p()
         self._call("cuMemAllocHost_v2", ctypes.byref(address), _U64(nbytes))
         return np.ctypeslib.as_array((ctypes.c_uint8 * nbytes).from_address(address.value or 0))
@@ -155,7 +155,7 @@ def _memory(array: NDArray[Any]) -> tuple[Any, Any]:
 
 
 def copies() -> Copies:
-    """Copies to and from the device that Taichi was started on."""
+    """Return an object that copies to and from the device that Taichi runs on."""
     if ti.lang.impl.current_cfg().arch == ti.cuda:
         with suppress(OSError):
             return CudaCopies()

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Additive integration on a device of many threads: a thread a ray, additions by atomics.
+"""Add rays to a map on a device of many threads: one thread per ray, with atomic additions.
 
 Every voxel gets the same sum as from `integrate.add_rays`: the additions are the same integers, and their
-order has no effect. Arrays are a device's (`ti.ndarray`); those of the map have a row of 512 voxels a slot.
-
-Counters are split over many places first: a device makes one addition to a place after the other.
+order has no effect. Arrays are in device memory (`ti.ndarray`); those of the map have a row of 512 voxels per
+slot. Counters are first split over many entries, because a device makes additions to one entry in sequence.
 """
 
 import taichi as ti
@@ -59,28 +58,28 @@ from tsfusion.kernels.integration.integrate import (
 )
 from tsfusion.kernels.integration.rays_from_images import TILE_SAMPLES
 
-# A listed update: place of the voxel in the layers, w·m << WEIGHT_FIELD | w, and the key of a missing block,
-# whose place is −1 − the number of the voxel in it.
+# A listed update: index of the voxel in the layers, w·m << WEIGHT_FIELD | w, and the key of a missing block,
+# whose index is −1 − the number of the voxel in the block.
 LISTED_FIELDS = 4
 PLACE, AMOUNT, KEY = 0, 1, 2
 WEIGHT_FIELD = 8  # bits
-SKIPPED = -1 - CUBE  # instead of a place
+SKIPPED = -1 - CUBE  # index of an update that is not made
 
-# Groups of rays, by their places: voxels that they cross, and the start of their updates in the list.
+# Groups of rays, by their indices: number of crossed voxels, and start of their updates in the list.
 GROUP, GROUP_FIELDS = TILE_SAMPLES, 2
 CROSSED, BASE = 0, 1
-LISTED, COSTS = 0, 1  # in `totals`: updates that are listed, and what the rays cost
+LISTED, COSTS = 0, 1  # in `totals`: number of listed updates, and cost of the rays
 
-WINNERS = 1 << 16  # places of a table, of which there are two
-HASH_PLACE, RANK = 0, 1  # of a missing block, if there are few
+WINNERS = 1 << 16  # entries of a table; there are two tables
+HASH_PLACE, RANK = 0, 1  # fields of a missing block, if there are few
 
-# Limits of a keyframe: new blocks, touched ones, what rays and new blocks cost; and what one of these does
+# Limits of a keyframe: new blocks, touched blocks, cost of rays and new blocks; and the cost of one new block
 ROOM_NEW, ROOM_TOUCHED, ROOM_COST, BLOCK_COST = 0, 1, 2, 3
 
 
 @ti.func
 def begin_groups(i, groups: ti.template(), totals: ti.template()):
-    """Clear a launch's counters in the i-th thread, if there are as many groups."""
+    """Clear a launch's counters; the i-th thread clears the i-th group, if there is one."""
     if i == 0:
         totals[LISTED], totals[COSTS] = 0, 0
     if i < groups.shape[0]:
@@ -89,14 +88,14 @@ def begin_groups(i, groups: ti.template(), totals: ti.template()):
 
 @ti.func
 def begin_list(g, groups: ti.template(), totals: ti.template(), listed: ti.template()):
-    """Give a group its part of the list."""
+    """Assign a group its part of the list."""
     base = ti.atomic_add(totals[LISTED], ti.cast(groups[g, CROSSED], ti.i64))
     groups[g, BASE] = ti.cast(ti.min(base, ti.i64(listed.shape[0])), ti.i32)
 
 
 @ti.func
 def list_block(slot, stamp, stamps: ti.template(), told: ti.template()):
-    """List a block among those that the keyframe touches, once."""
+    """Add a block to the list of the blocks that the keyframe touches, once."""
     if stamps[slot] != stamp:
         if ti.atomic_max(stamps[slot], stamp) != stamp:
             place = ti.atomic_add(told[TOUCHED_COUNT], 1)
@@ -105,19 +104,20 @@ def list_block(slot, stamp, stamps: ti.template(), told: ti.template()):
 
 @ti.func
 def missing_key(listed: ti.template(), i):
-    """Key of the missing block that is listed at place i."""
+    """Return the key of the missing block at index i of the list."""
     return joined(listed[i, KEY], listed[i, KEY + 1])
 
 
 @ti.func
 def winner_place(key, table: ti.template()):
-    """Place of a block in one of the two tables of `WINNERS` places."""
+    """Return the index of a block in one of the two tables of `WINNERS` entries."""
     return table * WINNERS + ((hash_key(key) >> (15 * table)) & (WINNERS - 1))
 
 
 @ti.func
 def is_winner(i, listed: ti.template(), winners: ti.template()):
-    """True if the missing block at place i is to be listed from here: nearly always one place only."""
+    """Return True if the missing block at index i is reported from this index: nearly always only one
+    index."""
     key = missing_key(listed, i)
     first, second = winners[winner_place(key, 0)], winners[winner_place(key, 1)]
     found = 1
@@ -130,13 +130,13 @@ def is_winner(i, listed: ti.template(), winners: ti.template()):
 
 @ti.func
 def shares_place(k, places: ti.template(), claims: ti.template()):
-    """True if the k-th missing block may share its place in the hash with another one."""
+    """Return True if the k-th missing block may share its index in the hash with another block."""
     return ti.cast(claims[places[k, HASH_PLACE] & (CLAIMS - 1)] > 1, ti.i32)
 
 
 @ti.func
 def crossed(rays: ti.template(), r):
-    """Number of voxels that ray `r` crosses."""
+    """Return the number of voxels that ray `r` crosses."""
     n, length = 1, parts_of(rays, r)[0]
     for a in ti.static(range(3)):
         if rays[r, CROSSING + a] < length:
@@ -150,15 +150,15 @@ def list_updates(
     listed: ti.template(),
 ):  # fmt: skip
     """List the update of every voxel that ray `r` crosses in blocks of slot ≥ `oldest` and in missing blocks,
-    from place `base` on, `most` in all. Returns the numbers of updates and of those in missing blocks, and
-    the place of the update whose voxel takes the colour, or −1."""
+    from index `base` on, at most `most`. Returns the numbers of updates and of updates in missing blocks, and
+    the index of the update whose voxel takes the colour, or −1."""
     walk, weight = begin_walk(rays, r), ray_weight(rays, r)
     length, end, support = parts_of(rays, r)
     half = length - end
     least, most_free = free_bounds(half, support)
     last, slot, key = vec3i(2147483647), -1, ti.i64(0)
     added, lacking, colored, n = 0, 0, -1, 0
-    is_colored = ti.select(end + 1 == length, 1, 0)  # or is to have none
+    is_colored = ti.select(end + 1 == length, 1, 0)  # 1 also for a ray without a colour
     while n < most:
         block = walk.voxel >> 3
         if (block[0] != last[0]) | (block[1] != last[1]) | (block[2] != last[2]):
@@ -189,7 +189,7 @@ def list_updates(
 
 @ti.func
 def add_update(listed: ti.template(), i, at, sign_, sums: ti.template()):
-    """Make the update that is listed at place i, of the voxel at place `at` of the layers."""
+    """Make the update at index i of the list, for the voxel at index `at` of the layers."""
     # Both sums in one addition; their quotient minimises Σ w (x − m)²: paper eq. 2
     packed = listed[i, AMOUNT]
     product, w = ti.cast(packed >> WEIGHT_FIELD, ti.i64), packed & ((1 << WEIGHT_FIELD) - 1)
@@ -200,7 +200,7 @@ def add_update(listed: ti.template(), i, at, sign_, sums: ti.template()):
 def vote_color(
     at, packed, kind, sign_, told: ti.template(), color_rgn: ti.template(), color_b: ti.template()
 ):
-    """Add a vote 0xRRGGBB for a voxel's colour, or a hit. A full colour stays, as in
+    """Add a vote 0xRRGGBB for a voxel's colour, or a hit. A full colour does not change, as in
     `integrate.vote_color`."""
     slot, o = at // CUBE, at % CUBE
     taken = COLOR_LIMIT
@@ -218,21 +218,21 @@ def vote_color(
 
 @ti.func
 def listed_end(count, totals: ti.template(), listed: ti.template()):
-    """Number of listed updates of `count` rays; 0 if there are more than the room for them."""
+    """Return the number of listed updates of `count` rays; 0 if they exceed the list's room."""
     is_listed = (count > 0) & (totals[LISTED] <= listed.shape[0])
     return ti.cast(ti.select(is_listed, totals[LISTED], 0), ti.i32)
 
 
 @ti.func
 def whole_groups(count):
-    """Places for so many rays in whole groups."""
+    """Return the number of ray indices in whole groups for `count` rays."""
     return (count + GROUP - 1) // GROUP * GROUP
 
 
 @ti.func
 def place_of(j):
-    """Place of the ray that the j-th thread looks at. Of a cell of four pixels only the first place has a
-    ray: neighbouring threads look at every fourth place, where all of them have a ray, or none."""
+    """Return the index of the ray that the j-th thread handles. In a cell of four pixels only the first index
+    has a ray. Neighbouring threads handle every fourth index, where all have a ray, or none."""
     return j // GROUP * GROUP + j % GROUP % (GROUP // 4) * 4 + j % GROUP // (GROUP // 4)
 
 
@@ -242,10 +242,10 @@ def list_rays(
     listed: ti.template(), marks: ti.template(), hash_keys: ti.template(), hash_slots: ti.template(),
     told: ti.template(),
 ):  # fmt: skip
-    """List the updates of `count` rays, which are in `places_end` places of whole groups. `marks`: for each
-    ray, the start of its updates in its group's part of the list, then the place of the update that takes its
-    colour. Each loop is a task of a device, in this function and the next ones; so is the first of each end.
-    """
+    """List the updates of `count` rays, in whole groups of `places_end` indices. `marks` has, for each ray,
+    the start of its updates in its group's part of the list, then the index of the update that takes its
+    colour. Each loop of this and the next functions is a task of a device, and so is the first evaluation of
+    each loop's end."""
     for j in range(places_end):
         i = place_of(j)
         r = first_ray + ti.min(i, count - 1)
@@ -271,9 +271,9 @@ def add_listed(
     places: ti.template(), claims: ti.template(), hash_keys: ti.template(), stamps: ti.template(),
     told: ti.template(), sums: ti.template(),
 ):  # fmt: skip
-    """Make the first `end` updates of the list, a thread each, so that those of one ray do not wait for each
-    other. No addition is inside a loop within a thread: after that, Mesa's software device (22.3) forgets
-    which threads run. Keys of missing blocks go to `missing`, hardly any of them twice (`is_winner`)."""
+    """Make the first `end` updates of the list, one thread each, so that a ray's updates do not wait for each
+    other. No addition is inside a loop within a thread: after that, Mesa's software device (22.3) loses track
+    of the running threads. Keys of missing blocks go to `missing`, rarely twice (`is_winner`)."""
     for i in range(end):
         at = listed[i, PLACE]
         if at >= 0:
@@ -305,8 +305,8 @@ def vote_colors(
     told: ti.template(), hash_keys: ti.template(), hash_slots: ti.template(), oldest,
     color_rgn: ti.template(), color_b: ti.template(),
 ):  # fmt: skip
-    """Cast the colour votes of `votes_end` − 1 rays, if their updates were made. New blocks from slot
-    `oldest` on that may share a place enter the hash, one after the other."""
+    """Add the colour votes of `votes_end` − 1 rays, if their updates were made. New blocks from slot `oldest`
+    on that may share an index are inserted into the hash, one after the other."""
     for k in range(votes_end):
         i = k - 1
         if i < 0:
@@ -327,7 +327,7 @@ def vote_colors(
 
 @ti.func
 def order_new(missing: ti.template(), places: ti.template(), claims: ti.template(), told: ti.template()):
-    """Put the missing blocks in order, if they are few: those that share no place in the hash first."""
+    """Sort the missing blocks, if they are few: blocks that share no index in the hash come first."""
     for k in range(FEW_NEW):
         if k < told[TOUCHED_MISSING] and told[TOUCHED_MISSING] <= FEW_NEW:
             key, shares = missing[k], shares_place(k, places, claims)
@@ -347,7 +347,7 @@ def order_new(missing: ti.template(), places: ti.template(), claims: ti.template
 
 @ti.func
 def new_blocks(room: ti.template(), totals: ti.template(), told: ti.template()):
-    """Number of missing blocks with room: all of them, or none."""
+    """Return the number of missing blocks to insert: all of them, or 0 without room."""
     new = told[TOUCHED_MISSING]
     cost = totals[COSTS] + new * room[BLOCK_COST]
     if (
@@ -368,7 +368,7 @@ def add_new(
 ):  # fmt: skip
     """Insert the new blocks from slot `oldest` on, if there is room, and make the updates of the list in
     them. The hash equals that of `block_hash.insert_blocks` with the blocks in the order of their slots.
-    Blocks that share no place with others enter it here, the others at last (`vote_colors`)."""
+    Blocks that share no index are inserted here, the others at the end (`vote_colors`)."""
     for i in range(end):
         new = new_blocks(room, totals, told)
         if i == 0:
@@ -395,7 +395,7 @@ def add_and_admit(
     sums: ti.template(), color_rgn: ti.template(), color_b: ti.template(),
 ):  # fmt: skip
     """Add a keyframe's first `count` rays and their colours (`vote_colors`). Missing blocks are inserted from
-    `first_slot` on, if they are few and there is `room` for them."""
+    `first_slot` on, if they are few and `room` allows it."""
     list_rays(rays, 0, count, places_end, 0, groups, totals, listed, marks, hash_keys, hash_slots, told)
     end = listed_end(count, totals, listed)
     add_listed(end, sign_, stamp, listed, winners, missing, places, claims, hash_keys, stamps, told, sums)
@@ -419,9 +419,9 @@ def add_rays(
     told: I32, groups: I32x2, totals: I64, listed: I32x2, marks: I32, sums: I64x2, color_rgn: I64x2,
     color_b: I32x2,
 ):  # fmt: skip
-    """Add rays of places `first_ray` … `end_ray` − 1 as `integrate.add_rays` does, to blocks of slot ≥
-    `oldest`. Missing blocks are reported. If `listed` has no room for all updates, none is made, and `told`
-    says so."""
+    """Add rays `first_ray` … `end_ray` − 1 as `integrate.add_rays` does, to blocks of slot ≥ `oldest`.
+    Missing blocks are reported. If `listed` has no room for all updates, no update is made, and `told`
+    reports it."""
     count = end_ray - first_ray
     for i in range(groups.shape[0] + BANDS):
         if i >= BANDS:

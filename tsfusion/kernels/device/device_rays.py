@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Rays of images and points on a device of many threads, a thread a pixel or point: equal to the bit to those
-of `rays_from_images` and `rays_from_points`.
+"""Make rays of images and points on a device of many threads, one thread per pixel or point. They equal the
+rays of `rays_from_images` and `rays_from_points` bit by bit.
 
-Rays have fixed places, so a band's rays do not follow each other: a place without a ray has weight 0. The
-kernels add the rays, too (`device_integration`): one launch takes half of the time of two.
+Rays have fixed indices, so a band's rays are not consecutive: an index without a ray has weight 0. The
+kernels also add the rays (`device_integration`): one launch takes half of the time of two.
 """
 
 import taichi as ti
@@ -56,7 +56,7 @@ from tsfusion.kernels.integration.rays_from_points import (
     write_bundle_ray,
 )
 
-# A tile: width and height of its cells, flag for a flat one, slopes of its plane (float32's bits), and
+# A tile: width and height of its cells, flag for a flat tile, slopes of its plane (float32's bits), and
 # counters of its rays: fields of a band.
 TILE_FIELDS = 16
 WIDE, HIGH, FLAT, SLOPE_X, SLOPE_Y, COUNTED = 0, 1, 2, 3, 4, 8
@@ -70,8 +70,8 @@ def image_rays(
     tiles: ti.template(), rays: ti.template(), told: ti.template(), groups: ti.template(),
     totals: ti.template(), listed: ti.template(), marks: ti.template(), claims: ti.template(),
 ):  # fmt: skip
-    """Begin a keyframe, and fill `rays` as `rays_from_images.rays_from_image` does; a tile has `TILE_SAMPLES`
-    places. Each loop is a task of a device."""
+    """Start a keyframe, and fill `rays` as `rays_from_images.rays_from_image` does. A tile has `TILE_SAMPLES`
+    ray indices. Each loop is a task of a device."""
     tiles_x = (image.shape[1] + TILE - 1) // TILE
     tile_count = tiles_x * ((image.shape[0] + TILE - 1) // TILE)
     for i in range(BEGINNERS + tile_count * TILE_SAMPLES):
@@ -103,7 +103,7 @@ def image_rays(
         for field in ti.static(COUNTS):
             tiles[tile, COUNTED + field] = 0
     for i in range(tile_count * TILE_SAMPLES):
-        tile, c = i % tile_count, i // tile_count  # neighbours in tiles alike: all of them have work, or none
+        tile, c = i % tile_count, i // tile_count  # neighbouring threads: similar tiles, with work or none
         wide, high = tiles[tile, WIDE], tiles[tile, HIGH]
         across = TILE // wide
         if c < across * (TILE // high):
@@ -159,7 +159,7 @@ def point_rays(
     rays: ti.template(), told: ti.template(), groups: ti.template(), totals: ti.template(),
     listed: ti.template(), marks: ti.template(), claims: ti.template(),
 ):  # fmt: skip
-    """Begin a keyframe, and fill `rays` as `rays_from_points.rays_from_points` does; a ray's place is that of
+    """Start a keyframe, and fill `rays` as `rays_from_points.rays_from_points` does. A ray has the index of
     its first point."""
     count = points.shape[0]
     for k in range(BEGINNERS + count):
@@ -228,7 +228,7 @@ def fuse_image(
     totals: I64, listed: I32x2, marks: I32, sums: I64x2, color_rgn: I64x2, color_b: I32x2,
 ):  # fmt: skip
     """Make an image's rays and add the first `count` of them: all or none."""
-    # Here, because each end of a loop that is found later is a task of its own
+    # Computed here, because a loop end that is computed later is a separate task
     rays_end, places_end, votes_end = count, whole_groups(count), 1 + ti.min(kind, COLOR_VOTE) * count
     image_rays(
         image, is_disparity, scale, color, has_color, confidence, has_confidence, camera_rows, model, bundle,

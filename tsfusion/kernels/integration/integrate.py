@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""Additive integer integration: rays → the map's sums.
+"""Add rays to the map's integer sums.
 
-A voxel's sum is one int64, (Σ w·m) · 2²⁷ + Σ w: m = signed distance along the ray in sixtieths of a voxel,
-|m| ≤ 1023, which is beyond the widest band there can be. Voxels before the band, where the sensor looks
+A voxel's sum is one int64, (Σ w·m) · 2²⁷ + Σ w: m is the signed distance along the ray in sixtieths of a
+voxel. |m| ≤ 1023, which is beyond the widest possible band. Voxels before the band, where the sensor looks
 through, get half the weight, and at most the support for m.
-Colour is (Σ R) · 2⁴⁰ + (Σ G) · 2¹⁶ + n in an int64 and Σ B in an int32, one vote a ray, in the voxel where
-it ends. In maps that count hits a ray without a colour is counted there instead, in an int32.
-Addition modulo 2⁶⁴ is a group: any order gives the same bytes, and subtracting restores them.
+
+Colour is (Σ R) · 2⁴⁰ + (Σ G) · 2¹⁶ + n in an int64 and Σ B in an int32, one vote per ray, in the voxel where
+it ends. Maps that count hits count a ray without a colour in this voxel instead, in an int32.
+
+Addition modulo 2⁶⁴ is a group: any order gives the same bytes, and subtraction restores them.
 """
 
 import taichi as ti
@@ -61,61 +63,61 @@ from tsfusion.kernels.integration.rays_abreast import (
 
 WEIGHT_BITS = 27
 WEIGHT_MASK = (1 << WEIGHT_BITS) - 1
-WEIGHT_LIMIT = 1 << 26  # half of what the lane holds: going over, or below none, shows before it can carry
+WEIGHT_LIMIT = 1 << 26  # half of the lane's range: an overflow, also below zero, shows before it can carry
 QUANTA_PER_VOXEL = 60
 MAX_DISTANCE = 1023  # quanta: the widest half-width, 16 voxels, and one to spare
-FREE_SHIFT = 1  # a vote for free space before the band is half of one for a surface
-COLOR_LIMIT = 1 << 15  # votes after which a voxel's colour is full and takes no more
+FREE_SHIFT = 1  # shift that halves the weight of a vote for free space before the band
+COLOR_LIMIT = 1 << 15  # votes after which a voxel's colour is full and does not change
 CUBE = 512
-CHANGED = 255  # a block is dirty for all that follow its changes: a bit each
+CHANGED = 255  # marks a block as changed for all followers, one bit each
 
 # `touched`: number of blocks, flag for too many missing ones, flag for a removed colour that was not there,
 # number of missing blocks, and then the slots of the touched ones
 TOUCHED_COUNT, TOUCHED_OVERFLOW, TOUCHED_MISMATCH, TOUCHED_MISSING, TOUCHED_HEADER = 0, 1, 2, 3, 4
 
-# Added rays of a band: all of them, those that cross blocks which were missing, or those that were added
-# before too many missing blocks were found (to take them away again).
+# Rays of a band to add: all of them; those that cross blocks which were missing; or those that were added
+# before too many missing blocks were found (to subtract them again).
 ALL, ONLY_DEFERRED, ONLY_ADDED = 0, 1, 2
-LATER, OTHERS = 0, 1  # rays that are added `again`: to blocks that are missing, to blocks of other units
+LATER, OTHERS = 0, 1  # lists of rays in `again`: for missing blocks, for blocks of other units
 
-# Reasons why nothing is added to a block: the map lacks it, another unit adds to it, its turn is in another
-# call; or not known yet. All are negative, and have a bit each among those that are zero in places of blocks.
+# Reasons why nothing is added to a block: the map lacks it, another unit adds to it, another call adds to it;
+# and `UNKNOWN`. All are negative. Each has its own bit, which is 0 in the index of a block's first voxel.
 ABSENT, OF_ANOTHER, LEFT_OUT = (bit - (1 << 31) for bit in (1, 2, 4))
 BITS = 15
 
 COLORS_AT = WINDOW_SCRATCH
 LISTED_COLORS = 512  # votes, one int64: the voxel's place above the colour
-LISTED_UPDATES = 2 * STRETCH  # in an array of the function: one of 512 numbers takes 0.2 s to compile
+LISTED_UPDATES = 2 * STRETCH  # in an array of the function; one of 512 numbers takes 0.2 s to compile
 UNIT_SCRATCH = COLORS_AT + LISTED_COLORS  # int64 of a unit: its windows, votes for colours
 
-# A launch, `job`: which rays of which bands, on how many units, sign, slots from which on, how many
-# blocks may be missing, number of the keyframe, vote of a ray in the voxel of its end (`NO_VOTE` …)
+# A launch, `job`: which rays, of which bands, on how many units, sign, first slot, how many blocks may be
+# missing, number of the keyframe, vote of a ray in the voxel of its end (`NO_VOTE` …)
 WHICH, FIRST_BAND, LAST_BAND, UNITS, SIGN, OLDEST, MOST_MISSING, STAMP, VOTE = range(9)
-NO_VOTE, COLOR_VOTE, HIT_VOTE = 0, 1, 2  # a hit is counted in the layer that is handed in place of Σ B
+NO_VOTE, COLOR_VOTE, HIT_VOTE = 0, 1, 2  # hits are counted in the layer that is passed instead of Σ B
 
 
 @ti.func
 def lane_weight(packed):
-    """Σ w of a voxel's sum."""
+    """Return Σ w of a voxel's sum."""
     return ti.cast(packed & WEIGHT_MASK, ti.i32)
 
 
 @ti.func
 def lane_distance(packed):
-    """Σ w·m of a voxel's sum."""
+    """Return Σ w·m of a voxel's sum."""
     return packed >> WEIGHT_BITS
 
 
 @ti.func
 def quantize(distance):
-    """Distance in 2⁻¹⁶ voxel → quanta."""
+    """Convert a distance in 2⁻¹⁶ voxel to quanta."""
     return ti.min((distance * QUANTA_PER_VOXEL + 32768) >> 16, MAX_DISTANCE)
 
 
 @ti.func
 def free_bounds(half, support):
-    """Least and greatest distance written to a voxel before the band of this half-width, quanta: its own, up
-    to the support; in a band as wide as the support, only this."""
+    """Return the smallest and largest distance written to a voxel before a band of this half-width, quanta. A
+    voxel has its own distance, up to the support. In a band as wide as the support, it has the support."""
     most = quantize(support)
     return ti.select(half < support, 0, most), most
 
@@ -125,8 +127,8 @@ def claim(
     slot, mark, stamp, owners: ti.template(), stamps: ti.template(), places: ti.template(),
     dirty: ti.template(), touched: ti.template(),
 ):  # fmt: skip
-    """True if a block belongs to the unit of this `mark`: the first unit to reach a block has it, and lists
-    it. A unit asks for its own mark alone, which nobody else writes."""
+    """Return True if a block belongs to the unit of this `mark`. The first unit to reach a block owns and
+    lists it. A unit only asks for its own mark, which no other unit writes."""
     is_own = ti.cast(owners[slot] == mark, ti.i32)
     if is_own == 0 and stamps[slot] != stamp:
         if ti.atomic_max(stamps[slot], stamp) != stamp:
@@ -141,7 +143,7 @@ def claim(
 
 @ti.func
 def note_missing(key, missing: ti.template(), most_missing, touched: ti.template()):
-    """Put the key of a block that the map does not have into the set, while there are not too many."""
+    """Add the key of a missing block to the set, unless there are too many."""
     if touched[TOUCHED_OVERFLOW] == 0:
         grown, full = set_insert(missing, missing.shape[0] - 1, key)
         if grown == 1:
@@ -156,7 +158,7 @@ def enter_block(
     missing: ti.template(), owners: ti.template(), stamps: ti.template(), places: ti.template(),
     dirty: ti.template(), touched: ti.template(), of_others: ti.template(),
 ):  # fmt: skip
-    """Place of a block's first voxel in the layers; or the reason why nothing is added to it."""
+    """Return the index of a block's first voxel in the layers, or the reason why nothing is added to it."""
     slot = map_find(hash_keys, hash_slots, hash_keys.shape[0] - 1, key)
     first = ABSENT
     if slot < 0:
@@ -190,8 +192,8 @@ def vote_color(
     atomically: ti.template(),
 ):  # fmt: skip
     """Add a listed vote for a colour, or a hit. A count just below 2¹⁶ has gone below zero. A full colour
-    stays through every addition and removal: it is no longer a sum. Hits may go below zero: a map of an
-    earlier version has not counted those that it took."""
+    does not change by any addition or removal, because it is no longer a sum. Hits may go below zero, because
+    a map of an earlier version did not count its hits."""
     at, packed = ti.cast(listed >> 32, ti.i32), ti.cast(listed, ti.i32)
     votes = COLOR_LIMIT
     if kind == HIT_VOTE:
@@ -226,9 +228,9 @@ def list_updates(
     owners: ti.template(), stamps: ti.template(), places: ti.template(), dirty: ti.template(),
     touched: ti.template(), of_others: ti.template(),
 ):  # fmt: skip
-    """List the voxels of the ray at place `k` in its stretch, after `count` others, and the addition to each.
+    """List the voxels of the ray in lane `k` in its stretch, after `count` others, and the addition to each.
 
-    The ray's vote for a colour is listed, too. Returns the bits of what the ray crosses (`ABSENT` …).
+    The ray's vote for a colour is listed, too. Returns the reason bits of its blocks (`ABSENT` …).
     """
     weight = (weight_color >> 24) & 255
     vote, free_vote = sign_ * weight, sign_ * ti.max(weight >> FREE_SHIFT, 1)
@@ -280,8 +282,8 @@ def add_updates(
 ):  # fmt: skip
     """Add the listed updates, and empty the list.
 
-    In so short a loop a processor waits for dozens of voxels' memory at once, not for ten: a LiDAR's rays,
-    whose voxels are in no cache, take a third of the time.
+    In such a short loop a processor waits for dozens of voxels' memory at once, not for ten. This takes a
+    third of the time for a LiDAR's rays, whose voxels are in no cache.
     """
     for i in range(count):
         add(sums, voxels[i], amounts[i], atomically)
@@ -296,7 +298,7 @@ def add_bands(
     touched: ti.template(), sums: ti.template(), color_rgn: ti.template(), color_b: ti.template(),
     of_others: ti.template(),
 ):  # fmt: skip
-    """Add the rays of one unit. A block belongs to the unit that reached it first. With `of_others`, add
+    """Add the rays of one unit. A block belongs to the unit that reaches it first. With `of_others`, add
     instead an equal share of the rays that cross other units' blocks."""
     which, stamp = job[WHICH], job[STAMP]
     sign_, oldest, most_missing, kind = job[SIGN], job[OLDEST], job[MOST_MISSING], job[VOTE]
@@ -388,12 +390,13 @@ def add_rays(
 ):  # fmt: skip
     """Add to every voxel that each ray crosses in its band, in blocks of slot ≥ `OLDEST`.
 
-    Rays that cross blocks the map does not have are listed in `again`, the keys in `missing`; when those
-    blocks exist, a second call with `ONLY_DEFERRED` and `OLDEST` = the first new slot adds the rest. With
-    more than `MOST_MISSING` of them every band ends after its current ray: `ONLY_ADDED` are the rays so far.
+    Rays that cross missing blocks are listed in `again`, the keys in `missing`. After these blocks are
+    inserted, a second call with `ONLY_DEFERRED` and `OLDEST` = the first new slot adds the rest. With more
+    than `MOST_MISSING` missing blocks every band ends after its current ray: `ONLY_ADDED` are the rays so
+    far.
 
-    Units run at the same time, each through its own bands. A block belongs to the unit that reaches it first,
-    which adds to it alone, without atomics. Rays that cross blocks of other units are listed, too, for
+    Units run in parallel, each through its own bands. A block belongs to the unit that reaches it first. Only
+    this unit adds to it, without atomics. Rays that cross blocks of other units are listed, too, for
     `add_shared_rays`. The layers are flat: slot · 512 + offset.
     """
     for run in range(runs(job[UNITS])):  # run loop: kernels/base/quick_launch.py
@@ -412,9 +415,9 @@ def add_shared_rays(
     scratch: I64, owners: I64, stamps: I32, places: I32, dirty: U8, touched: I32, sums: I64, color_rgn: I64,
     color_b: I32,
 ):  # fmt: skip
-    """Add the rays that cross blocks of other units to these, with atomics: after `add_rays`, same arguments.
+    """Add rays to the blocks of other units that they cross, with atomics: after `add_rays`, same arguments.
 
-    A kernel of its own, because one thread need not wait for its compilation.
+    This is a separate kernel, because a single thread need not wait for its compilation.
     """
     for run in range(runs(job[UNITS])):  # run loop: kernels/base/quick_launch.py
         unit = unit_of(run, job[UNITS])
@@ -428,7 +431,7 @@ def add_shared_rays(
 @QuickLaunch
 @ti.kernel
 def largest_weights(sums: I64x2, touched: I32, bounds: I32):
-    """`bounds[slot]` = the largest weight lane in each touched block."""
+    """Write the largest weight lane of each touched block to `bounds[slot]`."""
     count = touched[TOUCHED_COUNT]
     for run in range(runs(count)):  # run loop: kernels/base/quick_launch.py
         n = unit_of(run, count)

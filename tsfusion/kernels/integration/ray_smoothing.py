@@ -59,18 +59,18 @@ from tsfusion.kernels.integration.rays_abreast import (
     window_of,
 )
 
-LANES = ABREAST  # rays that are solved side by side, in vectors: a step of one waits for three divisions
-# Element i of lane k of a unit's field stands at (unit · FIELDS + field) · SIGNAL + i · LANES + k.
+LANES = ABREAST  # rays solved together, in vectors: a step of a single ray waits for three divisions
+# Element i of lane k of a unit's field has the index (unit · FIELDS + field) · SIGNAL + i · LANES + k.
 SIGNAL = MAX_CROSSED * LANES
 SIGNAL_FIELDS = 4  # Σ w·m and then z, W, and the two off-diagonals of L
 STORED, WEIGHT, LEFT, FAR_LEFT = 0, SIGNAL, 2 * SIGNAL, 3 * SIGNAL
-CROSSED_FIELDS = 2  # t and then the vote, place of the voxel in `votes`
+CROSSED_FIELDS = 2  # t, later the vote; index of the voxel in `votes`
 DISTANCE, PLACE = 0, SIGNAL
 QUANTA = 2.0**-16  # a unit of t
 VOTE_SCALE = 16.0  # x̂ is averaged in sixteenths of a quantum
 VOTE_BITS = 24
-CHUNK = 512  # places of the list of voted voxels that a unit takes at a time
-NO_VOXEL = -1  # in such a place
+CHUNK = 512  # entries of the list of voted voxels that a unit reserves per step
+NO_VOXEL = -1  # marks an unused entry
 
 
 @ti.func
@@ -78,11 +78,11 @@ def factorise(
     signal: ti.template(), crossed: ti.template(), at_signal, at_crossed, n: ti.template(),
     total: ti.template(), longest, weighted, smoothness,
 ):  # fmt: skip
-    """Solve L D z = A (y − t) of A + λ D2ᵀD2 = L D Lᵀ, with natural ends, for signals of n elements a lane
+    """Solve L D z = A (y − t) of A + λ D2ᵀD2 = L D Lᵀ, with natural ends, for signals of n elements per lane
     with weights that sum to `total`; z is y − t where n < 3.
 
-    Reads and writes go through arrays of the function, which no store to an argument may change: so the lanes
-    become vectors.
+    Reads and writes use arrays of the function, which no store to an argument can change: so the lanes become
+    vectors.
     """
     d1, d2 = ti.Vector([1.0] * LANES), ti.Vector([1.0] * LANES)
     l1_1, l2_1, l2_2 = ti.Vector([0.0] * LANES), ti.Vector([0.0] * LANES), ti.Vector([0.0] * LANES)
@@ -121,9 +121,9 @@ def factorise(
 def substitute_back(
     signal: ti.template(), crossed: ti.template(), at_signal, at_crossed, n: ti.template(), longest
 ):
-    """Solve Lᵀ (x̂ − t) = z, a lane each, and put ⌊16 x̂ + ½⌋ in the place of t.
+    """Solve Lᵀ (x̂ − t) = z, one lane each, and write ⌊16 x̂ + ½⌋ over t.
 
-    Elements behind a lane's end are ignored.
+    Elements after a lane's end are ignored.
     """
     x1, x2, votes = ti.Vector([0.0] * LANES), ti.Vector([0.0] * LANES), ti.Vector([0] * LANES)
     for back in range(longest):
@@ -148,7 +148,7 @@ def list_voxels(
     hash_slots: ti.template(), scratch: ti.template(), base, places: ti.template(), voxels: ti.template(),
     crossed: ti.template(), at_crossed, counts: ti.template(),
 ):  # fmt: skip
-    """Append the voxels of the ray at place `k`, in its stretch and band, to those it crosses."""
+    """Append the voxels of the ray in lane `k`, in its stretch and band, to the voxels that it crosses."""
     number = walks[ODD + k]
     window = window_of(walks, k, number)
     blocks = open_window(window, scratch, base)
@@ -162,7 +162,7 @@ def list_voxels(
             window = window_of(walks, k, number)
             blocks = open_window(window, scratch, base)
         b = (place >> BLOCK_AT) & (WINDOW_BLOCKS - 1)
-        corners = scratch[blocks + b]  # of the block in `votes`, above that in the map's layers
+        corners = scratch[blocks + b]  # index of the block in `votes`, above its index in the map's layers
         if corners == UNKNOWN:
             block = (window << (WINDOW_BITS - 3)) + voxel_of(b)
             key = pack(block[0], block[1], block[2])
@@ -183,9 +183,9 @@ def gather(
     voxels: ti.template(), counts: ti.template(), totals: ti.template(), feedback, sums: ti.template(),
     correction: ti.template(), signal: ti.template(), at_signal,
 ):  # fmt: skip
-    """Put the map's values in the voxels that each ray crosses into its signal.
+    """Copy the map's values in the voxels that each ray crosses into its signal.
 
-    A pass of its own lets a processor wait for more of them at once (`integrate.add_updates`).
+    A separate pass lets a processor wait for more values at once (`integrate.add_updates`).
     """
     for k in range(LANES):
         total = 0.0
@@ -213,9 +213,9 @@ def smooth_rays(
 ):  # fmt: skip
     """Gather y along each ray's band, solve, and add x̂ to `votes` as (Σ x̂ · 16) · 2²⁴ + n.
 
-    `units` run at the same time, each through its own bands. The layers are flat, as for `add_rays`. `voted`:
-    the length of the list of voxels that have votes, then their places in `votes`, or `NO_VOXEL`; each unit
-    takes `CHUNK` of its places at a time.
+    `units` run in parallel, each through its own bands. The layers are flat, as for `add_rays`. `voted` has
+    the length of the list of voxels with votes, then their indices in `votes`, or `NO_VOXEL`; each unit
+    reserves `CHUNK` entries per step.
     """
     for run in range(runs(units)):  # run loop: kernels/base/quick_launch.py
         unit = unit_of(run, units)
@@ -226,7 +226,7 @@ def smooth_rays(
                 scratch[base + i] = 0
             walks = ti.Vector([0] * WALKS)
             listed, distances = ti.Vector([0] * LIST), ti.Vector([0] * LIST)
-            voxels = ti.Vector([0] * SIGNAL)  # of the layers; then, in `votes`, those that had no vote
+            voxels = ti.Vector([0] * SIGNAL)  # in the layers; later, in `votes`, voxels with a first vote
             counts, totals = ti.Vector([0] * LANES), ti.Vector([0.0] * LANES)
             carves, here, chunk_end = 0, 0, 0
             for band in range(bands.shape[0]):
@@ -269,7 +269,7 @@ def smooth_rays(
                             vote = (ti.cast(crossed[at + DISTANCE], ti.i64) << VOTE_BITS) + 1
                             voxel = crossed[at + PLACE]
                             before = votes[voxel]
-                            if units == 1:  # an atomic addition waits until what it adds to is there
+                            if units == 1:  # an atomic addition would wait for the memory
                                 votes[voxel] = before + vote
                             else:
                                 before = ti.atomic_add(votes[voxel], vote)
@@ -288,7 +288,7 @@ def smooth_rays(
 @QuickLaunch
 @ti.kernel
 def commit_votes(touched: I32, sums: I64, votes: I64, voted: I32, correction: F32):
-    """Set a voxel's value (Σ w·m + correction) / Σ w to the mean that its rays propose; clears `votes`."""
+    """Set a voxel's value (Σ w·m + correction) / Σ w to the mean that its rays propose. Clears `votes`."""
     for i in range(voted[0]):
         place = voted[1 + i]
         if place != NO_VOXEL:

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""Eight rays that walk side by side, so that a step of all of them is a few vector instructions.
+"""Walk eight rays side by side, so that a step of all of them is a few vector instructions.
 
-A stretch is up to 64 voxels of each. Its first pass walks and lists voxels: arithmetic without a branch, on
-arrays of the function, which no store to an argument may change: so the rays become lanes of vectors. The
-user of a stretch goes through the list, ray by ray.
+A stretch is up to 64 voxels of each ray. Its first pass walks and lists voxels. This pass is arithmetic
+without a branch, on arrays of the function, which no store to an argument can change: so the rays become
+lanes of vectors. The caller then goes through the list, ray by ray.
 
 A ray crosses about ten voxels and two or three blocks. A look-up of each new block would cost more than the
-voxels: a jump that no processor predicts, and the hash. So a ray walks in a window of 8³ blocks: each voxel
-reads the place of its block from a small table.
+voxels: a jump that no processor predicts, and the hash. So a ray walks in a window of 8³ blocks, and each
+voxel reads the index of its block from a small table.
 """
 
 import taichi as ti
@@ -29,38 +29,38 @@ from tsfusion.kernels.base.voxel_traversal import (
 
 ABREAST = 8
 WINDOW_BITS = 6  # of a voxel's coordinate in its window
-STRETCH = 1 << WINDOW_BITS  # voxels: a ray leaves its window at most once an axis
+STRETCH = 1 << WINDOW_BITS  # voxels: a ray leaves its window at most once per axis
 LIST = ABREAST * STRETCH
 
-# Where a ray is in its window, 21 bits: number of the voxel in the block, 64 x + 8 y + z, that of the block
-# in the window, likewise, and of each axis whether the window's number is odd: seven bits an axis, in three
-# places. A listed voxel has above it, 11 bits, the distance to the surface, quanta.
+# Position of a ray in its window, 21 bits: number of the voxel in the block, 64 x + 8 y + z; number of the
+# block in the window, likewise; and for each axis 1 if the window's number is odd. So each axis has seven
+# bits, in three groups. A listed voxel has the distance to the surface above them, 11 bits, quanta.
 BLOCK_AT, WINDOW_AT, DISTANCE_AT = 9, 18, 21
-ONE = (1 << 6, 1 << 3, 1)  # a step towards +x, +y, +z adds that
+ONE = (1 << 6, 1 << 3, 1)  # a step towards +x, +y, +z adds this
 ALL_BITS = tuple(
     (7 * ONE[a] << BLOCK_AT) + 7 * ONE[a] + (4 >> a << WINDOW_AT) for a in range(3)
 )  # of an axis
 MOST_LISTED = 1023  # quanta
 
-# Numbers of the walking rays, `walks`: field + place. Three fields an axis: next crossing along the band, the
-# interval, changes of `AT` and `OFF` with a step, number of the window. `AT`: place in the window; `OFF`:
-# distance to the surface, 2⁻¹⁶ quantum; `ODD`: bits of the window in `WINDOW`.
+# Numbers of the walking rays, `walks`: field + lane. There are fields for each axis: next crossing along the
+# band, the interval, changes of `AT` and `OFF` per step, number of the window. `AT`: position in the window;
+# `OFF`: distance to the surface, 2⁻¹⁶ quantum; `ODD`: odd bits of the window in `WINDOW`.
 NEXT, EVERY, STEP, TURN, WINDOW = (axis * ABREAST for axis in (0, 3, 6, 9, 12))
 AT, OFF, ODD, RAY_LENGTH, BAND, COLORED, RAY, MET, VOXELS, FREE, UNCOLORED = (
     field * ABREAST for field in range(15, 26)
 )
 WALKS = 26 * ABREAST
-NOBODY = -1  # instead of a ray
-HALF_A_QUANTUM = 1 << 15  # of `OFF`, whose upper bits are rounded so
-WINDOWS = 64  # that a unit keeps: those it used last, one for each place that the low bits of the key name
+NOBODY = -1  # marks a lane without a ray
+HALF_A_QUANTUM = 1 << 15  # of `OFF`: added, so that its upper bits are rounded
+WINDOWS = 64  # windows that a unit keeps: the last one for each value of the low bits of the key
 WINDOW_BLOCKS = 512
-WINDOW_SCRATCH = WINDOWS * (1 + WINDOW_BLOCKS)  # int64 of a unit: keys, places of blocks in the layers
-UNKNOWN = 8 - (1 << 31)  # instead of a place
+WINDOW_SCRATCH = WINDOWS * (1 + WINDOW_BLOCKS)  # int64 of a unit: keys, indices of blocks in the layers
+UNKNOWN = 8 - (1 << 31)  # marks an index that was not looked up
 
 
 @ti.func
 def begin(rays: ti.template(), r, per_voxel: ti.template(), colors, walks: ti.template(), k):
-    """Begin ray `r` at place `k`; `per_voxel`: units of `OFF` for one of the ray's distance."""
+    """Start ray `r` in lane `k`. `per_voxel`: units of `OFF` per unit of the ray's distance."""
     length, end, _ = parts_of(rays, r)
     voxel, towards = ray_vector(rays, r, VOXEL), steps(rays[r, END])
     at = 0
@@ -83,11 +83,11 @@ def begin(rays: ti.template(), r, per_voxel: ti.template(), colors, walks: ti.te
 
 @ti.func
 def crossed_before(walks: ti.template(), k, until):
-    """Number of voxels that the ray at place `k` leaves before it is `until` along its band."""
+    """Return the number of voxels that the ray in lane `k` leaves before it is `until` along its band."""
     n = 0
     for a in ti.static(range(3)):
         gap = until - 1 - walks[NEXT + a * ABREAST + k]
-        # Exact: a quotient of such integers is an integer, or further from one than float64 rounds
+        # Exact: a quotient of such integers is an integer, or farther from it than float64 rounds
         times = ti.cast(ti.cast(gap, ti.f64) / ti.cast(walks[EVERY + a * ABREAST + k], ti.f64), ti.i32) + 1
         n += ti.select(gap >= 0, times, 0)
     return n
@@ -95,8 +95,8 @@ def crossed_before(walks: ti.template(), k, until):
 
 @ti.func
 def measure(walks: ti.template(), carves, colors):
-    """Count the remaining voxels of each ray: all, those in free space, those before the one that takes the
-    colour. Returns the largest number of all."""
+    """Count the remaining voxels of each ray: all, those in free space, and those before the voxel that takes
+    the colour. Returns the largest number of all."""
     for k in range(ABREAST):
         n = crossed_before(walks, k, walks[RAY_LENGTH + k]) + 1
         walks[VOXELS + k] = ti.select(walks[RAY + k] != NOBODY, n, 0)
@@ -118,14 +118,14 @@ def measure(walks: ti.template(), carves, colors):
 
 @ti.func
 def beyond(walks: ti.template(), k, here, a: ti.template()):
-    """Difference on an axis between the number of the window `here` (its odd bits) and that in `walks`."""
+    """Return the difference on an axis between the number of the window with odd bits `here` and `walks`."""
     changed = ((here ^ walks[ODD + k]) >> (2 - a)) & 1
     return ti.select(walks[STEP + a * ABREAST + k] == ALL_BITS[a], -changed, changed)
 
 
 @ti.func
 def window_of(walks: ti.template(), k, here):
-    """The window with the odd bits `here` that the ray at place `k` reaches in the stretch."""
+    """Return the window with the odd bits `here` that the ray in lane `k` reaches in the stretch."""
     window = vec3i(walks[WINDOW + k], walks[WINDOW + ABREAST + k], walks[WINDOW + 2 * ABREAST + k])
     for a in ti.static(range(3)):
         window[a] += beyond(walks, k, here, a)
@@ -136,8 +136,8 @@ def window_of(walks: ti.template(), k, here):
 def walk(
     walks: ti.template(), count, listed: ti.template(), distances: ti.template(), exactly: ti.template()
 ):
-    """List `count` voxels of each ray, the first of all rays, then the second. Entries behind a ray's end are
-    undefined. With `exactly`, distances as `OFF` has them go to `distances`, too."""
+    """List `count` voxels of each ray: the first of all rays, then the second. Entries after a ray's end are
+    undefined. With `exactly`, `distances` gets the exact distances (`OFF`), too."""
     for i in range(count):
         for k in range(ABREAST):
             at, off = walks[AT + k], walks[OFF + k]
@@ -150,7 +150,7 @@ def walk(
             step = ti.select(is_y, walks[STEP + ABREAST + k], walks[STEP + 2 * ABREAST + k])
             turn = ti.select(is_y, walks[TURN + ABREAST + k], walks[TURN + 2 * ABREAST + k])
             bits = ti.select(is_x, ALL_BITS[0], ti.select(is_y, ALL_BITS[1], ALL_BITS[2]))
-            # Ones between the axis' bits carry from one to the next
+            # Set bits between the axis' bits carry from one to the next
             stepped = (at | ~bits) + ti.select(is_x, walks[STEP + k], step)
             walks[AT + k] = (stepped & bits) | (at & ~bits)
             walks[OFF + k] = off + ti.select(is_x, walks[TURN + k], turn)
@@ -162,7 +162,7 @@ def walk(
 
 @ti.func
 def open_window(window, scratch: ti.template(), base):
-    """Place of a window's table of blocks in the unit's scratch, which begins at `base`.
+    """Return the index of a window's table of blocks in the unit's scratch, which begins at `base`.
 
     A window that is new to the unit starts with unknown blocks.
     """

@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Rays from depth or disparity images.
+"""Make rays from depth or disparity images.
 
-An image is read in tiles of 12×12 pixels. In a tile, the pixels of a cell about as wide as a voxel are
-bundled into one ray through their mean, a layer of depth at a time. In a flat tile, its plane
-gives the distance that the ray's voxels have to the surface; elsewhere it is the distance to the ray's end.
-Sums are integers, so nothing depends on threads. With `bundle = 0` every pixel is a ray.
-
-One unit of parallel work is a band, a contiguous run of tiles with a region of the ray buffer to itself.
+An image is read in tiles of 12×12 pixels. A cell of a tile is about as wide as a voxel. Its pixels become one
+ray through their mean for each layer of depth. In a flat tile, the tile's plane gives the distance from the
+ray's voxels to the surface. Elsewhere it is the distance to the ray's end. Sums are integers, so no result
+depends on threads. With `bundle = 0` every pixel is a ray.
+One unit of parallel work is a band, a contiguous run of tiles with its own region of the ray buffer.
 """
 
 import taichi as ti
@@ -30,30 +29,30 @@ from tsfusion.kernels.base.sensor_noise import (
 )
 from tsfusion.kernels.base.voxel_traversal import vec3i, write_band, write_ray
 
-TILE = 12  # divided by both sides of every cell
+TILE = 12  # divisible by both sides of every cell
 TILE_SAMPLES = TILE * TILE
 FEW = 15  # a number of rows or columns of a tile has four bits
 assert TILE <= FEW
 CELLS = ((2, 1), (2, 2), (3, 2), (3, 3), (4, 3), (4, 4), (6, 4), (6, 6), (12, 6), (12, 12))  # wide, high
-CELL_AREA = 1.0  # voxels across the ray
+CELL_AREA = 1.0  # largest area of a cell in voxels, across the ray
 PLANE_STEP = 2  # a plane is fitted to every second pixel of every second row
-LEAST, GREATEST, SUM = 0, TILE, 2 * TILE  # of the depths in each column of a row of cells
-MOST_SUMMED = 1 << 27  # so deep are twelve pixels whose sum has 31 bits
-LEAST_PLANE = 9  # of these, for a plane
-PLANE_NOISE = 2.0  # the most mean squared residual of a plane, in σ² …
+LEAST, GREATEST, SUM = 0, TILE, 2 * TILE  # fields for each column of a row of cells, about its depths
+MOST_SUMMED = 1 << 27  # limit of the depth: the sum of twelve such pixels has 31 bits
+LEAST_PLANE = 9  # least number of pixels for a plane
+PLANE_NOISE = 2.0  # limit of a plane's mean squared residual, in σ² …
 PLANE_ROUGHNESS = 0.1 * 1024.0  # … and, squared, on top of it: 2⁻¹⁰ voxel
-PLANE_SIGMA = 1.0  # voxels: with more noise than that a plane says nothing about voxels
-LEAST_FACING = 0.15  # cosine between plane normal and ray: what is seen more edge-on has no plane
+PLANE_SIGMA = 1.0  # voxels: with more noise a plane says nothing about voxels
+LEAST_FACING = 0.15  # cosine between plane normal and ray: a surface seen more edge-on has no plane
 
 
 # Conversion of an image's numbers to depths. `per_metre`: 2⁻¹⁰ voxels a metre.
 DepthReading = ti.types.struct(
     is_disparity=ti.i32, scale=ti.f32, has_confidence=ti.i32, near=ti.f32, far=ti.f32, per_metre=ti.f32
 )
-# Voxels: changes of the direction of a pixel's ray with a step right and a step down, that of pixel (0, 0);
-# its start.
+# Voxels: changes of a pixel ray's direction per column and per row, direction of pixel (0, 0); start of all
+# rays.
 CameraArgs = ti.types.struct(du=vec3, dv=vec3, corner=vec3, origin=vec3)
-# Pixels of a tile: from (x, y), counted from the tile's corner (left, top); its depths begin at `base`.
+# Pixels of a tile: from (x, y), counted from the tile's corner (left, top); its depths begin at index `base`.
 Cell = ti.types.struct(left=ti.i32, top=ti.i32, x=ti.i32, y=ti.i32, wide=ti.i32, high=ti.i32, base=ti.i32)
 # A tile's plane, if it is flat: slopes of the depth, 2⁻¹⁰ voxel a pixel.
 Plane = ti.types.struct(is_flat=ti.i32, slope_x=ti.f32, slope_y=ti.f32)
@@ -64,23 +63,23 @@ Layer = ti.types.struct(
 
 
 def tiles_of(height: int, width: int) -> int:
-    """Number of tiles of an image."""
+    """Return the number of tiles of an image."""
     return -(-height // TILE) * -(-width // TILE)
 
 
 def most_rays(height: int, width: int) -> int:
-    """Number of rays that there is room for in the buffer of an image."""
+    """Return the number of rays that an image's buffer has room for."""
     return tiles_of(height, width) * TILE_SAMPLES
 
 
 def are_given(sums: object) -> bool:
-    """True if a kernel passes sums of columns (`column_sums`, `color_sums`) to a function."""
+    """Return True if a kernel passes sums of columns (`column_sums`, `color_sums`) to a function."""
     return sums is not None
 
 
 @ti.func
 def camera_of(rows: ti.template()):
-    """The (4, 3) rows of `ray_buffers._camera` as a `CameraArgs`."""
+    """Convert the (4, 3) rows of `ray_buffers._camera` to a `CameraArgs`."""
     du, dv = vec3(rows[0, 0], rows[0, 1], rows[0, 2]), vec3(rows[1, 0], rows[1, 1], rows[1, 2])
     corner, origin = vec3(rows[2, 0], rows[2, 1], rows[2, 2]), vec3(rows[3, 0], rows[3, 1], rows[3, 2])
     return CameraArgs(du, dv, corner, origin)
@@ -88,8 +87,8 @@ def camera_of(rows: ti.template()):
 
 @ti.func
 def reading_of(model: ti.template(), is_disparity, scale, has_confidence):
-    """Reading of an image: its numbers' scale, float64, is metres a number or, of disparities, metres times
-    numbers."""
+    """Return the conversion of an image's numbers. `scale`, float64, is metres per number or, for
+    disparities, metres times numbers."""
     near, far = ti.cast(model[MIN_RANGE], ti.f32), ti.cast(model[MAX_RANGE], ti.f32)
     per_metre = ti.cast(1.0 / (model[VOXEL_SIZE] / 1024.0), ti.f32)
     return DepthReading(is_disparity, ti.cast(scale, ti.f32), has_confidence, near, far, per_metre)
@@ -97,27 +96,27 @@ def reading_of(model: ti.template(), is_disparity, scale, has_confidence):
 
 @ti.func
 def few(count):
-    """A small number of rows or columns of a tile. Without this hint LLVM adds a loop for 32 at once, which
-    never runs and takes long to compile."""
+    """Return a small number of rows or columns of a tile. Without this hint LLVM adds a loop for 32 at once,
+    which never runs and takes long to compile."""
     return count & FEW
 
 
 @ti.func
 def depth_of(raw, reading, divides: ti.template()):
-    """Depth of a pixel's number in 2⁻¹⁰ voxel; 0 = no usable return. All float32, and no branch: a row of a
-    tile is read in vectors. `divides`: the number may be a disparity."""
+    """Return the depth of a pixel's number in 2⁻¹⁰ voxel; 0 = no usable return. All is float32 without a
+    branch, so that a row of a tile is read in vectors. With `divides` the number may be a disparity."""
     z = raw * reading.scale
     if ti.static(divides):
         if reading.is_disparity == 1:
             z = quotient(reading.scale, ti.max(raw, 1e-9))
-    # False for NaN as well
+    # False also for NaN
     usable = (raw > 0.0) & (z >= reading.near) & (z <= reading.far)
     return ti.select(usable, ti.cast(z * reading.per_metre, ti.i32), 0)
 
 
 @ti.func
 def depth_at(image: ti.template(), confidence: ti.template(), reading, v, u):
-    """Depth of a pixel in 2⁻¹⁰ voxel; 0 = no usable return."""
+    """Return the depth of a pixel in 2⁻¹⁰ voxel; 0 = no usable return."""
     q = depth_of(ti.cast(image[v, u], ti.f32), reading, True)
     if reading.has_confidence == 1:
         if confidence[v, u] == 0:
@@ -155,8 +154,8 @@ def load_tile(image: ti.template(), confidence: ti.template(), reading, left, to
 
 @ti.func
 def fit_plane(depths: ti.template(), base, anchor, sigma):
-    """Least squares q = c + x·slope_x + y·slope_y over a lattice of the tile whose depths begin at `base`;
-    these and `sigma` in 2⁻¹⁰ voxel, `anchor` near the depths."""
+    """Fit q = c + x·slope_x + y·slope_y by least squares over a lattice of the tile whose depths begin at
+    `base`. Depths and `sigma` are in 2⁻¹⁰ voxel; `anchor` is near the depths."""
     sx, sy, sxx, sxy, syy, n = 0, 0, 0, 0, 0, 0
     sq, sxq, syq, sqq = 0, 0, 0, ti.i64(0)
     for row in range(TILE // PLANE_STEP):
@@ -205,7 +204,7 @@ def fit_plane(depths: ti.template(), base, anchor, sigma):
 
 @ti.func
 def tile_plane(model: ti.template(), unit, mean, depths: ti.template(), base):
-    """Plane of a tile of `mean` depth (metres), if it is flat and noise does not hide it."""
+    """Return the plane of a tile of `mean` depth (metres), if it is flat and noise does not hide it."""
     plane = Plane(0, 0.0, 0.0)
     sigma = noise_sigma(model, mean)
     if sigma < PLANE_SIGMA * model[VOXEL_SIZE]:
@@ -215,7 +214,7 @@ def tile_plane(model: ti.template(), unit, mean, depths: ti.template(), base):
 
 @ti.func
 def plane_gradient(ray, du, dv, z, slope_x, slope_y):
-    """n / (n·u) of the plane through `ray`·z whose depth has these slopes a pixel; zero if seen edge-on."""
+    """Return n / (n·u) of the plane through `ray`·z with these slopes per pixel; zero if seen edge-on."""
     right, down = product(du, z) + product(ray, slope_x), product(dv, z) + product(ray, slope_y)
     normal = cross(right, down)
     along = dot(normal, ray)
@@ -227,13 +226,13 @@ def plane_gradient(ray, du, dv, z, slope_x, slope_y):
 
 @ti.func
 def pixel_width(camera):
-    """Voxels that a pixel spans at a depth of one metre."""
+    """Return the voxels that a pixel spans at a depth of one metre."""
     return ti.max(norm(camera.du), norm(camera.dv))
 
 
 @ti.func
 def cell_shape(pixel):
-    """Width and height in pixels of the largest cell within `CELL_AREA`; `pixel` = voxels a pixel spans."""
+    """Return width and height in pixels of the largest cell within `CELL_AREA`. `pixel` is in voxels."""
     wide, high = 1, 1
     for w, h in ti.static(CELLS):
         if w * h * pixel * pixel <= CELL_AREA:
@@ -243,7 +242,7 @@ def cell_shape(pixel):
 
 @ti.func
 def layer_sums(depths: ti.template(), cell, low, up_to):
-    """Samples of the cell with depths in [`low`, `up_to`], and the least depth beyond (1 << 30: none)."""
+    """Return the samples of the cell with depths in [`low`, `up_to`], and the next depth (1 << 30: none)."""
     least, deepest, beyond, n, sum_q, sum_x, sum_y = 1 << 30, 0, 1 << 30, 0, ti.i64(0), 0, 0
     for row in range(few(cell.high)):
         y = cell.y + row
@@ -264,7 +263,7 @@ def layer_sums(depths: ti.template(), cell, low, up_to):
 
 @ti.func
 def column_sums(depths: ti.template(), first, high, columns: ti.template()):
-    """Least, greatest and sum of the depths in each column of `high` rows of a tile."""
+    """Write the smallest, largest and summed depth of each column of `high` rows of a tile."""
     for x in range(TILE):
         columns[LEAST + x] = 1 << 30
         columns[GREATEST + x] = 0
@@ -280,7 +279,7 @@ def column_sums(depths: ti.template(), first, high, columns: ti.template()):
 
 @ti.func
 def samples_of(depths: ti.template(), columns: ti.template(), cell):
-    """All samples of a cell; `columns`: of `column_sums`, or None."""
+    """Return all samples of a cell. `columns` is the result of `column_sums`, or None."""
     samples, is_known = Layer(1 << 30, 1 << 30, 0, 0, 0, 0, 0), 0
     if ti.static(are_given(columns)):
         low, deepest, sum_q = 1 << 30, 0, ti.i64(0)
@@ -289,7 +288,7 @@ def samples_of(depths: ti.template(), columns: ti.template(), cell):
             low = ti.min(low, columns[LEAST + x])
             deepest = ti.max(deepest, columns[GREATEST + x])
             sum_q += columns[SUM + x]
-        if low > 0 and deepest < MOST_SUMMED:  # every pixel has one
+        if low > 0 and deepest < MOST_SUMMED:  # every pixel has a depth
             n = cell.wide * cell.high
             sum_x, sum_y = cell.x * n + n * (cell.wide - 1) // 2, cell.y * n + n * (cell.high - 1) // 2
             samples, is_known = Layer(low, 1 << 30, deepest, n, sum_q, sum_x, sum_y), 1
@@ -302,7 +301,7 @@ def samples_of(depths: ti.template(), columns: ti.template(), cell):
 
 @ti.func
 def take_nearest(model: ti.template(), unit, depths: ti.template(), cell, rest: ti.template()):
-    """Nearest of the `rest` of a cell's samples that may belong to one surface; they leave it."""
+    """Take from `rest`, the remaining samples of a cell, the nearest that may belong to one surface."""
     layer = rest
     tolerance = ti.cast(ti.min(layer_depth(model, rest.low * unit) / unit, 1e9), ti.i32)
     layer.up_to = rest.low + tolerance
@@ -320,7 +319,7 @@ def take_nearest(model: ti.template(), unit, depths: ti.template(), cell, rest: 
 
 @ti.func
 def is_supported(image: ti.template(), confidence: ti.template(), reading, cell, layer):
-    """True if one of the eight neighbours of a layer's only sample has nearly the same depth."""
+    """Return True if a neighbour (of eight) of a layer's only sample has nearly the same depth."""
     v, u = cell.top + layer.sum_y, cell.left + layer.sum_x
     found = 0
     for k in range(9):
@@ -335,7 +334,7 @@ def is_supported(image: ti.template(), confidence: ti.template(), reading, cell,
 
 @ti.func
 def color_sums(color: ti.template(), left, top, first, high, columns: ti.template()):
-    """Sum of blue, green and red in each column of `high` rows of a tile, as far as the image goes."""
+    """Write the sums of blue, green and red in each column of `high` rows of a tile, within the image."""
     for x in range(3 * TILE):
         columns[x] = 0
     right = ti.min(3 * TILE, color.shape[1] - 3 * left)
@@ -349,7 +348,7 @@ def layer_color(
     color: ti.template(), has_color, confidence: ti.template(), has_confidence, depths: ti.template(),
     colors: ti.template(), cell, layer,
 ):  # fmt: skip
-    """Mean colour 0xRRGGBB and summed confidence of a layer's samples; `colors`: of `color_sums`, or None."""
+    """Return mean colour 0xRRGGBB and summed confidence of a layer; `colors` of `color_sums`, or None."""
     n, bgr, trust = layer.n, vec3i(0), 0
     is_summed = 0
     if ti.static(are_given(colors)):
@@ -384,7 +383,7 @@ def write_layer_ray(
     """Write ray `r` through the mean of a layer's samples. Returns its weight, 0 out of reach, and the cost
     of its addition.
 
-    paper eq. 1 (u = column, v = row), in voxels: point = origin + z (u·du + v·dv + corner).
+    This is eq. 1 of the paper (u = column, v = row), in voxels: point = origin + z (u·du + v·dv + corner).
     """
     n = layer.n
     z = (ti.cast(layer.sum_q, ti.f64) / n + 0.5) * unit
@@ -424,7 +423,7 @@ def rays_from_image(
     camera_rows: F64x2,  # (4, 3): `Camera`
     model: F64, bundle: ti.i32, rays: I32x2, bands: I32x2,
 ):  # fmt: skip
-    """Fill `rays`: one a layer of depth, cell by cell, tile by tile."""
+    """Fill `rays` with a ray for each layer of depth, cell by cell, tile by tile."""
     tiles_x = (image.shape[1] + TILE - 1) // TILE
     tiles = tiles_x * ((image.shape[0] + TILE - 1) // TILE)
     count = bands.shape[0]

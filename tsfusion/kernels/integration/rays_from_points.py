@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Rays from points, for instance of a LiDAR: consecutive points within a voxel of the first become one ray
-through their mean. With `bundle = 0` every point is a ray.
+"""Make rays from points, for instance of a LiDAR.
 
-One unit of parallel work is a band, a contiguous run of points with a region of the ray buffer to itself.
+Consecutive points within a voxel of the first become one ray through their mean. With `bundle = 0` every
+point is a ray. One unit of parallel work is a band, a run of points with its own region of the ray buffer.
 """
 
 import taichi as ti
@@ -29,13 +29,13 @@ from tsfusion.kernels.base.voxel_traversal import write_band, write_ray
 
 @ti.func
 def row(array: ti.template(), n):
-    """Row n of an array as a vector."""
+    """Return row n of an array as a vector."""
     return vec3f(array[n, 0], array[n, 1], array[n, 2])
 
 
 @ti.func
 def transform(pose: ti.template(), q):
-    """The point q (sensor frame, metres) in the map's frame, voxels."""
+    """Transform the point q (sensor frame, metres) to the map's frame, voxels."""
     p = vec3(0.0)
     for a in ti.static(range(3)):
         p[a] = dot(vec3(pose[a, 0], pose[a, 1], pose[a, 2]), q) + pose[a, 3]
@@ -50,10 +50,10 @@ Bundle = ti.types.struct(
 
 @ti.func
 def confidence_at(q, o, nearest, farthest, confidence: ti.template(), has_confidence, i):
-    """Confidence in point i at q, seen from o; 0 out of range. Ranges are squared metres."""
+    """Return the confidence in point i at q, seen from o; 0 out of range. Ranges are squared metres."""
     found = 0
     span = dot(q - o, q - o)
-    # False for NaN as well
+    # False also for NaN
     if span > 0.0 and span >= nearest and span <= farthest:
         found = 255
         if has_confidence == 1:
@@ -105,7 +105,7 @@ def rays_from_points(
     pose: F64x2,  # (3, 4), metres → voxels
     model: F64, bundle: ti.i32, rays: I32x2, bands: I32x2,
 ):  # fmt: skip
-    """Consecutive points within a voxel of the first become one ray; range is measured along the ray."""
+    """Fill `rays`: consecutive points within a voxel of the first become one. Range is along the ray."""
     count = points.shape[0]
     own_starts = ti.select(starts.shape[0] == 1, 0, 1)
     nearest = ti.cast(model[MIN_RANGE] * model[MIN_RANGE], ti.f32)

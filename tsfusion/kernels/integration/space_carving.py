@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""Space carving by images: the voxels that a depth image looks through, and their votes for free space.
+"""Carve space by images: find the voxels that a depth image looks through, and add free-space votes.
 
-A ray for each cell of the image would come to a voxel four times, and more often near the camera, where rays
-meet. Here each block is projected into the image instead, once. The look-up tables hold the depths up to
-which patches of 3×3 pixels are clear, and the least and the greatest of these in squares of patches, level by
-level, so that most blocks, and cubes of blocks, are known to be hidden or clear as a whole.
+A ray for each cell of the image would visit a voxel four times, and more often near the camera, where rays
+meet. Instead each block is projected into the image once. Look-up tables have the depths up to which 3x3
+pixel patches are clear. Further tables have the minimum and maximum of these depths in squares of patches,
+level by level. They show that most blocks, and cubes of blocks, are completely hidden or clear.
 
-Positions in the image are integers, linear in a voxel's coordinates: those of a block's corners bound those
-of all its voxels. Only quotients are float32, which every processor rounds alike. With the longest lenses and
-largest images they are as coarse as a sixty-fourth of a voxel, and a voxel is up to 3 · 63 steps away from
-the one that they are counted from.
+Positions in the image are integers, linear in a voxel's coordinates: the positions of a block's corners bound
+those of all its voxels. Only quotients are float32, which every processor rounds alike. With the longest
+lenses and largest images the integers are as coarse as a sixty-fourth of a voxel. Rounding errors add up over
+at most 3 · 63 steps from the voxel at which counting starts.
 """
 
 import taichi as ti
@@ -40,50 +40,50 @@ from tsfusion.kernels.integration.integrate import (
 from tsfusion.kernels.integration.rays_from_images import depth_at, depth_of, reading_of
 from tsfusion.kernels.integration.rays_from_points import confidence_at, row
 
-PATCH = 3  # pixels a side
-GROUP = 8  # patches that are read at once
+PATCH = 3  # pixels per side
+GROUP = 8  # patches that are read together
 WORDS, BITS = 8, 64  # of a block's mask: bit 8 y + z of word x
-SIDE = 64  # voxels of the cubes that blocks are looked for in
-MOST_SQUARES = 5  # a side, of those that are looked up for a cube
-NEAREST = 4.0  # voxels before the camera, from where on it carves
-MARGIN = 0.1  # patches: more than a quotient of float32 can be wrong
+SIDE = 64  # side in voxels of the cubes in which blocks are looked for
+MOST_SQUARES = 5  # largest side, in squares, of the area that is looked up for a cube
+NEAREST = 4.0  # voxels ahead of the camera, where carving begins
+MARGIN = 0.1  # patches: larger than the error of a float32 quotient
 NO_SAMPLE = 1 << 30
 HIDDEN, PARTLY, CLEAR = 0, 1, 2
 BLOCKS, VOXELS = 0, 1  # in `counts`
 
-# `view`, float64: the camera's centre (voxels); factors from a relative place (voxels) to column · depth, row
-# · depth (patches, voxels) and depth (voxels), three numbers each; the depth up to which it carves (voxels);
-# number of units in these, a power of two; fx, fy, cx, cy.
+# `view`, float64: the camera's centre (voxels); factors from a relative position (voxels) to column · depth,
+# row · depth (patches, voxels) and depth (voxels), three numbers each; the depth up to which the view carves
+# (voxels); units per such number, a power of two; fx, fy, cx, cy.
 CENTRE, COLUMN, ROW, DEPTH, FAR, SCALE, FX, FY, CX, CY = 0, 3, 6, 9, 12, 13, 14, 15, 16, 17
 VIEW_FIELDS = 18
-FINEST = 1 << 14  # units a voxel
-VIEWS = 6  # of points: both ways along x, y and z
-VIEW_TANGENT = 1.25  # of half of such a view's angle: views overlap, so that no cube lies in none as a whole
+FINEST = 1 << 14  # units per voxel
+VIEWS = 6  # views of points: both directions along x, y and z
+VIEW_TANGENT = 1.25  # of half a view's angle: views overlap, so that each cube is completely in one
 
-# Column · depth, row · depth and depth of a voxel, in units; changes of these with a step along each axis.
+# Column · depth, row · depth and depth of a voxel, in units; and their changes per step on each axis.
 PixelPlace = ti.types.struct(column=ti.i32, row=ti.i32, depth=ti.i32)
 Steps = ti.types.struct(column=vec3i, row=vec3i, depth=vec3i)
-# What is carved: depths from `near` to `far`, units, in an image of so many rows and columns of patches. The
-# last ones may be cut off: it is so many patches high and wide.
+# Carved space: depths from `near` to `far`, units, in an image of `rows` and `columns` of patches. The last
+# patches may be cut off: the image is `high` and `wide` patches large.
 DepthReach = ti.types.struct(near=ti.i32, far=ti.i32, rows=ti.i32, columns=ti.i32, high=ti.f32, wide=ti.f32)
 
 
 @ti.func
 def view_row(view: ti.template(), first):
-    """Three neighbouring numbers of a view."""
+    """Return three neighbouring numbers of a view."""
     return vec3(view[first], view[first + 1], view[first + 2])
 
 
 @ti.func
 def whole(number):
-    """The nearest integer, of numbers or of each component."""
+    """Round to the nearest integer, of numbers or of each component."""
     return ti.cast(ti.floor(number + 0.5), ti.i32)
 
 
 @ti.func
 def begin_cube(first, view: ti.template(), v, height, width, rows, columns):
-    """Place, steps and reach of a cube's first voxel in view v of images of (height, width) pixels and (rows,
-    columns) patches."""
+    """Return position, steps, reach and scale of a cube's first voxel in view v, for images of (height,
+    width) pixels and (rows, columns) patches."""
     at = VIEW_FIELDS * v
     scale, away = view[at + SCALE], ti.cast(first * SIDE, ti.f64) + 0.5 - view_row(view, at + CENTRE)
     column, row = view_row(view, at + COLUMN), view_row(view, at + ROW)
@@ -99,7 +99,7 @@ def begin_cube(first, view: ti.template(), v, height, width, rows, columns):
 
 @ti.func
 def note_sample(depth, x, nearest: ti.template(), second: ti.template()):
-    """Note the depth of a pixel in column x, 2⁻¹⁰ voxel, 0 = none, if it is one of the two nearest there."""
+    """Keep the depth of a pixel in column x, 2⁻¹⁰ voxel, 0 = none, if it is among the two nearest."""
     q = ti.select(depth > 0, depth, NO_SAMPLE)
     second[x] = ti.min(second[x], ti.max(nearest[x], q))
     nearest[x] = ti.min(nearest[x], q)
@@ -107,12 +107,12 @@ def note_sample(depth, x, nearest: ti.template(), second: ti.template()):
 
 @ti.func
 def clear_up_to(model: ti.template(), nearest, second, cosine, far, scale):
-    """Depth up to which a patch is clear, units: a band's half-width before the `second` nearest of its
-    samples, because a single one may be wrong. For one sample it is 0 with `outlier_filter`, as without a
-    sample.
+    """Return the depth up to which a patch is clear, units: a band's half-width before the `second` nearest
+    of its samples, because a single sample may be wrong. It is 0 without a sample, and with `outlier_filter`
+    also for one sample.
 
-    The samples are in 2⁻¹⁰ voxel, `cosine` is of the angle between the patch and the camera's axis. All
-    float32, and no branch: a row of patches is found in vectors.
+    The samples are in 2⁻¹⁰ voxel; `cosine` is of the angle between the patch and the camera's axis. All is
+    float32 without a branch, so that a row of patches is computed in vectors.
     """
     unit = model[VOXEL_SIZE] / 1024.0  # metres
     least = ti.select(second < NO_SAMPLE, second, nearest)
@@ -127,7 +127,7 @@ def clear_up_to(model: ti.template(), nearest, second, cosine, far, scale):
 def fill_level(
     n, levels: ti.template(), clear: ti.template(), v, base, least: ti.template(), most: ti.template()
 ):
-    """Fill the n-th level of squares of image v from the one below it, or from the patches."""
+    """Fill the n-th level of squares of image v from the level below it, or from the patches."""
     rows = levels[0, 3]
     for y in range(levels[n, 1]):
         for x in range(levels[n, 2]):
@@ -148,7 +148,7 @@ def fill_level(
 @QuickLaunch
 @ti.kernel
 def fill_levels(clear: I32x2, levels: I32x2, least: I32, most: I32):
-    """Fill the squares of some images, whose patches have their rows one below the other in `clear`."""
+    """Fill the squares of several images, whose patches have their rows one below the other in `clear`."""
     views = clear.shape[0] // levels[0, 3]
     for run in range(runs(views)):  # run loop: kernels/base/quick_launch.py
         v = unit_of(run, views)
@@ -165,8 +165,8 @@ def find_clear_depths(
     confidence: U8x2, has_confidence: ti.i32, view: F64, model: F64, levels: I32x2, clear: I32x2, least: I32,
     most: I32,
 ):  # fmt: skip
-    """Fill `clear`, (rows, columns) of patches, with their clear depths, and `least` and `most` with those of
-    squares of 2×2 patches, of 4×4, and so on.
+    """Fill `clear`, (rows, columns) of patches, with their clear depths, and `least` and `most` with the
+    minimum and maximum in squares of 2×2 patches, of 4×4, and so on.
 
     `levels`, (n, 4): start of a level's numbers, its rows and columns, and the rows of patches.
     """
@@ -215,7 +215,7 @@ def find_clear_depths(
 
 @ti.func
 def moved(place, steps, x, y, z):
-    """Place of the voxel that lies x, y, z voxels from another one."""
+    """Return the position of the voxel that lies x, y, z voxels from another voxel."""
     by = vec3i(x, y, z)
     return PixelPlace(
         place.column + (steps.column * by).sum(), place.row + (steps.row * by).sum(),
@@ -225,11 +225,11 @@ def moved(place, steps, x, y, z):
 
 @ti.func
 def look(place, steps, side, reach, levels: ti.template(), base, least: ti.template(), most: ti.template()):
-    """State of a cube of `side` voxels, the first of them at a place: hidden, clear, or maybe clear in part.
-    Numbers of squares begin at `base`."""
+    """Return HIDDEN, CLEAR or PARTLY (possibly clear in part) for a cube of `side` voxels, whose first voxel
+    is at `place`. The image's squares start at index `base` of `least` and `most`."""
     nearest, farthest = NO_SAMPLE, -NO_SAMPLE
     left, right, top, bottom = 1e9, -1e9, 1e9, -1e9
-    # Distance of the cube from each of the image's edges on the inner side, if it is there
+    # Distance of the cube from each of the image's edges, if on the inner side
     inner_left, inner_top, inner_right, inner_bottom = -1.0, -1.0, -1.0, -1.0
     for k in ti.static(range(8)):
         n = side - 1
@@ -250,13 +250,13 @@ def look(place, steps, side, reach, levels: ti.template(), base, least: ti.templ
         and nearest < reach.far
     ):
         if nearest < reach.near:
-            found = PARTLY  # it may lie anywhere in the image, or behind the camera
+            found = PARTLY  # the cube may lie anywhere in the image, or behind the camera
         else:
             x0 = ti.cast(ti.max(left - MARGIN, 0.0), ti.i32)
             y0 = ti.cast(ti.max(top - MARGIN, 0.0), ti.i32)
             x1 = ti.cast(ti.min(right + MARGIN, reach.columns - 1.0), ti.i32)
             y1 = ti.cast(ti.min(bottom + MARGIN, reach.rows - 1.0), ti.i32)
-            n, up = 0, 1  # the level, and the power of two that its squares are wide
+            n, up = 0, 1  # the level, and the power of two of its squares' width
             while ti.max((x1 >> up) - (x0 >> up), (y1 >> up) - (y0 >> up)) >= MOST_SQUARES:
                 n, up = n + 1, up + 1  # there are levels up to one square
             low, high = NO_SAMPLE, 0
@@ -265,7 +265,7 @@ def look(place, steps, side, reach, levels: ti.template(), base, least: ti.templ
                     at = base + levels[n, 0] + y * levels[n, 2] + x
                     low, high = ti.min(low, least[at]), ti.max(high, most[at])
                 if low <= farthest and high > nearest:
-                    break  # whatever the others are
+                    break  # the other squares change nothing
             if high > nearest:
                 found = PARTLY
                 is_inside = left >= MARGIN and top >= MARGIN
@@ -277,8 +277,8 @@ def look(place, steps, side, reach, levels: ti.template(), base, least: ti.templ
 
 @ti.func
 def look_at_middle(place, steps, side, reach, clear: ti.template(), top):
-    """State of a cube by the one patch at its middle: hidden or clear if all of its depths lie beyond or
-    before the patch's, else partly clear; clear outside the image. The image's rows begin at `top`."""
+    """Return the state of a cube by the patch at its middle: HIDDEN or CLEAR if all depths of the cube are
+    beyond or before the patch's, else PARTLY; CLEAR outside the image. The image's rows start at `top`."""
     middle = moved(place, steps, side // 2, side // 2, side // 2)
     inverse = 1.0 / ti.cast(ti.max(middle.depth, 1), ti.f32)
     x, y = ti.cast(middle.column * inverse, ti.i32), ti.cast(middle.row * inverse, ti.i32)
@@ -294,7 +294,7 @@ def look_at_middle(place, steps, side, reach, clear: ti.template(), top):
 
 @ti.func
 def block_in_cube(n):
-    """The n-th block of a cube, in an order in which those of every smaller cube follow each other."""
+    """Return the n-th block of a cube, in an order that keeps the blocks of every smaller cube together."""
     return vec3i(
         (n & 1) | (n >> 2 & 2) | (n >> 4 & 4), (n >> 1 & 1) | (n >> 3 & 2) | (n >> 5 & 4),
         (n >> 2 & 1) | (n >> 4 & 2) | (n >> 6 & 4),
@@ -303,10 +303,10 @@ def block_in_cube(n):
 
 @ti.func
 def free_vote(model: ti.template(), view: ti.template(), depth):
-    """Addition to a clear voxel at such a depth (voxels): the votes of a ray through the pixels that it
-    covers, with a band's half-width as their distance."""
+    """Return the addition to a clear voxel at this depth (voxels): the votes of a ray through the pixels that
+    the voxel covers, with a band's half-width as their distance."""
     sigma = noise_sigma(model, depth * model[VOXEL_SIZE])
-    pixel = depth / ti.min(view[FX], ti.abs(view[FY]))  # voxels that it spans
+    pixel = depth / ti.min(view[FX], ti.abs(view[FY]))  # voxels that a pixel spans
     weight = bundle_weight(model, sigma, 255.0 / ti.max(product(pixel, pixel), 1e-3))
     distance = (support_width(model, sigma) * QUANTA_PER_VOXEL + 128) >> 8
     return (ti.cast(distance * weight, ti.i64) << WEIGHT_BITS) + weight
@@ -349,7 +349,7 @@ def list_free_blocks(
     keys: I64, amounts: I64, masks: I64x2, counts: I32,
 ):  # fmt: skip
     """List the blocks with voxels that an image looks through: their keys, masks of these voxels, and the
-    addition to each. `counts`: number of blocks and voxels; a full list ends early."""
+    addition to each. `counts` gets the number of blocks and voxels; a full list ends early."""
     for run in range(runs(cubes[3] * cubes[4] * cubes[5])):  # run loop: kernels/base/quick_launch.py
         n = unit_of(run, cubes[3] * cubes[4] * cubes[5])
         if n < cubes[3] * cubes[4] * cubes[5]:
@@ -406,11 +406,11 @@ def list_clear_blocks(
     clear: I32x2, height: ti.i32, width: ti.i32, levels: I32x2, least: I32, most: I32, views: F64,
     cubes: I32x2, least_power: ti.i32, keys: I64, counts: I32,
 ):  # fmt: skip
-    """List the keys of the blocks that some images look through as a whole, once for each image, and their
-    number. These lie in clear cubes of 8 · 2^`least_power` voxels a side or more. `clear` has the images'
-    rows one below the other, `least` and `most` their squares one after the other. `cubes`: for each image,
-    the index of its first cube of 64 voxels in the list of all, that cube, and the number on each axis. At
-    its end is the end of the list."""
+    """List the keys of the blocks that images look through completely, once per image, and their number. They
+    lie in clear cubes of at least 8 · 2^`least_power` voxels per side. `clear` has the images' rows one below
+    the other, `least` and `most` their squares one after the other. `cubes` has for each image the index of
+    its first cube of 64 voxels in the list of all, that cube, and the cubes per axis. Its last entry is the
+    end of the list."""
     images = cubes.shape[0] - 1
     units, rows, squares = cubes[images, 0], clear.shape[0] // images, least.shape[0] // images
     for run in range(runs(units)):  # run loop: kernels/base/quick_launch.py
@@ -453,11 +453,11 @@ def see_points(
     points: F32x2, starts: F32x2, confidence: U8, has_confidence: ti.i32, step: ti.i32, centre: F32,
     model: F64, units: ti.f64, ends: I32x2, seen: I32,
 ):  # fmt: skip
-    """Draw every `step`-th point into six square images around `centre`, towards both sides along x, y and z:
-    the clear depth before the nearest point of a patch, in `units` a voxel.
+    """Draw every `step`-th point into six square images around `centre`, in both directions along x, y and z.
+    A patch gets the clear depth before its nearest point, in `units` per voxel.
 
-    `ends` has the images' rows one below the other, `NO_SAMPLE` without a point; `seen` marks the images with
-    any. A point too near for the map ends its patch at once.
+    `ends` has the images' rows one below the other, `NO_SAMPLE` without a point; `seen` marks used images. A
+    point too near for the map makes its patch's clear depth 0.
     """
     near, far = ti.cast(model[MIN_RANGE] ** 2, ti.f32), ti.cast(model[MAX_RANGE] ** 2, ti.f32)
     own_starts = ti.select(starts.shape[0] == 1, 0, 1)

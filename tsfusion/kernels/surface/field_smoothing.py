@@ -26,21 +26,21 @@ from tsfusion.kernels.base.sensor_noise import WEIGHT_ONE
 from tsfusion.kernels.integration.integrate import lane_weight
 from tsfusion.kernels.surface.surface_cells import lowest
 
-AT_ONCE = 3  # steps of a launch
-ABREAST = 4  # voxels of an iteration, whose number divides the list's: the last ones of it may be nobody
+AT_ONCE = 3  # steps per launch
+ABREAST = 4  # voxels per iteration; their number divides the list's, whose last entries may be empty
 
 abreast = ti.types.vector(ABREAST, ti.f32)
 
 
 @ti.func
 def count_bits(plane):
-    """Number of a word's bits that are set."""
+    """Return the number of set bits in a word."""
     return ti.cast(ti.math.popcnt(plane), ti.i32)
 
 
 @ti.func
 def without_lowest(plane):
-    """A word without the lowest bit that it has."""
+    """Return a word without its lowest set bit."""
     return plane & (plane - ti.u64(1))
 
 
@@ -53,8 +53,8 @@ def mark_voxels(values: F32x2, reach: ti.f32, planes: U64x2, counts: I32x2):
         if b < values.shape[0]:
             for word in range(planes.shape[1]):
                 plane = ti.u64(0)
-                for j in range(64):  # LLVM makes vectors of it
-                    is_near = abs(values[b, 64 * word + j]) <= reach  # never true of NaN
+                for j in range(64):  # LLVM vectorises this loop
+                    is_near = abs(values[b, 64 * word + j]) <= reach  # false for NaN
                     plane |= ti.cast(is_near, ti.u64) << ti.cast(j, ti.u64)
                 planes[b, word] = plane
                 counts[b, word] = count_bits(plane)
@@ -62,7 +62,7 @@ def mark_voxels(values: F32x2, reach: ti.f32, planes: U64x2, counts: I32x2):
 
 @ti.func
 def number_of(planes: ti.template(), places: ti.template(), b, o):
-    """Number of a listed cell in the list; for another cell, the next one's."""
+    """Return the number of a listed cell in the list; for another cell, that of the next listed cell."""
     below = (ti.u64(1) << ti.cast(o & 63, ti.u64)) - ti.u64(1)
     return places[b, o >> 6] + count_bits(planes[b, o >> 6] & below)
 
@@ -71,12 +71,12 @@ def number_of(planes: ti.template(), places: ti.template(), b, o):
 def neighbour(
     planes: ti.template(), places: ti.template(), around: ti.template(), bits, b, o, axis, side, none
 ):
-    """Number in the list of the cell before or after cell o along an axis, `none` if it is not listed."""
+    """Return the number of the cell before or after cell o along an axis, `none` if it is not listed."""
     shift = (2 - axis) * bits
     mask = (1 << bits) - 1
     at = ((o >> shift) & mask) + 2 * side - 1
     block = ti.select((at & ~mask) == 0, b, around[b, 2 * axis + side])
-    row = ti.max(block, 0)  # without branches: whether a cell is listed cannot be foretold
+    row = ti.max(block, 0)  # without branches: no processor predicts if a cell is listed
     cell = (o & ~(mask << shift)) | ((at & mask) << shift)
     is_listed = (planes[row, cell >> 6] >> ti.cast(cell & 63, ti.u64)) & ti.u64(1)
     return ti.select((block >= 0) & (is_listed == ti.u64(1)), number_of(planes, places, row, cell), none)
@@ -86,7 +86,7 @@ def neighbour(
 def link(
     planes: ti.template(), places: ti.template(), around: ti.template(), bits, b, o, i, links: ti.template()
 ):
-    """Column i of `links`: numbers of the cells beside cell o; the number of columns for a missing one."""
+    """Write column i of `links`: numbers of the cells beside cell o; the column count for a missing cell."""
     for side in ti.static(range(6)):
         links[side, i] = neighbour(planes, places, around, bits, b, o, side // 2, side % 2, links.shape[1])
 
@@ -117,7 +117,7 @@ def list_voxels(
 
 @ti.func
 def parent_of(o, bits):
-    """Cell of half the resolution that holds cell o of a block with 2^bits cells a side."""
+    """Return the cell of half the resolution that contains cell o of a block with 2^bits cells per side."""
     mask = (1 << bits) - 1
     x = o >> (2 * bits)
     y = (o >> bits) & mask
@@ -131,7 +131,7 @@ def mark_parents(
     bits: ti.i32,  # of the finer cells
     planes: U64x2, coarse_planes: U64x2, coarse_counts: I32x2,
 ):  # fmt: skip
-    """Mark the cells that hold a listed finer cell."""
+    """Mark the cells that contain a listed finer cell."""
     for run in range(runs(planes.shape[0])):  # run loop: kernels/base/quick_launch.py
         b = unit_of(run, planes.shape[0])
         if b < planes.shape[0]:
@@ -151,7 +151,7 @@ def mark_parents(
 
 @ti.func
 def slope(links: ti.template(), x: ti.template(), i, axis):
-    """Difference to the next cell along an axis: central, one-sided at the rim, 0 alone."""
+    """Return the difference to the next cell along an axis: central, one-sided at the rim, 0 if alone."""
     m = links[2 * axis, i]
     p = links[2 * axis + 1, i]
     none = links.shape[1]
@@ -167,7 +167,7 @@ def slope(links: ti.template(), x: ti.template(), i, axis):
 
 @ti.func
 def off_center(o, bits, axis):
-    """Offset of cell o from its parent's centre, in cells of its size: ±½."""
+    """Return the offset of cell o from its parent's centre, in cells of its size: ±½."""
     return ti.cast((o >> ((2 - axis) * bits)) & 1, ti.f32) - 0.5
 
 
@@ -222,7 +222,7 @@ def refine(
     links: I32x2,  # of the coarse cells
     coarse_planes: U64x2, coarse_places: I32x2, coarse_x: F32, planes: U64x2, places: I32x2, x: F32,
 ):  # fmt: skip
-    """Start the finer cells from the coarse solution, linear inside each coarse cell."""
+    """Start the finer cells from the coarse solution, which is linear inside each coarse cell."""
     for run in range(runs(planes.shape[0])):  # run loop: kernels/base/quick_launch.py
         b = unit_of(run, planes.shape[0])
         if b < planes.shape[0]:
@@ -242,13 +242,13 @@ def refine(
 
 @ti.func
 def bend(before: ti.template(), after: ti.template(), x: ti.template(), i):
-    """Second difference of x along the axis of these neighbours."""
+    """Return the second difference of x along the axis of these neighbours."""
     return x[before[i]] - 2.0 * x[i] + x[after[i]]
 
 
 @ti.func
 def share_of(before: ti.template(), after: ti.template(), bent, sharpness, i):
-    """ω along an axis."""
+    """Return ω along an axis."""
     share = 1.0 / (1.0 + (sharpness * bent) * (sharpness * bent))
     return ti.select(ti.max(before[i], after[i]) < before.shape[0], share, 0.0)
 
@@ -261,8 +261,8 @@ def weigh(
     weight: F32, smoothness: ti.f32, omega_x: F32, omega_y: F32, omega_z: F32, inverse: F32, q_x: F32,
     q_y: F32, q_z: F32,
 ):  # fmt: skip
-    """ω = 1 / (1 + (D2 x / ε)²), 0 where one of the three cells is missing; q = ω D2 x; and 1 / M with
-    M = W + 4 λ Σ |D2|ᵀ ω: then 0 < M⁻¹ A ≤ 1, as (1, −2, 1) has an l1 norm of 4."""
+    """Write ω = 1 / (1 + (D2 x / ε)²), 0 if one of the three cells is missing; q = ω D2 x; and 1 / M with M =
+    W + 4 λ Σ |D2|ᵀ ω: then 0 < M⁻¹ A ≤ 1, as (1, −2, 1) has an l1 norm of 4."""
     for group in range(x_before.shape[0] // ABREAST):
         along_x, along_y, along_z = abreast(0.0), abreast(0.0), abreast(0.0)
         share_x, share_y, share_z = abreast(0.0), abreast(0.0), abreast(0.0)
@@ -286,7 +286,7 @@ def weigh(
             total += 2.0 * omega_y[i] + omega_y[y_before[i]] + omega_y[y_after[i]]
             total += 2.0 * omega_z[i] + omega_z[z_before[i]] + omega_z[z_after[i]]
             whole[n] = weight[i] + 4.0 * smoothness * total
-        for n in ti.static(range(ABREAST)):  # what nothing draws at stays
+        for n in ti.static(range(ABREAST)):  # without data and neighbours a value does not change
             inverse[ABREAST * group + n] = ti.select(whole[n] > 0.0, 1.0 / whole[n], 0.0)
 
 
@@ -299,7 +299,7 @@ def relax(
     bent: ti.i32,  # whether q is of this x
     q_x: F32, q_y: F32, q_z: F32, step: F32, x: F32,
 ):  # fmt: skip
-    """Steps of the Chebyshev iteration, each after q = ω D2 x along each axis."""
+    """Do steps of the Chebyshev iteration, each after q = ω D2 x along each axis."""
     for k in ti.static(range(AT_ONCE)):
         for group in range(x_before.shape[0] // ABREAST * (1 - bent if ti.static(k == 0) else 1)):
             along_x, along_y, along_z = abreast(0.0), abreast(0.0), abreast(0.0)
@@ -329,7 +329,7 @@ def relax(
 @QuickLaunch
 @ti.kernel
 def write_values(planes: U64x2, places: I32x2, x: F32, values: F32x2):
-    """Write the field where it was solved; other values stay."""
+    """Write the field to solved voxels; other values do not change."""
     for run in range(runs(planes.shape[0])):  # run loop: kernels/base/quick_launch.py
         b = unit_of(run, planes.shape[0])
         if b < planes.shape[0]:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The field carried into unseen voxels, near where a surface breaks off (`hole_filling.py`).
+"""Extend the field into unseen voxels, near the end of a seen surface (`hole_filling.py`).
 
-Unseen voxels near a rim and the seen ones beside them are numbered into one list, as for the field
-regulariser, whose `weigh` and `relax` then solve it: paper eq. 3 with no weight where nothing was seen.
+Unseen voxels near a rim and the seen voxels beside them are numbered into one list, as for the field
+regulariser. Its `weigh` and `relax` then solve the list: eq. 3 of the paper with no weight where unseen.
 """
 
 import taichi as ti
@@ -16,10 +16,10 @@ from tsfusion.kernels.surface.normal_smoothing import block_at, value_at
 from tsfusion.kernels.surface.surface_cells import BANDS, case_of, corner_planes, lowest
 
 UNSEEN = 1  # voxels to solve
-BESIDE = 2  # seen voxels beside them
-RING = 4  # seen voxels that count, before or behind an unseen one
-SEEN_WEIGHT = 0.2  # of a seen value against the smoothness: noise at the rim does not lead the way
-EARLY = 1 << 20  # layer of a voxel that has no value yet
+BESIDE = 2  # seen voxels beside voxels to solve
+RING = 4  # number of seen voxels that count, before or behind an unseen voxel
+SEEN_WEIGHT = 0.2  # weight of a seen value against smoothness: noise at the rim must not steer the guess
+EARLY = 1 << 20  # layer of a voxel without a value
 
 vec3f = ti.types.vector(3, ti.f32)
 
@@ -29,7 +29,7 @@ def find_rims(
     around: I32x2,  # (blocks, 27): rows of the blocks around, −1 = none
     values: F32x2, rims: U8x2,
 ):  # fmt: skip
-    """Set 1 for each seen voxel that the surface passes and that has an unseen one among the 26 around."""
+    """Set 1 for each seen voxel that the surface passes, with an unseen voxel among the 26 around it."""
     for run in range(runs(values.shape[0])):  # run loop: kernels/base/quick_launch.py
         b = unit_of(run, values.shape[0])
         if b < values.shape[0]:
@@ -57,7 +57,7 @@ def find_rims(
 
 @ti.func
 def row_of(keys: ti.template(), count, key):
-    """Position of a key in the sorted keys, −1 where absent."""
+    """Return the index of a key in the sorted keys, −1 if absent."""
     low = 0
     high = count
     while low < high:
@@ -74,7 +74,7 @@ def row_of(keys: ti.template(), count, key):
 
 @ti.func
 def normal_at(values: ti.template(), around: ti.template(), b, p):
-    """Unit gradient at a seen voxel, from the seen ones beside it; 0 without any."""
+    """Return the unit gradient at a seen voxel, from the seen voxels beside it; 0 without any."""
     here = value_at(values, around, b, p)
     normal = vec3f(0.0)
     for a in ti.static(range(3)):
@@ -102,7 +102,7 @@ def mark_unseen(
 ):  # fmt: skip
     """Mark the unseen voxels in a ball around each rim voxel that are near the continued surface.
 
-    Threads that meet write the same.
+    Threads at the same voxel write the same value.
     """
     count = values.shape[0]
     for run in range(runs(count)):  # run loop: kernels/base/quick_launch.py
@@ -134,7 +134,7 @@ def mark_unseen(
 
 @ti.kernel
 def take_marked(around: I32x2, values: F32x2, marks: U8x2, planes: U64x2, counts: I32x2):
-    """Take the voxels to solve and the seen ones up to `RING` before or behind them along an axis."""
+    """Select the voxels to solve and the seen voxels up to `RING` before or behind them along an axis."""
     for run in range(runs(values.shape[0])):  # run loop: kernels/base/quick_launch.py
         b = unit_of(run, values.shape[0])
         if b < values.shape[0]:
@@ -188,8 +188,8 @@ def extend(
     layer: I32,  # the last of it, as of `x`, stands for none
     x: F32,
 ) -> ti.i32:  # fmt: skip
-    """Give a first value to voxels beside those that have one: the mean of the predictions of ramps and
-    neighbours. Returns their number."""
+    """Give a first value to voxels beside voxels with a value: the mean of the predictions of ramps and
+    neighbours. Returns the number of new values."""
     given = 0
     for i in range(links.shape[1]):
         if layer[i] == EARLY:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Marching cubes: vertices and triangles of the cells that `surface_cells.py` found. Every vertex belongs to
-one voxel edge and exists once, whichever block's cells use it: no cracks, no duplicates.
+"""Make vertices and triangles by marching cubes, for the cells that `surface_cells.py` found. Each vertex
+belongs to one voxel edge and exists once for the cells of all blocks: no cracks, no duplicates.
 
-Vertices are numbered by block, x, axis of their edge, y, z. A vertex's number is then its plane's start and
-the number of bits before its own.
+Vertices are numbered by block, x, axis of their edge, y, z. A vertex's number is the start of its bit plane
+plus the number of bits before its own.
 """
 
 import taichi as ti
@@ -13,7 +13,7 @@ from tsfusion.kernels.base.quick_launch import QuickLaunch, runs, unit_of
 from tsfusion.kernels.base.voxel_traversal import unpack, vec3i
 from tsfusion.kernels.surface.surface_cells import BANDS, case_of, corner_planes, lowest
 
-PAD = 11  # a block with one voxel before and two behind
+PAD = 11  # a block with a border of one voxel before and two behind
 PADDED = PAD * PAD * PAD
 GREY = 160
 
@@ -22,7 +22,7 @@ vec3f = ti.types.vector(3, ti.f32)
 
 @ti.func
 def neighbour_of(p):
-    """Number of the block, of the 27 around (13 = itself), that holds the voxel at block-relative p."""
+    """Return the index, among the 27 blocks around (13 = itself), of the block with relative voxel p."""
     return ((p[0] >> 3) + 1) * 9 + ((p[1] >> 3) + 1) * 3 + (p[2] >> 3) + 1
 
 
@@ -55,7 +55,7 @@ def gather(r, count, first, last, around: ti.template(), values: ti.template(), 
 
 @ti.func
 def slope(padded: ti.template(), band, i, step):
-    """Central difference, one-sided at the edge of the seen voxels."""
+    """Return the central difference, one-sided at the edge of the seen voxels."""
     before = padded[band, i - step]
     here = padded[band, i]
     after = padded[band, i + step]
@@ -71,7 +71,7 @@ def slope(padded: ti.template(), band, i, step):
 
 @ti.func
 def normal_at(padded: ti.template(), band, i, axis, t):
-    """Unit gradient at the share t of the edge that starts at i."""
+    """Return the unit gradient at the share t of the edge that starts at i."""
     step = axis_step(axis)
     normal = vec3f(0.0)
     for a in ti.static(range(3)):
@@ -80,7 +80,7 @@ def normal_at(padded: ti.template(), band, i, axis, t):
         other = padded[band, i + step + s] - padded[band, i + step - s]
         normal[a] = (1.0 - t) * one + t * other
     length = normal.norm()
-    if not (length == length):  # something around is unseen
+    if not (length == length):  # a neighbour is unseen
         for a in ti.static(range(3)):
             s = axis_step(a)
             normal[a] = (1.0 - t) * slope(padded, band, i, s) + t * slope(padded, band, i + step, s)
@@ -95,7 +95,7 @@ def normal_at(padded: ti.template(), band, i, axis, t):
 
 @ti.func
 def axis_step(axis):
-    """Distance of neighbours along an axis in `padded`."""
+    """Return the distance of neighbours along an axis in `padded`."""
     return ti.select(axis == 0, PAD * PAD, ti.select(axis == 1, PAD, 1))
 
 
@@ -103,7 +103,7 @@ def axis_step(axis):
 def add_color(
     slots: ti.template(), around: ti.template(), r, p, share, rgn: ti.template(), b: ti.template(), total
 ):
-    """Add the mean colour at voxel p, weighted; the fourth element counts the weight."""
+    """Add the mean colour at voxel p, weighted; the fourth element sums the weight."""
     row = r
     if ((p[0] | p[1] | p[2]) & ~7) != 0:
         row = around[r, neighbour_of(p)]
@@ -125,14 +125,14 @@ def add_color(
 def color_at(
     slots: ti.template(), around: ti.template(), r, p, axis, t, rgn: ti.template(), b: ti.template()
 ):
-    """Colour at the share t of voxel p's edge along `axis`, rounded."""
+    """Return the colour at the share t of voxel p's edge along `axis`, rounded."""
     q = p
     for a in ti.static(range(3)):
         q[a] += ti.cast(a == axis, ti.i32)
     total = ti.Vector([0.0, 0.0, 0.0, 0.0])
     total = add_color(slots, around, r, p, 1.0 - t, rgn, b, total)
     total = add_color(slots, around, r, q, t, rgn, b, total)
-    if total[3] == 0.0:  # the surface moved off the voxels that rays ended in
+    if total[3] == 0.0:  # the surface is not in the voxels where rays ended
         for n in range(27):
             near = p + vec3i(n // 9 - 1, n // 3 % 3 - 1, n % 3 - 1)
             total = add_color(slots, around, r, near, 1.0, rgn, b, total)
@@ -150,7 +150,7 @@ def emit_vertices(
     voxel_size: ti.f64, slots: I32, color_rgn: I64x2, color_b: I32x2, has_color: ti.i32, positions: F32x2,
     normals: F32x2, colors: U8x2,
 ):  # fmt: skip
-    """Position, unit normal and colour of every vertex: where the value crosses zero along its edge."""
+    """Write position, unit normal and colour of every vertex: the zero crossing of the value on its edge."""
     for run in range(runs(BANDS)):  # run loop: kernels/base/quick_launch.py
         band = unit_of(run, BANDS)
         if band < BANDS:
@@ -175,7 +175,7 @@ def emit_vertices(
                             i = ((p[0] + 1) * PAD + p[1] + 1) * PAD + p[2] + 1
                             here = padded[band, i]
                             there = padded[band, i + axis_step(axis)]
-                            # Off the voxel centres, where several edges' vertices would fall together
+                            # Away from voxel centres, where vertices of several edges would coincide
                             t = ti.min(ti.max(here / (here - there), 0.001), 0.999)
                             normal = normal_at(padded, band, i, axis, t)
                             for a in ti.static(range(3)):
@@ -192,7 +192,7 @@ def emit_vertices(
 
 @ti.func
 def vertex_on(edges: ti.template(), starts: ti.template(), first: ti.template(), row, plane, j):
-    """Number of the vertex on the edge of voxel j of a plane."""
+    """Return the number of the vertex on the edge of voxel j of a bit plane."""
     before = edges[row, plane] & ((ti.u64(1) << ti.cast(j, ti.u64)) - ti.u64(1))
     return first[row, 0] + starts[row, plane] + ti.cast(ti.math.popcnt(before), ti.i32)
 
@@ -203,7 +203,7 @@ def emit_faces(
     count: ti.i32, around: I32x2, inside: U64x2, active: U64x2, edges: U64x2, starts: I32x2, first: I32x2,
     triangle_count: I32, triangle_starts: I32x2, faces: I32x2,
 ):  # fmt: skip
-    """Triangles of each cell, as the numbers of the vertices on its edges."""
+    """Write the triangles of each cell, as the numbers of the vertices on its edges."""
     for run in range(runs(BANDS)):  # run loop: kernels/base/quick_launch.py
         band = unit_of(run, BANDS)
         if band < BANDS:

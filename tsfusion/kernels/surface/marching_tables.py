@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""Marching-cubes cases, derived rather than listed.
+"""Derive the cases of marching cubes, instead of listing them.
 
-The surface crosses a cube's face in segments that depend on that face's four signs alone (on an ambiguous
-face, inside corners are cut off one by one), so two cells that share a face agree on it: no cracks. The
-segments close into loops, and a loop is triangulated without any diagonal in a cube face, where the
-neighbouring cell could put one too: no edge is shared by more than two triangles.
+The surface crosses a cube's face in segments that depend only on that face's four signs. On an ambiguous
+face, inside corners are cut off one by one. So two cells agree on a shared face: no cracks. The segments
+close into loops. A loop is triangulated without a diagonal in a cube face, where the neighbouring cell could
+have one too: at most two triangles share an edge.
 
-Corner c has offsets (c & 1, c >> 1 & 1, c >> 2 & 1) in x, y, z. Edge e = 4·axis + k runs along `axis`
-from the corner `EDGE_CORNER[e]`.
+Corner c has offsets (c & 1, c >> 1 & 1, c >> 2 & 1) in x, y, z. Edge e = 4·axis + k runs along `axis` from
+the corner `EDGE_CORNER[e]`.
 """
 
 from functools import lru_cache
@@ -36,8 +36,8 @@ FACES = _faces()
 
 
 def _segments(case: int) -> dict[int, int]:
-    """Segments on all faces, edge → edge, directed so that the loops turn counter-clockwise seen from
-    outside. Inside corners have their bit set in `case`."""
+    """Return the segments on all faces, edge → edge. Their loops turn counter-clockwise seen from outside.
+    Inside corners have their bit set in `case`."""
     following = {}
     for face in FACES:
         inside = [case >> corner & 1 for corner in face]
@@ -72,7 +72,7 @@ def _share_face(a: int, b: int) -> bool:
 
 
 def _triangulate(loop: list[int]) -> list[tuple[int, int, int]] | None:
-    """Triangles of a polygon of cube edges, without a diagonal in a cube face."""
+    """Return the triangles of a polygon of cube edges, without a diagonal in a cube face."""
 
     @lru_cache(maxsize=None)
     def best(i: int, j: int) -> tuple[tuple[int, int, int], ...] | None:

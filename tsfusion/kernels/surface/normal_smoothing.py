@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Smoothing along normals: the 1-D solve of paper eq. 3 on the field sampled along its gradient.
+"""Smooth along normals: the 1-D solution of eq. 3 of the paper on the field sampled along its gradient.
 
-No state is kept between keyframes: each voxel near the surface samples the values before and behind it and
-takes the centre row of (I + λ D2ᵀD2)⁻¹, as many samples a side as were seen.
+No state is kept between keyframes. Each voxel near the surface samples the values before and behind it, and
+uses the centre row of (I + λ D2ᵀD2)⁻¹ for the number of seen samples per side.
 """
 
 import taichi as ti
@@ -17,13 +17,13 @@ vec3f = ti.types.vector(3, ti.f32)
 
 @ti.func
 def block_at(around: ti.template(), b, p):
-    """Row of the block that holds a voxel, −1 for an absent block; p is relative to block b."""
+    """Return the row of the block with voxel p, −1 for an absent block; p is relative to block b."""
     return around[b, ((p[0] >> 3) + 1) * 9 + ((p[1] >> 3) + 1) * 3 + (p[2] >> 3) + 1]
 
 
 @ti.func
 def value_at(values: ti.template(), around: ti.template(), b, p):
-    """Value of the voxel with block-relative coordinates p, NaN where unseen."""
+    """Return the value of the voxel with block-relative coordinates p, NaN if unseen."""
     row = block_at(around, b, p)
     value = ti.math.nan
     if row >= 0:
@@ -33,7 +33,7 @@ def value_at(values: ti.template(), around: ti.template(), b, p):
 
 @ti.func
 def interpolate(values: ti.template(), around: ti.template(), b, p):
-    """Trilinear value at block-relative p (voxel centres at integers), NaN unless all corners were seen."""
+    """Return the trilinear value at block-relative p (centres at integers), NaN if a corner is unseen."""
     low = vec3i(0)
     share = vec3f(0.0)
     for a in ti.static(range(3)):
@@ -77,8 +77,8 @@ def smooth_along_normals(
                             values, around, r, p - step
                         )
                     length = normal.norm()
-                    if length > 0.0:  # never true of NaN
-                        sums = ti.Vector([here, here, here, here])  # with 0 … 3 samples a side
+                    if length > 0.0:  # false for NaN
+                        sums = ti.Vector([here, here, here, here])  # with 0 … 3 samples per side
                         for n in ti.static(range(4)):
                             sums[n] = centre[n, 0] * here
                         seen = 0

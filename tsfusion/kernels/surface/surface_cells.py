@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""Values from the map's sums; masks of the cells that the surface crosses and of voxel edges with a vertex.
+"""Read values from the map's sums, and find the cells that the surface crosses and the edges of vertices.
 
-A block's voxels are eight planes of bits, one an x; bit 8·y + z of a plane is voxel (x, y, z). Shifts and
-combinations of planes of the block and of its neighbours then find the crossed cells. A cell takes part when
-its eight corners are seen, and a surface was measured there (`is_between`); an edge carries a vertex when its
-ends differ in sign and a cell that takes part has it: as that cell then has both signs, `active` cells say
-all.
+A block's voxels are eight bit planes, one for each x; bit 8·y + z of a plane is voxel (x, y, z). Shifts and
+combinations of bit planes of the block and of its neighbours find the crossed cells. A cell is active if its
+eight corners are seen, and a surface was measured between them (`is_between`). An edge has a vertex if its
+ends differ in sign and an active cell contains it. That cell then has both signs, so the `active` cells
+determine all vertices.
 
-Blocks are rows of arrays. Row `count` stands for every absent block: nothing is seen in it.
+Blocks are rows of arrays. Row `count` stands for every absent block, in which all is unseen.
 """
 
 import taichi as ti
@@ -19,48 +19,48 @@ from tsfusion.kernels.base.voxel_traversal import hash_key
 from tsfusion.kernels.integration.integrate import CUBE, QUANTA_PER_VOXEL, WEIGHT_BITS, lane_weight
 
 AROUND = 27
-HERE = 13  # of the 27 blocks around: (x + 1)·9 + (y + 1)·3 + z + 1
+HERE = 13  # index among the 27 blocks around: (x + 1)·9 + (y + 1)·3 + z + 1
 PLANES = 24  # of edges: 3·x + axis
 NEVER = 1e9  # quanta
-NO_LIMITS = 0.0, NEVER  # of `behind` and `clear`, where maps are not carved
-Z0 = 0x0101010101010101  # the voxels of a plane with z = 0, and all but those with z = 7
+NO_LIMITS = 0.0, NEVER  # `behind` and `clear` of a map that is not carved
+Z0 = 0x0101010101010101  # the voxels of a plane with z = 0; below, those with z < 7
 Z06 = 0x7F7F7F7F7F7F7F7F
 
 planes4 = ti.types.vector(4, ti.u64)
-BANDS = 64  # units of parallel work; fixed, so that nothing depends on the thread count
+BANDS = 64  # units of parallel work; fixed, so that no result depends on the thread count
 # A loop that stores to an array does not become vector code (LLVM cannot exclude that the store changes the
 # array's address); one that stores to a small local vector does: 0.5 µs a block instead of 1.4.
 STRIDE = 32
-SEVERAL = 3  # rays that end in a voxel: a surface is there, however many others look through it
+SEVERAL = 3  # rays that end in a voxel, from which it counts as surface, however many others look through it
 
 
 @ti.func
 def next_z(plane, block_z):
-    """Plane of each voxel's neighbour at z + 1; `block_z` is the same plane of the next block."""
+    """Return the bit plane of each voxel's neighbour at z + 1; `block_z` is that plane of the next block."""
     return ((plane >> ti.u64(1)) & ti.u64(Z06)) | ((block_z & ti.u64(Z0)) << ti.u64(7))
 
 
 @ti.func
 def next_y(plane, block_y):
-    """Plane of each voxel's neighbour at y + 1; `block_y` is the same plane of the next block."""
+    """Return the bit plane of each voxel's neighbour at y + 1; `block_y` is that plane of the next block."""
     return (plane >> ti.u64(8)) | (block_y << ti.u64(56))
 
 
 @ti.func
 def previous_z(plane, block_z):
-    """Plane of each voxel's neighbour at z − 1; `block_z` is the same plane of the block before."""
+    """Return the bit plane of each voxel's neighbour at z − 1; `block_z` is that of the block before."""
     return ((plane & ti.u64(Z06)) << ti.u64(1)) | ((block_z >> ti.u64(7)) & ti.u64(Z0))
 
 
 @ti.func
 def previous_y(plane, block_y):
-    """Plane of each voxel's neighbour at y − 1; `block_y` is the same plane of the block before."""
+    """Return the bit plane of each voxel's neighbour at y − 1; `block_y` is that of the block before."""
     return (plane << ti.u64(8)) | (block_y >> ti.u64(56))
 
 
 @ti.func
 def corner_planes(planes: ti.template(), around: ti.template(), r, x):
-    """Planes of the corners (y, z) = (0, 0), (1, 0), (0, 1), (1, 1) of the cells at x, 0 ≤ x ≤ 8."""
+    """Return planes of the corners (y, z) = (0, 0), (1, 0), (0, 1), (1, 1) of the cells at x, 0 ≤ x ≤ 8."""
     k = HERE + 9 * (x >> 3)
     i = x & 7
     here = planes[around[r, k], i]
@@ -72,13 +72,13 @@ def corner_planes(planes: ti.template(), around: ti.template(), r, x):
 
 @ti.func
 def lowest(plane):
-    """Number of the lowest bit of a plane that has one."""
+    """Return the number of the lowest set bit of a non-zero bit plane."""
     return ti.cast(ti.math.popcnt(~plane & (plane - ti.u64(1))), ti.i32)
 
 
 @ti.func
 def case_of(low, high, j):
-    """Marching-cubes case of cell j between corner planes at x and x + 1: bit c is corner c inside."""
+    """Return the case of cell j between corner planes at x and x + 1: bit c is 1 if corner c is inside."""
     case = 0
     for c in ti.static(range(4)):
         case |= ti.cast((low[c] >> ti.cast(j, ti.u64)) & ti.u64(1), ti.i32) << (2 * c)
@@ -88,7 +88,7 @@ def case_of(low, high, j):
 
 @ti.func
 def shift_column(key, column):
-    """The key of the block −1, 0 or 1 along x and y: column = (x + 1)·3 + y + 1."""
+    """Return the key of the block −1, 0 or 1 along x and y: column = (x + 1)·3 + y + 1."""
     return key + (ti.cast(column // 3 - 1, ti.i64) << 42) + (ti.cast(column % 3 - 1, ti.i64) << 21)
 
 
@@ -98,7 +98,7 @@ def collect_around(
     table: I64,  # empty; never more than half full
     keys: I64,
 ) -> ti.i32:  # fmt: skip
-    """List the blocks of the map that are, or touch, one of the `wanted` (sorted). Returns their number."""
+    """List the `wanted` blocks (sorted) and their neighbours in the map. Returns their number."""
     found = 0
     mask = table.shape[0] - 1
     map_mask = map_keys.shape[0] - 1
@@ -107,7 +107,7 @@ def collect_around(
         key = wanted[n]
         first = -1
         if n > 0 and wanted[ti.max(n - 1, 0)] == key - 1:
-            first = 1  # the block before this one has listed the others
+            first = 1  # the block before this one has already listed the others
         for column in range(9):
             for z in range(first, 2):
                 k = shift_column(key, column) + z
@@ -123,14 +123,14 @@ def collect_around(
 
 @ti.func
 def find_signs(r, values: ti.template(), seen: ti.template(), inside: ti.template()):
-    """Planes of the voxels of a row that are seen, and of those with a value < 0. Returns 1 if the row has
+    """Write the bit planes of a row's seen voxels, and of those with a value < 0. Returns 1 if the row has
     any inside, 2 outside, 3 both."""
     any_inside = ti.u64(0)
     any_outside = ti.u64(0)
     for x in range(8):
         seen_plane = ti.u64(0)
         inside_plane = ti.u64(0)
-        for j in range(64):  # LLVM makes vectors of it
+        for j in range(64):  # LLVM vectorises this loop
             value = values[r, 64 * x + j]
             seen_plane |= ti.cast(value == value, ti.u64) << ti.cast(j, ti.u64)
             inside_plane |= ti.cast(value < 0.0, ti.u64) << ti.cast(j, ti.u64)
@@ -145,7 +145,7 @@ def find_signs(r, values: ti.template(), seen: ti.template(), inside: ti.templat
 def find_around(
     r, count, keys: ti.template(), table: ti.template(), table_rows: ti.template(), around: ti.template()
 ):
-    """Rows of the 27 blocks around a row's."""
+    """Write the rows of the 27 blocks around a row's block."""
     mask = table.shape[0] - 1
     for column in range(9):
         key = shift_column(keys[r], column)
@@ -154,7 +154,7 @@ def find_around(
             middle = map_find(table, table_rows, mask, key)
         below = -1
         above = -1
-        if middle >= 0:  # the keys are sorted: its neighbours in z stand beside it
+        if middle >= 0:  # the keys are sorted: neighbours in z are adjacent rows
             if middle > 0 and keys[ti.max(middle - 1, 0)] == key - 1:
                 below = middle - 1
             if middle + 1 < count and keys[ti.min(middle + 1, count - 1)] == key + 1:
@@ -169,10 +169,10 @@ def find_around(
 
 @ti.func
 def is_between(r, x, j, around: ti.template(), values: ti.template(), behind, clear):
-    """True if cell j of a plane lies between a voxel that is `clear` and one far `behind` a surface (quanta).
+    """Return 1 if cell j of a plane has a voxel that is `clear` and one far `behind` a surface (quanta).
 
-    Sensors looked through the one, and the other lies behind a known surface: no surface was measured in
-    between, or its voxels would be near it.
+    Sensors looked through the first voxel; the other lies behind a known surface. No surface was measured
+    between them, because its voxels would be near it.
     """
     least, most = 0.0, 0.0
     for c in range(8):
@@ -256,14 +256,14 @@ def find_edges(
 
 @ti.func
 def clear_planes(planes: ti.template(), r):
-    """Empty the eight planes of a row."""
+    """Set the eight bit planes of a row to zero."""
     for x in range(8):
         planes[r, x] = ti.u64(0)
 
 
 @ti.func
 def signs_around(state: ti.template(), around: ti.template(), r):
-    """Signs of the row's block and those that its cells reach into: 1 inside, 2 outside, 3 both."""
+    """Return the signs of a row's block and the blocks its cells reach into: 1 inside, 2 outside, 3 both."""
     signs = 0
     for c in ti.static(range(8)):
         signs |= state[around[r, HERE + 9 * (c >> 2) + 3 * (c >> 1 & 1) + (c & 1)], 1]
@@ -272,7 +272,7 @@ def signs_around(state: ti.template(), around: ti.template(), r):
 
 @ti.func
 def triangles_around(state: ti.template(), around: ti.template(), r):
-    """Flag, not zero if a cell that has one of the row's edges has triangles."""
+    """Return a number other than zero if a cell with one of the row's edges has triangles."""
     near = 0
     for c in ti.static(range(7)):
         near |= state[around[r, HERE - 9 * (c >> 2) - 3 * (c >> 1 & 1) - (c & 1)], 2]
@@ -310,7 +310,7 @@ def find_cells(
             for r in range(count * band // BANDS, count * (band + 1) // BANDS):
                 state[r, 1] = find_signs(r, values, seen, inside)
                 find_around(r, count, keys, table, table_rows, around)
-    for r in range(count, count + 1):  # the blocks that are not there
+    for r in range(count, count + 1):  # the row for absent blocks
         clear_planes(seen, r)
         clear_planes(inside, r)
         clear_planes(active, r)
@@ -346,7 +346,7 @@ def find_cells(
 
 @ti.func
 def distance_as_float(packed):
-    """Nearest float32 to a lane of at most 37 bits. AVX2 converts vectors of int32, not of int64."""
+    """Return the nearest float32 to a lane of at most 37 bits. AVX2 only converts vectors of int32."""
     high = ti.cast(ti.cast(packed >> (WEIGHT_BITS + 16), ti.i32), ti.f32)
     low = ti.cast(ti.cast(packed >> WEIGHT_BITS, ti.i32) & 65535, ti.f32)
     return high * 65536.0 + low
@@ -354,10 +354,10 @@ def distance_as_float(packed):
 
 @ti.func
 def held(value, slot, o, color_rgn: ti.template(), hits: ti.template(), layers):
-    """Signed distance of a voxel, voxels, for a reader that must not run into something.
+    """Return the signed distance of a voxel, in voxels, for a reader that must avoid obstacles.
 
-    The mean of rays that end in the voxel and of others that pass a thin thing there is that of free space;
-    so a voxel in which `SEVERAL` rays have ended is at the surface. `layers`: 1 = the map counts votes for
+    In a voxel of a thin object, the mean of rays that end and of rays that pass by is that of free space. So
+    a voxel in which `SEVERAL` rays have ended is at the surface. `layers`: 1 = the map counts votes for
     colours, 2 = hits.
     """
     ended = 0
@@ -373,7 +373,7 @@ def held(value, slot, o, color_rgn: ti.template(), hits: ti.template(), layers):
 def is_clear(
     key, slot, shows_surface: ti.template(), keys: ti.template(), slots: ti.template(), counts: ti.template()
 ):
-    """True if a block is free as a whole: a keyframe looks through it, and its voxels show no surface."""
+    """Return 1 if a block is wholly free: a keyframe looks through it, and its voxels show no surface."""
     found = 0
     if slot < 0 or shows_surface[slot] == 0:
         own = map_find(keys, slots, keys.shape[0] - 1, key)
@@ -385,7 +385,7 @@ def is_clear(
 @QuickLaunch
 @ti.kernel
 def find_surfaces(slots: I32, sums: I64x2, color_rgn: I64x2, hits: I32x2, layers: ti.i32, shows_surface: U8):
-    """Mark blocks in which a ray has ended in a voxel, or a voxel is at a surface or behind it."""
+    """Mark blocks in which a ray has ended, or a voxel is at or behind a surface."""
     for run in range(runs(BANDS)):  # run loop: kernels/base/quick_launch.py
         band = unit_of(run, BANDS)
         if band < BANDS:
@@ -407,7 +407,7 @@ def find_surfaces(slots: I32, sums: I64x2, color_rgn: I64x2, hits: I32x2, layers
 
 @ti.kernel
 def hold_hits(slots: I32, color_rgn: I64x2, hits: I32x2, layers: ti.i32, values: F32x2):
-    """Replace row r of `values`, that of the block in `slots[r]` in voxels, by its `held` distances."""
+    """Replace row r of `values`, in voxels, by the `held` distances of the block in `slots[r]`."""
     for run in range(runs(BANDS)):  # run loop: kernels/base/quick_launch.py
         band = unit_of(run, BANDS)
         if band < BANDS:
@@ -423,7 +423,7 @@ def read_values(
     count: ti.i32, keys: I64, map_keys: I64, map_slots: I32, sums: I64x2, correction: F32x2,
     corrected: ti.i32, min_weight: ti.i32, values: F32x2,
 ):  # fmt: skip
-    """Row r of `values`: smoothed or raw values of block `keys[r]` in quanta; NaN below `min_weight`."""
+    """Write row r of `values`: smoothed or raw values of block `keys[r]`, quanta; NaN below `min_weight`."""
     mask = map_keys.shape[0] - 1
     for run in range(runs(BANDS)):  # run loop: kernels/base/quick_launch.py
         band = unit_of(run, BANDS)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Ray casting into worlds of analytic solids, with procedural colour.
+"""Cast rays into synthetic worlds of analytic solids, with procedural colours.
 
-A world is a table of solids (`datasets/worlds/worlds.py` names the columns). Every ray is independent and
-in float64, so images do not depend on the thread count.
+A world is a table of solids (`datasets/worlds/worlds.py` names the columns). Every ray is independent and in
+float64, so images do not depend on the thread count.
 """
 
 import taichi as ti
@@ -20,7 +20,7 @@ vec3 = ti.types.vector(3, ti.f64)
 
 @ti.func
 def box_ray(o, d, half):
-    """(entry, exit) of a ray through an origin-centred box; entry > exit = missed."""
+    """Return (entry, exit) of a ray through an origin-centred box; entry > exit = missed."""
     near, far = ti.f64(-1e9), ti.f64(1e9)
     for k in ti.static(range(3)):
         if d[k] == 0:
@@ -34,7 +34,7 @@ def box_ray(o, d, half):
 
 @ti.func
 def quadric_ray(a, b, c):
-    """(entry, exit) where a t² + 2 b t + c < 0."""
+    """Return (entry, exit) of the range where a t² + 2 b t + c < 0."""
     near, far = ti.f64(1e9), ti.f64(-1e9)
     if a == 0:
         if c < 0:
@@ -49,13 +49,13 @@ def quadric_ray(a, b, c):
 
 @ti.func
 def prism_slope(half, top):
-    """(k, c) of a prism's slanted ends, the planes |x| + k z = c."""
+    """Return (k, c) of a prism's slanted ends, the planes |x| + k z = c."""
     return half[0] * (1 - top) / (2 * half[2]), half[0] * (1 + top) / 2
 
 
 @ti.func
 def prism_ray(o, d, half, top):
-    """(entry, exit) of a ray through an origin-centred prism; entry > exit = missed."""
+    """Return (entry, exit) of a ray through an origin-centred prism; entry > exit = missed."""
     near, far = box_ray(o, d, half)
     k, c = prism_slope(half, top)
     for side in ti.static((-1, 1)):
@@ -71,13 +71,13 @@ def prism_ray(o, d, half, top):
 
 @ti.func
 def to_local(p, cosine, sine):
-    """p turned about z into the axes of a solid."""
+    """Rotate p about z into the axes of a solid."""
     return vec3(cosine * p[0] + sine * p[1], cosine * p[1] - sine * p[0], p[2])
 
 
 @ti.func
 def may_meet(solids: ti.template(), s, o, d):
-    """True if the line meets the ball around a solid: cheaper than `solid_ray`, never wrong about a miss."""
+    """Return True if the line meets the ball around a solid: cheaper than `solid_ray`, never a false miss."""
     kind = ti.i32(solids[s, 0])
     to_center = vec3(solids[s, 1], solids[s, 2], solids[s, 3]) - o
     half = vec3(solids[s, 4], solids[s, 5], solids[s, 6])
@@ -88,7 +88,7 @@ def may_meet(solids: ti.template(), s, o, d):
 
 @ti.func
 def solid_ray(solids: ti.template(), s, o_world, d_world):
-    """Distance at which the ray enters solid `s`, in units of `d_world`'s length; 1e9 = never."""
+    """Return the distance at which the ray enters solid `s`, in lengths of `d_world`; 1e9 = never."""
     kind = ti.i32(solids[s, 0])
     cosine, sine = solids[s, 7], solids[s, 8]
     o = to_local(o_world - vec3(solids[s, 1], solids[s, 2], solids[s, 3]), cosine, sine)
@@ -131,7 +131,7 @@ def solid_ray(solids: ti.template(), s, o_world, d_world):
 
 @ti.func
 def solid_distance(solids: ti.template(), s, p_world):
-    """Signed distance to solid `s`, metres, negative inside."""
+    """Return the signed distance to solid `s`, metres, negative inside."""
     kind = ti.i32(solids[s, 0])
     p = to_local(p_world - vec3(solids[s, 1], solids[s, 2], solids[s, 3]), solids[s, 7], solids[s, 8])
     half = vec3(solids[s, 4], solids[s, 5], solids[s, 6])
@@ -151,7 +151,7 @@ def solid_distance(solids: ti.template(), s, p_world):
         radial = ti.sqrt(p[0] * p[0] + p[2] * p[2]) - half[0]
         outside = ti.sqrt(ti.max(radial, 0.0) ** 2 + ti.max(q[1], 0.0) ** 2)
         result = outside + ti.min(ti.max(radial, q[1]), 0.0)
-    elif kind == PRISM:  # a bound from below next to its edges
+    elif kind == PRISM:  # a lower bound near its edges
         k, c = prism_slope(half, solids[s, 11])
         result = ti.max(q[1], q[2], (ti.abs(p[0]) + k * p[2] - c) / ti.sqrt(1 + k * k))
     return result
@@ -159,7 +159,7 @@ def solid_distance(solids: ti.template(), s, p_world):
 
 @ti.func
 def solid_normal(solids: ti.template(), s, p_local):
-    """Outward normal at a point of the surface, in the solid's own axes."""
+    """Return the outward normal at a surface point, in the solid's own axes."""
     kind = ti.i32(solids[s, 0])
     half = vec3(solids[s, 4], solids[s, 5], solids[s, 6])
     normal = vec3(0, 0, 1)
@@ -206,7 +206,7 @@ def solid_normal(solids: ti.template(), s, p_local):
 
 @ti.func
 def daylight(solids: ti.template(), listed: ti.template(), first, last, p, normal):
-    """Soft light from above and the side, dimmed in corners; the same from every view."""
+    """Return soft light from above and the side, dimmed in corners; the same from every view."""
     nearest = vec3(1, 1, 1)  # open space at three heights above the surface, as a share of the height
     for place in range(first, last):
         s = listed[place]

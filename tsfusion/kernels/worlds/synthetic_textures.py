@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Procedural colours of the synthetic worlds' solids: the same from every view, and not plain."""
+"""Colour the solids of synthetic worlds by procedures: the same from every view, and with texture."""
 
 import taichi as ti
 import taichi.math as tm
@@ -12,7 +12,7 @@ vec3 = ti.types.vector(3, ti.f64)
 
 @ti.func
 def lattice(x, y, z, salt):
-    """A number in [0, 1) for each integer cell."""
+    """Return a pseudo-random number in [0, 1) for each integer cell."""
     h = ti.cast(x, ti.u32) * ti.u32(0x8DA6B343) ^ ti.cast(y, ti.u32) * ti.u32(0xD8163841)
     h ^= ti.cast(z, ti.u32) * ti.u32(0xCB1AB31F) ^ ti.cast(salt, ti.u32) * ti.u32(0x9E3779B1)
     h ^= h >> 15
@@ -25,7 +25,7 @@ def lattice(x, y, z, salt):
 
 @ti.func
 def noise(p, scale, salt):
-    """Value noise in [0, 1] with cells of `scale` metres."""
+    """Return value noise in [0, 1] with cells of `scale` metres."""
     q = p / scale
     cell = ti.floor(q)
     f = q - cell
@@ -41,19 +41,19 @@ def noise(p, scale, salt):
 
 @ti.func
 def fract(x):
-    """The fractional part of x, in [0, 1)."""
+    """Return the fractional part of x, in [0, 1)."""
     return x - ti.floor(x)
 
 
 @ti.func
 def mix(a, b, share):
-    """a and b blended: a at share 0, b at 1."""
+    """Blend a and b: a at share 0, b at 1."""
     return a + (b - a) * tm.clamp(share, 0.0, 1.0)
 
 
 @ti.func
 def palette(x):
-    """A saturated RGB colour for x in [0, 1)."""
+    """Return a saturated RGB colour for x in [0, 1)."""
     return vec3(
         0.5 + 0.42 * ti.cos(6.2832 * x),
         0.5 + 0.42 * ti.cos(6.2832 * (x + 0.33)),
@@ -63,7 +63,7 @@ def palette(x):
 
 @ti.func
 def tile_joint(u, v, width):
-    """1 in the joints between unit tiles, else 0."""
+    """Return 1 in the joints between unit tiles, else 0."""
     a, b = fract(u), fract(v)
     return ti.cast(a < width or b < width, ti.f64)
 
@@ -172,7 +172,7 @@ def paint_color(p, half, variant, grain):
 
 @ti.func
 def solid_color(solids: ti.template(), s, p, normal):
-    """RGB in [0, 1] at a point of solid `s`, in the solid's own axes."""
+    """Return RGB in [0, 1] at a point of solid `s`, in the solid's own axes."""
     material = ti.i32(solids[s, 9])
     variant = solids[s, 10]
     half = vec3(solids[s, 4], solids[s, 5], solids[s, 6])
