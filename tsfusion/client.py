@@ -51,7 +51,7 @@ from tsfusion.wire.sockets.sockets import control_address
 
 __all__ = ["Client", "ClientStats"]
 
-_SEGMENTS = 8  # at least so many files hold what the spool may hold: it shrinks by whole files
+_SEGMENTS = 8  # a full spool has at least so many files: it shrinks by whole files
 _SILENCE = 1.0  # seconds; the server answers a ping every half second
 
 log = logging.getLogger(__name__)
@@ -74,7 +74,7 @@ class Client:
         policy: treatment of keyframes that come faster than the map takes them.
         key: the file of this client's secret key.
         server_key: the server's public key, or its file.
-        config: the other settings.
+        config: the other settings; its addresses are not used.
 
     Raises:
         InvalidConfig: for a malformed address or setting, or a key file that cannot be used.
@@ -308,7 +308,7 @@ class Client:
             raise FlushTimeout(f"{waiting} not acknowledged after {timeout:g} s: {self._why()}{kept}")
 
     def wait_fused(self, timeout: float = 60.0) -> None:
-        """Wait until the map has taken or rejected everything sent (`stats.rejected` counts the latter).
+        """Wait until the map has taken or rejected every record sent (`stats.rejected` counts rejections).
 
         Args:
             timeout: seconds.
@@ -380,7 +380,7 @@ class Client:
 
     @property
     def problem(self) -> str:
-        """Reason why the spool or the server takes nothing at the moment; empty without a problem."""
+        """Reason why the spool or the server takes no keyframe at the moment; empty without a problem."""
         return "; ".join(filter(None, (self._outbox.spool_problem, self._link_problem())))
 
     def _link_problem(self) -> str:

@@ -102,7 +102,7 @@ class Sessions:
         return session
 
     def admit(self, key: bytes, seq: int, previous: int, taken: int = 0) -> SeqOrder:
-        """Compare keyframe `seq` with its session's progress: "next" is to be journaled.
+        """Return "next" if record `seq` is to be journaled, else "duplicate" or "gap".
 
         Args:
             previous: the number before `seq` that the client still has.
@@ -188,7 +188,7 @@ _MAX_ROUTES_OF_A_NAME = 64  # where there are keys
 _MIN_NEW_ROUTES = 16  # routes of a name reserved for clients that have sent no keyframe yet
 _SILENT_AFTER = 5.0  # seconds without a message; a client sends two a second
 ABANDONED_AFTER = 30.0  # seconds of silence: the client is gone, and another one can take its session
-_LARGEST_OFFSET_NS = 10 * 366 * 86_400 * 10**9  # ten years; monotonic clocks begin when a machine does
+_LARGEST_OFFSET_NS = 10 * 366 * 86_400 * 10**9  # ten years; monotonic clocks start with their machine
 _LARGEST_BOUND_NS = 3600 * 10**9
 
 
@@ -204,7 +204,7 @@ class ClientRoute(Struct, eq=False):
     waiting: int = 0  # this and `skipped`: figures of its last Ping
     skipped: dict[str, int] = field(default_factory=dict)
     received_bytes: int = 0
-    refused: int = 0  # records that were turned away for good
+    refused: int = 0  # records that were refused for good
     damaged: tuple[int, int] = (0, 0)  # seq of the last record that came damaged, and how often in a row
     address: str = ""  # address of its machine; empty if not known
     left: bool = False  # True after its goodbye
@@ -221,7 +221,7 @@ class ClientRoute(Struct, eq=False):
         return self.map, self.session
 
     def open_to(self, client: str) -> bool:
-        """True if a client can continue the session: it is its own, or its client is silent for long."""
+        """True if a client can continue the session: its own, or one whose client is silent for long."""
         return self.client == client or time.monotonic() - self.last_message >= ABANDONED_AFTER
 
     def update(self, ping: Ping) -> None:
@@ -239,7 +239,7 @@ class ClientRoute(Struct, eq=False):
 
     @property
     def problem(self) -> Problem | None:
-        """Problem that keeps hardly any of its keyframes in the map, or None."""
+        """Problem of a client whose keyframes hardly ever reach the map; None without one."""
         hold = "" if self.hold_reason == "disk" else self.hold_message  # its map reports the disk already
         text = self.fates.problem(hold)
         who = self.client or f"at {self.address or 'an unknown address'}"
@@ -383,7 +383,7 @@ class Admission:
         return client
 
     def maps_of(self, client: str) -> AllowedMaps:
-        """Return the maps that a client may use."""
+        """Return the maps that a client has the right to use."""
         return self._access.maps_of(client)
 
     def denial_of_map(self, client: str, map_name: str, *, sends: bool = False) -> str:

@@ -108,7 +108,7 @@ class FuserSupervisor:
             volume,
             server.mesh_interval,
             server.checkpoint_every,
-            "",  # each process has its own
+            "",  # working file: each process has its own
             server.journal_bytes is not None,
             server.fuser_memory_bytes or process.physical_memory_bytes() * 3 // 4,
             server.quota_cost,

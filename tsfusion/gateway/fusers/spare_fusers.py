@@ -15,7 +15,7 @@ from tsfusion.gateway.fusers.fuser_process import FuserProcess
 
 log = logging.getLogger(__name__)
 
-_LONGEST_PAUSE = 60.0  # seconds between one start and the next, where they fail
+_LONGEST_PAUSE = 60.0  # most seconds between two starts that fail
 
 
 class _Spare:

@@ -139,7 +139,7 @@ class MetricsPage:
             return HttpResponse(404, f"there is {', '.join(self._pages)}")
         try:
             return page()
-        except Exception:  # the next request may fare better; the thread has to live
+        except Exception:  # the next request may succeed; the thread must not end
             log.exception("%s cannot be shown", request["path"])
             return HttpResponse(500, "this page failed; the server's log says why")
 

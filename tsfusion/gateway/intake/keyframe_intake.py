@@ -64,7 +64,7 @@ class Allowance:
 
 
 class Quotas:
-    """The allowance of every client."""
+    """The allowances of all clients."""
 
     def __init__(self, server: ServerConfig) -> None:
         self._server = server

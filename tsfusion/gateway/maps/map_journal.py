@@ -40,7 +40,7 @@ def open_journal(folder: Path, server: ServerConfig, watch: ReadingWatcher) -> J
 
 
 def warn_of_old_corrections(folder: Path) -> None:
-    """Log that corrections of an early version are not read."""
+    """Log that the corrections of an early development version are not read."""
     old = folder / "corrections"
     if glob.glob("*.tsc", root_dir=old):  # empty also for a folder that cannot be read
         log.warning(

@@ -137,7 +137,7 @@ class DiskPause:
         return max(self._until - now, 0.0)
 
     def begin(self, error: JournalError) -> None:
-        """Pause because of an error."""
+        """Start a pause because of an error."""
         if Problem(str(error)).key != Problem(self.problem).key:  # log each problem only once
             log.error("no keyframes are taken: %s", error, extra=logs.about(map=self._map))
         self.problem = str(error)
@@ -146,7 +146,7 @@ class DiskPause:
         self._until = self._look_at = time.monotonic() + _DISK_PAUSE
 
     def end(self) -> None:
-        """Take keyframes (again)."""
+        """End the pause, if there is one: keyframes are taken."""
         if self.problem:
             log.warning("keyframes are taken again", extra=logs.about(map=self._map))
             self.problem, self.is_away, self._shows = "", False, False

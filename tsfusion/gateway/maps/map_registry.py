@@ -113,7 +113,7 @@ class MapRegistry:
     # --- other servers ---
 
     def has(self, name: str) -> bool:
-        """True if a map is open here and not empty."""
+        """True if a map is open on this server and not empty."""
         hosted = self.get(name)
         return hosted is not None and not hosted.is_empty
 
@@ -280,7 +280,8 @@ class MapRegistry:
     def free_name(self, like: str, maps: AllowedMaps = ALL_MAPS) -> str | None:
         """Return the first of NAME, NAME-2, NAME-3, … that no map has and nobody was given recently.
 
-        If a client cannot use that name, return such a name like one that it can use, or None.
+        If the client cannot use that name, return the first free name made from a map name that it can use.
+        Return None without one.
 
         Args:
             maps: maps that the client can use.

@@ -214,7 +214,7 @@ class MapDirectory:
             return self._find(database, name)
 
     def claim(self, name: str, own: AddressPair) -> AddressPair:
-        """Enter a map as this server's unless another server has it. Return the addresses of its server.
+        """Enter a map for this server unless another one has it. Return the addresses of its server.
 
         Raises:
             JournalError: when the file cannot be read or written.
@@ -224,7 +224,7 @@ class MapDirectory:
             return self._find(database, name) or own
 
     def move(self, name: str, own: AddressPair) -> None:
-        """Enter a map as this server's, whatever the entry was. Raise JournalError as `claim`."""
+        """Enter a map for this server, whatever the entry was. Raise JournalError as `claim`."""
         with self._open() as database:
             database.execute("INSERT OR REPLACE INTO maps VALUES (?, ?, ?)", (name, *own))
 

@@ -38,7 +38,7 @@ _DOUBTED_S = 0.5  # a third server is told to ask again after such a silence: ta
 
 
 class _Departure(Struct, eq=False):
-    """A map that is being copied."""
+    """A map that another server is copying."""
 
     move: bytes
     hosted: HostedMap

@@ -35,7 +35,7 @@ class ScanUpdates:
         self._waiting: dict[tuple[bytes, bytes], tuple[Scanned, Any]] = {}  # topic, session → update, picture
 
     def note(self, map_name: str, header: KeyframeHeader, buffers: Sequence[Any], client: str) -> None:
-        """Tell viewers of a keyframe."""
+        """Tell viewers that a keyframe was journaled."""
         self._numbers[map_name] += 1
         topic = scan_topic(map_name)
         self._waiting.pop((topic, header.session), None)

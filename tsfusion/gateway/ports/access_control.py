@@ -100,7 +100,7 @@ class AccessControl:
 
     @property
     def limits_maps(self) -> bool:
-        """True if some client may not use every map."""
+        """True if a client is limited to some maps."""
         return self._allowed is not None and self._allowed.limits_maps
 
     def maps_of(self, client: str) -> AllowedMaps:

@@ -62,13 +62,13 @@ class PendingReplies:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of all replies that wait."""
+        """Bytes of all waiting replies."""
         self._forget()
         return sum(nbytes for _, nbytes in self._trackers.values())
 
     @property
     def largest(self) -> int:
-        """Bytes of the largest reply that waits."""
+        """Bytes of the largest waiting reply."""
         self._forget()
         return max((nbytes for _, nbytes in self._trackers.values()), default=0)
 
@@ -140,7 +140,7 @@ class ConnectionLimits:
         self._ports.cut_off(first)
 
     def all_must_go(self, uncounted: int) -> bool:
-        """True if every connection must be made anew: a key was revoked, or they hold too much memory.
+        """True if every connection must be made anew: a key was revoked, or connections hold too much memory.
 
         ZeroMQ limits the size of a frame and the queue of complete messages, but not a message that never
         ends.

@@ -44,7 +44,7 @@ class OpenConnection(Struct, frozen=True):
 
 
 class Connections:
-    """The connections to some ports of this process. Call `step` again and again."""
+    """The TCP connections to some ports of this process. Call `step` again and again."""
 
     def __init__(self, memory_bytes: int) -> None:
         files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
@@ -52,7 +52,7 @@ class Connections:
         self._ports: Collection[int] = ()
         self._viewers_port = 0
         self._next_look = self._next_full_look = 0.0  # time.monotonic()
-        self._others = 0  # files of this process that are no connections, at the last full look
+        self._others = 0  # files of this process that are no connections, at the last full check
         self._read: Counter[int] = Counter()  # fd → bytes of the messages that the gateway got
 
     def listen_at(self, data: int, control: int, viewers: int) -> None:
@@ -127,7 +127,7 @@ class Connections:
     def cut(self, fd: int) -> bool:
         """Cut a connection off. Return False if the file is no connection (any more)."""
         with suppress(OSError), _shared(fd) as link:
-            if self._is_ours(link):  # one that has ended may have left its number to another file
+            if self._is_ours(link):  # another file may have the number of an ended connection
                 link.shutdown(socket.SHUT_RDWR)
                 return True
         return False

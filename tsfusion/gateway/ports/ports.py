@@ -22,7 +22,7 @@ log = logging.getLogger(__name__)
 
 _MESSAGES_A_STEP = 16
 _SECONDS_A_STEP = 0.05
-_MANY_FRAMES = 1000  # surplus ones, which no mistake explains
+_MANY_FRAMES = 1000  # more surplus frames than any mistake explains
 _MOST_DISCARDED = 50_000  # frames of one message that are read and dropped: some 50 ms
 _REBIND_INTERVAL = 0.01  # seconds
 Handler: TypeAlias = Callable[[list[zmq.Frame]], None]
@@ -31,7 +31,7 @@ Handler: TypeAlias = Callable[[list[zmq.Frame]], None]
 class Flood(NamedTuple):
     """A message with many more frames than any valid one.
 
-    ZeroMQ has all frames in memory, and delivers other messages of the socket only after the last frame.
+    ZeroMQ keeps all frames in memory, and delivers other messages of the socket only after the last frame.
     """
 
     first: zmq.Frame
@@ -76,17 +76,17 @@ class Ports:
 
     @property
     def keyframes(self) -> sockets.AnySocket:
-        """Records come in here."""
+        """Socket for incoming records."""
         return self._sockets["keyframes"]
 
     @property
     def control(self) -> sockets.AnySocket:
-        """Greetings, pings and commands come in here, and their answers leave."""
+        """Socket for incoming greetings, pings and commands, and for the answers."""
         return self._sockets["control"]
 
     @property
     def viewers(self) -> sockets.AnySocket:
-        """Mesh updates leave here, and subscriptions come in."""
+        """Socket for outgoing updates, and for incoming subscriptions."""
         return self._sockets["viewers"]
 
     def is_served(self, socket: sockets.AnySocket) -> bool:
@@ -229,7 +229,7 @@ def send_now(socket: sockets.AnySocket, frames: list[Any]) -> None:
     """Send a message, or drop it if it cannot leave at once: its receiver will ask again."""
     try:
         socket.send_multipart(frames, zmq.NOBLOCK, copy=False)
-    except zmq.ZMQError as error:  # zmq.Again: it is full; or it is being made anew
+    except zmq.ZMQError as error:  # zmq.Again: the queue is full; others: the socket is being made anew
         log.warning("an answer was dropped: %s", error)
 
 

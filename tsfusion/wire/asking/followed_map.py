@@ -185,7 +185,7 @@ class FollowedMap:
         self._is_idle = health.state == "idle"
         before, self._server = self._server, (server, health.fuser_restarts)
         if before not in (None, self._server) and self.epoch:
-            self._miss()  # the answer shows whether it is another process
+            self._miss()  # the next answer shows if the fuser is another process
         if health.mesh_epoch != self.epoch or health.mesh_number <= self._number:
             self._behind = None
         elif self._behind is None or self._behind[0] <= self._number:

@@ -20,7 +20,7 @@ from tsfusion.wire.sockets.curve import ClientKeys
 _HEALTH_INTERVAL = 1.0  # seconds
 _SILENT_AFTER = 4.0  # seconds without an answer to the request for health
 _GRACE_S = 1.0  # a new connection within this time is no problem to report
-_QUESTION_S = 5.0  # that a question may take
+_QUESTION_S = 5.0  # longest time of a question
 _MOST_AT_ONCE = 32  # replies
 OnReply = Callable[[Reply, list[memoryview]], None]
 
@@ -96,7 +96,7 @@ class Inquiry:
         )
 
     def connect_to(self, address: str) -> None:
-        """Ask another server from now on."""
+        """Switch to another server, and drop the open question."""
         self.drop_question()
         self.address, self.version, self._health_asked = address, None, None
         self._seen = time.monotonic()

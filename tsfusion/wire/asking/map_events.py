@@ -26,8 +26,8 @@ class SurfaceUpdate:
 
     Attributes:
         cells: (n, 3) int32 block coordinates; an edge is 8 voxels.
-        first_face: (n + 1,) int32: cell i has the faces of the mesh from `first_face[i]` to `first_face[i +
-            1]`. A cell without surface has no faces.
+        first_face: (n + 1,) int32: `first_face[i]` is the first face of cell i in the mesh, and
+            `first_face[i+1]` is after its last. A cell without surface has no faces.
         mesh: triangles of these cells, in metres of the map.
         is_refined: True if the surface is the one that the map's settings ask for, False if it is raw.
         clients: sessions (16 bytes each) that saw these cells.

@@ -311,7 +311,7 @@ class Exchange:
 
     def __init__(self, connection: ServerLink, name: str = "") -> None:
         self.is_there = False
-        self._connection, self._name = connection, name  # of the server, in errors; empty = the address
+        self._connection, self._name = connection, name  # name in errors; empty takes the address
         self._asked = self._greeted = 0  # connections on which the command was sent, and a ping answered
         self._ping_at = 0.0  # time.monotonic()
         self._why = ""  # reason why there is no connection

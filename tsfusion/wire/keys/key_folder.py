@@ -116,8 +116,8 @@ def allow(
 
     Args:
         key: 40 characters, or a file; None keeps the name's present key.
-        maps: names of maps that the client may use; a `*` at the end stands for any rest. None keeps the
-            name's present maps; a new name may then use every map.
+        maps: names of maps that the client gets; a `*` at the end stands for any rest. None keeps the name's
+            present maps; a new name then gets every map.
         forget: True gives the right to forget keyframes of other clients. None keeps the present right; a new
             name then has none.
 
@@ -233,7 +233,7 @@ def _checked_patterns(maps: Iterable[str]) -> tuple[str, ...]:
 
 
 def _limits(rights: dict[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
-    """Return the limits to maps, without names that may use every map."""
+    """Return the limits to maps, without names that have no limit."""
     return {name: maps for name, maps in rights.items() if "*" not in maps}
 
 
@@ -317,7 +317,7 @@ _RETRY = 1.0  # seconds
 
 
 class AllowedMaps(Struct, frozen=True):
-    """The maps that a key may send keyframes into, ask about and watch.
+    """The maps that a key has the right to send keyframes into, ask about and watch.
 
     Attributes:
         patterns: names of maps; a `*` at the end of one stands for any rest. None allows every map.
@@ -334,7 +334,7 @@ class AllowedMaps(Struct, frozen=True):
         return "every map" if self.patterns is None else ", ".join(self.patterns) or "no map"
 
     def denial(self, name: str) -> str:
-        """Return the reason why this key may not use a map. It does not reveal if the map exists."""
+        """Return the reason why this key cannot use a map. It does not reveal if the map exists."""
         return f"this key may not use map {name}, but: {self}"
 
     def topics(self, topic: bytes) -> list[bytes]:
@@ -405,7 +405,7 @@ class AllowList:
 
     @property
     def limits_maps(self) -> bool:
-        """True if some name may not use every map."""
+        """True if a client is limited to some maps."""
         return any(maps.patterns is not None for maps in self._maps.values())
 
     def maps_of(self, name: str) -> AllowedMaps:

@@ -24,7 +24,7 @@ class Spread(Struct, frozen=True, kw_only=True):
 
 
 def spread(values_ms: NDArray[np.float64]) -> Spread:
-    """Count, mean, p50, p95, p99 and maximum of the values that are not NaN."""
+    """Return the statistics of the values that are not NaN, in milliseconds."""
     known = values_ms[~np.isnan(values_ms)]
     if not len(known):
         return Spread()
@@ -127,8 +127,8 @@ ClientState = Literal["connected", "silent", "gone"]
 class ClientHealth(Struct, frozen=True, kw_only=True):
     """Health of one session that has sent a message since the server began."""
 
-    client: str  # name that its key is allowed under; empty without keys
-    session: str  # first 8 hexadecimal digits of its number
+    client: str  # name under which its key is allowed; empty without keys
+    session: str  # first 8 hexadecimal digits of the session's id
     map: str
     heard_s: float  # seconds since its last message
     durable: int  # keyframes: in the journal when the server began, or journaled since
@@ -141,7 +141,7 @@ class ClientHealth(Struct, frozen=True, kw_only=True):
     # silent: nothing was heard for 5 s; gone: it said goodbye, or nothing was heard for 30 s
     state: ClientState = "connected"
     address: str = ""  # address of its machine; empty if not known
-    refused: int = 0  # number of its keyframes and corrections that were turned away for good, not journaled
+    refused: int = 0  # number of its keyframes and corrections that were refused for good, not journaled
     rejected: int = 0  # number of its keyframes that the map could not take, since the server began
 
 
@@ -169,7 +169,7 @@ class Health(Struct, frozen=True, kw_only=True):
 
 
 class Status(MapCounts, frozen=True, kw_only=True):
-    """Status of a map. Counts are of the whole journal and map; the delay is of this process."""
+    """Status of a map. Counts are of the whole journal and map; the delay is since this server's start."""
 
     epoch: str
     map: str

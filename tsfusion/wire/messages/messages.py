@@ -49,7 +49,7 @@ Seq = Annotated[int, Meta(ge=0, le=(1 << 63) - 1)]
 
 
 class Stamps(Struct, frozen=True, array_like=True):
-    """Server times of one keyframe, monotonic nanoseconds; 0 = not yet."""
+    """Server times of one keyframe, monotonic nanoseconds; 0 before the stage."""
 
     seq: Seq
     received_ns: int = 0
@@ -111,7 +111,7 @@ class Welcome(Struct, frozen=True, tag="welcome"):
     version: int
     durable: Seq  # highest seq of this session on the server's disk; 0 without one
     fused: Seq  # highest seq that the map has taken or rejected; 0 without one
-    window_keyframes: int  # most keyframes that may be sent and not yet durable
+    window_keyframes: int  # limit for keyframes that are sent and not yet durable
     window_bytes: int
     max_frame_bytes: int
 
@@ -239,7 +239,7 @@ class Elsewhere(Struct, frozen=True):
 
 
 class Reply(Struct, frozen=True, tag="reply", kw_only=True, omit_defaults=True):
-    """The answer to a Command; arrays of a mesh follow as raw frames."""
+    """The answer to a Command. Arrays of a mesh follow as raw frames."""
 
     name: str
     error: str | None = None  # why there is no answer, for a person

@@ -29,12 +29,12 @@ FARTHEST_M = 100.0  # largest `max_distance` of a distance field
 CELLS_AT_ONCE = 256  # of an answer
 REFINED_AT_ONCE = 64  # of an answer with the refined surface
 KEYFRAMES_AT_ONCE = 4096
-LONGEST_S = 60.0  # that a question may wait
+LONGEST_S = 60.0  # longest time that a question can wait
 LATE = "its time was over before the map came to it"
 _POINTS_A_FRAME = CONTROL_MAX_BYTES // 12
 _FARTHEST_BLOCK = 1 << 20
 _CELL_BYTES, _KEYFRAME_BYTES = 1 << 15, 1 << 8  # of an answer, roughly
-_PACKED = ("float32", "int8", "uint8", "int32")  # what `array_encoding.pack` takes
+_PACKED = ("float32", "int8", "uint8", "int32")  # dtypes that `array_encoding.pack` takes
 _PACKED_FROM = 4096  # bytes: smaller arrays travel as they are
 Matrix16 = Annotated[tuple[float, ...], Meta(min_length=16, max_length=16)]
 

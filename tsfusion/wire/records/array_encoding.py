@@ -31,7 +31,7 @@ _PNG_CHUNK = struct.Struct(">I4s")
 _PNG_AROUND = 12  # bytes of a chunk besides its content
 # No animation (other sizes), and nothing compressed but the image: zTXt, iTXt, iCCP unfold at will.
 _PNG_KINDS = frozenset(b"PLTE IDAT tRNS gAMA cHRM sRGB sBIT bKGD pHYs tIME tEXt oFFs".split())
-_MAX_PNG_CHUNKS = 1 << 14  # writers of PNG begin a new one every 8 kB or more
+_MAX_PNG_CHUNKS = 1 << 14  # writers of PNG start a new chunk every 8 kB or more
 
 _JPEG = b"\xff\xd8"
 _JPEG_FRAMES = frozenset((0xC0, 0xC1, 0xC2))  # baseline, extended, progressive
@@ -134,7 +134,7 @@ def _jpeg_size(view: memoryview) -> tuple[int, int]:
     if sum(1 for _ in islice(_SCAN.finditer(view), _MAX_SCANS + 1)) > _MAX_SCANS:
         raise Refused("payload", f"a JPEG of more than {_MAX_SCANS} scans")
     at = len(_JPEG)
-    for _ in range(_MAX_JPEG_SEGMENTS):  # 32 MB of tiny ones would take seconds
+    for _ in range(_MAX_JPEG_SEGMENTS):  # 32 MB of tiny segments would take seconds
         if at + 9 > view.nbytes or view[at] != 0xFF:
             break
         marker, length = view[at + 1], int.from_bytes(view[at + 2 : at + 4], "big")

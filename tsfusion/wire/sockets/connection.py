@@ -55,7 +55,7 @@ class ServerLink:
 
     @property
     def events(self) -> sockets.AnySocket:
-        """The socket that is readable when `check` has news."""
+        """Socket that becomes readable when `check` has news."""
         return self._monitor.socket
 
     @property

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""CURVE keys: reading their files, and setting them on sockets.
+"""CURVE keys: reading key files, and setting keys on sockets.
 
 A key is 40 characters (Z85 of 32 bytes). Files are ZeroMQ certificates, as `zmq.auth.load_certificate` reads
-them: `NAME.key` holds the public key, `NAME.key_secret` both.
+them. `NAME.key` holds the public key, `NAME.key_secret` both keys.
 """
 
 import os
@@ -30,7 +30,7 @@ _LINE = re.compile(r'^\s*(public|secret)-key\s*=\s*"([^"\s]+)"\s*$', re.MULTILIN
 
 
 class ServerKeys(Struct, frozen=True):
-    """A server's own pair."""
+    """A server's own pair of keys."""
 
     public: str
     secret: str
@@ -156,7 +156,7 @@ def is_key(text: str) -> bool:
 
 
 def _read(path: Path, *, secret: bool) -> dict[str, str]:
-    """Read the keys in a file, by kind."""
+    """Return the keys in a file, by kind."""
     try:
         with path.open("rb") as file:
             mode = os.fstat(file.fileno()).st_mode

@@ -200,7 +200,7 @@ def file_of(frame: zmq.Frame) -> int | None:
 
 
 def parse_address(address: str) -> tuple[str, int]:
-    """Return host and port of `tcp://host:port` (port `*` or 0 = random). Brackets enclose an IPv6 address.
+    """Return host and port of `tcp://host:port` (port `*` or 0 = random). An IPv6 address is in brackets.
 
     Raises:
         InvalidConfig: for anything else.
