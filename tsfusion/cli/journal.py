@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from tsfusion.journal.state_folder import JournalPlace
 
 _Returned = TypeVar("_Returned")
-_MOST_LINES = 20  # printed of one kind; --json has all
+_MOST_LINES = 20  # lines printed of a kind; --json has all
 
 app = typer.Typer(
     cls=verbs.Group,

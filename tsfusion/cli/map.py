@@ -429,7 +429,7 @@ def _merge(a: "AlignedMap", b: "AlignedMap", found: "Alignment", out: Path, disp
     from tsfusion.pipelines.maps import map_alignment
 
     volume = a.volume
-    assert volume is not None  # it was opened here
+    assert volume is not None  # `open_map` sets it
     done = map_alignment.merge(volume, b, np.array(found.T_a_b), watch=display.show_fused)
     volume.save(out)
     return {

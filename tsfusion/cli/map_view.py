@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from tsfusion.tsdf.sums.map_difference import MapDifference
     from tsfusion.tsdf.volume import Volume
 
-_MOST_LINES = 20  # printed of one kind; --json has all
+_MOST_LINES = 20  # lines printed of a kind; --json has all
 EXAMPLES = (
     "tsfusion map convert out/latest/map.tsf field.vdb --field distance",
     "tsfusion map convert my-maps yard.yaml --heights 0.1 1.8 --above-floor",

@@ -223,7 +223,7 @@ def configuration(file: Path | None, *, preset: dict[str, Any] | None = None, **
 
 
 def _with_flags(table: Any, flags: Mapping[str, Any]) -> Any:
-    """Return a table of settings, overridden by its own flags; None = not given."""
+    """Return a table of settings, overridden by those flags that belong to it and are not None."""
     from tsfusion.core import config
 
     settings = {**flags, **_band(flags.get("truncation"), flags.get("support"))}
@@ -376,7 +376,7 @@ def own_server(config: "Config", state: Path | None) -> "ServerConfig":
     """Return settings of a run's own server: only this machine reaches it, and its errors are shown here.
 
     Args:
-        state: folder for its journals and maps; None = they are thrown away.
+        state: folder for its journals and maps; None to throw them away.
     """
     from msgspec.structs import replace
 
@@ -433,7 +433,7 @@ def _band(truncation: float | None, support: str | None) -> dict[str, float]:
     names = "min_support", "max_support", "min_behind"
     try:
         numbers = support.split(":")
-        if len(numbers) == 3 and any(numbers):  # an empty one of three numbers leaves its setting unchanged
+        if len(numbers) == 3 and any(numbers):  # an empty number leaves its setting unchanged
             return {name: float(number) for name, number in zip(names, numbers, strict=True) if number}
         return dict(zip(names[:2], map(float, numbers), strict=True))
     except ValueError as error:

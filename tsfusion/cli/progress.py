@@ -406,7 +406,7 @@ def page_beside(view: str | None, display: "Quiet", *, truth: str | None = None)
     """Return the page beside a run. Its address is shown with the run's progress.
 
     Args:
-        view: HOST:PORT; None = no page.
+        view: HOST:PORT; None for no page.
         truth: known surface of the map; see `ViewerChild`.
 
     Raises:

@@ -287,8 +287,8 @@ def _check_poses(
 def _open(context: typer.Context, spec: str, flags: dict[str, Any]) -> "tuple[Source, list[str]]":
     """Open the source that the flags describe. Return it with the oddities of its frames.
 
-    Of a recording it is the selected part. If the recording or the trajectory in `flags` has no times, the
-    trajectory's poses become the recording's own.
+    Of a recording, only the selected frames are opened. If the recording or the trajectory in `flags` has no
+    times, the trajectory's poses become the recording's own.
     """
     from tsfusion.scanner.sources.named_sources import is_live, open_source
     from tsfusion.scanner.sources.source import LimitedSource, RecordedSource

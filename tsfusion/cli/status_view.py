@@ -134,7 +134,7 @@ def _presence(one: ClientHealth) -> Text:
 
 
 def _settings(snapshot: ServerSnapshot, *, is_wide: bool) -> RenderableType:
-    """Return settings, memory and hash of each map, which only its fuser knows. A busy one has no hash."""
+    """Return settings, memory and hash of each map, as its fuser knows them. A busy map has no hash."""
     table = _table(
         "map", ">voxel size", "sensor", ">fuser's memory", "hash", *(["folder"] if is_wide else [])
     )
@@ -246,7 +246,7 @@ class StatusScreen:
         return render(self._snapshot, self._console.width, silent=now - self._answered if is_missing else 0.0)
 
     def cut(self) -> RenderableType:
-        """Return the lines that fit on the terminal, and the number of the others."""
+        """Return the lines that fit on the terminal, and how many lines do not."""
         height, whole = self._console.height, self.whole()
         lines = self._console.render_lines(whole, pad=False)
         if len(lines) <= height:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Fuse journals and datasets into one map by many workers: fuse shares of keyframes, add them, mesh."""
+"""Fuse journals and datasets into a map by many workers: fuse shares of keyframes, add them, mesh."""
 
 import hashlib
 import os
@@ -52,12 +52,12 @@ class Wishes:
     """Wishes of the user, apart from the settings of the map.
 
     Attributes:
-        up: up direction; None = it is found.
+        up: up direction; None to find it.
         keep_islands: see `mesh_finishing.write`.
-        worker_memory: most bytes for each worker; None = no limit.
+        worker_memory: limit of memory for each worker, bytes; None for no limit.
         tile_size: metres, edge of a tile of the mesh. None = tiles of a suitable size, made only if the map
             does not fit into a worker's memory.
-        sensor: sensor preset for all keyframes; None = the sensor that each keyframe names.
+        sensor: sensor preset for all keyframes; None for the sensor that each keyframe names.
     """
 
     up: Up | None = None
@@ -77,7 +77,7 @@ class FusedRun(msgspec.Struct, frozen=True, kw_only=True):
         workers_lost: how often a worker ended before its job was done.
         jobs, jobs_found: number of all jobs, and of those that an earlier run had done.
         seconds: wall time by step; `worker_seconds`: CPU time of its jobs.
-        worker_peak_rss: most memory of one worker, bytes.
+        worker_peak_rss: peak memory of any worker, bytes.
         tiles: number of tiles of the mesh.
     """
 
@@ -159,7 +159,7 @@ def fuse(
         InvalidConfig: for settings with which maps of parts do not add up.
         OutputError: when `out` cannot be written, or holds files already; for a map without a surface.
         MapFull, WeightOverflow: when the sum has no room.
-        WorkerLost: when one worker after the other ends at the same job.
+        WorkerLost: when several workers, one after the other, end at the same job.
         TsfusionError: any error of a job.
     """
     check(config)
@@ -317,7 +317,7 @@ class _Run:
         return files[0], ended
 
     def _mesh_runs(self, doing: CarryingOut, file: str, blocks: int, workers: int) -> list[JobDone]:
-        """Mesh parts of the whole map by all workers, if the map fits into the memory of one."""
+        """Mesh parts of the whole map by all workers, if the map fits into a worker's memory."""
         self._display.stage("meshing")
         if self._wishes.worker_memory is not None:
             return []

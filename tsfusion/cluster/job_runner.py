@@ -126,7 +126,7 @@ class _JobParts:
     def save(self, *, is_last: bool = False) -> None:
         """Write the map to a file of its own, and begin another map unless `is_last`."""
         if not self._volume.stats().blocks and self.files:
-            return  # nothing came after the last one
+            return  # no keyframe came after the last save
         path = _new(self._folder, self._job.name, ".tsf")
         self._volume.save(path, {"world": self._job.world} if self._job.world else None)
         self.files.append(path.name)

@@ -77,7 +77,7 @@ class Job(Struct, frozen=True, kw_only=True):
     Attributes:
         name: name of the job, unique in its run.
         folder: folder for its files.
-        worker_memory: most bytes for the whole process; None = no limit.
+        worker_memory: limit of memory for the whole process, bytes; None for no limit.
         threads: number of threads of the kernels.
     """
 
@@ -118,7 +118,7 @@ class MeshMap(Job, tag="mesh", frozen=True, kw_only=True):
         file: file of the map.
         runs: files of its `MeshRunJob` jobs, in their order; empty without such jobs.
         view: settings of the surface that differ from the map's.
-        up: up direction; None = it is found.
+        up: up direction; None to find it.
         keep_islands: see `mesh_finishing.write`.
     """
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Schedule jobs by Ray (extra `ray`), on an existing cluster or on one started on this machine.
+"""Schedule jobs by Ray (extra `ray`), on an existing cluster or on a cluster of this machine.
 
 Workers on other machines need tsfusion, and the results' folder under the same path.
 """

@@ -108,7 +108,7 @@ def _node(which: NDArray[np.int64], corners: NDArray[np.float64]) -> dict[str, A
     centers = corners[which].mean(axis=1)
     octant = (centers > (centers.min(axis=0) + centers.max(axis=0)) / 2) @ (4, 2, 1)
     groups = [which[octant == number] for number in np.unique(octant)]
-    if len(groups) == 1:  # all at one place
+    if len(groups) == 1:  # all boxes have the same centre
         groups = np.array_split(which, min(8, len(which)))
     error = float(np.linalg.norm(high - low)) / 2
     return {**node, "geometricError": error, "children": [_node(group, corners) for group in groups]}
@@ -121,7 +121,7 @@ def _box(low: NDArray[np.float64], high: NDArray[np.float64]) -> list[float]:
 
 
 def shares(blocks: int, workers: int) -> list[range]:
-    """Return the tiles of a map's mesh in runs, one for each worker; empty if one worker is as fast."""
+    """Return the tiles of a map's mesh in runs, one for each worker; empty if a single worker is as fast."""
     tiles = mesh_tiles.tile_count(blocks)
     count = min(workers, tiles // LEAST_TILES)
     if count < 2:

@@ -28,7 +28,7 @@ def read(source: str) -> NDArray[np.float64]:
     """Return the (n, 3) float64 points of a file: columns of numbers, an array, or the vertices of a PLY.
 
     Args:
-        source: path of a file, or `-` for columns of numbers on the standard input.
+        source: path of a file, or `-` to read columns of numbers from the standard input.
 
     Raises:
         DatasetError: when the file cannot be read, has no points, or has a point that is not finite.

@@ -204,7 +204,7 @@ def map_of(
 
 
 def _is_of_server(saved: Path) -> bool:
-    """True if a saved map says which records of its journal it has; a file copied here by hand does not."""
+    """True if a saved map says which records of its journal it has. A file copied by hand does not say it."""
     with checkpoint.reading(saved) as (header, _):
         return "done" in header.meta
 
@@ -249,7 +249,7 @@ def textured(
         until, only: selection of keyframes, see `choose`.
 
     Raises:
-        JournalError: when there is no journal, or no keyframe in it. Others: see `texturing.textured`.
+        JournalError: when there is no journal, or it has no keyframe. See also `texturing.textured`.
     """
     keyframes = choose(source, until=until, only=only, watch=reading)
     if not len(keyframes):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Find the pose of one map in the coordinate frame of another, or refuse; and merge the two maps."""
+"""Find the pose of a map in the coordinate frame of another map, and merge them, or refuse."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -52,14 +52,14 @@ class Alignment(msgspec.Struct, kw_only=True):
 
     Attributes:
         T_a_b: (4, 4) rows; p_a = T_a_b @ p_b.
-        error_mm: estimated error of T_a_b. Pieces of the common surface are aligned alone; this is the spread
-            of their results, divided by `overlap`. A map that has drifted fits nowhere exactly.
+        error_mm: estimated error of T_a_b: how far parts of the common surface disagree about the position of
+            B, divided by `overlap`. A map that has drifted fits nowhere exactly.
         overlap, rmse_mm, constraint: see `SurfaceFit`; here the RMSE is in millimetres.
-        contradicted: share of a map's surface points, seen by the other map's sensors, that these looked
-            through. Without keyframes: share of points in the free space before the other surface.
-        looks: number of points so observed.
+        contradicted: share of the surface points in view of the other map's sensors that these sensors looked
+            through. Without keyframes: share of the points in free space before the other map's surface.
+        looks: number of points in view.
         contradicted_alone: the same share for each map's own surface. Noise, thin things and drift cause it.
-        tilt_deg: angle between the up directions of both maps; None if one of them is unknown.
+        tilt_deg: angle between the up directions of the maps; None if the up direction of a map is unknown.
     """
 
     T_a_b: list[list[float]]
@@ -80,7 +80,7 @@ class AlignedMap:
     Attributes:
         mesh: its surface.
         views: some of its keyframes with their poses. Space that their cameras looked through is free.
-        volume: its voxels, to look up the free space before its surface; None if they are elsewhere.
+        volume: its voxels, to look up the free space before its surface; None if another process has them.
         keyframes: keyframes of its journal; None without a journal.
         missing: number of its keyframes that the journal does not have.
         lost: number of keyframes (or more) that damage of the journal has cost.
@@ -123,7 +123,7 @@ def open_map(source: Path, *, watch: FusionProgress = lambda *_: None) -> Aligne
 
 
 def align(a: AlignedMap, b: AlignedMap) -> Alignment:
-    """Find where map `b` lies in map `a`.
+    """Find the pose of map `b` in map `a`.
 
     Raises:
         AlignmentRefused: when the maps share too little surface, or several poses fit equally well.
@@ -154,7 +154,7 @@ def align(a: AlignedMap, b: AlignedMap) -> Alignment:
 def check_one_frame(a: Volume, b: Volume, names: Sequence[object]) -> None:
     """Raise MapError unless the surfaces of two maps show that both are in one coordinate frame.
 
-    Where both have blocks, the surface of one must not lie in the free space before that of the other. The
+    In blocks that both maps have, the surface of a map must not lie in free space before the other's. The
     three directions of normals are judged separately, because the floors of two buildings always agree.
 
     Args:
@@ -280,7 +280,7 @@ class _MapPair:
         return _JudgedTransform(T, fit(*surfaces, T, _TOLERANCE * self._voxel), looks, self._tilt(T))
 
     def spread(self, T: Transform) -> float:
-        """Return how far apart, in metres, pieces of the common surface, each alone, would put map `b`."""
+        """Return by how many metres parts of the common surface disagree about the position of map `b`."""
         return surface_fit.parts_spread(*self._sampled(self._voxel), T, _PART_REACH * self._voxel)
 
     def _looks_at(self, for_a: NDArray[np.float64], for_b: NDArray[np.float64]) -> _Looks:

@@ -45,7 +45,7 @@ def render(
 ) -> Path:
     """Draw `mesh` to a PNG file with its up direction upwards (+z if unknown). No partial file is left.
 
-    A wide back face that hides a front face is left out: a room can be looked into from outside.
+    Wide back faces that hide front faces are left out, so that the viewer sees into rooms.
 
     Args:
         width: pixels.

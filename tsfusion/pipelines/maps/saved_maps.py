@@ -94,7 +94,7 @@ def find(path: Path, map_name: str | None = None) -> SavedMap:
         map_name: name of the map, where the state folder has several.
 
     Raises:
-        CheckpointError: when there is no map. JournalError: when it is not clear which map is meant.
+        CheckpointError: when there is no map. JournalError: when it is unclear which map is meant.
     """
     if not path.exists():
         raise CheckpointError(f"{path} does not exist; expected a map (.tsf) or a state folder", missing=True)

@@ -127,7 +127,7 @@ def find_place(
                 break
         if running is not None:
             placing.T_map_world, placing.why = _answer(running)
-        if placing.T_map_world is None and placing.keyframes:  # with all there is
+        if placing.T_map_world is None and placing.keyframes:  # last try, with all keyframes
             placing.T_map_world, placing.why = _answer(begin())
     return placing
 

@@ -90,7 +90,7 @@ def records_after(
                 all_lost += places.pop(0).lost
             keyframes += not record.is_correction
             if record.seq <= checkpointed.get(record.session, 0):
-                there, lost = keyframes, all_lost  # the checkpoint is not before this one
+                there, lost = keyframes, all_lost  # the checkpoint has this record
             if record.seq > last.get(record.session, 0) and not record.is_erased:
                 last[record.session] = record.seq
                 found.append(record)
@@ -101,7 +101,7 @@ def records_after(
 def _newest_segment(histories: list[map_history.SessionHistory]) -> int:
     """Return the number of the segment with a checkpoint's newest record, or 0 if it is not known.
 
-    A checkpoint has the positions of keyframes in the map only, not of rejected ones or of corrections.
+    A checkpoint has positions only of keyframes in the map, not of rejected keyframes or of corrections.
     """
     if not all(len(one.seqs) and one.seqs[-1] == one.last for one in histories):
         return 0

@@ -91,10 +91,10 @@ def open_map(path: Path, name: str | None = None) -> Iterator[StoredMap]:
 
     Args:
         path: a state folder, or the folder of a map in it.
-        name: of the map, where the state folder has several.
+        name: name of the map, where the state folder has several.
 
     Raises:
-        JournalError: when there is no such map, or a server uses it.
+        JournalError: when the map does not exist, or a server uses it.
         CheckpointError: when no server has saved it yet: its settings are not known.
     """
     folder = state_folder.resolve_map(path, name).absolute()

@@ -78,7 +78,7 @@ def _of_run(folder: Path) -> Measure:
         raise DatasetError(f"{folder}/error.npy is not of the mesh beside it: run it again")
     kind, _, name = record.source.partition(" ")
     if kind == _WORLD:
-        with suppress(DatasetError):  # the world is another version's, or of a package that is not here
+        with suppress(DatasetError):  # the world has changed, or its package is not installed
             measure, some = _of_world(name), slice(None, None, 1 + len(vertices) // _TRIED)
             if np.allclose(measure(vertices[some].astype(np.float32)), errors[some], rtol=0.0, atol=_AGREES):
                 return measure

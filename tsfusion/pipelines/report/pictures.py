@@ -50,7 +50,7 @@ class Sides:
         self.angles = mesh_preview.choose_angles(mesh, self._up, aspect=self._aspect)
 
     def picture(self, side: int, colors: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
-        """(height, width, 3) uint8 RGB from one of `SIDES` sides.
+        """Return the (height, width, 3) uint8 RGB picture from one of `SIDES` sides.
 
         Args:
             colors: (n, 3) uint8 RGB of the vertices, instead of the mesh's own.

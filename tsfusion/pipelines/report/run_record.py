@@ -88,16 +88,16 @@ class Accuracy(Struct, frozen=True):
 
 
 class MapResult(Struct, frozen=True, kw_only=True):
-    """Figures of one submap. Those of the map are empty if a scan sends to a server elsewhere."""
+    """Figures of one submap. Figures of the map are empty if a scan sends to a server elsewhere."""
 
     name: str = ""
     frames: int = 0  # that have a pose
     keyframes: int = 0  # of them, sent to the map
     loops: int = 0  # closed by loop closure
-    trajectory_error: TrajectoryError | None = None  # as tracked; None = the source has no poses
-    corrected_error: TrajectoryError | None = None  # after loop closure; None = there were no corrections
+    trajectory_error: TrajectoryError | None = None  # as tracked; None if the source has no poses
+    corrected_error: TrajectoryError | None = None  # after loop closure; None without corrections
     map_hash: str = ""
-    keyframes_moved: int = 0  # times that one was fused anew at a corrected pose
+    keyframes_moved: int = 0  # number of moves of keyframes to corrected poses
     moving_s: float = 0.0  # seconds for that
     corrections_unavailable: int = 0  # corrected keyframes that could not be moved: the log says why
     blocks: int = 0
@@ -122,17 +122,17 @@ class RunRecord(Struct, frozen=True, kw_only=True):
     keyframes_rejected: dict[str, int] = {}
     keyframes_by_rule: dict[str, int] = {}
     warnings: list[str] = []  # what is odd about the recording, a sentence each
-    missed: str = ""  # how the run fell short of its goal; empty = it did not
-    verdict: Verdict | None = None  # the headline; None = not known yet
+    missed: str = ""  # how the run fell short of its goal, if it did
+    verdict: Verdict | None = None  # the headline; None until it is known
     left: int = 0  # keyframes still in the spool at the end
-    link: str = ""  # why the server took nothing at the end; empty = it did
+    link: str = ""  # why the server took nothing at the end, if so
     seconds: float = 0.0  # from the first frame until the last keyframe was fused (a scan elsewhere: sent)
-    server_start_seconds: float | None = None  # None = the server was there already
+    server_start_seconds: float | None = None  # None if the server ran already
     tracking_cpu_ms: float = 0.0  # CPU milliseconds of the localizer a frame
     map_hash: str = ""  # of the first map, as are `blocks` and `mesh`
     blocks: int = 0
     mesh: dict[str, Any] = {}
-    accuracy: Accuracy | None = None  # of the first map's mesh; None = the true surface is not known
+    accuracy: Accuracy | None = None  # of the first map's mesh; None if the true surface is unknown
     maps: list[MapResult] = []
     origin_m: tuple[int, int, int] | None = None  # subtracted from given positions; None = nothing
     delay_ms: Spread = Spread()
@@ -168,7 +168,7 @@ def verdict(record: RunRecord) -> Verdict:
 
 
 def read(folder: Path) -> RunRecord:
-    """Read the record in a run's folder, also one of an older version.
+    """Read the record in a run's folder. The run may be of an older version.
 
     Raises:
         OutputError: when it cannot be read, or is not the record of a run.

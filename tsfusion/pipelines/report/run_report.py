@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Write the report of a run: one HTML page with its results, first in short, then in detail."""
+"""Write the report of a run: an HTML page with its results, first in short, then in detail."""
 
 from pathlib import Path
 

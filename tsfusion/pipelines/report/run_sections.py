@@ -18,7 +18,7 @@ from tsfusion.pipelines.report.run_record import Circumstances, MapFindings, Map
 from tsfusion.wire.messages.health import Spread, spread
 from tsfusion.wire.messages.messages import DELAY, SKIP_REASONS, STAGES, KeyframeTimes
 
-_COLUMNS = 200  # of a chart by keyframe: if there are more keyframes, a column shows several
+_COLUMNS = 200  # of a chart by keyframe; each column shows several keyframes of a long run
 _BINS = 50
 _STYLES = dict(zip(STAGES, ("k1", "k2", "k3", "k4", "k5", "k6"), strict=True))
 _WAY = ("encode", "wire", "journal", "queue", "fuse")  # the stages whose sum is the delay

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Say in one line how a run fell short of its goal, and what to do about it.
 
-One rule holds for all runs. Each keyframe sent must be on the server's disk and in one map; half of them are
-enough if the others have no sample in range. Nearly all frames must have a pose. A run that falls short keeps
+One rule holds for all runs. Each keyframe sent must be on the server's disk and in one map. Half of them are
+enough if the rest has no sample in range. Nearly all frames must have a pose. A run that falls short keeps
 its results, but the command prints the line and ends with status 1.
 """
 

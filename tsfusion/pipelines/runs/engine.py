@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Steps that replay and scan share: the pace of sending, the wait for the map, and progress.
 
-A replay knows its poses and sends every keyframe. A scan finds poses and chooses among frames. All that comes
-after is the same. Both hand keyframes to the clients of one `Target`, and ask this engine when the next one
-may go and when all are in the map.
+A replay knows its poses and sends every keyframe. A scan finds poses and chooses among frames. The later
+steps are the same. Both hand keyframes to the clients of one `Target`. They ask this engine when the next
+keyframe may go, and when all of them are in the map.
 """
 
 import logging

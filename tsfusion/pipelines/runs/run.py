@@ -76,19 +76,19 @@ class RunPlan:
         scan: settings of a scan's localizer and selection of keyframes.
         volume: the map of the own server; a server at `connect` has its own.
         connect: data address of a running server; None starts one for this run.
-        server: settings of the own server; None = a free port, and a temporary state folder.
-        spool: for a scan with `connect`: folder where keyframes wait for acknowledgement. What earlier scans
-            left there is sent to its own maps, or waits on.
+        server: settings of the own server; None for a free port and a temporary state folder.
+        spool: folder where keyframes of a scan with `connect` wait for acknowledgement. Keyframes of earlier
+            scans in this folder are sent to their own maps, or wait on.
         same_frame: the user declares that the poses are in the map's frame, whatever worlds the map has.
         align: with `connect`: find the scan's pose in the map, if the map has a surface, before anything is
             sent. If that fails, the scan goes into a free map.
         rate: frames a second that a recording is played at; None = as fast as keyframes are fused.
-        sensor: sensor preset for all frames; None = the sensor that each frame names.
+        sensor: sensor preset for all frames; None for the sensor that each frame names.
         min_weight: full-confidence samples a voxel needs to be meshed; None = the sensor's.
-        up: up direction in the map's frame; None = it is found.
+        up: up direction in the map's frame; None to find it.
         keep_islands: see `mesh_finishing.write`.
         distance: (n,) signed metres from (n, 3) points to the true surface, in the frame of given poses;
-            None = the surface is unknown.
+            None if the surface is unknown.
         warnings: oddities of the frames, a sentence each.
         missed: reasons why the map is wrong or incomplete, a sentence each.
     """
@@ -261,7 +261,7 @@ class _PlannedFrames:
 
 
 class _PlacedFrames(NamedTuple):
-    """Coordinate frame and map of a run: as asked for, or others if a scan's pose was not found."""
+    """Coordinate frame and map of a run: as asked for, or a free map if a scan's pose was not found."""
 
     localizer: Localizer
     frames: Iterator[Frame]  # from the first frame not sent yet
@@ -295,7 +295,7 @@ def _place(
 
 
 def _existing_map(target: Target) -> ExistingMap | None:
-    """Return the map to scan into as it is now, or None if it has no surface and the scan may begin it."""
+    """Return the map to scan into as it is now, or None if it has no surface yet: the scan may begin it."""
     name = target.link.map
     if name not in target.health().maps:
         return None

@@ -143,7 +143,7 @@ def write_map(
         held: poses and forces of the sensor, to find the up direction.
         suffix: text before the endings of the files.
         world: name of the coordinate frame of the poses; empty = that of poses given from elsewhere.
-        up: up direction in the map's frame; None = it is found.
+        up: up direction in the map's frame; None to find it.
         min_weight: full-confidence samples a voxel needs to be meshed; None = the sensor's.
         keep_islands: see `mesh_finishing.write`.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Open the server that a run sends its keyframes to: start one for this run, or connect to another."""
+"""Open the server that a run sends its keyframes to: start it for this run, or connect to it."""
 
 import json
 import logging
@@ -179,8 +179,8 @@ class Target:
 
     link: ClientConfig  # addresses of the server, and the map to scan into
     keys: ClientKeys | None  # keys of the connection, if it has any
-    spools: Path  # folder that holds one spool a map
-    child: ServerChild | None  # the server started for this run; None = the server runs elsewhere
+    spools: Path  # folder with a spool for each map
+    child: ServerChild | None  # the server started for this run; None if it runs elsewhere
     _clients: ExitStack
     _kept: dict[str, Path]  # maps of the server started for this run, and the files that they become
     _unkept: list[str] = field(default_factory=list)  # why some maps were not kept
@@ -196,7 +196,7 @@ class Target:
         """Return a client for a map, with an empty spool. It is closed with the target.
 
         Args:
-            policy: what to do when the spool is full; None = as in the settings.
+            policy: treatment of keyframes that come too fast for the server; None for that of the settings.
             world, same_frame: see `Client`.
         """
         while True:
@@ -286,8 +286,8 @@ def opened(
         client: settings of the connection. The map `auto` means a name that no map of the server has.
         scratch: a folder that does not exist yet, removed at the end of the block.
         volume: settings of the map, for a server started here.
-        server: settings of the server started here; None = a free port, and `THROWN_AWAY`.
-        spools: with `connect`, the folder of spools; None = one in `scratch`.
+        server: settings of the server started here; None for a free port and `THROWN_AWAY`.
+        spools: with `connect`, the folder of spools; None for a folder in `scratch`.
 
     Raises:
         TransportError: when the server does not start or answer.

@@ -118,7 +118,7 @@ class ViewerChild:
                 self._tell(json.loads(line)["url"])
             elif line.startswith(_WARNING):
                 log.warning("page: %s", line.removeprefix(_WARNING))
-            elif line:  # the last one says why it ends
+            elif line:  # the last line says why the viewer ends
                 why = f": {line.removeprefix('tsfusion: ')}"
         status = child.wait()
         if not self._is_ending:

@@ -139,7 +139,7 @@ class RewoundMap:
 
     @property
     def behind(self) -> int:
-        """Number of keyframes to add, remove or move from the saved map to the settled one."""
+        """Number of keyframes to add, remove or move until the saved map is settled."""
         return _steps(self._saved, len(self._saved)) + len(self._removed)
 
     @property
@@ -178,7 +178,7 @@ class RewoundMap:
         self._now, self._to_remove = self._contents(self._way)
 
     def _contents(self, way: str) -> tuple[NDArray[np.int8], list[_Removed]]:
-        """Return the states of keyframes where a way begins, and the keyframes to be removed."""
+        """Return the states of keyframes at the start of a way, and the keyframes to be removed."""
         if way == "empty":
             return np.full_like(self._saved, _ABSENT), []
         return (self._now, self._to_remove) if way == "on" else (self._saved.copy(), list(self._removed))
@@ -192,7 +192,7 @@ class RewoundMap:
         return not to_remove and not (now == _ELSEWHERE).any() and not (now[self.target :] == _THERE).any()
 
     def step(self) -> bool:
-        """Add or remove one keyframe, or begin from another map. Return True if `volume` is another one now.
+        """Add or remove a keyframe, or begin from another map. Return True if `volume` is a new object.
 
         Raises:
             CheckpointError: when the saved map cannot be read any more.

@@ -37,7 +37,7 @@ class PiecewiseMap:
 
     Args:
         name: name of the map.
-        note: text that the page always shows; empty = none.
+        note: text that the page always shows; may be empty.
         send: takes events.
         attend: called between the steps of a piece. It returns True if the user wants something else now.
     """
