@@ -377,7 +377,7 @@ class Volume(AskableMap):
         return len(empty)
 
     def stats(self) -> VolumeStats:
-        """Counts and exact bytes."""
+        """Return the counts of the map, and its exact size in bytes."""
         store = self._store
         return VolumeStats(
             keyframes=self.keyframes,

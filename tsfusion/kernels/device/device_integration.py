@@ -368,7 +368,7 @@ def add_new(
 ):  # fmt: skip
     """Insert the new blocks from slot `oldest` on, if there is room, and make the updates of the list in
     them. The hash equals that of `block_hash.insert_blocks` with the blocks in the order of their slots.
-    Blocks that share no index are inserted here, the others at the end (`vote_colors`)."""
+    Blocks that share no index are inserted first, the others at the end (`vote_colors`)."""
     for i in range(end):
         new = new_blocks(room, totals, told)
         if i == 0:

@@ -71,8 +71,8 @@ COLOR_LIMIT = 1 << 15  # votes after which a voxel's colour is full and does not
 CUBE = 512
 CHANGED = 255  # marks a block as changed for all followers, one bit each
 
-# `touched`: number of blocks, flag for too many missing ones, flag for a removed colour that was not there,
-# number of missing blocks, and then the slots of the touched ones
+# `touched`: number of blocks, flag for too many missing blocks, flag for a removed colour that the map
+# lacked, number of missing blocks, and then the slots of the touched blocks
 TOUCHED_COUNT, TOUCHED_OVERFLOW, TOUCHED_MISMATCH, TOUCHED_MISSING, TOUCHED_HEADER = 0, 1, 2, 3, 4
 
 # Rays of a band to add: all of them; those that cross blocks which were missing; or those that were added
@@ -86,7 +86,7 @@ ABSENT, OF_ANOTHER, LEFT_OUT = (bit - (1 << 31) for bit in (1, 2, 4))
 BITS = 15
 
 COLORS_AT = WINDOW_SCRATCH
-LISTED_COLORS = 512  # votes, one int64: the voxel's place above the colour
+LISTED_COLORS = 512  # votes, one int64: the voxel's index above the colour
 LISTED_UPDATES = 2 * STRETCH  # in an array of the function; one of 512 numbers takes 0.2 s to compile
 UNIT_SCRATCH = COLORS_AT + LISTED_COLORS  # int64 of a unit: its windows, votes for colours
 

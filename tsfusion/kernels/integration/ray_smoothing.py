@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""Regularised integration (paper eq. 2–3): least squares along each ray with a second-difference penalty.
+"""Smooth the map along each ray: least squares with a second-difference penalty (paper eq. 2–3).
 
     x̂ = argmin (x − y)ᵀ A (x − y) + λ ‖D2 (x − t)‖²
 
-y: the stored values after fusing the measurement, along the voxels the ray crosses; t: those voxels'
-own distances to the end point. With evenly spaced voxels D2 t = 0 and this is eq. 3; with every crossed
-voxel in the signal, spacing is uneven, and without t the penalty would bend a perfect ramp.
-A = I is the paper's; A = diag(W), scaled to mean 1, moves voxels of much weight little.
+y are the stored values along the voxels that the ray crosses, after the measurement is fused. t are those
+voxels' own distances to the end point. With evenly spaced voxels D2 t = 0, and this is eq. 3. Here every
+crossed voxel is in the signal, so the spacing is uneven. Without t the penalty would bend a perfect ramp.
+A = I is the paper's choice. A = diag(W), scaled to mean 1, moves voxels of large weight little.
 
-Two passes, never in place: each ray solves against the frozen state and adds x̂ as integers; afterwards
-each voxel that was voted for becomes the mean of its x̂.
+Two passes, never in place: first each ray solves with the unchanged values and adds x̂ as integers. Then each
+voxel with votes gets the mean of its x̂.
 """
 
 import taichi as ti

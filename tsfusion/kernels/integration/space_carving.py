@@ -258,7 +258,7 @@ def look(place, steps, side, reach, levels: ti.template(), base, least: ti.templ
             y1 = ti.cast(ti.min(bottom + MARGIN, reach.rows - 1.0), ti.i32)
             n, up = 0, 1  # the level, and the power of two of its squares' width
             while ti.max((x1 >> up) - (x0 >> up), (y1 >> up) - (y0 >> up)) >= MOST_SQUARES:
-                n, up = n + 1, up + 1  # there are levels up to one square
+                n, up = n + 1, up + 1  # the last level is a single square
             low, high = NO_SAMPLE, 0
             for y in range(y0 >> up, (y1 >> up) + 1):
                 for x in range(x0 >> up, (x1 >> up) + 1):

@@ -1,21 +1,21 @@
 # SPDX-License-Identifier: MIT
-"""The field regulariser: paper eq. 3 carried from the ray to the volume.
+"""Smooth the field (the regulariser): eq. 3 of the paper, extended from the ray to the volume.
 
     x̂ = argmin Σ W (x − y)² + λ Σ over the three axes of ω |D2 x|²      D2: second differences
 
-y = Σ w·m / Σ w and W = Σ w are read from the map, x near a flat surface is a ramp with D2 x = 0, and
-ω = 1 / (1 + (D2 x / ε)²), taken anew from x now and then, lets edges bend: what bends more than ε hardly
+y = Σ w·m / Σ w and W = Σ w are read from the map. x near a flat surface is a ramp with D2 x = 0.
+ω = 1 / (1 + (D2 x / ε)²), computed again from x in each round, lets edges bend: a bend of more than ε hardly
 counts (Geman and McClure; the gentler 1 / √(1 + …) rounds edges by a quarter more, docs/accuracy.md).
 
-The voxels near the surface are numbered into one dense list with the numbers of their neighbours; a missing
-one has the number past the end, where all is 0. Each cell of a block has a bit, 1 = listed: `planes`, 64
-cells a word, and `places`, where the first cell of each word stands in the list. A cell's number is a count
-of bits, so what looks for numbers reads a hundred bytes a block.
+The voxels near the surface are numbered into one dense list, with the numbers of their neighbours. A missing
+neighbour has the number past the end, where all is 0. Each cell of a block has a bit in the bit planes
+`planes`, 1 = listed, 64 cells per word. `places` has the index in the list of each word's first cell. A
+cell's number is a count of bits, so a search for numbers reads only a hundred bytes per block.
 
-A step is two sweeps of the list, each writing only its own voxel: the first leaves q = ω D2 x, the second
-goes down the gradient W (x − y) + λ D2ᵀ q. Hence no order of threads can show. A launch costs as much as a
-step of a thousand voxels: one does several steps. An array for each axis and side, and four voxels read
-before one is written: where an array is, LLVM looks up again after each store.
+A step is two sweeps of the list, each writing only its own voxel: the first computes q = ω D2 x, the second
+descends the gradient W (x − y) + λ D2ᵀ q. Hence the order of threads has no effect. A launch costs as much as
+a step of a thousand voxels, so it does several steps. Each axis and side has its own array, and four voxels
+are read before one is written, because LLVM loads an array's address again after each store.
 """
 
 import taichi as ti

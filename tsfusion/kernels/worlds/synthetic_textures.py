@@ -70,7 +70,7 @@ def tile_joint(u, v, width):
 
 @ti.func
 def interior_color(p, normal, half, grain):
-    """Checker floor, painted walls with a wainscot, a rail and a picture each, pale ceiling."""
+    """Return the colour of a checker floor, walls with wainscot, rail and picture, or a pale ceiling."""
     rgb = vec3(0.92, 0.91, 0.87)
     if normal[2] > 0.5:
         u, v = p[0] / 0.4, p[1] / 0.4
@@ -114,7 +114,7 @@ def interior_color(p, normal, half, grain):
 
 @ti.func
 def facade_color(p, normal, half, variant, grain):
-    """Brick or plaster with rows of windows and a ground floor of another colour."""
+    """Return the colour of brick or plaster, with rows of windows and a ground floor of another colour."""
     height = p[2] + half[2]
     along = p[0] * ti.abs(normal[1]) + p[1] * ti.abs(normal[0])
     wall = mix(vec3(0.62, 0.33, 0.24), vec3(0.82, 0.74, 0.6), lattice(ti.i32(variant), 1, 0, 21))
@@ -136,7 +136,7 @@ def facade_color(p, normal, half, variant, grain):
 
 @ti.func
 def road_color(p, grain):
-    """Asphalt with a broken centre line and edge lines; the road runs along x."""
+    """Return the colour of asphalt with a broken centre line and edge lines; the road runs along x."""
     rgb = vec3(0.31, 0.31, 0.33) * (0.65 + 0.45 * grain[0] + 0.3 * grain[2])
     y = ti.abs(p[1])
     worn = 0.75 * grain[0] + 0.35
@@ -147,7 +147,7 @@ def road_color(p, grain):
 
 @ti.func
 def wood_color(p, normal, grain):
-    """Planks with grain."""
+    """Return the colour of planks with grain."""
     board = ti.floor(p[2] / 0.13)
     rgb = vec3(0.66, 0.43, 0.24) * (0.62 + 0.45 * grain[0] + 0.2 * lattice(ti.cast(board, ti.i32), 0, 0, 42))
     if fract(p[2] / 0.13) < 0.07 and ti.abs(normal[2]) < 0.5:
@@ -157,7 +157,7 @@ def wood_color(p, normal, grain):
 
 @ti.func
 def paint_color(p, half, variant, grain):
-    """A car's paint; dark glass above the belt line is a solid of its own, tyres are drawn."""
+    """Return the colour of a car's paint and tyres; glass above the belt line is a separate solid."""
     rgb = palette(lattice(ti.i32(variant), 3, 0, 51)) * 0.7 + 0.18
     if lattice(ti.i32(variant), 4, 0, 51) > 0.6:
         rgb = vec3(1, 1, 1) * (0.25 + 0.6 * lattice(ti.i32(variant), 5, 0, 51))

@@ -85,7 +85,7 @@ class BlockStore:
     With a `cache` the layers are in files, and blocks unchanged for long leave memory. A caller that touches
     rows of many blocks calls `keep_within_memory` repeatedly.
 
-    With a `device` keyframes are added on the device. Rows are updated here before they are read. After a
+    With a `device` keyframes are added on the device. The store updates its rows before a read. After a
     write to rows, the writer calls `note_written`.
     """
 
