@@ -184,7 +184,7 @@ class RecentFates:
 
 
 _MAX_ROUTES = 1024
-_MAX_ROUTES_OF_A_NAME = 64  # where there are keys
+_MAX_ROUTES_OF_A_NAME = 64  # limit for a server with keys
 _MIN_NEW_ROUTES = 16  # routes of a name reserved for clients that have sent no keyframe yet
 _SILENT_AFTER = 5.0  # seconds without a message; a client sends two a second
 ABANDONED_AFTER = 30.0  # seconds of silence: the client is gone, and another one can take its session

@@ -219,7 +219,7 @@ class KeyframeOutcomes:
         self.acknowledge(self._records.sessions.numbered(entry.session).key, [stamps])
 
 
-_DELAYS = 1024  # the newest ones count
+_DELAYS = 1024  # only the newest delays count
 _LONGEST_DELAY_NS = 86_400 * 10**9  # a day
 
 

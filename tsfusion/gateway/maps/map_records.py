@@ -146,7 +146,7 @@ class DiskPause:
         self._until = self._look_at = time.monotonic() + _DISK_PAUSE
 
     def end(self) -> None:
-        """End the pause, if there is one: keyframes are taken."""
+        """Record that the disk takes keyframes (again)."""
         if self.problem:
             log.warning("keyframes are taken again", extra=logs.about(map=self._map))
             self.problem, self.is_away, self._shows = "", False, False

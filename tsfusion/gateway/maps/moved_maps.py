@@ -182,7 +182,7 @@ def install(state: str | Path, name: str) -> None:
     forget_departed(state, name)
 
 
-_WAIT_S = 0.5  # for another server that writes
+_WAIT_S = 0.5  # longest wait for another server that writes
 _TABLE = (
     "CREATE TABLE IF NOT EXISTS maps (name TEXT PRIMARY KEY, address TEXT NOT NULL, control TEXT NOT NULL)"
 )

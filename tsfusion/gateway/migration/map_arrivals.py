@@ -38,13 +38,13 @@ from tsfusion.wire.sockets.curve import ClientKeys
 
 log = logging.getLogger(__name__)
 
-_ANSWER_S = 10.0  # for one answer of the other server
+_ANSWER_S = 10.0  # longest wait for one answer of the other server
 _LITTLE = 4 << 20  # new bytes of the last round, at most: the rest is copied while the map is frozen
 _MOST_ROUNDS = 30
 _ROUND_S = 0.1  # between two rounds while there is little to copy
-_SAVING_S = 60.0  # for the other server's checkpoint: without it, this server fuses more records again
+_SAVING_S = 60.0  # longest wait for the giver's checkpoint: without it, this server fuses more records again
 _RETRY_S = 1.0  # before a question without an answer, or one that came too early, is asked again
-_OPENING_S = 120.0  # for the other server to open the map
+_OPENING_S = 120.0  # longest wait until the other server has opened the map
 OnEnd = Callable[[Moved | str], None]
 
 

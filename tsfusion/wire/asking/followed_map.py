@@ -71,7 +71,7 @@ class FollowedMap:
         if self.epoch:
             self._past.append(self.epoch)
         self.epoch, self._held = "", HeldCells()
-        self._number = 0  # of the newest update
+        self._number = 0  # number of the newest update
         self._until = 0, 0  # stamp and drops up to which all updates came
         self._missed: tuple[int, int] | None = None  # stamp and drops after which an update is missing
         self._refined: tuple[int, int] | None = None  # stamp and drops up to which all cells are refined

@@ -304,7 +304,7 @@ def _check_not_taken(name: str, public: str, own: str, listed: Allowed) -> None:
 
 
 def _new_pair() -> tuple[str, str]:
-    """Draw a pair whose public key does not begin with a character of command options."""
+    """Draw a pair whose public key cannot be mistaken for a command option."""
     while True:
         public, secret = (key.decode("ascii") for key in zmq.curve_keypair())
         if re.match("[0-9a-zA-Z]", public):

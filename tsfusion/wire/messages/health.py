@@ -110,7 +110,7 @@ class MapHealth(MapCounts, frozen=True, kw_only=True):
     corrections: Annotated[int, Figure("Corrections of keyframes' poses in the journal.", grows=True)] = 0
     checkpoints: int = 0  # written since the server began
     journal_missing: Annotated[int, Figure("Segments of the journal that are gone.")] = 0
-    journal_put_back: int = 0  # times that the segment being written was deleted, and written again
+    journal_put_back: int = 0  # times that the segment being written was removed, and written again
     fusing_s: float = 0.0  # seconds since the fuser's last answer, while it has keyframes to answer
     # By outcome: answered, refused, late, failed; since the map was opened
     questions: Annotated[
