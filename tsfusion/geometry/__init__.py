@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Keyframes, frames, cameras, rigid transforms, trajectories and meshes. NumPy and OpenCV, no Taichi."""
+"""Model keyframes, frames, cameras, rigid transforms, trajectories and meshes, with NumPy and OpenCV only."""

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Cameras with distorted lenses: undistortion, and rectification of stereo pairs.
+"""Model cameras with distorted lenses; undistort images and rectify stereo pairs.
 
 Lens models are OpenCV's: `radtan` (Brown-Conrady; ROS: plumb_bob, rational_polynomial) and `equidistant`
-(Kannala-Brandt; OpenCV: fisheye). The result is a pinhole camera of the same size with square pixels, cut to
-the pixels that the original saw, or widened to keep all that it saw.
+(Kannala-Brandt; OpenCV: fisheye). The result is a pinhole camera of the same size with square pixels. Its
+view is cropped to seen pixels, or widened to the whole view.
 """
 
 from dataclasses import dataclass, replace
@@ -32,10 +32,10 @@ MODELS: dict[str, Model] = {
     "equidistant": "equidistant", "equi": "equidistant", "fisheye": "equidistant",
     "kannala_brandt4": "equidistant",
 }  # fmt: skip
-MAX_NO_SKEW = 1e-3  # pixels: less is none
+MAX_NO_SKEW = 1e-3  # pixels: a smaller skew counts as none
 _COEFFICIENTS = {"pinhole": (0,), "radtan": (4, 5, 8, 12, 14), "equidistant": (4,)}
-_MAX_ANGLE = np.radians(60)  # from the axis: the flat image of a wider fisheye would take too many pixels
-_INSET = 0.5  # pixels of the border that interpolation could blend with the outside
+_MAX_ANGLE = np.radians(60)  # from the axis: a wider fisheye would need too many pixels in a flat image
+_INSET = 0.5  # pixels of the border that interpolation could mix with the outside
 _EDGE_POINTS = 33  # along each border of the image
 _MAX_ITERATIONS = 50
 _MAX_RESIDUAL = 1e-10  # on the unit plane
@@ -50,7 +50,7 @@ class Camera:
     model: Model = "pinhole"  # lens model
     # radtan: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tx ty]]]]; equidistant: k1 k2 k3 k4
     distortion: tuple[float, ...] = ()
-    skew: float = 0.0  # pixels that a column moves by where y / z is 1: K[0, 1] of its matrix
+    skew: float = 0.0  # K[0, 1] of the matrix: pixels by which a column shifts at y / z = 1
 
     def __post_init__(self) -> None:
         expected = _COEFFICIENTS.get(self.model)
@@ -79,15 +79,15 @@ class Camera:
         return self.model == "pinhole" and not self.skew
 
     def resized(self, size: Size) -> "Camera":
-        """Camera of the same images in another size of the same shape."""
+        """Return the camera of the same images scaled to another size of the same aspect ratio."""
         factor = size[1] / self.size[1]
         return replace(self, intrinsics=self.intrinsics.scaled(factor), size=size, skew=self.skew * factor)
 
     @classmethod
     def named(cls, K: Any, size: Size, model: str, distortion: Any = (), skew: float = 0.0) -> "Camera":
-        """Make a camera of a 3×3 matrix (or its 9 numbers, or fx fy cx cy) and a model name of `MODELS`.
+        """Make a camera from a 3×3 matrix (or its 9 numbers, or fx fy cx cy) and a model name of `MODELS`.
 
-        Coefficients that are all 0 make it a pinhole camera. The skew is a matrix's own.
+        If all coefficients are 0, the camera is a pinhole camera. A matrix replaces `skew` by its own skew.
         """
         if model.lower() not in MODELS:
             raise InvalidConfig(
@@ -122,11 +122,11 @@ class Camera:
         return found
 
     def _sheared(self, rows: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Pixels by which the skew moves columns in these rows."""
+        """Return the pixels by which the skew shifts columns in these rows."""
         return np.asarray(self.skew / self.intrinsics.fy * (rows - self.intrinsics.cy), np.float64)
 
     def rays(self, pixels: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Rays of (n, 2) pixels as (n, 2) x/z and y/z, limited to 60° from the axis."""
+        """Return the rays of (n, 2) pixels as (n, 2) x/z and y/z, limited to 60° from the axis."""
         K = self.intrinsics
         pixels = np.array(pixels, dtype=np.float64).reshape(-1, 2)
         if self.skew:
@@ -136,7 +136,7 @@ class Camera:
         if self.model == "equidistant":
             return _cut(_from_fisheye(distorted, self.distortion))
         rays = distorted
-        for _ in range(_MAX_ITERATIONS):  # as cv2.undistortPoints does, to the end
+        for _ in range(_MAX_ITERATIONS):  # as cv2.undistortPoints does, until convergence
             ones = np.ones((len(rays), 1))
             seen = (self.project(np.hstack([rays, ones])) - (K.cx, K.cy)) / (K.fx, K.fy)
             missing = distorted - seen
@@ -170,8 +170,8 @@ class Undistorter:
     """Undistort a camera's images to those of a pinhole camera with `intrinsics` and `size`.
 
     Args:
-        keep: 0 cuts to the largest upright rectangle that the camera saw whole; 1 keeps all that it saw (up
-            to 60° from the axis), with black elsewhere; values between are allowed.
+        keep: 0 crops to the largest upright rectangle that the camera saw completely; 1 keeps its whole view
+            (up to 60° from the axis), with black elsewhere; values in between are allowed.
     """
 
     def __init__(self, camera: Camera, *, keep: float = 0.0) -> None:
@@ -193,8 +193,7 @@ class Undistorter:
 
 @dataclass(frozen=True, eq=False)
 class StereoRig:
-    """Two cameras side by side; `p_right = T_right_left @ p_left`. Raises InvalidConfig, naming the wrong
-    value."""
+    """Two cameras; `p_right = T_right_left @ p_left`. Raises InvalidConfig, naming the wrong value."""
 
     left: Camera
     right: Camera
@@ -281,7 +280,7 @@ class _Maps:
 
 
 def _flat(cameras: list[tuple[Camera, NDArray[np.float64]]], size: Size, keep: float) -> Intrinsics:
-    """Intrinsics of the pinhole camera that shows the view of all cameras, turned by their rotations."""
+    """Return the intrinsics of the pinhole camera that shows the view of all rotated cameras."""
     if not 0 <= keep <= 1:
         raise InvalidConfig(f"keep must be between 0 and 1, got {keep}")
     inner, outer = np.array([_seen(camera, R) for camera, R in cameras]).swapaxes(0, 1)
@@ -299,8 +298,7 @@ def _flat(cameras: list[tuple[Camera, NDArray[np.float64]]], size: Size, keep: f
 
 
 def _seen(camera: Camera, R: NDArray[np.float64]) -> tuple[list[float], list[float]]:
-    """Largest rectangle inside a turned camera's image on the unit plane, and the smallest around it; each is
-    left, top, right, bottom."""
+    """Return a turned image's inner and outer rectangle (left, top, right, bottom), unit plane."""
     last_row, last_column = (side - 1 - _INSET for side in camera.size)
     along = np.linspace(0, 1, _EDGE_POINTS)
     u, v = _INSET + along * (last_column - _INSET), _INSET + along * (last_row - _INSET)
@@ -311,7 +309,7 @@ def _seen(camera: Camera, R: NDArray[np.float64]) -> tuple[list[float], list[flo
         edges.append(turned[:, :2] / turned[:, 2:])
     inner, outer = np.zeros(4), np.zeros(4)
     for axis, (a, b) in enumerate(((edges[0], edges[2]), (edges[1], edges[3]))):
-        low, high = sorted((a[:, axis], b[:, axis]), key=np.mean)  # fy < 0: the image stands on its head
+        low, high = sorted((a[:, axis], b[:, axis]), key=np.mean)  # fy < 0: the image is upside down
         inner[[axis, axis + 2]] = low.max(), high.min()
     everything = np.concatenate(edges)
     outer[:] = (*everything.min(axis=0), *everything.max(axis=0))

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Reading of calibration files.
+"""Read calibration files of single cameras and stereo rigs.
 
-Kalibr's camchain (`cam0`, `cam1`), EuRoC's sensor.yaml, ROS camera_info (which OpenCV's calibration sample
-writes too), one camera of Open3D, RealSense, Replica or ORB-SLAM, a matrix or `fx fy cx cy` in a text file,
-and OpenCV's stereo files (M1 D1 M2 D2 R T, or LEFT.K … RIGHT.P as ORB-SLAM has them). YAML and XML are parsed
-by OpenCV's FileStorage.
+Kalibr's camchain (`cam0`, `cam1`), EuRoC's sensor.yaml, ROS camera_info (also written by OpenCV's calibration
+sample), single-camera files of Open3D, RealSense, Replica or ORB-SLAM, a matrix or `fx fy cx cy` in a text
+file, and OpenCV's stereo files (M1 D1 M2 D2 R T, or LEFT.K … RIGHT.P as in ORB-SLAM). OpenCV's FileStorage
+parses YAML and XML.
 """
 
 import json
@@ -30,7 +30,7 @@ EXPECTED_CAMERA = (
     "Kalibr's, EuRoC's, ROS's, OpenCV's, Open3D's or RealSense's file of a camera; or in a .txt its 3×3 "
     "matrix, or fx fy cx cy"
 )
-# Place of the camera in files with more
+# Names of the camera's section in files with more content
 _PARTS = ("cam0", "cam", "camera", "camera_params", "intrinsic", "intrinsics", "depth")
 _MATRICES = ("camera_matrix", "cameraMatrix", "intrinsic_matrix", "camera_intrinsics", "K", "k", "mtx")
 _COEFFICIENTS = (
@@ -39,7 +39,7 @@ _COEFFICIENTS = (
 )  # fmt: skip
 _NAMED_COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _SIZES = (("image_width", "image_height"), ("width", "height"), ("w", "h"), ("W", "H"), ("cols", "rows"))
-_ORB_SLAM = ("Camera.", "Camera1.")  # in front of its names
+_ORB_SLAM = ("Camera.", "Camera1.")  # prefixes of ORB-SLAM's names
 _MAX_TEXT, _MAX_DEPTH, _MAX_INDENTATION = 1 << 20, 64, 256  # characters, brackets or tags, spaces
 # Names of a unit of depth, in small letters: depth_scale, png_depth_scale, DepthMapFactor, depth.units, …
 _DEPTH_UNIT = re.compile(
@@ -51,10 +51,10 @@ Tree = dict[str, Any]
 
 
 def read_camera(path: str | Path, *, size: Size | None = None) -> Camera:
-    """Read the camera of a file (of a Kalibr chain: `cam0`); `.txt` is a matrix, or `fx fy cx cy` and more.
+    """Read the camera of a file (`cam0` of a Kalibr chain); a `.txt` has a matrix, or `fx fy cx cy` and more.
 
     `size`: (height, width) for a file without one. Raises DatasetError for a missing file, an unknown format,
-    a missing or wrong value.
+    or a missing or wrong value.
     """
     path = Path(path)
     try:
@@ -66,11 +66,11 @@ def read_camera(path: str | Path, *, size: Size | None = None) -> Camera:
 
 
 def read_depth_unit(path: str | Path) -> float | None:
-    """Metres a unit of integer depth as a camera's file states it; None = unstated or unreadable.
+    """Return the metres per unit of integer depth in a camera's file; None if unstated or unreadable.
 
-    A number above 1 is of units a metre, whatever its name: Open3D's `depth_scale` is 1000, others' 0.001.
+    A number above 1 means units per metre, whatever its name: Open3D's `depth_scale` is 1000, others' 0.001.
 
-    Raises DatasetError for no unit of depth, or several.
+    Raises DatasetError for a wrong unit of depth, or several.
     """
     path, tree = Path(path), {}
     with suppress(DatasetError):
@@ -88,7 +88,7 @@ def read_depth_unit(path: str | Path) -> float | None:
 
 
 def _leaves(tree: Tree, above: str = "") -> Iterator[tuple[str, Any]]:
-    """Values of a file by their names, with the names above them: `depth.scale`."""
+    """Yield the values of a file by full name: `depth.scale`."""
     for name, value in tree.items():
         if isinstance(value, dict):
             yield from _leaves(value, f"{above}{name}.")
@@ -99,12 +99,12 @@ def _leaves(tree: Tree, above: str = "") -> Iterator[tuple[str, Any]]:
 def _is_depth_unit(name: str, value: Any) -> bool:
     plain = re.sub(r"[^a-z]", "", name.lower())
     match = None if isinstance(value, bool | list) or value is None else _DEPTH_UNIT.search(plain)
-    # `scale` alone may be that of the images
+    # A plain `scale` may be the scale of the images
     return match is not None and ("depth" in plain or "unit" in plain or _metres(value) not in (None, 1.0))
 
 
 def _metres(value: Any) -> float | None:
-    """Metres a unit in a value that states them or units a metre; None = it states neither."""
+    """Return metres per unit from a value in metres per unit or units per metre; None for any other value."""
     try:
         number = _METRES.get(str(value).strip().lower().removesuffix("s")) or float(value)
     except ValueError:
@@ -114,7 +114,7 @@ def _metres(value: Any) -> float | None:
 
 
 def read_rig(*paths: str | Path, size: Size | None = None) -> StereoRig:
-    """Read a stereo rig from one file, the left and the right camera's, or intrinsics and extrinsics.
+    """Read a stereo rig from one file, two camera files (left, right), or intrinsics and extrinsics.
 
     Raises DatasetError as `read_camera`, and for a missing transform between the cameras.
     """
@@ -127,7 +127,7 @@ def read_rig(*paths: str | Path, size: Size | None = None) -> StereoRig:
 
 
 def rig_of_camera_info(left: Camera, right: Camera, R: Any, P: Any) -> StereoRig:
-    """Make a rig of two ROS CameraInfo messages; `R` and `P` are (left, right) pairs of their `r` and `p`."""
+    """Make a rig from two ROS CameraInfo messages; `R`, `P` are (left, right) pairs of their `r`, `p`."""
     R_left, R_right = (np.asarray(each, dtype=np.float64).reshape(3, 3) for each in R)
     P_right = np.asarray(P[1], dtype=np.float64).reshape(3, 4)
     t = R_right.T @ (P_right[:, 3] / P_right[0, 0])
@@ -171,7 +171,7 @@ def read_tree(path: Path) -> Tree:
 
 
 def _json(text: str) -> Any:
-    """Values of a JSON file; None for another file (OpenCV's YAML may look like it)."""
+    """Return the values of a JSON file; None for another file (OpenCV's YAML may look like JSON)."""
     try:
         return json.loads(text)
     except (ValueError, RecursionError):
@@ -179,7 +179,7 @@ def _json(text: str) -> Any:
 
 
 def _is_too_large(text: str) -> bool:
-    """True if text is larger or deeper than any calibration: it could crash OpenCV's parser."""
+    """Return True if text is larger or deeper than any calibration: it could crash OpenCV's parser."""
     if len(text) > _MAX_TEXT or re.search(rf"^ {{{_MAX_INDENTATION}}}", text, re.MULTILINE):
         return True
     depth = 0
@@ -209,7 +209,7 @@ def _plain(node: Any) -> Any:
 
 
 def _camera(tree: Tree, size: Size | None) -> tuple[Camera, Tree]:
-    """Read the camera. Returns also its part of the file."""
+    """Return the camera of a file, and the file's section about this camera."""
     while (part := next((name for name in _PARTS if isinstance(tree.get(name), dict)), None)) is not None:
         if "data" in tree[part] or "fx" in tree:  # a matrix of OpenCV's, or other things beside the camera
             break
@@ -272,7 +272,7 @@ def _matrix(value: Any, *, by_column: bool) -> NDArray[np.float64]:
 
 
 def _distortion(tree: Tree) -> tuple[float, ...]:
-    """Coefficients of a lens; none if the file has none."""
+    """Return the coefficients of a lens; empty if the file has none."""
     named = next((tree[name] for name in _COEFFICIENTS if name in tree), None)
     if named is None:
         model = str(tree.get("distortion_model", ""))
@@ -289,7 +289,7 @@ def _is_fisheye(tree: Tree) -> bool:
 
 
 def _camera_in_text(text: str, size: Size | None) -> Camera:
-    """`fx: 585` a line; or a matrix, or fx fy cx cy [k1 k2 p1 p2 [k3]] [width height] in any lines."""
+    """Read `fx: 585` lines, or a matrix or fx fy cx cy [k1 k2 p1 p2 [k3]] [width height] over any lines."""
     if named := _named_in_text(text):
         numbers = {name: float(word) for name, word in named.items() if not _is_depth_unit(name, word)}
         return _camera(numbers, size)[0]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Colours for numbers and for names, also for colour-blind people, and round ends for scales."""
+"""Choose colours for numbers and names, also for colour-blind people, and round ends for scales."""
 
 import colorsys
 import math
@@ -16,7 +16,7 @@ _STEPS = (1, 2, 3, 4, 5, 8, 10)
 
 @cache
 def ramp() -> NDArray[np.uint8]:
-    """(256, 3) uint8 RGB of the colour map viridis: dark is little, bright is much, also without colour."""
+    """Return (256, 3) uint8 RGB of the colour map viridis: dark is low, bright is high."""
     import cv2
 
     bgr = cv2.applyColorMap(np.arange(256, dtype=np.uint8).reshape(-1, 1), cv2.COLORMAP_VIRIDIS)
@@ -24,7 +24,7 @@ def ramp() -> NDArray[np.uint8]:
 
 
 def of_number(index: int) -> tuple[int, int, int]:
-    """RGB of the first, second … of several things."""
+    """Return the RGB colour for the item of this index."""
     if index < len(_PALETTE):
         packed = _PALETTE[index]
         return packed >> 16, packed >> 8 & 255, packed & 255
@@ -33,12 +33,12 @@ def of_number(index: int) -> tuple[int, int, int]:
 
 
 def as_hex(rgb: tuple[int, int, int]) -> str:
-    """A colour as #rrggbb."""
+    """Return a colour as #rrggbb."""
     return "#{:02x}{:02x}{:02x}".format(*rgb)
 
 
 def rounded_up(most: float) -> float:
-    """The next number that is 1, 2, 3, 4, 5 or 8 times a power of ten, at least 0.001."""
+    """Return the next number that is 1, 2, 3, 4, 5 or 8 times a power of ten, at least 0.001."""
     most = max(most, 1e-3)
     power = 10.0 ** math.floor(math.log10(most))
     return next(step for step in _STEPS if step * power >= most) * power

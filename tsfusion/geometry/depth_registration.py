@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Registration of a depth and a colour camera: the colour of depth pixels."""
+"""Register a colour camera to a depth camera: find the colour of depth pixels."""
 
 from collections.abc import Iterator
 
@@ -46,10 +46,10 @@ class Registration:
         self._moved = (color.matrix @ T[:3, 3]).astype(np.float32)
 
     def color_of_depth(self, color: NDArray[np.uint8], depth_m: NDArray[np.float32]) -> NDArray[np.uint8]:
-        """Colour of every depth pixel: (H, W, 3) uint8 of the depth's size.
+        """Return the colour of every depth pixel: (H, W, 3) uint8 of the depth's size.
 
-        A pixel without depth (0) gets the colour far away there; one outside of the colour image, the colour
-        of its border; one hidden from the colour camera, the colour of the surface that hides it.
+        A pixel without depth (0) gets the colour of a distant point, one outside the colour image that of the
+        border, and one hidden from the colour camera that of the hiding surface.
         """
         expected = (*self.color_size, 3)
         if color.shape != expected or color.dtype != np.uint8:
@@ -61,7 +61,7 @@ class Registration:
         return seen
 
     def _strips(self, depth_m: NDArray[np.float32]) -> Iterator[tuple[slice, NDArray[np.float32]]]:
-        """Depth image a few rows at a time, so that intermediate arrays stay in the cache."""
+        """Yield the depth image a few rows at a time, so that intermediate arrays stay in the cache."""
         if depth_m.shape != self.size:
             raise InvalidConfig(f"depth must be of size {self.size}, got {depth_m.shape}")
         for top in range(0, len(depth_m), _STRIP):
@@ -69,7 +69,7 @@ class Registration:
             yield rows, depth_m[rows]
 
     def _pixels(self, z: NDArray[np.float32], rows: slice) -> tuple[NDArray[np.float32], ...]:
-        """Columns and rows of some rows' depth pixels in the colour camera."""
+        """Return the columns and rows, in the colour camera, of the depth pixels of some rows."""
         x, y, there = (
             z * each[rows] + moved for each, moved in zip(self._at_infinity, self._moved, strict=True)
         )

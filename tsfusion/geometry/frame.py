@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Frames: measurements of a sensor at one moment, before its pose is known."""
+"""Hold frames: measurements of a sensor at one moment, before its pose is known."""
 
 import dataclasses
 from dataclasses import dataclass, field
@@ -20,26 +20,26 @@ FrameKind = Literal["depth", "disparity", "points", "pair"]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Frame:
-    """One measurement, its pose unknown. Give one of `depth`, `disparity`, `points`, or `left` and `right`.
+    """One measurement without a known pose. Give one of `depth`, `disparity`, `points`, or `left` and
+    `right`.
 
-    Fields of the same name mean the same as in a `Keyframe` and are checked in the same way.
+    Fields have the same meaning and checks as those of the same name in a `Keyframe`.
 
     Attributes:
-        sensor: name of the sensor model (`kinect`, `tof`, `realsense`, `stereo`, `lidar`, `scanner`);
-            empty = it says none.
+        sensor: sensor model (`kinect`, `tof`, `realsense`, `stereo`, `lidar`, `scanner`); empty = unknown.
         timestamp_ns: the sensor's clock; 0 = unknown.
         captured_ns: `time.monotonic_ns()` at capture; 0 = unknown.
-        T_world_camera: (4, 4) float64, the source's own pose (ground truth, another SLAM); None = it has
-            none. Only the localizer `given` uses it.
+        T_world_camera: (4, 4) float64, the source's own pose (ground truth, another SLAM), used only by the
+            localizer `given`; None = no pose.
         left, right: (H, W) uint8 grey, rectified, with `intrinsics` of both and `baseline_fx`.
         color: (H, W, 3) uint8 BGR of the depth or of the left image, or (N, 3) of the points.
-        motion: of the sensor in the time of its points by the source's own poses; None = not known.
-        untimed: why times that the points came with are of no use; empty = they had none, or these are used.
-        specific_force: (3,) m/s², what an accelerometer measured, in the axes of the camera or LiDAR (at rest
-            it points away from the ground); None = nothing.
+        motion: motion of the sensor while it measures, by the source's own poses; None = unknown.
+        untimed: why the times of the points are useless; empty = there are none, or they are used.
+        specific_force: (3,) m/s², the accelerometer's value in the axes of the camera or LiDAR (at rest it
+            points away from the ground); None = no value.
 
     Raises:
-        InvalidKeyframe: naming the field, its value and what was expected.
+        InvalidKeyframe: names the field, its value and the expected value.
     """
 
     sensor: str
@@ -93,8 +93,7 @@ class Frame:
         return cls(**{**fields, "sensor": keyframe.sensor or sensor})
 
     def along_axis(self) -> "Frame":
-        """Convert depth along each pixel's ray to depth along the optical axis. Raises InvalidKeyframe
-        without depth."""
+        """Convert depth along rays to depth along the axis. Raises InvalidKeyframe without depth."""
         if self.depth is None or self.intrinsics is None:
             raise InvalidKeyframe(f"depth_along_ray is for depth images, and this is one of {self.kind}")
         z = self.depth / self.intrinsics.ray_lengths(self.depth.shape)
@@ -102,9 +101,9 @@ class Frame:
         return dataclasses.replace(self, depth=z)
 
     def keyframe(self, T_world_camera: NDArray[np.float64], motion: Motion | None = None) -> Keyframe:
-        """Make a keyframe of the frame; a stereo pair is matched for it.
+        """Make a keyframe of the frame; a stereo pair is matched first.
 
-        `motion` of the sensor corrects points with times; None = not known.
+        `motion`: motion of the sensor, which corrects points with times; None = unknown.
         """
         if self.kind != "pair":
             return self._at(T_world_camera, motion=motion)
@@ -121,8 +120,8 @@ class Frame:
     def tracking_disparity(self) -> NDArray[np.float32] | None:
         """Disparity of a stereo pair, (H, W) float32 pixels, 0 = none; None without a pair.
 
-        From `matched` if the pair was matched before, else of half the resolution, which tracks as
-        well: rendered KITTI 06 drifts by 0.11 % with both, KITTI 06 itself by 0.9 %.
+        If the pair was matched before, this is `matched`; otherwise it is matched at half the resolution.
+        Both track equally well: rendered KITTI 06 drifts by 0.11 % with both, KITTI 06 itself by 0.9 %.
         """
         if self.left is None or self.right is None:
             return None
@@ -186,7 +185,7 @@ class Frame:
             raise InvalidKeyframe(f"baseline_fx says {metres:.4g} m of baseline: are these millimetres?")
 
     def _at(self, T: NDArray[np.float64], disparity: Any = None, motion: Motion | None = None) -> Keyframe:
-        if self.left is not None and disparity is None:  # stands for the one that is matched when needed
+        if self.left is not None and disparity is None:  # placeholder until `matched` is needed
             disparity = np.broadcast_to(np.uint16(0), self.left.shape)
         return Keyframe(
             T_world_camera=T,

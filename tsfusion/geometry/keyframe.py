@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Keyframes: measurements of any sensor with a pose, checked once at construction; their points."""
+"""Check and hold keyframes: measurements of any sensor with a pose; compute their points."""
 
 import functools
 from collections.abc import Mapping, Sequence
@@ -21,10 +21,10 @@ Kind = Literal["depth", "disparity", "points"]
 
 MAX_IMAGE_SIDE = 8192
 MAX_POINTS = 2_000_000
-MAX_BASELINE_M = 5.0  # of a stereo camera; more are millimetres
+MAX_BASELINE_M = 5.0  # of a stereo camera; a larger number must be millimetres
 MAX_TRANSLATION = 1e6
 MAX_SENSOR_NAME = 32
-_LEAST = np.finfo(np.float64).tiny  # smaller numbers stop LAPACK where a library has the processor flush them
+_LEAST = np.finfo(np.float64).tiny  # LAPACK fails on smaller numbers if a library makes the CPU flush them
 _ROTATION_TOLERANCE = 1e-3
 _ROTATION_EXACT = 1e-9
 
@@ -51,20 +51,20 @@ class Intrinsics(msgspec.Struct, frozen=True, array_like=True):
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def ray_lengths(self, shape: Sequence[int]) -> NDArray[np.float32]:
-        """Length of each pixel's ray where its depth along the axis is 1: (H, W) float32, of `shape`."""
+        """Return each pixel's ray length for depth 1 along the axis: (H, W) float32, of `shape`."""
         x = (np.arange(shape[1]) - self.cx) / self.fx
         y = (np.arange(shape[0]) - self.cy) / self.fy
         return np.sqrt(1 + x**2 + y[:, None] ** 2).astype(np.float32)
 
     def scaled(self, factor: float) -> "Intrinsics":
-        """Intrinsics of the image resized by `factor` (pixel centres at integers)."""
+        """Return the intrinsics of the image resized by `factor` (pixel centres at integers)."""
         return Intrinsics(
             self.fx * factor, self.fy * factor, (self.cx + 0.5) * factor - 0.5, (self.cy + 0.5) * factor - 0.5
         )
 
 
 def _explains_names(cls: type[_T]) -> type[_T]:
-    """Add the right name of a field to the error about a wrong one."""
+    """Make the error about a wrong field name suggest the right name."""
     made = cls.__init__
 
     @functools.wraps(made)
@@ -102,14 +102,14 @@ class Keyframe(object_cards.Shown):
         baseline_fx: stereo baseline times fx, metre · pixels. Also allowed with `depth` from a stereo
             camera, where it drives the noise model.
         points: (N, 3) float32 metres in the sensor frame.
-        point_times_s: (N,) seconds of each point after `timestamp_ns`, of a sensor that moves while it
-            measures them; each point is in the sensor frame of its own time. Without `motion` that moves
-            nothing, and a `Client` says so.
-        motion: `(times_s, poses)` of the sensor in the time of its points: (k,) seconds after `timestamp_ns`,
+        point_times_s: (N,) seconds of each point after `timestamp_ns`, for a sensor that moves while it
+            measures; each point is in the sensor frame of its own time. Without `motion` the times are
+            not used, and a `Client` says so.
+        motion: `(times_s, poses)` of the sensor while it measures: (k,) seconds after `timestamp_ns`,
             rising, and (k, 4, 4) in the sensor frame at `timestamp_ns`
-            (`np.linalg.inv(T_world_camera) @ T_world_then`). The keyframe puts its points where they were
-            at their times and forgets both: they are None.
-        origins: where each ray starts, in the sensor frame: (3,) or (N, 3) float32 metres; default the
+            (`np.linalg.inv(T_world_camera) @ T_world_then`). The keyframe uses both to move its points
+            into the frame at `timestamp_ns`, and then sets both to None.
+        origins: start of each ray, in the sensor frame: (3,) or (N, 3) float32 metres; default the
             frame's origin. For scanners whose rays do not meet in one point.
         color: (H, W, 3) uint8 BGR, registered to the depth image, or (N, 3) uint8 BGR for points.
         confidence: (H, W) or (N,) uint8; 255 = full weight, 0 = do not use.
@@ -313,8 +313,7 @@ class KeyframeFields(TypedDict, total=False):
 
 
 def keyframe_of(value: Any) -> Keyframe:
-    """Keyframe of a keyframe, a mapping of its fields or an object with such attributes. Raises
-    InvalidKeyframe."""
+    """Return a keyframe from itself or from a mapping or object of its fields. Raises InvalidKeyframe."""
     if isinstance(value, Keyframe):
         return value
     if isinstance(value, Mapping):
@@ -331,7 +330,7 @@ def keyframe_of(value: Any) -> Keyframe:
 
 
 def intrinsics_of(value: Any) -> Intrinsics | None:
-    """Intrinsics of intrinsics, a camera matrix, or four numbers; None = another value."""
+    """Return intrinsics from intrinsics, a camera matrix or four numbers; None for any other value."""
     if isinstance(value, Intrinsics) or value is None:
         return value
     try:
@@ -357,9 +356,9 @@ def check_intrinsics(intrinsics: Intrinsics) -> Intrinsics:
 
 
 def check_pose(pose: Any, *, farthest: float = MAX_TRANSLATION) -> NDArray[np.float64]:
-    """Check a rigid transform. Returns it as (4, 4) float64, with a rotation within 1e-3 made exact.
+    """Check a rigid transform; return it as (4, 4) float64, with a rotation within 1e-3 made exact.
 
-    Idempotent to the bit, so that a keyframe checked at both ends of a wire keeps its map.
+    A second check changes no bit, so a keyframe checked at both ends of a wire gives the same map.
     """
     try:
         T = np.array(pose, dtype=np.float64)
@@ -394,7 +393,7 @@ def check_pose(pose: Any, *, farthest: float = MAX_TRANSLATION) -> NDArray[np.fl
 
 
 def are_far(points: NDArray[np.floating]) -> bool:
-    """True if all returns of (n, 3) points are beyond `FAR` along an axis; False if there are none."""
+    """Return True if all valid (n, 3) points are beyond `FAR` along an axis; False without points."""
     if not len(points) or np.abs(points[0]).max() <= FAR:
         return False
     away = np.abs(points).max(axis=1)
@@ -412,7 +411,7 @@ def _nearest_rotation(R: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _array(name: str, value: Any, dtypes: tuple[type, ...], shape: tuple[int | None, ...]) -> NDArray[Any]:
     expected = " or ".join(np.dtype(dtype).name for dtype in dtypes)
-    if isinstance(value, np.ma.MaskedArray):  # what is masked is no return
+    if isinstance(value, np.ma.MaskedArray):  # a masked value is no return
         value = value.filled(np.nan if value.dtype.kind == "f" else 0)
     try:
         array = np.asarray(value)
@@ -446,7 +445,7 @@ def _positive(name: str, value: Any) -> float:
 
 
 def depth_metres(keyframe: Keyframe) -> NDArray[np.float64]:
-    """(H, W) float64 z of a depth or disparity keyframe; 0 = no return."""
+    """Return the z of a depth or disparity keyframe, (H, W) float64; 0 = no return."""
     if keyframe.disparity is not None:
         d = keyframe.disparity * keyframe.disparity_scale
         z = np.divide(keyframe.baseline_fx or 0.0, d, out=np.zeros(keyframe.shape), where=d > 0)
@@ -458,7 +457,7 @@ def depth_metres(keyframe: Keyframe) -> NDArray[np.float64]:
 
 
 def points_camera(keyframe: Keyframe) -> NDArray[np.float64]:
-    """(n, 3) float64 of the valid pixels, or of the points, in the sensor's frame."""
+    """Return (n, 3) float64 points in the sensor's frame, of the valid pixels or of the points."""
     if keyframe.points is not None:
         return keyframe.points.astype(np.float64)
     z, K = depth_metres(keyframe), keyframe.intrinsics
@@ -469,7 +468,7 @@ def points_camera(keyframe: Keyframe) -> NDArray[np.float64]:
 
 
 def points_world(keyframe: Keyframe) -> NDArray[np.float64]:
-    """`points_camera`, moved by the keyframe's pose."""
+    """Return `points_camera` moved by the keyframe's pose."""
     T = keyframe.T_world_camera
     moved: NDArray[np.float64] = points_camera(keyframe) @ T[:3, :3].T + T[:3, 3]
     return moved

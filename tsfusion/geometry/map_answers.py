@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Answers of a map: samples of its distance field, and the view of a camera."""
+"""Hold answers of a map: samples of its distance field, views of cameras, and point clouds."""
 
 import os
 from dataclasses import dataclass
@@ -18,16 +18,16 @@ from tsfusion.geometry.mesh_arrays import generator
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """The map's signed distance at points of the world, which it knows near its surfaces alone.
+    """The map's signed distance at points of the world; it is known only near surfaces.
 
-    NaN says nothing about what is there: whoever may not run into something asks a `DistanceField`.
+    NaN means unknown, not free: to avoid collisions, use a `DistanceField`.
 
     Attributes:
-        distance: (n,) float32 metres, positive in the free space in front of a surface; NaN where unseen, and
+        distance: (n,) float32 metres, positive in the free space in front of a surface; NaN if unseen, or
             beyond the band around the surface.
-        weight: (n,) float32 votes in full-confidence samples; 0 where there are none.
-        gradient: (n, 3) float32, how the distance grows along x, y, z; NaN where unseen.
-        reach: metres before a surface, up to which distances are known.
+        weight: (n,) float32, in samples of full confidence; 0 without samples.
+        gradient: (n, 3) float32, derivative of the distance along x, y, z; NaN if unseen.
+        reach: metres in front of a surface up to which distances are known.
 
     Examples:
         >>> wall = tsfusion.Keyframe(
@@ -57,8 +57,8 @@ class View:
     Attributes:
         depth: (H, W) float32 metres along the optical axis; 0 = nothing hit, as in a keyframe's depth.
         normals: (H, W, 3) float32 unit normals in the world's frame, towards the camera; 0 = nothing hit.
-            None if they were not asked for.
-        colors: (H, W, 3) uint8 RGB (sRGB), 0 = nothing hit; None if the map holds none, or likewise.
+            None if not requested.
+        colors: (H, W, 3) uint8 RGB (sRGB), 0 = nothing hit; None if the map has none, or if not requested.
 
     Examples:
         >>> volume = tsfusion.Volume(0.05)
@@ -81,7 +81,7 @@ class PointCloud:
     Attributes:
         points: (n, 3) float32 metres.
         normals: (n, 3) float32, unit length, away from the surface.
-        weights: (n,) float32 votes in full-confidence samples.
+        weights: (n,) float32, in samples of full confidence.
         colors: (n, 3) uint8 RGB (sRGB); None if the map holds none.
 
     Examples:
@@ -127,7 +127,7 @@ class PointCloud:
 
 
 def import_open3d() -> Any:
-    """Module `open3d`. Raises MissingDependency without it."""
+    """Return the module `open3d`. Raises MissingDependency without it."""
     try:
         return import_module("open3d")
     except ImportError as error:
@@ -135,7 +135,7 @@ def import_open3d() -> Any:
 
 
 def checked_points(points: Any) -> NDArray[np.floating]:
-    """Points as a contiguous (n, 3) array of float32 or float64. Raises InvalidConfig for anything else."""
+    """Return points as contiguous (n, 3) float32 or float64. Raises InvalidConfig for anything else."""
     array = np.asarray(points)
     if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in "fiu":
         raise InvalidConfig(
@@ -147,8 +147,7 @@ def checked_points(points: Any) -> NDArray[np.floating]:
 def checked_camera(
     intrinsics: Any, T_world_camera: Any, shape: Any
 ) -> tuple[Intrinsics, NDArray[np.float64], tuple[int, int]]:
-    """Intrinsics, pose and (height, width) of a requested view. Raises InvalidConfig, naming the wrong
-    value."""
+    """Return the checked intrinsics, pose and (height, width). Raises InvalidConfig, naming the error."""
     found = intrinsics_of(intrinsics)
     if found is None:
         raise InvalidConfig(

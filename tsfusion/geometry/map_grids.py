@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Grids of a map for robots: distances and occupancy, and the files that planners read."""
+"""Hold grids of distances and occupancy for robots, and write them as files for planners."""
 
 import json
 from collections.abc import Sequence
@@ -19,16 +19,16 @@ from tsfusion.geometry.up_direction import Up
 
 FREE, OCCUPIED, UNSEEN = 0, 100, -1  # as in ROS's nav_msgs/OccupancyGrid
 SLICE_FORMATS = (".pgm", ".yaml", ".png", ".npz")
-# Reading of a pixel p by map_server and nav2: occupied if (255 − p) / 255 > OCCUPIED_THRESH, free if it is
-# < FREE_THRESH, else unknown. 205 is 0.19608: at 0.25, which some tools write, all that is unknown is free.
+# map_server and nav2 read a pixel p as occupied if (255 − p) / 255 > OCCUPIED_THRESH, as free if that is
+# < FREE_THRESH, else as unknown. 205 gives 0.19608: the 0.25 of some tools would read unknown cells as free.
 OCCUPIED_THRESH, FREE_THRESH = 0.65, 0.196
 _PIXELS = {FREE: 254, OCCUPIED: 0, UNSEEN: 205}
 
 
 @dataclass(frozen=True)
 class SliceGrid:
-    """The cells of a slice: rows along `axes[1]`, columns along `axes[0]`, between two heights along
-    `axes[2]`, which is up.
+    """The cells of a slice between two heights: rows lie along `axes[1]`, columns along `axes[0]`, and
+    `axes[2]` is up.
 
     The centre of cell (row, column) is at origin + (column + 0.5, row + 0.5) · resolution in the slice's
     frame. Its axes are the rows of `axes`: p_slice = axes @ p_map, without a shift.
@@ -39,7 +39,7 @@ class SliceGrid:
         shape: rows, columns.
         low, high: metres along up, in the map's frame.
         axes: (3, 3) float64, the slice's axes in the map's frame; the last one is up.
-        floor: metres along up from the map's origin, where the floor was found; None = not looked for.
+        floor: height of the floor along up from the map's origin, metres; None = no search was made.
 
     Examples:
         >>> volume = tsfusion.Volume(0.05)
@@ -56,17 +56,16 @@ class SliceGrid:
     low: float  # metres from the map's origin
     high: float
     axes: NDArray[np.float64]  # (3, 3)
-    floor: float | None = None  # height of the floor, metres from the map's origin; None = not looked for
+    floor: float | None = None  # height of the floor, metres; None = no search was made
 
     def cells_of(self, points: NDArray[np.floating]) -> NDArray[np.int64]:
-        """Cells of `points`, (n, 3) metres in the map's frame: (n, 2) int64 row and column, maybe outside of
-        the slice."""
+        """Return the (n, 2) int64 cells (row, column), maybe outside, of `points` (n, 3) in metres."""
         flat = np.asarray(points, np.float64) @ self.axes[:2].T
         cells: NDArray[np.int64] = np.floor((flat - self.origin) / self.resolution).astype(np.int64)
         return cells[:, ::-1]
 
     def centres(self, height: float | None = None) -> NDArray[np.float64]:
-        """Centres of the cells: (rows, columns, 3) float64 metres in the map's frame.
+        """Return the centres of the cells: (rows, columns, 3) float64 metres in the map's frame.
 
         `height`: metres along up; None = half-way between `low` and `high`.
         """
@@ -86,7 +85,7 @@ class SliceGrid:
 
     @property
     def heights_in_words(self) -> str:
-        """Heights of the slice, and where they count from."""
+        """Heights of the slice as text, with their reference."""
         if self.floor is None:
             return f"{self.low:g} and {self.high:g} m"
         low, high = self.low - self.floor, self.high - self.floor
@@ -100,7 +99,7 @@ class SliceGrid:
 
 @dataclass(frozen=True)
 class OccupancySlice:
-    """A costmap: what stands between two heights.
+    """A costmap of the obstacles between two heights.
 
     `cells` (rows, columns) int8: 0 free, 100 occupied, −1 unseen, as in a `nav_msgs/OccupancyGrid`.
 
@@ -122,7 +121,7 @@ class OccupancySlice:
     knows_free_space: bool  # else it is known near surfaces alone
 
     def save(self, path: str | Path) -> list[Path]:
-        """Write files for ROS's map_server, a picture or arrays. Returns the files.
+        """Write files for ROS's map_server, a picture or arrays; return the files.
 
         Args:
             path: `.yaml` or `.pgm` writes the pair that map_server reads, `.png` a picture, `.npz` arrays.
@@ -142,7 +141,7 @@ class OccupancySlice:
         return [text, picture]
 
     def pixels(self) -> NDArray[np.uint8]:
-        """(rows, columns) uint8 for map_server, last row on top: 0 occupied, 254 free, 205 unseen."""
+        """Return (rows, columns) uint8 for map_server, last row on top: 0 occupied, 254 free, 205 unseen."""
         pixels = np.full(self.cells.shape, _PIXELS[UNSEEN], np.uint8)
         pixels[self.cells == FREE], pixels[self.cells == OCCUPIED] = _PIXELS[FREE], _PIXELS[OCCUPIED]
         return np.ascontiguousarray(pixels[::-1])
@@ -163,12 +162,12 @@ class OccupancySlice:
 
 @dataclass(frozen=True)
 class DistanceSlice:
-    """Horizontal distances to what stands between two heights.
+    """Horizontal distances to the obstacles between two heights.
 
-    `distance` (rows, columns) float32 metres, at most `max_distance`: to the nearest surface, negative where
-    the map knows that a cell lies behind one. After too few samples it is 0, so that a robot does not go
-    there; with `unseen_is_free` the distance to the nearest surface that was. `cells` tells which these are,
-    as in an `OccupancySlice`.
+    `distance` (rows, columns) float32 metres, at most `max_distance`, to the nearest surface. It is negative
+    in a cell that is known to lie behind a surface. In unseen cells (too few samples) it is 0, so that robots
+    stay away; with `unseen_is_free` it is the distance to the nearest seen surface. `cells` marks these cells
+    as an `OccupancySlice` does.
 
     Attributes:
         grid: where the cells are.
@@ -189,11 +188,11 @@ class DistanceSlice:
 
     @property
     def reach(self) -> float:
-        """Distance up to which an answer knows, metres."""
+        """Largest distance that an answer can tell, metres."""
         return self.max_distance
 
     def save(self, path: str | Path) -> list[Path]:
-        """Write a picture (.png) or arrays (.npz) to `path`, by its suffix. Returns the files.
+        """Write a picture (.png) or arrays (.npz) to `path`, by its suffix; return the files.
 
         Raises OutputError for a file that cannot be written, InvalidConfig for another suffix.
         """
@@ -204,7 +203,7 @@ class DistanceSlice:
         return _save_arrays(path, {**arrays, **self.grid.figures})
 
     def picture(self) -> NDArray[np.uint8]:
-        """(rows, columns, 3) BGR, the last row on top: near red, far blue; occupied black, unseen grey."""
+        """Return (rows, columns, 3) BGR, last row on top: near red, far blue; occupied black, unseen grey."""
         near = np.clip(1 - np.maximum(self.distance, 0) / self.max_distance, 0, 1)
         colors = cv2.applyColorMap((255 * near).astype(np.uint8), cv2.COLORMAP_TURBO)
         colors[self.cells == UNSEEN] = _PIXELS[UNSEEN]
@@ -216,10 +215,10 @@ class DistanceSlice:
 class DistanceField:
     """Distances to the nearest surface in a box of voxels.
 
-    `distance` (X, Y, Z) float32 metres, at most `max_distance`, negative where the map knows that a voxel
-    lies behind the surface. In unseen voxels it is 0, so that a robot does not go there; with
-    `unseen_is_free` the distance to the nearest surface that was seen. `occupancy` (X, Y, Z) int8 tells which
-    these are: 0 free, 100 occupied, −1 unseen. The centre of voxel (i, j, k) is at
+    `distance` (X, Y, Z) float32 metres, at most `max_distance`; negative in voxels that are known to lie
+    behind a surface. In unseen voxels it is 0, so that robots stay away; with
+    `unseen_is_free` it is the distance to the nearest seen surface. `occupancy` (X, Y, Z) int8 marks the
+    voxels: 0 free, 100 occupied, −1 unseen. The centre of voxel (i, j, k) is at
     origin + ((i, j, k) + 0.5) · voxel_size.
 
     Attributes:
@@ -245,13 +244,13 @@ class DistanceField:
 
     @property
     def reach(self) -> float:
-        """Distance up to which an answer knows, metres."""
+        """Largest distance that an answer can tell, metres."""
         return self.max_distance
 
     def at(self, points: ArrayLike) -> NDArray[np.float32]:
-        """Lower bounds of the distances at points, from their voxels: (n,) metres; 0 outside the box.
+        """Return lower bounds of the distances at points, from their voxels: (n,) metres; 0 outside the box.
 
-        `points`: (n, 3) metres in the map's frame. Raises InvalidConfig for an array of anything else.
+        `points`: (n, 3) metres in the map's frame. Raises InvalidConfig for any other array.
         """
         places = (checked_points(points) - self.origin) / self.voxel_size
         voxels = np.floor(places)
@@ -263,7 +262,7 @@ class DistanceField:
         return found
 
     def save(self, path: str | Path) -> list[Path]:
-        """Write the arrays to `path` (.npz). Returns the files.
+        """Write the arrays to `path` (.npz); return the files.
 
         Raises OutputError for a file that cannot be written, InvalidConfig for another suffix.
         """
@@ -294,7 +293,7 @@ class OwnSliceSettings(SliceSettings, total=False):
 def blocked(
     distance: NDArray[np.float32], states: NDArray[np.int8], *, unseen_is_free: bool
 ) -> NDArray[np.float32]:
-    """Distances as a planner may compare them: 0 where unseen, unless unseen counts as free."""
+    """Return distances for a planner: 0 in unseen cells, unless unseen counts as free."""
     return distance if unseen_is_free else np.where(states == UNSEEN, np.float32(0), distance)
 
 

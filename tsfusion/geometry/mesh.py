@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Triangle meshes, and their files."""
+"""Hold triangle meshes, change them and write their files."""
 
 import dataclasses
 import os
@@ -38,10 +38,10 @@ class Mesh(MeshArrays, object_cards.Shown):
         faces: (m, 3) int32, counter-clockwise seen from outside.
         normals: (n, 3) float32, unit length.
         colors: (n, 3) uint8 RGB (sRGB); grey where no colour was seen, None if the map holds none.
-        known_up: away from the ground; None = `up` finds it.
-        held: how the sensors that saw a whole map were held; None = nobody knows.
-        guessed: (m,) bool, the faces that close holes where nothing was seen; None = there are none.
-        provenance: where it comes from, for whoever gets a file of it; None = not known.
+        known_up: direction away from the ground; None = `up` finds it.
+        held: attitudes of the sensors that saw the whole map; None = unknown.
+        guessed: (m,) bool, True for faces that close holes in unseen regions; None = no such faces.
+        provenance: origin of the mesh, for readers of its files; None = unknown.
 
     Examples:
         >>> volume = tsfusion.Volume(0.05)
@@ -68,9 +68,9 @@ class Mesh(MeshArrays, object_cards.Shown):
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write PLY (binary), GLB, OBJ or STL by the file's suffix; complete or not at all.
 
-        PLY, OBJ and STL keep the map's frame. GLB is turned so that up is +Y, as glTF 2.0 asks for; where up
-        is not known it keeps the map's frame, too. Each file says its unit, its up direction, where it comes
-        from, and which triangles are guessed (`mesh_encoding`); STL holds no colours.
+        PLY, OBJ and STL keep the map's frame. GLB is turned so that up is +Y, as glTF 2.0 asks; with unknown
+        up it keeps the map's frame. Each file contains its unit, up direction, origin and guessed triangles
+        (`mesh_encoding`); STL has no colours.
 
         Args:
             path: the file; `.ply`, `.glb`, `.obj` or `.stl`.
@@ -124,10 +124,10 @@ class Mesh(MeshArrays, object_cards.Shown):
         return mesh
 
     def without_islands(self, min_extent: float | None = None) -> "Mesh":
-        """Mesh without its islands; the same object if it has none.
+        """Return the mesh without its islands; the same object if it has none.
 
-        `min_extent`: least diagonal of the box around a piece that stays, metres; None = small pieces by
-        their number of vertices (`mesh_islands.find`).
+        `min_extent`: smaller pieces, by the diagonal of their box in metres, are islands; None = pieces with
+        few vertices (`mesh_islands.find`).
         """
         islands = self.islands(min_extent)
         if not islands.any():
@@ -135,7 +135,7 @@ class Mesh(MeshArrays, object_cards.Shown):
         return dataclasses.replace(self.of_faces(~islands[self.faces[:, 0]]), known_up=self.up)
 
     def islands(self, min_extent: float | None = None) -> NDArray[np.bool_]:
-        """Vertices of islands, as `without_islands` leaves them out: (n,) bool.
+        """Return an (n,) bool mask of the vertices of islands, which `without_islands` leaves out.
 
         `min_extent`: metres; None = the bound of `without_islands`.
         """
@@ -144,26 +144,26 @@ class Mesh(MeshArrays, object_cards.Shown):
         return mesh_islands.find_smaller(self.faces, self.vertices, min_extent)
 
     def count_islands(self, islands: NDArray[np.bool_]) -> dict[str, int]:
-        """Number of `islands` and their `triangles`, of what `islands` found."""
+        """Return the number of `islands` in the mask of `islands`, and of their `triangles`."""
         triangles = int(islands[self.faces[:, 0]].sum())
         return {"islands": mesh_islands.count(self.faces, islands), "triangles": triangles}
 
     def cropped(self, box: Sequence[float]) -> "Mesh":
-        """Part of the mesh inside a `box`: x0, y0, z0, x1, y1, z1 in metres, in the mesh's frame.
+        """Return the part of the mesh inside a `box`: x0, y0, z0, x1, y1, z1 in metres, in the mesh's frame.
 
-        Triangles across a side are cut there. Raises InvalidConfig for another box.
+        Triangles across a side of the box are cut. Raises InvalidConfig for another box.
         """
         return dataclasses.replace(mesh_cropping.cropped(self, box), known_up=self.up)
 
     def simplified(
         self, *, ratio: float | None = None, triangles: int | None = None, max_error: float | None = None
     ) -> "Mesh":
-        """The mesh with fewer triangles, the same borders, and the mean colours of what became one.
+        """Return the mesh with fewer triangles, the same borders, and mean colours at merged vertices.
 
         Args:
-            ratio: share of the triangles that is wanted, above 0 and up to 1.
-            triangles: number that is wanted. Borders need two triangles an edge: fewer are not made.
-            max_error: metres that a new vertex may be off the planes of the triangles that it stands for.
+            ratio: wanted share of the triangles, above 0 and up to 1.
+            triangles: wanted number. Borders need two triangles per edge: the result has at least these.
+            max_error: largest distance of a new vertex from the planes of its original triangles, metres.
 
         Raises:
             InvalidConfig: unless one of them is given, in its range.
@@ -173,7 +173,7 @@ class Mesh(MeshArrays, object_cards.Shown):
         return dataclasses.replace(less, known_up=self.up)
 
     def with_guesses_marked(self) -> "Mesh":
-        """The mesh with its guessed triangles in `GUESS_COLOR`, on vertices of their own."""
+        """Return the mesh with its guessed triangles in `GUESS_COLOR`, on separate vertices."""
         if self.guessed is None or not self.guessed.any():
             return self
         seen, guess = self.of_faces(~self.guessed), self.of_faces(self.guessed)
@@ -217,7 +217,7 @@ class Mesh(MeshArrays, object_cards.Shown):
 
 
 def summarise(figures: dict[str, Any]) -> str:
-    """A mesh's `figures` as one line."""
+    """Return a mesh's `figures` as one line."""
     extent = " × ".join(f"{length:.2f}" for length in figures["extent_m"])
     if figures["islands"] is None:
         pieces = "islands not looked for"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Arrays of a triangle mesh and its origin, for functions that make files and other meshes."""
+"""Hold the arrays of a triangle mesh and its origin, for functions that make files and other meshes."""
 
 import dataclasses
 from dataclasses import dataclass, field
@@ -23,10 +23,10 @@ class Provenance:
     """Origin of a surface; None = unknown.
 
     Attributes:
-        source: name of the map, or of its file or folder, without the path, as files are sent around.
-        keyframes: number that the map was made from.
+        source: name of the map, or of its file or folder without the path, because files are sent around.
+        keyframes: number of keyframes in the map.
         map_hash: `map_hash()` of the map.
-        world: coordinate frames of its scans; empty = poses were given from elsewhere.
+        world: worlds (coordinate frames) of its scans; empty = poses were given from elsewhere.
         voxel_size: metres.
     """
 
@@ -38,7 +38,7 @@ class Provenance:
 
     @property
     def origins(self) -> list[Origin]:
-        """Origins of its worlds, in the frame of their scans' given poses."""
+        """Origins of its worlds, in the frame of the scans' given poses."""
         return [one for world in (self.world or "").split() if (one := Origin.of_world(world))]
 
     @property
@@ -76,20 +76,20 @@ class MeshArrays:
 
     @cached_property
     def up(self) -> Up | None:
-        """Direction away from the ground, as given or found; None = not known."""
+        """Direction away from the ground, as given or found; None = unknown."""
         if self.known_up is not None or self.held is None:
             return self.known_up
         return up_direction.find(self, self.held)
 
     def of_faces(self: AnyMesh, kept: NDArray[np.bool_] | NDArray[np.integer]) -> AnyMesh:
-        """Mesh of some of the faces and the vertices that they use, in the same order.
+        """Return the mesh of some faces and the vertices that they use, in the same order.
 
         `kept`: (m,) bool for each face, or the numbers of faces.
         """
         chosen = np.flatnonzero(kept) if kept.dtype == np.bool_ else kept
         faces = np.take(self.faces, chosen, axis=0)
         first, last = (int(faces.min()), int(faces.max())) if len(faces) else (0, -1)
-        is_used = np.zeros(last + 1 - first, bool)  # of a part of the mesh these are few of all vertices
+        is_used = np.zeros(last + 1 - first, bool)  # a part of the mesh uses few of all vertices
         is_used[faces - first] = True
         used, number = first + np.flatnonzero(is_used), np.cumsum(is_used, dtype=np.int32) - np.int32(1)
         return dataclasses.replace(

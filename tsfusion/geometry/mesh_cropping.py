@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Cut a mesh along a plane or the sides of a box: triangles across it are cut there, exactly."""
+"""Cut a mesh along a plane or the sides of a box; triangles across them are cut exactly."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from tsfusion.geometry.mesh_arrays import AnyMesh
 
 
 def checked_box(box: Sequence[float]) -> NDArray[np.float64]:
-    """x0, y0, z0, x1, y1, z1 in metres as (2, 3); raises InvalidConfig for anything else."""
+    """Return x0, y0, z0, x1, y1, z1 in metres as (2, 3); raise InvalidConfig for anything else."""
     corners = np.asarray(box, np.float64)
     if corners.shape != (6,) or not np.isfinite(corners).all() or (corners[3:] <= corners[:3]).any():
         raise InvalidConfig(f"a box is x0 y0 z0 x1 y1 z1 in metres, the lower corner first, got {list(box)}")
@@ -29,21 +29,21 @@ def cropped(mesh: AnyMesh, box: Sequence[float]) -> AnyMesh:
 
 
 def cut(mesh: AnyMesh, normal: NDArray[np.float64], offset: float) -> AnyMesh:
-    """The part of a mesh where `normal · p ≤ offset`, metres; triangles across that plane are cut there."""
+    """Return the part of a mesh where `normal · p ≤ offset`, metres; triangles across that plane are cut."""
     return _cut(mesh, np.float32(offset) - mesh.vertices @ normal.astype(np.float32))
 
 
 def _cut(mesh: AnyMesh, height: NDArray[np.float32], plane: tuple[int, np.float32] | None = None) -> AnyMesh:
-    """Part of a mesh above a plane, where vertices have a height ≥ 0.
+    """Return the part of a mesh above a plane: vertices with a height ≥ 0.
 
-    `plane`: its axis, and its place on it: cut vertices are there to the last bit.
+    `plane`: its axis and its coordinate on this axis; cut vertices get this coordinate to the last bit.
     """
     kept = height >= 0
     count = kept[mesh.faces].sum(axis=1)
     if (count == 3).all():
         return mesh
     crossed = np.flatnonzero((count == 1) | (count == 2))
-    # Turned so that corner 0 is the one that is alone on its side
+    # Turned so that corner 0 is the only corner on its side
     faces = mesh.faces[crossed]
     alone = kept[faces] == (count[crossed] == 1)[:, None]
     turn = (np.argmax(alone, axis=1)[:, None] + np.arange(3)) % 3
@@ -60,7 +60,7 @@ def _cut(mesh: AnyMesh, height: NDArray[np.float32], plane: tuple[int, np.float3
     result = dataclasses.replace(
         mesh, faces=pieces, guessed=None if mesh.guessed is None else mesh.guessed[origin]
     )
-    return result.of_faces((pieces != pieces[:, [1, 2, 0]]).all(axis=1))  # a corner on the plane leaves none
+    return result.of_faces((pieces != pieces[:, [1, 2, 0]]).all(axis=1))  # drop empty triangles
 
 
 def _with_cuts(
@@ -69,8 +69,7 @@ def _with_cuts(
     height: NDArray[np.float32],
     plane: tuple[int, np.float32] | None,
 ) -> tuple[AnyMesh, NDArray[np.int64]]:
-    """Mesh with one vertex where each edge meets the plane, and their numbers; an edge that ends on the plane
-    has this end."""
+    """Return the mesh with a vertex where each edge meets the plane, and the vertices' numbers."""
     edges, which = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True)
     p, q = edges.T
     share = (height[p] / (height[p] - height[q]))[:, None]

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Content of a PLY, GLB, OBJ or STL file of a mesh, with the file's notes about it.
+"""Encode a mesh as PLY, GLB, OBJ or STL, with facts about the mesh in the file.
 
-Vertices are in the map's frame; the nodes of a GLB turn them so that up is +Y, as glTF 2.0 asks for. Guessed
-triangles are the last ones in PLY, an object of their own in GLB and OBJ, and have 1 as their attribute in
-STL.
+Vertices are in the map's frame; the nodes of a GLB turn them so that up is +Y, as glTF 2.0 asks. Guessed
+triangles come last in PLY, are a separate object in GLB and OBJ, and have the attribute 1 in STL.
 """
 
 import dataclasses
@@ -21,17 +20,17 @@ _STL_FACET = np.dtype([("floats", "<f4", 12), ("attribute", "<u2")])
 _PLY_FORMAT = b"format binary_little_endian 1.0\n"
 _LINEAR = "_LINEAR"  # trimesh's name for colours of 16 bits, until they are COLOR_0
 _OPAQUE = 65535
-TURNED_BY_NODE = "turned to +y by the node"  # what an object's note ends with
+TURNED_BY_NODE = "turned to +y by the node"  # end of an object's metadata `up`
 _MATTE = {"name": "matte", "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}}
 
 
 def encode(mesh: MeshArrays, suffix: str) -> bytes:
-    """The content of a file with this suffix, one of `FORMATS`."""
+    """Return the content of a file with this suffix, one of `FORMATS`."""
     return FORMATS[suffix](mesh)
 
 
 def _ply(mesh: MeshArrays) -> bytes:
-    if mesh.guessed is not None:  # a property of faces ends readers that know lists alone
+    if mesh.guessed is not None:  # some readers fail on a face property that is no list
         order = np.argsort(mesh.guessed, kind="stable")
         mesh = dataclasses.replace(mesh, faces=mesh.faces[order], guessed=mesh.guessed[order])
     content = bytes(mesh.to_trimesh().export(file_type="ply", vertex_normal=True))
@@ -69,9 +68,9 @@ def _glb(mesh: MeshArrays) -> bytes:
 
 
 def glb_of(scene: Any, mesh: MeshArrays) -> bytes:
-    """Content of a GLB with a mesh's objects, which are in the map's frame.
+    """Return a GLB of a mesh's objects, which are in the map's frame.
 
-    Each node turns its object so that up is +Y. Objects without a picture get a material that is no metal.
+    Each node turns its object so that up is +Y. Objects without a texture get a non-metallic material.
     """
     if mesh.up is not None:
         turn = np.eye(4)
@@ -96,7 +95,7 @@ def glb_of(scene: Any, mesh: MeshArrays) -> bytes:
 
 
 def _scene(mesh: MeshArrays) -> Any:
-    """Seen and guessed triangles as objects of these names; one, `mesh`, without guesses."""
+    """Return a scene with the objects `seen` and `guessed`, or one object `mesh` without guesses."""
     import trimesh
 
     scene = trimesh.Scene()
@@ -115,7 +114,7 @@ FORMATS: dict[str, Callable[[MeshArrays], bytes]] = {".ply": _ply, ".glb": _glb,
 
 
 def facts_of(mesh: MeshArrays) -> dict[str, str]:
-    """Notes in a file about its mesh: by name, a line each."""
+    """Return facts for a file about its mesh: by name, one line each."""
     facts = {
         "generator": generator(),
         "unit": "metre",
@@ -130,18 +129,18 @@ def facts_of(mesh: MeshArrays) -> dict[str, str]:
 
 
 def comments(mesh: MeshArrays, comment: bytes) -> bytes:
-    """Comments with the file's notes about its mesh."""
+    """Return comment lines with the facts about a mesh."""
     lines = [f"{name} {value}".encode() for name, value in facts_of(mesh).items()]
     return b"".join(comment + line + b"\n" for line in lines)
 
 
 def described(up: Up | None) -> str:
-    """A direction in words."""
+    """Return a direction as text."""
     return "unknown" if up is None else str(up)
 
 
 def _srgb_to_linear() -> NDArray[np.uint16]:
-    """Linear light of each level of sRGB, 0 to 65535: in 8 bits most dark levels would coincide."""
+    """Return the linear light of each sRGB level, 0 to 65535; in 8 bits most dark levels would coincide."""
     s = np.arange(256) / 255
     linear = np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
     return np.round(linear * _OPAQUE).astype(np.uint16)

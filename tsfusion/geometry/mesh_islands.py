@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Islands: small pieces of a mesh that are connected with nothing else, mostly noise.
+"""Find islands: small pieces of a mesh without connection to the rest, mostly noise.
 
-Islands of a mesh that is too large for memory are found part by part: a number for each vertex waits in a
-file; memory holds a part, and a box for each piece of one. A part's triangles may name vertices of earlier
-parts: pieces that meet there are one.
+A mesh that is too large for memory is searched part by part. A file holds a number for each vertex; memory
+holds one part, and a box for each piece. Triangles may use vertices of earlier parts, which joins pieces.
 """
 
 from collections.abc import Iterable, Iterator
@@ -15,14 +14,14 @@ from numpy.typing import NDArray
 
 from tsfusion.core.errors import InvalidConfig
 
-ISLAND = 50  # vertices that a piece needs to be none: marching cubes makes about one on each voxel's face
+ISLAND = 50  # vertices; a smaller piece is an island: marching cubes makes about one vertex per voxel face
 
 
 def find(faces: NDArray[np.int32], vertices: int) -> NDArray[np.bool_]:
-    """(n,) bool of `vertices` vertices: those in pieces of fewer than `ISLAND` vertices.
+    """Return an (n,) bool mask of the vertices in pieces of fewer than `ISLAND` vertices.
 
-    Such a piece has as much surface as 7 × 7 voxels, 14 cm across at 2 cm. None if most triangles would be on
-    islands: then they are the scene.
+    Such a piece has as much surface as 7 × 7 voxels, 14 cm across at 2 cm. If most triangles would be on
+    islands, these are the scene, and the mask is False.
     """
     label = pieces(faces, vertices)
     small = (np.bincount(label, minlength=1) < ISLAND)[label]
@@ -32,7 +31,7 @@ def find(faces: NDArray[np.int32], vertices: int) -> NDArray[np.bool_]:
 def find_smaller(
     faces: NDArray[np.int32], vertices: NDArray[np.float32], min_extent: float
 ) -> NDArray[np.bool_]:
-    """Vertices of pieces whose box is less than `min_extent` metres across its corners: (n,)."""
+    """Return an (n,) mask of the vertices of pieces whose box has a diagonal below `min_extent` metres."""
     checked_extent(min_extent)
     label = pieces(faces, len(vertices))
     order = np.argsort(label, kind="stable")
@@ -46,26 +45,27 @@ def find_smaller(
 
 
 def checked_extent(min_extent: float) -> float:
-    """Least extent of pieces; raises InvalidConfig for an impossible one."""
+    """Return the least extent of pieces; raise InvalidConfig for an impossible one."""
     if not 0 <= min_extent < np.inf:
         raise InvalidConfig(f"the least extent of a piece must be 0 metres or more, got {min_extent}")
     return min_extent
 
 
 def count(faces: NDArray[np.int32], islands: NDArray[np.bool_]) -> int:
-    """Number of pieces with triangles among the vertices that `find` found."""
+    """Return the number of pieces with triangles among the vertices that `find` found."""
     inside = faces[islands[faces[:, 0]]]
     return len(np.unique(pieces(inside, len(islands))[inside[:, 0]]))
 
 
 def pieces(faces: NDArray[np.int32], vertices: int) -> NDArray[np.int32]:
-    """For each of `vertices` vertices, the lowest number of a vertex that triangles connect it with: (n,)."""
+    """Return the lowest vertex number in the connected piece of each of `vertices` vertices: (n,)."""
     a, b = np.concatenate((faces[:, :2], faces[:, 1:])).T
     return linked(a, b, vertices)
 
 
 def linked(a: NDArray[np.int32], b: NDArray[np.int32], count: int) -> NDArray[np.int32]:
-    """For each of `count` items, the lowest number of an item that links a[i]–b[i] connect it with: (n,).
+    """Return the lowest item number in the connected group of each of `count` items; a[i]–b[i] are links:
+    (n,).
 
     Labels go down along every link, and each item jumps to its label's label, until nothing changes.
     """
@@ -83,11 +83,11 @@ def linked(a: NDArray[np.int32], b: NDArray[np.int32], count: int) -> NDArray[np
 
 @dataclass(frozen=True)
 class Islands:
-    """Pieces of parts that are islands.
+    """The islands among the pieces of mesh parts.
 
     Attributes:
-        small: (k,) bool by the numbers that the vertices have.
-        count: of islands in the whole mesh.
+        small: (k,) bool for each piece number of the vertices.
+        count: number of islands in the whole mesh.
     """
 
     small: NDArray[np.bool_]
@@ -98,8 +98,8 @@ def find_in_parts(parts: Iterable[Any], number: NDArray[np.int32], min_extent: f
     """Number the vertices by piece, and find the pieces smaller than `min_extent` metres.
 
     Args:
-        parts: `MeshPart`s, the last of the mesh first.
-        number: (vertices + 1,) to fill, by the vertices' numbers from the end of the mesh.
+        parts: `MeshPart`s, the last part of the mesh first.
+        number: (vertices + 1,) array to fill; its index is the vertex number counted from the mesh's end.
     """
     checked_extent(min_extent)
     done, total = 0, 0
@@ -107,7 +107,7 @@ def find_in_parts(parts: Iterable[Any], number: NDArray[np.int32], min_extent: f
     for part in parts:
         count = len(part.vertices)
         own = done + count - np.arange(count)  # its vertices' numbers
-        ids = np.union1d(part.faces, own)  # ascending: those of parts before come first
+        ids = np.union1d(part.faces, own)  # ascending: vertices of earlier parts come first
         label = pieces(np.searchsorted(ids, part.faces).astype(np.int32), len(ids))
         _, piece = np.unique(label, return_inverse=True)
         piece = piece.astype(np.int32) + np.int32(total)
@@ -130,7 +130,7 @@ def find_in_parts(parts: Iterable[Any], number: NDArray[np.int32], min_extent: f
 
 
 def _boxes(vertices: NDArray[np.float32], piece: NDArray[np.int32], total: int) -> NDArray[np.float32]:
-    """(total, 6): lowest and highest corner of each piece's vertices; inverted for a piece without any."""
+    """Return (total, 6): lowest and highest corner of each piece's vertices; inverted for an empty piece."""
     boxes = np.tile(np.repeat(np.array((np.inf, -np.inf), np.float32), 3), (total, 1))
     order = np.argsort(piece, kind="stable")
     found, first = np.unique(piece[order], return_index=True)
@@ -141,7 +141,7 @@ def _boxes(vertices: NDArray[np.float32], piece: NDArray[np.int32], total: int) 
 
 
 def without(parts: Iterable[Any], number: NDArray[np.int32], islands: Islands) -> Iterator[Any]:
-    """Parts without the islands; `number` becomes the new numbers of the vertices, 0 for a removed one."""
+    """Yield the parts without islands; set `number` to the new vertex numbers, 0 for a removed vertex."""
     done = kept_before = 0
     for part in parts:
         count = len(part.vertices)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A mesh that is too large for memory: it comes in parts, waits on a disk, and is written from there."""
+"""Hold a mesh that is too large for memory in files on the disk, part by part, and save it from there."""
 
 import tempfile
 import weakref
@@ -24,8 +24,10 @@ _FACE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
 
 
 class MeshPart(NamedTuple):
-    """Part of a mesh, as a `Mesh`, but `faces` (m, 3) int32 count vertices from the end of the whole: 1 is
-    the last one. Faces may name vertices of the parts that come behind this one in the mesh."""
+    """A part of a mesh; `faces` (m, 3) int32 number vertices from the whole mesh's end, the last is 1.
+
+    Faces may use vertices of parts that come later in the mesh.
+    """
 
     vertices: NDArray[np.float32]
     faces: NDArray[np.int32]
@@ -34,7 +36,7 @@ class MeshPart(NamedTuple):
 
 
 def joined(parts: list[MeshPart]) -> Mesh:
-    """The whole mesh of its parts, the last of the mesh first."""
+    """Return the whole mesh from its parts, given from the last part of the mesh to the first."""
     nothing = np.zeros((0, 3), np.float32)
     vertices, faces, normals = (
         np.concatenate([part[which] for part in reversed(parts)]) if parts else nothing for which in range(3)
@@ -52,17 +54,17 @@ class MeshParts:
     """A mesh on the disk.
 
     Args:
-        parts: the last of the mesh first.
-        folder: for files without names.
-        held: how the sensors that saw the map were held.
-        known_up: away from the ground; None = it is found.
+        parts: the last part of the mesh first.
+        folder: folder for temporary files without names.
+        held: attitudes of the sensors that saw the map.
+        known_up: direction away from the ground; None = it is found.
 
     Attributes:
-        provenance: what its files say of where it comes from.
-        left_out: number of `islands` and their `triangles`, in a mesh without them.
+        provenance: origin of the mesh, which its files contain.
+        left_out: number of removed `islands` and of their `triangles`.
 
     Raises:
-        OutputError: when the folder's disk has no room.
+        OutputError: the folder's disk has no room.
     """
 
     def __init__(
@@ -71,7 +73,7 @@ class MeshParts:
         self._held, self._known_up, self._folder = held, known_up, folder
         self.provenance: Provenance | None = None
         self.left_out = {"islands": 0, "triangles": 0}
-        self._counts: list[tuple[int, int]] = []  # vertices and faces of each part, as they came
+        self._counts: list[tuple[int, int]] = []  # vertices and faces of each part, in order of arrival
         self._low, self._high = np.full(3, np.inf), np.full(3, -np.inf)
         self._vertex = np.dtype([])
         try:
@@ -104,7 +106,7 @@ class MeshParts:
 
     @cached_property
     def up(self) -> Up | None:
-        """Direction away from the ground, as given or found; None = not known."""
+        """Direction away from the ground, as given or found; None = unknown."""
         if self._known_up is not None:
             return self._known_up
         step, skipped = max(1, self.faces // up_direction.SAMPLE), 0
@@ -117,7 +119,7 @@ class MeshParts:
         return up_direction.find(Mesh(rows["position"], faces, rows["normal"]), self._held)
 
     def without_islands(self, min_extent: float) -> "MeshParts":
-        """Mesh on the disk without pieces smaller than `min_extent` metres, as of a `Mesh`.
+        """Return a mesh on the disk without pieces smaller than `min_extent` metres, as `Mesh` does.
 
         Raises OutputError without room on the folder's disk.
         """
@@ -146,7 +148,7 @@ class MeshParts:
 
     @property
     def figures(self) -> dict[str, Any]:
-        """Figures as of a `Mesh`, without a search for islands."""
+        """The figures of a `Mesh`, without a search for islands."""
         extent = self._high - self._low if self.vertices else np.zeros(3)
         return {
             "vertices": self.vertices,
@@ -158,8 +160,8 @@ class MeshParts:
         }
 
     def save(self, path: Path) -> list[Path]:
-        """Write one PLY, the same as `Mesh.save`, or GLB files of a part each: `NAME-0001.glb` and on.
-        Returns the files.
+        """Write one PLY, the same as `Mesh.save`, or a GLB for each part (`NAME-0001.glb` and on); return the
+        files.
 
         Raises OutputError for another suffix, an empty mesh, or a path that cannot be written.
         """
@@ -174,7 +176,7 @@ class MeshParts:
         meshes = (self._mesh(faces) for faces in self._in_order() if len(faces))
         files = [mesh.save(_tile(path, number)) for number, mesh in enumerate(meshes, 1)]
         number = len(files) + 1
-        while (left := _tile(path, number)).is_file():  # of a larger mesh that was written here before
+        while (left := _tile(path, number)).is_file():  # left by an earlier, larger mesh
             left.unlink()
             number += 1
         return files
@@ -194,7 +196,7 @@ class MeshParts:
         return path
 
     def _header(self) -> bytes:
-        """Header of a PLY of one triangle, with the numbers of this mesh."""
+        """Return the header of a one-triangle PLY, with the counts of this mesh."""
         corners, grey = np.eye(3, dtype=np.float32), np.zeros((3, 3), np.uint8)
         faces = np.arange(3, dtype=np.int32)[None]
         one = Mesh(corners, faces, corners, grey if self._has_color else None, known_up=self.up)
@@ -204,14 +206,14 @@ class MeshParts:
         return head.replace(b"element face 1\n", b"element face %d\n" % self.faces) + end
 
     def _pieces(self, which: int, item_bytes: int) -> Iterator[tuple[int, int]]:
-        """Number of items and offset in the file of each part, in the order of the mesh."""
+        """Yield the number of items and the file offset of each part, in the order of the mesh."""
         offset = sum(counts[which] for counts in self._counts) * item_bytes
         for counts in reversed(self._counts):
             offset -= counts[which] * item_bytes
             yield counts[which], offset
 
     def _in_order(self) -> Iterator[NDArray[np.int32]]:
-        """Faces of each part, in the order of the mesh: numbers of the whole mesh's vertices."""
+        """Yield the faces of each part in the order of the mesh, with vertex numbers of the whole mesh."""
         for count, offset in self._pieces(1, 12):
             from_end = np.frombuffer(_read(self._faces, offset, 12 * count), "<i4").reshape(-1, 3)
             yield np.asarray(self.vertices - from_end, np.int32)
@@ -225,7 +227,7 @@ class MeshParts:
         return replace(mesh, provenance=self.provenance)
 
     def _rows(self, numbers: NDArray[np.int32]) -> NDArray[Any]:
-        """Vertices, as they stand in the file: parts lie there last first."""
+        """Return vertices by number from the file, which stores the mesh's last part first."""
         if not len(numbers):
             return np.empty(0, self._vertex)
         counts = np.array([count for count, _ in reversed(self._counts)])
@@ -244,7 +246,7 @@ def _tile(path: Path, number: int) -> Path:
 
 
 def check(path: Path) -> None:
-    """Raise OutputError for a file that is not written in parts."""
+    """Raise OutputError for a file type that cannot be written in parts."""
     if path.suffix.lower() not in FORMATS:
         raise OutputError(
             f"a mesh that is too large for memory is saved as {' or '.join(FORMATS)}, got {path.name!r}"

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Fewer triangles by collapsing edges in the order of their quadric error (Garland and Heckbert, 1997), by
-the library `fast-simplification`. Borders stay as they are; each vertex gets the mean colour and normal of
-the vertices merged into it. No edge has more than two triangles afterwards."""
+"""Simplify a mesh by collapsing edges in the order of their quadric error (`fast-simplification`).
+
+The method is Garland and Heckbert's (1997). Borders stay unchanged; a merged vertex gets the mean colour and
+normal. No edge has more than two triangles afterwards.
+"""
 
 import dataclasses
 from typing import Any
@@ -13,7 +15,7 @@ from tsfusion.core.errors import InvalidConfig, MissingDependency
 from tsfusion.geometry.mesh_arrays import AnyMesh
 
 _INSTALL = "to simplify a mesh: pip install fast-simplification (or '.[mesh]')"
-_RISE = 5.0  # how fast the allowed error rises when a number of triangles is wanted
+_RISE = 5.0  # growth of the allowed error if a number of triangles is wanted
 _ALLOWED = 1e-9  # the library's first allowed error, squared units: lengths are scaled to it
 _CHUNK = 1 << 18  # vertices whose deviation is measured at once
 
@@ -41,7 +43,7 @@ def simplified(
 
 
 def library() -> Any:
-    """The module `fast_simplification`; raises MissingDependency where it is not installed."""
+    """Return the module `fast_simplification`; raise MissingDependency if it is not installed."""
     try:
         import fast_simplification
     except ImportError as error:
@@ -50,14 +52,14 @@ def library() -> Any:
 
 
 def _reduced(mesh: AnyMesh, ratio: float | None, max_error: float | None) -> AnyMesh:
-    """One part with its border locked."""
+    """Return one part simplified, with its border unchanged."""
     fast_simplification = library()
     points = mesh.vertices.astype(np.float64)
     wanted: dict[str, Any] = {"target_count": 0, "agg": 0.0}
     if max_error is not None:
         points *= _ALLOWED**0.5 / max_error
     elif ratio is not None:
-        # With its border kept a mesh has at least so many; close to it triangles would be torn long
+        # A mesh with its border kept has at least this many triangles; near this number they get long
         least = 2 * len(border_edges(mesh.faces))
         wanted = {"target_count": max(int(ratio * len(mesh.faces)), least), "agg": _RISE}
         if wanted["target_count"] >= len(mesh.faces):
@@ -74,7 +76,7 @@ def _reduced(mesh: AnyMesh, ratio: float | None, max_error: float | None) -> Any
 def _with_means(
     full: AnyMesh, vertices: NDArray[np.float32], faces: NDArray[np.int32], became: NDArray[np.int64]
 ) -> AnyMesh:
-    """Simplified mesh; each vertex with the mean of the vertices that became it."""
+    """Return the simplified mesh; each vertex has the means of the vertices merged into it."""
     used = became >= 0
     count = np.bincount(became[used], minlength=len(vertices))
 
@@ -95,7 +97,7 @@ def _with_means(
 
 
 def _joined(parts: list[AnyMesh], like: AnyMesh) -> AnyMesh:
-    """Seen and guessed triangles as one mesh; vertices at the same place are one again."""
+    """Join seen and guessed triangles to one mesh, and merge vertices at the same position."""
     if len(parts) == 1:
         return parts[0]
     vertices = np.concatenate([part.vertices for part in parts])
@@ -119,11 +121,13 @@ def _joined(parts: list[AnyMesh], like: AnyMesh) -> AnyMesh:
 
 
 def _unfolded(mesh: AnyMesh) -> AnyMesh:
-    """Mesh with at most two triangles at each edge, and none twice. Collapsed edges can fold a surface onto
-    itself. Two triangles with the same corners that face each other both go; at an edge of more than two
-    triangles, each sheet gets vertices of its own (Guéziec et al., 2001)."""
+    """Return the mesh with at most two triangles at each edge, and no triangle twice.
+
+    Collapsed edges can fold a surface onto itself. Two opposite triangles on the same corners are removed. At
+    an edge of more than two, each sheet gets vertices of its own (Guéziec et al., 2001).
+    """
     rising = (mesh.faces < np.roll(mesh.faces, -1, axis=1)).sum(axis=1)
-    facing = np.where(rising == 2, 1, -1)  # whether the corners' order is an even one
+    facing = np.where(rising == 2, 1, -1)  # 1 for an even order of the corners, else −1
     _, group = np.unique(np.sort(mesh.faces, axis=1), axis=0, return_inverse=True)
     group = group.reshape(-1)
     left = np.flatnonzero(facing == np.sign(np.bincount(group, facing))[group])
@@ -160,7 +164,7 @@ def _unfolded(mesh: AnyMesh) -> AnyMesh:
 
 
 def border_edges(faces: NDArray[np.int32]) -> NDArray[np.int32]:
-    """(n, 2) edges of only one triangle."""
+    """Return the (n, 2) edges with only one triangle."""
     edges = np.concatenate((faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]))
     key = edges.min(axis=1).astype(np.int64) << 32 | edges.max(axis=1)
     _, first, count = np.unique(key, return_index=True, return_counts=True)

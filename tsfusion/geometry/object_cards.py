@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Figures and a picture of maps, meshes, keyframes and recordings, for a prompt and a notebook."""
+"""Describe maps, meshes, keyframes and recordings by figures and a picture, for a prompt and a notebook."""
 
 import base64
 from abc import ABC, abstractmethod
@@ -20,11 +20,11 @@ _CELL = "text-align:left;padding:2px 12px 2px 0"
 
 
 class Shown(ABC):
-    """Base of objects that describe themselves in a line, and in a notebook with pictures."""
+    """Base of objects that describe themselves in one line, and with pictures in a notebook."""
 
     @abstractmethod
     def _facts(self) -> dict[str, str]:
-        """Figures by name, each with its unit."""
+        """Return figures by name, each with its unit."""
 
     def _pictures(self) -> list[Picture | None]:
         return []
@@ -46,7 +46,7 @@ class Shown(ABC):
 
 
 class ShownRecording(Shown):
-    """Base of recordings. `name`, `sensor`, `timestamps_ns` and `skipped` are those of a `Dataset`."""
+    """Base of recordings. `name`, `sensor`, `timestamps_ns` and `skipped` are as in a `Dataset`."""
 
     name: str
     sensor: str
@@ -74,14 +74,14 @@ class ShownRecording(Shown):
 
 
 def extent(points: NDArray[np.floating]) -> str:
-    """Size of the box around points (n, 3), metres."""
+    """Return the size of the box around points (n, 3), metres."""
     if not len(points):
         return "empty"
     return " × ".join(f"{side:.2f}" for side in np.ptp(points, axis=0)) + " m"
 
 
 def measured(one: Any) -> list[Picture | None]:
-    """Pictures of a keyframe or frame: its depth, near is bright, and its colours; points from above."""
+    """Return pictures of a keyframe or frame: depth (near is bright) and colours, or points from above."""
     left = getattr(one, "left", None)  # of a stereo pair
     color = one.color if left is None else np.repeat(left[..., None], 3, axis=2)
     if one.points is not None:
@@ -98,12 +98,12 @@ def surface(
     colors: NDArray[np.uint8] | None,
     up: Iterable[float] = (0.0, 0.0, 1.0),
 ) -> Picture | None:
-    """Points of a surface from obliquely above, those that face the viewer; None = no such points.
+    """Return a picture of a surface's points, seen obliquely from above; None if no point faces the viewer.
 
     Args:
         points, normals: (n, 3); None = all face the viewer.
         colors: (n, 3) RGB; None = grey by the light.
-        up: away from the ground.
+        up: direction away from the ground.
     """
     above = np.array(list(up), np.float64)
     side = np.eye(3)[np.argmin(np.abs(above))]
@@ -122,7 +122,7 @@ def surface(
     light = 0.4 + 0.6 * facing[seen] if normals is not None else 0.3 + 0.7 * _share(near)
     shade = light[:, None] * (np.full(3, 255) if colors is None else colors[seen])
     picture = np.full((row.max() + 1, column.max() + 1, 3), 255, np.uint8)
-    order = np.argsort(near, kind="stable")  # of those in one pixel the nearest stays
+    order = np.argsort(near, kind="stable")  # the nearest point of a pixel comes last and stays
     picture[row[order], column[order]] = shade[order]
     zoom = max(1, _SIDE // max(picture.shape[:2]))
     return picture.repeat(zoom, axis=0).repeat(zoom, axis=1)
@@ -134,7 +134,7 @@ def _small(image: NDArray[Any]) -> NDArray[Any]:
 
 
 def _grey(image: NDArray[Any], *, inverse: bool) -> Picture:
-    """Image as grey values; 0 and NaN are black."""
+    """Return an image as grey values; 0 and NaN are black."""
     values = np.nan_to_num(np.asarray(image, np.float64), nan=0.0, posinf=0.0, neginf=0.0)
     there = values > 0
     grey = np.zeros(values.shape)
@@ -144,7 +144,7 @@ def _grey(image: NDArray[Any], *, inverse: bool) -> Picture:
 
 
 def _share(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Values scaled to 0 … 1, between the 2nd and the 98th percentile."""
+    """Return values scaled to 0 … 1, between the 2nd and the 98th percentile."""
     if not len(values):
         return values
     low, high = np.percentile(values, (2, 98))

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Origins of maps whose poses are in a national grid or UTM.
+"""Shift the poses of a recording in a national grid or UTM to an origin near the map.
 
-Voxels and float32 vertices reach some kilometres around zero; eastings and northings are hundreds of
-kilometres away. So the reader of a recording subtracts whole metres from all positions. The name of the map's
-world has them: it goes with each record into the journal, the map and the meshes, and maps of two origins are
-of two worlds.
+Voxels and float32 vertices reach some kilometres around zero, but eastings and northings are hundreds of
+kilometres long. So the reader of a recording subtracts whole metres from all positions. The name of the map's
+world (coordinate frame) contains these metres. Each record carries this name into the journal, the map and
+the meshes, so maps of two origins have two worlds.
 """
 
 import re
@@ -19,22 +19,22 @@ from numpy.typing import NDArray
 from tsfusion.core.errors import InvalidConfig, MissingDependency
 
 AUTO = "auto"
-FAR = 1e4  # metres from zero, beyond which poses that begin there are taken to be in a grid
-_STEP = 1000  # metres: an origin that was found is a multiple of it, so that drives of a place have one
+FAR = 1e4  # metres from zero; a recording that starts farther away is taken to be in a grid
+_STEP = 1000  # metres: found origins are multiples, so that drives through one area share an origin
 FARTHEST = 1e8  # metres from zero; the Earth is smaller
 _CRS = re.compile(r"EPSG:[0-9]{4,6}|[A-Z_]+\[.*", re.DOTALL)
 _WORLD = re.compile(r"(?:EPSG([0-9]{4,6})|origin)((?:_-?[0-9]{1,9}){3})")
 
 
 class System(NamedTuple):
-    crs: str = ""  # its code, such as `EPSG:25832`; empty = nobody said, or it has none
-    metres: tuple[float, float, float] = (1.0, 1.0, 1.0)  # of a unit along x, y and z
+    crs: str = ""  # code such as `EPSG:25832`; empty = not stated, or none exists
+    metres: tuple[float, float, float] = (1.0, 1.0, 1.0)  # metres of one unit along x, y and z
     projection: Any = None  # a `pyproj.CRS`
 
 
 @lru_cache(maxsize=64)
 def system(text: str) -> System:
-    """System of a code or WKT. Raises InvalidConfig for none or degrees, MissingDependency without pyproj."""
+    """Return a system by code or WKT. Raises InvalidConfig (none, degrees) or MissingDependency (pyproj)."""
     if not _CRS.fullmatch(text):
         raise InvalidConfig(f"crs must be EPSG: and a number, such as EPSG:25832, got {text!r}")
     try:
@@ -55,11 +55,11 @@ def system(text: str) -> System:
 
 @dataclass(frozen=True)
 class Origin:
-    """Position of a map's zero in the frame of the poses that a recording came with.
+    """Position of the map's zero in the coordinate frame of a recording's given poses.
 
     Attributes:
-        position: whole metres along the axes of that frame, also where its system counts feet.
-        crs: its coordinate reference system, such as `EPSG:25832`; empty = nobody said.
+        position: whole metres along the axes of that frame, even if its system uses feet.
+        crs: its coordinate reference system, such as `EPSG:25832`; empty = not stated.
 
     Examples:
         >>> origin = Origin((447800, 5411400, 300), "EPSG:25832")
@@ -72,12 +72,12 @@ class Origin:
 
     @property
     def world(self) -> str:
-        """World name of keyframes whose positions count from here."""
+        """Name of the world (coordinate frame) whose positions count from this origin."""
         return "_".join([self.crs.replace(":", "") or "origin", *map(str, self.position)])
 
     @staticmethod
     def of_world(world: str) -> "Origin | None":
-        """Origin in the name of a world; None = the world has none."""
+        """Return the origin in the name of a world, or None without one."""
         found = _WORLD.fullmatch(world)
         if found is None:
             return None
@@ -89,13 +89,13 @@ class Origin:
 
 
 def found(positions: Sequence[NDArray[np.float64]], wanted: object = None, crs: str = "") -> Origin | None:
-    """Origin of a recording; None = its positions stay as they are.
+    """Return the origin of a recording, or None if its positions stay unchanged.
 
     Args:
         positions: (3,) metres each, in the recording's order.
         wanted: `auto` or None = near the first position, if that is farther than `FAR` from zero; `X,Y,Z` or
-            three numbers = that place in whole metres.
-        crs: code of their coordinate reference system.
+            three numbers = this position in whole metres.
+        crs: code of the positions' coordinate reference system.
 
     Raises InvalidConfig for anything else.
     """
@@ -108,7 +108,7 @@ def found(positions: Sequence[NDArray[np.float64]], wanted: object = None, crs: 
 
 
 def world_of(recording: Any) -> str:
-    """Name of the world of a recording's given poses, by its `origin`; empty = it has none."""
+    """Return the world name of a recording's given poses, by its `origin`; empty without an origin."""
     there: Origin | None = getattr(recording, "origin", None)
     return "" if there is None else there.world
 

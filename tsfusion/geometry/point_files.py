@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""Points with normals and colours as PLY, PCD, LAS or LAZ files, in the map's frame; OpenVDB grids.
+"""Write points with normals and colours as PLY, PCD, LAS or LAZ files, and grids as OpenVDB files.
 
-PLY and PCD are binary and hold float32 as it is. LAS and LAZ (laspy) hold integers of `_LAS_STEP` metres,
-normals as extra dimensions, and what is known about the points in a record of their own; the map's origin is
-in their coordinates.
+All are in the map's frame. PLY and PCD are binary and hold float32 unchanged. LAS and LAZ (laspy) hold
+integers of `_LAS_STEP` metres, normals as extra dimensions, and facts about the points in a record of their
+own. Their coordinates include the map's origin.
 
-OpenVDB is format 224, as its `io/File.cc`, `tree/RootNode.h`, `tree/InternalNode.h` and `io/Compression.h`
-write it: a root, nodes of 32³ nodes of 16³ leaves, which are the map's blocks of 8³ voxels. Values that are
-the background are inactive and not stored, and nothing is compressed otherwise. Everything is little-endian.
-The grid's class is `unknown`, no level set: a map's distances end behind each surface, where readers of level
-sets see a second one.
+OpenVDB is format 224, as `io/File.cc`, `tree/RootNode.h`, `tree/InternalNode.h` and `io/Compression.h` write
+it: a root, nodes of 32³ nodes of 16³ leaves; a leaf is a block of 8³ voxels. Voxels with the background value
+are inactive and not stored, and nothing is compressed otherwise. Everything is little-endian. The grid's
+class is `unknown`, not level set: a map's distances end behind each surface, where readers of level sets
+would see a second surface.
 """
 
 import os
@@ -33,13 +33,13 @@ ONLY_POINTS = (".pcd", ".las", ".laz")  # formats that hold no triangles
 _INSTALL = "to write LAS or LAZ: pip install 'laspy[lazrs]' (or '.[mesh]')"
 _LAS_STEP = 1e-5  # metres; int32 then reaches 21 km
 _LAS_FARTHEST = 2**31 * _LAS_STEP
-_RECORD = 4711  # of our own user id
+_RECORD = 4711  # id of the record with facts
 _MAGIC, _FORMAT, _LIBRARY = 0x56444220, 224, (12, 0)
 _ACTIVE_VALUES_ONLY = 2  # COMPRESS_ACTIVE_MASK
 _ALL_OTHERS_ARE_BACKGROUND = b"\0"  # NO_MASK_OR_INACTIVE_VALS
 _GRID = "Tree_float_5_4_3"
 _NO_UUID = b"00000000-0000-0000-0000-000000000000"  # the same map gives the same file
-_LEAVES, _NODES = 16, 32  # a side of a node of leaves, and of a node of those
+_LEAVES, _NODES = 16, 32  # leaves along a node's side; such nodes along a larger node's side
 Parts = Iterable[tuple[NDArray[np.int32], NDArray[np.float32]]]
 
 
@@ -58,8 +58,8 @@ def save(
         points: (n, 3) float32, metres.
         normals: (n, 3) float32.
         colors: (n, 3) uint8 RGB.
-        facts: what the file says about them, by name.
-        origin: of the map; LAS and LAZ have the system, units and coordinates that its poses came with.
+        facts: text that the file contains about the points, by name.
+        origin: origin of the map; LAS and LAZ use the system, units and coordinates of the given poses.
 
     Raises:
         OutputError: for another suffix, no points, or a path that cannot be written.
@@ -109,7 +109,7 @@ def _write_ply(file: BinaryIO, rows: NDArray[Any], facts: dict[str, str]) -> Non
 
 
 def _write_pcd(file: BinaryIO, rows: NDArray[Any], facts: dict[str, str]) -> None:
-    """PCD 0.7, as the Point Cloud Library describes it; colour as the bits of one float."""
+    """Write PCD 0.7 of the Point Cloud Library; a colour is packed into the bits of one float."""
     kinds: list[Any] = [("point", "<f4", 3)]
     names = ["x", "y", "z"]
     if "normal" in (rows.dtype.names or ()):
@@ -170,7 +170,7 @@ def _write_las(
 
 
 def order_of(blocks: NDArray[np.int32]) -> NDArray[np.int64]:
-    """Indices that put (n, 3) blocks into the order of their leaves in a file."""
+    """Return the indices that sort (n, 3) blocks into the order of their leaves in a file."""
     node, root = blocks // _LEAVES, blocks // (_LEAVES * _NODES)
     columns = [*blocks.T[::-1], *node.T[::-1], *root.T[::-1]]
     found: NDArray[np.int64] = np.lexsort(columns)
@@ -178,15 +178,15 @@ def order_of(blocks: NDArray[np.int32]) -> NDArray[np.int64]:
 
 
 def write(path: Path, parts: Parts, *, name: str, voxel_size: float, background: float) -> None:
-    """Write a grid; complete or not at all, in memory for one part and 80 bytes a block.
+    """Write a grid, complete or not at all; needs memory for one part and 80 bytes a block.
 
     Args:
         parts: blocks (n, 3) int32 in the order of `order_of`, and their values (n, 8, 8, 8) float32.
-        name: of the grid, such as `tsdf`.
-        background: value of every voxel that is not in `parts`, metres.
+        name: name of the grid, such as `tsdf`.
+        background: value of every voxel outside `parts`, metres.
 
     Raises:
-        OutputError: when there is no block, or the file cannot be written.
+        OutputError: there is no block, or the file cannot be written.
     """
     try:
         with tempfile.TemporaryFile(dir=path.parent) as buffers:
@@ -204,7 +204,7 @@ def write(path: Path, parts: Parts, *, name: str, voxel_size: float, background:
 
 
 def _write_leaves(file: BinaryIO, values: NDArray[np.float32], background: float) -> NDArray[np.uint8]:
-    """Write the values of leaves. Returns their masks (n, 64) of active voxels."""
+    """Write the values of leaves; return their masks (n, 64) of active voxels."""
     flat = np.ascontiguousarray(values.reshape(len(values), 512), "<f4")
     active = flat != np.float32(background)
     masks = np.packbits(active, axis=1, bitorder="little")
@@ -216,7 +216,7 @@ def _write_leaves(file: BinaryIO, values: NDArray[np.float32], background: float
 
 
 def _write_file(file: BinaryIO, name: str, grid: bytes, buffers: BinaryIO) -> None:
-    """Write a file of one grid from `grid`, all before its leaves' values, and these."""
+    """Write a file of one grid: `grid` holds all bytes before the leaves' values, `buffers` the values."""
     file.write(struct.pack("<qIII?", _MAGIC, _FORMAT, *_LIBRARY, True) + _NO_UUID)
     file.write(_metadata({"creator": "tsfusion"}) + struct.pack("<I", 1))
     file.write(_text(name) + _text(_GRID) + _text(""))
@@ -237,7 +237,7 @@ def _metadata(entries: dict[str, str]) -> bytes:
 
 
 def _transform(voxel_size: float) -> bytes:
-    """Index to metres: a voxel's whole numbers are its centre."""
+    """Return the transform from index to metres: whole numbers are the centres of voxels."""
     rows = (voxel_size / 2, voxel_size, voxel_size, 1 / voxel_size, voxel_size**-2, 0.5 / voxel_size)
     numbers = np.repeat(np.array(rows, "<f8"), 3)
     return _text("UniformScaleTranslateMap") + numbers.tobytes()
@@ -261,7 +261,7 @@ def _topology(blocks: NDArray[np.int32], masks: NDArray[np.uint8]) -> bytes:
 
 
 def _node(children: NDArray[np.int32], side: int) -> bytes:
-    """Node with these (n, 3) children: their mask, and an empty mask of its own active values."""
+    """Return a node with these (n, 3) children: their mask, and an empty mask of its own active values."""
     has_child = np.zeros(side**3, bool)
     has_child[np.ravel_multi_index(tuple(children.T), (side,) * 3)] = True
     return (

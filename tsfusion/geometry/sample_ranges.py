@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Ranges of a keyframe's samples, and advice about ranges that a sensor could not have measured."""
+"""Compute the ranges of a keyframe's samples, and advise about impossible ranges."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +13,7 @@ NEAREST_M, FARTHEST_M = 0.01, 100.0
 
 
 def sample_ranges(keyframe: Keyframe) -> NDArray[np.float64]:
-    """(n,) metres of the samples with a return: depth along the optical axis; for points, the ray's
-    length."""
+    """Return (n,) metres of the samples with a return: depth along the axis, or a ray's length."""
     measured = keyframe.measurement
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         if keyframe.points is not None:
@@ -31,9 +30,9 @@ def sample_ranges(keyframe: Keyframe) -> NDArray[np.float64]:
 
 
 def wrong_unit(keyframe: Keyframe) -> str:
-    """Advice about depth in a wrong unit, for a person; empty = it may be in metres.
+    """Return advice about depth in a wrong unit, for a person; empty if it may be in metres.
 
-    The median decides: in metres, no sensor would measure so near or so far.
+    The median decides: no sensor measures so near or so far in metres.
     """
     ranges = sample_ranges(keyframe)
     if not len(ranges):
@@ -54,11 +53,11 @@ def wrong_unit(keyframe: Keyframe) -> str:
 
 
 def why_no_samples(keyframe: Keyframe, min_range: float, max_range: float, reach: float) -> str:
-    """Reason why a map can use none of a keyframe's samples, and its cure, for a person.
+    """Return the reason why a map can use none of a keyframe's samples, and the cure, for a person.
 
     Args:
         min_range, max_range: of the sensor's model, metres.
-        reach: of the map from its origin along each axis, metres.
+        reach: reach of the map from its origin along each axis, metres.
     """
     ranges = sample_ranges(keyframe)
     count = int(np.prod(keyframe.shape))

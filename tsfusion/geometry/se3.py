@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Rigid transforms SE(3) as 4×4 matrices and as twists (ρ, φ), one or many at once.
+"""Compute with rigid transforms SE(3) as 4×4 matrices and as twists (ρ, φ), one or many at once.
 
 A twist is 6 float64 numbers: translation ρ (metres), then rotation φ (radians). Conventions and equation
-numbers are those of Barfoot, "State Estimation for Robotics" (2017), ch. 7: `exp(twist)` multiplies from the
-left for a step in the world's axes, from the right for one in the camera's. Leading dimensions are batches:
-every function takes `(…, 4, 4)` or `(…, 6)` and keeps the `…`.
+numbers are those of Barfoot, "State Estimation for Robotics" (2017), ch. 7. A factor `exp(twist)` on the left
+is a step in the world's axes, on the right a step in the camera's axes. Leading dimensions are batches: every
+function takes `(…, 4, 4)` or `(…, 6)` and keeps the `…`.
 """
 
 import numpy as np
@@ -22,13 +22,13 @@ _SERIES = 0.02  # radians below which the Jacobian's series are better than its 
 
 
 def hat(v: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Matrix of the cross product with `v`: (…, 3) → (…, 3, 3)."""
+    """Return the matrix of the cross product with `v`: (…, 3) → (…, 3, 3)."""
     W: NDArray[np.float64] = v @ _HAT
     return W.reshape(*v.shape, 3)
 
 
 def exp(twist: NDArray[np.floating]) -> Transform:
-    """Transform of a twist: (…, 6) → (…, 4, 4) (eq. 7.33)."""
+    """Return the transform of a twist: (…, 6) → (…, 4, 4) (eq. 7.33)."""
     phi = twist[..., 3:]
     angle = _length(phi)[..., None, None]
     a, b = np.sin(angle) / angle, 2 * (np.sin(angle / 2) / angle) ** 2
@@ -42,21 +42,21 @@ def exp(twist: NDArray[np.floating]) -> Transform:
 
 
 def log(T: Transform) -> Twist:
-    """Twist of a transform, with a rotation of at most π: (…, 4, 4) → (…, 6)."""
+    """Return the twist of a transform, with a rotation of at most π: (…, 4, 4) → (…, 6)."""
     phi = rotation_vector(T[..., :3, :3])
     rho = (_left_jacobian_inverse(phi) @ T[..., :3, 3, None])[..., 0]
     return np.concatenate([rho, phi], axis=-1)
 
 
 def rotation_vector(R: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The axis of a rotation times its angle, at most π: (…, 3, 3) → (…, 3)."""
+    """Return a rotation's axis times its angle, at most π: (…, 3, 3) → (…, 3)."""
     axis: NDArray[np.float64] = R.reshape(*R.shape[:-2], 9) @ _HAT.T  # times 2 sin(angle)
     sine = _length(axis) / 2
     cosine = (R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2] - 1) / 2
     angle = np.arctan2(sine, cosine)
     phi: NDArray[np.float64] = axis * (angle / (2 * sine))[..., None]
     obtuse = cosine < 0
-    if obtuse.any():  # towards π that axis vanishes; R's symmetric part gives it, but for its sign
+    if obtuse.any():  # near π this axis vanishes; R's symmetric part gives the axis without sign
         far, c = R[obtuse], cosine[obtuse][:, None, None]
         squares = (far + far.swapaxes(1, 2)) / 2 - c * _EYE  # (1 - cos) times axis axisᵀ
         longest = squares[np.arange(len(far)), squares.diagonal(axis1=1, axis2=2).argmax(axis=1)]
@@ -73,7 +73,7 @@ def transform(R: ArrayLike, t: ArrayLike) -> Transform:
 
 
 def inverse(T: Transform) -> Transform:
-    """Inverse of a rigid transform: (…, 4, 4)."""
+    """Return the inverse of a rigid transform: (…, 4, 4)."""
     result = _identity(T.shape[:-2])
     R = T[..., :3, :3].swapaxes(-1, -2)
     result[..., :3, :3] = R
@@ -82,7 +82,7 @@ def inverse(T: Transform) -> Transform:
 
 
 def adjoint(T: Transform) -> Matrix6:
-    """The matrix with `T exp(x) T⁻¹ = exp(adjoint(T) x)`: (…, 4, 4) → (…, 6, 6)."""
+    """Return the matrix with `T exp(x) T⁻¹ = exp(adjoint(T) x)`: (…, 4, 4) → (…, 6, 6)."""
     R = T[..., :3, :3]
     A = np.zeros((*T.shape[:-2], 6, 6))
     A[..., :3, :3] = A[..., 3:, 3:] = R
@@ -91,7 +91,7 @@ def adjoint(T: Transform) -> Matrix6:
 
 
 def right_jacobian_inverse(twist: Twist) -> Matrix6:
-    """The matrix J with `log(exp(x) exp(d)) ≈ x + J d`: (…, 6) → (…, 6, 6) (eq. 7.94 of −x)."""
+    """Return the matrix J with `log(exp(x) exp(d)) ≈ x + J d`: (…, 6) → (…, 6, 6) (eq. 7.94 of −x)."""
     rho, phi = -twist[..., :3], -twist[..., 3:]
     P, W, J = hat(rho), hat(phi), _left_jacobian_inverse(phi)
     c, d, e = _jacobian_coefficients(_length(phi)[..., None, None])
@@ -104,23 +104,23 @@ def right_jacobian_inverse(twist: Twist) -> Matrix6:
 
 
 def apply(T: Transform, points: NDArray[np.floating]) -> NDArray[np.float64]:
-    """(n, 3) points moved by one (4, 4) transform."""
+    """Move (n, 3) points by one (4, 4) transform."""
     moved: NDArray[np.float64] = points @ T[:3, :3].T + T[:3, 3]
     return moved
 
 
 def angle(T: Transform) -> float:
-    """The angle of one transform's rotation, 0 to π radians."""
+    """Return the angle of one transform's rotation, 0 to π radians."""
     return float(np.linalg.norm(rotation_vector(T[:3, :3])))
 
 
 def distance(T: Transform) -> float:
-    """The length of one transform's translation, metres."""
+    """Return the length of one transform's translation, metres."""
     return float(np.linalg.norm(T[:3, 3]))
 
 
 def nearest(T: Transform) -> Transform:
-    """The rigid transform nearest to one (4, 4) matrix that has drifted by rounding."""
+    """Return the rigid transform nearest to one (4, 4) matrix with rounding errors."""
     U, _, Vt = np.linalg.svd(T[:3, :3])
     result = np.eye(4)
     result[:3, :3] = U @ np.diag([1.0, 1.0, float(np.linalg.det(U @ Vt))]) @ Vt
@@ -141,14 +141,14 @@ def _length(v: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def _left_jacobian_inverse(phi: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(…, 3, 3) inverses of the left Jacobians of rotations (eq. 7.37)."""
+    """Return the (…, 3, 3) inverses of the left Jacobians of rotations (eq. 7.37)."""
     angle = _length(phi)[..., None, None]
     W = hat(phi)
     return _EYE - W / 2 + (1 - angle / 2 / np.tan(angle / 2)) / angle**2 * (W @ W)
 
 
 def _jacobian_coefficients(angle: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """The factors of the three terms of Q (eq. 7.86) for angles (…, 1, 1)."""
+    """Return the factors of the three terms of Q (eq. 7.86) for angles (…, 1, 1)."""
     small, square = angle < _SERIES, angle**2
     x = np.where(small, 1.0, angle)
     exact = (

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Disparity of a rectified stereo pair by semi-global matching (Hirschmüller 2008; OpenCV's 3-way form).
+"""Compute the disparity of a rectified stereo pair by semi-global matching (Hirschmüller 2008).
 
-Settings were chosen on KITTI 06 (agreement of frames over their poses) and Middlebury's Motorcycle
-(ground truth).
+OpenCV's 3-way form does the matching. Settings were chosen on KITTI 06 (agreement of frames) and Middlebury's
+Motorcycle (ground truth).
 """
 
 from dataclasses import dataclass
@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 UNITS = 16  # units of OpenCV's disparity in a pixel
-_SURE_DISPARITY = 2.0  # pixels: less may be an error of the rows, or of the rectification
-_MIN_MATCHED, _MIN_MORE = 0.5, 2.0  # share of the pixels, and times as many as the other way round
+_SURE_DISPARITY = 2.0  # pixels: a smaller value may come from errors of the rectification
+_MIN_MATCHED, _MIN_MORE = 0.5, 2.0  # share of the pixels matched; factor over the match of the given order
 EXCHANGED = "the left and right images are exchanged: they match the other way round; exchange them"
 
 
@@ -22,10 +22,10 @@ EXCHANGED = "the left and right images are exchanged: they match the other way r
 class Matcher:
     """Stereo matcher: `matcher(left, right)` → (H, W) uint16 disparity in 1/16 px; 0 = uncertain.
 
-    OpenCV's 3-way mode ignores `disp12MaxDiff`, so the pair is matched the other way round, too, and compared
-    here: on KITTI 06 this takes disagreements of more than 2 px between frames from 6.0 % to 2.4 %. Half the
-    resolution is enough for that: it takes an eighth of the time, and its errors differ, so that more of them
-    show. Images are widened by the search range before, which keeps the left edge.
+    OpenCV's 3-way mode ignores `disp12MaxDiff`. So this class also matches from right to left and compares:
+    on KITTI 06 this reduces disagreements of more than 2 px between frames from 6.0 % to 2.4 %. Half the
+    resolution is enough for this check: it takes an eighth of the time, and its different errors show more
+    disagreements. Images are first widened by the search range, which keeps the left edge.
     """
 
     # Range of disparities, pixels, a multiple of 16; None = a twelfth of the width, at least 32
@@ -38,7 +38,7 @@ class Matcher:
     def __call__(self, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.uint16]:
         search = self.search or _usual_search(left)
         found = self._match(left, right, search)
-        # Mirrored, the right image is a left one.
+        # In mirrored images, the right camera is on the left.
         one, two = (_halved(np.ascontiguousarray(image[:, ::-1])) for image in (right, left))
         other = self._match(one, two, _multiple_of_16(search / 2))[:, ::-1]
         whole = cv2.resize(2 * other, left.shape[::-1], interpolation=cv2.INTER_NEAREST)
@@ -52,7 +52,7 @@ class Matcher:
 
 
 def quick_disparity(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Match at half the resolution and in one direction: (H, W) float32 pixels of disparity; 0 = none.
+    """Return (H, W) float32 pixels of disparity, matched at half the resolution in one direction; 0 = none.
 
     For tracking: it takes a fifth of `Matcher`'s time, and is less exact at edges.
     """
@@ -67,7 +67,7 @@ def quick_disparity(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArra
 
 
 def exchanged(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> bool:
-    """True if a rectified pair's images are surely each other's: far more pixels match when exchanged."""
+    """Return True if a rectified pair's images are surely swapped: far more pixels match after a swap."""
     as_given, swapped = (
         np.mean(quick_disparity(*pair) > _SURE_DISPARITY) for pair in ((left, right), (right, left))
     )
@@ -75,7 +75,7 @@ def exchanged(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> bool:
 
 
 def _semi_global(search: int, *, block: int = 5, uniqueness: int = 10, **more: int) -> Any:
-    """OpenCV's matcher on four independent bands of the image: threads change nothing."""
+    """Return OpenCV's matcher for four independent bands: the number of threads changes nothing."""
     return cv2.StereoSGBM.create(
         minDisparity=0,
         numDisparities=search,
@@ -111,7 +111,7 @@ def _match(matcher: Any, left: NDArray[np.uint8], right: NDArray[np.uint8], sear
 
 
 def _agree(left: NDArray[np.int16], right: NDArray[np.int16], tolerance: float) -> NDArray[np.bool_]:
-    """Mask (H, W) of pixels whose partner in the right image has the same disparity."""
+    """Return an (H, W) mask of pixels whose partner in the right image has the same disparity."""
     height, width = left.shape
     pixel = np.empty((height, width, 2), np.int16)
     pixel[..., 0] = np.arange(width) - (left + UNITS // 2) // UNITS

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Sweeps: points that a moving sensor measures one after the other, moved to one time."""
+"""Correct sweeps: move points that a moving sensor measures one by one to one common time."""
 
 from typing import NamedTuple
 
@@ -10,18 +10,18 @@ from tsfusion.core.errors import InvalidKeyframe
 from tsfusion.geometry import se3
 from tsfusion.geometry.trajectory import PoseAt
 
-_LOOKED_UP = 32  # poses of a trajectory in the time of a sweep
-_STEPS = 256  # of a motion, between which points move along straight lines
+_LOOKED_UP = 32  # poses read from a trajectory for each duration of a sweep
+_STEPS = 256  # pieces of a motion in which points move along straight lines
 _AT_ONCE = 1 << 16  # points
-_OFF = 0.1  # metres, and radians: of a motion at time 0 from none
+_OFF = 0.1  # metres and radians: largest motion at time 0
 
 
 class Motion(NamedTuple):
-    """Motion of a sensor about its frame's timestamp.
+    """Motion of a sensor around its frame's timestamp.
 
     Attributes:
         times_s: (k,) float64 seconds after the timestamp, rising, k >= 2.
-        poses: (k, 4, 4) float64, of the sensor at these times in its own axes at the timestamp.
+        poses: (k, 4, 4) float64, poses of the sensor at these times, in its own axes at the timestamp.
     """
 
     times_s: NDArray[np.float64]
@@ -29,13 +29,13 @@ class Motion(NamedTuple):
 
 
 def motion_about(at: PoseAt, stamp_ns: int, times_s: NDArray[np.float32] | None) -> Motion | None:
-    """Motion during a sweep by the poses of a trajectory; beyond their end it is extrapolated.
+    """Return the motion during a sweep from the poses of a trajectory; it is extrapolated beyond their end.
 
     Args:
         at: T_world_sensor.
-        times_s: (N,) seconds of the points after the stamp; None = they have none.
+        times_s: (N,) seconds of the points after the stamp; None = points without times.
 
-    Returns None without a pose at the stamp, or with poses around it for less than half of the sweep.
+    Returns None without a pose at the stamp, or if the poses around it span less than half of the sweep.
     """
     if times_s is None:
         return None
@@ -60,26 +60,26 @@ def motion_about(at: PoseAt, stamp_ns: int, times_s: NDArray[np.float32] | None)
 
 
 def steady(twist: NDArray[np.float64], times_s: NDArray[np.floating]) -> Motion:
-    """Motion of a constant twist, (6,) a second, over (N,) times."""
+    """Return the motion of a constant twist, (6,) a second, over (N,) times."""
     times = np.array([min(0.0, times_s.min()), max(1e-9, times_s.max())], np.float64)
     return Motion(times, se3.exp(times[:, None] * twist))
 
 
 def skewed(why: str) -> str:
-    """Notice that the motion within sweeps is left in the points, with the reason."""
+    """Return the notice that the motion within sweeps is not corrected, with the reason."""
     return f"motion within sweeps is not taken out: {why}"
 
 
 def at_stamp(
     points: NDArray[np.floating], times_s: NDArray[np.floating], motion: Motion
 ) -> NDArray[np.float32]:
-    """Points of a sweep, (N, 3) metres, in the sensor's axes at the timestamp.
+    """Return the points of a sweep, (N, 3) metres, in the sensor's axes at the timestamp.
 
     Args:
         points: each in the sensor's axes at its own time.
         times_s: (N,) seconds after the timestamp.
 
-    Raises InvalidKeyframe if the motion does not cover these times, or lacks the timestamp.
+    Raises InvalidKeyframe if the motion does not cover these times, or is not zero at the timestamp.
     """
     rises = len(motion.times_s) > 1 and (np.diff(motion.times_s) > 0).all()
     if not rises or not np.isfinite(motion.times_s).all() or not np.isfinite(motion.poses).all():

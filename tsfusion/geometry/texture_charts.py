@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Charts: pieces of a mesh that lie flat without folding, laid on the pages of a texture by xatlas.
+"""Split a mesh into charts, pieces that lie flat without folds, and pack them into texture images (xatlas).
 
 Every triangle is projected along the one of six directions that it faces most: both ways along the three
-perpendicular axes that most of the surface follows, as walls and floors do. Neighbours of one direction are
-one chart. Tens of thousands of small triangles take a second; a general unwrapper fits a plane to each piece
-for a minute, and leaves thousands of pieces.
+perpendicular axes that most of the surface follows, as walls and floors do. Neighbours of one direction form
+one chart. Tens of thousands of small triangles take a second; a general unwrapper takes a minute and leaves
+thousands.
 """
 
 from importlib.util import find_spec
@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from tsfusion.core.errors import MissingDependency
 from tsfusion.geometry import mesh_islands
 
-_DIRECTIONS = 600  # tried for the main one
-_TURNS = 90  # tried for the others, a degree each
-_NORMALS = 20_000  # at most, of which the directions are found
-_STEEPEST = 0.2  # cosine between a triangle and the direction that it is seen along, at least
+_DIRECTIONS = 600  # directions tried for the main axis
+_TURNS = 90  # angles tried for the other axes, one degree each
+_NORMALS = 20_000  # largest number of normals used to find the axes
+_STEEPEST = 0.2  # least cosine between a triangle's normal and its direction
 _NEVER = 9.0  # cost of a direction that is too steep
-_SMOOTHNESS = 0.35  # cost of a neighbour that is seen along another direction
+_SMOOTHNESS = 0.35  # cost of a neighbour with another direction
 _SWEEPS = 30
 GUARD = 2  # texels around each chart that repeat its border
 _NOWHERE = 0xFFFFFFFF
@@ -31,8 +31,8 @@ class Charts(NamedTuple):
     """Pieces of a mesh of m faces.
 
     Attributes:
-        number: (m,) int32, of each face's chart.
-        corners: (m, 3, 2) float64, metres: the faces as their charts see them.
+        number: (m,) int32, the chart of each face.
+        corners: (m, 3, 2) float64, metres: each face projected into its chart.
     """
 
     number: NDArray[np.int32]
@@ -40,7 +40,7 @@ class Charts(NamedTuple):
 
 
 def find(vertices: NDArray[np.float32], faces: NDArray[np.int32], normals: NDArray[np.float32]) -> Charts:
-    """Charts of a mesh, as few as smoothing makes them; the same mesh has the same ones."""
+    """Find the charts of a mesh, as few as smoothing makes them; the same mesh gives the same charts."""
     corners = vertices.astype(np.float64)[faces]
     flat = _unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     smooth = _unit(normals.astype(np.float64)[faces].sum(axis=1))
@@ -52,7 +52,7 @@ def find(vertices: NDArray[np.float32], faces: NDArray[np.int32], normals: NDArr
 
 
 def split(charts: Charts, faces: NDArray[np.int32], vertices: int, covered: NDArray[np.bool_]) -> Charts:
-    """Charts in which `faces`, which lie below others of their chart, are charts of their own."""
+    """Return charts with own charts for the `covered` faces, which lie below others of their chart."""
     label = 2 * charts.number.astype(np.int64) + covered
     return charts._replace(number=connected(label, _neighbours(faces, vertices)))
 
@@ -65,7 +65,7 @@ def connected(label: NDArray[np.integer], pairs: NDArray[np.int32]) -> NDArray[n
 
 
 def _neighbours(faces: NDArray[np.int32], vertices: int) -> NDArray[np.int32]:
-    """(k, 2) int32 faces that share an edge."""
+    """Return (k, 2) int32 pairs of faces that share an edge."""
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
     key = edges[:, 0].astype(np.int64) * vertices + edges[:, 1]
     order = np.argsort(key, kind="stable")
@@ -75,7 +75,7 @@ def _neighbours(faces: NDArray[np.int32], vertices: int) -> NDArray[np.int32]:
 
 
 def _main_axes(normals: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(6, 3) unit vectors: the direction most normals follow, its opposite, and those across it."""
+    """Return (6, 3) unit vectors: the direction of most normals, its opposite, and the two axes across it."""
     some = normals[:: max(1, len(normals) // _NORMALS)]
     step = np.arange(_DIRECTIONS) + 0.5  # a spiral of even steps over the sphere
     height, turn = 1 - 2 * step / _DIRECTIONS, np.pi * (1 + 5**0.5) * step
@@ -96,12 +96,12 @@ def _main_axes(normals: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _followed(normals: NDArray[np.float64], directions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Share of the normals near each direction or its opposite."""
+    """Return how many normals are near each direction or its opposite, weighted by nearness."""
     return np.asarray(np.maximum(np.abs(normals @ directions.T) - 0.9, 0).sum(axis=0))
 
 
 def _plane(axis: NDArray[np.float64], hint: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(2, 3): right and up in a view against an axis."""
+    """Return (2, 3): right and up in a view against an axis."""
     first = _unit(hint - axis * (axis @ hint))
     return np.stack([first, np.cross(axis, first)])
 
@@ -109,7 +109,7 @@ def _plane(axis: NDArray[np.float64], hint: NDArray[np.float64]) -> NDArray[np.f
 def _labels(
     flat: NDArray[np.float64], smooth: NDArray[np.float64], pairs: NDArray[np.int32]
 ) -> NDArray[np.intp]:
-    """Direction of each face: (m,), by the cosines (m, 6) with its plane and with its normals.
+    """Return the direction of each face, (m,), from the cosines (m, 6) with its plane and with its normals.
 
     Iterated conditional modes (Besag 1986), half of the faces at a time.
     """
@@ -132,12 +132,12 @@ def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 class ChartPlacement(NamedTuple):
-    """Places of m faces on pages.
+    """Positions of m faces in texture images (pages).
 
     Attributes:
-        corners: (m, 3, 2) float32, x and y in texels of the face's page; y goes down.
-        page: (m,) int32.
-        sizes: height and width of each page.
+        corners: (m, 3, 2) float32, x and y in texels of the face's image; y goes down.
+        page: (m,) int32, the image of each face.
+        sizes: height and width of each image.
     """
 
     corners: NDArray[np.float32]
@@ -146,7 +146,7 @@ class ChartPlacement(NamedTuple):
 
 
 def check_installed() -> None:
-    """Raise MissingDependency without xatlas, before the work that needs it at the end."""
+    """Raise MissingDependency without xatlas, before long work that needs it at the end."""
     if find_spec("xatlas") is None:
         raise MissingDependency(
             "a texture needs xatlas, which is not installed (pip install xatlas, or '.[texture]')"
@@ -154,7 +154,7 @@ def check_installed() -> None:
 
 
 def pack(charts: Charts, faces: NDArray[np.int32], *, texel: float, side: int) -> ChartPlacement:
-    """Lay charts out on pages of at most `side` texels of `texel` metres a side; larger charts shrink.
+    """Pack charts into images of at most `side`² texels of `texel` metres; too large charts shrink.
 
     Raises MissingDependency without xatlas.
     """
@@ -178,7 +178,7 @@ def pack(charts: Charts, faces: NDArray[np.int32], *, texel: float, side: int) -
     _, triangles, uv = atlas.get_mesh(0)
     page = np.asarray(atlas.get_mesh_vertex_assignment(0)[0])[triangles]  # (m, 3)
     corners = np.asarray(uv * np.array([atlas.width, atlas.height]), np.float32)[triangles]
-    # Triangles without area have no place of their own: they shrink to the one of a corner.
+    # Triangles without area are not packed: they shrink to the position of a corner.
     placed = page != _NOWHERE
     one = placed.argmax(axis=1)
     rows = np.arange(len(faces))
@@ -187,7 +187,7 @@ def pack(charts: Charts, faces: NDArray[np.int32], *, texel: float, side: int) -
 
 
 def _cropped(corners: NDArray[np.float32], page: NDArray[np.int32], side: int) -> ChartPlacement:
-    """Pages cropped to their charts, up to a side."""
+    """Crop each image to its charts, at most `side` texels a side."""
     sizes = []
     for number in range(int(page.max()) + 1):
         of_page = corners[page == number].reshape(-1, 2)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Meshes with a texture, and their files."""
+"""Hold meshes with a texture, and write their files."""
 
 import dataclasses
 import os
@@ -21,13 +21,13 @@ _WHITE, _BLACK = np.array([[255] * 4, [0, 0, 0, 255]], np.uint8)
 
 @dataclass(frozen=True, eq=False)
 class Texture:
-    """Pictures of a mesh's surface.
+    """Images of a mesh's surface.
 
     Attributes:
-        corners: (m, 3, 2) float32, where each face's corners lie on its page: from 0 to 1 to the right and
-            down (as glTF has it).
-        page: (m,) int32, of each face.
-        pages: (H, W, 3) uint8 RGB (sRGB).
+        corners: (m, 3, 2) float32, position of each face's corners in its image: 0 to 1 to the right and down
+            (as in glTF).
+        page: (m,) int32, the image of each face.
+        pages: the images, (H, W, 3) uint8 RGB (sRGB).
     """
 
     corners: NDArray[np.float32]
@@ -35,7 +35,7 @@ class Texture:
     pages: list[NDArray[np.uint8]]
 
     def of_faces(self, kept: NDArray[np.bool_] | NDArray[np.integer]) -> "Texture":
-        """Texture of some faces, a (m,) bool or numbers, on the same pages."""
+        """Return the texture of some faces, a (m,) bool or numbers, on the same images."""
         return dataclasses.replace(self, corners=self.corners[kept], page=self.page[kept])
 
 
@@ -44,8 +44,8 @@ class TexturedMesh(Mesh):
     """A mesh whose surface shows the images of the cameras.
 
     Attributes:
-        texture: its pictures. `colors` are theirs at the vertices: the colours in a PLY file.
-        seen: share of the surface that an image shows; the rest has the map's colours.
+        texture: its images. `colors` are their colours at the vertices, for PLY files.
+        seen: share of the surface that a camera image shows; the rest has the map's colours.
     """
 
     texture: Texture = field(kw_only=True)
@@ -54,8 +54,8 @@ class TexturedMesh(Mesh):
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write as `Mesh.save` does, GLB and OBJ with the texture.
 
-        A GLB holds its pictures; beside an OBJ lie `NAME.mtl` and `NAME-0.png`. Other files have the colours
-        at the vertices. Raises as `Mesh.save`.
+        A GLB contains its images; an OBJ has `NAME.mtl` and `NAME-0.png` beside it. Other files have the
+        colours at the vertices. Raises as `Mesh.save`.
         """
         path = Path(path)
         if path.suffix.lower() not in TEXTURED or not len(self.faces):
@@ -77,8 +77,7 @@ class TexturedMesh(Mesh):
         return mesh_encoding.glb_of(self._scene("page"), self)
 
     def sample(self, face: NDArray[np.integer], weight: NDArray[np.floating]) -> NDArray[np.float32]:
-        """(n, 3) float32 RGB, 0 to 255, of the texture at points on `face` (n,) with barycentric `weight` (n,
-        3)."""
+        """Return (n, 3) float32 RGB, 0 to 255, at points on `face` (n,) with barycentric `weight` (n, 3)."""
         found = np.empty((len(face), 3), np.float32)
         at = (np.asarray(weight, np.float32)[..., None] * self.texture.corners[face]).sum(axis=1)
         for number, page in enumerate(self.texture.pages):
@@ -95,7 +94,7 @@ class TexturedMesh(Mesh):
 
     @property
     def figures(self) -> dict[str, Any]:
-        """Figures as of a mesh, with the texture's pages and the share of the surface that an image shows."""
+        """The figures of a mesh, with the texture's sizes and the share of the surface in images."""
         texture = {
             "pages": [list(page.shape[1::-1]) for page in self.texture.pages],
             "seen": round(self.seen, 4),
@@ -107,9 +106,9 @@ class TexturedMesh(Mesh):
         return dataclasses.replace(self, **fields_of(part), texture=self.texture.of_faces(kept))
 
     def page_mesh(self, page: int, *, name: str = "page") -> Any:
-        """Faces of a page as a `trimesh.Trimesh` with texture; vertices on a seam are doubled.
+        """Return the faces of one image as a `trimesh.Trimesh` with texture; vertices on a seam are doubled.
 
-        `name`: of its material, before the page's number.
+        `name`: the material's name before the image's number.
         """
         with process.uninterrupted():  # trimesh ignores exceptions while it is imported
             import trimesh
@@ -161,8 +160,7 @@ class TexturedMesh(Mesh):
 def barycentric(
     ray: NDArray[np.float64], a: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """(n, 3) weights of corners (n, 3) where rays from the origin meet their triangles' planes, kept inside
-    the triangles (Möller and Trumbore 1997)."""
+    """Return (n, 3) clipped weights where rays from the origin meet triangles (Möller, Trumbore 1997)."""
     across = (np.cross(b, c), np.cross(c, a), np.cross(a, b))
     weight = np.stack([(ray * normal).sum(axis=1) for normal in across], axis=1)
     total = weight.sum(axis=1, keepdims=True)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Poses over time, interpolated, and rotations as quaternions."""
+"""Interpolate poses over time, and convert rotations to and from quaternions."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from tsfusion.geometry.se3 import Transform, transform
 
 PoseAt = Callable[[int], Transform | None]  # (4, 4) at a time in nanoseconds; None = not known
-_EXACT_NS = 1_000_000  # nanoseconds within which a pose is taken as it is
+_EXACT_NS = 1_000_000  # nanoseconds; a pose this near is used without interpolation
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,7 +19,7 @@ class Trajectory:
 
     Attributes:
         timestamps_ns: (n,) int64, strictly increasing.
-        translations: (n, 3) float64, metres; NaN = the pose is not known.
+        translations: (n, 3) float64, metres; NaN = unknown pose.
         quaternions: (n, 4) float64, x y z w, unit length, or NaN.
     """
 
@@ -29,14 +29,14 @@ class Trajectory:
 
     @classmethod
     def of(cls, timestamps_ns: NDArray[np.int64], poses: NDArray[np.float64]) -> "Trajectory":
-        """Make one of (n, 4, 4) poses, NaN where they are not known."""
+        """Make a trajectory from (n, 4, 4) poses; NaN = unknown pose."""
         return cls(timestamps_ns, poses[:, :3, 3], np.array([quaternion(T[:3, :3]) for T in poses]))
 
     def at(self, timestamp_ns: int, *, max_gap_ns: int) -> Transform | None:
-        """Interpolate the pose at a time: SLERP and linear between the neighbours, never beyond the ends.
+        """Interpolate the pose at a time between its neighbours (SLERP and linear), never beyond the ends.
 
-        None when the neighbours are more than `max_gap_ns` apart, unless one is within a millisecond, or when
-        one of them is not known.
+        Return None if the neighbours are more than `max_gap_ns` apart and none is within a millisecond, or if
+        a neighbour is unknown.
         """
         stamps = self.timestamps_ns
         right = int(np.searchsorted(stamps, timestamp_ns))
@@ -69,7 +69,7 @@ def _known(quaternion: NDArray[np.float64], translation: NDArray[np.float64]) ->
 
 
 def slerp(q0: NDArray[np.float64], q1: NDArray[np.float64], share: float) -> NDArray[np.float64]:
-    """Interpolate between unit quaternions, `share` of the short way from `q0` to `q1` (SLERP)."""
+    """Interpolate between unit quaternions: `share` of the shorter way from `q0` to `q1` (SLERP)."""
     cosine = float(q0 @ q1)
     if cosine < 0:
         q1, cosine = -q1, -cosine
@@ -83,7 +83,7 @@ def slerp(q0: NDArray[np.float64], q1: NDArray[np.float64], share: float) -> NDA
 
 
 def rigid(quaternion: NDArray[np.float64], translation: NDArray[np.float64]) -> Transform:
-    """Make a (4, 4) transform of a unit quaternion (x y z w) and a translation."""
+    """Make a (4, 4) transform from a unit quaternion (x y z w) and a translation."""
     x, y, z, w = quaternion
     R = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],

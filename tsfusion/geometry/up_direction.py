@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Up direction of a map: as given, by an accelerometer, by the floor, or by how cameras are held."""
+"""Find the up direction of a map: given, by an accelerometer, by the floor, or by the cameras' attitudes."""
 
 import math
 from collections.abc import Sequence
@@ -13,20 +13,20 @@ from tsfusion.core.errors import InvalidConfig
 from tsfusion.geometry import se3
 
 GRAVITY = 9.81  # m/s²
-# Of the mean of how a sensor was held, in which the floor's normal is looked for. A wall is 90° from a floor:
-# beyond half of that it would be taken for one.
+# Largest angle between the floor's normal and the sensors' mean up vector. A wall is 90° from a floor:
+# beyond 45° a wall could be taken for the floor.
 _CONE = math.cos(math.radians(45))
-_LEVEL = math.cos(math.radians(8))  # of a direction, in which a normal is one of a plane across it
+_LEVEL = math.cos(math.radians(8))  # largest angle between a plane's normal and a triangle's normal
 SAMPLE = 50_000  # triangles looked at
-_UPRIGHT = 0.5  # least length of the mean of the cameras' unit up vectors: less, and they were turned about
-_LEAST = 0.02  # share of the surface that a floor has at least
-_LARGE = 0.2  # share of the largest level plane that a floor has at least: what mirrors show is less
-_APART = math.cos(math.radians(30))  # of two directions that are not the same
-_SURE = 3.0  # how many times more surface faces up than any other way, where no camera is known
-_GRAIN = 2.0**-20  # of the sums of poses, metres or none: they are exact in any order
+_UPRIGHT = 0.5  # least length of the cameras' mean unit up vector; less: cameras were held in all ways
+_LEAST = 0.02  # least share of the surface in a floor
+_LARGE = 0.2  # least size of a floor, as a share of the largest level plane; mirrored floors are smaller
+_APART = math.cos(math.radians(30))  # least angle between two different directions
+_SURE = 3.0  # least ratio of the surface that faces up to that of any other way, without known cameras
+_GRAIN = 2.0**-20  # step to which summed numbers are rounded: their sums are exact in any order
 _USUAL = np.array(((0.0, 0, 1), (0, -1, 0), (0, 1, 0)))  # robots' and surveyors' up, that of a camera, glTF's
 _SHORT = 0.1  # relative difference of a mean specific force from gravity
-_FITS = 3  # of a plane, each to what the one before has found
+_FITS = 3  # successive fits of a plane
 _AXES = ("x", "y", "z")
 
 
@@ -54,7 +54,7 @@ class Up(msgspec.Struct, frozen=True):
         return ("-" if self.direction[index] < 0 else "+") + _AXES[index]
 
     def to_y(self) -> NDArray[np.float64]:
-        """(3, 3) rotation that takes up to +y by the shortest way, or half around x and on from there."""
+        """Return the (3, 3) shortest rotation of up to +y, after half a turn around x if up[1] < 0."""
         up = np.array(self.direction)
         half = np.diag((1.0, -1, -1)) if up[1] < 0 else np.eye(3)
         W = se3.hat(np.cross(half @ up, (0.0, 1, 0)))
@@ -82,9 +82,9 @@ def parse(text: str) -> Up:
 
 
 class HeldSensor:
-    """Attitudes of the sensors of a map: sums over their poses, and over their accelerometers' values.
+    """Attitudes of a map's sensors: sums over their poses and their accelerometers' values.
 
-    `numbers`: those of another, to continue from; None = nothing yet.
+    `numbers`: the `numbers` of an earlier object, to continue from; None = start at zero.
     """
 
     def __init__(self, numbers: Sequence[float] | None = None) -> None:
@@ -104,13 +104,13 @@ class HeldSensor:
         *,
         times: int = 1,
     ) -> None:
-        """Take a keyframe into account.
+        """Add a keyframe to the sums.
 
         Args:
             T_world_sensor: (4, 4). A LiDAR's own axes are x forward, y left, z up; a camera's are x right, y
                 down, z forward.
             sensor: name of the sensor model.
-            force: (3,) specific force, in the sensor's axes; None = nothing.
+            force: (3,) specific force, in the sensor's axes; None = no value.
             times: -1 removes the keyframe again.
         """
         up = T_world_sensor[:3, 2] if sensor == "lidar" else -T_world_sensor[:3, 1]
@@ -122,7 +122,7 @@ class HeldSensor:
         self._sums[: len(rows)] += times * rows
 
     def merge(self, other: "HeldSensor") -> None:
-        """Take the keyframes of another into account."""
+        """Add the keyframes of another object."""
         self._sums += other._sums
 
     @property
@@ -131,7 +131,7 @@ class HeldSensor:
 
     @property
     def up(self) -> NDArray[np.float64]:
-        """(3,) mean of the directions away from the ground, if they were held upright: 0 to 1 long."""
+        """(3,) mean direction away from the ground, assuming upright sensors; length 0 to 1."""
         return self._mean(0)
 
     @property
@@ -141,7 +141,7 @@ class HeldSensor:
 
     @property
     def force(self) -> NDArray[np.float64]:
-        """(3,) mean specific force in the world, gravity's opposite: the sensors' own motion cancels out."""
+        """(3,) mean specific force in the world, opposite to gravity: the sensors' own motion cancels out."""
         return self._mean(2)
 
     def _mean(self, row: int) -> NDArray[np.float64]:
@@ -150,14 +150,14 @@ class HeldSensor:
 
 
 def find(mesh: SurfaceArrays, held: HeldSensor, *, given: Up | None = None) -> Up | None:
-    """Find up from a mesh and from the attitudes of the sensors that saw it; None = unknown.
+    """Find up from a mesh and from the attitudes of its sensors; return None if up is unknown.
 
-    An accelerometer decides, if its mean over the scan is as long as gravity. Else the plane with the largest
-    surface does, among those seen from above by sensors that were held upright within 45°; without such a
-    plane, the mean attitude. Without known attitudes, a direction counts only if three times as much surface
-    faces there as any other way, and it is −y, +y or +z within 45°: walls look like a floor.
+    The accelerometer decides, if its mean over the scan is as long as gravity. Else the largest plane
+    decides, among planes seen from above by sensors that were upright within 45°. Else the mean attitude
+    decides. Without known attitudes, a direction needs three times as much surface as any other, and must be
+    −y, +y or +z within 45°: walls look like a floor.
 
-    `given`: by a person: the answer.
+    `given`: a person's answer, which is returned.
     """
     if given is not None:
         return given
@@ -174,10 +174,11 @@ def find(mesh: SurfaceArrays, held: HeldSensor, *, given: Up | None = None) -> U
 
 
 def floor_height(mesh: SurfaceArrays, up: Up, held: HeldSensor) -> float | None:
-    """Height of the floor along `up` from the map's origin, metres; None = no such surface is large enough.
+    """Return the floor's height along `up` from the map's origin, metres; None without a large enough
+    surface.
 
-    The floor is the lowest of the large level surfaces that face up, below the mean place of the sensors: at
-    least a fifth as large as the largest one. In a scan with a table and no floor, it is the table.
+    The floor is the lowest of the large level surfaces that face up, below the sensors' mean position: at
+    least a fifth as large as the largest. In a scan with a table but no floor, it is the table.
     """
     direction = np.array(up.direction)
     below = float(held.position @ direction) if held.is_known else np.inf
@@ -195,11 +196,11 @@ class _FacingSurface:
         self.area = area / max(float(area.sum()), 1e-12)
         self.points, mean = corners.mean(axis=1), normals.sum(axis=1)
         self.normals = mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
-        # Within this a point belongs to a plane: two edges, which are about as long as a voxel
+        # Largest distance of a plane's points: two edges, each about as long as a voxel
         self.thickness = 2 * float(np.median(np.linalg.norm(edges[:, 0], axis=1))) if len(faces) else 1.0
 
     def floor(self, held: NDArray[np.float64], camera: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """(3,) normal of the largest plane seen from the side of `held` and below a camera."""
+        """Return the (3,) normal of the largest plane below a camera that faces `held`, or None."""
         below = (self.points - camera) @ held < 0
         directions = _sphere()
         directions = directions[directions @ held > _CONE]
@@ -210,7 +211,7 @@ class _FacingSurface:
         return normal if share >= _LEAST else None
 
     def most_faced(self) -> Up | None:
-        """Direction that far more surface faces than any other, if maps are likely to have up there."""
+        """Return the direction that most surface faces, if it is clear and likely to be up; else None."""
         directions = _sphere()
         shares = self._facing(directions, np.ones(len(self.area), bool))
         best = directions[shares.argmax()]
@@ -221,7 +222,7 @@ class _FacingSurface:
         return _up(normal, "floor") if share >= _LEAST else None
 
     def lowest_level(self, up: NDArray[np.float64], below: float) -> float | None:
-        """Height of the lowest of the large planes that face up, below a height; None = there is none."""
+        """Return the height of the lowest large plane that faces up, below a height; None without one."""
         heights = self.points @ up
         facing = np.flatnonzero((self.normals @ up > _LEVEL) & (heights < below))
         if not len(facing):
@@ -240,14 +241,14 @@ class _FacingSurface:
         return float(heights[order[middle]])
 
     def _facing(self, directions: NDArray[np.float64], among: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """(m,) share of the surface whose normal is near each of (m, 3) directions."""
+        """Return the (m,) shares of the surface whose normal is near each of (m, 3) directions."""
         normals, area = self.normals[among], self.area[among]
         return np.array([area[normals @ direction > _LEVEL].sum() for direction in directions])
 
     def _plane(
         self, normal: NDArray[np.float64], among: NDArray[np.bool_]
     ) -> tuple[NDArray[np.float64], float]:
-        """The largest plane across a direction: its exact normal, and its share of the surface."""
+        """Return the largest plane across a direction: its exact normal, and its share of the surface."""
         share = 0.0
         for _ in range(_FITS):
             facing = np.flatnonzero(among & (self.normals @ normal > _LEVEL))
@@ -271,7 +272,7 @@ def _up(direction: NDArray[np.float64], found_by: str) -> Up:
 
 
 def _sphere(count: int = 1500) -> NDArray[np.float64]:
-    """(count, 3) unit vectors, about 5° apart (Fibonacci's lattice)."""
+    """Return (count, 3) unit vectors, about 5° apart (Fibonacci's lattice)."""
     z = 1 - (2 * np.arange(count) + 1) / count
     turn = np.pi * (3 - math.sqrt(5)) * np.arange(count)
     r = np.sqrt(1 - z * z)
