@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""Recorded and synthetic datasets: sequences of keyframes, loaded one at a time.
+"""Open recorded and synthetic datasets: sequences of keyframes, loaded one at a time.
 
 Any object with `__len__` and `__getitem__` that follows the `Dataset` protocol can be replayed.
 
 Rooms:
-    formats: readers of recording layouts.
+    formats: readers, one for each layout of recordings.
     rosbag: ROS 1 and ROS 2 bags and MCAP files as datasets, without ROS.
     worlds: scenes with a known surface, rendered as keyframes.
-    download: public recordings: downloaded, checked and unpacked.
+    download: download, check and unpacking of public recordings.
 """
 
 from pathlib import Path
@@ -68,15 +68,15 @@ def open_dataset(path: str | Path, /, *, unpack: bool = False, **options: Any) -
     """Open a recording of any layout, or a synthetic world.
 
     Args:
-        path: a folder in one of `layouts()`, one that holds exactly one such, a file that stands for a
-            dataset (`transforms.json`, a `.log`, …); or `synthetic:WORLD:SENSOR`.
-        unpack: unpack an archive beside itself first.
-        options: passed to the layout's class (`posed=False` keeps frames without a pose; `sequence=`,
+        path: `synthetic:WORLD:SENSOR`, or a folder in one of `layouts()`, or a folder that holds exactly one
+            such folder, or a file that stands for a dataset (`transforms.json`, a `.log`, …).
+        unpack: True first unpacks an archive, to a folder beside it.
+        options: arguments of the layout's class (`posed=False` keeps frames without a pose; `sequence=`,
             `modality=`, `poses=` for KITTI, `trajectory=` for TUM, `count=`, `seed=` for synthetic worlds,
-            …); those that are None are left out.
+            …). Options that are None are left out.
 
     Raises:
-        DatasetError: the files are wrong, or the layout is unknown; the message says what was expected.
+        DatasetError: the files are wrong, or the layout is unknown. The message says what was expected.
 
     Examples:
         >>> room = tsfusion.open_dataset("synthetic:room", count=3)

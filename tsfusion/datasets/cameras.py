@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The camera of a recording's depth images: as given, from a file of the recording, or as published.
+"""Find the camera of a recording's depth images: given by the user, from a file, or published.
 
-In this order, and never guessed: the camera that a benchmark publishes counts for the benchmark's own
-recordings (by their names) and its own image size alone.
+These are tried in this order, and nothing is guessed. The camera published by a benchmark is used only for
+the benchmark's own recordings (known by their names), and only at its own image size.
 """
 
 import os
@@ -35,29 +35,29 @@ _FILE = re.compile(
     r"|cam(era)?0?(intrinsics?|matrix|info|param(eter)?s?|calib(ration)?|primesense)?)(?P<after>depth|colou?r|rgb)?"
     r"\.(txt|json|ya?ml|xml)|(ost|sensor|camchain.*)\.ya?ml"
 )
-_EQUAL_PX, _EQUAL_SHARE = 0.5, 2e-3  # by which two files of one camera may differ: pixels, and of them
+_EQUAL_PX, _EQUAL_SHARE = 0.5, 2e-3  # allowed difference of two files of one camera: pixels, plus a share
 
 
 class UnknownCamera(DatasetError):
-    """Nothing says what the camera of a recording is."""
+    """The camera of a recording is not known from any source."""
 
 
 @dataclass(frozen=True)
 class PublishedCamera:
-    """The camera that a benchmark publishes for its recordings."""
+    """Camera that a benchmark publishes for its recordings."""
 
-    name: str  # of the benchmark
+    name: str  # name of the benchmark
     intrinsics: Intrinsics
     size: Size = (480, 640)
 
 
 @dataclass(frozen=True)
 class DepthUnit:
-    """The unit of a recording's integer depth, and where it comes from; `str` says both."""
+    """Unit of a recording's integer depth, with its source; `str` shows both."""
 
     metres: float
     source: str
-    is_stated: bool = True  # else it is what such a layout usually has
+    is_stated: bool = True  # False = usual for the layout
 
     def __str__(self) -> str:
         return f"depth unit {1000 * self.metres:.4g} mm ({1 / self.metres:.6g} a metre), {self.source}"
@@ -68,13 +68,13 @@ MILLIMETRES = DepthUnit(0.001, "as usual", is_stated=False)
 
 @dataclass(frozen=True, eq=False)
 class RecordedCamera:
-    """The pinhole camera of a recording's depth images, and where it came from; `str` says both."""
+    """Pinhole camera of a recording's depth images, with its source; `str` shows both."""
 
     intrinsics: Intrinsics  # of the images after `depth` and `color`
     size: Size  # (height, width) of the depth images
     source: str
     undistorter: Undistorter | None = None
-    stated_unit: DepthUnit | None = None  # of depth, as a file of the camera states it
+    stated_unit: DepthUnit | None = None  # of depth, stated by a camera file
 
     def __str__(self) -> str:
         undistorted = "" if self.undistorter is None else ", undistorted"
@@ -88,26 +88,26 @@ class RecordedCamera:
         return Camera(self.intrinsics, self.size) if self.undistorter is None else self.undistorter.camera
 
     def depth_unit(self, given: float | None, usual: DepthUnit = MILLIMETRES) -> DepthUnit:
-        """The unit of the depth images: as given (metres), else as stated by a file, else the usual one."""
+        """Return the unit of depth: as given (metres), else as stated by a file, else the usual one."""
         return self.stated_unit or usual if given is None else DepthUnit(given, "as given")
 
     def depth(self, depth: NDArray[Any]) -> NDArray[Any]:
-        """Depth without the distortion of the lens: the nearest pixel's, 0 where the camera did not see."""
+        """Remove the distortion from depth, by the nearest pixel; 0 where the camera did not see."""
         return depth if self.undistorter is None else self.undistorter.depth(depth)
 
     def color(self, color: NDArray[Any]) -> NDArray[Any]:
-        """The colour of the same pixels."""
+        """Remove the distortion from colour, for the same pixels."""
         return color if self.undistorter is None else self.undistorter.image(color)
 
 
 def described(intrinsics: Intrinsics, size: Sequence[int]) -> str:
-    """Intrinsics and image size, such as `fx 585 fy 585 cx 320 cy 240, 640×480`."""
+    """Return intrinsics and image size as text, such as `fx 585 fy 585 cx 320 cy 240, 640×480`."""
     numbers = " ".join(f"{name} {getattr(intrinsics, name):.6g}" for name in ("fx", "fy", "cx", "cy"))
     return f"{numbers}, {size[1]}×{size[0]}"
 
 
 def camera_line(dataset: Dataset, first: Frame | None = None) -> str:
-    """A dataset's camera in one line: its own description, else what its first frame says; empty = none."""
+    """Describe a dataset's camera in one line, by its own text or by its first frame; empty without one."""
     camera = getattr(dataset, "camera", None)
     if isinstance(camera, RecordedCamera):
         return str(camera)
@@ -116,7 +116,7 @@ def camera_line(dataset: Dataset, first: Frame | None = None) -> str:
 
 
 def depth_line(dataset: Dataset, first: Frame) -> str:
-    """The unit of a dataset's depth images and where it comes from; empty where it has none."""
+    """Describe the unit of a dataset's depth images and its source; empty without a unit."""
     if first.depth is None:
         return ""
     unit = getattr(dataset, "depth_unit", None) or DepthUnit(first.depth_scale, "from its frames")
@@ -136,19 +136,19 @@ def find_camera(
 ) -> RecordedCamera:
     """Find the camera of a recording's depth images.
 
-    A calibration of another image size is scaled where the shape is the same.
+    A calibration for another image size is scaled if the shape is the same.
 
     Args:
         root: the recording's folder.
-        size: (height, width) of its depth images.
-        intrinsics: beat everything else.
-        calibration: a camera's file; beats those of the recording.
-        places: folders to look in for files of a camera, the first that has some counts; default `root`.
-        files: the layout's own files of the camera, before any others.
-        published: the benchmark's camera, if this is a recording of it.
+        size: (height, width) of the depth images.
+        intrinsics: used before everything else.
+        calibration: camera file, used before files of the recording.
+        places: folders with camera files; the first folder that has some is used; default `root`.
+        files: the layout's own camera files, used before files in `places`.
+        published: the benchmark's camera, if this is a recording of the benchmark.
 
     Raises:
-        DatasetError: no camera, two that contradict each other, one of another image size.
+        DatasetError: there is no camera, two cameras contradict each other, or the image size differs.
     """
     height_width = int(size[0]), int(size[1])
     given = given_camera(height_width, intrinsics=intrinsics, calibration=calibration)
@@ -168,7 +168,7 @@ def find_camera(
 def given_camera(
     size: Size, *, intrinsics: Intrinsics | None, calibration: str | Path | None
 ) -> RecordedCamera | None:
-    """The camera that somebody gave; None = nobody did. Raises as `find_camera`."""
+    """Return the camera given by the user, or None if none was given. Raises as `find_camera`."""
     if intrinsics is not None and calibration is not None:
         raise DatasetError("intrinsics and calibration exclude each other: give one of them")
     if intrinsics is not None:
@@ -183,10 +183,10 @@ def given_camera(
 
 
 def camera_files(place: Path) -> list[Path]:
-    """Files of a folder that hold its depth camera, by their names; a depth camera's own before others.
+    """Return the camera files of a folder, known by their names. Files for a depth camera are preferred.
 
     Raises:
-        DatasetError: there is one of the colour camera alone.
+        DatasetError: there is only a file of the colour camera.
     """
     named: dict[str, list[Path]] = {"depth": [], "": [], "color": []}
     for path in sorted(place.iterdir()) if place.is_dir() else []:
@@ -204,7 +204,7 @@ def camera_files(place: Path) -> list[Path]:
 
 
 def _consistent(files: Sequence[Path], size: Size, root: Path) -> RecordedCamera | None:
-    """The camera of several files: one with a lens's distortion, else the first."""
+    """Return the camera of several files: the one with a lens's distortion, or else the first."""
     cameras = [(path, read_camera(path, size=size)) for path in files]
     fitted = [_fitted(camera, size, path, f"from {os.path.relpath(path, root)}") for path, camera in cameras]
     for (path, camera), other in zip(cameras[1:], cameras, strict=False):
@@ -216,7 +216,7 @@ def _consistent(files: Sequence[Path], size: Size, root: Path) -> RecordedCamera
 
 
 def _stated_unit(files: Sequence[Path], root: Path) -> DepthUnit | None:
-    """The unit of depth that a camera's files state; raises DatasetError where two contradict each other."""
+    """Return the unit of depth stated by camera files. Raises DatasetError if two contradict each other."""
     stated = [(metres, path) for path in files if (metres := read_depth_unit(path)) is not None]
     if not stated:
         return None
@@ -240,7 +240,7 @@ def _agree(one: Camera, other: Camera, size: Size) -> bool:
 
 
 def _fitted(camera: Camera, size: Size, path: Path, source: str) -> RecordedCamera:
-    """A file's camera for images of this size."""
+    """Return a file's camera for images of this size, scaled if the shape is the same."""
     if camera.size != size:
         if camera.size[0] * size[1] != camera.size[1] * size[0]:
             raise DatasetError(
@@ -260,7 +260,7 @@ def _fitted(camera: Camera, size: Size, path: Path, source: str) -> RecordedCame
 
 
 def _check_centre(intrinsics: Intrinsics, size: Size, source: object) -> None:
-    """Raise DatasetError for a principal point outside the images: the camera is of other ones."""
+    """Raise DatasetError if the principal point is outside the images: the camera is of other images."""
     for name, side in (("cx", size[1]), ("cy", size[0])):
         value = getattr(intrinsics, name)
         if not -0.5 < value < side - 0.5:

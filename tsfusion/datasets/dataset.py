@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The `Dataset` protocol, its base for recordings, and choosing some of a dataset's frames."""
+"""The `Dataset` protocol, the base class of recordings, and the selection of a dataset's frames."""
 
 import logging
 from abc import abstractmethod
@@ -23,21 +23,21 @@ from tsfusion.geometry.origin import Origin, System
 from tsfusion.geometry.sweeps import Motion, motion_about
 from tsfusion.geometry.trajectory import PoseAt
 
-STREET = MappingProxyType({"voxel_size": 0.1})  # usual there: at 2 cm a stereo keyframe takes 1.5 s
-NOMINAL_NS = 33_333_333  # between frames of a recording without times: thirty a second
+STREET = MappingProxyType({"voxel_size": 0.1})  # usual in a street: at 2 cm, a stereo keyframe takes 1.5 s
+NOMINAL_NS = 33_333_333  # between frames of a recording without times: 30 frames a second
 SCAN = "`tsfusion scan PATH` finds poses by itself"
 WITHOUT_DEPTH = "without depth"
-WITHOUT_POSE = "without a pose"  # how the reasons of frames that poses would have kept begin
+WITHOUT_POSE = "without a pose"  # start of the reason for frames left out for want of a pose
 NO_POSE_IN_TIME = f"{WITHOUT_POSE} in time"
-NO_HALF = "without their other half"  # images of a stereo camera
-UNREADABLE = "unreadable"  # reason of frames that are left out when they are read
-CLOCK = "after the clock"  # how the reason of those begins that came when it had stepped back
-_LATE_NS = 50_000_000  # a stamp may come late: from another thread, or with exposure
-_FEWEST_TIMES, _MOST_PARTS = 10, 100  # of each part on average; more parts are a series without an order
-_FIRST_TRIES = 50  # frames that cannot be read and none before them that can: so it is with all
+NO_HALF = "without their other half"  # for images of a stereo camera
+UNREADABLE = "unreadable"  # for frames that are left out while reading
+CLOCK = "after the clock"  # start of the reason for frames after a step back of the clock
+_LATE_NS = 50_000_000  # a stamp can be so late, because of threads or exposure
+_FEWEST_TIMES, _MOST_PARTS = 10, 100  # mean times in a part; with more parts, a series has no order
+_FIRST_TRIES = 50  # so many unreadable frames, with no readable one before, mean that all are
 _T = TypeVar("_T")
-Times = NDArray[np.int64] | None  # (n,) nanoseconds of a recording's frames; None where none were recorded
-FramePoses = Sequence[NDArray[np.float64] | None]  # (4, 4) T_world_camera of frames, None where there is none
+Times = NDArray[np.int64] | None  # (n,) nanoseconds of a recording's frames; None = not recorded
+FramePoses = Sequence[NDArray[np.float64] | None]  # (4, 4) T_world_camera or None of each frame
 
 log = logging.getLogger(__name__)
 _AROUND_NS = 50_000_000  # on each side of a frame's time
@@ -49,7 +49,7 @@ class Accelerometer:
     Args:
         stamps_ns: (n,) nanoseconds of the frames' clock.
         forces: (n, 3) m/s²; at rest they point away from the ground. Rows that are not finite are left out.
-        R_sensor_imu: (3, 3) rotation from the accelerometer's axes into those of the camera or LiDAR.
+        R_sensor_imu: (3, 3) rotation from the accelerometer's axes to those of the camera or LiDAR.
     """
 
     def __init__(self, stamps_ns: ArrayLike, forces: ArrayLike, R_sensor_imu: NDArray[np.float64]) -> None:
@@ -59,7 +59,7 @@ class Accelerometer:
         self._stamps, self._forces = stamps[kept][order], (rows[kept] @ R_sensor_imu.T)[order]
 
     def around(self, stamp_ns: int) -> NDArray[np.float64] | None:
-        """(3,) mean within 50 ms of a time, in the camera's or LiDAR's axes; None = nothing was measured."""
+        """Return the (3,) mean within 50 ms of a time, in the camera's or LiDAR's axes; None without data."""
         begin, end = np.searchsorted(self._stamps, (stamp_ns - _AROUND_NS, stamp_ns + _AROUND_NS))
         return self._forces[begin:end].mean(axis=0) if end > begin else None
 
@@ -67,12 +67,12 @@ class Accelerometer:
 def read_table(
     path: Path, content: str, R_sensor_imu: NDArray[np.float64], *, separator: str | None, first: int
 ) -> Accelerometer | None:
-    """Read a text table: a stamp, and from column `first` on three numbers; None where there is no file.
+    """Read a text table with a stamp, and three numbers from column `first` on. Return None without the file.
 
-    Stamps are whole nanoseconds, or seconds where they have a point.
+    Stamps are integer nanoseconds, or seconds if they contain a decimal point.
 
     Raises:
-        DatasetError: for a malformed line.
+        DatasetError: a line is malformed.
     """
     if not path.is_file():
         return None
@@ -88,7 +88,7 @@ def read_table(
 
 
 class UnreadableFrame(DatasetError):
-    """A frame of a recording cannot be read, and is counted in its `skipped`; most others can."""
+    """A frame of a recording cannot be read. It is counted in `skipped`; most other frames can be read."""
 
 
 class UnreadableRecording(DatasetError):
@@ -100,20 +100,20 @@ class NoPoses(DatasetError):
 
 
 class SeveralRecordings(DatasetError):
-    """A folder holds several recordings, each of which has a path of its own below it."""
+    """A folder holds several recordings. Each must be opened by its own path."""
 
 
 @runtime_checkable
 class Dataset(Protocol):
-    """Keyframes by index: all that `replay` needs.
+    """Keyframes by index, as `replay` needs them.
 
-    A dataset that a localizer can follow has `frame(index)` too, as `Frames` gives it.
+    A dataset for a localizer also has `frame(index)`, as in `Frames`.
 
     Attributes:
         name: for reports.
         sensor: name of the sensor model (`kinect`, `tof`, `stereo`, `lidar`).
-        timestamps_ns: (n,) int64 nanoseconds of the sensor's clock; None where none were recorded.
-        skipped: frames left out at opening, by reason.
+        timestamps_ns: (n,) int64 nanoseconds of the sensor's clock; None if none were recorded.
+        skipped: reason → number of frames left out while opening.
     """
 
     name: str
@@ -129,31 +129,32 @@ class Dataset(Protocol):
 
 
 class Frames(ShownRecording):
-    """Base of recordings: indexing and iteration over `_frame(index)`, which alone opens a frame's files.
+    """Base class of recordings: indexing and iteration over `_frame(index)`, which opens the frame's files.
 
-    A frame that cannot be read raises UnreadableFrame, and iteration leaves it out, unless most are so.
+    A frame that cannot be read raises UnreadableFrame, and iteration leaves it out. If most frames cannot be
+    read, UnreadableRecording is raised.
     """
 
-    camera: Any = None  # `cameras.RecordedCamera` of depth images; None = points
+    camera: Any = None  # `cameras.RecordedCamera` of depth images; None for points
     depth_unit: Any = None  # `cameras.DepthUnit` of integer depth
-    along_ray: bool = False  # whether depth was measured along each pixel's ray; `frame` gives z all the same
+    along_ray: bool = False  # True if depth was measured along each pixel's ray; `frame` returns z
     timestamps_ns: NDArray[np.int64] | None = None
-    quaternions: bool = False  # whether rotations were recorded as quaternions; else as matrices
-    usual: Mapping[str, Any] = MappingProxyType({})  # settings of a map of such a place (`VolumeConfig`)
-    origin: Origin | None = None  # what was taken off the poses' positions
-    system: System = System()  # of the positions as they were recorded
+    quaternions: bool = False  # True if rotations were recorded as quaternions, False = matrices
+    usual: Mapping[str, Any] = MappingProxyType({})  # usual settings of a map (`VolumeConfig`)
+    origin: Origin | None = None  # subtracted from the poses' positions
+    system: System = System()  # of the recorded positions
     _poses: Sequence[NDArray[np.float64] | None] = ()
-    _deskew = True  # whether times of points count
-    _between: Callable[[], PoseAt] | None = None  # makes `_pose_at`; None = there are poses of frames alone
+    _deskew = True  # False ignores the times of points
+    _between: Callable[[], PoseAt] | None = None  # makes `_pose_at`; None = only frames have poses
     _accelerometer: Accelerometer | None = None
-    _unread: Mapping[int, str] = MappingProxyType({})  # why frames cannot be read, by index
-    _was_read: bool = False  # whether any frame could be
+    _unread: Mapping[int, str] = MappingProxyType({})  # index → why the frame cannot be read
+    _was_read: bool = False  # True once a frame was read
 
     @abstractmethod
     def _frame(self, index: int) -> Frame: ...
 
     def frame(self, index: int) -> Frame:
-        """The measurement alone; `T_world_camera` where the recording has a pose for it."""
+        """Return the measurement, with `T_world_camera` if the recording has a pose for it."""
         index = self._checked(index)
         try:
             frame = self._frame(index)
@@ -165,7 +166,7 @@ class Frames(ShownRecording):
         return frame.along_axis() if self.along_ray else frame
 
     def _left_out(self, index: int, error: TsfusionError) -> DatasetError:
-        """Count a frame that cannot be read; its error, which is the recording's where most are like it."""
+        """Count an unreadable frame. Return its error, or the recording's if most frames are unreadable."""
         if isinstance(error, UnreadableRecording):
             return error
         unnamed = f"keyframe {index} of {self.name}: " if isinstance(error, InvalidKeyframe) else ""
@@ -180,15 +181,15 @@ class Frames(ShownRecording):
         return UnreadableRecording(next(iter(self._unread.values())) + others)
 
     def pose(self, index: int) -> NDArray[np.float64] | None:
-        """(4, 4) T_world_camera as recorded, None where it is not; no image is read where that can be."""
+        """Return (4, 4) T_world_camera as recorded, or None. If possible, no image is read."""
         index = self._checked(index)
         return self._poses[index] if self._poses else self.frame(index).T_world_camera
 
     def take_off_origin(self, wanted: object = None, crs: str | None = None) -> None:
-        """Let positions count in metres from an origin, as `origin.found` chooses it.
+        """Subtract an origin, chosen by `origin.found`, from positions, and convert them to metres.
 
         Raises:
-            InvalidConfig: for an origin or a reference system that cannot be.
+            InvalidConfig: the origin or the reference system is impossible.
         """
         self.system, self.origin = self.system if crs is None else origin.system(str(crs)), None
         positions = [self._counted(T[:3, 3]) for T in self._poses if T is not None]
@@ -196,7 +197,7 @@ class Frames(ShownRecording):
         self._poses = [self._counted_pose(T) for T in self._poses]
 
     def _counted(self, positions: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Recorded positions, (…, 3), in metres from the origin."""
+        """Return recorded positions, (…, 3), in metres from the origin."""
         zero = np.zeros(3) if self.origin is None else np.array(self.origin.position)
         return np.asarray(positions * np.array(self.system.metres) - zero)
 
@@ -204,7 +205,7 @@ class Frames(ShownRecording):
         return None if T is None else se3.transform(T[:3, :3], self._counted(T[:3, 3]))
 
     def specific_force(self, index: int) -> NDArray[np.float64] | None:
-        """(3,) m/s² in the frame's axes, as an accelerometer measured it; None where there is none."""
+        """Return (3,) m/s² in the frame's axes, measured by an accelerometer, or None."""
         if self._accelerometer is None or self.timestamps_ns is None:
             return None
         return self._accelerometer.around(self._stamp(self._checked(index)))
@@ -247,11 +248,11 @@ class Frames(ShownRecording):
         posed: bool,
         reason: str = WITHOUT_POSE,
     ) -> list[_T]:
-        """Files of the frames that stay: all, or if `posed` those with a pose; their poses are `_poses`.
+        """Return the files of the frames to keep, and set `_poses`. If `posed`, keep only frames with a pose.
 
         Args:
-            where: the folder and what is expected there, for the error that none stays.
-            reason: of those that are left out, in `skipped`.
+            where: the folder and the expected files, for the error if no frame is left.
+            reason: why frames are left out, for `skipped`.
         """
         pairs = [pair for pair in zip(files, poses, strict=True) if pair[1] is not None or not posed]
         if len(pairs) < len(files):
@@ -261,7 +262,7 @@ class Frames(ShownRecording):
         return [file for file, _ in pairs]
 
     def _posed_frame(self, index: int, **measurement: Any) -> Frame:
-        """A frame with the recorded pose, sensor and time of an index."""
+        """Return a frame with the recorded pose, sensor and time of an index."""
         T, stamp = self._poses[index], self._stamp(index)
         force = self.specific_force(index)
         return Frame(
@@ -269,7 +270,7 @@ class Frames(ShownRecording):
         )
 
     def _sweep(self, index: int, scan: Scan) -> Frame:
-        """A `_posed_frame` of points, with their times and the recorded motion where there are some."""
+        """Return a `_posed_frame` of points, with their times and the recorded motion, if known."""
         stamps = self.timestamps_ns
         between_s = 1.0 if stamps is None or len(stamps) < 2 else float(np.median(np.diff(stamps))) / 1e9
         found = point_times(scan, self._stamp(index), between_s) if self._deskew else PointTimes()
@@ -280,12 +281,12 @@ class Frames(ShownRecording):
 
     @cached_property
     def _pose_at(self) -> PoseAt:
-        """The pose at a time of the frames' clock, also between frames."""
+        """Function from a time of the frames' clock to the pose, also between frames."""
         recorded: PoseAt = (lambda _: None) if self._between is None else self._between()
         return lambda stamp_ns: self._counted_pose(recorded(stamp_ns))
 
     def _motion(self, index: int, times_s: NDArray[np.float32] | None) -> Motion | None:
-        """Motion of the sensor during a frame's sweep, by the recorded poses; None = not known."""
+        """Return the sensor's motion during a frame's sweep, from recorded poses, or None."""
         if times_s is None or self.timestamps_ns is None:
             return None
         return motion_about(self._pose_at, self._stamp(index), times_s)
@@ -297,7 +298,7 @@ class Frames(ShownRecording):
 class Wrapped(Frames):
     """Chosen frames of another dataset.
 
-    `distance` is the other's, if it has one: the measure of a world whose surface is known.
+    `distance` is that of the other dataset, if there is one: the distance from the known surface of a world.
     """
 
     distance: Callable[[NDArray[np.floating]], NDArray[np.float64]]
@@ -325,7 +326,7 @@ class Wrapped(Frames):
 
 
 class PartOfDataset(Wrapped):
-    """Selected keyframes of another dataset; `select` makes one."""
+    """Selected keyframes of another dataset, made by `select`."""
 
     def pose(self, index: int) -> NDArray[np.float64] | None:
         return pose_of(self._dataset, self._indices[self._checked(index)])
@@ -338,16 +339,16 @@ class PartOfDataset(Wrapped):
 
 
 def frame_of(dataset: Dataset, index: int) -> Frame:
-    """Frame `index` of any dataset: without its pose's help where the dataset has frames of its own.
+    """Return frame `index` of any dataset, from its `frame` if it has one, else from the keyframe.
 
-    A keyframe that names no sensor is a frame that names none: whoever fuses it says which.
+    A keyframe without a sensor gives a frame without one. The caller must then name the sensor.
     """
     own: Callable[[int], Frame] | None = getattr(dataset, "frame", None)
     return own(index) if own is not None else Frame.of(dataset[index], "")
 
 
 def readable(read: Callable[[int], _T], indices: Iterable[int]) -> Iterator[tuple[int, _T]]:
-    """Yield each index with the result of `read`; an index whose frame alone cannot be read is left out."""
+    """Yield each index with the result of `read`. Leave out indices with UnreadableFrame."""
     for index in indices:
         try:
             found = read(index)
@@ -357,19 +358,19 @@ def readable(read: Callable[[int], _T], indices: Iterable[int]) -> Iterator[tupl
 
 
 def first_frame(dataset: Dataset) -> Frame:
-    """The first frame that can be read; raises DatasetError where there is none."""
+    """Return the first readable frame. Raises DatasetError if there is none."""
     found = readable(partial(frame_of, dataset), range(len(dataset)))
     return next((frame for _, frame in found), None) or frame_of(dataset, 0)
 
 
 def pose_of(dataset: Dataset, index: int) -> NDArray[np.float64] | None:
-    """Frame `index`'s (4, 4) T_world_camera as recorded, of any dataset; None where there is none."""
+    """Return the recorded (4, 4) T_world_camera of frame `index` of any dataset, or None."""
     own: Callable[[int], NDArray[np.float64] | None] | None = getattr(dataset, "pose", None)
     return own(index) if own is not None else dataset[index].T_world_camera
 
 
 def force_of(dataset: Dataset, index: int) -> NDArray[np.float64] | None:
-    """Specific force of frame `index` of any dataset, (3,) m/s² in its axes; None where there is none."""
+    """Return the specific force of frame `index` of any dataset, (3,) m/s² in the frame's axes, or None."""
     own: Callable[[int], NDArray[np.float64] | None] | None = getattr(dataset, "specific_force", None)
     return own(index) if own is not None else None
 
@@ -377,12 +378,12 @@ def force_of(dataset: Dataset, index: int) -> NDArray[np.float64] | None:
 def poses_if_any(
     read: Callable[[], FramePoses], count: int, *, posed: bool, guessed: bool = False
 ) -> FramePoses:
-    """The poses of `count` frames; None for each where the recording has none.
+    """Return the poses of `count` frames, or None for each if the recording has no poses.
 
     Args:
-        posed: whether that is an error.
-        guessed: whether a file was taken for the poses by its name alone; if not `posed`, one that does not
-            fit is a warning.
+        posed: True makes missing poses an error.
+        guessed: True if the file of poses was found by its name alone. A file that does not fit is then only
+            a warning, unless `posed`.
     """
     try:
         return read()
@@ -397,10 +398,10 @@ def poses_if_any(
 def select(
     dataset: Dataset, *, start: int = 0, stop: int | None = None, stride: int = 1, limit: int | None = None
 ) -> PartOfDataset:
-    """Every `stride`-th keyframe of `dataset[start:stop]`, at most `limit` of them.
+    """Return every `stride`-th keyframe of `dataset[start:stop]`, at most `limit` of them.
 
     Raises:
-        DatasetError: when none is left.
+        DatasetError: no keyframe is left.
     """
     if stride < 1:
         raise DatasetError(f"stride must be >= 1, got {stride}")
@@ -414,7 +415,7 @@ def select(
 
 
 def nearest_in_time(sorted_ns: NDArray[np.int64], stamps_ns: NDArray[np.int64]) -> NDArray[np.intp]:
-    """Index in `sorted_ns` (not empty) of the time nearest to each of `stamps_ns`; of equals the first."""
+    """Return the index in `sorted_ns` (not empty) of the nearest to each of `stamps_ns`; of equals the first."""
     right = np.minimum(np.searchsorted(sorted_ns, stamps_ns), len(sorted_ns) - 1)
     left = np.maximum(right - 1, 0)
     nearer = np.abs(sorted_ns[left] - stamps_ns) <= np.abs(sorted_ns[right] - stamps_ns)
@@ -422,9 +423,9 @@ def nearest_in_time(sorted_ns: NDArray[np.int64], stamps_ns: NDArray[np.int64]) 
 
 
 def clock_parts(stamps_ns: ArrayLike) -> list[slice]:
-    """Parts of a series of times, (n,) nanoseconds as they were recorded, between which its clock steps back.
+    """Split a series of times, (n,) nanoseconds as recorded, where its clock steps back.
 
-    No step is: one late time among others, times before all of the part, a series that has no order.
+    These are not steps: a single late time, times before all times of the part, a series without any order.
     """
     stamps, begin = np.asarray(stamps_ns, np.int64), 0
     parts: list[slice] = []
@@ -440,9 +441,9 @@ def clock_parts(stamps_ns: ArrayLike) -> list[slice]:
 
 
 def require_one_clock(stamps_ns: Sequence[int], path: Path) -> None:
-    """Raise DatasetError where the times of a list, in its order, step back into those before.
+    """Raise DatasetError if the times of a list, in its order, step back to earlier times.
 
-    A list of files that was sorted as text, 10.5 before 9.5, does not.
+    A list of files sorted as text, 10.5 before 9.5, is allowed.
     """
     parts = clock_parts(stamps_ns)
     texts = [f"{stamp / 1e9:.9f}" for stamp in stamps_ns] if len(parts) > 1 else []
@@ -456,7 +457,7 @@ def require_one_clock(stamps_ns: Sequence[int], path: Path) -> None:
 
 
 def require_folder(path: str | Path, layout: str) -> Path:
-    """`path` as an existing folder; raises DatasetError for another."""
+    """Return `path` as an existing folder. Raises DatasetError for anything else."""
     path = Path(path).expanduser()
     if not path.is_dir():
         wrong = "is not a folder" if path.exists() else "does not exist"
@@ -465,7 +466,6 @@ def require_folder(path: str | Path, layout: str) -> Path:
 
 
 def require_frames(count: int, path: Path, expected: str, skipped: dict[str, int]) -> None:
-    """Raise DatasetError unless at least one frame is left."""
     if count:
         return
     reasons = "; ".join(f"{number} {reason}" for reason, number in skipped.items() if number)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Numbers in the names of a recording's files: their order, their times, and which files belong together."""
+"""Read the numbers in file names, which give order and times of files, and which files belong together."""
 
 import re
 from collections.abc import Iterable, Sequence
@@ -17,23 +17,23 @@ _NUMBER = re.compile(r"[0-9]+(?:\.[0-9]+)?")
 _SPLIT = re.compile(
     r"[^0-9]*(?P<s>[0-9]+(?=\.)|[0-9]{10}(?=[^0-9.]))(?P<mark>[^0-9]+)(?P<f>[0-9]{1,9})[^0-9]*"
 )
-_UNIX_DIGITS = 10  # of seconds of this century
-_EPOCH_UNITS = {13: 10**6, 16: 10**3, 19: 1}  # nanoseconds, by the digits of a time of this century
+_UNIX_DIGITS = 10  # digits of Unix seconds in this century
+_EPOCH_UNITS = {13: 10**6, 16: 10**3, 19: 1}  # digits of a Unix time of this century → unit in ns
 _UNITS = {"hundredths": 10**7, "milliseconds": 10**6, "microseconds": 10**3, "nanoseconds": 1}
-_USUAL_WIDTHS = {3, 6, 9}  # digits of ms, µs and ns with their zeros
-_FASTEST_NS, _SLOWEST_NS = 2 * 10**6, 10**12  # between frames
+_USUAL_WIDTHS = {3, 6, 9}  # digits of ms, µs and ns with leading zeros
+_FASTEST_NS, _SLOWEST_NS = 2 * 10**6, 10**12  # between two frames
 
 
 def order(name: str) -> SortKey:
-    """Sort key of names by their numbers: 9 before 10, 1.25 before 1.5."""
+    """Return a sort key of a name by its numbers: 9 before 10, 1.25 before 1.5."""
     parts = re.findall(r"([0-9]+(?:\.[0-9]+)?)|([^0-9]+)", name)
     return tuple((0, Decimal(number), "") if number else (1, Decimal(0), text) for number, text in parts)
 
 
 def in_order(files: Iterable[Path]) -> list[Path]:
-    """Files in the order of their folders, and in each of the numbers in their names.
+    """Sort files by their folders, and in each folder by the numbers in their names.
 
-    Names of one length are in the order of their characters: hexadecimal ones, too.
+    If all names have one length, sort by characters: this suits hexadecimal names, too.
     """
     found = list(files)
     if len({len(file.stem) for file in found}) == 1:
@@ -42,14 +42,14 @@ def in_order(files: Iterable[Path]) -> list[Path]:
 
 
 def numbers_in(name: str) -> list[str]:
-    """The numbers in a name, decimal ones too."""
+    """Return the integers and decimal numbers in a name, as text."""
     return _NUMBER.findall(name)
 
 
 def series_of(files: Iterable[Path]) -> list[list[Path]]:
-    """Files of names that differ in their numbers alone, and of one kind; each series in the order of these.
+    """Group files of one kind whose names differ only in their numbers. Each series is sorted.
 
-    A number that follows a letter names a sensor (`cam0_`, `lidar1_`), unless it is the only one or the last.
+    A number after a letter names a sensor (`cam0_`, `lidar1_`), unless it is the only or the last number.
     """
     found: dict[tuple[str, str], list[Path]] = {}
     for file in files:
@@ -69,21 +69,21 @@ def _unnumbered(name: str) -> str:
 
 
 def time_of(name: str) -> int | None:
-    """Timestamp in a name, nanoseconds: of decimal seconds (TUM) or a Unix time in ms, µs or ns (EuRoC)."""
+    """Return the time in a name, nanoseconds: decimal seconds (TUM), or Unix time in ms, µs or ns (EuRoC)."""
     if re.fullmatch(r"\d+\.\d+", name, re.ASCII):
         return int(Decimal(name) * 1_000_000_000)
     return int(name) * _EPOCH_UNITS[len(name)] if name.isdecimal() and len(name) in _EPOCH_UNITS else None
 
 
 def in_time(files: Sequence[Path], names: Sequence[str]) -> tuple[list[Path], NDArray[np.int64] | None]:
-    """Files in the order of the times in their names, with (n,) nanoseconds; else as they are, and None.
+    """Sort files by the times in their names. Return them with (n,) nanoseconds, or unsorted with None.
 
-    A time is one that `time_of` reads, beside words too, or Unix seconds, a separator and a fraction
-    (`SEC_USEC`). Fractions of unequal width are decimals, or ms, µs or ns without leading zeros: what fits
-    all names, with the most regular steps.
+    A time is one that `time_of` reads, also between words; or Unix seconds, a separator and a fraction
+    (`SEC_USEC`). Fractions of unequal width are decimals, or ms, µs or ns without leading zeros. The reading
+    that fits all names and has the most regular steps is taken.
 
     Raises:
-        DatasetError: more than one of these fits.
+        DatasetError: several readings fit.
     """
     stamps = _times(names)
     if stamps is None:
@@ -105,13 +105,13 @@ def _times(names: Sequence[str]) -> NDArray[np.int64] | None:
         one.string[one.start("s") - 1].isalpha() for one in split
     )
     if (is_sensor or not (is_decimal and len(widths) == 1)) and _counts(steps):
-        return None  # a counter beside a sensor's number, a chapter's or seconds
+        return None  # a counter after the number of a sensor or chapter, or after seconds
     if len(widths) == 1 and (is_decimal or widths <= _USUAL_WIDTHS):
         ways = {"decimals": _read(parts, None)}
     else:
         ways = _ways(parts)
         if not is_decimal and len(widths) > 1:
-            ways.pop("decimals", None)  # without a point nobody leaves out their last zeros
+            ways.pop("decimals", None)  # without a point, trailing zeros are not left out
     is_stripped = len(parts[0][0]) < _UNIX_DIGITS and not any(f[-1] == "0" for _, f in parts if len(f) > 1)
     if not any(map(_is_plausible, ways.values())):
         decimals = ways.get("decimals") if is_decimal else None
@@ -122,31 +122,31 @@ def _times(names: Sequence[str]) -> NDArray[np.int64] | None:
 
 
 def _counts(steps: NDArray[np.int64]) -> bool:
-    """True if numbers with these steps count on, with holes or not, after any number before them."""
+    """Return True if numbers with these steps count on, perhaps with gaps, after any number before them."""
     return not len(steps) or bool(steps.min() > 0 and np.median(steps) == 1)
 
 
 def _ways(parts: Sequence[tuple[str, str]]) -> dict[str, NDArray[np.int64]]:
-    """Nanoseconds by each way to read fractions of unequal width that none of them excludes."""
+    """Return reading → nanoseconds, for each possible reading of fractions of unequal width."""
     several = [fraction for _, fraction in parts if len(fraction) > 1]
     led, ended = (any(one[at] == "0" for one in several) for at in (0, -1))
     largest = max(int(fraction) for _, fraction in parts)
     units = {} if led else {way: unit for way, unit in _UNITS.items() if largest * unit < 10**9}
     ways = {way: _read(parts, unit) for way, unit in units.items()}
     is_unix, is_even = len(parts[0][0]) == _UNIX_DIGITS, len({len(one) for one in several}) == 1
-    if not (ended and ways and is_unix and not is_even):  # decimals end in 0 where all have one width
+    if not (ended and ways and is_unix and not is_even):  # decimals end in 0 if all have one width
         ways["decimals"] = _read(parts, None)
     return ways
 
 
 def _read(parts: Sequence[tuple[str, str]], unit: int | None) -> NDArray[np.int64]:
-    """(n,) nanoseconds of seconds and their fractions, in `unit` nanoseconds; None = decimals."""
+    """Return (n,) nanoseconds of seconds and fractions, in `unit` nanoseconds; None = decimal fractions."""
     fractions = [int(f.ljust(9, "0")) if unit is None else int(f) * unit for _, f in parts]
     return np.array([int(s) * 10**9 for s, _ in parts], np.int64) + np.array(fractions, np.int64)
 
 
 def _chosen(ways: dict[str, NDArray[np.int64]], name: str, is_stripped: bool) -> NDArray[np.int64]:
-    """The way with clearly the most regular steps; else decimals, if these may lack their last zeros."""
+    """Return the reading with clearly the most regular steps; else decimals, if they may lack last zeros."""
     best, *others = sorted(ways, key=lambda way: _unevenness(ways[way]))
     if not others or _unevenness(ways[others[0]]) > 2 * _unevenness(ways[best]) + 0.05:
         return ways[best]
@@ -164,5 +164,5 @@ def _is_plausible(stamps: NDArray[np.int64]) -> bool:
 
 
 def _unevenness(stamps: NDArray[np.int64]) -> float:
-    """Spread of the logarithms of the steps between times; 0 = all are equal."""
+    """Return the spread of the logarithms of the steps between times; 0 = all steps are equal."""
     return float(np.log(np.diff(np.sort(stamps))).std()) if len(stamps) > 1 else 0.0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Recordings that are a folder of files: which frames there are, and their poses, recorded or given."""
+"""Base class of recordings that are a folder of files: it lists the frames, and finds their poses."""
 
 import dataclasses
 import inspect
@@ -32,33 +32,34 @@ from tsfusion.geometry.trajectory import PoseAt, Trajectory
 
 
 class FolderFrames(Frames):
-    """Frames of the files in a folder, with the poses that it has or that somebody gave.
+    """Frames of the files in a folder, with the folder's own poses or given ones.
 
-    A layout is a class: its attributes say what is usual there, `_list` and `_recorded_poses` what its folder
-    holds. A folder with one file or folder (a name without a dot) of each of its `signs` is in the layout.
-    `_files` are the files of the frames that stay, `_kept` their places among all.
+    A layout is a subclass: attributes state what is usual, `_list` and `_recorded_poses` read the folder. A
+    folder is in the layout if it holds, for each entry of `signs`, one of the files or folders (names without
+    a dot). `_files` are the files of the frames that are kept, `_kept` their indices among all files.
 
     Args:
         path: the recording's folder.
-        trajectory: poses instead of those in the folder; in TUM's, KITTI's or Redwood's format.
-        max_gap_s: between two poses that are interpolated, seconds; across a longer gap there is no pose.
+        trajectory: file of poses, used instead of those in the folder; in TUM's, KITTI's or Redwood's format.
+        max_gap_s: largest gap for interpolation between two poses, seconds; a longer gap has no pose.
         time_offset_s: added to a frame's time before its pose is looked up, seconds.
         sensor: name of the sensor model; default the layout's.
-        posed: leave out frames without a pose; else they are kept, with `T_world_camera` None.
+        posed: True leaves out frames without a pose; False keeps them, with `T_world_camera` None.
 
     Raises:
-        DatasetError: no such folder, no frames, most files missing, malformed poses.
+        DatasetError: there is no such folder, there are no frames, most files are missing, or poses are
+            malformed.
     """
 
     layout = ""
     expected = ""
     signs: tuple[tuple[str, ...], ...] = ()
     usual_gap_s = 0.2
-    guesses = False  # whether it finds a file of poses by its name alone
+    guesses = False  # True if it finds a file of poses by the name alone
     _files: list[Any]
 
     def __init_subclass__(cls) -> None:
-        """Name the options of the bases where a layout adds some of its own and passes on `**options`."""
+        """Make a signature with the options of base classes for a layout that passes on `**options`."""
         named = dict(inspect.signature(cls.__init__).parameters)
         for base in cls.__mro__[1:] if named.pop("options", None) else ():
             named = {**inspect.signature(base.__init__).parameters, **named}  # type: ignore[misc]
@@ -97,32 +98,31 @@ class FolderFrames(Frames):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """True for a folder in this layout, and for a file that stands for one."""
+        """Return True for a folder in this layout, and for a file that stands for such a folder."""
         return all(any(_is_there(path, sign) for sign in either) for either in cls.signs)
 
     def _opened(self, path: str | Path, trajectory: str | Path | None) -> tuple[Path, Path | None]:
-        """The folder, and the file of poses that was given, which may be named from there."""
+        """Return the folder, and the given file of poses. Its path may be relative to the folder."""
         root = require_folder(path, self.layout)
         given = None if trajectory is None else Path(trajectory).expanduser()
         return root, given if given is None or given.exists() else root / given
 
     @abstractmethod
     def _list(self, root: Path) -> tuple[list[Any], Times]:
-        """Files of the frames in order, and their times, (n,) nanoseconds, where they are known."""
+        """Return the files of the frames in order, and their times, (n,) nanoseconds, if known."""
 
     @abstractmethod
     def _recorded_poses(self, root: Path, files: list[Any]) -> FramePoses:
-        """The pose of each frame; raises NoPoses where the folder has none."""
+        """Return the pose of each frame. Raises NoPoses if the folder has none."""
 
     def _poses_of(self, path: Path, files: list[Any]) -> FramePoses:
-        """Poses of a trajectory: by time where both have times, else one for each frame."""
+        """Return the poses of a trajectory: by time if both have times, else one for each frame."""
         self._why = WITHOUT_POSE if self._times is None else NO_POSE_IN_TIME
         where = {"max_gap_s": self._gap_s, "time_offset_s": self._offset_s}
         self._between = partial(poses_between, path, self._times, **where)
         return poses_of(path, len(files), self._times, posed=self._posed, **where)
 
     def _wanted(self) -> str:
-        """Files or times that frames with poses need, in words."""
         if self._why == WITHOUT_POSE:
             return self.expected
         return (
@@ -144,17 +144,17 @@ def poses_of(
     max_gap_s: float = 0.2,
     time_offset_s: float = 0.0,
 ) -> list[Transform | None]:
-    """The (4, 4) T_world_camera of each of `count` frames, from a TUM, KITTI or Redwood `.log` file.
+    """Return (4, 4) T_world_camera of each of `count` frames, from a TUM, KITTI or Redwood `.log` file.
 
     Args:
-        stamps_ns: times of the frames, nanoseconds; None = they have none.
-        posed: whether it is an error that the poses end before the frames begin, or the other way round.
-        max_gap_s: seconds between two poses at most; there is no pose in longer gaps.
+        stamps_ns: times of the frames, nanoseconds; None = no times.
+        posed: True raises an error if poses and frames have no time in common.
+        max_gap_s: most seconds between two poses; longer gaps have no pose.
         time_offset_s: seconds to add to a frame's stamp before its pose is looked up.
 
     Raises:
-        DatasetError: a missing or malformed file, times that do not meet, or without times in one
-            of both another number of poses than of frames.
+        DatasetError: the file is missing or malformed, or no times meet; or times are missing and the numbers
+            of poses and frames differ.
     """
     times, poses = read_poses(path)
     if times is None or stamps_ns is None:
@@ -179,10 +179,10 @@ def poses_of(
 def poses_between(
     path: Path, stamps_ns: NDArray[np.int64] | None, *, max_gap_s: float = 0.2, time_offset_s: float = 0.0
 ) -> PoseAt:
-    """Make the function that gives T_world_camera at a time of the frames' clock, also between frames.
+    """Return a function from a time of the frames' clock to T_world_camera, also between frames.
 
     Args:
-        stamps_ns: times of the frames, for poses without times; other arguments are as of `poses_of`.
+        stamps_ns: times of the frames, for poses without times. Other arguments are as for `poses_of`.
     """
     times, poses = read_poses(path)
     offset = 0 if times is None else round(time_offset_s * 1e9)
@@ -194,9 +194,9 @@ def poses_between(
 
 
 def pairs_by_time(path: Path, dataset: Dataset) -> bool:
-    """True if a scan pairs poses and frames by their times: both have times.
+    """Return True if a scan pairs poses and frames by time, because both have times.
 
-    Frames without times have a scan's nominal ones; as many poses as frames are theirs in order.
+    A scan gives nominal times to frames without times. As many poses as frames are paired in order.
     """
     times, poses = read_poses(path)
     return times is not None and (dataset.timestamps_ns is not None or len(poses) != len(dataset))
@@ -206,8 +206,8 @@ class WithTrajectory(Wrapped):
     """Another dataset's frames with the poses of a file.
 
     Args:
-        posed: leave out frames without a pose; else they are kept, with `T_world_camera` None.
-        where: as of `poses_of`.
+        posed: True leaves out frames without a pose; False keeps them, with `T_world_camera` None.
+        where: as for `poses_of`.
     """
 
     def __init__(self, dataset: Dataset, path: Path, *, posed: bool = True, **where: float) -> None:

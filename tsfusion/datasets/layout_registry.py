@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The known layouts of recordings, and the one that a path is in.
+"""List the known layouts of recordings, and find the layout of a path.
 
-Another package adds a layout by an entry point in the group `tsfusion.datasets` that names a `Layout`; it is
-tried before the built-in ones.
+Another package adds a `Layout` by an entry point in the group `tsfusion.datasets`. Such layouts are tried
+before the built-in ones.
 """
 
 import logging
@@ -41,20 +41,20 @@ from tsfusion.geometry.origin import System
 GROUP = "tsfusion.datasets"
 
 _log = logging.getLogger(__name__)
-_MAC = "__MACOSX"  # what macOS puts into archives beside the recording
-_INDEX = (".txt", ".json", ".yaml", ".csv", ".freiburg")  # a file of these is taken for its folder
+_MAC = "__MACOSX"  # folder that macOS adds to archives
+_INDEX = (".txt", ".json", ".yaml", ".csv", ".freiburg")  # a file with such a suffix stands for its folder
 
 
 class Layout(NamedTuple):
-    """A way in which recordings are stored on the disk.
+    """One way to store recordings on disk.
 
     Attributes:
         name: for reports.
         description: the expected files, in one line.
-        recognises: True if a folder or file is in this layout; quick, reads no images, raises nothing. Of a
-            layout that is a world's, True for `Path("synthetic:WORLD")`.
-        open: `open(path, **options)` → a dataset; takes `posed` where frames may lack a pose. A world's takes
-            `world` and `sensor` by name.
+        recognises: function that returns True for a folder or file in this layout. It is quick, reads no
+            images and raises nothing. The layout of a world returns True for `Path("synthetic:WORLD")`.
+        open: `open(path, **options)` → a dataset. It takes `posed` if frames may lack a pose. The layout of a
+            world takes `world` and `sensor` by name.
 
     Examples:
         >>> from tsfusion.datasets import layouts
@@ -76,10 +76,10 @@ class FoundDataset(NamedTuple):
     also: tuple[str, ...]  # names of less specific layouts that fit too
 
     def open(self, /, **options: Any) -> Dataset:
-        """Open the dataset; options that are None are left out.
+        """Open the dataset. Options that are None are left out.
 
         Raises:
-            DatasetError: the files are wrong, or an option that the layout does not have.
+            DatasetError: the files are wrong, or the layout does not have an option.
         """
         return open_as(self.layout.name, partial(self.layout.open, self.path), options)
 
@@ -88,7 +88,7 @@ def _row(layout: type[FolderFrames], name: str = "", also: str = "") -> Layout:
     return Layout(name or layout.layout, layout.expected + also, layout.recognises, layout)
 
 
-# In the order in which they are tried: specific layouts first.
+# In the order of trial: specific layouts first.
 BUILT_IN = (
     _row(EuRoC),
     Layout("KITTI odometry", kitti.EXPECTED, kitti.recognises, kitti.open_kitti),
@@ -103,9 +103,9 @@ BUILT_IN = (
     _row(Redwood),
     Layout("ROS bag", rosbag_dataset.EXPECTED, rosbag_dataset.recognises, rosbag_dataset.Bag),
 )
-# Tried where no other layout fits.
+# Tried if no other layout fits.
 PLAIN = (Layout("RGB-D folders", PLAIN_EXPECTED, Redwood.recognises_plain, Redwood), _row(StereoFolder))
-# Tried where nothing there is in any other: points beside a recording are often made of it.
+# Tried if nothing fits another layout: points beside a recording are often made from the recording.
 SCANS = (_row(ScanFolder),)
 SYNTHETIC = (
     "synthetic",
@@ -115,28 +115,28 @@ SYNTHETIC = (
 
 
 def layouts() -> list[Layout]:
-    """Every layout, in the order in which they are tried."""
+    """Return every layout, in the order of trial."""
     return [*_plugins(), *BUILT_IN, *PLAIN, *SCANS]
 
 
 def world_layout(name: str) -> Layout | None:
-    """Layout of another package that stands for `synthetic:NAME`."""
+    """Return another package's layout for `synthetic:NAME`, or None."""
     return next((one for one in _plugins() if _recognises(one, Path(f"synthetic:{name}"))), None)
 
 
 def find(path: str | Path, *, unpack: bool = False) -> FoundDataset:
-    """Find the dataset at a path: its folder, a folder that holds exactly one, or a file that stands for it.
+    """Find the dataset at a path: a folder, a folder that holds exactly one, or a file that stands for it.
 
     Args:
-        unpack: unpack an archive beside itself; otherwise the error names the command that does.
+        unpack: True unpacks an archive beside itself. Otherwise the error names the command that does.
 
     Raises:
-        DatasetError: nothing or more than one dataset found; the message says what was expected.
+        DatasetError: there is no dataset, or more than one. The message says what was expected.
     """
     root = Path(path).expanduser()
     if not root.exists():
         raise DatasetError(f"{root} does not exist; expected a dataset or synthetic:room, synthetic:street")
-    if root.name in ("", ".."):  # such as the present folder: a benchmark is known by its folder's name
+    if root.name in ("", ".."):  # such as the current folder: benchmarks are recognised by the folder's name
         root = root.resolve()
     if root.is_file() and archives.is_archive(root):
         root = _unpacked(root, unpack=unpack)
@@ -157,13 +157,13 @@ def find(path: str | Path, *, unpack: bool = False) -> FoundDataset:
 
 
 def open_as(name: str, opener: Callable[..., Dataset], options: dict[str, Any]) -> Dataset:
-    """Call a layout's opener; it may lack the options `posed` and `trajectory`; `poses` is the latter.
+    """Call a layout's opener. The options `posed` and `trajectory` work even if the opener lacks them.
 
-    Options of any layout: `origin` and `crs`, see `Frames.take_off_origin`; `depth_along_ray`: depth images
-    hold distances along rays, which become depth.
+    `poses` is another name of `trajectory`. All layouts have the options `origin` and `crs`, see
+    `Frames.take_off_origin`, and `depth_along_ray`: depth images hold distances along rays, which become z.
 
     Raises:
-        DatasetError: an option that it does not take, or of the wrong type.
+        DatasetError: an option is unknown to the opener, or has the wrong type.
     """
     options = dict(options)
     origin, crs, along_ray = (options.pop(each, None) for each in ("origin", "crs", "depth_along_ray"))
@@ -204,7 +204,7 @@ def _open_as(name: str, opener: Callable[..., Dataset], options: dict[str, Any])
 
 
 def describe(dataset: Dataset) -> str:
-    """One line: number and kind of frames, size, rate, how many have a pose, the camera. Reads one frame."""
+    """Return one line: number and kind of frames, size, rate, poses, camera. Reads one frame."""
     from tsfusion.datasets.cameras import camera_line, depth_line
     from tsfusion.datasets.dataset import first_frame, pose_of
 
@@ -239,7 +239,7 @@ def describe(dataset: Dataset) -> str:
 
 
 def sweep_doubt(first: Frame) -> str:
-    """Reason why no motion is known within sweeps; empty = it is, or points have no times."""
+    """Return the reason why no motion is known within sweeps; empty if known, or points have no times."""
     if first.untimed:
         return first.untimed
     lacks = first.motion is None and first.T_world_camera is not None and first.point_times_s is not None
@@ -259,7 +259,7 @@ def _unpacked(path: Path, *, unpack: bool) -> Path:
 
 
 def _match(places: Iterable[Path], only: tuple[Layout, ...] = ()) -> list[FoundDataset]:
-    """The datasets at these places, in any layout but the last, or in `only` these."""
+    """Return the datasets at these paths, in any layout; PLAIN ones only if no other fits. Or in `only`."""
     ranked = [] if only else [*_plugins(), *BUILT_IN]
     found = []
     for place in places:

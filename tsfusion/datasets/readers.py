@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Text tables, images, depth and camera matrices from files; errors name the file."""
+"""Read text tables, images, depth and camera matrices from files. Errors name the file."""
 
 import struct
 import zlib
@@ -25,17 +25,17 @@ from tsfusion.wire.records.record_header import Refused
 _PNG = b"\x89PNG\r\n\x1a\n"
 _PIXEL_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")
 _HEADER = 13  # bytes of IHDR
-_PIXEL, _FEW = 9, 1 << 20  # bytes of a pixel that is not compressed, and of all that is no pixel
+_PIXEL, _FEW = 9, 1 << 20  # bytes of an uncompressed pixel; bytes of everything else
 DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".pgm", ".exr", ".npy")
-_EVERY = 4  # pixels, looked at for the unit; rows, for the order of bytes
-_FEWEST_STEPS = 200  # between neighbours, that tell the order of bytes
-_SMOOTHER = 8  # times; depth the right way round is 10 to 100 times smoother
+_EVERY = 4  # every 4th pixel is used to check the unit, every 4th row for the order of bytes
+_FEWEST_STEPS = 200  # between neighbours, needed to check the order of bytes
+_SMOOTHER = 8  # times; depth in the right order of bytes is 10 to 100 times smoother
 
 
 def read_lines(path: Path, content: str) -> list[tuple[int, str]]:
-    """(line number, text) of every line that is neither blank nor a `#` comment.
+    """Return (line number, text) of each line that is neither blank nor a `#` comment.
 
-    Copes with CRLF and a byte order mark.
+    CRLF and a byte order mark are allowed.
     """
     lines = read_text(path, content).splitlines()
     numbered = ((number, line.strip()) for number, line in enumerate(lines, 1))
@@ -43,7 +43,7 @@ def read_lines(path: Path, content: str) -> list[tuple[int, str]]:
 
 
 def read_numbers(path: Path, content: str, *, columns: int | None = None) -> NDArray[np.float64]:
-    """A text table: (rows, columns) float64, finite; with `columns` None all rows must be equally long."""
+    """Read a text table: (rows, columns) float64, finite. With `columns` None rows must be equally long."""
     lines = read_lines(path, content)
     if not lines:
         raise DatasetError(f"{path} is empty; expected {content}")
@@ -52,12 +52,11 @@ def read_numbers(path: Path, content: str, *, columns: int | None = None) -> NDA
 
 
 def listed_file(root: Path, name: str) -> Path:
-    """A file that a list names, from `root`; with Windows' separators too."""
+    """Return a file named by a list, below `root`. Windows' separators are allowed."""
     return root / name if (root / name).exists() else root / PureWindowsPath(name).as_posix()
 
 
 def numbers(path: Path, line: int, words: list[str], count: int, content: str) -> list[float]:
-    """`words` as exactly `count` finite numbers."""
     try:
         values = [float(word) for word in words]
     except ValueError as error:
@@ -70,7 +69,7 @@ def numbers(path: Path, line: int, words: list[str], count: int, content: str) -
 
 
 def read_image(path: Path, what: str, flags: int = cv2.IMREAD_UNCHANGED) -> NDArray[Any]:
-    """Any image as stored: (H, W) or (H, W, 3) BGR; or as OpenCV's `flags` say."""
+    """Read an image as stored, (H, W) or (H, W, 3) BGR, or by OpenCV's `flags`."""
     if not path.is_file():
         raise DatasetError(f"{path} is missing; expected {what}")
     try:
@@ -85,12 +84,12 @@ def read_image(path: Path, what: str, flags: int = cv2.IMREAD_UNCHANGED) -> NDAr
 
 
 def decode_image(file: BinaryIO, flags: int) -> NDArray[Any] | None:
-    """Decode an image file as OpenCV's `flags` say; None where that fails, or it is far too large.
+    """Decode an image file by OpenCV's `flags`. Return None if it is damaged or far too large.
 
-    Pixels come as stored, as calibrations and depth have them: an EXIF orientation is for picture viewers.
-    OpenCV believes an image of a few bytes that claims gigabytes of pixels (but for PNG and JPEG, the command
-    bounds that). libpng prints what it does not like: a PNG is checked here first, and what
-    its pixels do not need is not even read.
+    Pixels come as stored, because calibrations and depth refer to stored pixels: an EXIF orientation is
+    ignored. OpenCV trusts an image of a few bytes that claims gigabytes of pixels; for PNG and JPEG the size
+    is checked here. libpng prints messages about what it does not like. So a PNG is checked first, and chunks
+    without pixels are not read.
     """
     is_png = file.read(len(_PNG)) == _PNG
     content = _png_of_pixels(file) if is_png else _whole(file)
@@ -105,18 +104,18 @@ def decode_image(file: BinaryIO, flags: int) -> NDArray[Any] | None:
 
 
 def _whole(file: BinaryIO) -> bytes | None:
-    """The bytes of an image that is no PNG; None where it is far too large."""
+    """Return the bytes of an image that is no PNG, or None if it is far too large."""
     nbytes = file.seek(0, SEEK_END)
     file.seek(0)
     content = file.read() if nbytes <= limits.MAX_FILE_BYTES else b""
-    with suppress(Refused):  # neither a JPEG, nor one that can be read in one way alone
+    with suppress(Refused):  # no JPEG, or an ambiguous one
         if max(array_encoding.image_size(content)) > MAX_IMAGE_SIDE:
             return None
     return content
 
 
 def _png_of_pixels(file: BinaryIO) -> bytes | None:
-    """A PNG without the chunks that do not change its pixels; None where it is damaged or far too large."""
+    """Return a PNG with only the chunks that change pixels, or None if it is damaged or far too large."""
     kept, left = [_PNG], _FEW
     while len(head := file.read(8)) == 8:
         length, name = struct.unpack(">I4s", head)
@@ -141,7 +140,7 @@ def _png_of_pixels(file: BinaryIO) -> bytes | None:
 
 
 def read_color(path: Path, shape: tuple[int, ...] | None) -> NDArray[np.uint8]:
-    """(H, W, 3) uint8 BGR of the depth image's `shape`; None: of any."""
+    """Read (H, W, 3) uint8 BGR. It must have the depth image's `shape`, unless that is None."""
     color: NDArray[np.uint8] = read_image(path, "a colour image", cv2.IMREAD_COLOR)
     if shape is not None and color.shape[:2] != shape:
         cure = turned_by_exif(path, color.shape, shape) or "register colour and depth before"
@@ -153,7 +152,7 @@ def read_color(path: Path, shape: tuple[int, ...] | None) -> NDArray[np.uint8]:
 
 
 def turned_by_exif(path: Path, stored: Sequence[int], shape: Sequence[int]) -> str:
-    """Cure of a JPEG of the size `stored` that only its EXIF orientation turns to `shape`; else empty."""
+    """Return advice if only its EXIF orientation turns a JPEG of the size `stored` to `shape`; else ""."""
     if tuple(stored[:2]) != tuple(shape[1::-1]) or path.suffix.lower() == ".png":
         return ""
     shown = cv2.imread(str(path), cv2.IMREAD_COLOR)
@@ -163,9 +162,9 @@ def turned_by_exif(path: Path, stored: Sequence[int], shape: Sequence[int]) -> s
 
 
 def intrinsics_of(K: NDArray[np.float64], source: object) -> Intrinsics:
-    """The intrinsics in a camera or projection matrix, checked; an error names where it came from.
+    """Return the checked intrinsics of a camera or projection matrix. An error names the `source`.
 
-    Images of a camera with skew are no pinhole camera's before they are undistorted.
+    A matrix with skew is refused: such images must be undistorted first.
     """
     if abs(K[0, 1]) > MAX_NO_SKEW:
         raise DatasetError(
@@ -176,7 +175,7 @@ def intrinsics_of(K: NDArray[np.float64], source: object) -> Intrinsics:
 
 
 def checked_intrinsics(intrinsics: Intrinsics, source: object) -> Intrinsics:
-    """`intrinsics`, or an error that names where they came from."""
+    """Return valid intrinsics, or raise an error that names the `source`."""
     try:
         check_intrinsics(intrinsics)
     except InvalidKeyframe as error:
@@ -185,11 +184,11 @@ def checked_intrinsics(intrinsics: Intrinsics, source: object) -> Intrinsics:
 
 
 def read_depth(path: Path, *, invalid: int | None = None) -> NDArray[Any]:
-    """(H, W) depth: uint16 in the recording's units, with 0 for `invalid`, or float32 as stored.
+    """Read (H, W) depth: uint16 in the recording's units, with 0 for `invalid`, or float32 as stored.
 
     Raises:
-        DatasetError: no such file, or not one channel of 16 bits or floats.
-        MissingDependency: for EXR without the OpenEXR package.
+        DatasetError: there is no such file, or it is not one channel of 16 bits or floats.
+        MissingDependency: the OpenEXR package is not installed, for EXR.
     """
     depth = _stored(path)
     depth = depth.astype(depth.dtype.newbyteorder("="), copy=False)
@@ -212,7 +211,7 @@ def read_depth(path: Path, *, invalid: int | None = None) -> NDArray[Any]:
 
 
 def check_metres(depth: NDArray[np.float32], source: object) -> None:
-    """Raise DatasetError where floats are evidently not metres: half are beyond 100 m, or within 1 cm."""
+    """Raise DatasetError if floats are clearly not metres: their median is above 100 m, or below 1 cm."""
     some = depth[::_EVERY, ::_EVERY]
     valid = some[np.isfinite(some) & (some > 0)]
     middle = float(np.median(valid)) if valid.size else 1.0
@@ -226,8 +225,8 @@ def check_metres(depth: NDArray[np.float32], source: object) -> None:
 
 
 def check_byte_order(depth: NDArray[Any], source: object) -> None:
-    """Raise DatasetError where (H, W) uint16 depth is far smoother with its numbers' bytes exchanged."""
-    if depth.dtype != np.uint16 or not (depth & 0xFF).any():  # others are what they are
+    """Raise DatasetError if (H, W) uint16 depth is far smoother after an exchange of its bytes."""
+    if depth.dtype != np.uint16 or not (depth & 0xFF).any():  # floats and 8-bit values have no such error
         return
     rows = depth[::_EVERY]
     both = (rows[:, 1:] > 0) & (rows[:, :-1] > 0)
@@ -245,8 +244,8 @@ def check_byte_order(depth: NDArray[Any], source: object) -> None:
 
 
 def read_npy(path: Path) -> NDArray[Any]:
-    """The array of a `.npy` file; raises DatasetError."""
-    try:  # its size is compared with what is there
+    """Read the array of a `.npy` file. Raises DatasetError."""
+    try:  # NumPy compares the array's size with the file's
         found = np.lib.format.open_memmap(path, mode="r")
         limits.check(path, found.nbytes)
         return np.array(found)
@@ -264,7 +263,7 @@ def _stored(path: Path) -> NDArray[Any]:
 
 
 def _read_exr(path: Path) -> NDArray[Any]:
-    """The only channel, or equal ones stacked; OpenCV's wheels come without OpenEXR."""
+    """Read the only channel, or equal channels stacked. OpenCV's wheels come without OpenEXR."""
     if not path.is_file():
         raise DatasetError(f"{path} is missing; expected a depth image")
     try:
@@ -285,7 +284,7 @@ def _read_exr(path: Path) -> NDArray[Any]:
 
 
 def _described(image: NDArray[Any]) -> str:
-    """Description of a file's content in place of depth."""
+    """Return a description of a file that should hold depth."""
     shape = f"shape {image.shape} of {image.dtype}"
     if image.ndim == 3 and image.dtype == np.uint8:
         return f"{shape}: a colour image"

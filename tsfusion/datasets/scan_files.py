@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A LiDAR's scans from files (raw floats, PCD, PLY, LAS, LAZ), and the times of their points.
+"""Read scans of a LiDAR from files (raw floats, PCD, PLY, LAS, LAZ), with the times of their points.
 
 No file states the unit and the clock of such times.
 """
@@ -23,55 +23,55 @@ from tsfusion.geometry.sweeps import skewed
 from tsfusion.geometry.trajectory import Trajectory
 
 SUFFIXES = (".bin", ".pcd", ".ply", ".las", ".laz")
-USUAL_FIELDS = 4  # float32 a point of raw floats: x, y, z and the intensity
+USUAL_FIELDS = 4  # float32 numbers for each point of a raw file: x, y, z, intensity
 _HEADER_BYTES = 1 << 14
 _WKT, _CODE, _GEOGRAPHIC, _UNIT, _HEIGHT, _HEIGHT_UNIT = 2112, 3072, 2048, 3076, 4096, 4099  # GeoTIFF's keys
-_UNITS = {9001: 1.0, 9002: 0.3048, 9003: 1200 / 3937}  # metres, by EPSG's codes
-_HEIGHTS = {6360: 9003, 8228: 9002}  # units of heights that are no metres
+_UNITS = {9001: 1.0, 9002: 0.3048, 9003: 1200 / 3937}  # EPSG code → metres
+_HEIGHTS = {6360: 9003, 8228: 9002}  # height system → unit, if not metres
 _FIELD = re.compile(
     r"(?:scalar_?)?(?:t|ts|time_?stamp|(?:gps|point|offset|rel|relative|delta)?_?time(?:_?offset)?)"
     r"(?:_(s|sec|ms|us|ns))?",
     re.IGNORECASE,
 )
 _UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-_SHORTEST_S, _LONGEST_S = 0.003, 0.6  # of a sweep; a packet of points takes less
-_FRAMES = 3.0  # the longest sweep, in times between two frames: two sensors may take turns
-_NEAR_S = 1.2  # within which a time is one of the stamp's clock
-_COARSE = 0.01  # of a sweep: steps of numbers that are too coarse for its times
+_SHORTEST_S, _LONGEST_S = 0.003, 0.6  # length of a sweep; a packet of points is shorter
+_FRAMES = 3.0  # longest sweep, as a multiple of the frame interval: two sensors may alternate
+_NEAR_S = 1.2  # a time nearer to the stamp is of the stamp's clock
+_COARSE = 0.01  # of a sweep; numbers with larger steps are too coarse for its times
 
 
 class Scan(NamedTuple):
-    """Points of one sweep, and their times as they are written."""
+    """Points of one sweep, and their times as written in the file."""
 
     points: NDArray[np.floating]  # (N, 3) metres in the LiDAR's axes, or the file's system; NaN = no return
-    time_field: str | None = None  # None = there are no times
-    moments: NDArray[Any] | None = None  # (N,) of that field
+    time_field: str | None = None  # None = no times
+    moments: NDArray[Any] | None = None  # (N,) values of the time field
     color: NDArray[np.uint8] | None = None  # (N, 3) BGR
-    system: System | None = None  # that the file names
+    system: System | None = None  # named by the file
 
 
 class PointTimes(NamedTuple):
-    """Seconds of points after a stamp, (N,) float32; or in words why the recorded ones are of no use."""
+    """Seconds of points after a stamp, (N,) float32; or the reason why recorded times are of no use."""
 
     point_times_s: NDArray[np.float32] | None = None
     untimed: str = ""
 
 
 def time_field(names: Iterable[str]) -> str | None:
-    """The field that holds the times of points, as drivers and programs name it; None = there is none."""
+    """Return the field with the times of points, by its usual names in drivers and programs, or None."""
     return next((name for name in names if _FIELD.fullmatch(name)), None)
 
 
 def point_times(scan: Scan, stamp_ns: int, between_s: float = 1.0) -> PointTimes:
     """Read the times of a sweep's points.
 
-    The unit is that of the field's name (`time_us`), else the largest of s, ms, µs and ns in which a sweep
-    can be so long: drivers write Ouster `t` and Livox `offset_time` in ns, Velodyne `time` in s, Hesai
-    `timestamp` in absolute s, Livox `timestamp` in absolute ns, LAS `gps_time` in s. Times of neither the
-    stamp's clock nor the sweep count from the sweep's first point.
+    The field's name may tell the unit (`time_us`). Otherwise it is the largest of s, ms, µs and ns that gives
+    a possible length of a sweep. Drivers write Ouster `t` and Livox `offset_time` in ns, Velodyne `time` in
+    s, Hesai `timestamp` in absolute s, Livox `timestamp` in absolute ns, LAS `gps_time` in s. Times that
+    count neither by the stamp's clock nor from the stamp are counted from the sweep's first point.
 
     Args:
-        stamp_ns: of the frame; 0 = it has none.
+        stamp_ns: stamp of the frame; 0 = no stamp.
         between_s: seconds between two frames.
     """
     points, field, moments = scan[:3]
@@ -102,7 +102,7 @@ def point_times(scan: Scan, stamp_ns: int, between_s: float = 1.0) -> PointTimes
 
 
 def times_on(scan: Scan, trajectory: Trajectory) -> NDArray[np.float64]:
-    """(N,) nanoseconds of points in the unit in which any is on a trajectory, NaN where it is not."""
+    """Return (N,) nanoseconds of points, in the unit that puts any on a trajectory; NaN for the others."""
     first, last = trajectory.timestamps_ns[[0, -1]]
     for unit_s in () if scan.moments is None else _UNITS_S.values():
         times = np.asarray(scan.moments) * (unit_s * 1e9)
@@ -112,15 +112,15 @@ def times_on(scan: Scan, trajectory: Trajectory) -> NDArray[np.float64]:
 
 
 def read_scan(path: Path, *, fields: int = USUAL_FIELDS) -> Scan:
-    """Read a scan, in the order of the file; float64 where the file has more digits than float32.
+    """Read a scan, in the file's order. It is float64 if the file has more digits than float32.
 
     Args:
-        fields: float32 numbers a point in a `.bin` file, x, y and z first; other formats say it themselves.
+        fields: float32 numbers for each point of a `.bin` file, x, y and z first. Other formats tell it.
 
     Raises:
         DatasetError: the file is missing, empty, cut off, damaged, or holds something else.
-        InvalidConfig: its coordinates are degrees, or in a unit that is not known.
-        MissingDependency: for PCD without pypcd4, for LAS without laspy, for its system without pyproj.
+        InvalidConfig: the coordinates are degrees, or in an unknown unit.
+        MissingDependency: pypcd4 is missing for PCD, laspy for LAS, or pyproj for the reference system.
     """
     suffix = path.suffix.lower()
     try:
@@ -166,7 +166,7 @@ def _raw(path: Path, fields: int) -> tuple[Scan, int]:
     return Scan(points[:, :3]), len(points)
 
 
-# Each reads the points, and how many the file's header names.
+# Each function returns the points, and the number of points in the file's header.
 
 
 def _pcd(path: Path) -> tuple[Scan, int]:
@@ -185,7 +185,7 @@ def _pcd(path: Path) -> tuple[Scan, int]:
 
 
 def _without_empty_fields(head: bytes) -> bytes:
-    """The start of a PCD file without fields of COUNT 0, which hold nothing."""
+    """Return the start of a PCD file without fields of COUNT 0, which are empty."""
     counts = re.search(rb"^COUNT +([0-9 ]+)", head, re.MULTILINE)
     kept = [bool(int(count)) for count in counts[1].split()] if counts else []
     if all(kept):
@@ -217,7 +217,7 @@ def _las(path: Path) -> tuple[Scan, int]:
     except ImportError as error:
         raise MissingDependency("to read LAS or LAZ: pip install 'laspy[lazrs]' (or '.[mesh]')") from error
     with laspy.open(path) as opened:
-        named = opened.header.point_count  # before it is told what was found
+        named = opened.header.point_count  # read first: `read` changes it
         limits.check(path, named * opened.header.point_format.size)
         system, read = _system_in(opened.header), opened.read()
         scan = _timed(np.asarray(read.xyz), read.point_format.dimension_names, read)
@@ -225,7 +225,7 @@ def _las(path: Path) -> tuple[Scan, int]:
 
 
 def _system_in(header: Any) -> System | None:
-    """The coordinate reference system that the head of a LAS file names, as WKT or GeoTIFF; None = none."""
+    """Return the coordinate reference system in a LAS file's header, from WKT or GeoTIFF keys, or None."""
     named = [*header.vlrs, *(header.evlrs or [])]
     text = next((one.string for one in named if one.record_id == _WKT and getattr(one, "string", "")), "")
     keys = {key.id: key.value_offset for one in named for key in getattr(one, "geo_keys", ())}
@@ -238,7 +238,7 @@ def _system_in(header: Any) -> System | None:
 
 
 def _timed(points: NDArray[Any], names: Iterable[str], values: Any) -> Scan:
-    """A scan with the times among named values, where there are some."""
+    """Return a scan with the times from named values, if there are any."""
     field = time_field(names)
     return Scan(points) if field is None else Scan(points, field, np.ravel(values[field]))
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Stereo cameras: their calibration, rectification of their images, and the frames made of them."""
+"""Read the calibration of stereo cameras, rectify their images, and make frames of them."""
 
 import logging
 from collections.abc import Sequence
@@ -34,7 +34,7 @@ FILE_PAIRS = (
 
 
 class PairRectifier(Protocol):
-    """Rectifies pairs of images, as `calibration.Rectifier` does."""
+    """Rectifier for pairs of images, such as `calibration.Rectifier`."""
 
     @property
     def intrinsics(self) -> Intrinsics: ...
@@ -54,7 +54,7 @@ class PairRectifier(Protocol):
 
 @dataclass(frozen=True)
 class AlreadyRectified:
-    """`PairRectifier` for images that are rectified already."""
+    """`PairRectifier` for images that are already rectified."""
 
     intrinsics: Intrinsics
     baseline_fx: float  # metre · pixels
@@ -62,10 +62,10 @@ class AlreadyRectified:
     T_left_rectified: ClassVar[Transform] = np.eye(4)
 
     def pair(self, left: NDArray[Any], right: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Return both images as they are.
+        """Return both images unchanged.
 
         Raises:
-            InvalidConfig: they have another size.
+            InvalidConfig: the images have another size.
         """
         for shown in (left.shape[:2], right.shape[:2]):
             if shown != self.size:
@@ -77,10 +77,10 @@ def read_rectifier(calibration: str | Path, *, size: Size | None) -> Rectifier:
     """Read a calibration from a file, or from a folder with a pair of files (`FILE_PAIRS`).
 
     Args:
-        size: (height, width) of one image, for files without one.
+        size: (height, width) of one image, for files without a size.
 
     Raises:
-        DatasetError: it cannot be read; the message says what was expected.
+        DatasetError: the calibration cannot be read. The message says what was expected.
     """
     path = Path(calibration).expanduser()
     files = [path]
@@ -111,18 +111,18 @@ def find_pairs(
     baseline: float | None = None,
     places: Sequence[Path] = (),
 ) -> tuple[PairRectifier, RecordedCamera]:
-    """Find the stereo camera of a recording: how its pairs are rectified, and the left camera then.
+    """Find the stereo camera of a recording. Return the rectifier, and the left camera after rectification.
 
     Args:
         root: the recording's folder.
-        size: (height, width) of its images.
-        intrinsics, baseline: of rectified images; pixels, metres; default from files of the folder.
-        calibration: of raw images; default a pair of files in the folder (`FILE_PAIRS`).
-        places: folders to look in for files of a camera, as of `find_camera`.
+        size: (height, width) of the images.
+        intrinsics, baseline: pixels, metres, for rectified images; default from files of the folder.
+        calibration: for raw images; default a pair of files in the folder (`FILE_PAIRS`).
+        places: folders with camera files, as for `find_camera`.
 
     Raises:
-        UnknownCamera: nothing says what it is.
-        DatasetError: a file of it cannot be used.
+        UnknownCamera: the camera is not known from any source.
+        DatasetError: a camera file cannot be used.
     """
     there = any(all((root / name).is_file() for name in names) for names in FILE_PAIRS)
     if calibration is not None or there:
@@ -139,7 +139,7 @@ def find_pairs(
 
 
 def baseline_of(root: Path) -> float | None:
-    """Read the baseline, metres, from `baseline.txt`; None = not there (yet).
+    """Read the baseline, metres, from `baseline.txt`, or return None without the file.
 
     Raises:
         DatasetError: the file does not hold one number > 0.
@@ -155,7 +155,7 @@ def baseline_of(root: Path) -> float | None:
 
 
 def pair_of(left: NDArray[Any], right: NDArray[Any], pairs: PairRectifier) -> dict[str, Any]:
-    """Fields of a rectified `Frame`, of raw (H, W) grey or (H, W, 3) BGR uint8; colour is the left one's."""
+    """Return fields of a rectified `Frame` from raw (H, W) grey or (H, W, 3) BGR uint8 and left colour."""
     left, right = pairs.pair(left, right)
     return {
         "left": _grey(left),
@@ -169,7 +169,7 @@ def pair_of(left: NDArray[Any], right: NDArray[Any], pairs: PairRectifier) -> di
 def paired(
     left: dict[_FrameKey, Path], right: dict[_FrameKey, Path], skipped: dict[str, int]
 ) -> dict[_FrameKey, tuple[Path, Path]]:
-    """Images of both cameras by name or number; those of one camera alone are counted."""
+    """Pair the images of both cameras by name or number. Count images without a partner."""
     alone = [(left | right)[key] for key in left.keys() ^ right.keys()]
     if alone:
         skipped[NO_HALF] = len(alone)
@@ -179,9 +179,9 @@ def paired(
 
 
 class PairedImages(Frames):
-    """Frames of a left and a right image each, rectified where they are not."""
+    """Frames of a left and a right image each, rectified if they are not yet."""
 
-    _files: list[Any]  # left and right image of each
+    _files: list[Any]  # left and right image of each frame
     _pairs: PairRectifier
     _with_color: bool
 
@@ -196,11 +196,11 @@ class PairedImages(Frames):
         return self._posed_frame(index, **measured)
 
     def _color(self, index: int, left: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """(H, W, 3) uint8 BGR of the left camera, whose rectified image is `left`; grey three times."""
+        """Return (H, W, 3) uint8 BGR of the left camera. `left` is its rectified image; grey three times."""
         return left
 
     def _image(self, file: Path) -> NDArray[Any]:
-        """(H, W) or (H, W, 3) uint8, as stored."""
+        """Return (H, W) or (H, W, 3) uint8, as stored."""
         return read_image(file, "an image", cv2.IMREAD_ANYCOLOR)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Trajectory files: the text formats of the field, read and written."""
+"""Read and write trajectory files in the usual text formats."""
 
 import logging
 from collections.abc import Callable, Iterable, Sequence
@@ -22,7 +22,7 @@ from tsfusion.geometry.trajectory import Trajectory, quaternion, rigid
 _T = TypeVar("_T")
 _RTABMAP_COLUMNS = 9
 _TUM_COLUMNS = (8, _RTABMAP_COLUMNS)
-_SAME_M, _SAME_DEG = 0.01, 1.0  # two poses at one time that differ by less are one
+_SAME_M, _SAME_DEG = 0.01, 1.0  # two poses at one time with a smaller difference are one
 
 log = logging.getLogger(__name__)
 
@@ -30,10 +30,10 @@ log = logging.getLogger(__name__)
 def usable(
     source: object, items: Iterable[_T], read: Callable[[_T], Transform | None]
 ) -> list[Transform | None]:
-    """The pose that `read` makes of each item, None where it is broken; the first broken one is said.
+    """Return the poses that `read` makes of items, None for broken ones. Log the first broken one.
 
     Raises:
-        DatasetError: most are broken; the error of the first.
+        DatasetError: most items are broken. It is the error of the first broken item.
     """
     poses: list[Transform | None] = []
     broken: list[DatasetError] = []
@@ -52,12 +52,12 @@ def usable(
 
 @lru_cache(maxsize=64)
 def _warn_once(line: str) -> None:
-    """Log a warning, but not again where the same file is read again."""
+    """Log a warning once, even if the same file is read again."""
     log.warning("%s", line)
 
 
 def write_tum(path: Path, timestamps_ns: Sequence[int], poses: Sequence[Transform]) -> None:
-    """`timestamp tx ty tz qx qy qz qw` a line, nine decimals: what `read_tum` and the field's tools read."""
+    """Write lines of `timestamp tx ty tz qx qy qz qw`, nine decimals, for `read_tum` and common tools."""
     lines = ["# timestamp tx ty tz qx qy qz qw (T_world_camera)\n"]
     for stamp, T in zip(timestamps_ns, poses, strict=True):
         numbers_ = " ".join(f"{value:.9f}" for value in (*T[:3, 3], *quaternion(T[:3, :3])))
@@ -66,7 +66,7 @@ def write_tum(path: Path, timestamps_ns: Sequence[int], poses: Sequence[Transfor
 
 
 def nanoseconds(seconds: str, path: Path, line: int) -> int:
-    """Decimal seconds as exact integer nanoseconds (a double holds a Unix stamp only to 0.2 µs)."""
+    """Convert decimal seconds to exact integer nanoseconds (a double holds a Unix stamp only to 0.2 µs)."""
     whole, _, fraction = seconds.partition(".")
     if not whole.isdigit() or (fraction and not fraction.isdigit()):
         try:
@@ -81,9 +81,9 @@ def nanoseconds(seconds: str, path: Path, line: int) -> int:
 
 
 def read_tum(path: Path) -> Trajectory:
-    """`timestamp tx ty tz qx qy qz qw` a line (TUM RGB-D, CoRBS, most SLAM systems); RTAB-Map adds an id.
+    """Read lines of `timestamp tx ty tz qx qy qz qw` (TUM RGB-D and most SLAM systems); RTAB-Map adds an id.
 
-    A line without a rigid pose is a hole: nothing is interpolated across it.
+    A line without a rigid pose makes a gap: poses are not interpolated across it.
 
     Raises:
         DatasetError: most lines are no poses, or two poses at one time differ.
@@ -98,7 +98,7 @@ def read_tum(path: Path) -> Trajectory:
 
 
 def read_euroc(path: Path) -> Trajectory:
-    """EuRoC / ASL ground truth: `ns, px, py, pz, qw, qx, qy, qz, …` a line, T_world_body; as `read_tum`."""
+    """Read EuRoC / ASL ground truth, T_world_body: lines of `ns, px, py, pz, qw, qx, qy, qz, …`."""
     content = "`ns,px,py,pz,qw,qx,qy,qz,…` a line"
 
     def stamp(word: str, line: int) -> int:
@@ -120,7 +120,7 @@ def _read(
     stamp_of: Callable[..., int],
     values_of: Callable[[list[str], int], list[float]],
 ) -> Trajectory:
-    """The poses of a file's lines in time order; of a broken one whose time can be read NaN."""
+    """Return the poses of a file's lines in time order; NaN for a broken line with a readable time."""
     stamps: list[int] = []
 
     def read(line: tuple[int, str]) -> NDArray[np.float64]:
@@ -141,14 +141,14 @@ def _read(
     table = np.array([np.full(7, np.nan) if row is None else row for row in rows])
     order = np.argsort(times, kind="stable")[np.count_nonzero(times < 0) :]
     times, table = times[order], table[order]
-    if words := twins(times, table):  # nobody knows which one counts
+    if words := twins(times, table):  # it is not known which one is right
         raise DatasetError(f"{path} has {words}; expected one pose a time")
     first = np.unique(times, return_index=True)[1]
     return Trajectory(times[first], table[first, :3], table[first, 3:])
 
 
 def twins(times: NDArray[np.int64], table: NDArray[np.float64]) -> str:
-    """Poses at one time that differ, in words; empty = there are none.
+    """Return a text about poses at one time that differ; empty if there are none.
 
     Args:
         times: (n,) nanoseconds, in order.
@@ -167,14 +167,14 @@ def twins(times: NDArray[np.int64], table: NDArray[np.float64]) -> str:
 
 
 def check_quaternion(quaternion: Sequence[float] | NDArray[np.float64], path: Path, line: int) -> None:
-    """Raise a DatasetError unless its length is 1 to a hundredth."""
+    """Raise DatasetError unless the length is 1 ± 0.01."""
     norm = float(np.linalg.norm(quaternion))
     if abs(norm - 1) > 0.01:
         raise DatasetError(f"{path}:{line}: quaternion must have length 1, got {norm:.4g}")
 
 
 def read_kitti(path: Path) -> list[Transform | None]:
-    """3×4 row-major matrices, one a line; the line number is the frame number; None where one is broken."""
+    """Read lines of 3×4 row-major matrices. The line number is the frame number; None = a broken line."""
     return _read_rows(path, "12 numbers a line, a 3×4 row-major camera-to-world matrix", 12)
 
 
@@ -187,7 +187,7 @@ def read_matrix(path: Path) -> Transform:
 
 
 def read_matrix_rows(path: Path) -> list[Transform | None]:
-    """4×4 matrices, one a line of 16 numbers (HoloLens folders); None where one is broken."""
+    """Read 4×4 matrices from lines of 16 numbers (HoloLens folders); None = a broken line."""
     return _read_rows(path, "16 numbers a line, a 4×4 row-major camera-to-world matrix", 16)
 
 
@@ -205,9 +205,9 @@ def _read_rows(path: Path, content: str, columns: int) -> list[Transform | None]
 
 
 def read_log(path: Path) -> list[tuple[int, Transform | None]]:
-    """Redwood / Open3D `.log`: a line of three integers, then a 4×4 camera-to-world matrix; repeated.
+    """Read a Redwood / Open3D `.log`: three integers on a line, then a 4×4 camera-to-world matrix, repeated.
 
-    None where a matrix is broken.
+    A broken matrix becomes None.
     """
     lines = read_lines(path, "a Redwood trajectory: three integers, then a 4×4 matrix, repeated")
     if not lines or len(lines) % 5:
@@ -230,14 +230,16 @@ def read_log(path: Path) -> list[tuple[int, Transform | None]]:
 
 
 def read_poses(path: Path) -> tuple[NDArray[np.int64] | None, NDArray[np.float64]]:
-    """Read a trajectory file: TUM (8 numbers in the first line, with RTAB-Map's ids 9), KITTI (12), 4×4
-    matrices (16) or Redwood's `.log` (3), whose poses come in the order of their numbers.
+    """Read a trajectory file, whose format is known by the numbers in its first line.
+
+    It is TUM (8 numbers, with RTAB-Map's ids 9), KITTI (12), 4×4 matrices (16) or Redwood's `.log` (3). The
+    poses of a `.log` are sorted by their numbers.
 
     Returns:
-        (n,) timestamps in nanoseconds, None where the format has none; (n, 4, 4) poses, NaN where broken.
+        (n,) timestamps in nanoseconds, or None if the format has none; (n, 4, 4) poses, NaN for broken ones.
 
     Raises:
-        DatasetError: for a missing file, or one of another format.
+        DatasetError: the file is missing, or has another format.
     """
     columns = _columns(path)
     if columns in _TUM_COLUMNS:
@@ -257,12 +259,12 @@ def read_poses(path: Path) -> tuple[NDArray[np.int64] | None, NDArray[np.float64
 
 
 def has_times(path: Path) -> bool:
-    """True for a trajectory in TUM's format or RTAB-Map's."""
+    """Return True for a trajectory in TUM's or RTAB-Map's format."""
     return _columns(path) in _TUM_COLUMNS
 
 
 def is_log(path: Path) -> bool:
-    """True for a Redwood `.log` trajectory, and for a file that `read_poses` cannot read."""
+    """Return True for a Redwood `.log` trajectory, and for a file that `read_poses` cannot read."""
     return _columns(path) not in (*_TUM_COLUMNS, 12, 16)
 
 
@@ -272,7 +274,7 @@ def _columns(path: Path) -> int:
 
 
 def checked_pose(matrix: NDArray[np.float64], source: object) -> Transform:
-    """(3, 4) or (4, 4) as a rigid (4, 4), or an error that names where it came from."""
+    """Return a (3, 4) or (4, 4) matrix as a rigid (4, 4), or raise an error that names the `source`."""
     T = np.eye(4)
     T[: len(matrix)] = matrix
     try:
