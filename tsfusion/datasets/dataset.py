@@ -415,7 +415,7 @@ def select(
 
 
 def nearest_in_time(sorted_ns: NDArray[np.int64], stamps_ns: NDArray[np.int64]) -> NDArray[np.intp]:
-    """Return the index in `sorted_ns` (not empty) of the nearest to each of `stamps_ns`; of equals the first."""
+    """Return the index in `sorted_ns` (not empty) nearest to each of `stamps_ns`; of equals the first."""
     right = np.minimum(np.searchsorted(sorted_ns, stamps_ns), len(sorted_ns) - 1)
     left = np.maximum(right - 1, 0)
     nearer = np.abs(sorted_ns[left] - stamps_ns) <= np.abs(sorted_ns[right] - stamps_ns)

@@ -205,10 +205,7 @@ def _read_rows(path: Path, content: str, columns: int) -> list[Transform | None]
 
 
 def read_log(path: Path) -> list[tuple[int, Transform | None]]:
-    """Read a Redwood / Open3D `.log`: three integers on a line, then a 4×4 camera-to-world matrix, repeated.
-
-    A broken matrix becomes None.
-    """
+    """Read a Redwood / Open3D `.log`: three integers, then a 4×4 matrix, repeated. Broken ones are None."""
     lines = read_lines(path, "a Redwood trajectory: three integers, then a 4×4 matrix, repeated")
     if not lines or len(lines) % 5:
         raise DatasetError(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Unpack archives of recordings beside themselves, safely."""
+"""Unpack archives of recordings to a folder beside them, safely."""
 
 import lzma
 import shutil
@@ -18,18 +18,18 @@ _SUFFIXES = (".tar.gz", ".tar.bz2", ".tar.xz", ".tgz", ".tbz2", ".txz", ".tar", 
 
 
 def is_archive(path: Path) -> bool:
-    """True if the name is an archive's: `.zip`, `.tar` and its compressed kinds."""
+    """Return True for the name of an archive: `.zip`, `.tar` and its compressed kinds."""
     return path.name.lower().endswith(_SUFFIXES)
 
 
 def destination(path: Path) -> Path:
-    """The folder that an archive is unpacked to: beside it, with its name."""
+    """Return the folder that an archive is unpacked to: beside the archive, with its name."""
     suffix = next(suffix for suffix in _SUFFIXES if path.name.lower().endswith(suffix))
     return path.with_name(path.name[: -len(suffix)])
 
 
 def command(path: Path) -> str:
-    """The shell command that unpacks an archive to `destination`."""
+    """Return the shell command that unpacks an archive to `destination`."""
     into = destination(path)
     if path.suffix.lower() == ".zip":
         return f"unzip -q '{path}' -d '{into}'"
@@ -37,10 +37,11 @@ def command(path: Path) -> str:
 
 
 def unpack(path: Path) -> Path:
-    """Unpack beside the archive, all or nothing; returns the folder. Windows paths inside become folders.
+    """Unpack beside the archive, all or nothing. Return the folder. Windows paths inside become folders.
 
     Raises:
-        DatasetError: when it is broken or leads out of its folder, the folder exists, or the disk is full.
+        DatasetError: the archive is broken or leads out of its folder, the folder exists, or the disk is
+            full.
     """
     into = destination(path)
     if into.exists():
@@ -57,14 +58,14 @@ def unpack(path: Path) -> Path:
 
 
 def extract(path: Path, into: Path, *, nested: bool = False) -> None:
-    """Unpack into an empty folder. Unpacked files stay there when the rest fails.
+    """Unpack into an empty folder. If it fails, files unpacked so far stay there.
 
     Args:
-        nested: unpack zip files inside too, and remove them.
+        nested: True also unpacks zip files inside, and removes them.
 
     Raises:
-        DatasetError: when it is broken, or a member is a link or leads out of the folder.
-        OSError: when it cannot be written.
+        DatasetError: the archive is broken, or a member is a link or leads out of the folder.
+        OSError: a file cannot be written.
     """
     into.mkdir(parents=True, exist_ok=True)
     try:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Public recordings that `tsfusion download` knows: where they are, how large, under which licence.
+"""List the public recordings that `tsfusion download` knows: addresses, sizes and licences.
 
-A checksum is the publisher's where one is published, else one that independent users of the same archive
-have published; None = neither is known, and the first download writes down its own.
+A checksum is published by the publisher, or else by independent users of the same archive. None = not known;
+the first download then stores its own checksum.
 """
 
 from typing import NamedTuple
@@ -22,21 +22,21 @@ _CORBS = "http://corbs.dfki.uni-kl.de/suppfiles/ElectricalCabinet/E1"
 
 
 class File(NamedTuple):
-    """A file to download."""
+    """File to download."""
 
     url: str
-    name: str  # of the file on this disk and at a mirror
+    name: str  # of the file on disk and at a mirror
     checksum: str | None = None  # `sha256:…` or `md5:…`; None = unknown
     into: str = ""  # subfolder that an archive is unpacked to
 
 
 class PublicRecording(NamedTuple):
-    """An entry of the catalogue.
+    """Entry of the catalogue.
 
     Attributes:
-        files: empty = fetch it by hand; `note` says why.
-        nbytes: of all files; None = unknown.
-        opens: path to open, below the folder it is unpacked to.
+        files: files to download; empty = the user must fetch it by hand, and `note` gives the reason.
+        nbytes: size of all files; None = unknown.
+        opens: path to open, relative to the folder that it is unpacked to.
     """
 
     name: str
@@ -148,10 +148,10 @@ CATALOGUE: tuple[PublicRecording, ...] = (
 
 
 def entry(name: str) -> PublicRecording:
-    """The recording of a name.
+    """Return the recording with a name.
 
     Raises:
-        DatasetError: no such name; lists the known ones.
+        DatasetError: the name is unknown. The message lists the known names.
     """
     for one in CATALOGUE:
         if one.name == name:

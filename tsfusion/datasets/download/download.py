@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Fetch a recording of the catalogue: checked, resumable, unpacked completely or not at all.
+"""Download a recording of the catalogue: checked, resumable, and unpacked completely or not at all.
 
-pooch compares checksums; `http` downloads, and goes on where it was interrupted.
+Pooch compares checksums. `http` downloads, and continues after an interruption.
 """
 
 import logging
@@ -20,17 +20,17 @@ ENDING = ".sha256"
 
 
 class CheckedFile(NamedTuple):
-    """A downloaded file of a recording."""
+    """Downloaded file of a recording."""
 
     path: Path
-    sha256: str  # of the file on the disk
-    # Whether a checksum was known to compare with; otherwise this one was written beside the file
+    sha256: str  # of the file on disk
+    # True if a checksum was known for comparison; otherwise this one was written beside the file
     known: bool
-    fetched: bool  # whether it was downloaded by this call
+    fetched: bool  # True if this call downloaded it
 
 
 class FetchedRecording(NamedTuple):
-    """A recording on the disk; `path` is to be opened, `files` lacks archives that the user has removed."""
+    """Recording on disk. `path` is the path to open; `files` lacks archives that the user has removed."""
 
     path: Path
     files: list[CheckedFile]
@@ -39,15 +39,15 @@ class FetchedRecording(NamedTuple):
 def fetch(
     recording: PublicRecording, to: Path, watch: OnProgress, *, base: str | None = None
 ) -> FetchedRecording:
-    """Bring a recording into `to`: its archives, and the folder `to/NAME` with what they hold.
+    """Bring a recording into `to`: its archives, and the folder `to/NAME` with their contents.
 
     Args:
         base: address of a mirror that has the files under their names.
 
     Raises:
-        MissingDependency: without pooch.
-        DatasetError: it has to be fetched by hand, cannot be fetched, or has another checksum.
-        OutputError: it cannot be written.
+        MissingDependency: pooch is not installed.
+        DatasetError: the recording must be fetched by hand, cannot be fetched, or has another checksum.
+        OutputError: a file cannot be written.
     """
     if not recording.files:
         raise DatasetError(f"{recording.title}: {recording.note}: {recording.page}")
@@ -63,7 +63,7 @@ def fetch(
 
 
 def check(recording: PublicRecording, to: Path) -> list[CheckedFile]:
-    """Compare the files of a recording that are in `to` with their checksums.
+    """Compare the files of a recording in `to` with their checksums.
 
     Raises:
         DatasetError: a file has another checksum.
@@ -110,7 +110,7 @@ def _pooch() -> Any:
 
 
 def _known_checksum(file: File, path: Path) -> str | None:
-    """The checksum of the catalogue, or the one written at the first download."""
+    """Return the checksum of the catalogue, or the one written at the first download, or None."""
     if file.checksum is not None:
         return file.checksum
     try:
@@ -134,7 +134,7 @@ def _verified(file: File, path: Path) -> CheckedFile:
 
 
 def _with_checksum_file(path: Path, *, known: bool, fetched: bool) -> CheckedFile:
-    """The file and its checksum, which is written beside it as `sha256sum --check` reads it."""
+    """Return the file with its checksum, and write it beside the file in the form of `sha256sum --check`."""
     sha256 = _file_hash(path, "sha256")
     beside = path.with_name(path.name + ENDING)
     try:

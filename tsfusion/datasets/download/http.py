@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Download one file over HTTP in as many requests as needed; received bytes stay in a `.part` file.
+"""Download one file over HTTP in as many requests as needed. Received bytes stay in a `.part` file.
 
-A part is continued only if the server still has the same file (RFC 9110: Range and If-Range).
+A `.part` file is continued only if the server still has the same file (RFC 9110: Range and If-Range).
 """
 
 import errno
@@ -28,11 +28,11 @@ _PAUSE_S = 1.0
 
 
 def download(url: str, part: Path, watch: OnProgress) -> None:
-    """Complete `part`, from where an earlier call stopped; without ranges at the server, from the start.
+    """Complete `part` from where an earlier call stopped. If the server has no ranges, start again.
 
     Raises:
         DatasetError: the server refuses, sends a web page, or cannot be reached.
-        OutputError: it cannot be written.
+        OutputError: the file cannot be written.
     """
     if not url.startswith(("https://", "http://")):
         raise DatasetError(f"cannot download {url}: only https and http are fetched")
@@ -52,7 +52,7 @@ def download(url: str, part: Path, watch: OnProgress) -> None:
             raise DatasetError(f"cannot download {url}: no host can have that name") from error
         except (OSError, http.client.HTTPException) as error:
             cause = str(getattr(error, "reason", error)) or type(error).__name__
-        fruitless = 0 if size_of(part) > most else fruitless + 1  # a part that began again is no progress
+        fruitless = 0 if size_of(part) > most else fruitless + 1  # a file that starts again is no progress
         most = max(most, size_of(part))
         if fruitless < _GIVE_UP_AFTER:
             time.sleep(_PAUSE_S * fruitless)
@@ -62,7 +62,7 @@ def download(url: str, part: Path, watch: OnProgress) -> None:
 
 
 def _request(url: str, part: Path, watch: OnProgress) -> bool:
-    """Send one request; True if the file is complete then."""
+    """Send one request. Return True if the file is then complete."""
     start, validator = size_of(part), _validator(part)
     headers = {"User-Agent": f"tsfusion/{version_of('tsfusion')}", "Accept-Encoding": "identity"}
     if start and validator:
@@ -110,7 +110,6 @@ def _copy(response: Any, part: Path, at: int, total: int, watch: OnProgress) -> 
 
 @contextmanager
 def _locked(part: Path) -> Iterator[IO[bytes]]:
-    """The part, opened and locked."""
     try:
         with folder_lock.hold(part.parent, part.name), part.open("r+b") as file:
             yield file
@@ -121,7 +120,7 @@ def _locked(part: Path) -> Iterator[IO[bytes]]:
 
 
 def _first_byte(response: Any) -> int:
-    """Position in the file of the response's first byte."""
+    """Return the position in the file of the response's first byte."""
     if response.status != http.client.PARTIAL_CONTENT:
         return 0
     found = re.match(r"bytes (\d+)-", response.headers.get("Content-Range", ""))
@@ -129,7 +128,7 @@ def _first_byte(response: Any) -> int:
 
 
 def _validator_of(response: Any) -> str:
-    """Identifier of this version of the file: a strong ETag, or its date; empty without either."""
+    """Return the identifier of the file's version: a strong ETag, or its date; empty without either."""
     tag = str(response.headers.get("ETag") or "")
     return tag if tag.startswith('"') else str(response.headers.get("Last-Modified") or "")
 
@@ -171,7 +170,7 @@ def _not_written(part: Path, error: OSError) -> OutputError:
 
 
 class _NoDowngrade(urllib.request.HTTPRedirectHandler):
-    """Follows redirects to http and https, but never from https to http."""
+    """Follow redirects to http and https, but never from https to http."""
 
     def redirect_request(self, req: Any, *response: Any) -> Any:
         newurl = str(response[-1])
@@ -181,7 +180,7 @@ class _NoDowngrade(urllib.request.HTTPRedirectHandler):
 
 
 def _opener() -> urllib.request.OpenerDirector:
-    """An opener for http and https alone."""
+    """Return an opener for http and https only."""
     opener = urllib.request.OpenerDirector()
     for handler in (
         urllib.request.ProxyHandler,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""EuRoC micro aerial vehicle recordings, and others in the ASL layout: stereo pairs with a body's poses."""
+"""Read EuRoC drone recordings, and others in the ASL layout: stereo pairs with poses of the body."""
 
 from pathlib import Path
 from typing import Any
@@ -35,9 +35,9 @@ class EuRoC(PairedImages, FolderFrames):
     """Stereo pairs in the ASL layout, undistorted and rectified by `sensor.yaml`.
 
     https://projects.asl.ethz.ch/datasets/doku.php?id=kmavvisualinertialdatasets. Frames are grey pairs in the
-    axes of the rectified left camera; `radial-tangential` and `equidistant` lenses. The ground truth is of
-    the body: a frame's pose is T_world_body · T_BS · T_cam0_rectified, interpolated at the left image's
-    stamp. Images without their other half (not listed, or listed and not there) are left out and counted.
+    axes of the rectified left camera, with `radial-tangential` or `equidistant` lenses. The ground truth is
+    of the body. A frame's pose is T_world_body · T_BS · T_cam0_rectified, interpolated at the left image's
+    stamp. Images without a partner (not listed, or listed but missing) are left out and counted.
 
     Args:
         path: the sequence's folder (it holds `mav0`), or `mav0`.
@@ -45,7 +45,8 @@ class EuRoC(PairedImages, FolderFrames):
         options: those of `FolderFrames`.
 
     Raises:
-        DatasetError: no such folder, no pairs, a malformed line, a calibration that cannot be used.
+        DatasetError: there is no such folder, there are no pairs, a line is malformed, or the calibration
+            cannot be used.
     """
 
     layout, expected, sensor = "EuRoC", EXPECTED, "stereo"
@@ -80,7 +81,7 @@ class EuRoC(PairedImages, FolderFrames):
 
 
 def _pairs(place: Path, max_difference_ns: int, skipped: dict[str, int]) -> list[tuple[int, Path, Path]]:
-    """(left's stamp, left, right) of images that are there and near in time; a right image serves once."""
+    """Return (left's stamp, left, right) of existing images near in time. Each right image is used once."""
     left, right = (_listed(place / camera) for camera in ("cam0", "cam1"))
     stamps = np.array([stamp for stamp, _ in right], dtype=np.int64)
     pairs: list[tuple[int, Path, Path]] = []
@@ -110,7 +111,7 @@ def _listed(camera: Path) -> list[tuple[int, Path]]:
 
 
 def _calibrated(place: Path) -> tuple[Rectifier, Transform]:
-    """The rectification, and T_body_rectified of the left camera."""
+    """Return the rectifier, and T_body_rectified of the left camera."""
     files = [place / camera / "sensor.yaml" for camera in ("cam0", "cam1")]
     for file in files:
         if file.is_file() and "distortion_model" not in read_tree(file):
@@ -123,7 +124,7 @@ def _calibrated(place: Path) -> tuple[Rectifier, Transform]:
 
 
 def _on_body(file: Path) -> Transform:
-    """T_BS of a sensor.yaml: the sensor's place on the body."""
+    """Return T_BS of a sensor.yaml: the sensor's pose on the body."""
     try:
         T_BS = np.array(read_tree(file)["T_BS"]["data"], dtype=np.float64)
         return check_pose(T_BS.reshape(4, 4))
@@ -132,7 +133,7 @@ def _on_body(file: Path) -> Transform:
 
 
 def _accelerometer(place: Path, T_body_camera: Transform) -> Accelerometer | None:
-    """Accelerometer of `imu0`, if there is one."""
+    """Return the accelerometer of `imu0`, or None without one."""
     sensor = place / "imu0" / "sensor.yaml"
     R_body_imu = _on_body(sensor)[:3, :3] if sensor.is_file() else np.eye(3)
     return read_table(

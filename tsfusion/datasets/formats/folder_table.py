@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The known layouts of folders with depth images: a row of attributes each, and what a row cannot say."""
+"""Define the known layouts of folders with depth images: attributes for each, and methods for exceptions."""
 
 import re
 from collections.abc import Sequence
@@ -35,16 +35,16 @@ PLAIN_EXPECTED = (
     "in one folder (depth_N.png and color_N.png, N-depth.png and N-rgb.jpg, …), and camera-intrinsics.txt or "
     "camera_intrinsic.json; without poses, so for a scan, or with --trajectory"
 )
-KINECT = Intrinsics(585.0, 585.0, 320.0, 240.0)  # the release's own figure
-# The colour camera is not in the release: measured on RedKitchen by bringing depth edges onto colour edges
-# (mean gradient under them 2.34 times the image's; 1.24 as released).
+KINECT = Intrinsics(585.0, 585.0, 320.0, 240.0)  # published with the data
+# The release has no colour camera. It was measured on RedKitchen by moving depth edges onto colour edges
+# (the mean gradient under them is 2.34 times the image's; 1.24 as released).
 KINECT_COLOR = Intrinsics(527.0, 527.0, 320.0, 237.5)
 KINECT_BASELINE = -0.025  # metres, x of the depth camera's origin in the colour camera's axes
 _SCENES = re.compile(r"chess|fire|heads|office|pumpkin|redkitchen(_\w+)?|stairs")
 _RELEASE = re.compile(r"7[-_]?scenes|seven[-_]?scenes", re.IGNORECASE)
-_RELEASED = ("TrainSplit.txt", "TestSplit.txt")  # beside the sequences of every scene
-NOT_MEASURED = 65535  # the original release marks invalid depth so; 0 in re-encoded copies
-# Open3D's PrimeSenseDefault, for the recordings that Redwood and Open3D distribute
+_RELEASED = ("TrainSplit.txt", "TestSplit.txt")  # in every scene's folder
+NOT_MEASURED = 65535  # invalid depth in the original release; 0 in re-encoded copies
+# Open3D's PrimeSenseDefault, for recordings distributed by Redwood and Open3D
 _PRIMESENSE = PublishedCamera("Redwood's recordings", Intrinsics(525.0, 525.0, 319.5, 239.5))
 _REDWOODS_NAMES = re.compile(
     r"redwood[-_](sample|lounge|bedroom|living_?room\d|office\d)|(lounge|bedroom|sampleredwood)rgbdimages"
@@ -54,24 +54,24 @@ _REDWOODS_FILES = ("livingroom[12]-traj.txt", "office[12]-traj.txt")
 _IMAGES = {*DEPTH_SUFFIXES, *COLOR_SUFFIXES}
 _LOGS = ("trajectory.log", "scene/trajectory.log", "odometry.log")  # by preference
 _LOG_NAMES = ("*traj*.log", "*-traj.txt")
-# In the name of an image that has its colour beside it: depth_3, depth16_3, depth_raw_3
+# In the name of a depth image with its colour image in the same folder: depth_3, depth16_3, depth_raw_3
 _DEPTH = re.compile("depth(?:16(?=[_-])|[_-]?raw)?", re.IGNORECASE)
 _FEWEST = 2  # images of a series
 _CAMERAS = ("intrinsic/intrinsic_{}.txt", "intrinsics_{}.txt", "intrinsic_{}.txt")  # ScanNet's
 
 
 class SevenScenes(DepthImages):
-    """A scene (every `seq-*` in it, one world) or a single sequence.
+    """A scene (every `seq-*` in it, with one world) or a single sequence.
 
-    Depth is uint16 millimetres. 7-Scenes colour has the depth's size but comes from another camera, up to
-    35 pixels off: it is registered to the depth here. There are no timestamps (nominally 30 Hz).
+    Depth is uint16 millimetres. The colour of 7-Scenes has the depth's size, but comes from another camera
+    and is up to 35 pixels off: it is registered to the depth here. There are no timestamps (nominally 30 Hz).
 
     Args:
-        path: the scene's or the sequence's folder. A file of the camera may lie beside the frames or up to
-            two folders up; a scene of 7-Scenes (by its name and `TrainSplit.txt`, or in a folder `7scenes`)
-            at 640×480 has 585, 585, 320, 240 without one.
-        register: move colour onto depth; default: for a scene of 7-Scenes with its own depth camera
-            (3DMatch's colour is registered already).
+        path: folder of the scene or the sequence. A camera file may be beside the frames or up to two folders
+            up. Without one, a scene of 7-Scenes (known by its name and `TrainSplit.txt`, or by a folder
+            `7scenes`) at 640×480 has 585, 585, 320, 240.
+        register: True moves colour onto depth. Default True for a scene of 7-Scenes with its own depth camera
+            (3DMatch's colour is already registered).
         options: those of `DepthImages`.
     """
 
@@ -124,12 +124,12 @@ class SevenScenes(DepthImages):
 
 
 class ScanNet(DepthImages):
-    """A scene as ScanNet's SensReader exports it, or one of `scannet_frames_25k`.
+    """A scene as exported by ScanNet's SensReader, or one of `scannet_frames_25k`.
 
-    http://www.scan-net.org. Depth in uint16 millimetres; the colour camera stands beside the depth camera
-    and has other pixels: colour is resampled by both cameras' matrices, as if they stood in one place.
-    Frames that the authors' tracker lost have poses of -inf: they count as frames without a pose. No
-    timestamps (nominally 30 Hz). Options are those of `DepthImages`.
+    http://www.scan-net.org. Depth is uint16 millimetres. The colour camera is beside the depth camera and has
+    other pixels: colour is resampled with both cameras' matrices, as if the cameras had one position. Frames
+    that the authors' tracker lost have poses of -inf: they count as frames without a pose. No timestamps
+    (nominally 30 Hz). Options are those of `DepthImages`.
     """
 
     layout = "ScanNet"
@@ -161,8 +161,9 @@ class Replica(DepthImages):
     """A scene of Replica as distributed with NICE-SLAM (also used by many later SLAM systems).
 
     https://github.com/cvg/nice-slam. Line k of `traj.txt` is frame k's 4×4 camera-to-world matrix, OpenCV
-    axes; depth is 6553.5 units a metre at 1200×680, K 600, 600, 599.5, 339.5, unless `cam_params.json` says
-    otherwise. Rendered, without noise; no timestamps. Options are those of `DepthImages`.
+    axes. Depth has 6553.5 units for each metre, at 1200×680 with K 600, 600, 599.5, 339.5, unless
+    `cam_params.json` states otherwise. The images are rendered, without noise or timestamps. Options are
+    those of `DepthImages`.
     """
 
     layout = "Replica"
@@ -180,8 +181,8 @@ class Replica(DepthImages):
 class HoloLens(DepthImages):
     """HoloLens RGB-D as in deep-video-mvs: line k of `poses.txt` belongs to the k-th image by name.
 
-    https://github.com/ardaduz/deep-video-mvs. Time-of-flight depth in uint16 millimetres, registered to
-    colour; no timestamps. Options are those of `DepthImages`.
+    https://github.com/ardaduz/deep-video-mvs. Depth is time-of-flight in uint16 millimetres, registered to
+    colour. There are no timestamps. Options are those of `DepthImages`.
     """
 
     layout, expected, sensor = "HoloLens", "K.txt, poses.txt, depth/*.png and images/*.png", "tof"
@@ -193,17 +194,18 @@ class HoloLens(DepthImages):
 class Redwood(DepthImages):
     """Redwood's data sets and Open3D's reconstructions: a `.log` of poses, depth in uint16 millimetres.
 
-    http://redwood-data.org and Open3D's reconstruction system: `depth/` beside `color/`, `image/` or others,
-    or Redwood's own `NAME-depth-clean/`, `NAME-color/`, `NAME-traj.txt`. A pose's number is the one in its
-    image's file name; of as many poses as images, with other numbers, the k-th pose is the k-th image's.
-    Poses without an image are ignored. Images named by their seconds or nanoseconds have times, others none.
+    http://redwood-data.org and Open3D's reconstruction system. The folders are `depth/` beside `color/`,
+    `image/` or others, or Redwood's own `NAME-depth-clean/`, `NAME-color/`, `NAME-traj.txt`. A pose belongs
+    to the image with its number in the file name. If there are as many poses as images but with other
+    numbers, the k-th pose belongs to the k-th image. Poses without an image are ignored. Images named by
+    seconds or nanoseconds have times, others have none.
 
     Args:
-        path: the folder, or the `.log` in it to take the poses from.
-        trajectory: default `trajectory.log`, `scene/trajectory.log`, `odometry.log` or the one file named
+        path: the folder, or the `.log` in it with the poses to take.
+        trajectory: default `trajectory.log`, `scene/trajectory.log`, `odometry.log` or the only file named
             `*traj*.log` or `*-traj.txt`.
-        intrinsics, calibration: default a file of the camera in the folder (`cameras.FILES`); for recordings
-            that Redwood and Open3D distribute, known by their names, at 640×480 else 525, 525, 319.5, 239.5.
+        intrinsics, calibration: default a camera file in the folder (`cameras.FILES`); else 525, 525, 319.5,
+            239.5 at 640×480 for recordings distributed by Redwood and Open3D, known by their names.
 
     Other options are those of `DepthImages`.
     """
@@ -217,14 +219,14 @@ class Redwood(DepthImages):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """True for a folder with depth images and a trajectory, and for a `.log` file of such a folder."""
+        """Return True for a folder with depth images and a trajectory, and for the `.log` file in it."""
         if path.is_file():
             return path.suffix == ".log" and _root_of(path) is not None
         return bool(cls.depth_at.folders(path)) and _log(path) is not None
 
     @classmethod
     def recognises_plain(cls, path: Path) -> bool:
-        """True for a folder with one of depth images and one of colour images, or with both in one."""
+        """Return True for a folder with a depth and a colour folder, or with both kinds of image in it."""
         if cls.depth_at.folders(path):
             return bool(cls.color_at.folders(path))
         return bool(_beside(path))
@@ -250,13 +252,13 @@ class Redwood(DepthImages):
     def _recorded_poses(self, root: Path, files: list[Path]) -> FramePoses:
         path = _log(root)
         if path is None:
-            given = root / "groundtruth.txt"  # TUM's
+            given = root / "groundtruth.txt"  # in TUM's layout
             hint = f"{SCAN}, or --trajectory {given} names them" if given.is_file() else SCAN
             raise NoPoses(f"{root} has no trajectory; expected {self.expected}; {hint}")
         return self._poses_of(path, files)
 
     def _poses_of(self, path: Path, files: list[Path]) -> FramePoses:
-        """FramePoses of a `.log` by number; of another trajectory by time, or one for each image."""
+        """Return the poses of a `.log` by number; of another trajectory by time, or one for each image."""
         if is_log(path):
             return poses_by_number(_names(files), read_log(path), path)
         return super()._poses_of(path, files)
@@ -279,7 +281,7 @@ def _registration(depth: Intrinsics, size: tuple[int, int]) -> Registration:
 
 
 def _sequences(root: Path) -> list[Path]:
-    """The folder itself when it holds frames, else its `seq-*` folders."""
+    """Return the folder itself if it holds frames, else its `seq-*` folders."""
     if _frames(root, "depth.png") or _frames(root, "pose.txt"):
         return [root]
     return in_order(path for path in root.glob("seq-*") if path.is_dir())
@@ -294,7 +296,7 @@ def _sibling(depth: Path, kind: str) -> Path:
 
 
 def _is_seven_scenes(root: Path) -> bool:
-    """True for a scene of 7-Scenes or a sequence of one; names alone, free for anybody, decide nothing."""
+    """Return True for a scene or sequence of 7-Scenes. Its name alone, free for all, is not enough."""
     root = root.resolve()
     names = root.parts[-3:]
     scene = next((place for place in (root, root.parent) if _SCENES.fullmatch(place.name)), None)
@@ -315,17 +317,17 @@ def _color_intrinsics(root: Path) -> Intrinsics | None:
 
 
 def _names(files: list[Path]) -> list[str]:
-    """Names of images; of those that have their colour beside them the only number in each."""
+    """Return names of images, or the only number in each if the colour images are in the same folder."""
     numbers = [numbers_in(_DEPTH.sub("", file.stem)) for file in files if _DEPTH.search(file.stem)]
     is_numbered = len(numbers) == len(files) and all(len(one) == 1 for one in numbers)
     return [one[0] for one in numbers] if is_numbered else [file.stem for file in files]
 
 
 def _only_series(root: Path) -> dict[Path, Path | None]:
-    """The depth images of a folder, each with its colour image beside it, in their order.
+    """Return depth image → colour image in the same folder, in order.
 
     Raises:
-        DatasetError: several series are there.
+        DatasetError: there are several series.
     """
     found = _beside(root)
     if len(found) > 1:
@@ -335,7 +337,7 @@ def _only_series(root: Path) -> dict[Path, Path | None]:
 
 
 def _beside(root: Path) -> list[dict[Path, Path | None]]:
-    """Series of depth images that have their colour images beside them, told by the names."""
+    """Return series of depth images with colour images in the same folder, known by their names."""
     if not root.is_dir():
         return []
     files = {file.name.lower(): file for file in root.glob("[!.]*") if file.suffix.lower() in _IMAGES}
@@ -350,14 +352,14 @@ def _beside(root: Path) -> list[dict[Path, Path | None]]:
 
 
 def _partner(depth: Path, files: dict[str, Path]) -> Path | None:
-    """The colour image whose name says colour where that of the depth image says depth."""
+    """Return the colour image whose name has "color" where the depth image's name has "depth", or None."""
     stems = (_DEPTH.sub(word, depth.stem).lower() for word in COLOR)
     names = (stem + suffix for stem in stems for suffix in COLOR_SUFFIXES)
     return next((files[name] for name in names if name in files), None)
 
 
 def _is_deep(file: Path) -> bool:
-    """True for a PNG image of one 16-bit channel, by its header, and for other formats, judged when read."""
+    """Return True for a PNG of one 16-bit channel, by its header, and for any file of another format."""
     if file.suffix.lower() != ".png":
         return True
     try:
@@ -368,7 +370,7 @@ def _is_deep(file: Path) -> bool:
 
 
 def _root_of(log: Path) -> Path | None:
-    """The recording that a trajectory lies in: `scene/trajectory.log` is one folder down."""
+    """Return the recording that a trajectory belongs to: `scene/trajectory.log` is one folder down."""
     log = log.absolute()
     places = (log.parent, log.parent.parent)
     return next((place for place in places if Redwood.depth_at.folders(place) or _beside(place)), None)

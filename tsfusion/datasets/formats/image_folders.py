@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Base of layouts with depth images in one folder and colour images in another."""
+"""Base class of layouts with depth images in one folder and colour images in another."""
 
 import logging
 import os
@@ -27,49 +27,49 @@ from tsfusion.geometry.se3 import Transform
 log = logging.getLogger(__name__)
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
-_SIZES = 3  # images that tell the size of all
-_FIRST_TRIES = 50  # images that cannot be read and none that can: so it is with all
-COLOR = ("color", "colour", "rgb", "image", "images")  # folders beside depth/, by preference
+_SIZES = 3  # images used to find the size of all
+_FIRST_TRIES = 50  # so many unreadable images, with no readable one, mean that all are
+COLOR = ("color", "colour", "rgb", "image", "images")  # folders beside depth/, in order of preference
 
 
 class ImagesAt(NamedTuple):
-    """Images of one kind in a layout: their folders by preference, and their names without suffix.
+    """Images of one kind in a layout: folders in order of preference, and file names without suffix.
 
-    In a name {} stands for what all files of a frame share.
+    In a name, {} stands for the part that all files of a frame share.
     """
 
     places: tuple[str, ...]
     name: str = "{}"
 
     def folders(self, root: Path) -> list[Path]:
-        """Folders of the first place that is there; several where it is a pattern."""
+        """Return the folders of the first entry that exists; several if it is a pattern."""
         found = ([path for path in _places(root, place) if path.is_dir()] for place in self.places)
         return next(filter(None, found), [])
 
     def folder(self, root: Path) -> Path:
-        """First of these folders, which may be missing."""
+        """Return the first of these folders. It may not exist."""
         return next(iter(self.folders(root)), root / self.places[0])
 
     def files(self, root: Path, expected: str, suffixes: tuple[str, ...]) -> list[Path]:
-        """Images in the order of the numbers in their names; no hidden files."""
+        """Return images in the order of the numbers in their names, without hidden files."""
         return _files(
             self.folder(root), expected, self.name.format("*" if self.name != "{}" else "[!.]*"), suffixes
         )
 
     def shared(self, stem: str) -> str:
-        """Part of an image's name that the other files of its frame share."""
+        """Return the part of an image's name that the other files of its frame share."""
         before, after = self.name.split("{}")
         return stem.removeprefix(before).removesuffix(after)
 
 
 class PoseRows(NamedTuple):
-    """A file of one 4×4 matrix a line: of the image of its number, else of the k-th image."""
+    """File with one 4×4 matrix on each line: for the image with the line's number, or for the k-th image."""
 
     file: str
     by_number: bool = False
 
     def read(self, root: Path, files: list[Path], images: ImagesAt) -> FramePoses:
-        """The pose of each image; raises NoPoses where the file is missing."""
+        """Return the pose of each image. Raises NoPoses without the file."""
         path = root / self.file
         if not path.exists():
             raise NoPoses(f"{path} is missing; expected 16 numbers a line; {SCAN}")
@@ -85,12 +85,12 @@ class PoseRows(NamedTuple):
 
 
 class PoseFiles(NamedTuple):
-    """A file of one 4×4 matrix for each image: in a folder of their own, or beside the image."""
+    """File with one 4×4 matrix for each image, in a separate folder or beside the image."""
 
-    file: str  # {} as of `ImagesAt`
+    file: str  # with {} as in `ImagesAt`
 
     def read(self, root: Path, files: list[Path], images: ImagesAt) -> FramePoses:
-        """The pose of each image; None where its file is missing, or a tracker wrote that it was lost."""
+        """Return the pose of each image, or None if its file is missing or the tracker was lost (inf)."""
         is_apart = "/" in self.file
 
         def pose(image: Path) -> Transform | None:
@@ -104,28 +104,28 @@ class PoseFiles(NamedTuple):
 
 
 class DepthReader:
-    """Reader of the depth images of one camera, and of the colour of the same pixels."""
+    """Reader of one camera's depth images, and of colour for the same pixels."""
 
     camera: RecordedCamera
     usual_unit = MILLIMETRES
-    not_measured: int | None = None  # a value that means so, beside 0
+    not_measured: int | None = None  # a value that means "no depth", besides 0
 
     def use_camera(self, camera: RecordedCamera, depth_scale: float | None) -> None:
-        """Name the camera of the images, before the first is read.
+        """Set the camera of the images. Call it before the first image is read.
 
         Args:
             camera: its distortion is removed from depth and colour.
-            depth_scale: metres per unit; None = of integers as the camera's file states, else `usual_unit`,
-                and floats are metres.
+            depth_scale: metres per unit. None = as stated by the camera's file, else `usual_unit`, for
+                integers; floats are metres.
         """
         self.camera, self.intrinsics = camera, camera.intrinsics
         self.depth_unit = camera.depth_unit(depth_scale, self.usual_unit)
         self.depth_scale = self.depth_unit.metres
         self._float_scale = 1.0 if depth_scale is None else depth_scale
-        self._kind: np.dtype[Any] | None = None  # of the first depth image that was read
+        self._kind: np.dtype[Any] | None = None  # type of the first depth image read
 
     def read(self, depth: Path, color: Path | None) -> dict[str, Any]:
-        """Fields of a `Frame`; raises DatasetError for an image that is not as the others."""
+        """Return fields of a `Frame`. Raises DatasetError for an image unlike the others in size or kind."""
         measured = self._measured(depth)
         return {
             "depth": measured,
@@ -135,7 +135,7 @@ class DepthReader:
         }
 
     def _measured(self, file: Path) -> NDArray[Any]:
-        """Depth of the pinhole camera: uint16 in `depth_scale`, or float32 metres."""
+        """Return depth of the pinhole camera: uint16 in `depth_scale`, or float32 metres."""
         depth, size = read_depth(file, invalid=self.not_measured), self.camera.size
         self._kind = self._kind or depth.dtype
         if depth.shape != size:
@@ -151,26 +151,26 @@ class DepthReader:
         return self.camera.depth(depth)
 
     def _registered(self, color: Path, depth: NDArray[Any]) -> NDArray[np.uint8]:
-        """The colour of each depth pixel."""
+        """Return the colour of each depth pixel."""
         return np.asarray(self.camera.color(read_color(color, depth.shape)), np.uint8)
 
 
 class DepthImages(DepthReader, FolderFrames):
-    """Frames of one depth image each, with colour and a pose where they are recorded.
+    """Frames of one depth image each, with colour and a pose if recorded.
 
-    A layout is a row of attributes: `depth_at`, `color_at`, `poses_at`, `camera_at` (files of the camera by
-    preference) and `published`. Methods say the rest: `_registered` how colour fits.
+    A layout sets attributes: `depth_at`, `color_at`, `poses_at`, `camera_at` (camera files in order of
+    preference) and `published`. It overrides methods for the rest: `_registered` decides how colour fits.
 
     Args:
-        intrinsics, calibration: of the depth images, instead of a file of the camera in the folder
-            (`cameras.FILES`) or of the camera that a benchmark publishes; distortion is removed.
-        depth_scale: metres per unit; default as a file of the camera states, else as usual in the layout,
-            and 1 for floats.
-        color: read colour images.
+        intrinsics, calibration: of the depth images, instead of a camera file in the folder (`cameras.FILES`)
+            or the camera published by a benchmark; distortion is removed.
+        depth_scale: metres per unit; default as stated by a camera file, else as usual in the layout, and 1
+            for floats.
+        color: True reads colour images.
         options: those of `FolderFrames`.
 
     Raises:
-        DatasetError: most images missing, a camera that is not known or malformed; as of `FolderFrames`.
+        DatasetError: most images are missing, the camera is unknown or malformed; and as for `FolderFrames`.
     """
 
     sensor = "kinect"
@@ -204,17 +204,17 @@ class DepthImages(DepthReader, FolderFrames):
         return self.poses_at.read(root, files, self.depth_at)
 
     def _colors(self, root: Path) -> Sequence[Path | None]:
-        """A colour image for each depth image, None where there is none; empty where there is no colour."""
+        """Return a colour image or None for each depth image; empty without any colour."""
         if self.color_at is None:
             return []
         return color_images(self._files, root, (self.depth_at, self.color_at), self.expected)
 
     def _find_camera(self, root: Path, size: Size, depth_scale: float | None, **given: Any) -> RecordedCamera:
-        """The camera of the depth images; `given` are intrinsics and calibration."""
+        """Return the camera of the depth images; `given` are intrinsics and calibration."""
         return find_camera(root, size, **given, **self._known_camera(root))
 
     def _known_camera(self, root: Path) -> dict[str, Any]:
-        """Place of the camera: `places`, `files` and `published` of `find_camera`."""
+        """Return the arguments `places`, `files` and `published` for `find_camera`."""
         places = (Path(os.path.normpath(root / file)) for file in self.camera_at)
         return {"files": [path for path in places if path.is_file()][:1], "published": self.published}
 
@@ -226,9 +226,9 @@ class DepthImages(DepthReader, FolderFrames):
 def resample_for_camera(
     color: NDArray[np.uint8], own: Intrinsics, other: Intrinsics, shape: tuple[int, ...]
 ) -> NDArray[np.uint8]:
-    """Resample an image for another camera in the same place: (h, w, 3) uint8 → (*shape, 3).
+    """Resample an image for another camera at the same position: (h, w, 3) uint8 → (*shape, 3).
 
-    Averages pixels where it shrinks; repeats the border beyond the image.
+    Pixels are averaged if the image shrinks. Outside the image, its border is repeated.
     """
     factor = other.fx / own.fx
     if factor < 1:
@@ -254,15 +254,15 @@ def resample_for_camera(
 
 
 def images(root: Path, place: str, expected: str) -> list[Path]:
-    """The images in a folder, in the order of the numbers in their names; no hidden files."""
+    """Return the images in a folder, in the order of the numbers in their names, without hidden files."""
     return ImagesAt((place,)).files(root, expected, SUFFIXES)
 
 
 def depth_images(root: Path, at: ImagesAt, expected: str) -> list[Path]:
-    """The files of depth in a recording, in order; one named otherwise than most is left out.
+    """Return the depth files of a recording, in order. Files not named like most are left out.
 
     Raises:
-        DatasetError: they are of several kinds.
+        DatasetError: the files are of several kinds.
     """
     found = at.files(root, expected, readers.DEPTH_SUFFIXES)
     kinds = sorted({path.suffix.lower() for path in found})
@@ -294,14 +294,14 @@ def _files(where: Path, expected: str, pattern: str, suffixes: tuple[str, ...]) 
 
 
 def first_size(files: Sequence[Path], read: Callable[[Path], NDArray[Any]] = read_depth) -> tuple[int, int]:
-    """(height, width) of most of a recording's first images, for which its camera is looked up."""
+    """Return (height, width) of most of a recording's first images, to find its camera."""
     sizes: list[tuple[int, int]] = []
     for index, file in enumerate(files):
         try:
             height, width = read(file).shape[:2]
         except DatasetError:
             if not sizes and (2 * index + 2 > len(files) or index >= _FIRST_TRIES):
-                raise  # so it is with all of them
+                raise  # all images are taken as unreadable
             continue
         sizes.append((height, width))
         if len(sizes) == _SIZES:
@@ -310,13 +310,13 @@ def first_size(files: Sequence[Path], read: Callable[[Path], NDArray[Any]] = rea
 
 
 def color_images(depth: list[Path], root: Path, at: tuple[ImagesAt, ImagesAt], expected: str) -> list[Path]:
-    """The colour image of each depth image, by file name; of some it may be missing.
+    """Return the colour image of each depth image, by file name. Some of the files may be missing.
 
     Args:
-        at: where depth and colour are; of one folder all of colour may be missing.
+        at: where depth and colour are; in one common folder, all colour may be missing.
 
     Raises:
-        DatasetError: of most it is.
+        DatasetError: most colour images are missing.
     """
     deep, colored = at
     found = colored.files(root, expected, SUFFIXES)
@@ -338,10 +338,10 @@ def color_images(depth: list[Path], root: Path, at: tuple[ImagesAt, ImagesAt], e
 def poses_by_number(
     names: Sequence[str], poses: Sequence[tuple[int, Transform | None]], source: Path
 ) -> list[Transform | None]:
-    """The pose of each image: the one numbered as its name; of as many poses with other numbers the k-th.
+    """Return the pose of each image, paired by the number in its name, or else in order.
 
-    Numbers are others where some names have none, where images or poses are merely counted, or where a tenth
-    of them differs.
+    Poses are paired in order if they are as many as images and the numbers do not fit: some names have no
+    number, or images or poses are merely counted, or a tenth of the numbers differs.
     """
     numbers, listed = [_number(name) for name in names], [number for number, _ in poses]
     are_unique = None not in numbers and len(set(listed)) == len(listed)
@@ -361,12 +361,12 @@ def poses_by_number(
 
 
 def _number(name: str) -> int | None:
-    """The only number in a name, if it is a whole one."""
+    """Return the only number in a name if it is an integer, else None."""
     found = numbers_in(name)
     return int(found[0]) if len(found) == 1 and found[0].isdecimal() else None
 
 
 def _counts_on(numbers: Sequence[int | None]) -> bool:
-    """True if numbers are consecutive, in any order."""
+    """Return True if numbers are consecutive, in any order."""
     there = [number for number in numbers if number is not None]
     return len(there) == len(numbers) == len(set(there)) == max(there) - min(there) + 1

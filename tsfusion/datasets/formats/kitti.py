@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""KITTI odometry and raw: rectified stereo pairs or Velodyne scans, with poses or those of the GPS/IMU unit.
+"""Read KITTI odometry and raw: rectified stereo pairs or Velodyne scans, with poses.
 
-Calibration and GPS packets are read by pykitti, files are chosen here: pykitti pairs them by their place in a
-sorted list, so that one missing file shifts all later ones unnoticed. A file's name is its frame number, and
-a frame's pose and time are the lines of that number.
+Pykitti reads calibration and GPS packets; files are chosen here. Pykitti pairs files by their index in a
+sorted list: one missing file would shift all later ones unnoticed. Here a file's name is its frame number,
+and the frame's pose and time are on the lines of that number.
 """
 
 from collections.abc import Mapping, Sequence
@@ -40,13 +40,13 @@ from tsfusion.geometry.se3 import Transform, inverse, transform
 EXPECTED = "sequences/NN/{calib.txt,times.txt,image_0,image_1,velodyne} and poses/NN.txt"
 RAW_EXPECTED = "DATE/DATE_drive_NNNN_sync/{image_00..03,velodyne_points,oxts}/data and DATE/calib_*.txt"
 _PAIRS = {"grey": ("00", "01"), "color": ("02", "03")}
-_PACKET = 30  # numbers of an oxts line
+_PACKET = 30  # numbers in an oxts line
 _T = TypeVar("_T")
-_ALONG = 0.9  # cosine of the angle between axes that point forward
+_ALONG = 0.9  # cosine of the angle between two axes that point forward, at least
 
 
 def recognises(path: Path) -> bool:
-    """True for the benchmark's root and for each of its sequences."""
+    """Return True for the benchmark's root and for each of its sequences."""
     return any((path / "sequences").glob("*/calib.txt")) or _is_sequence(path)
 
 
@@ -59,7 +59,7 @@ def open_kitti(
     color: bool = True,
     posed: bool = True,
 ) -> "KITTI":
-    """Open the root or a sequence's own folder; sequence and modality may be left out where one exists."""
+    """Open the root, or a sequence's own folder. Sequence and modality may be left out if only one exists."""
     root = Path(root)
     if sequence is None and _is_sequence(root):
         root, sequence = root.resolve().parents[1], root.resolve().name
@@ -71,7 +71,7 @@ def open_kitti(
 
 
 class KITTIFrames(PairedImages):
-    """Base of both KITTI layouts: stereo pairs or Velodyne scans by frame number."""
+    """Base class of both KITTI layouts: stereo pairs or Velodyne scans by frame number."""
 
     intrinsics: Intrinsics | None = None
     baseline_fx: float | None = None
@@ -96,19 +96,21 @@ class KITTIFrames(PairedImages):
 class KITTI(KITTIFrames):
     """One sequence as stereo disparity (`modality="stereo"`) or as Velodyne scans (`"lidar"`).
 
-    Stereo: the left camera's frame, disparity in 1/16 px by semi-global matching at each access; colour is
-    the grey image, or `image_2` where the calibration says that it is the left camera's.
-    LiDAR: points in the Velodyne's axes (x forward, z up), pose inv(Tr)·P·Tr; scans are as recorded, not
-    corrected for the car's motion.
+    Stereo: frames are the left camera's; disparity in 1/16 px comes from semi-global matching at each access.
+    Colour is the grey image, or `image_2` if the calibration shows that it is of the left camera. LiDAR:
+    points are in the Velodyne's axes (x forward, z up), with the pose inv(Tr)·P·Tr. Scans are as recorded,
+    not corrected for the car's motion.
 
     Args:
-        root: the benchmark's folder, holding `sequences/` and `poses/`.
+        root: the benchmark's folder, with `sequences/` and `poses/`.
         sequence: "00" … "21".
-        poses: another poses file in KITTI's format, from here or from `root`; default `poses/NN.txt`.
-        posed: leave out frames without a pose; else they are kept, with `T_world_camera` None.
+        poses: another poses file in KITTI's format, relative to the current folder or to `root`; default
+            `poses/NN.txt`.
+        posed: True leaves out frames without a pose; False keeps them, with `T_world_camera` None.
 
     Raises:
-        DatasetError: no such folder, files or calibration; unequal image pairs; a malformed line.
+        DatasetError: there is no such folder, file or calibration, a pair's images differ in size, or a line
+            is malformed.
     """
 
     def __init__(
@@ -140,7 +142,7 @@ class KITTI(KITTIFrames):
         self._with_color = color
         if modality == "stereo":
             self.intrinsics, self.baseline_fx = _stereo_camera(calibration, place / "calib.txt")
-            if np.array_equal(calibration.get("P2", ()), calibration["P0"]):  # never in the benchmark itself
+            if np.array_equal(calibration.get("P2", ()), calibration["P0"]):  # not in the benchmark itself
                 self._colored = files_by_frame(place / "image_2", ".png")
             self._describe_camera("calib.txt")
         else:
@@ -169,7 +171,7 @@ def _only_sequence(root: Path) -> str:
 
 
 def files_by_frame(place: Path, suffix: str) -> dict[int, Path]:
-    """Frame number → file, in order."""
+    """Return frame number → file, in order."""
     files = in_order(place.glob(f"*{suffix}"))
     for path in files:
         if not path.stem.isdigit():
@@ -178,7 +180,7 @@ def files_by_frame(place: Path, suffix: str) -> dict[int, Path]:
 
 
 def frames_of(place: Path, folders: Sequence[str], skipped: dict[str, int]) -> dict[int, tuple[Path, ...]]:
-    """Frame number → left and right image, or the scan alone; images without their other half are counted."""
+    """Return frame number → left and right image, or a scan. Count images without a partner."""
     if len(folders) == 1:
         return {number: (file,) for number, file in files_by_frame(place / folders[0], ".bin").items()}
     left, right = (files_by_frame(place / folder, ".png") for folder in folders)
@@ -186,7 +188,7 @@ def frames_of(place: Path, folders: Sequence[str], skipped: dict[str, int]) -> d
 
 
 def _trajectory(root: Path, sequence: str, poses: str | Path | None, frames: list[int]) -> FramePoses:
-    """The pose of each frame; the benchmark has none from sequence 11 on."""
+    """Return the pose of each frame. The benchmark has no poses from sequence 11 on."""
     path = root / "poses" / f"{sequence}.txt"
     if poses is not None:
         path = Path(poses) if Path(poses).is_file() else root / poses
@@ -198,7 +200,7 @@ def _trajectory(root: Path, sequence: str, poses: str | Path | None, frames: lis
 
 @cache
 def pykitti_utils() -> Any:
-    """The module `pykitti.utils` without its package, which loads pandas and matplotlib: 0.3 s and 35 MB."""
+    """Load `pykitti.utils` without its package, which would load pandas and matplotlib: 0.3 s and 35 MB."""
     package = find_spec("pykitti")
     folders = None if package is None else package.submodule_search_locations
     spec = None if folders is None else PathFinder.find_spec("pykitti.utils", folders)
@@ -210,7 +212,7 @@ def pykitti_utils() -> Any:
 
 
 def read_calibration(path: Path, wanted: dict[str, int]) -> Mapping[str, NDArray[np.float64]]:
-    """`name: numbers` a line; each wanted name must be there with so many finite numbers."""
+    """Read lines of `name: numbers`. Each wanted name must have so many finite numbers."""
     for number, line in read_lines(path, f"KITTI's calibration with the lines {', '.join(wanted)}"):
         if ":" not in line:
             raise DatasetError(f"{path}:{number}: {line!r}; expected `name: numbers`")
@@ -238,7 +240,7 @@ def _stereo_camera(calibration: Mapping[str, NDArray[np.float64]], path: Path) -
 
 
 def _read_times(path: Path, frames: list[int]) -> NDArray[np.int64] | None:
-    """Nanoseconds of each frame, by line number; None where the file is absent."""
+    """Return nanoseconds of each frame, by line number, or None without the file."""
     if not path.exists():
         return None
     lines = read_lines(path, "seconds, one frame a line")
@@ -246,7 +248,7 @@ def _read_times(path: Path, frames: list[int]) -> NDArray[np.int64] | None:
 
 
 def _of_frames(path: Path, lines: list[_T], frames: list[int]) -> list[_T]:
-    """The entries of frames in a file with a line a frame."""
+    """Return the entries of frames in a file with one line for each frame."""
     if frames[-1] < len(lines):
         return [lines[number] for number in frames]
     raise DatasetError(
@@ -255,25 +257,26 @@ def _of_frames(path: Path, lines: list[_T], frames: list[int]) -> list[_T]:
 
 
 def recognises_raw(path: Path) -> bool:
-    """True for a drive, and for a day's folder that holds drives."""
+    """Return True for a drive, and for a day's folder that holds drives."""
     return _is_drive(path) or bool(_drives(path))
 
 
 class KITTIRaw(KITTIFrames):
     """One synchronised and rectified drive (`…_sync`) as stereo disparity or as Velodyne scans.
 
-    https://www.cvlibs.net/datasets/kitti/raw_data.php. A frame's pose comes from the GPS/IMU packet of its
-    number: east, north, up from the drive's first packet; stereo is posed at the left camera, LiDAR at the
+    https://www.cvlibs.net/datasets/kitti/raw_data.php. A frame's pose comes from the GPS/IMU packet with the
+    same number: east, north, up from the drive's first packet. It is the pose of the left camera, or of the
     Velodyne. Scans are as recorded, not corrected for the car's motion.
 
     Args:
-        path: the drive's folder, or the day's where it holds one drive.
-        modality: `stereo` or `lidar`; default stereo where there are images.
-        cameras: `grey` (image_00, image_01) or `color` (image_02, image_03); default grey where it is there.
-        posed: leave out frames without a pose; else they are kept, with `T_world_camera` None.
+        path: the drive's folder, or the day's folder if it holds one drive.
+        modality: `stereo` or `lidar`; default stereo if there are images.
+        cameras: `grey` (image_00, image_01) or `color` (image_02, image_03); default grey if it exists.
+        posed: True leaves out frames without a pose; False keeps them, with `T_world_camera` None.
 
     Raises:
-        DatasetError: no such folder, files or calibration; an unsynchronised drive; a malformed line.
+        DatasetError: there is no such folder, file or calibration, the drive is not synchronised, or a line
+            is malformed.
     """
 
     def __init__(
@@ -317,10 +320,10 @@ class _SensorCalibration(NamedTuple):
 
 
 def _sensor_calibration(day: Path, cameras: tuple[str, str] | None, *, imu: bool) -> _SensorCalibration:
-    """The pinhole model of a pair, and the place of its left camera (without `cameras`, of the Velodyne).
+    """Return a pair's pinhole model, and the pose of its left camera; without `cameras`, of the Velodyne.
 
     Args:
-        imu: whether that place is needed; without, the calibration of the GPS/IMU unit may be missing.
+        imu: True if this pose is needed. If False, the calibration of the GPS/IMU unit may be missing.
     """
     T_velo_imu = _rigid(day / "calib_imu_to_velo.txt", forward=0) if imu else np.eye(4)
     if cameras is None:
@@ -331,7 +334,7 @@ def _sensor_calibration(day: Path, cameras: tuple[str, str] | None, *, imu: bool
     left, right = (found[f"P_rect_{camera}"].reshape(3, 4) for camera in cameras)
     rectified, shift = np.eye(4), np.eye(4)
     rectified[:3, :3] = found["R_rect_00"].reshape(3, 3)
-    shift[0, 3] = left[0, 3] / left[0, 0]  # the camera's place beside camera 0
+    shift[0, 3] = left[0, 3] / left[0, 0]  # position relative to camera 0
     T_imu_camera = inverse(checked_pose(shift @ rectified @ T_cam0_velo @ T_velo_imu, path))
     baseline_fx = float(left[0, 3] - right[0, 3])
     if baseline_fx <= 0:
@@ -370,7 +373,7 @@ def _cameras(drive: Path, cameras: str | None) -> tuple[str, str]:
 
 
 def _imu_poses(place: Path, frames: list[int]) -> FramePoses:
-    """T_world_imu of frames, by pykitti's Mercator projection; the first packet is the origin."""
+    """Return T_world_imu of frames, by pykitti's Mercator projection. The first packet is the origin."""
     files = files_by_frame(place, ".txt")
     if not files:
         raise NoPoses(f"{place} has no packets (*.txt); expected {RAW_EXPECTED}")
@@ -390,7 +393,7 @@ def _imu_poses(place: Path, frames: list[int]) -> FramePoses:
 
 
 def _rigid(path: Path, forward: int) -> Transform:
-    """The transform of a file, whose axis x points along the target's axis `forward`."""
+    """Return the transform of a file. Its axis x must point along the target's axis `forward`."""
     found = read_calibration(path, {"R": 9, "T": 3})
     T = checked_pose(transform(found["R"].reshape(3, 3), found["T"]), path)
     if T[forward, 0] < _ALONG:
@@ -399,9 +402,9 @@ def _rigid(path: Path, forward: int) -> Transform:
 
 
 def _read_dates(path: Path, frames: list[int]) -> NDArray[np.int64] | None:
-    """Nanoseconds since 1970 of each frame, by line number; None where the file is absent.
+    """Return nanoseconds since 1970 of each frame, by line number, or None without the file.
 
-    The clock is the car's, of no zone. A scan that is missing has an empty line.
+    The clock is the car's, in no time zone. A missing scan has an empty line.
     """
     if not path.exists():
         return None

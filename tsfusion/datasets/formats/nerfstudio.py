@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Captures described by a `transforms.json`: nerfstudio, instant-ngp, and the apps that export for them."""
+"""Read captures described by a `transforms.json`: from nerfstudio, instant-ngp and compatible apps."""
 
 import json
 from dataclasses import dataclass
@@ -34,17 +34,17 @@ _MODELS = {
 
 
 _COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
-_OTHER_LENSES = ("ftheta", "latlong", "equirectangular", "orthographic")  # of instant-ngp, by their keys
+_OTHER_LENSES = ("ftheta", "latlong", "equirectangular", "orthographic")  # start of instant-ngp's keys
 
 
 @dataclass(frozen=True)
 class _ListedFrame:
-    """A frame of the capture that has depth."""
+    """Frame of the capture with depth."""
 
     depth: Path
     color: Path | None
-    size: tuple[int, int] | None  # (height, width) that the camera is given for; None = the images' own
-    camera: dict[str, Any]  # of the frame, over the capture's
+    size: tuple[int, int] | None  # (height, width) of the camera; None = the images' own
+    camera: dict[str, Any]  # keys of the capture, replaced by those of the frame
     where: str
 
 
@@ -52,10 +52,10 @@ class Nerfstudio(DepthImages):
     """Frames with depth of a nerfstudio or instant-ngp capture.
 
     https://docs.nerf.studio/quickstart/data_conventions.html. Poses are camera-to-world with OpenGL axes, in
-    `applied_scale` units a metre (default 1); pixel centres lie at halves. Depth is along the optical axis,
-    a 16-bit image (0 = none) or a `.npy`, of `depth_file_path` (nerfstudio) or `depth_path` (instant-ngp,
-    NeRFCapture). Distorted images are undistorted, depth by the nearest pixel. Where depth has another size
-    than colour, colour is resampled to it. No timestamps.
+    `applied_scale` units for each metre (default 1). Pixel centres are at halves. Depth is along the optical
+    axis, in a 16-bit image (0 = none) or a `.npy`, named by `depth_file_path` (nerfstudio) or `depth_path`
+    (instant-ngp, NeRFCapture). Distorted images are undistorted, depth by the nearest pixel. If depth has
+    another size than colour, colour is resampled. No timestamps.
 
     Args:
         path: the folder, or the `.json` file in it.
@@ -71,7 +71,7 @@ class Nerfstudio(DepthImages):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """True also for a `.json` file with `transforms` in its name."""
+        """Return True also for a `.json` file with `transforms` in its name."""
         return super().recognises(path) or (
             path.is_file() and path.suffix == ".json" and "transforms" in path.name
         )
@@ -80,7 +80,7 @@ class Nerfstudio(DepthImages):
         path = Path(path).expanduser()
         self._file = path if path.is_file() else path / "transforms.json"
         self._undistorters: dict[Camera, Undistorter] = {}
-        self._given: Camera | None = None  # instead of the file's
+        self._given: Camera | None = None  # used instead of the file's
         self._capture = _read(self._file)
         self.usual_unit = _depth_unit(self._capture, self._file)
         return super()._opened(self._file.absolute().parent, trajectory)
@@ -128,7 +128,7 @@ class Nerfstudio(DepthImages):
         return self._posed_frame(index, depth=depth, depth_scale=scale, color=color, intrinsics=intrinsics)
 
     def _find_camera(self, root: Path, size: Size, depth_scale: float | None, **given: Any) -> RecordedCamera:
-        """The camera that was given, which is that of all frames; else that of the first frame."""
+        """Return the given camera, which is then used for all frames; else that of the first frame."""
         found = given_camera(size, **given)
         if found is not None:
             self._given = found.lens
@@ -141,7 +141,7 @@ class Nerfstudio(DepthImages):
 
     def _undistorter(self, camera: Camera) -> Undistorter:
         if camera not in self._undistorters:
-            self._undistorters.clear()  # cameras of their own for each frame would fill the memory
+            self._undistorters.clear()  # a different camera for each frame would fill the memory
             self._undistorters[camera] = Undistorter(camera)
         return self._undistorters[camera]
 
@@ -174,7 +174,7 @@ def _listed_frame(
 
 
 def _image(path: Path) -> Path:
-    """Blender's captures leave the suffix out."""
+    """Return the path of an image. Blender's captures leave out the suffix."""
     return path if path.suffix or not path.with_suffix(".png").exists() else path.with_suffix(".png")
 
 
@@ -192,7 +192,7 @@ def _pose(frame: dict[str, Any], applied_scale: float, where: str) -> Transform 
 
 
 def _camera(entry: _ListedFrame, size: tuple[int, ...]) -> Camera:
-    """The camera that a frame's keys give for images of (height, width) `size`."""
+    """Return the camera described by a frame's keys, for images of (height, width) `size`."""
     given, where = entry.camera, entry.where
     model = str(given.get("camera_model", "OPENCV"))
     other = next((key for key in given if key.startswith(_OTHER_LENSES) and given[key]), None)
@@ -202,7 +202,7 @@ def _camera(entry: _ListedFrame, size: tuple[int, ...]) -> Camera:
     if given.get("is_fisheye"):  # instant-ngp's
         model = "OPENCV_FISHEYE"
     bent = [key for key in _COEFFICIENTS if key in given and _number(given, key, where)]
-    if bent and not _MODELS[model]:  # nerfstudio applies them, whatever the model is called
+    if bent and not _MODELS[model]:  # nerfstudio applies them with any model
         model = "OPENCV"
     if unused := [key for key in bent if key not in _MODELS[model]]:
         raise DatasetError(f"{where}: {unused[0]} is not 0, which the lens {model} has no use for here")
@@ -222,7 +222,7 @@ def _camera(entry: _ListedFrame, size: tuple[int, ...]) -> Camera:
 
 
 def _focal_length(given: dict[str, Any], axis: str, side: int, where: str) -> float | None:
-    """Pixels, as given or by the angle of view over `side` pixels; None where there is neither."""
+    """Return pixels, as given or from the angle of view over `side` pixels, or None without either."""
     if f"fl_{axis}" in given:
         return _number(given, f"fl_{axis}", where)
     name = f"camera_angle_{axis}"
@@ -235,7 +235,6 @@ def _focal_length(given: dict[str, Any], axis: str, side: int, where: str) -> fl
 
 
 def _resized(camera: Camera, shape: tuple[int, ...], where: str) -> Camera:
-    """The camera for images of another size."""
     if abs(shape[0] / camera.size[0] - shape[1] / camera.size[1]) > 0.01:
         raise DatasetError(
             f"{where}: image {shape[1]}×{shape[0]}, but camera {camera.size[1]}×{camera.size[0]}; "
@@ -266,7 +265,7 @@ def _scale(capture: dict[str, Any], key: str, file: Path) -> float:
 
 
 def _read_depth(path: Path, scale: float) -> tuple[NDArray[Any], float]:
-    """Depth, and metres per unit: 1 of floats, which are metres after `scale`."""
+    """Return depth and metres per unit. Floats become metres by `scale`, with unit 1."""
     depth = read_depth(path)
     if depth.dtype == np.uint16 and path.suffix != ".npy":
         return depth, scale

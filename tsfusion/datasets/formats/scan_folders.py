@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Folders of a LiDAR's scans, one file each: of drivers and other fusion programs, of gtsam_points."""
+"""Read folders of a LiDAR's scans, one file each, from drivers, fusion programs and gtsam_points."""
 
 import logging
 import re
@@ -35,14 +35,14 @@ EXPECTED = (
 _PLACES = ("", "velodyne", "lidar", "scans", "points", "clouds")
 _POSES = ("poses.txt", "*poses_kitti.txt", "*poses_tum.txt", "*_kitti.txt", "*_tum.txt")
 _FEWEST = 2
-_FEW_OTHERS = 4  # files of a series for each of another name, at least
+_FEW_OTHERS = 4  # files of a series for each file with another name, at least
 _IN_GRID = (
     "where the scanner was, in the grid of the points (--trajectory FILE): one pose a file in order, or "
     "TUM's format in the clock of the points' times (gps_time; --option time_offset_s is added to these)"
 )
-_TRIED = 10  # scans of which the first that can be read tells whether all are in a grid
-_COARSE = 0.01  # metres: steps of numbers that are too coarse for points
-_RUN = "run.json"  # beside the meshes of a scan
+_TRIED = 10  # scans; the first readable one tells whether all are in a grid
+_COARSE = 0.01  # metres; numbers with larger steps are too coarse for points
+_RUN = "run.json"  # in a folder with the meshes of a scan
 _HEADER_BYTES = 1 << 14
 
 log = logging.getLogger(__name__)
@@ -50,23 +50,22 @@ LIDAR_KEYFRAMES = "NNNNNN/points.bin (float32 x, y, z) and graph.txt (`vK tx ty 
 
 
 class ScanFolder(FolderFrames):
-    """Scans in the LiDAR's axes, each with the LiDAR's pose in the world's where one is known.
+    """Scans in the LiDAR's axes, each with the LiDAR's pose in the world if known.
 
-    The layout of KITTI's `velodyne/`, and of the folders that KISS-ICP's generic reader takes, with the poses
-    that it writes. Names that are decimal seconds or nanoseconds are times; others only give the order, and
-    scans have the times of as many poses. Points of PCD, PLY and LAS with times are put where they were then.
-
-    Clouds farther from zero than a LiDAR sees are in the frame of the poses, such as UTM. Each has a pose, or
-    its rays begin where a trajectory was at the times of the points.
+    The layout is that of KITTI's `velodyne/`, and of folders for KISS-ICP's generic reader, with the poses
+    that KISS-ICP writes. Names that are decimal seconds or nanoseconds are times. Other names only give the
+    order; such scans have the times of the poses if these are as many. Points of PCD, PLY and LAS with times
+    are moved to where they were measured. Clouds farther from zero than a LiDAR sees are in the frame of the
+    poses, such as UTM. Each of them has a pose, or its rays start on a trajectory at the times of the points.
 
     Args:
-        fields: float32 numbers a point in `.bin` files, x, y and z first.
-        deskew: False for points that are put right already, though they have times.
+        fields: float32 numbers for each point in `.bin` files, x, y and z first.
+        deskew: False for points that are already corrected for the motion, though they have times.
         options: those of `FolderFrames`; default poses are `poses.txt`, `*_kitti.txt` or `*_tum.txt`.
     """
 
     layout, expected, sensor, guesses = "LiDAR scans", EXPECTED, "lidar", True
-    _begins: Callable[[Scan], NDArray[np.float64]] | None = None  # of rays; None = at the poses
+    _begins: Callable[[Scan], NDArray[np.float64]] | None = None  # start of rays; None = at the poses
 
     def __init__(
         self, path: str | Path, *, fields: int = USUAL_FIELDS, deskew: bool = True, **options: Any
@@ -78,7 +77,7 @@ class ScanFolder(FolderFrames):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """True for a folder with scans, and for a file that is a point cloud."""
+        """Return True for a folder with scans, and for a file that is a point cloud."""
         is_cloud = path.is_file() and path.suffix.lower() in SUFFIXES[1:] and not _is_mesh(path)
         return is_cloud or bool(_all_series(path))
 
@@ -106,7 +105,7 @@ class ScanFolder(FolderFrames):
             self._times = self._follow(path, files)
         found = super()._poses_of(path, files)
         times = read_poses(path)[0] if self._times is None else None
-        if times is not None and (np.diff(times) > 0).all():  # one pose a scan, in order
+        if times is not None and (np.diff(times) > 0).all():  # one pose for each scan, in order
             self._times, self._offset_s = times, 0.0
             self._between = partial(poses_between, path, times, max_gap_s=self._gap_s)
         return found
@@ -116,13 +115,13 @@ class ScanFolder(FolderFrames):
         return self._cloud(index, scan) if self.in_world else self._sweep(index, scan)
 
     def _tried(self, file: Path) -> Scan | None:
-        """A scan; None = it cannot be read, as whoever reads it as a frame says."""
+        """Return a scan, or None if it cannot be read: the frame's reader raises the error later."""
         with suppress(DatasetError):
             return read_scan(file, fields=self._fields)
         return None
 
     def _follow(self, path: Path, files: list[Path]) -> Times:
-        """Let rays begin on a trajectory: (n,) ns of first points, -1 = not there; None = one pose a file."""
+        """Start rays on a trajectory. Return (n,) ns of first points, -1 = none; None = one pose a file."""
         along = read_tum(path)
         if len(along.timestamps_ns) == len(files):
             return None
@@ -132,7 +131,7 @@ class ScanFolder(FolderFrames):
         return np.array([np.append(each[np.isfinite(each)], -1)[0] for each in times], np.int64)
 
     def _cloud(self, index: int, scan: Scan) -> Frame:
-        """Points in the frame of the poses, brought into the LiDAR's axes in float64."""
+        """Return the frame of points in the poses' coordinates, moved to the LiDAR's axes in float64."""
         file, T = self._files[index], self._poses[index]
         assert T is not None
         step = np.spacing(np.abs(scan.points[np.isfinite(scan.points)]).max(initial=0))
@@ -152,17 +151,17 @@ class ScanFolder(FolderFrames):
 
 
 class _Series(NamedTuple):
-    """Files of a name but for its numbers, in their order; and how many of their kind have another name."""
+    """Sorted files whose names differ only in numbers; number of files of their kind with other names."""
 
     files: list[Path]
     others: int
 
 
 def _series(root: Path) -> _Series:
-    """The scans of a folder, or the one of a file.
+    """Return the scans of a folder, or the one scan of a file.
 
     Raises:
-        DatasetError: there are none, or which ones are meant is not clear.
+        DatasetError: there are none, or it is not clear which ones are meant.
     """
     found = [_Series([root], 0)] if root.is_file() else _all_series(root)
     if len(found) > 1:
@@ -180,7 +179,7 @@ def _series(root: Path) -> _Series:
 
 
 def _all_series(root: Path) -> list[_Series]:
-    """The longest series of each kind of file in each place where scans may be."""
+    """Return the longest series of each kind of file, in each folder that may hold scans."""
     found = []
     for where in (root / place for place in _PLACES):
         if not where.is_dir() or (where / _RUN).is_file():
@@ -197,7 +196,7 @@ def _all_series(root: Path) -> list[_Series]:
 
 
 def _is_mesh(file: Path) -> bool:
-    """True for a PLY file whose header declares faces."""
+    """Return True for a PLY file whose header declares faces."""
     if file.suffix.lower() != ".ply":
         return False
     try:
@@ -209,7 +208,7 @@ def _is_mesh(file: Path) -> bool:
 
 
 def _poses(root: Path, expected: str) -> Path:
-    """The file of poses in a folder, by preference; raises NoPoses where there is none."""
+    """Return the file of poses in a folder, by preference. Raises NoPoses without one."""
     named = (path for pattern in _POSES for path in sorted(root.glob(pattern)) if path.is_file())
     found = next((path for path in named if not path.name.startswith(".")), None)
     if found is None:
@@ -223,7 +222,7 @@ def _poses(root: Path, expected: str) -> Path:
 
 
 class LidarDump(FolderFrames):
-    """Clouds in the LiDAR's axes with the pose of each in the world's.
+    """Clouds in the LiDAR's axes, each with its pose in the world.
 
     https://github.com/koide3/gtsam_points, `data/kitti_07_dump`. Folder K belongs to line `vK`; other lines
     (edges) are ignored. No timestamps. Options are those of `FolderFrames`.

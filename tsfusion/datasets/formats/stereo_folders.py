@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Folders of a stereo camera's images: left/ and right/ with equal names."""
+"""Read folders of a stereo camera's images: left/ and right/ with equal file names."""
 
 from pathlib import Path
 from typing import Any
@@ -21,19 +21,18 @@ _SIDES = ("left", "right")
 
 
 class StereoFolder(PairedImages, FolderFrames):
-    """Pairs of images by name, rectified where they are not, in the axes of the rectified left camera.
+    """Pairs of images with equal names, in the axes of the rectified left camera; raw images are rectified.
 
-    Names that are decimal seconds or nanoseconds are times. Images without their other half are left out and
+    Names that are decimal seconds or nanoseconds are times. Images without a partner are left out and
     counted.
 
     Args:
-        intrinsics, baseline: of rectified images; pixels, metres; default `K.txt` and `baseline.txt`.
-        calibration: of raw images; default one of `stereo_pairs.FILE_PAIRS` in the folder.
-        options: those of `FolderFrames`; there are no poses here, so that `trajectory` names some or `posed`
-            is False.
+        intrinsics, baseline: pixels, metres, for rectified images; default `K.txt` and `baseline.txt`.
+        calibration: for raw images; default one of `stereo_pairs.FILE_PAIRS` in the folder.
+        options: those of `FolderFrames`. The folder has no poses: give `trajectory`, or `posed` False.
 
     Raises:
-        DatasetError: no such folder, no pairs, no camera.
+        DatasetError: there is no such folder, there are no pairs, or there is no camera.
     """
 
     layout, expected, sensor = "stereo folders", EXPECTED, "stereo"
@@ -41,7 +40,7 @@ class StereoFolder(PairedImages, FolderFrames):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """True for a folder with images in `left/` and in `right/`."""
+        """Return True for a folder with images in `left/` and in `right/`."""
         return super().recognises(path) and all(images(path, side, EXPECTED) for side in _SIDES)
 
     def __init__(

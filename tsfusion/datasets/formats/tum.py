@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""TUM RGB-D recordings, and what shares their layout: CoRBS (pre-registered) and ICL-NUIM."""
+"""Read TUM RGB-D recordings, and others in their layout: CoRBS (pre-registered) and ICL-NUIM."""
 
 import re
 from pathlib import Path
@@ -28,7 +28,7 @@ EXPECTED = (
     "camera-intrinsics.txt unless it is a recording of TUM, CoRBS or ICL-NUIM"
 )
 DEPTH_SCALE = 1 / 5000  # metres per unit
-# A Kinect's accelerometer is turned by half around the camera's axis.
+# A Kinect's accelerometer is rotated by 180° around the optical axis.
 _R_CAMERA_KINECT = np.diag((-1.0, -1.0, 1.0))
 ASSOCIATIONS = ("associations.txt", "association.txt", "associated.txt")
 
@@ -38,15 +38,15 @@ class ImageList(NamedTuple):
 
     timestamps_ns: list[int]  # nanoseconds of each depth image
     depth: list[Path]  # files of the depth images
-    # As many files, None where none is near in time; empty where the recording has no colour
+    # A file or None for each depth image; empty if the recording has no colour
     color: list[Path | None]
 
 
 def read_recording(root: Path, *, max_difference_ns: int) -> ImageList:
-    """`depth.txt` with `rgb.txt` where it exists, or a list of pairs in one of `ASSOCIATIONS` alone.
+    """Read `depth.txt`, and `rgb.txt` if it exists; or, without `depth.txt`, pairs from `ASSOCIATIONS`.
 
     Raises:
-        DatasetError: a malformed line, an empty list, most listed images are missing.
+        DatasetError: a line is malformed, a list is empty, or most listed images are missing.
     """
     pairs = next((root / name for name in ASSOCIATIONS if (root / name).is_file()), None)
     if pairs is not None and not (root / "depth.txt").exists():
@@ -67,7 +67,7 @@ def read_recording(root: Path, *, max_difference_ns: int) -> ImageList:
 
 
 def _read(path: Path, content: str, images: int) -> list[tuple[tuple[int, Path], ...]]:
-    """(timestamp_ns, image) of each line, in time order; of a pair depth first, as its path says."""
+    """Return (timestamp_ns, image) of each line, in time order; in a pair, depth first, known by its path."""
     rows: list[tuple[tuple[int, Path], ...]] = []
     for number, line in read_lines(path, content):
         words = line.split(maxsplit=1) if images == 1 else line.split()
@@ -86,14 +86,14 @@ def _read(path: Path, content: str, images: int) -> list[tuple[tuple[int, Path],
             f"{missing[0]} is missing ({len(missing)} of {len(listed)} images that {path} lists)"
         )
     require_one_clock([row[0][0] for row in rows], path)
-    return sorted(set(rows))  # a line may be there twice
+    return sorted(set(rows))  # without repeated lines
 
 
 class _Benchmark(NamedTuple):
-    """A benchmark in this layout; its recordings are known by the folder's name."""
+    """Benchmark in this layout. Its recordings are known by the folder's name."""
 
     name: str
-    folder: str  # regular expression, searched in the last two folder names
+    folder: str  # regular expression for the last two folder names
     intrinsics: Intrinsics
     source: str
     sensor: str = "kinect"
@@ -119,19 +119,19 @@ _BENCHMARKS = (
 class TUM(DepthImages):
     """Lists of time-stamped images and a trajectory, associated by time.
 
-    Reads the lists (`timestamp path`) of https://cvg.cit.tum.de/data/datasets/rgbd-dataset and of CoRBS
-    (http://corbs.dfki.uni-kl.de: backslashes, CRLF), and ICL-NUIM's as published
+    It reads the lists (`timestamp path`) of https://cvg.cit.tum.de/data/datasets/rgbd-dataset, those of CoRBS
+    (http://corbs.dfki.uni-kl.de: backslashes, CRLF), and ICL-NUIM as published
     (https://www.doc.ic.ac.uk/~ahanda/VaFRIC/iclnuim.html: `associations.txt`, `*.gt.freiburg`). Each depth
-    image takes the nearest colour image and the pose interpolated at its own time; those without a colour
+    image gets the nearest colour image, and a pose interpolated at its time. Depth images without a colour
     image are kept and counted in `uncolored`.
 
     Args:
         path: folder with `depth.txt` or `associations.txt`.
-        trajectory: default `groundtruth.txt` in the folder, or in a sibling `*_Trajectory` folder (CoRBS);
-            or `*.gt.freiburg` in the folder, or beside it under ICL-NUIM's own name.
-        intrinsics, calibration: default a file of the camera in the folder (`cameras.FILES`); else the
-            benchmark's, by the folder's name (freiburg1-3, CoRBS, ICL-NUIM), at 640×480 alone.
-        depth_scale: metres per unit; default as a file of the camera states, else 1/5000, and 1 for floats.
+        trajectory: default `groundtruth.txt` in the folder, or in a sibling `*_Trajectory` folder (CoRBS); or
+            `*.gt.freiburg` in the folder, or beside it under ICL-NUIM's own name.
+        intrinsics, calibration: default a camera file in the folder (`cameras.FILES`); else the benchmark's
+            camera, by the folder's name (freiburg1-3, CoRBS, ICL-NUIM), only at 640×480.
+        depth_scale: metres per unit; default as stated by a camera file, else 1/5000, and 1 for floats.
         max_difference_s: between a depth image and its colour image, seconds.
         options: those of `DepthImages`.
     """
@@ -179,9 +179,9 @@ def _trajectory(root: Path) -> Path:
 
 
 def _corbs(root: Path) -> list[Path]:
-    """Several CoRBS recordings side by side: D1_pre_registereddata belongs to D1_Trajectory.
+    """Return possible trajectories of CoRBS: D1_pre_registereddata belongs to D1_Trajectory beside it.
 
-    An archive that was unpacked into a folder of its own leaves it one level further up.
+    If an archive was unpacked to a folder of its own, the trajectory is one level further up.
     """
     own = root.name.split("_")[0]
     places = [place for up in root.absolute().parents[:2] for place in sorted(up.glob("*_Trajectory*"))]
@@ -194,7 +194,7 @@ def _corbs(root: Path) -> list[Path]:
 
 
 def _icl(root: Path) -> list[Path]:
-    """`*.gt.freiburg` in the folder; or `livingRoom2.gt.freiburg` beside `living_room_traj2_frei_png`."""
+    """Return `*.gt.freiburg` in the folder, and `livingRoom2.gt.freiburg` beside `living_room_traj2_…`."""
     number = re.search(r"traj(\d)", root.name)
     if number is None:
         return sorted(root.glob("[!.]*.gt.freiburg"))

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""ROS 1 bags, ROS 2 bags (SQLite or MCAP) and MCAP files as datasets, without ROS.
+"""Open ROS 1 bags, ROS 2 bags (SQLite or MCAP) and MCAP files as datasets, without ROS.
 
-`Bag` finds topics and poses by type and name, or takes those that the user names.
+`Bag` finds topics and poses by type and name, or takes topics that the user names.
 """
 
 import logging
@@ -37,47 +37,46 @@ _DIFFERENCE_S = {"depth": 0.02, "stereo": 0.005, "lidar": 0.0}
 
 
 def recognises(path: Path) -> bool:
-    """True for a ROS recording or a folder with one; False for a tsfusion journal, MCAP too."""
+    """Return True for a ROS recording or a folder with one; False for a tsfusion journal (also MCAP)."""
     return recording(path) is not None
 
 
 class Bag(Frames):
     """Depth images, stereo pairs or point clouds of a ROS recording, in the order of their header stamps.
 
-    Colour goes with the depth image nearest in time; where it is not registered to it (in the same frame, or
-    `aligned`/`registered` in the depth topic's name), /tf_static and its CameraInfo register it here. Depth
-    without colour is kept and counted in `uncolored`. Poses come from
-    /tf where a transform between the sensor's frame and the root of its tree changes, else from odometry,
-    transform, pose or path messages, carried to the sensor by /tf_static. A time without poses around it
-    gives none. Broken messages, pairs that miss an image, and (`posed`) frames without a pose are counted in
-    `skipped`.
-
-    Opening reads the recording once; a frame is read from the disk at each access.
+    Each depth image gets the colour image nearest in time. Colour counts as registered if it has the same
+    frame, or if the depth topic's name has `aligned` or `registered`. Other colour is registered here, by
+    /tf_static and its CameraInfo. Depth without colour is kept and counted in `uncolored`. Poses come from
+    /tf if a transform between the sensor's frame and the root of its tree changes. Otherwise they come from
+    odometry, transform, pose or path messages, and /tf_static carries them to the sensor. A time without
+    poses around it has no pose. Broken messages, pairs without one image, and (`posed`) frames without a pose
+    are counted in `skipped`. Opening reads the recording once. A frame is read from disk at each access.
 
     Args:
         path: a file, or a folder with exactly one recording.
-        modality: `depth`, `stereo` or `lidar`; default the first of them that is there.
+        modality: `depth`, `stereo` or `lidar`; default the first of them that the recording has.
         info_topic: CameraInfo of the images; default the one beside or above their topic.
         pose_topic: default by type, as above.
         world_frame: default the root of the sensor's tree, or the frame of the pose topic.
-        body_frame: the frame whose poses the pose topic holds; default its `child_frame_id`, or the sensor's.
-        intrinsics, calibration: of the depth camera instead of a CameraInfo's; of a stereo pair the
+        body_frame: frame that the poses of the pose topic belong to; default its `child_frame_id`, or the
+            sensor's frame.
+        intrinsics, calibration: of the depth camera, instead of a CameraInfo; for a stereo pair, the
             calibration of both cameras.
-        depth_scale: metres per unit; default of 16-bit depth 0.001 (REP 118), or as a RealSense recorded it,
-            and of floats 1.
-        rectified: whether the images are rectified, so that `P` is theirs; default where the topic's name
-            has `rect`. Others are undistorted or rectified here (colour by its depth's camera).
-        part: where the clock stepped back, the part to read, from 1; default the first, and the others are
-            counted in `skipped`.
+        depth_scale: metres per unit; default for 16-bit depth 0.001 (REP 118), or as a RealSense recorded it,
+            and 1 for floats.
+        rectified: True if the images are rectified, and `P` describes them; default True if the topic's name
+            has `rect`. Other images are undistorted or rectified here (colour by its depth's camera).
+        part: number of the part to read, from 1, if the clock stepped back; default the first. The other
+            parts are counted in `skipped`.
         max_difference_s: between a depth image and its colour (default 20 ms), or left and right (5 ms).
-        max_gap_s: between the two poses interpolated, seconds.
+        max_gap_s: largest gap between two poses for interpolation, seconds.
         time_offset_s: added to a frame's stamp before its pose is looked up, seconds.
-        deskew: put points that have times where they were then; False for those that are put right already.
-        posed: leave out frames without a pose; otherwise they have `T_world_camera` None.
+        deskew: True moves points with times to where they were measured; False for points already corrected.
+        posed: True leaves out frames without a pose; otherwise they have `T_world_camera` None.
 
     Raises:
-        MissingDependency: without rosbags.
-        DatasetError: it cannot be read, or the topics cannot be chosen (the message lists them).
+        MissingDependency: rosbags is not installed.
+        DatasetError: the recording cannot be read, or the topics cannot be chosen (the message lists them).
     """
 
     quaternions = True
@@ -162,9 +161,9 @@ class Bag(Frames):
     def _index(
         self, poses: PoseFinder, imu: ImuTopics, part: int | None
     ) -> tuple[dict[int, MessageLocation], dict[int, MessageLocation], int | None]:
-        """Locations by time of the main and the other messages, from one pass over the recording.
+        """Return time → location of the main and of the other messages, from one pass over the recording.
 
-        The last is the number of the part that they are of, None where the clock never stepped back.
+        The last value is the number of their part, or None if the clock never stepped back.
         """
         chosen = self._chosen
         used = [chosen.main]
@@ -196,14 +195,14 @@ class Bag(Frames):
             if count:
                 self.skipped[f"of {topic} that are broken"] = count
         cut = self._cut(locations, part)
-        # Messages by their header's stamp, or by the recorder's clock where a header says nothing
+        # Messages by their header's stamp, or by the recorder's clock if a header has no stamp
         found = [{each.stamp_ns or each.log_ns: each for each in locations[one.topic]} for one in used]
         if repeated := len(locations[chosen.main.topic]) - len(found[0]):
             self.skipped[f"of {chosen.main.topic} with another's time"] = repeated
         return found[0], found[1] if len(found) > 1 else {}, cut
 
     def _cut(self, locations: dict[str, list[MessageLocation]], part: int | None) -> int | None:
-        """Keep one part of messages whose clock stepped back; returns its number, None = it never did."""
+        """Keep one part of messages whose clock stepped back. Return its number, or None if it never did."""
         main = self._chosen.main.topic
         stamps = {topic: [one.stamp_ns or one.log_ns for one in own] for topic, own in locations.items()}
         parts = {topic: clock_parts(own) for topic, own in stamps.items()}
@@ -227,7 +226,7 @@ class Bag(Frames):
     def _pair(
         self, mains: dict[int, MessageLocation], others: dict[int, MessageLocation], max_difference_ns: int
     ) -> None:
-        """Give each main message the nearest other one."""
+        """Give each main message the other message nearest in time."""
         stamps = np.array(sorted(mains), dtype=np.int64)
         there = np.array(sorted(others), dtype=np.int64)
         nearest = nearest_in_time(there, stamps) if len(there) else np.zeros_like(stamps)
@@ -243,7 +242,7 @@ class Bag(Frames):
         self._others = [others[int(there[i])] if ok else None for i, ok in zip(nearest, near, strict=True)]
 
     def _pose(self, at: Callable[[int], Transform | None], offset_ns: int, posed: bool) -> None:
-        """Find the frames' poses; leave out those without."""
+        """Find the frames' poses. Leave out frames without a pose, if `posed`."""
         assert self.timestamps_ns is not None
         self._poses = [at(stamp + offset_ns) for stamp in self.timestamps_ns.tolist()]
         if self._chosen.pairs is not None:
@@ -257,7 +256,7 @@ class Bag(Frames):
         self._others = [self._others[i] for i in chosen]
 
     def _register(self, poses: PoseFinder) -> Registration | None:
-        """Registration that brings the colour of a separate camera onto the depth; None = it is left out."""
+        """Return the registration of a separate camera's colour to the depth; None without colour."""
         chosen = self._chosen
         if chosen.color_camera is None or chosen.camera is None or not len(self):
             return None
@@ -280,7 +279,7 @@ class Bag(Frames):
         )
 
     def _from_frame(self, poses: PoseFinder, frame: str) -> Transform | None:
-        """The transform from another frame to that of the images or points; None = not known."""
+        """Return the transform from another frame to that of the images or points, or None if unknown."""
         T_sensor_frame = poses.between(self._chosen.frame, frame, self._stamp(0))
         pairs = self._chosen.pairs
         if T_sensor_frame is None or pairs is None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The topics of images in a recording, and the cameras that took them."""
+"""Find the topics of images in a recording, and the cameras of these images."""
 
 import re
 from contextlib import suppress
@@ -23,22 +23,22 @@ from tsfusion.geometry.calibration import Camera as Lens
 from tsfusion.geometry.calibration_files import read_rig
 from tsfusion.geometry.keyframe import Intrinsics
 
-_MAX_TRIED = 20  # messages
+_MAX_TRIED = 20  # messages of a topic
 _TRANSPORT = re.compile(r"/(compressed|compressedDepth)$")
 RECTIFIED = re.compile(r"(?<![a-z])rect")
 REGISTERED = re.compile(r"(?<![a-z])(?<!not_)(aligned(?!_depth_to_infra)|registered)")
 _NO_COLOR = re.compile(r"infra|(^|[/_])ir([/_\d]|$)|fisheye|confidence", re.IGNORECASE)
 _UNDISTORTED = 1e-6  # largest coefficient of a camera without distortion
 _NO_TURN = 1e-6
-_CHANGED = 0.02  # of the focal length, or of a coefficient: more than autofocus
+_CHANGED = 0.02  # share of the focal length, or change of a coefficient: more than autofocus gives
 
 
 class ImageTopic(NamedTuple):
-    """A topic of images."""
+    """Topic of images."""
 
     stream: Stream
-    base: str  # the topic without its transport
-    first: Any  # its first message that can be decoded
+    base: str  # name of the topic without the transport
+    first: Any  # first message that can be decoded
     size: tuple[int, int]  # height and width
     frame: str
 
@@ -54,12 +54,11 @@ class ImageTopic(NamedTuple):
 
     @property
     def is_gray(self) -> bool:
-        """True for images of one channel."""
         return bag_messages.encoding(self.first) in ("mono8", "8UC1")
 
 
 def image_topic(recording: BagRecording, stream: Stream) -> ImageTopic | None:
-    """Describe a topic by its first readable image; None = none of the first few can be decoded."""
+    """Describe a topic by its first readable image, or return None if the first few cannot be decoded."""
     for message in islice(recording.messages([stream]), _MAX_TRIED):
         if isinstance(message, Message):
             content = message.content
@@ -75,18 +74,14 @@ def image_topic(recording: BagRecording, stream: Stream) -> ImageTopic | None:
 
 
 class CameraWatch:
-    """Compares each CameraInfo of some topics with the first one, which counts for all images.
-
-    Args:
-        streams: the topics.
-    """
+    """Compare each CameraInfo of some topics with the first one, which is used for all images."""
 
     def __init__(self, streams: list[Stream]) -> None:
         self.streams = streams
         self._first: dict[tuple[Stream, str], tuple[CameraInfo, int]] = {}  # by topic and frame
 
     def add(self, message: Message) -> None:
-        """Raise DatasetError where the camera is another one than at first."""
+        """Raise DatasetError if the camera differs from the first one."""
         found, now = bag_messages.camera(message.content), message.location.log_ns
         first, began = self._first.setdefault((message.stream, frame_id(message.content)), (found, now))
         if not (first.K[0, 0] and found.K[0, 0]):  # not calibrated
@@ -102,13 +97,13 @@ class CameraWatch:
 
 
 class Cameras:
-    """Finds the CameraInfo of images.
+    """Find the CameraInfo of images.
 
     Args:
         info_topic: of all images; None = the one beside or above their topic, or the only one.
-        intrinsics: of all images, instead of a CameraInfo's.
-        calibration: a camera's file, or a stereo camera's, instead of a CameraInfo's.
-        rectified: whether images have been rectified already; None = by the topic's name.
+        intrinsics: of all images, instead of a CameraInfo.
+        calibration: file of a camera or stereo camera, instead of a CameraInfo.
+        rectified: True if images are already rectified; None = by the topic's name.
     """
 
     def __init__(
@@ -121,16 +116,16 @@ class Cameras:
     ) -> None:
         self._recording, self._info_topic = recording, info_topic
         self._intrinsics, self._calibration, self._rectified = intrinsics, calibration, rectified
-        self.used: list[Stream] = []  # whose first CameraInfo is that of some images
+        self.used: list[Stream] = []  # the first CameraInfo of each is used for some images
 
     def find(self, images: ImageTopic) -> CameraInfo | None:
-        """The camera of a topic of images; None = there is no CameraInfo."""
+        """Return the camera of a topic of images, or None without a CameraInfo."""
         stream = self._info_stream(images)
         message = None if stream is None else self._recording.first(stream)
         return None if message is None else bag_messages.camera(message)
 
     def camera(self, images: ImageTopic) -> CameraInfo:
-        """The camera of a topic of images; raises DatasetError where there is no CameraInfo."""
+        """Return the camera of a topic of images. Raises DatasetError without a CameraInfo."""
         found = self.find(images)
         if found is None:
             raise DatasetError(
@@ -153,7 +148,7 @@ class Cameras:
         return next((one for one in found.values() if len(found) == 1 and self._is_of(one, images)), None)
 
     def _is_of(self, info: Stream, images: ImageTopic) -> bool:
-        """True if the only CameraInfo may be that of some images: it names no other frame than theirs."""
+        """Return True if the only CameraInfo may belong to the images: it names no other frame."""
         message = self._recording.first(info)
         frame = "" if message is None else frame_id(message)
         return not frame or not images.frame or frame == images.frame or bool(REGISTERED.search(images.base))
@@ -168,7 +163,6 @@ class Cameras:
         return given or self._recorded_view(images)
 
     def _recorded_view(self, images: ImageTopic) -> RecordedCamera:
-        """The camera of the images' CameraInfo."""
         camera, source = self._checked(images), self._source(images)
         if self._is_rectified(images):
             K = camera.P[:, :3] if camera.P[0, 0] else camera.K
@@ -179,7 +173,7 @@ class Cameras:
         return RecordedCamera(undistorter.intrinsics, images.size, source, undistorter)
 
     def _source(self, images: ImageTopic) -> str:
-        """Note the topic that the camera of some images is from; returns it in words."""
+        """Add the topic of the images' CameraInfo to `used`. Return a text that names it."""
         stream = self._info_stream(images)
         if stream is None:
             return "from CameraInfo"
@@ -187,17 +181,17 @@ class Cameras:
         return f"from {stream.topic}"
 
     def own_view(self, images: ImageTopic) -> RecordedCamera | None:
-        """The camera of images that is not the depth's; None where it has no CameraInfo of its own."""
+        """Return the camera of images not from the depth camera, or None without an own CameraInfo."""
         stream = None if self._info_topic is not None else self._info_stream(images)
         if stream is None or not _is_beside(stream.topic, images.base):
             return None
         return self._recorded_view(images)
 
     def pairs(self, left: ImageTopic, right: ImageTopic) -> tuple[PairRectifier, str]:
-        """Find how a pair's images become those of two equal cameras with matching rows, and from what.
+        """Return the rectifier of a stereo pair, and the source of its calibration.
 
         Raises:
-            DatasetError: as of `view`.
+            DatasetError: as for `view`.
         """
         if self._calibration is not None:
             return self._pairs_of_file(left, Path(self._calibration).expanduser())
@@ -223,7 +217,6 @@ class Cameras:
         return Rectifier(StereoRig(lenses[0], lenses[1], _right_of(*cameras))), self._source(left)
 
     def _pairs_of_file(self, left: ImageTopic, path: Path) -> tuple[PairRectifier, str]:
-        """Rectification by a stereo camera's file that was given."""
         try:
             rectifier = Rectifier(read_rig(path))
         except InvalidConfig as error:
@@ -239,7 +232,7 @@ class Cameras:
         return bool(RECTIFIED.search(images.base)) if self._rectified is None else self._rectified
 
     def _checked(self, images: ImageTopic) -> CameraInfo:
-        """The camera, after its size was compared with that of the images."""
+        """Return the camera, after a comparison of its size with the images' size."""
         camera = self.camera(images)
         height, width = images.size
         if camera.width and (camera.width, camera.height) != (width, height):
@@ -253,7 +246,7 @@ class Cameras:
         return intrinsics_of(matrix, f"{self._recording.path}: CameraInfo of {images.stream.topic}")
 
     def _lens(self, images: ImageTopic, camera: CameraInfo) -> Lens:
-        self._pinhole(images, camera.K * ((1, 0, 1), (1, 1, 1), (1, 1, 1)))  # its skew is used
+        self._pinhole(images, camera.K * ((1, 0, 1), (1, 1, 1), (1, 1, 1)))  # skew is allowed here
         try:
             return Lens.named(camera.K, images.size, camera.model, camera.D)
         except InvalidConfig as error:
@@ -264,7 +257,7 @@ class Cameras:
 
 
 def _is_beside(info_topic: str, base: str) -> bool:
-    """True if a CameraInfo is of these images alone: in their topic's own folder."""
+    """Return True if a CameraInfo is only for these images: it is in their topic's own folder."""
     place = base.rpartition("/")[0]
     return info_topic.startswith((f"{place}/", f"{base}/"))
 
@@ -278,7 +271,7 @@ def _turn(camera: CameraInfo) -> float:
 
 
 def _right_of(left: CameraInfo, right: CameraInfo) -> NDArray[np.float64]:
-    """(4, 4) T_right_left: both turn by their `R` into rectified cameras, which stand side by side."""
+    """Return (4, 4) T_right_left: both cameras turn by their `R` into rectified cameras side by side."""
     R_left, R_right = (one.R if one.R.any() else np.eye(3) for one in (left, right))
     t = R_right.T @ np.array([right.P[0, 3] / right.P[0, 0] - left.P[0, 3] / left.P[0, 0], 0, 0])
     return se3.transform(R_right.T @ R_left, t)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""ROS messages as arrays: images, compressed images, point clouds and cameras.
+"""Convert ROS messages to arrays: images, compressed images, point clouds and cameras.
 
-By the definitions of sensor_msgs, REP 118 (depth) and image_transport's plugins. A message that contradicts
-itself raises DatasetError; the caller adds which message it was.
+It follows the definitions of sensor_msgs, REP 118 (depth) and image_transport's plugins. A message that
+contradicts itself raises DatasetError; the caller adds which message it was.
 """
 
 import struct
@@ -26,7 +26,7 @@ CLOUD = "sensor_msgs/msg/PointCloud2"
 DEPTH_ENCODINGS = ("16UC1", "mono16", "32FC1")
 _QUANTISATION = struct.Struct("<iff")  # compressed_depth_image_transport's ConfigHeader
 
-# Encoding → what it is stored as, channels, and how OpenCV makes BGR of it (None = it is). ROS names a Bayer
+# Encoding → stored type, channels, and OpenCV's conversion to BGR (None = not needed). ROS names a Bayer
 # pattern by its first row, OpenCV by its second row from the second column.
 _PIXELS: dict[str, tuple[str, int, int | None]] = {
     "mono8": ("u1", 1, cv2.COLOR_GRAY2BGR),
@@ -53,7 +53,7 @@ _FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8
 
 
 class CameraInfo(NamedTuple):
-    """A CameraInfo. `P` is of the rectified image, `K`, `D` and `R` of the image as it comes."""
+    """Content of a CameraInfo. `P` is for the rectified image; `K`, `D` and `R` are for the raw image."""
 
     width: int
     height: int
@@ -65,24 +65,24 @@ class CameraInfo(NamedTuple):
 
 
 def encoding(message: Any) -> str:
-    """Encoding of the pixels of an Image or CompressedImage, by ROS's name."""
+    """Return the encoding of an Image's or CompressedImage's pixels, by ROS's name."""
     if hasattr(message, "encoding"):
         return str(message.encoding)
     return str(message.format).split(";")[0].strip()
 
 
 def is_depth(message: Any) -> bool:
-    """True if an Image or CompressedImage holds 16-bit or floating-point pixels."""
+    """Return True if an Image or CompressedImage holds 16-bit or floating-point pixels."""
     return encoding(message) in DEPTH_ENCODINGS
 
 
 def check_image(message: Any) -> None:
-    """Raise DatasetError unless an Image holds the bytes that its size and step ask for."""
+    """Raise DatasetError unless an Image holds the bytes required by its size and step."""
     _layout(message)
 
 
 def depth(message: Any) -> NDArray[Any]:
-    """(H, W) uint16, millimetres unless a driver says otherwise, or float32 metres."""
+    """Return (H, W) uint16, in millimetres unless a driver says otherwise, or float32 metres."""
     image = _stored(message) if hasattr(message, "encoding") else _decoded_depth(message)
     if image.ndim != 2 or image.dtype not in (np.uint16, np.float32):
         raise DatasetError(f"is no depth image: {encoding(message)} of shape {image.shape}")
@@ -90,7 +90,7 @@ def depth(message: Any) -> NDArray[Any]:
 
 
 def color(message: Any) -> NDArray[np.uint8]:
-    """(H, W, 3) uint8 BGR."""
+    """Return (H, W, 3) uint8 BGR."""
     if not hasattr(message, "encoding"):
         return _decoded(message, cv2.IMREAD_COLOR)
     conversion = _PIXELS.get(message.encoding, ("", 0, None))[2]
@@ -101,7 +101,7 @@ def color(message: Any) -> NDArray[np.uint8]:
 
 
 def gray(message: Any) -> NDArray[np.uint8]:
-    """(H, W) uint8."""
+    """Return (H, W) uint8."""
     if not hasattr(message, "encoding"):
         return _decoded(message, cv2.IMREAD_GRAYSCALE)
     if message.encoding in ("mono8", "8UC1"):
@@ -110,7 +110,7 @@ def gray(message: Any) -> NDArray[np.uint8]:
 
 
 def _layout(message: Any) -> tuple[np.dtype[Any], int]:
-    """Pixel type and channels, once the sizes agree."""
+    """Return pixel type and channels. Raise DatasetError if sizes contradict each other."""
     if message.encoding not in _PIXELS:
         raise DatasetError(f"has the encoding {message.encoding!r}; read are {', '.join(_PIXELS)}")
     kind, channels, _ = _PIXELS[message.encoding]
@@ -144,7 +144,7 @@ def _decoded(message: Any, flags: int, start: int = 0) -> NDArray[Any]:
 
 
 def _decoded_depth(message: Any) -> NDArray[Any]:
-    """PNG, or image_transport's compressedDepth: 12 bytes, then a PNG; metres as inverse depth in 16 bits."""
+    """Decode PNG, or image_transport's compressedDepth: 12 bytes, then a PNG; metres as inverse depth."""
     if "compressedDepth" not in message.format:
         return _decoded(message, cv2.IMREAD_UNCHANGED)
     if "rvl" in message.format.lower():
@@ -161,12 +161,12 @@ def _decoded_depth(message: Any) -> NDArray[Any]:
 
 
 def check_cloud(message: Any) -> None:
-    """Raise DatasetError unless a PointCloud2 has x, y and z, and the bytes that its size asks for."""
+    """Raise DatasetError unless a PointCloud2 has x, y and z, and the bytes required by its size."""
     _records(message)
 
 
 def cloud(message: Any) -> Scan:
-    """Points with their colours and times, where they have some; (0, 0, 0) is no return."""
+    """Return points, with colours and times if there are any. A point (0, 0, 0), no return, becomes NaN."""
     records = _records(message)
     points = np.column_stack([records[axis].ravel().astype(np.float32) for axis in "xyz"])
     points[~points.any(axis=1)] = np.nan
@@ -180,7 +180,7 @@ def cloud(message: Any) -> Scan:
 
 
 def _records(message: Any) -> NDArray[Any]:
-    """(height, width) structured array over the message's bytes."""
+    """Return a (height, width) structured array over the message's bytes."""
     order = ">" if message.is_bigendian else "<"
     names, formats, offsets = [], [], []
     for one in message.fields:
@@ -213,7 +213,7 @@ def _records(message: Any) -> NDArray[Any]:
 
 
 def camera(message: Any) -> CameraInfo:
-    """A CameraInfo with the binning and region of its images worked in."""
+    """Return a CameraInfo with `K` and `P` changed for the images' binning and region."""
     K, D, R, P = (
         np.array(getattr(message, name, getattr(message, name.upper(), None)), np.float64) for name in "kdrp"
     )

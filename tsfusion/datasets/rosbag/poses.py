@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The pose of a bag's sensor at a time, from transforms or a topic of poses; its accelerometer."""
+"""Find the pose of a bag's sensor at a time, from transforms or a pose topic; find its accelerometer."""
 
 import logging
 from array import array
@@ -21,8 +21,8 @@ from tsfusion.geometry.se3 import Transform
 from tsfusion.geometry.trajectory import Trajectory, rigid
 
 IMU = "sensor_msgs/msg/Imu"
-_NOT_MEASURED = -1.0  # as first covariance: sensor_msgs/Imu.msg
-_LEAST, _MOST = 8.0, 12.0  # m/s²: the median length of what an accelerometer at rest measures
+_NOT_MEASURED = -1.0  # as first covariance; see sensor_msgs/Imu.msg
+_LEAST, _MOST = 8.0, 12.0  # m/s²: bounds of an accelerometer's median, near gravity
 log = logging.getLogger(__name__)
 
 TF = "tf2_msgs/msg/TFMessage"
@@ -32,12 +32,12 @@ ODOMETRY = "nav_msgs/msg/Odometry"
 TRANSFORM = "geometry_msgs/msg/TransformStamped"
 POSE = "geometry_msgs/msg/PoseStamped"
 POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
-POSE_KINDS = (ODOMETRY, TRANSFORM, POSE, POSE_WITH_COVARIANCE, PATH)  # the preferred first
-_SAME = 1e-9  # metres, and quaternion components: a transform that is sent again and again
+POSE_KINDS = (ODOMETRY, TRANSFORM, POSE, POSE_WITH_COVARIANCE, PATH)  # in order of preference
+_SAME = 1e-9  # metres, and quaternion components: the transform does not change
 
 
 class PoseSamples:
-    """Poses with their times, 64 bytes each: a robot may send a thousand a second."""
+    """Poses with their times, in 64 bytes each: a robot may send a thousand a second."""
 
     def __init__(self) -> None:
         self._stamps, self._values = array("q"), array("d")
@@ -46,7 +46,7 @@ class PoseSamples:
         return len(self._stamps)
 
     def add(self, stamp: int, t: Any, q: Any) -> None:
-        """A translation and a quaternion at a time; left out where they are not finite, or no rotation."""
+        """Add a translation and a quaternion at a time, if they are finite and a rotation."""
         values = np.array([t.x, t.y, t.z, q.x, q.y, q.z, q.w])
         length = float(np.linalg.norm(values[3:]))
         if np.isfinite(values).all() and 0.5 < length < 2:
@@ -55,16 +55,16 @@ class PoseSamples:
             self._values.extend(values.tolist())
 
     def last(self) -> Trajectory:
-        """The pose that was added last, which counts of a static transform."""
+        """Return the pose that was added last: the valid one of a static transform."""
         table: NDArray[np.float64] = np.array(self._values[-7:]).reshape(1, 7)
         return Trajectory(np.array(self._stamps[-1:], np.int64), table[:, :3], table[:, 3:])
 
     def trajectory(self, part: int | None = None, of: str = "") -> Trajectory:
-        """The poses in the order of time; of equal times the first.
+        """Return the poses in the order of time; the first of equal times.
 
         Args:
-            part: number of the part to take where their clock stepped back, from 1; None = all.
-            of: name for the warning about poses at one time that differ.
+            part: number of the part to take if their clock stepped back, from 1; None = all.
+            of: name for the warning about different poses at one time.
         """
         own = slice(None) if part is None else clock_parts(self._stamps)[:part][-1]
         stamps = np.array(self._stamps[own], np.int64)
@@ -88,12 +88,12 @@ class _Edge(NamedTuple):
 
 
 class TransformTree:
-    """The tree of frames in /tf and /tf_static, each transform over time.
+    """Tree of the frames in /tf and /tf_static, with each transform over time.
 
-    A frame has one parent: of several, the one named most often.
+    A frame has one parent. If messages name several, it is the one named most often.
 
     Args:
-        max_gap_ns: between the two transforms interpolated; across a longer gap there is none.
+        max_gap_ns: largest gap between two transforms for interpolation; a longer gap has no transform.
     """
 
     def __init__(self, max_gap_ns: int) -> None:
@@ -103,10 +103,10 @@ class TransformTree:
         self._edges: dict[str, _Edge] = {}
 
     def add(self, message: Any, log_ns: int, *, static: bool) -> None:
-        """Add the transforms of a TFMessage; those that are not finite are left out.
+        """Add the transforms of a TFMessage that are finite.
 
         Args:
-            log_ns: when it was recorded: the time of those without a stamp.
+            log_ns: time of recording, used for transforms without a stamp.
         """
         for one in message.transforms:
             key = frame_id(one), str(one.child_frame_id).strip("/")
@@ -117,7 +117,7 @@ class TransformTree:
                     self._dynamic.add(key)
 
     def finish(self, part: int | None) -> None:
-        """Build the tree, after the last `add`; `part` as of `PoseSamples.trajectory`."""
+        """Build the tree, after the last `add`. `part` is as for `PoseSamples.trajectory`."""
         for (parent, child), samples in sorted(self._samples.items(), key=lambda item: len(item[1])):
             if not samples:
                 continue
@@ -129,18 +129,18 @@ class TransformTree:
         self._samples.clear()
 
     def ancestors(self, frame: str) -> list[str]:
-        """The frame itself, its parent, and so on to the root."""
+        """Return the frame itself, its parent, and so on to the root."""
         chain = [frame]
         while (edge := self._edges.get(chain[-1])) is not None and edge.parent not in chain:
             chain.append(edge.parent)
         return chain
 
     def moves(self, frame: str) -> bool:
-        """True if a transform between the frame and its root changes."""
+        """Return True if a transform between the frame and its root changes."""
         return any(not self._edges[one].is_constant for one in self.ancestors(frame)[:-1])
 
     def is_dynamic(self, frame: str) -> bool:
-        """True if a transform between the frame and its root was sent on /tf, not only on /tf_static."""
+        """Return True if a transform between the frame and its root came on /tf, not only on /tf_static."""
         chain = self.ancestors(frame)
         return any((parent, child) in self._dynamic for child, parent in pairwise(chain))
 
@@ -148,7 +148,7 @@ class TransformTree:
         return self.ancestors(one)[-1] == self.ancestors(other)[-1]
 
     def at(self, target: str, source: str, stamp: int) -> Transform | None:
-        """`T_target_source` at a time; None where it is not known."""
+        """Return `T_target_source` at a time, or None if unknown."""
         if target == source:
             return np.eye(4)
         up_target, up_source = self.ancestors(target), self.ancestors(source)
@@ -162,7 +162,7 @@ class TransformTree:
         return se3.inverse(T_common_target) @ T_common_source
 
     def _down(self, frames: list[str], stamp: int) -> Transform | None:
-        """The pose of the first frame in the parent of the last."""
+        """Return the pose of the first frame in the parent of the last frame."""
         T: Transform = np.eye(4)
         for frame in frames:
             step = self._edges[frame].at(stamp, self._max_gap_ns)
@@ -176,7 +176,7 @@ class TransformTrack(NamedTuple):
     """Poses of one frame in another."""
 
     world: str
-    body: str  # the frame whose pose it is; empty = the topic does not name it
+    body: str  # the frame with these poses; empty = not named by the topic
     trajectory: Trajectory
 
 
@@ -184,7 +184,7 @@ class PoseTopic:
     """Poses of one topic, collected message by message."""
 
     def __init__(self) -> None:
-        self.world, self.body = "", ""  # frames that the first message names; an empty body = it names none
+        self.world, self.body = "", ""  # frames named by the first message; empty body = not named
         self._samples, self._began = PoseSamples(), False
 
     def add(self, message: Any, kind: str) -> None:
@@ -201,7 +201,7 @@ class PoseTopic:
             self._samples.add(stamp_ns(one), *where)
 
     def track(self, part: int | None) -> TransformTrack | None:
-        """The poses so far, `part` as of `PoseSamples.trajectory`; None = there is none."""
+        """Return the poses so far, or None without any. `part` is as for `PoseSamples.trajectory`."""
         return (
             TransformTrack(
                 self.world, self.body, self._samples.trajectory(part, f"{self.body} in {self.world}")
@@ -212,7 +212,7 @@ class PoseTopic:
 
 
 def pose_streams(recording: BagRecording, pose_topic: str | None) -> list[Stream]:
-    """The streams of transforms, and the named topic of poses, or all such topics.
+    """Return the streams of transforms, and the named topic of poses, or all topics of poses.
 
     Raises:
         DatasetError: the named topic holds no poses.
@@ -230,12 +230,12 @@ def pose_streams(recording: BagRecording, pose_topic: str | None) -> list[Stream
 
 
 class PoseFinder:
-    """The sensor's pose at any time, by the pose messages of a recording.
+    """Find the sensor's pose at any time, from the pose messages of a recording.
 
     Args:
         frame: name of the sensor's frame.
-        streams: those of `pose_streams`.
-        topic_named: the user named the topic of poses: it is preferred to the transforms.
+        streams: result of `pose_streams`.
+        topic_named: True if the user named the topic of poses; the topic is then preferred to transforms.
     """
 
     def __init__(
@@ -257,23 +257,23 @@ class PoseFinder:
         self._pose_topics: dict[Stream, PoseTopic] = {}
 
     def add(self, message: Message) -> None:
-        """Take a message of one of `streams` into account."""
         if message.stream.kind in (TF, OLD_TF):
             is_static = message.stream.topic.endswith("static")
             self._transforms.add(message.content, message.location.log_ns, static=is_static)
         else:
             if message.stream.kind == PATH or message.stream not in self._pose_topics:
-                self._pose_topics[message.stream] = PoseTopic()  # each path holds all that were before
+                self._pose_topics[message.stream] = PoseTopic()  # each path message holds all earlier poses
             self._pose_topics[message.stream].add(message.content, message.stream.kind)
 
     def finish(self, *, required: bool, part: int | None = None) -> Callable[[int], Transform | None]:
-        """A function from nanoseconds to `T_world_sensor`, None where the pose is not known.
+        """Return a function from nanoseconds to `T_world_sensor`, or None if the pose is unknown.
 
         Args:
-            part: number of the part that counts of poses whose clock stepped back, from 1; None = all.
+            part: number of the part of the poses to use if their clock stepped back, from 1; None = all.
 
         Raises:
-            DatasetError: `required` and there are no poses; or no transforms connect the named frames.
+            DatasetError: there are no poses but they are `required`, or no transforms connect the named
+                frames.
         """
         self._transforms.finish(part)
         if not self._topic_named and self._transforms.moves(self._frame):
@@ -291,7 +291,7 @@ class PoseFinder:
         return lambda _stamp: None
 
     def between(self, target: str, source: str, stamp: int) -> Transform | None:
-        """`T_target_source` at a time by the transforms, after `finish`; None where it is not known."""
+        """Return `T_target_source` at a time by the transforms, or None. Call it after `finish`."""
         return self._transforms.at(target, source, stamp)
 
     def _by_transforms(self) -> Callable[[int], Transform | None]:
@@ -304,7 +304,7 @@ class PoseFinder:
         return lambda stamp: self._transforms.at(world, self._frame, stamp)
 
     def _track(self, part: int | None) -> TransformTrack | None:
-        """The poses of the first kind in `POSE_KINDS` that leads to the sensor."""
+        """Return the poses of the first kind in `POSE_KINDS` that leads to the sensor."""
         for kind in POSE_KINDS:
             tracks = {
                 stream.topic: found
@@ -356,7 +356,6 @@ class ImuTopics:
         self._forces: defaultdict[Stream, array[float]] = defaultdict(lambda: array("d"))
 
     def add(self, message: Message) -> None:
-        """Take a message of one of `streams` into account."""
         content, stream = message.content, message.stream
         if content.linear_acceleration_covariance[0] == _NOT_MEASURED:
             return
@@ -366,10 +365,10 @@ class ImuTopics:
         self._forces[stream].extend((force.x, force.y, force.z))
 
     def accelerometer(self, leads: Callable[[str], Transform | None]) -> Accelerometer | None:
-        """The first topic that measures gravity, and whose frame's place is known.
+        """Return the first topic that measures gravity and has a frame with a known position, or None.
 
         Args:
-            leads: gives the transform from a frame to the camera or LiDAR; None = not known.
+            leads: returns the transform from a frame to the camera or LiDAR, or None if unknown.
         """
         for stream, stamps in self._stamps.items():
             forces = np.array(self._forces[stream]).reshape(-1, 3)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Messages of ROS 1 and ROS 2 recordings, read one after the other or by their location; without ROS.
+"""Read messages of ROS 1 and ROS 2 recordings, in order or by location, without ROS.
 
 A recording is a `.bag`, a ROS 2 folder (`metadata.yaml` beside `.db3` or `.mcap` files), or one such file.
 """
@@ -34,21 +34,21 @@ _HINTS = {
     "not indexed": _REINDEX,
     "index looks damaged": _REINDEX,
     "could not be read from file": _REINDEX,
-    "Invalid argument": _RECOVER,  # to read a footer from a few bytes
+    "Invalid argument": _RECOVER,  # the error for a file too short for a footer
     "File end magic": _RECOVER,
     "malformed": _UNCLOSED.format("sqlite3 FILE .recover | sqlite3 NEW"),
     "Profile is not ros2": "only MCAP files of the profile ros2 are read",
     "larger than": _CHUNKS,
     "unpacks to": _CHUNKS,
 }
-_FILE_ORDER = -1  # connection of rosbags' index of a ROS 1 bag: all that are wanted
+_FILE_ORDER = -1  # key in rosbags' index of a ROS 1 bag, for all wanted connections
 
 
 class Stream(NamedTuple):
-    """The messages of one type in one topic."""
+    """Messages of one type in one topic."""
 
     topic: str
-    kind: str  # such as sensor_msgs/msg/Image, of ROS 1 too
+    kind: str  # such as sensor_msgs/msg/Image, for ROS 1 too
     messages: int
 
 
@@ -57,8 +57,8 @@ class MessageLocation(NamedTuple):
 
     connection: int
     log_ns: int
-    stamp_ns: int  # of its header; 0 = the header has none
-    earlier: int = 0  # messages of the same connection and times before it in the file
+    stamp_ns: int  # of the header; 0 = no stamp
+    earlier: int = 0  # number of earlier messages in the file with the same connection and times
 
 
 class Message(NamedTuple):
@@ -66,13 +66,13 @@ class Message(NamedTuple):
 
     stream: Stream
     location: MessageLocation
-    content: Any  # the fields, by ROS's names
+    content: Any  # the message's fields, with ROS's names
 
 
 def recording(path: Path) -> Path | None:
-    """The recording at a path: the path itself, or the only recording in a folder; None = there is none.
+    """Return the path itself if it is a recording, or the only recording in a folder, or None.
 
-    The first bytes decide what a file is; an `.mcap` of tsfusion's own journal does not count.
+    The first bytes decide what a file is. An `.mcap` of tsfusion's own journal does not count.
     """
     if path.is_file():
         return path if _is_bag(path) else None
@@ -102,11 +102,11 @@ def _opening(path: Path) -> bytes:
 
 
 class BagRecording:
-    """The messages of a recording. Its files stay open as long as this object lives.
+    """Messages of a recording. The files stay open as long as this object lives.
 
     Raises:
-        MissingDependency: without rosbags.
-        DatasetError: when it cannot be read.
+        MissingDependency: rosbags is not installed.
+        DatasetError: the recording cannot be read.
     """
 
     def __init__(self, path: Path) -> None:
@@ -130,17 +130,17 @@ class BagRecording:
         self._warn_if_unindexed()
 
     def listing(self) -> str:
-        """Every topic with its type and number of messages, for an error."""
+        """Return every topic with its type and number of messages, for an error message."""
         shown = ", ".join(
             f"{one.topic} ({one.kind.replace('/msg/', '/')}, {one.messages})" for one in self.streams
         )
         return f"its topics: {shown}" if shown else "it holds no messages"
 
     def messages(self, streams: Collection[Stream]) -> Iterator[Message | Stream]:
-        """Messages of some streams in the order of recording; of a broken message its stream alone.
+        """Yield messages of some streams in the order of recording. For a broken message, yield its stream.
 
         Raises:
-            DatasetError: when the file ends or is damaged before the last one.
+            DatasetError: the file ends, or is damaged, before the last message.
         """
         wanted = {(one.topic, one.kind): one for one in streams}
         numbers = {
@@ -164,17 +164,17 @@ class BagRecording:
                     yield Message(stream, MessageLocation(number, log_ns, stamp_ns(content)), content)
 
     def first(self, stream: Stream) -> Any:
-        """The first readable message of a stream; None = there is none."""
+        """Return the first readable message of a stream, or None."""
         for message in self.messages([stream]):
             if isinstance(message, Message):
                 return message.content
         return None
 
     def read(self, location: MessageLocation) -> Any:
-        """The message at a location.
+        """Return the message at a location.
 
         Raises:
-            DatasetError: the recording has changed, and the message is no longer there.
+            DatasetError: the recording has changed, and the message is gone.
         """
         connection, left = self._connections[location.connection], location.earlier
         with self._lock, self._errors():
@@ -189,7 +189,7 @@ class BagRecording:
         )
 
     def _raw(self, connections: list[Any]) -> Iterator[tuple[Any, int, bytes]]:
-        """Messages as they lie in the file: rosbags sorts them by a clock that may have stepped back."""
+        """Yield messages in the file's order. Rosbags would sort them by a clock that may step back."""
         (reader,) = self._reader.readers
         if not self._is2:
             entries = chain.from_iterable(reader.indexes[one.id] for one in connections)
@@ -209,7 +209,7 @@ class BagRecording:
                 yield own[number], log_ns, unpack(raw)
 
     def _content(self, raw: bytes, kind: str) -> Any:
-        """The message of some bytes, by the recording's own definition or else the usual one."""
+        """Return the message of some bytes, by the recording's definition or the usual one; None = broken."""
         store = self._reader.typestore
         if kind not in store.fielddefs:
             store = self._usual
@@ -230,7 +230,7 @@ class BagRecording:
 
     @contextmanager
     def _errors(self) -> Iterator[None]:
-        """Turn what rosbags lets through of its parts (SQLite, YAML, zstd, lz4, struct) into DatasetError."""
+        """Turn errors of rosbags and its libraries (SQLite, YAML, zstd, lz4, struct) into DatasetError."""
         try:
             yield
         except (DatasetError, MissingDependency):
@@ -244,13 +244,13 @@ class BagRecording:
 
 
 def stamp_ns(content: Any) -> int:
-    """Nanoseconds of a message's header; 0 = it has no header, or no time in it."""
+    """Return the nanoseconds of a message's header, or 0 without a header or time."""
     stamp = getattr(getattr(content, "header", None), "stamp", None)
     return 0 if stamp is None else max(0, stamp.sec * 10**9 + stamp.nanosec)
 
 
 def frame_id(content: Any) -> str:
-    """The frame that a message's header names, without ROS 1's leading slash."""
+    """Return the frame named in a message's header, without ROS 1's leading slash."""
     return str(content.header.frame_id).strip("/")
 
 
@@ -266,7 +266,7 @@ def _reader(path: Path) -> Any:
 
 @cache
 def _bound_unpacking() -> Callable[[bytes], bytes]:
-    """Have rosbags unpack within `read_limits`, by its tables of unpackers; returns that of zstd."""
+    """Make rosbags unpack within `read_limits`, by its tables of unpackers. Return the one for zstd."""
     import apsw
     import lz4.frame
     from rosbags.rosbag1 import reader as ros1
@@ -290,12 +290,12 @@ def _bound_unpacking() -> Callable[[bytes], bytes]:
 
 
 def _files(reader: Any) -> list[Any]:
-    """The storages of a ROS 2 recording, in the order of its parts."""
+    """Return the storages of a ROS 2 recording, in the order of its parts."""
     return list(getattr(reader.storage, "storages", [reader.storage]))
 
 
 def _rows(storage: Any, connections: Collection[int]) -> Iterator[tuple[int, int, bytes]]:
-    """Connection, time and bytes of the messages in one file, as they lie there."""
+    """Yield connection, time and bytes of the messages in one file, in the file's order."""
     if hasattr(storage, "messages_scan"):
         named = [one for one in storage.connections if one.id in connections]
         yield from ((one.id, log_ns, raw) for one, log_ns, raw in storage.messages_scan(named))

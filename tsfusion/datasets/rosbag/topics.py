@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The topics of a depth camera, a stereo pair or a LiDAR: as named, or found by type and name."""
+"""Choose the topics of a depth camera, a stereo pair or a LiDAR: as named, or by type and name."""
 
 import logging
 import re
@@ -39,7 +39,7 @@ _SENSORS = (
 
 
 class ColorCamera(NamedTuple):
-    """A colour camera that is not the depth camera."""
+    """Colour camera that is not the depth camera."""
 
     frame: str
     camera: RecordedCamera
@@ -50,17 +50,17 @@ class ChosenTopics(NamedTuple):
 
     modality: Modality
     main: Stream  # depth images, left images or point clouds
-    other: Stream | None  # colour images of the depth, or right images; None = none
+    other: Stream | None  # colour images for the depth, or right images; None without either
     sensor: str
-    frame: str  # of `main`; empty = its messages name none
+    frame: str  # of `main`; empty if its messages name none
     size: tuple[int, int]  # height and width of an image of `main`
-    camera: RecordedCamera | None = None  # of depth images, of the left one of rectified pairs
+    camera: RecordedCamera | None = None  # of depth images, or the left camera of rectified pairs
     pairs: PairRectifier | None = None
-    infos: tuple[Stream, ...] = ()  # whose first CameraInfo is that of all images
-    color_camera: ColorCamera | None = None  # of `other`, where its images are registered to the depth
+    infos: tuple[Stream, ...] = ()  # the first CameraInfo of each is used for all images
+    color_camera: ColorCamera | None = None  # of `other`, if its images must be registered to the depth
 
     def check_size(self, stream: Stream, size: tuple[int, ...]) -> None:
-        """Raise DatasetError for an image of a stream whose size is not that of the stream's first one."""
+        """Raise DatasetError if an image's size is not that of the first image of its stream."""
         own = self.color_camera if stream == self.other else None
         expected = self.size if own is None else own.camera.size
         if self.modality != "lidar" and size != expected:
@@ -68,12 +68,13 @@ class ChosenTopics(NamedTuple):
 
 
 class TopicChooser:
-    """Chooses among the topics of one recording.
+    """Choose among the topics of one recording.
 
     Args:
-        given: topics as `depth_topic`, `color_topic`, `info_topic`, …, as `Bag` names them; None = find it.
-        intrinsics, calibration: of all images, instead of a CameraInfo's.
-        rectified: whether images have been rectified already; None = by the topic's name.
+        given: option name → topic, for `depth_topic`, `color_topic`, `info_topic`, … of `Bag`; None = find
+            it.
+        intrinsics, calibration: of all images, instead of a CameraInfo.
+        rectified: True if images are already rectified; None = by the topic's name.
     """
 
     def __init__(
@@ -92,10 +93,10 @@ class TopicChooser:
         self._found: list[ImageTopic] | None = None
 
     def choose(self, modality: Modality | None) -> ChosenTopics:
-        """The sensor to read; of several kinds depth goes before stereo before LiDAR.
+        """Return the topics of the sensor to read: depth if there is any, else stereo, else LiDAR.
 
         Raises:
-            DatasetError: there is none, or no single one; lists the topics.
+            DatasetError: there is none, or several fit. The message lists the topics.
         """
         named = [kind for kind, names in _OF_MODALITY.items() if any(self._given[name] for name in names)]
         if len(named) > 1 or (modality and named and modality != named[0]):
@@ -114,7 +115,7 @@ class TopicChooser:
         return DatasetError(f"{self._path}: {what}; {self._recording.listing()}")
 
     def _named(self, option: str, kinds: tuple[str, ...]) -> Stream | None:
-        """The stream that an option names; None where the option is not given."""
+        """Return the stream named by an option, or None if the option is not given."""
         topic = self._given[option]
         if topic is None:
             return None
@@ -125,7 +126,7 @@ class TopicChooser:
         raise self._error(f"{option}={topic!r} is no topic of {wanted}")
 
     def _image_topics(self) -> list[ImageTopic]:
-        """Every topic of images that can be read."""
+        """Return every topic of readable images."""
         if self._found is None:
             streams = [one for one in self._recording.streams if one.kind in (IMAGE, COMPRESSED)]
             found = [image_topic(self._recording, one) for one in streams]
@@ -157,9 +158,10 @@ class TopicChooser:
         )
 
     def _color_of(self, depth: ImageTopic) -> tuple[Stream | None, ColorCamera | None]:
-        """The colour images of a depth camera, and their own camera where they are not registered to it.
+        """Return the colour images for a depth camera, and their own camera if they are not registered.
 
-        Images count as registered when they have the depth's size, and its frame or a depth topic named so.
+        Images count as registered if they have the depth's size, and also its frame, or a depth topic named
+        so.
         """
         given = self._named_images("color_topic")
         found = [one for one in self._image_topics() if one.is_color]
@@ -202,7 +204,7 @@ class TopicChooser:
         )
 
     def _pair(self, right: ImageTopic) -> tuple[ImageTopic, ImageTopic] | None:
-        """The left and the right images, if these are some of a right camera."""
+        """Return the left and right images if these are images of a right camera, else None."""
         if bag_messages.is_depth(right.first):
             return None
         camera = self._cameras.find(right)
@@ -233,7 +235,7 @@ class TopicChooser:
         return ChosenTopics("lidar", stream, None, "lidar", frame_id(first), (0, 0))
 
     def _only(self, found: list[ImageTopic], rank: Any, option: str) -> ImageTopic | None:
-        """The one that ranks highest; of the transports of one topic the fullest, then the raw one."""
+        """Return the topic of highest rank. Of several transports, prefer the fullest, then the raw one."""
         if not found:
             return None
         highest = max(map(rank, found))
@@ -245,7 +247,7 @@ class TopicChooser:
 
 
 def recorded_scale(recording: BagRecording, depth: Stream) -> float | None:
-    """Metres per unit of a depth that librealsense itself recorded; None = it is somebody else's."""
+    """Return metres per unit of depth that librealsense itself recorded, or None for other recordings."""
     device = re.match(r"/device_\d+/sensor_\d+", depth.topic)
     for stream in recording.streams if device else ():
         if re.fullmatch(rf"{device and device[0]}/option/Depth[_ ]Units/value", stream.topic):
@@ -257,7 +259,7 @@ def recorded_scale(recording: BagRecording, depth: Stream) -> float | None:
 
 
 def _closeness(color: ImageTopic, depth: ImageTopic) -> tuple[object, ...]:
-    """Rank of colour images as those of the depth images: by frame, name and rectification."""
+    """Rank colour images as partners of depth images: by frame, name and rectification."""
     return (
         color.frame == depth.frame,
         bool(re.search(r"colou?r|rgb", color.base)),
@@ -270,6 +272,6 @@ def _closeness(color: ImageTopic, depth: ImageTopic) -> tuple[object, ...]:
 
 
 def _shared(one: str, other: str) -> int:
-    """Number of names that two topics have in common from the left."""
+    """Return the number of names that two topics have in common, from the left."""
     pairs = zip(one.split("/"), other.split("/"), strict=False)
     return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))

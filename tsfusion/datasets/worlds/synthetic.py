@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Rendered recordings of synthetic worlds, whose surfaces are known exactly."""
+"""Render recordings of synthetic worlds. Their surfaces are known exactly."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ DEPTH_SCALE = 1e-4  # metres per unit
 DISPARITY_SCALE = 1 / 16  # pixels per unit
 KINECT_RANGE = 6.0  # metres; the uint16 depth ends at 6.5
 TOF_RANGE = (0.5, 4.5)  # metres
-COLOR_NOISE = 3.0  # levels, of the camera beside the time-of-flight sensor
+COLOR_NOISE = 3.0  # levels, for the colour camera of the time-of-flight sensor
 SENSORS = {
     "kinect": KINECT_RANGE + 1,
     "tof": KINECT_RANGE + 1,
@@ -31,9 +31,9 @@ SENSORS = {
 
 # LiDAR axes (x forward, y left, z up) in camera axes.
 _T_CAMERA_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
-TILE = 16  # rays along a side
-# Metres by which a solid's ball is widened: around a point that is met, solids as near as this dim the light
-# (`daylight`), and rounding is far below the rest.
+TILE = 16  # rays along a side of a tile
+# Metres by which a solid's bounding ball is enlarged: solids so near to a hit point dim its light
+# (`daylight`). Rounding errors are far smaller.
 WIDER = 0.6
 
 Indices = NDArray[np.int32]
@@ -41,7 +41,7 @@ Indices = NDArray[np.int32]
 
 @dataclass(frozen=True)
 class SyntheticLidar:
-    """A spinning LiDAR: elevations in degrees, range and noise in metres."""
+    """Spinning LiDAR: elevations in degrees, range and noise in metres."""
 
     rows: int = 64
     columns: int = 900
@@ -50,11 +50,11 @@ class SyntheticLidar:
     max_range: float = 80.0
     sigma: float = 0.02
     dropout: float = 0.02
-    grazing: float = 0.03  # |cosine| below which nothing returns
+    grazing: float = 0.03  # |cosine of incidence|; below it, nothing returns
 
 
 LIDARS = {"room": SyntheticLidar(lowest=-45.0, highest=45.0, max_range=30.0), "street": SyntheticLidar()}
-WORLDS: dict[str, Callable[[int], worlds.World]] = {  # by the number of keyframes
+WORLDS: dict[str, Callable[[int], worlds.World]] = {  # number of keyframes → world
     "room": lambda _: worlds.room(),
     "street": lambda count: worlds.street(max(80.0, count + 40.0)),
     "corridor": lambda _: worlds.ring(),
@@ -67,30 +67,32 @@ WORLDS: dict[str, Callable[[int], worlds.World]] = {  # by the number of keyfram
 
 
 class Synthetic(Frames):
-    """Posed keyframes of the `room`, the `street`, …, seen by one kind of sensor.
+    """Posed keyframes of a world (`room`, `street`, …), seen by one kind of sensor.
 
-    Equal arguments give equal bytes, whatever the thread count and the order of access. Noise:
+    Equal arguments give equal bytes, for any number of threads and order of access. Noise:
 
-    - kinect: Gaussian, σ = 0.0012 + 0.0019 (z - 0.4)² m; uint16 depth in 0.1 mm; nothing beyond 6 m.
-    - tof: a Kinect v2's: σ = (0.0012 + 0.0004 z²) / √cos of the angle to the surface; pixels at outlines lie
-      between front and back or are lost; nothing where the surface is grazed, below 0.5 or beyond 4.5 m.
-      Colour has white noise of 3 levels.
+    - kinect: Gaussian, σ = 0.0012 + 0.0019 (z - 0.4)² m; uint16 depth in 0.1 mm; no depth beyond 6 m.
+    - tof: as of a Kinect v2, σ = (0.0012 + 0.0004 z²) / √cos of the angle to the surface. Pixels at outlines
+      lie between front and back or are lost. No depth at grazing angles, below 0.5 m or beyond 4.5 m. Colour
+      has white noise of 3 levels.
     - stereo: disparity error 0.35 px correlated over 2.5 px and 0.15 px white, 1 % outliers of 4 px; ×16.
-    - lidar: 64 × 900 rays, range error 2 cm, 2 % lost, grazing rays lost. Points carry colour.
+    - lidar: 64 × 900 rays, range error 2 cm, 2 % lost, grazing rays lost. Points have colour.
 
     Args:
-        world: a name in `WORLDS` (`room`, `street`, …), or a `World` of your own, seen with the room's LiDAR.
+        world: a name in `WORLDS` (`room`, `street`, …), or your own `World`, seen with the room's LiDAR.
         sensor: `kinect`, `tof`, `stereo` or `lidar`; default the world's, `kinect`.
-        count: keyframes, spread over the whole path; default the first 40 of as many as let a scanner follow
-            it (`World.steps`). The room's path is a closed circle, the street's goes on by a metre each.
+        count: keyframes, spread over the whole path. Default: the first 40 of `World.steps`, which are close
+            enough for a scanner. The room's path is a closed circle; the street's has one metre for each
+            keyframe.
         seed: of the noise; the world does not change.
-        width: of the image, pixels; default 320 in the room, 620 in the street. The noise in pixels stays.
-        color: render colour too.
-        path: of the sensor; in a room `circle` (looking in, default), `tour` (all of it) or `handheld` (10 Hz
-            as a person walks, whatever the count), in the street `drive`.
+        width: of the image, pixels; default 320 in the room, 620 in the street. The noise in pixels is the
+            same.
+        color: True renders colour too.
+        path: of the sensor. In a room `circle` (looking inwards, default), `tour` (the whole room) or
+            `handheld` (10 Hz at walking speed, for any count); in the street `drive`.
 
     Raises:
-        DatasetError: for an unknown world, sensor or path, or a count or width below 1.
+        DatasetError: the world, sensor or path is unknown, or count or width is too small.
     """
 
     def __init__(
@@ -141,11 +143,11 @@ class Synthetic(Frames):
         return self._count
 
     def distance(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Signed distance to the true surface: (n, 3) metres → (n,) float64."""
+        """Return the signed distance to the true surface: (n, 3) metres → (n,) float64."""
         return self.world.distance(points)
 
     def pose(self, index: int) -> NDArray[np.float64]:
-        """(4, 4) T_world_camera of a keyframe; for LiDAR, T_world_sensor."""
+        """Return (4, 4) T_world_camera of a keyframe; for LiDAR, T_world_sensor."""
         T = self._path(index, self._steps)
         return T @ _T_CAMERA_LIDAR if self.sensor == "lidar" else T
 
@@ -180,7 +182,7 @@ class Synthetic(Frames):
     def _render(
         self, T: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.uint8]]:
-        """(distance, |cosine of incidence|, BGR) of every ray, without noise."""
+        """Return (distance, |cosine of incidence|, BGR) of every ray, without noise."""
         from tsfusion.kernels.base import runtime
 
         runtime.start()
@@ -213,7 +215,7 @@ class Synthetic(Frames):
 
 
 def kinect(z: NDArray[np.float64], rng: "np.random.Generator | None") -> NDArray[np.uint16]:
-    """(H, W) metres → uint16 of 0.1 mm, with axial noise (Nguyen, Izadi and Lovell 2012); 0 = no return."""
+    """Convert (H, W) metres to uint16 of 0.1 mm with noise (Nguyen, Izadi and Lovell 2012); 0 = no return."""
     valid = (z > 0) & (z < KINECT_RANGE)
     if rng is not None:
         z = z + (0.0012 + 0.0019 * (z - 0.4) ** 2) * rng.standard_normal(z.shape)
@@ -224,9 +226,10 @@ def kinect(z: NDArray[np.float64], rng: "np.random.Generator | None") -> NDArray
 def time_of_flight(
     z: NDArray[np.float64], incidence: NDArray[np.float64], rng: "np.random.Generator | None"
 ) -> NDArray[np.uint16]:
-    """(H, W) metres and |cosines| → uint16 of 0.1 mm, with a Kinect v2's errors; 0 = no return.
+    """Convert (H, W) metres and |cosines| to uint16 of 0.1 mm, with a Kinect v2's errors; 0 = no return.
 
-    Noise by distance and angle after Fankhauser et al. 2015; at outlines two surfaces share a pixel's light.
+    Noise by distance and angle is after Fankhauser et al. 2015. At outlines, pixels mix the light of two
+    surfaces.
     """
     valid = (z > TOF_RANGE[0]) & (z < TOF_RANGE[1])
     if rng is not None:
@@ -245,7 +248,7 @@ def time_of_flight(
 def stereo(
     z: NDArray[np.float64], baseline_fx: float, rng: "np.random.Generator | None"
 ) -> NDArray[np.uint16]:
-    """(H, W) metres → uint16 disparity × 16 with a matcher's errors; 0 = no match."""
+    """Convert (H, W) metres to uint16 disparity × 16 with a matcher's errors; 0 = no match."""
     valid = z > 0
     disparity = np.divide(baseline_fx, z, out=np.zeros_like(z), where=valid)
     if rng is not None:
@@ -267,7 +270,7 @@ def _resized(camera: worlds.SyntheticCamera, width: int | None) -> worlds.Synthe
 
 
 def _camera_rays(camera: worlds.SyntheticCamera) -> NDArray[np.float64]:
-    """(H·W, 3) float64 directions with z = 1."""
+    """Return (H·W, 3) float64 directions with z = 1."""
     K, (height, width) = camera.intrinsics, camera.size
     v, u = np.mgrid[:height, :width]
     rays = np.stack([(u - K.cx) / K.fx, (v - K.cy) / K.fy, np.ones(u.shape)], axis=-1)
@@ -275,7 +278,7 @@ def _camera_rays(camera: worlds.SyntheticCamera) -> NDArray[np.float64]:
 
 
 def _lidar_rays(lidar: SyntheticLidar) -> NDArray[np.float64]:
-    """(rows·columns, 3) float64 unit directions, x forward, z up."""
+    """Return (rows·columns, 3) float64 unit directions, x forward, z up."""
     elevation = np.radians(np.linspace(lidar.highest, lidar.lowest, lidar.rows))[:, None]
     azimuth = np.linspace(np.pi, -np.pi, lidar.columns, endpoint=False)[None, :]
     x, y = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth)
@@ -286,7 +289,7 @@ class RayTiles:
     """Cones around the tiles of a grid of rays.
 
     Args:
-        directions: (H·W, 3) float64 of the rays, row by row, in the sensor's axes.
+        directions: (H·W, 3) float64 directions of the rays, row by row, in the sensor's axes.
         shape: (H, W).
     """
 
@@ -301,19 +304,19 @@ class RayTiles:
         np.minimum.at(cosines, self.tile_of, (rays * self._axes[self.tile_of]).sum(axis=1))
         self._angles: NDArray[np.float64] = np.arccos(
             np.clip(cosines, -1, 1)
-        )  # half of the cones' opening, radians
+        )  # half of the cones' opening angle, radians
 
     def lists(self, T_world_sensor: NDArray[np.float64], solids: Solids) -> tuple[Indices, Indices]:
-        """(starts, listed) of `cast`: tile t may meet the solids listed[starts[t] : starts[t + 1]].
+        """Return (starts, listed) for `cast`: tile t may meet the solids listed[starts[t] : starts[t + 1]].
 
         Args:
-            solids: (m, 12), as of a world.
+            solids: (m, 12), as in a `World`.
         """
         away = solids[:, 1:4] - T_world_sensor[:3, 3]
         distance = np.linalg.norm(away, axis=1)
         radius = np.linalg.norm(solids[:, 4:7], axis=1) + WIDER
         beyond = np.maximum(distance, radius)
-        ball = np.arcsin(radius / beyond)  # half of the angle under which it is seen
+        ball = np.arcsin(radius / beyond)  # half of the angle under which the solid is seen
         cosines = (self._axes @ T_world_sensor[:3, :3].T) @ (away / beyond[:, None]).T
         meets = np.arccos(np.clip(cosines, -1, 1)) <= self._angles[:, None] + ball
         meets |= (distance <= radius) | np.isin(solids[:, 0], (ROOM, GROUND))

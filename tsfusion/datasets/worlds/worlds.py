@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""The synthetic worlds: tables of solids with a known signed distance, and a path through each.
+"""Define the synthetic worlds: tables of solids with a known signed distance, and paths of the sensor.
 
-A world is the union of its solids; the renderer casts rays at the same table.
+A world is the union of its solids. The renderer casts rays at the same table.
 """
 
 from collections.abc import Callable
@@ -17,25 +17,25 @@ from tsfusion.geometry.keyframe import Intrinsics
 # (m, 12): kind, centre xyz, half sizes xyz, cos yaw, sin yaw, material, variant, top
 Solids = NDArray[np.float64]
 
-# As in kernels/worlds/synthetic_raycast.py, which cannot be imported without Taichi; a test compares them.
-# AXLE: a cylinder along y. PRISM: a box whose ends x shrink upwards, to `top` of their length.
+# Equal to those of kernels/worlds/synthetic_raycast.py, which needs Taichi; a test compares them.
+# AXLE: a cylinder along y. PRISM: a box whose length in x shrinks upwards to the share `top`.
 ROOM, BOX, SPHERE, CYLINDER, GROUND, AXLE, PRISM = range(7)
 INTERIOR, WOOD, MARBLE, STRIPES, ROAD, PAVEMENT, FACADE, PAINT, METAL, BARK, LEAVES, GLASS, PLAIN = range(13)
 
-_CHUNK = 1 << 16  # points measured at once
+_CHUNK = 1 << 16  # points measured together
 LAPS = 2
 ROOMS = 8
 PITCH = 4.0  # metres from room to room
 
-_HALF = (5.0, 3.6)  # metres, of the outer walls
+_HALF = (5.0, 3.6)  # metres, half sizes of the outer walls
 _WIDTH = 1.8
 _HEIGHT = 2.6
-_RADIUS = 0.7  # of the way round a corner
+_RADIUS = 0.7  # metres, radius of the path round a corner
 
 
 @dataclass(frozen=True)
 class SyntheticCamera:
-    """A pinhole camera of a synthetic recording; `baseline` in metres, for stereo."""
+    """Pinhole camera of a synthetic recording; `baseline` in metres, for stereo."""
 
     size: tuple[int, int]  # height, width
     intrinsics: Intrinsics
@@ -44,21 +44,21 @@ class SyntheticCamera:
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """Solids, the sensor's path, and the sensor that usually takes it."""
+    """Solids, the sensor's paths, and the usual sensor."""
 
     name: str
     solids: Solids  # (m, 12) float64, metres
     # `paths[name](index, count)` → (4, 4) T_world_camera, OpenCV axes; the first is the usual one
     paths: dict[str, Callable[[int, int], NDArray[np.float64]]]
-    # Frames of the whole usual path when a person walks it, near enough for a scanner to follow
+    # Frames on the whole usual path at walking speed: close enough for a scanner to follow
     steps: int = 40
     sensor: str = "kinect"
     camera: SyntheticCamera = SyntheticCamera((240, 320), Intrinsics(292.5, 292.5, 159.5, 119.5), 0.12)
 
     def distance(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Signed distance to the nearest surface: (n, 3) metres → (n,) float64, negative inside solids.
+        """Return the signed distance to the nearest surface: (n, 3) metres → (n,) float64, negative inside.
 
-        Exact outside every solid; inside it is exact where solids do not overlap.
+        It is exact outside solids, and inside where solids do not overlap.
         """
         points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
         result = np.full(len(points), np.inf)
@@ -69,7 +69,7 @@ class World:
         return result
 
     def near(self, position: NDArray[np.float64], reach: float) -> Solids:
-        """The solids that begin within `reach` metres of `position`."""
+        """Return the solids with a part within `reach` metres of `position`."""
         half = np.linalg.norm(self.solids[:, 4:7], axis=1)
         away = np.linalg.norm(self.solids[:, 1:4] - position, axis=1) - half
         endless = np.isin(self.solids[:, 0], (ROOM, GROUND))
@@ -77,10 +77,10 @@ class World:
 
 
 def room(name: str = "room") -> World:
-    """A 4×4×2.8 m room with a sphere, a box and a column; the usual path is a closed circle.
+    """Return a 4×4×2.8 m room with a sphere, a box and a column. The usual path is a closed circle.
 
-    Others, hard for one who has to find the path: `room-untextured` (everything of one colour), `room-plain`
-    (the walls of one colour), `room-bare` (the walls alone, coloured: one to three planes in view).
+    Three variants are hard for trackers: `room-untextured` (one colour everywhere), `room-plain` (walls of
+    one colour), `room-bare` (only coloured walls: one to three planes in view).
     """
     walls = solid(ROOM, (0, 0, 1.4), (2, 2, 1.4), INTERIOR)
     things = [
@@ -97,9 +97,9 @@ def room(name: str = "room") -> World:
 
 
 def street(length: float = 80.0) -> World:
-    """A street along x: road, pavements, facades, parked cars, lamp posts, trees and bins.
+    """Return a street along x: road, pavements, facades, parked cars, lamp posts, trees and bins.
 
-    Built piece by piece from x = -16 m on, so that a longer street begins like a shorter one.
+    It is built piece by piece from x = -16 m on: a longer street starts like a shorter one.
     """
     rng = {side: np.random.default_rng(20 + side) for side in (-1, 1)}
     solids = [
@@ -124,12 +124,12 @@ def solid(
     variant: int = 0,
     top: float = 1.0,
 ) -> list[float]:
-    """One row of the table."""
+    """Return one row of the table of solids."""
     return [kind, *center, *half, np.cos(yaw), np.sin(yaw), material, variant, top]
 
 
 def look_at(position: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(4, 4) T_world_camera at `position` with its optical axis through `target`; z is up in the world."""
+    """Return (4, 4) T_world_camera at `position` with the optical axis through `target`; z is up."""
     forward = target - position
     forward = forward / np.linalg.norm(forward)
     right = np.cross(forward, (0.0, 0.0, 1.0))
@@ -144,7 +144,7 @@ def _circle(index: int, count: int) -> NDArray[np.float64]:
 
 
 def _tour(index: int, count: int) -> NDArray[np.float64]:
-    """Path through the whole room in three rounds: the things, the foot of the walls, their upper part."""
+    """Return a pose of three rounds through the room: objects, foot of the walls, upper walls."""
     first, second = 2 * count // 5, 7 * count // 10
     start, end = next(part for part in ((0, first), (first, second), (second, count)) if index < part[1])
     angle = 2.5 + 2 * np.pi * (index - start) / (end - start)
@@ -159,7 +159,7 @@ def _tour(index: int, count: int) -> NDArray[np.float64]:
 
 
 def _handheld(index: int, _count: int) -> NDArray[np.float64]:
-    """Path of a person who walks round with a camera, ten frames a second: 0.4 m/s, 20 to 40 degrees/s."""
+    """Return a pose of a walking person's camera at ten frames a second: 0.4 m/s, 20 to 40 degrees/s."""
     t = index * 0.1
     angle = 2.5 + 0.4 * t + 0.12 * np.sin(0.9 * t)
     radius = 0.9 + 0.15 * np.sin(0.7 * t + 1)
@@ -173,16 +173,16 @@ def _handheld(index: int, _count: int) -> NDArray[np.float64]:
 
 
 def _drive(index: int, count: int) -> NDArray[np.float64]:
-    """One metre a keyframe in the right lane, swaying a little."""
+    """Return a pose of a car in the right lane: one metre for each keyframe, with a slight sway."""
     x = float(index)
     position = np.array([x, -1.15 + 0.25 * np.sin(0.11 * x), 1.65 + 0.02 * np.sin(0.7 * x)])
     ahead = np.array([x + 10, -1.15 + 0.25 * np.sin(0.11 * (x + 10)), 1.6 + 0.03 * np.sin(0.9 * x)])
     return look_at(position, ahead)
 
 
-# `np.random` is quoted wherever worlds name it: the name alone loads it, 2 MB that few need.
+# Annotations with `np.random` are quoted: the bare name would load the module, which takes 2 MB.
 def _houses(rng: "np.random.Generator", side: int, length: float) -> list[list[float]]:
-    """Houses side by side with an alley now and then, each with a door step and balconies."""
+    """Return houses side by side with some alleys, each with a door step and perhaps balconies."""
     solids, x, number = [], -16.0, 0
     while x < length + 60:
         width, height, front = rng.uniform(7, 13), rng.uniform(6.5, 12.0), rng.uniform(8.6, 9.4)
@@ -205,7 +205,7 @@ def _houses(rng: "np.random.Generator", side: int, length: float) -> list[list[f
 
 
 def _kerbside(rng: "np.random.Generator", side: int, length: float) -> list[list[float]]:
-    """Parked cars, and on the pavement posts, trees and bins in turn."""
+    """Return parked cars, and on the pavement posts, trees and bins in turn."""
     solids, x, number = [], -13.0, 0
     while x < length + 50:
         number += 1
@@ -260,7 +260,7 @@ def _distance(row: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[
 def _trapezoid(
     x: NDArray[np.float64], z: NDArray[np.float64], half: NDArray[np.float64], top: float
 ) -> NDArray[np.float64]:
-    """Signed distance to a symmetric trapezoid, at x >= 0: half[0] long below, `top` of it above."""
+    """Return the signed distance to a symmetric trapezoid, x >= 0: half[0] long below, `top` of it above."""
     length = half[0] * np.where(z < 0, 1.0, top)
     ends = np.stack([x - np.minimum(x, length), np.abs(z) - half[2]])
     corner = np.array([half[0] * top, half[2]])
@@ -273,9 +273,9 @@ def _trapezoid(
 
 
 def ring() -> World:
-    """A corridor 1.8 m wide around a block of 6.4×3.6 m; `laps` goes round it twice, 26 m each.
+    """Return a corridor 1.8 m wide around a block of 6.4×3.6 m. The path `laps` goes round twice, 26 m each.
 
-    The second lap keeps a little more to the side and looks a little elsewhere.
+    The second lap is a little more to the side, and looks in a slightly different direction.
     """
     rng = np.random.default_rng(40)
     inner = (_HALF[0] - _WIDTH, _HALF[1] - _WIDTH)
@@ -290,9 +290,10 @@ def ring() -> World:
 
 
 def rooms(*, identical: bool = True) -> World:
-    """Eight rooms of 4 m in a row with wide doorways between; where `identical`, equal to the last pixel.
+    """Return eight rooms of 4 m in a row with wide doorways; if `identical`, equal to the last pixel.
 
-    Path `walk` passes them all and looks at their long wall; `return` comes back, looking the same way.
+    The path `walk` passes all rooms and looks at their long wall. `return` also comes back, with the same
+    view.
     """
     rng = np.random.default_rng(41)
     module = _room(rng)
@@ -312,7 +313,7 @@ def rooms(*, identical: bool = True) -> World:
 def _along_a_wall(
     rng: "np.random.Generator", side: int, half: tuple[float, float], outward: int
 ) -> list[list[float]]:
-    """Things at one wall of the ring: panels, pictures, cupboards and columns, no two of equal size."""
+    """Return objects at one wall of the ring: panels, pictures, cupboards, columns, all of different size."""
     turn = side * np.pi / 2
     length, away = (half[1], half[0]) if side % 2 == 0 else (half[0], half[1])
     solids, at = [], -length + 0.3
@@ -337,7 +338,7 @@ def _along_a_wall(
 
 
 def _room(rng: "np.random.Generator") -> Solids:
-    """One room around x = 0: floor, ceiling, walls, a doorway at its end, and furniture."""
+    """Return one room around x = 0: floor, ceiling, walls, a doorway at the end, and furniture."""
     half = PITCH / 2
     solids = [
         solid(worlds.BOX, (0, 0, -0.1), (half, 2, 0.1), worlds.PAVEMENT),
@@ -367,7 +368,7 @@ def _turned(turn: float, forward: float, left: float, up: float) -> tuple[float,
 
 
 def _laps(index: int, count: int) -> NDArray[np.float64]:
-    """Counter-clockwise along the middle of the corridor, looking ahead and a little down."""
+    """Return a pose on the corridor's middle, counter-clockwise, with a view ahead and slightly down."""
     progress = LAPS * index / count
     lap, share = divmod(progress, 1.0)
     here, ahead = _centre(share), _centre(share + 0.045)
@@ -380,7 +381,7 @@ def _laps(index: int, count: int) -> NDArray[np.float64]:
 
 
 def _centre(share: float) -> NDArray[np.float64]:
-    """(2,) point of the corridor's middle line, a rectangle with round corners; `share` of a lap."""
+    """Return the (2,) point at `share` of a lap on the corridor's middle line, which has round corners."""
     a, b = (half - _WIDTH / 2 - _RADIUS for half in _HALF)
     arc = _RADIUS * np.pi / 2
     way = (share % 1.0) * (4 * (a + b) + 4 * arc)
@@ -399,7 +400,7 @@ def _centre(share: float) -> NDArray[np.float64]:
 
 
 def _walk(index: int, count: int) -> NDArray[np.float64]:
-    """Along x, looking at the wall on the left and a little ahead."""
+    """Return a pose on a walk along x, with a view of the left wall and slightly ahead."""
     x = -PITCH / 4 + (ROOMS - 0.5) * PITCH * index / count
     phase = 2 * np.pi * x / PITCH  # equal in every room
     position = np.array([x, -0.6 + 0.1 * np.sin(phase), 1.35 + 0.02 * np.cos(phase)])
