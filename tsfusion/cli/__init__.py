@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The `tsfusion` command.
+"""Define the `tsfusion` command, and run a command line.
 
 Each verb imports what it needs when it runs, so that `--help` and `status` answer at once.
 """

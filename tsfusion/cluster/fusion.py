@@ -108,7 +108,7 @@ class FusedRun(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass
 class _Clock:
-    """Time and memory of each step."""
+    """Time of each step, and memory of the workers."""
 
     seconds: dict[str, float] = field(default_factory=dict)
     worker_seconds: dict[str, float] = field(default_factory=dict)

@@ -353,7 +353,7 @@ def reading(keyframes: Sequence[KeyframeList]) -> Iterator[Callable[[], Keyframe
 
 
 class _LazyFrame:
-    """A keyframe of a dataset."""
+    """Reads a keyframe of a dataset when it is called."""
 
     def __init__(self, dataset: Dataset, index: int) -> None:
         self._dataset, self._index = dataset, index

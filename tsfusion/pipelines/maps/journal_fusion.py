@@ -222,7 +222,7 @@ class JournalImages:
         """Read a keyframe.
 
         Raises:
-            JournalError: when it cannot be read any more.
+            JournalError: when the keyframe can no longer be read.
         """
         try:
             return self._keyframes[index].keyframe

@@ -89,7 +89,7 @@ def picture(
 
 
 def has_colors(mesh: Mesh) -> bool:
-    """True if a mesh has colours that differ; a LiDAR's map is grey all over."""
+    """True if a mesh has different colours. The map of a LiDAR is grey all over."""
     return mesh.colors is not None and len(mesh.colors) > 0 and bool(np.ptp(mesh.colors, axis=0).any())
 
 

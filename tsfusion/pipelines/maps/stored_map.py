@@ -121,7 +121,7 @@ def open_map(path: Path, name: str | None = None) -> Iterator[StoredMap]:
 
 
 def _settings(folder: Path) -> VolumeConfig:
-    """The settings of a saved map."""
+    """Return the settings of a saved map."""
     try:
         with checkpoint.reading(folder / state_folder.MAP_FILE) as (header, _):
             return header.config

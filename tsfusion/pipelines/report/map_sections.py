@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Sections of a report that show a map: pictures, the 3-D view, its error, its plan with the trajectory."""
+"""Build the sections of a report that show a map: pictures, 3-D view, error, plan with trajectory."""
 
 import dataclasses
 import json

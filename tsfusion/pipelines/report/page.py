@@ -31,7 +31,7 @@ class Page:
     """Contents of a report page.
 
     Attributes:
-        verdict: a sentence that says if all went well; `level` is its colour.
+        verdict: a sentence that says if all is well; `level` gives its colour.
         warnings: a sentence each.
         tiles: title, figure and note of each headline figure.
         sections: title and HTML of each section.

@@ -37,7 +37,7 @@ class ErrorScale(NamedTuple):
     level: NDArray[np.uint8]
 
     def colors(self) -> NDArray[np.uint8]:
-        """(n, 3) uint8 RGB."""
+        """Return the (n, 3) uint8 RGB of the vertices."""
         return ramp()[self.level]
 
 

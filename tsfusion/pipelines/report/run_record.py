@@ -234,7 +234,7 @@ class MapFindings:
     """Results of one map of a run.
 
     Attributes:
-        mesh: None if the run has no mesh, because the map is on a server.
+        mesh: None if the folder has no mesh, for example because the map is on a server.
         error_m: (n,) signed metres of the vertices from the true surface; None if that is unknown.
         paths: trajectories by the name of their file without its ending.
     """

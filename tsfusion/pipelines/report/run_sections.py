@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Sections of a report that show how a run went: delay, growth, trajectory error, keyframes, settings."""
+"""Build the sections of a report that show a run: delay, growth, trajectory error, keyframes, settings."""
 
 import json
 from collections.abc import Sequence

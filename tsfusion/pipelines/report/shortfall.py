@@ -50,7 +50,7 @@ def of_delivery(stats: ClientStats, *, spool: str | os.PathLike[str], link: str,
 
 
 def of_sweeps(clients: Iterable[Client]) -> list[str]:
-    """Return a line on keyframes whose motion within a sweep is not corrected, or an empty list."""
+    """Return a list with a line on keyframes whose motion within the sweep stays; empty without any."""
     count = sum(client.skewed for client in clients)
     text = skewed(f"{count_of(count, 'keyframe has', 'keyframes have')} point times without a motion")
     return [text] if count else []

@@ -42,7 +42,7 @@ class Progress(Protocol):
         """Show the counts. The method is called often.
 
         Args:
-            total: number of frames of the source, or of keyframes without `scan`; None if nobody knows.
+            total: number of frames of the source, or of keyframes without `scan`; None if it is unknown.
             stats: sums over all clients.
             link: why the server takes no keyframes at the moment; empty if it does.
             scan: state of the sensor and its frames, for a scan.

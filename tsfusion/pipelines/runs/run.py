@@ -156,7 +156,7 @@ def run(
     Raises:
         SourceError: the sensor failed; what came before is in `out`.
         DatasetError, JournalError: the recording's first frame cannot be read; in a scan also a later one,
-            with what came before in `out`. A replay only notes this in its record.
+            with what came before in `out`. A replay only records this.
         InvalidKeyframe: a frame lacks what the localizer needs; what came before is in `out`.
         OutputError: `out` cannot be written, or no frame could be localised. Or the own map has no surface;
             then all else is in `out`.
@@ -203,7 +203,7 @@ class _PlannedFrames:
     Attributes:
         scan: settings of the localizer.
         first: the first frame, read ahead.
-        failure: error of the source; None so far.
+        failure: error of the source; None while it has none.
 
     Raises:
         SourceError: the source gives no frame, or its left and right images are exchanged.

@@ -174,7 +174,7 @@ def _provenance(status: Status, target: Target, world: str) -> Provenance:
 
 
 def write_ledger(work: Path, records: list[KeyframeTimes]) -> None:
-    """Write `delay.csv`, and `delay.png` where matplotlib is installed."""
+    """Write `delay.csv`, and `delay.png` if matplotlib is installed."""
     latency_ledger.write_csv(records, work / "delay.csv")
     if find_spec("matplotlib") is not None:
         latency_ledger.plot(records, work / "delay.png")

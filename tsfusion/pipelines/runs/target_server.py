@@ -98,7 +98,7 @@ class ServerChild:
                 log.warning("%s", found[1])  # a missing device, a damaged journal
 
     def check(self) -> None:
-        """Raise TransportError, with the server's own error message, unless it is running."""
+        """Raise TransportError, with the server's own error message, if the server has ended."""
         if self._process.poll() is not None:
             lines = self._log.read_text(encoding="utf-8", errors="replace").splitlines()
             errors = [line for line in lines if line.startswith("tsfusion: ") and not _ROUTINE.match(line)]
@@ -112,7 +112,7 @@ class ServerChild:
             log.error("the server says: %s", error)
 
     def stop(self) -> None:
-        """Let the server drain and save its map; kill it when that takes too long."""
+        """Let the server drain and save its map. Kill it if that takes too long."""
         self._process.terminate()
         try:
             self._process.wait(STOP_DEADLINE)
@@ -286,7 +286,7 @@ def opened(
         client: settings of the connection. The map `auto` means a name that no map of the server has.
         scratch: a folder that does not exist yet, removed at the end of the block.
         volume: settings of the map, for a server started here.
-        server: settings of the server started here; None for a free port and `THROWN_AWAY`.
+        server: settings of the server started here; None for the defaults with a free port and `THROWN_AWAY`.
         spools: with `connect`, the folder of spools; None for a folder in `scratch`.
 
     Raises:

@@ -73,7 +73,7 @@ class RewoundMap:
         self._to_remove = list(self._removed)
 
     def _list(self, journaled: JournaledKeyframes | None) -> None:
-        """Find out which keyframes the saved map has, and where."""
+        """Find out which keyframes the saved map has, and at which poses."""
         histories = {bytes.fromhex(one.session): one for one in map_history.sessions(self.header.meta)}
         fused = {
             (key, seq): (T, position)
@@ -172,7 +172,7 @@ class RewoundMap:
         if self._begins_empty:
             costs["empty"] = self._cost("empty")
         if self.header.config.checked_model().regularizer != "off":
-            # A map smoothed along rays depends on the order of keyframes: none can be subtracted
+            # A map smoothed along rays depends on the order of keyframes: only add, if that is possible
             costs = {way: cost for way, cost in costs.items() if self._only_adds(way)} or costs
         self._way = min(costs, key=costs.__getitem__)
         self._now, self._to_remove = self._contents(self._way)
@@ -305,7 +305,7 @@ def _is_readable(place: KeyframePlace) -> bool:
 
 
 def _square(rows: NDArray[np.float64]) -> Poses:
-    """(n, 12) upper rows → (n, 4, 4)."""
+    """Return (n, 4, 4) poses from their (n, 12) upper rows."""
     T = np.tile(np.eye(4), (len(rows), 1, 1))
     T[:, :3] = rows.reshape(-1, 3, 4)
     return T

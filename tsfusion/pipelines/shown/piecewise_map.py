@@ -108,7 +108,7 @@ class PiecewiseMap:
         return self._map.header.config.checked_model().surface == "raw"
 
     def _take(self, volume: Volume) -> None:
-        """Show another volume."""
+        """Begin to show another volume: all its cells are to be sent."""
         self._volume, self._values = volume, None
         volume.set_pause(self._pause)
         volume.take_dirty()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Feed a page with a saved map: a file, a run's folder, or a state folder with its past."""
+"""Feed a page with a saved map: a file, a run's folder, or a state folder at any time of its journal."""
 
 import os
 import socket
@@ -78,7 +78,7 @@ class ViewFailed:
 
 @dataclass(frozen=True, eq=False)
 class Told:
-    """Events of a map."""
+    """Events of a map, and the bytes of their triangles."""
 
     number: int
     events: list[MapEvent]
