@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""The live page: a map that grows in a browser.
+"""Show a growing map in a browser: the live page.
 
 Rooms:
-    panels: what the page says beside the map, and its switches.
+    panels: controls and text beside the map.
     map: tiles of the surface, colours, clipping, scanners.
     page: the web server, its guard, and the browser's messages.
 """
 
-LISTEN = "127.0.0.1:5558"  # where it is shown: the port after those of a server
+LISTEN = "127.0.0.1:5558"  # the page's address; its port follows those of a server

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The live page: the events of a map's feed, shown in a browser."""
+"""Show the events of a map's feed in browsers: the live page."""
 
 import logging
 import sys
@@ -42,29 +42,29 @@ if TYPE_CHECKING:
     import viser
 
 MAX_BYTES_PER_SECOND = 8e6  # to each browser, as triangles
-_WAIT = 0.1  # seconds that are waited for an event
-_SHARE = 0.008  # of a core, for putting updates into tiles: many at once cost little more than one
-_TOGETHER = (0.25, 1.5)  # seconds of updates that are taken at once, at least and at most
-_MOST_UPDATES = 64  # that wait for that
+_WAIT = 0.1  # seconds to wait for an event
+_SHARE = 0.008  # share of a core for putting updates into tiles: many at once cost little more than one
+_TOGETHER = (0.25, 1.5)  # least and most seconds of updates that are applied together
+_MOST_UPDATES = 64  # waiting updates
 _BEHIND = 50  # voxels that a following camera is behind a scanner
 _SLIDER_REST_S = 0.25  # seconds that a time slider rests before the map is rewound
-_DRAW_SHARE = 0.01  # of a core, for sending tiles and marks: what changes meanwhile is sent once
-_DRAW = (0.25, 1.0)  # seconds between two sendings to browsers, at least and at most
-_OFTEN, _SELDOM = 0.3, 1.0  # seconds between two looks at cameras, and at scales and states
-_FAREWELL = 0.5  # seconds that browsers have for the last words of a page
+_DRAW_SHARE = 0.01  # share of a core for sending tiles and marks: repeated changes are sent once
+_DRAW = (0.25, 1.0)  # least and most seconds between two messages to browsers
+_OFTEN, _SELDOM = 0.3, 1.0  # seconds between two updates of cameras, and of scales and states
+_FAREWELL = 0.5  # seconds that browsers have to receive the last message of a page
 
 log = logging.getLogger(__name__)
 
 
 class LivePage:
-    """A page that shows a feed of a map. Its browsers share it, except for their `BrowserPanel`.
+    """A page that shows a feed of a map. All browsers share it, except for their `BrowserPanel`.
 
     Args:
-        server: to fill; its maker ends it.
-        feed: of the map; its maker closes it.
-        measures: further quantities to colour by. Each has a name that may end with its unit, `error [m]`,
-            and gives (n,) values at (n, 3) points in metres; NaN = none there. Called on another thread.
-        max_bytes_per_second: of triangles to each browser, on average.
+        server: viser's server, which the caller closes.
+        feed: feed of the map, which the caller closes.
+        measures: more quantities to colour by. A name may end with a unit, `error [m]`. Each function gives
+            (n,) values at (n, 3) points in metres, NaN = no value; it is called on another thread.
+        max_bytes_per_second: average bytes of triangles to each browser.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class LivePage:
         self._problem = ""
         self._up = MapUp()
         self._tiles = MapTiles()
-        self._updates: list[SurfaceUpdate] = []  # that have yet to be applied
+        self._updates: list[SurfaceUpdate] = []  # not applied yet
         self._next_apply = -np.inf
         self._measures = measures or {}
         self._marks = ScannerMarks(server.scene)
@@ -92,7 +92,7 @@ class LivePage:
         self._whole_views = map_views.WholeViews(self._tiles)
         self._browsers: dict[int, BrowserPanel] = {}
         self._next_draw = self._looked = self._reckoned = -np.inf
-        self._lock = threading.Lock()  # of `_browsers`
+        self._lock = threading.Lock()  # guards `_browsers`
         set_theme(server.gui, dark=False)
         self._panel = SharedPanel(server.gui, feed, self._marks.show)
         server.on_client_connect(calm(self._welcome))
@@ -116,7 +116,7 @@ class LivePage:
                 look.colors.values.close()
 
     def tell_end(self, sentence: str) -> None:
-        """Show in every browser why the page no longer changes, and wait until that is on its way."""
+        """Show the reason for the page's end in every browser, and wait until the message is on its way."""
         self._problem, self._health = sentence, None
         self._reckon()
         self._server.flush()
@@ -204,7 +204,7 @@ class LivePage:
                 calm(BrowserPanel.update)(browser)
 
     def _obey(self, now: float) -> None:
-        """Do what browsers have asked for."""
+        """Carry out the requests of browsers."""
         orders = self._panel.take_orders(now, _SLIDER_REST_S)
         if orders.map_name is not None and orders.map_name != self.map_name:
             self._feed.choose(orders.map_name)
@@ -216,12 +216,12 @@ class LivePage:
                 calm(BrowserPanel.change_look)(browser)
 
     def _reckon(self) -> None:
-        """Bring up direction, scales and states up to date."""
+        """Update the up direction, the scales and the states."""
         before = self._up.up
         self._up.look(self._tiles)
         if self._up.up != before:
             self._server.scene.set_up_direction(self._up.direction)
-            self._looked = -np.inf  # cameras follow at once: what browsers tell of them is turned, too
+            self._looked = -np.inf  # update cameras at once: the poses that browsers report turn, too
         self._whole_views.refresh(self._up.direction)
         for look in self._looks():
             look.refresh(self._up.direction)
@@ -257,16 +257,16 @@ class LivePage:
     # Questions of the browsers' panels
 
     def whole_view(self, aspect: float, covered: float) -> PageCamera | None:
-        """View of all of the map; see `map_views.whole`."""
+        """Return a view of the whole map; see `map_views.whole`."""
         return self._whole_views.of(aspect, covered)
 
     def scanner_view(self, session: bytes) -> PageCamera | None:
-        """View from behind a scanner."""
+        """Return a view from behind a scanner; None if its pose is unknown."""
         pose, up = self._marks.pose(session), self._up.direction
         return None if pose is None else map_views.behind(pose, up, distance=50 * self.voxel_size)
 
     def scanners(self) -> list[tuple[bytes, str]]:
-        """Sessions and names."""
+        """Return the sessions and names of all scanners."""
         return [(session, self._marks.name(session)) for session in self._marks.sessions]
 
     def new_look(self, client: "viser.ClientHandle") -> OwnLook:
@@ -277,14 +277,14 @@ class LivePage:
     def hit(
         self, look: TileLook, origin: NDArray[np.float64], direction: NDArray[np.float64]
     ) -> NDArray[np.float64] | None:
-        """(3,) the point of the shown surface that a ray meets."""
+        """Return the (3,) point at which a ray meets the shown surface; None without one."""
         return map_views.first_hit(self._tiles, look.nodes.clipping, origin, direction)
 
     def shown_mesh(self, look: TileLook) -> Mesh:
-        """Shown surface as a mesh, in the map's frame."""
+        """Return the shown surface as a mesh, in the map's frame."""
         return look.mesh(self._up.up)
 
 
 def _rest(began: float, share: float, bounds: tuple[float, float]) -> float:
-    """Seconds after which work that began at `began` (`time.thread_time`) has had its share of a core."""
+    """Return the rest after work since `began` (`time.thread_time`) that keeps its share of a core."""
     return min(max((time.thread_time() - began) / share, bounds[0]), bounds[1])

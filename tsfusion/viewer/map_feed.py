@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Source of a page's map: a running server, a saved map or a recording of one."""
+"""Define the source of a page's map: a running server, a saved map or a recording of one."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -12,11 +12,11 @@ from tsfusion.wire.asking.map_events import MapEvent
 
 @dataclass(frozen=True)
 class TimeLine:
-    """Times that a feed can show.
+    """The states of a map over time that a feed can show.
 
     Attributes:
-        keyframes: their number: places 0 (nothing) to `keyframes` (all).
-        seconds: from the first to the last; None = not known.
+        keyframes: number of keyframes: `seek` takes 0 (empty map) to `keyframes` (whole map).
+        seconds: duration from the first to the last keyframe; None = unknown.
     """
 
     keyframes: int
@@ -33,11 +33,11 @@ class MapFeed(Protocol):
 
     @property
     def time_line(self) -> TimeLine | None:
-        """Times that `seek` takes; None = only the present can be shown."""
+        """States that `seek` can show; None = only the present."""
         ...
 
     def maps(self) -> list[str]:
-        """Names of the maps that `choose` takes."""
+        """Return the names of the maps that `choose` takes."""
         ...
 
     def choose(self, map_name: str) -> None:
@@ -45,15 +45,15 @@ class MapFeed(Protocol):
         ...
 
     def seek(self, keyframes: int) -> None:
-        """Show the map as it was after so many keyframes; the differences come as events."""
+        """Show the map after so many keyframes; the differences come as events."""
         ...
 
     def events(self, timeout: float) -> list[MapEvent]:
-        """Events since the last call; waits at most `timeout` seconds for the first event."""
+        """Return the events since the last call; wait at most `timeout` seconds for the first one."""
         ...
 
     def weights(self, points: NDArray[np.float32]) -> NDArray[np.float32] | None:
-        """(n,) weight of the map at (n, 3) points; None = unknown now."""
+        """Return the (n,) weights of the map at (n, 3) points; None if they are unknown now."""
         ...
 
     def close(self) -> None:

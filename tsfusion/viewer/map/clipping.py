@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Parts of a map's tiles left by a plane and a box, and the controls of both."""
+"""Clip a map's tiles with a plane and a box, and build the controls of both."""
 
 import math
 from collections.abc import Callable
@@ -38,7 +38,7 @@ class Clipping:
     box: NDArray[np.float64] | None = None
 
     def side(self, bounds: NDArray[np.float32]) -> ClipSide:
-        """Shown share of a region with (2, 3) bounds."""
+        """Return how much of a region with (2, 3) bounds is shown."""
         whole = True
         if self.normal is not None:
             middle = bounds.mean(axis=0) @ self.normal
@@ -53,7 +53,7 @@ class Clipping:
         return "whole" if whole else "part"
 
     def cut(self, mesh: Mesh) -> Mesh:
-        """Shown part of a mesh; triangles across the border are cut there."""
+        """Return the shown part of a mesh; triangles across the border are cut."""
         if self.normal is not None:
             mesh = mesh_cropping.cut(mesh, self.normal, self.offset)
         if self.box is not None and len(mesh.faces):
@@ -61,7 +61,7 @@ class Clipping:
         return mesh
 
     def shows(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """(n,) mask of shown (n, 3) points."""
+        """Return an (n,) mask of the shown (n, 3) points."""
         shown = np.ones(len(points), bool)
         if self.normal is not None:
             shown &= points @ self.normal <= self.offset
@@ -71,7 +71,7 @@ class Clipping:
 
 
 class ClippingControls:
-    """Sliders as long as the map. `changed` is called, on any thread, after a move."""
+    """Sliders with the range of the map. `changed` is called, on any thread, after a move."""
 
     def __init__(self, gui: "viser.GuiApi", changed: Callable[[], None]) -> None:
         self.up = np.array((0.0, 0.0, 1.0))
@@ -133,7 +133,7 @@ class ClippingControls:
         self._at.min, self._at.max, self._at.value = low, high, value
 
     def _move_to_end(self) -> None:
-        """Move a newly chosen plane to where it hides nothing."""
+        """Move a newly chosen plane to the end where it hides nothing."""
         self._other.value = False
         self._fit_plane(to_end=True)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Surface of a map in cubes of some blocks: the newest triangles of each cell, ready to be shown or saved."""
+"""Hold the surface of a map in tiles (cubes of blocks), with the newest triangles of each cell."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -18,19 +18,19 @@ CELL = 8  # voxels along a cell's edge
 # Cells along a tile's edge. A million triangles are 173 tiles, 80 MB of a browser's heap and 0.24 s of CPU;
 # with 4 cells 674 tiles, 129 MB and 0.46 s. A small change sends twice as many bytes with 8 as with 4.
 EDGE = 8
-GREY = 190  # of a surface whose colour nobody saw
+GREY = 190  # of a surface without a seen colour
 CellKey = tuple[int, int, int]
 
 
 @dataclass(frozen=True, eq=False)
 class Tile:
-    """Triangles of the cells of one cube. Never changed: newer ones make a new tile.
+    """Triangles of the cells of one cube. A tile never changes: new triangles make a new tile.
 
     Attributes:
-        mesh: without guesses; has colours.
+        mesh: mesh with colours and without guesses.
         cell: (m,) int16 number of each face's cell in the tile.
         changed_s: (EDGE³,) float32 time of each cell's last change.
-        client: (EDGE³,) int32 last client that saw each cell, a number of `MapTiles.clients`; −1 = not known.
+        client: (EDGE³,) int32 last client that saw each cell, an index of `MapTiles.clients`; −1 = unknown.
     """
 
     mesh: Mesh
@@ -41,19 +41,19 @@ class Tile:
     @cached_property
     def bounds(self) -> NDArray[np.float32]:
         """(2, 3) lowest and highest coordinates, metres."""
-        axes = np.ascontiguousarray(self.mesh.vertices.T)  # along rows of three it takes three times as long
+        axes = np.ascontiguousarray(self.mesh.vertices.T)  # three times faster than along rows of three
         return np.stack((axes.min(axis=1), axes.max(axis=1)))
 
     @cached_property
     def cell_of_vertex(self) -> NDArray[np.int16]:
-        """(n,) number of a cell that has the vertex."""
+        """(n,) number of a cell that uses the vertex."""
         found = np.zeros(len(self.mesh.vertices), np.int16)
         found[self.mesh.faces] = self.cell[:, None]
         return found
 
 
 class MapTiles:
-    """All tiles of a map, by their place.
+    """All tiles of a map, by their position in the grid of tiles.
 
     Attributes:
         clients: sessions that saw cells, in order of appearance.
@@ -75,13 +75,13 @@ class MapTiles:
         self.__init__(self.edge)  # type: ignore[misc]
 
     def apply(self, update: SurfaceUpdate, now_s: float) -> set[CellKey]:
-        """Replace cells by those of an update. Returns the changed tiles."""
+        """Replace cells by those of an update; return the changed tiles."""
         return self.apply_all([update], now_s)
 
     def apply_all(self, updates: Sequence[SurfaceUpdate], now_s: float) -> set[CellKey]:
-        """Apply several updates at once, oldest first.
+        """Apply several updates at once, oldest first; return the changed tiles.
 
-        A scanner that stands still changes the same cells with each keyframe: only the newest are looked at.
+        A scanner at rest changes the same cells with each keyframe: only the newest version is used.
         """
         self.has_colors |= any(update.mesh.colors is not None for update in updates)
         self.version += 1
@@ -127,7 +127,7 @@ class MapTiles:
             del self.tiles[key]
 
     def _numbered(self, update: SurfaceUpdate) -> NDArray[np.int32]:
-        """(n,) last client of each cell, as a number of `clients`."""
+        """Return the (n,) last client of each cell, as an index of `clients`."""
         if update.client is None:
             return np.full(len(update.cells), -1, np.int32)
         for session in update.clients:
@@ -139,7 +139,7 @@ class MapTiles:
 
 @dataclass(frozen=True, eq=False)
 class _TileUpdate:
-    """Part of an update for one tile: cells, their clients, each face's cell, and the faces in a mesh."""
+    """Update of one tile: cells, their clients, each face's cell, and the faces' numbers in a mesh."""
 
     cells: NDArray[np.int16]
     client: NDArray[np.int32]
@@ -152,7 +152,7 @@ class _TileUpdate:
 
 
 def _newest_rows(updates: Sequence[SurfaceUpdate]) -> list[NDArray[np.int64]]:
-    """Rows of each update's cells that no later update replaces."""
+    """Return the rows of each update's cells that no later update replaces."""
     keys = np.concatenate([keys_of(update.cells) for update in updates])
     if len(updates) == 1:
         return [np.arange(len(keys))]
@@ -166,9 +166,9 @@ def _newest_rows(updates: Sequence[SurfaceUpdate]) -> list[NDArray[np.int64]]:
 def _as_one(
     updates: Sequence[SurfaceUpdate], rows_of: Sequence[NDArray[np.int64]]
 ) -> tuple[Mesh, NDArray[np.int64], NDArray[np.int64]]:
-    """Mesh of some cells of several updates; for each cell its first face there, and the number of faces.
+    """Return one mesh of chosen cells of several updates, and each cell's first face and number of faces.
 
-    `rows_of`: the rows of those cells, ascending, of each update.
+    `rows_of`: ascending rows of the chosen cells of each update.
     """
     meshes, counts = [], []
     for update, rows in zip(updates, rows_of, strict=True):
@@ -201,7 +201,7 @@ def _joined(meshes: Sequence[Mesh]) -> Mesh:
 
 
 def whole(meshes: list[Mesh], up: Up | None) -> Mesh:
-    """Meshes joined to one; at the seams, vertices of the same place and colour are merged."""
+    """Join meshes to one; at the seams, vertices of equal position and colour are merged."""
     if not meshes:
         return Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
     offsets = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
@@ -217,7 +217,7 @@ def whole(meshes: list[Mesh], up: Up | None) -> Mesh:
 
 
 def _ranges(starts: NDArray[np.integer], counts: NDArray[np.integer]) -> NDArray[np.int64]:
-    """Consecutive numbers from each start, `counts` of each."""
+    """Return consecutive numbers from each start, `counts` of each."""
     before = np.cumsum(counts) - counts
     found: NDArray[np.int64] = np.arange(int(counts.sum())) + np.repeat(starts - before, counts)
     return found

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Views of a map, the point of it that the pointer's ray meets, and its up direction."""
+"""Compute camera views of a map, the point that the pointer's ray hits, and the map's up direction."""
 
 import math
 from typing import NamedTuple
@@ -16,13 +16,13 @@ from tsfusion.wire.asking.map_events import PathsFound, ScannerSeen
 
 FOV = math.radians(50)  # from top to bottom of the picture
 _ELEVATION = math.radians(42)
-_SIDES = 12  # that are tried
-_SAMPLE = 20  # points of a tile
-_SHARE = (0.5, 99.5)  # percent of the points that are in the picture
-_FILLED = 0.92  # of the picture
-_MOST_VIEWS = 16  # of the whole map that are kept: for windows of so many shapes
-_FIRST = 2000  # triangles from which on it is looked for
-_LESS = 0.985  # cosine of 10°: a new direction counts that is further from the old one
+_SIDES = 12  # directions tried around the map
+_SAMPLE = 20  # points per tile
+_SHARE = (0.5, 99.5)  # percentiles of the coordinates that the picture must contain
+_FILLED = 0.92  # share of the picture that the map fills
+_MOST_VIEWS = 16  # cached views of the whole map, one for each window shape
+_FIRST = 2000  # triangles at which the search for up starts
+_LESS = 0.985  # cosine of 10°: only a larger change of the up direction counts
 
 
 class PageCamera(NamedTuple):
@@ -39,7 +39,7 @@ class ShownPoint(NamedTuple):
 
 
 def sample(tiles: MapTiles) -> ShownPoint:
-    """A few points of each tile, in proportion to its triangles."""
+    """Return a few points of each tile, in proportion to its triangles."""
     meshes = [tile.mesh for tile in list(tiles.tiles.values())]
     total = sum(len(mesh.vertices) for mesh in meshes)
     step = max(1, total // (_SAMPLE * max(len(meshes), 50)))
@@ -52,11 +52,11 @@ def sample(tiles: MapTiles) -> ShownPoint:
 def whole(
     surface: ShownPoint, up: NDArray[np.float64], aspect: float, *, covered: float = 0.0
 ) -> PageCamera | None:
-    """View from above, from the side that shows most of the surface; None = an empty map.
+    """Return a view from above, from the side that shows most of the surface; None for an empty map.
 
     Args:
         aspect: width / height of the picture.
-        covered: share of the picture's height, at its lower end, that is hidden.
+        covered: share of the picture's height that is hidden at its lower end.
     """
     if len(surface.points) < 3:
         return None
@@ -71,7 +71,7 @@ def whole(
 
 
 class WholeViews:
-    """Views of all of a map, cached until `refresh` notes a change."""
+    """Views of the whole map, cached until `refresh` finds a change."""
 
     def __init__(self, tiles: MapTiles) -> None:
         self._tiles = tiles
@@ -85,20 +85,20 @@ class WholeViews:
         self._views.clear()
 
     def refresh(self, up: NDArray[np.float64]) -> None:
-        """Clear the cache if the tiles, or the direction up, have changed."""
+        """Clear the cache if the tiles, or the up direction, have changed."""
         if self._version != self._tiles.version or not np.array_equal(up, self._up):
             self._up, self._version = up, self._tiles.version
             self.forget()
 
     def of(self, aspect: float, covered: float) -> PageCamera | None:
-        """View as of `whole`; None is not cached, so that the first surface is seen at once."""
+        """Return the view of `whole`; None is not cached, so that the first surface is shown at once."""
         view = self._views.get((aspect, covered))
         if view is None:
             if self._sample is None or not len(self._sample.points):
                 self._sample = sample(self._tiles)
             view = whole(self._sample, self._up, aspect, covered=covered)
             if view is not None:
-                if len(self._views) >= _MOST_VIEWS:  # a window that is drawn larger has many
+                if len(self._views) >= _MOST_VIEWS:  # a window has many shapes while it is resized
                     self._views.clear()
                 self._views[aspect, covered] = view
         return view
@@ -110,7 +110,7 @@ def _fitted(
     aspect: float,
     covered: float,
 ) -> PageCamera:
-    """Nearest camera in a direction with nearly all points in the picture."""
+    """Return the nearest camera in a direction that has nearly all points in the picture."""
     toward, up = directions
     right = np.cross(up, toward)
     right /= np.linalg.norm(right)
@@ -120,7 +120,7 @@ def _fitted(
     points = inside if len(inside) > 2 else points
     x, y, z = points @ right, points @ above, points @ toward
     tall = _FILLED * math.tan(FOV / 2)
-    # A camera at (cx, cy, d) sees what has −first (d − z) ≤ x − cx ≤ last (d − z), and y alike
+    # A camera at (cx, cy, d) sees points with −first (d − z) ≤ x − cx ≤ last (d − z), likewise for y
     sides = [(x, tall * aspect, tall * aspect), (y, tall * (1 - 2 * covered), tall)]
     ends = [((p - first * z).min(), (p + last * z).max(), first, last) for p, first, last in sides]
     d = max((high - low) / (first + last) for low, high, first, last in ends)
@@ -131,7 +131,7 @@ def _fitted(
 
 
 def behind(T_world_camera: NDArray[np.float64], up: NDArray[np.float64], *, distance: float) -> PageCamera:
-    """View from behind and above a scanner, in its direction.
+    """Return a view from behind and above a scanner, in the scanner's direction.
 
     Args:
         T_world_camera: (4, 4), OpenCV axes.
@@ -147,7 +147,7 @@ def behind(T_world_camera: NDArray[np.float64], up: NDArray[np.float64], *, dist
 def first_hit(
     tiles: MapTiles, clipping: Clipping, origin: NDArray[np.float64], direction: NDArray[np.float64]
 ) -> NDArray[np.float64] | None:
-    """(3,) nearest shown point of a surface's front; None = the ray meets none.
+    """Return the (3,) nearest shown point at which a ray hits the front of the surface; None without a hit.
 
     `origin` and `direction`: (3,) of the ray, in the map's frame.
     """
@@ -166,7 +166,7 @@ def first_hit(
 
 
 def _entry(bounds: NDArray[np.float32], origin: NDArray[np.float64], direction: NDArray[np.float64]) -> float:
-    """Distance at which a ray enters a box; infinity = never."""
+    """Return the distance at which a ray enters a box; infinity = never."""
     with np.errstate(divide="ignore", invalid="ignore"):
         ends = (bounds - origin) / direction
     ends = np.where(np.isnan(ends), np.array((-np.inf, np.inf))[:, None], ends)
@@ -175,7 +175,7 @@ def _entry(bounds: NDArray[np.float32], origin: NDArray[np.float64], direction: 
 
 
 def _hits(tile: Tile, origin: NDArray[np.float64], direction: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distances at which a ray meets front sides of triangles, the nearest first (Möller and Trumbore)."""
+    """Return distances at which a ray hits front sides of triangles, nearest first (Möller, Trumbore)."""
     a, b, c = tile.mesh.vertices[tile.mesh.faces].astype(np.float64).transpose(1, 0, 2)
     ab, ac = b - a, c - a
     p = np.cross(direction, ac)
@@ -198,32 +198,32 @@ class MapUp:
         self.up: Up | None = None
         self._is_given = False
         self._held = HeldSensor()
-        self._looked_at = 0  # triangles
+        self._looked_at = 0  # number of triangles at the last search
 
     @property
     def direction(self) -> NDArray[np.float64]:
-        """(3,) unit length; +z = unknown."""
+        """(3,) unit vector; +z while up is unknown."""
         return np.array((0.0, 0.0, 1.0) if self.up is None else self.up.direction)
 
     def note_scanner(self, event: ScannerSeen) -> None:
-        """Take a sensor's attitude into account."""
+        """Add a sensor's attitude."""
         if not self._held.is_known:
-            self._looked_at = 0  # what was found before was found without
+            self._looked_at = 0  # earlier results lacked attitudes
         self._held.add(event.T_world_camera, "lidar" if event.intrinsics is None else "camera")
 
     def note_paths(self, event: PathsFound) -> None:
-        """Take the attitudes of the sensors of the whole map into account."""
+        """Replace the attitudes by those of all sensors of the map."""
         if event.held is not None and event.held.is_known:
             self._held = HeldSensor(event.held.numbers)
-            self._looked_at = 0  # what was found before was found without
+            self._looked_at = 0  # earlier results lacked attitudes
 
     def note_given(self, up: Up | None) -> None:
-        """Take the direction stored with the map."""
+        """Use the up direction that is stored with the map."""
         if up is not None:
             self.up, self._is_given = up, True
 
     def look(self, tiles: MapTiles) -> None:
-        """Estimate it again, each time that the map has doubled."""
+        """Estimate up again each time that the map has doubled."""
         if self._is_given or (count := tiles.triangles) < max(_FIRST, 2 * self._looked_at):
             return
         self._looked_at = count
@@ -233,7 +233,7 @@ class MapUp:
 
 
 def _some_triangles(tiles: MapTiles, count: int) -> Mesh:
-    """Mesh of some triangles from everywhere, each with corners of its own."""
+    """Return a mesh of some triangles from all tiles, each with its own vertices."""
     step = max(1, count // up_direction.SAMPLE)
     corners, normals = [], []
     for tile in tiles.tiles.values():

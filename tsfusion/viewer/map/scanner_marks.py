@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Scanners in the scene: their poses, last pictures, and the paths of their keyframes."""
+"""Draw scanners in the scene: their poses, last pictures, and the paths of their keyframes."""
 
 import math
 from dataclasses import dataclass, field
@@ -18,12 +18,12 @@ from tsfusion.wire.records.record_header import Refused
 if TYPE_CHECKING:
     import viser
 
-_PICTURE_PAUSE = 1.0  # seconds between two pictures of a scanner, at least
+_PICTURE_PAUSE = 1.0  # least seconds between two pictures of a scanner
 _PATH_PAUSE = 1.0  # seconds between two versions of a path
 _MOST_POINTS = 3000  # of a drawn path
 _WIDTHS = {"paths": 4.0, "first paths": 1.5}  # pixels
-_FADED = 0.6  # of the way to grey
-_LOST = 60  # voxels: further apart, two keyframes are no neighbours of a path
+_FADED = 0.6  # share of grey in the colour of first paths
+_LOST = 60  # voxels: keyframes farther apart are not connected in a path
 _PICTURE_WIDTH = 320  # pixels
 _MOST_PIXELS = 1 << 26
 
@@ -34,10 +34,10 @@ class _ScannerMark:
     newest: ScannerSeen | None = None
     pose: NDArray[np.float64] | None = None
     now: dict[int, NDArray[np.float64]] = field(default_factory=dict)  # position by keyframe
-    first: dict[int, NDArray[np.float64]] = field(default_factory=dict)  # where it was at first
-    is_found: bool = False  # in an event with all paths
-    is_placed: bool = False  # the frustum is where it belongs
-    is_drawn: bool = False  # so is the path
+    first: dict[int, NDArray[np.float64]] = field(default_factory=dict)  # first position by keyframe
+    is_found: bool = False  # was in a `PathsFound` event
+    is_placed: bool = False  # the frustum shows the newest pose
+    is_drawn: bool = False  # the path shows the newest positions
     path_at: float = -math.inf
     picture_at: float = -math.inf
     picture: bytes | None = None
@@ -65,25 +65,25 @@ class ScannerMarks:
         return list(self._scanners)
 
     def name(self, session: bytes) -> str:
-        """Name of a scanner for a person: its key's name, or the beginning of its session's number."""
+        """Return a scanner's name for a person: its key's name, or the first digits of its session."""
         scanner = self._scanners.get(session)
         client = scanner.newest.client if scanner and scanner.newest else ""
         return client or session.hex()[:8]
 
     def pose(self, session: bytes) -> NDArray[np.float64] | None:
-        """(4, 4) T_world_camera of its newest keyframe."""
+        """Return the pose of a scanner's newest keyframe, (4, 4) T_world_camera; None if unknown."""
         scanner = self._scanners.get(session)
         return None if scanner is None else scanner.pose
 
     def positions(self) -> NDArray[np.float64]:
-        """(n, 3) places of the keyframes of all scanners."""
+        """Return the (n, 3) positions of the keyframes of all scanners."""
         found = [list(scanner.now.values()) for scanner in self._scanners.values() if scanner.now]
         return np.concatenate(found) if found else np.zeros((0, 3))
 
     def note_seen(self, event: ScannerSeen) -> None:
-        """Take a keyframe into account."""
+        """Add a keyframe."""
         scanner = self._scanner(event.session)
-        scanner.newest, scanner.pose = event, event.T_world_camera  # an earlier one: the map is rewound
+        scanner.newest, scanner.pose = event, event.T_world_camera  # an earlier keyframe after a rewind
         scanner.picture = event.picture or scanner.picture
         position = event.T_world_camera[:3, 3]
         scanner.first.setdefault(event.seq, position)
@@ -91,7 +91,7 @@ class ScannerMarks:
         scanner.is_placed = scanner.is_drawn = False
 
     def note_paths(self, event: PathsFound) -> None:
-        """Take the places of all keyframes; newer ones stay."""
+        """Take the positions of all keyframes; newer keyframes keep theirs."""
         for session, scanner in self._scanners.items():
             if session not in event.paths and scanner.is_found:
                 scanner.now, scanner.newest, scanner.pose = {}, None, None
@@ -118,7 +118,7 @@ class ScannerMarks:
         )
 
     def draw(self, now: float) -> None:
-        """Bring changes into the scene."""
+        """Send changes to the scene."""
         for session, scanner in self._scanners.items():
             if not scanner.is_placed:
                 scanner.is_placed = True
@@ -220,11 +220,11 @@ class ScannerMarks:
 
 
 def _segments(points: NDArray[np.float64], most: float) -> NDArray[np.float32]:
-    """(n, 2, 3) from point to point, without jumps of more than `most` metres."""
+    """Return (n, 2, 3) segments from point to point, without jumps of more than `most` metres."""
     points = points[:: max(1, math.ceil(len(points) / _MOST_POINTS))]
     pairs = np.stack((points[:-1], points[1:]), axis=1)
     steps = np.linalg.norm(pairs[:, 1] - pairs[:, 0], axis=1)
-    # A path that was thinned out, or of a fast scanner, has long steps everywhere
+    # Thinned paths and fast scanners have long steps everywhere
     usual = 10 * float(np.median(steps)) if len(steps) else 0.0
     found: NDArray[np.float32] = pairs[steps <= max(most, usual)].astype(np.float32)
     return found
@@ -235,7 +235,7 @@ def _is_frustum(node: Any) -> bool:
 
 
 def small_picture(jpeg: bytes) -> NDArray[np.uint8] | None:
-    """(h, w, 3) RGB of a JPEG, at most 320 pixels wide; None = it cannot be read."""
+    """Return a JPEG as (h, w, 3) RGB, at most 320 pixels wide; None if it cannot be read."""
     try:
         height, width = array_encoding.image_size(jpeg)
     except Refused:

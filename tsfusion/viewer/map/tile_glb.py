@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Coloured triangles as GLB for viser's scene: few bytes, and exactly the wanted colours on the screen.
+"""Encode coloured triangles as GLB for viser's scene: few bytes, and exact colours on the screen.
 
-Positions are 16 bit on a grid that all tiles share, so that neighbours meet without a crack; colours are 16
-bit, too. The material is unlit: a map's colours were lit at capture. three.js then applies a film curve
-(ACES) to its picture; the colours are sent through the inverse curve.
+Positions have 16 bits on a grid that all tiles share, so that neighbours meet without gaps; colours have 16
+bits, too. The material is unlit, because a map's colours were lit at capture. three.js applies a film curve
+(ACES) to its picture, so the colours are first put through the inverse curve.
 """
 
 import json
@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-SHARES = 256  # of a voxel: the grid of the positions
+SHARES = 256  # grid steps in a voxel
 _MOST = 65535
-_BRIGHT = 4.0  # of white before the curve: above it, mixing along an edge would spread the brighter colour
+_BRIGHT = 4.0  # largest white before the curve; more would spread bright colours along an edge
 _VERTEX = np.dtype([("position", "<u2", 4), ("color", "<u2", 4)])  # the fourth fills up
 _UINT16, _UINT32 = 5123, 5125
 # three.js, `ACESFilmicToneMapping`: linear sRGB / 0.6 → _IN → the curve → _OUT
@@ -33,19 +33,19 @@ def encode(
     corner: NDArray[np.float64],
     voxel_size: float,
 ) -> bytes:
-    """Content of a GLB file.
+    """Return the content of a GLB file.
 
     Args:
         vertices: (n, 3), metres.
         faces: (m, 3), at least one.
-        colors: (n, 3) RGB (sRGB), as they are to be seen.
+        colors: (n, 3) RGB (sRGB), as shown on the screen.
         corner: (3,) a point of the grid, below all vertices.
-        voxel_size: metres; positions are rounded to 1/256 of it, or of its double and so on where they do not
-            fit.
+        voxel_size: metres; positions are rounded to 1/256 of this, or to twice or four times (…) as much if
+            they do not fit.
     """
     step = voxel_size / SHARES
     steps = (vertices - corner) / step
-    while steps.max() > _MOST:  # halves of a step are on the coarser grid's points, or between two of them
+    while steps.max() > _MOST:  # half a step lies on the coarser grid, or between two of its points
         step, steps = 2 * step, steps / 2
     rows = np.zeros(len(vertices), _VERTEX)
     rows["position"][:, :3] = np.clip(np.rint(steps), 0, _MOST)
@@ -57,9 +57,10 @@ def encode(
 
 
 def before_curve(colors: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """(n, 3) linear values that three.js turns into these sRGB colours, or the nearest possible ones.
+    """Return the (n, 3) linear values that three.js turns into these sRGB colours, or the nearest possible
+    ones.
 
-    The most glaring colours are impossible: 1 % of light is taken from white, pure yellow becomes paler.
+    The brightest colours are impossible: white loses 1 % of its light, pure yellow becomes paler.
     """
     y = np.clip(_LINEAR[colors] @ _AFTER, 0.0, 0.999)
     # The curve is (v² + 0.0245786 v − 0.000090537) / (0.983729 v² + 0.432951 v + 0.238081): solved for v

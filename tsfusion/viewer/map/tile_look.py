@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Look of a map's tiles, colours and cut: shared by browsers, or chosen by one."""
+"""Manage the tiles, colours and cut that browsers see: shared by all, or chosen by one."""
 
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
@@ -28,7 +28,7 @@ class TileLook:
         self._tiles, self.colors, self.nodes = tiles, colors, nodes
 
     def changed(self, keys: Iterable[CellKey]) -> None:
-        """Note tiles with other triangles. Tiles that are not shown yet do not wait for their values."""
+        """Handle tiles with new triangles. Tiles not shown yet are shown before their values arrive."""
         keys = set(keys)
         if self.colors.is_asked_for:
             found = {key: self._tiles.tiles[key] for key in keys if key in self._tiles.tiles}
@@ -42,7 +42,7 @@ class TileLook:
         self.changed(self._tiles.tiles)
 
     def refresh(self, up: NDArray[np.float64]) -> None:
-        """Take new values, and fit the scale to the shown tiles."""
+        """Take new values, and fit the colour scale to the shown tiles."""
         self.colors.up = up
         if self.colors.fit_scale():
             self.nodes.changed(self._tiles.tiles)
@@ -52,13 +52,13 @@ class TileLook:
         self.colors.choose(self.colors.mode)
 
     def mesh(self, up: Up | None) -> Mesh:
-        """Shown surface as a mesh, in the map's frame."""
+        """Return the shown surface as a mesh, in the map's frame."""
         parts = [self.nodes.shown_mesh(key, tile) for key, tile in list(self._tiles.tiles.items())]
         return map_tiles.whole(parts, up)
 
 
 class OwnLook(TileLook):
-    """Look of one browser, which replaces the shared one once it is complete."""
+    """Tiles and colours of one browser, which replace the shared ones once they are complete."""
 
     def __init__(
         self, client: "viser.ClientHandle", tiles: MapTiles, colors: VertexColors, bucket: Bucket
@@ -67,10 +67,10 @@ class OwnLook(TileLook):
         super().__init__(tiles, colors, nodes)
         self._client = client
         self._missing = set(tiles.tiles)
-        self._cover: viser.FrameHandle | None = None  # stands before the shared look and hides it
+        self._cover: viser.FrameHandle | None = None  # its node replaces the shared root and hides it
 
     def send(self, now: float) -> None:
-        """Send due tiles, if the browser reads."""
+        """Send due tiles, unless too many messages to the browser are unread."""
         unread = self._client._websock_connection.get_message_buffer().message_from_id
         if len(unread) > MOST_UNREAD:
             return

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Tiles of a map in the scene of all browsers: the newest wins, and bytes a second are bounded."""
+"""Send a map's changed tiles to browsers: only the newest version, within a limit of bytes a second."""
 
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
@@ -16,25 +16,25 @@ from tsfusion.viewer.map.vertex_colors import VertexColors
 if TYPE_CHECKING:
     import viser
 
-# Seconds between two versions of a tile, at least. A browser drops a model as soon as it gets another, and
-# shows that only after reading it: so a tile has two nodes in turn, and the last one stays meanwhile. A node
-# costs viser ten times as much to make as to change: an emptied one is kept while it may be needed.
+# Least seconds between two versions of a tile. A browser drops a model as soon as it gets another one, but
+# shows that only after parsing. So a tile uses two nodes in turn, and the old one stays meanwhile. A node
+# costs viser ten times as much to make as to change, so an emptied node is kept for some time.
 PAUSE = 1.0
-STEADY_PAUSE = 2.0  # of a tile that changes all the time: half of the work for everybody, and nobody sees it
+STEADY_PAUSE = 2.0  # for a tile that changes all the time: half the work, and nobody sees the difference
 _SPARED = 5.0  # seconds that an empty node is kept after its last version
-_SOON = 0.5  # seconds after a pause within which a change is one of many
+_SOON = 0.5  # seconds; a change this soon after a pause means a tile that changes all the time
 _CUT_PAUSE = 0.25  # while somebody moves the clip plane
-ROOT = "/map"  # of the names of nodes
-_MARGIN = 1.0  # of a tile's edge that its triangles may reach beyond it
+ROOT = "/map"  # prefix of the nodes' names
+_MARGIN = 1.0  # share of a tile's edge by which its triangles may stick out
 
 
 class TileNodes:
-    """Sender of changed tiles, the longest waiting first.
+    """Sends changed tiles, the longest waiting tile first.
 
     Args:
-        bucket: of bytes a second, of all tiles together.
-        root: of the names of nodes.
-        keeps: browsers that come later get the tiles sent before.
+        bucket: limit of bytes a second, for all tiles together.
+        root: prefix of the nodes' names.
+        keeps: True if browsers that connect later get the tiles sent before.
     """
 
     def __init__(
@@ -50,15 +50,15 @@ class TileNodes:
         self._root, self._keeps = root, keeps
         self._scene, self._tiles, self._colors = scene, tiles, colors
         self._bucket = bucket
-        self.waiting: dict[CellKey, None] = {}  # in the order in which they are sent
+        self.waiting: dict[CellKey, None] = {}  # in the order of sending
         self._sent_at: dict[CellKey, float] = {}
-        self._pauses: dict[CellKey, float] = {}  # until the next version
-        self._sides: dict[CellKey, ClipSide] = {}  # of what is in the scene
+        self._pauses: dict[CellKey, float] = {}  # seconds until the next version
+        self._sides: dict[CellKey, ClipSide] = {}  # side of the version in the scene
         self._nodes: dict[CellKey, viser.GlbHandle] = {}
-        self._last: dict[CellKey, tuple[viser.GlbHandle, float]] = {}  # versions before, and when they go
-        self._spare: dict[CellKey, tuple[viser.GlbHandle, float]] = {}  # empty nodes, and when they go
-        self._cut: set[CellKey] = set()  # wait because of the clipping
-        self._hidden: set[CellKey] = set()  # have changed while they were not to be seen
+        self._last: dict[CellKey, tuple[viser.GlbHandle, float]] = {}  # old versions, removal times
+        self._spare: dict[CellKey, tuple[viser.GlbHandle, float]] = {}  # empty nodes, removal times
+        self._cut: set[CellKey] = set()  # tiles that wait because of a new clipping
+        self._hidden: set[CellKey] = set()  # tiles that changed while hidden
         self.clipping = Clipping()
         self.voxel_size = 1.0
         self.bytes_sent = 0
@@ -92,7 +92,7 @@ class TileNodes:
             self.waiting.setdefault(key)
 
     def clip(self, clipping: Clipping) -> None:
-        """Hide tiles beyond at once; cut tiles follow."""
+        """Hide tiles outside the clipping at once; tiles across its border follow."""
         self.clipping = clipping
         for key, tile in list(self._tiles.tiles.items()):
             side, shown = clipping.side(tile.bounds), self._sides.get(key)
@@ -108,7 +108,7 @@ class TileNodes:
                 node.visible = True
 
     def send(self, now: float) -> int:
-        """Send due tiles. Returns their number."""
+        """Send due tiles; return their number."""
         count = 0
         for key, (_, end) in list(self._last.items()):
             if now >= end:
@@ -139,12 +139,12 @@ class TileNodes:
         return self._sent_at.get(key, -np.inf) + pause
 
     def shown_mesh(self, key: CellKey, tile: Tile) -> Mesh:
-        """Shown part of a tile, in the chosen colours."""
+        """Return the shown part of a tile, in the chosen colours."""
         mesh = Mesh(tile.mesh.vertices, tile.mesh.faces, tile.mesh.normals, self._colors.colors(key, tile))
         return mesh if self.clipping.side(tile.bounds) == "whole" else self.clipping.cut(mesh)
 
     def _send(self, key: CellKey, now: float) -> int:
-        """Update a tile in the scene. Returns the bytes that this takes."""
+        """Update a tile in the scene; return the bytes sent."""
         tile, node = self._tiles.tiles.get(key), self._nodes.get(key)
         if tile is None:
             if node is not None:
@@ -192,14 +192,14 @@ class TileNodes:
         return len(content)
 
     def _add(self, key: CellKey, node: "viser.GlbHandle | None") -> "viser.GlbHandle":
-        """An empty node beside another one: viser keeps its first content in memory as long as the node."""
+        """Add an empty node beside another: viser keeps a node's first content in memory for ever."""
         names = [f"{self._root}/" + "_".join(map(str, key)) + version for version in ("", "b")]
         if node is not None:
             names.remove(node.name)
         return self._scene.add_glb(names[0], tile_glb.EMPTY, cast_shadow=False, receive_shadow=False)
 
     def _empty_last(self, key: CellKey, now: float) -> None:
-        """Empty the former version of a tile, and keep its node."""
+        """Empty the previous version of a tile, and keep its node."""
         node, _ = self._last.pop(key)
         node.glb_data = tile_glb.EMPTY
         self._spare[key] = (node, now + _SPARED)

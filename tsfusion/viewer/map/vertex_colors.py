@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Colours of a tile's vertices: as seen, or by height, direction, weight, scanner, age or a measure."""
+"""Colour a tile's vertices: as seen, or by height, direction, weight, scanner, age or a measure."""
 
 import html
 import math
@@ -17,10 +17,10 @@ from tsfusion.viewer.map.vertex_values import Function, VertexValues
 
 PICTURE, HEIGHT, NORMAL, WEIGHT, CLIENT, AGE = "Picture", "Height", "Normal", "Weight", "Scanner", "Age"
 _UNKNOWN = (125, 125, 125)
-_FEW = 64  # values of a tile that the scale's ends are found from
-_UNIT = re.compile(r"(.*) \[(.+)\]")  # of a measure, in its name
-_LIGHT = 0.45  # how much darker a surface is that faces away from the light
-_STOPS = 9  # of a legend's bar
+_FEW = 64  # values of each tile used to find the scale's ends
+_UNIT = re.compile(r"(.*) \[(.+)\]")  # a measure's name with its unit
+_LIGHT = 0.45  # loss of brightness of a surface that faces away from the light
+_STOPS = 9  # colours in a legend's bar
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Scale:
     high: float
 
     def colors(self, values: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:
-        """(n, 3) RGB of (n,) values; grey for NaN."""
+        """Return (n, 3) RGB of (n,) values; grey for NaN."""
         share = np.nan_to_num((values - self.low) / (self.high - self.low))
         colors: NDArray[np.uint8] = ramp()[np.rint(255 * np.clip(share, 0, 1)).astype(np.uint8)]
         colors[np.isnan(values)] = _UNKNOWN
@@ -39,12 +39,12 @@ class Scale:
 
 
 class VertexColors:
-    """Current meaning of colours.
+    """The chosen way to colour tiles.
 
     Args:
-        tiles: that get colours.
-        weights: of the map at points.
-        measures: further quantities by name; a unit stands in brackets at its end: `error [m]`.
+        tiles: tiles to colour.
+        weights: function for the map's weights at points.
+        measures: more quantities by name; the name may end with a unit in brackets: `error [m]`.
     """
 
     def __init__(self, tiles: MapTiles, weights: Function, measures: Mapping[str, Function]) -> None:
@@ -61,16 +61,16 @@ class VertexColors:
         self.values.choose(mode)
 
     def name_clients(self, name: Callable[[bytes], str]) -> None:
-        """Take sessions' names from a function."""
+        """Set the function that gives sessions their names."""
         self._of_client = name
 
     @property
     def is_asked_for(self) -> bool:
-        """True if the values come from elsewhere, later than the triangles."""
+        """True if the values come from a function, later than the triangles."""
         return self.mode in self.values.names
 
     def colors(self, key: CellKey, tile: Tile) -> NDArray[np.uint8]:
-        """(n, 3) sRGB colours of a tile's vertices."""
+        """Return (n, 3) sRGB colours of a tile's vertices."""
         mesh = tile.mesh
         assert mesh.colors is not None
         if self.mode == PICTURE:
@@ -87,7 +87,7 @@ class VertexColors:
         return self._shaded(self.scale.colors(values), mesh.normals)
 
     def fit_scale(self) -> bool:
-        """Fit the scale to the present values. Returns True if its ends, and so all colours, have changed."""
+        """Fit the scale to the present values; return True if its ends, and so all colours, have changed."""
         before = self.scale
         if self.mode in {HEIGHT, AGE} or self.is_asked_for:
             self.scale = self._fitted()
@@ -140,7 +140,7 @@ class VertexColors:
         return Scale(-rounded_up(-low) if low < 0 else 0.0, rounded_up(high))
 
     def _shaded(self, colors: NDArray[np.uint8], normals: NDArray[np.float32]) -> NDArray[np.uint8]:
-        """Colours under a light from above and aside, which shows shape without a picture."""
+        """Return the colours under a light from above and aside, which shows shape without a picture."""
         side = np.roll(self.up, 1)
         light = self.up + 0.6 * (side - (side @ self.up) * self.up)
         light /= np.linalg.norm(light)

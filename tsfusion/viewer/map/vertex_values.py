@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Foreign values at the vertices of tiles, requested on a thread of their own."""
+"""Compute values at the vertices of tiles with given functions, on a separate thread."""
 
 import logging
 import threading
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tsfusion.viewer.map.map_tiles import CellKey, Tile
 
 Function = Callable[[NDArray[np.float32]], "NDArray[np.floating[Any]] | None"]
-_AGAIN = 3.0  # seconds after which a question without an answer is asked again
+_AGAIN = 3.0  # seconds until a function without an answer is called again
 
 log = logging.getLogger(__name__)
 
@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 class VertexValues:
     """Values of one quantity at a time.
 
-    `functions`, by name: (n, 3) float32 points in metres → (n,) values, NaN = none there; None = not now.
+    `functions`, by name: (n, 3) float32 points in metres → (n,) values, NaN = no value; None = no answer now.
     """
 
     def __init__(self, functions: Mapping[str, Function]) -> None:
@@ -33,14 +33,14 @@ class VertexValues:
         self._change = threading.Condition()
         self._ended = False
         self._thread: threading.Thread | None = None
-        self.is_unknown = False  # whether the last question had no answer
+        self.is_unknown = False  # the last call had no answer
 
     @property
     def names(self) -> list[str]:
         return list(self._functions)
 
     def choose(self, name: str) -> None:
-        """Request another quantity from now on; an unknown name for none."""
+        """Compute another quantity from now on; an unknown name stops the computation."""
         with self._change:
             self._name = name if name in self._functions else ""
             self._wanted.clear()
@@ -49,7 +49,7 @@ class VertexValues:
             self.is_unknown = False
 
     def ask(self, tiles: Mapping[CellKey, Tile]) -> None:
-        """Request the values of tiles; only the newest version of each counts."""
+        """Request the values of tiles; only the newest version of each tile counts."""
         with self._change:
             if not self._name:
                 return
@@ -62,22 +62,22 @@ class VertexValues:
             self._change.notify()
 
     def of(self, key: CellKey, tile: Tile) -> NDArray[np.float32] | None:
-        """(n,) values at the vertices of a tile; None = not there (yet)."""
+        """Return the (n,) values at a tile's vertices, or None if they are not known (yet)."""
         known = self._known.get(key)
         return known[1] if known is not None and known[0] is tile else None
 
     def known(self) -> list[NDArray[np.float32]]:
-        """Values of all tiles."""
+        """Return the known values of all tiles."""
         return [values for _, values in list(self._known.values())]
 
     def take_ready(self) -> set[CellKey]:
-        """Tiles whose values came since the last call."""
+        """Return the tiles whose values came since the last call."""
         with self._change:
             ready, self._ready = self._ready, set()
         return ready
 
     def close(self) -> None:
-        """End the thread; a running request ends by itself."""
+        """End the thread; a running call ends by itself."""
         with self._change:
             self._ended = True
             self._change.notify()

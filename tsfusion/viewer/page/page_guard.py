@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Guard of a page: requests are judged by their Host, Origin and token. The place where it is served.
+"""Guard a page: check the Host, Origin and token of each request; parse and open the page's address.
 
-A foreign page can make a browser send requests to this machine, and a foreign name can resolve to it: so Host
-must name this server, and the Origin of a WebSocket must be that Host. Beyond loopback, a token must be in
-the address of the first visit; a cookie stands for it from then on.
+A foreign web page can make a browser send requests to this machine, and a foreign name can resolve to it. So
+Host must name this server, and the Origin of a WebSocket must be that Host. If other machines can reach the
+page, the first visit needs a token in its address; afterwards a cookie replaces the token.
 """
 
 import hashlib
@@ -23,10 +23,10 @@ from tsfusion.viewer import LISTEN
 from tsfusion.wire.sockets import sockets
 from tsfusion.wire.sockets.sockets import is_loopback
 
-_TOKEN = re.compile(r"[\w.~-]{8,128}", re.ASCII)  # as it stands in an address
+_TOKEN = re.compile(r"[\w.~-]{8,128}", re.ASCII)  # as written in an address
 _HOST = re.compile(r"(?:\[(?P<host6>[0-9A-Fa-f:.]+)\]|(?P<host>[\w.-]+))(?::[0-9]{1,5})?", re.ASCII)
 _ANY = ("0.0.0.0", "::")
-_FARAWAY = "192.0.2.1"  # of no machine (RFC 5737)
+_FARAWAY = "192.0.2.1"  # an address of no machine (RFC 5737)
 _INSTALL = "the live page needs viser; install it with: pip install '.[viewer]' in your clone of tsfusion"
 
 
@@ -35,7 +35,7 @@ class Headers(Protocol):
 
 
 class Refusal(NamedTuple):
-    """Answer to a refused request, and a word for the reason."""
+    """Answer to a refused request, with the reason in one word."""
 
     reason: str
     status: HTTPStatus
@@ -43,16 +43,16 @@ class Refusal(NamedTuple):
 
 
 class PageGuard:
-    """Judge of the requests to one page.
+    """Checks the requests to one page.
 
     Args:
         host: the page's address: a name or number.
         port: its real port.
-        token: 8 to 128 letters, digits and . _ ~ -; None = a random one if other machines can reach the page,
-            else none is needed.
+        token: 8 to 128 letters, digits and . _ ~ -; None = a random token if other machines can reach the
+            page, else no token.
 
     Attributes:
-        token: the required one; None = none is.
+        token: the required token; None = no token is needed.
         url: address to open the page with, token included.
 
     Raises InvalidConfig for a bad token.
@@ -74,7 +74,7 @@ class PageGuard:
         self.url = f"http://{place}" + (f"/?token={token}" if token is not None else "")
 
     def refusal(self, path: str, headers: Headers) -> Refusal | None:
-        """Reason why a request is refused; None = it is accepted."""
+        """Return the refusal of a request, or None if it is accepted."""
         hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
         if len(hosts) != 1 or not self._is_own(hosts[0]):
             return Refusal(
@@ -93,14 +93,14 @@ class PageGuard:
         return None
 
     def is_given(self, path: str) -> bool:
-        """True if a required token stands in the requested address."""
+        """Return True if the requested address contains the required token."""
         if self.token is None:
             return False
         given = parse_qs(path.partition("?")[2]).get("token", [""])[0]
         return hmac.compare_digest(given.encode(errors="surrogateescape"), self.token.encode())
 
     def answer_headers(self, path: str, headers: Headers) -> dict[str, str]:
-        """Headers of the answer to an accepted request: nothing is loaded from elsewhere."""
+        """Return headers for the answer to an accepted request; they forbid content from other hosts."""
         (host,) = headers.get_all("Host")
         policy = (
             "default-src 'self' data: blob: 'unsafe-inline' 'unsafe-eval'",
@@ -126,7 +126,7 @@ class PageGuard:
             return True
         try:
             ip_address(name)
-        except ValueError:  # a name that may be anybody's
+        except ValueError:  # an unknown name, which could belong to anybody
             return False
         return self._is_any or is_loopback(name)
 
@@ -146,7 +146,7 @@ def is_websocket(headers: Headers) -> bool:
 
 
 def _is_from(origins: list[str], host: str) -> bool:
-    """True if the browser says that a page of `host` sends the request."""
+    """Return True if the browser says that a page of `host` sends the request."""
     if len(origins) != 1:
         return False
     scheme, _, place = origins[0].lower().partition("://")
@@ -159,7 +159,7 @@ def _own_names() -> set[str]:
 
 
 def _own_address(host: str) -> str:
-    """Address of this machine that others see; nothing is sent to find it out."""
+    """Return an address of this machine that others can reach; sends nothing on the network."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
@@ -170,13 +170,13 @@ def _own_address(host: str) -> str:
 
 
 def check_installed() -> None:
-    """Raise MissingDependency where viser is not installed, without loading it."""
+    """Raise MissingDependency if viser is not installed, without loading it."""
     if find_spec("viser") is None:
         raise MissingDependency(_INSTALL)
 
 
 def parse_place(text: str) -> tuple[str, int]:
-    """Host and port of `HOST:PORT`; an IPv6 address stands in brackets.
+    """Return host and port of `HOST:PORT`; an IPv6 address is in brackets.
 
     Raises:
         InvalidConfig: for anything else.
@@ -192,10 +192,10 @@ def parse_place(text: str) -> tuple[str, int]:
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """A socket that listens there; port 0 = a free one.
+    """Return a socket that listens at an address; port 0 = a free port.
 
     Raises:
-        TransportError: when the port is taken, or there is no such address here.
+        TransportError: the port is taken, or this machine has no such address.
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     both = host == "::" and socket.has_dualstack_ipv6()

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Messages of browsers that a page takes: its camera, a click, a picture, a new value of a control.
+"""Check the messages of browsers: camera, click, picture, or a new value of a control.
 
-viser takes more than our page uses, keeps some of it, and believes the values: so each message is read as one
-of these and written anew, and anything else ends its connection.
+viser accepts more message types than our page uses, keeps some data, and trusts the values. So each message
+is decoded as one of these types and encoded again; any other message ends its connection.
 """
 
 import math
@@ -13,16 +13,16 @@ from typing import Annotated, Any, Literal
 from msgspec import Meta, Struct, ValidationError, msgpack
 
 _MOST_PIXELS = 1 << 25  # of a picture: 8K has less
-_MOST_BYTES = 4096  # of a message that is no picture
-_FAR = 1e12  # metres, and any other number
-_PNG_SIZE = slice(16, 24)  # bytes of width and height, the high one first
+_MOST_BYTES = 4096  # of a message without a picture
+_FAR = 1e12  # largest number, metres or other
+_PNG_SIZE = slice(16, 24)  # bytes of width and height, big-endian
 
 _PixelCount = Annotated[int, Meta(ge=0, le=1 << 16)]
 _Vector = tuple[float, float, float]
 
 
 class _FromBrowser(Struct, tag_field="type", forbid_unknown_fields=True):
-    """A message as viser's page sends it."""
+    """A message sent by viser's page."""
 
 
 class _CameraMoved(_FromBrowser, tag="ViewerCameraMessage"):
@@ -63,10 +63,10 @@ _decoder = msgpack.Decoder(_CameraMoved | _Click | _PictureTaken | _NewValue)
 
 
 def checked(message: str | bytes, control: Callable[[str], Any]) -> bytes | None:
-    """Safe form of a browser's message for viser; None = viser must not have it.
+    """Return the safe form of a browser's message for viser, or None if viser must not get it.
 
-    `control`: present control of a name, or None. Raises msgspec.MsgspecError, RecursionError or TypeError
-    for a message that no page of ours sends.
+    `control`: returns the present control of a name, or None. Raises msgspec.MsgspecError, RecursionError or
+    TypeError for a message that no page of ours sends.
     """
     read = _decoder.decode(message)  # type: ignore[arg-type]  # TypeError for text
     if len(message) > _MOST_BYTES and not isinstance(read, _PictureTaken):
@@ -93,7 +93,7 @@ def checked(message: str | bytes, control: Callable[[str], Any]) -> bytes | None
 
 
 def _fitted(value: Any, control: Any) -> Any:
-    """Value of a control within its bounds when a browser sends `value`; None = none."""
+    """Return a browser's `value` limited to the control's bounds; None if the control cannot take it."""
     before = getattr(control, "value", None)
     if isinstance(before, bool) or isinstance(value, bool):  # a box, or a button
         return value if isinstance(before, bool) and isinstance(value, bool) else None

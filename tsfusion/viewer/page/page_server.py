@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Web server of a page: viser's, behind a door that admits or refuses each connection.
+"""Run viser's web server for a page, and accept or refuse each connection first.
 
-viser's own listens for every Origin, takes another port when one is in use, and prints. So it is given a
-`websockets.asyncio.server.serve` of ours while it starts; without using that, it serves nothing.
+viser's own server accepts every Origin, takes another port if one is in use, and prints. So viser gets our
+replacement of `websockets.asyncio.server.serve` while it starts. If viser does not use it, nothing is served.
 """
 
 import asyncio
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from websockets.http11 import Request, Response
 
 BROWSERS = 32  # at once
-KNOCKING = 64  # connections at once that are no browser yet; the oldest makes room for a new one
+KNOCKING = 64  # connections at once that are not open yet; a new one closes the oldest
 _MAX_MESSAGE = 16 << 20  # bytes: a browser sends a picture of its page
 _OPEN_SECONDS = 10.0  # for a request and its answer
 _CLOSE_SECONDS = 1.0
@@ -47,20 +47,20 @@ class PageServer:
     """A running web server with an empty page.
 
     Args:
-        host: its address; by default only this machine reaches it.
-        port: 0 = a free one.
-        token: needed to open the page; None = none on this machine, else a random one.
+        host: its address; by default only this machine can reach it.
+        port: 0 = a free port.
+        token: needed to open the page; None = no token on this machine, else a random token.
 
     Attributes:
-        server: to fill the page with.
-        url: to open it with.
-        port, token: the real ones; the token is None if none is needed.
+        server: viser's server, to fill the page with.
+        url: address to open the page with.
+        port, token: the real values; the token is None if none is needed.
         refused: number of refused requests, by reason: host, origin, token, full, message.
 
     Raises:
-        MissingDependency: without viser.
-        InvalidConfig: for a bad token.
-        TransportError: when the port is taken, or viser cannot be guarded.
+        MissingDependency: viser is not installed.
+        InvalidConfig: the token is bad.
+        TransportError: the port is taken, or viser cannot be guarded.
     """
 
     def __init__(self, host: str = "127.0.0.1", port: int = 0, *, token: str | None = None) -> None:
@@ -89,7 +89,7 @@ class PageServer:
         import viser
         import websockets.asyncio.server as module
 
-        rich.reconfigure(quiet=True)  # viser prints there, and stdout is the command's own
+        rich.reconfigure(quiet=True)  # viser prints through it, but stdout belongs to the command
         with _START:
             usual = module.serve
             module.serve = partial(self._serve, usual, listener)  # type: ignore[assignment, misc]
@@ -108,29 +108,29 @@ class PageServer:
     async def _serve(
         self, usual: Any, listener: socket.socket, handler: Any, host: str, port: int, **options: Any
     ) -> AsyncIterator[Any]:
-        """Stand in for `websockets.asyncio.server.serve`. Always yields: viser waits for that without end."""
+        """Replace `websockets.asyncio.server.serve`. Always yields: viser waits for that without end."""
         asyncio.get_running_loop().set_exception_handler(_note_failure)
         async with AsyncExitStack() as stack:
             try:
                 guarded = options | self._guarded(options["process_request"])
                 running = await stack.enter_async_context(usual(handler, sock=listener, **guarded))
                 self._running = running
-            except _MISFITS as error:  # of another viser or websockets; `_start` tells
+            except _MISFITS as error:  # another version of viser or websockets; `_start` reports
                 self._problem = repr(error)
                 running = SimpleNamespace(server=SimpleNamespace(sockets=()))
             yield running
 
     def _guarded(self, answer: "Callable[[ServerConnection, Request], Response | None]") -> dict[str, Any]:
-        """Options of a server behind the guard. `answer`: viser's answer to a request."""
+        """Return options of a guarded server. `answer`: viser's answer to a request."""
         from websockets.asyncio.server import ServerConnection
         from websockets.frames import CloseCode
 
         page = self
 
         class Knocking(ServerConnection):
-            """A connection that gives viser the messages of our page, and makes room for others.
+            """A connection that passes only messages of our page to viser.
 
-            The oldest connection that is not a browser yet is closed.
+            A new connection closes the oldest connection that is not open yet, if there are too many.
             """
 
             def connection_made(self, transport: asyncio.BaseTransport) -> None:
@@ -185,7 +185,7 @@ class PageServer:
         log.warning("a browser at %s is turned away (%s): %s", peer[0], reason, text)
 
     def _control(self, name: str) -> Any:
-        """Control of that name, of all browsers or of one; None = there is none."""
+        """Return the control of this name, shared or of one browser; None without one."""
         panels = [self.server.gui, *(client.gui for client in self.server.get_clients().values())]
         found = [
             one._gui_input_handle_from_uuid[name] for one in panels if name in one._gui_input_handle_from_uuid
@@ -209,7 +209,7 @@ class PageServer:
 
 @lru_cache(2)
 def _with_our_head(html: bytes) -> bytes:
-    """viser's page, packed or not, with names for its controls, a title and more contrast."""
+    """Return viser's page, compressed or not, with names for its controls, a title and more contrast."""
     is_packed = html.startswith(b"\x1f\x8b")
     html = gzip.decompress(html) if is_packed else html
     ours = resources.files(__package__).joinpath("page_head.html").read_bytes()
@@ -218,7 +218,7 @@ def _with_our_head(html: bytes) -> bytes:
 
 
 def _quiet_logger() -> logging.Logger:
-    """Logger for connections; any number of broken ones is normal."""
+    """Return a logger that ignores broken connections: any number of them is normal."""
     made = logging.Logger(f"{__name__}.connections")
     made.addHandler(logging.NullHandler())
     made.addFilter(lambda record: record.getMessage() == "connection handler failed")
@@ -230,7 +230,7 @@ def _note_failure(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> N
 
 
 def calm(callback: Callable[..., object]) -> Callable[..., None]:
-    """The callback, whose exceptions are logged in a line."""
+    """Return a callback that logs exceptions of the given callback in one line."""
 
     def call(*given: Any) -> None:
         try:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Controls of one browser: its colours, cut and camera, measuring, pictures and downloads."""
+"""Build the controls of one browser: colours, cut, camera, measuring, pictures and downloads."""
 
 import threading
 import time
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from tsfusion.geometry.mesh import Mesh
 
 WHOLE, BY_HAND, _FOLLOW = "Whole map", "By hand", "Follow "
-_SLOWEST_S = 10.0  # seconds after a move of ours, in which a slow browser may still tell older places
-_AGAIN = 1.0  # seconds after which a camera is moved once more that a new up direction has turned
-_MOVED = 0.02  # of the distance to the target: further away, somebody moved the camera
+_SLOWEST_S = 10.0  # seconds after our move, in which a slow browser may still report old positions
+_AGAIN = 1.0  # seconds after which a camera turned by a new up direction is moved again
+_MOVED = 0.02  # share of the distance to the target; a larger shift means that a person moved the camera
 _RENDER = 30.0  # seconds that a browser may take for a picture
 # Width / height of a phone. Up to 576 points of width viser puts the panel over the lower half of the
 # picture; but a browser tells pixels: a phone has two or three a point, one that draws slowly three quarters.
@@ -35,7 +35,7 @@ _MARK = (213, 94, 0)
 
 
 class ShownPage(Protocol):
-    """Page of a browser, as its panel needs it (`LivePage`)."""
+    """A browser's page, as its panel needs it (`LivePage`)."""
 
     map_name: str
     shared: TileLook
@@ -54,12 +54,12 @@ class BrowserPanel:
     """Controls of one browser.
 
     Args:
-        view, cut: make the containers of the controls current.
-        modes: of colours, the first is chosen.
+        view, cut: contexts that make the containers of the controls current.
+        modes: names of colourings; the first is chosen.
 
     Attributes:
-        own: look that the browser has chosen; None = the shared one.
-        is_changed: True if another look has been chosen since `change_look`.
+        own: tiles and colours of this browser; None = it shows the shared ones.
+        is_changed: True if a person has changed a control since `change_look`.
     """
 
     def __init__(
@@ -73,8 +73,8 @@ class BrowserPanel:
         self._client, self._shown = client, shown
         self._commanded: PageCamera | None = None
         self._moved_at = self._sent_at = 0.0
-        self._is_elsewhere = False  # than where we moved it, as the browser tells
-        self._has_arrived = False  # whether the browser has been where we moved its camera
+        self._is_elsewhere = False  # the browser reports another camera position than ours
+        self._has_arrived = False  # the browser has reported our camera position
         self._points: list[NDArray[np.float64]] = []
         self._marks: list[Any] = []
         self._saving = threading.Lock()
@@ -110,7 +110,7 @@ class BrowserPanel:
         self.is_changed = True
 
     def change_look(self) -> None:
-        """Take the controls' look: a look of its own if it differs from the shared one."""
+        """Apply the controls: use tiles of its own if their state differs from the shared look."""
         self.is_changed = False
         mode, clipping, shared = self._mode.value, self._clipping.clipping, self._shown.shared
         if mode == shared.colors.mode and clipping.normal is None and clipping.box is None:
@@ -160,7 +160,7 @@ class BrowserPanel:
             self._client.camera.position = view.position
             self._client.camera.look_at = view.target
             self._client.camera.up_direction = view.up
-        self._has_arrived = False  # a callback may have read meanwhile what we have just set
+        self._has_arrived = False  # a callback may have set it during our move
 
     def _wanted(self) -> PageCamera | None:
         if self._camera.value == WHOLE:
@@ -283,5 +283,5 @@ class BrowserPanel:
 
 
 def set_theme(gui: "viser.GuiApi", *, dark: bool) -> None:
-    """Choose light or dark, without the framework's own signs."""
+    """Choose a light or dark theme, without viser's logo and buttons."""
     gui.configure_theme(dark_mode=dark, show_logo=False, show_share_button=False, control_width="medium")

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Delay, queue and memory of a server while keyframes come, over the time that a page has been open; the
-state of its maps and scanners as HTML, with every text escaped."""
+"""Plot a server's delay, queue and memory; write the state of maps and scanners as escaped HTML."""
 
 from collections.abc import Iterable, Sequence
 from html import escape
@@ -15,15 +14,15 @@ from tsfusion.wire.messages.health import ClientHealth, Health
 if TYPE_CHECKING:
     import viser
 
-_MOST = 600  # moments that are kept
+_MOST = 600  # most stored samples
 _HEIGHT = 130  # pixels
 _TEXT = "font-size:.85em;line-height:1.5;padding:0 .9em .4em .6em;overflow-wrap:anywhere"
 _GOOD, _BAD = "#009e73", "#d55e00"
-_ADDRESS = 40  # characters of a name that are shown
+_ADDRESS = 40  # most shown characters of a name
 
 
 class HealthPlots:
-    """Three plots, hidden without data; ended ones stay. After a long time half is dropped."""
+    """Three plots, hidden until data comes. Beyond `_MOST` samples, every second one is dropped."""
 
     def __init__(self, gui: "viser.GuiApi") -> None:
         self._rows: list[tuple[float, ...]] = []
@@ -39,7 +38,7 @@ class HealthPlots:
         self._stride, self._count, self._fused = 1, 0, -1
 
     def note(self, health: Health, map_name: str, now_s: float) -> None:
-        """Add the health of a moment."""
+        """Add the health of one moment."""
         found = health.maps.get(map_name)
         if found is None:
             return
@@ -57,7 +56,7 @@ class HealthPlots:
             self._rows, self._stride = self._rows[::2], 2 * self._stride
 
     def draw(self) -> None:
-        """Show the noted health."""
+        """Show the stored samples."""
         if len(self._rows) < 2:
             return
         columns = np.array(self._rows, np.float64).T
@@ -85,11 +84,11 @@ def _plot(gui: "viser.GuiApi", title: str, names: tuple[str, str]) -> "viser.Gui
 
 
 def summary(title: str, map_name: str, problem: str, facts: Sequence[str], problems: Sequence[str]) -> str:
-    """Head of a panel: the watched map, its state, and its problems.
+    """Return the head of a panel as HTML: the watched map, its state, and its problems.
 
     Args:
-        problem: reason why the watched map is not there; empty = it is.
-        problems: of the server, a sentence each.
+        problem: why the watched map is missing; empty = it is shown.
+        problems: problems of the server, one sentence each.
     """
     color, word = (_BAD, escape(problem)) if problem else (_GOOD, "connected")
     dot = f'<span style="color:{color}">{"▲" if problem else "●"}</span>'
@@ -104,7 +103,7 @@ def summary(title: str, map_name: str, problem: str, facts: Sequence[str], probl
 
 
 def tables(health: Health, map_name: str, order: Sequence[str]) -> str:
-    """Every scanner and every map of a server.
+    """Return tables of every scanner and every map of a server.
 
     `order`: the first 8 hexadecimal digits of the sessions that have a colour in the scene.
     """
@@ -137,7 +136,7 @@ def tables(health: Health, map_name: str, order: Sequence[str]) -> str:
 
 
 def text(content: str) -> str:
-    """A paragraph; `content` is HTML already."""
+    """Return a paragraph; `content` is HTML already."""
     return f'<div style="{_TEXT}">{content}</div>'
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Panel that all browsers of a page share: the shown map, and the state of the server."""
+"""Build the panel that all browsers of a page share: the shown map, and the state of the server."""
 
 import threading
 import time
@@ -24,11 +24,11 @@ _MARKS = {"scanners": "Scanners", "paths": "Paths", "first paths": "Paths before
 
 @dataclass
 class Orders:
-    """Requests of browsers since the last look; None = none.
+    """Requests of browsers since the last `take_orders`; None = no request.
 
     Attributes:
-        map_name: to be shown.
-        place: number of keyframes of which the map is to be shown.
+        map_name: map to show.
+        place: number of keyframes after which to show the map.
     """
 
     map_name: str | None = None
@@ -38,14 +38,14 @@ class Orders:
 class SharedPanel:
     """Controls and figures in three tabs.
 
-    `show` is told what to show or hide in the scene. Attributes `view`, `cut`: containers for a browser's own
-    controls.
+    `show` is called to show or hide objects in the scene. Attributes `view`, `cut`: containers for a
+    browser's own controls.
     """
 
     def __init__(self, gui: "viser.GuiApi", feed: MapFeed, show: Callable[[str, bool], None]) -> None:
         self._feed = feed
         self._orders, self._lock, self._slid_at = Orders(), threading.Lock(), 0.0
-        self._wanted_map: str | None = None  # until it is shown
+        self._wanted_map: str | None = None  # chosen map, until it is shown
         gui.set_panel_label("tsfusion")
         gui.main_panel.dock_right()
         self._head = gui.add_html(health_plots.summary(feed.title, "", "", ["waiting for the map"], ()))
@@ -62,7 +62,7 @@ class SharedPanel:
             self.plots = HealthPlots(gui)
 
     def take_orders(self, now: float, rest_s: float) -> Orders:
-        """Requests of browsers; a time slider counts once it has rested for `rest_s` seconds."""
+        """Return the requests of browsers; a time slider counts once it has rested for `rest_s` seconds."""
         with self._lock:
             orders, self._orders = self._orders, Orders()
             if orders.place is not None and now < self._slid_at + rest_s:
@@ -126,7 +126,7 @@ class SharedPanel:
 
     def _note_map(self, event: Any) -> None:
         name = event.target.value
-        if event.client is not None and name in self._map.options:  # the feed is for the page's thread alone
+        if event.client is not None and name in self._map.options:  # only the page's thread may use the feed
             with self._lock:
                 self._orders.map_name = self._wanted_map = name
 
