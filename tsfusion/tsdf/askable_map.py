@@ -48,8 +48,7 @@ class AskableMap(ReadableMap):
     def sample(
         self, points: ArrayLike, *, min_weight: float | None = None, surface: Surface | None = None
     ) -> Samples:
-        """Sample the signed distance, its weight and its gradient at points, interpolated between voxel
-        centres.
+        """Sample signed distance, weight and gradient at points, interpolated between voxel centres.
 
         NaN beyond `reach` does not mean free: planners ask `distance_field`.
 
@@ -196,8 +195,7 @@ class AskableMap(ReadableMap):
     def distance_blocks(
         self, *, max_distance: float = 0.5, min_weight: float | None = None
     ) -> Iterator[FieldBlocks]:
-        """Yield the distance field of the whole map: blocks of 8³ voxels nearer than `max_distance` to
-        surfaces.
+        """Yield the distance field of the whole map: blocks of 8³ voxels within `max_distance` of surfaces.
 
         Memory holds one tile of 16³ blocks and its surroundings. The values equal those of `distance_field`.
 
@@ -224,8 +222,7 @@ class AskableMap(ReadableMap):
         above_floor: bool = False,
         most_cells: int = map_slices.MOST_CELLS,
     ) -> CurrentSlice:
-        """Return occupancy and horizontal distances between two heights, as an object that can follow the
-        map.
+        """Return occupancy and horizontal distances between two heights; the result can follow the map.
 
         Args:
             low, high: metres along `up` from the map's origin.
@@ -265,8 +262,7 @@ class AskableMap(ReadableMap):
     def occupancy_slice(
         self, low: float, high: float, *, need_free: bool = False, **options: "Unpack[OwnSliceSettings]"
     ) -> OccupancySlice:
-        """Return a costmap: free, occupied or unseen between two heights; its `save` writes ROS map_server
-        files.
+        """Return a costmap: free, occupied or unseen between two heights; its `save` is for ROS map_server.
 
         A cell is occupied if a surface, or the space behind one, was seen. It is free if at least half of its
         samples were seen, and no surface. A map without `space_carving` knows free space in a band before

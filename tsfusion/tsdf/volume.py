@@ -234,18 +234,18 @@ class Volume(AskableMap):
         last bit.
 
         Settled colours (32768 votes) are averaged. Smoothed values fall back to raw values in blocks of both
-        maps.
-        Each journal keeps its own keyframes: a server with the merged map can add keyframes, but cannot move
-        or remove those already in it. `retract` removes a keyframe of `other` exactly only if both maps have
-        the same settings.
+        maps. Each journal keeps its own keyframes: a server with the merged map can add keyframes, but cannot
+        move or remove those already in it. `retract` removes a keyframe of `other` exactly only if both maps
+        have the same settings.
 
         Args:
             other: a map of the same voxel size and layers; it does not change.
             same_frame: the maps share a frame, although each scan found its poses itself.
 
         Raises:
-            MapError: when voxels, layers or worlds differ, or when a keyframe would count twice, as far as a
-                server listed them. Parts of one map that share no voxel (`crop`) may be merged.
+            MapError: when voxels, layers or worlds differ, when both are the same map, or when they hold the
+                same keyframes, as far as a server listed them. Parts of one map that share no voxel (`crop`)
+                may be merged.
             MapFull, WeightOverflow, MemoryError: without room. After each error the map is unchanged.
         """
         if other is self:
@@ -433,9 +433,7 @@ class Volume(AskableMap):
             raise OutputError(f"a map is saved as .tsf, got {os.fspath(path)!r}: use {how}, or another name")
         layers = self._store.layers()
         header = checkpoint.CheckpointHeader(
-            config=msgspec.structs.replace(
-                self.config, arch="cpu"
-            ),  # the device depends on the machine, not on the map
+            config=msgspec.structs.replace(self.config, arch="cpu"),  # the machine decides on the device
             keyframes=self.keyframes,
             map_hash="",
             meta={**(self.meta if meta is None else meta), HELD: self.held.numbers},

@@ -4,8 +4,8 @@
 An image is read in tiles of 12×12 pixels. A cell of a tile is about as wide as a voxel. Its pixels become one
 ray through their mean for each layer of depth. In a flat tile, the tile's plane gives the distance from the
 ray's voxels to the surface. Elsewhere it is the distance to the ray's end. Sums are integers, so no result
-depends on threads. With `bundle = 0` every pixel is a ray.
-One unit of parallel work is a band, a contiguous run of tiles with its own region of the ray buffer.
+depends on threads. With `bundle = 0` every pixel is a ray. One unit of parallel work is a band, a contiguous
+run of tiles with its own region of the ray buffer.
 """
 
 import taichi as ti

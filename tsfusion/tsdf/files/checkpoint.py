@@ -221,10 +221,9 @@ def array_for(blocks: int, layers: Iterable[str]) -> NDArray[np.uint8]:
 
 @contextmanager
 def reading(path: Path, *, is_checked: bool = False) -> Iterator[tuple[CheckpointHeader, Iterator[Chunk]]]:
-    """Open a checkpoint. Yields its header and chunks; the `with` block copies each chunk into a map.
+    """Open a checkpoint. Yields its header and chunks; the `with` block reads each chunk into its own arrays.
 
-    Memory holds one chunk in addition to the map. A MemoryError of the `with` block becomes a
-    CheckpointError.
+    Memory holds one chunk besides these. A MemoryError of the `with` block becomes a CheckpointError.
 
     Args:
         is_checked: the caller has just read the file, so its digest is not compared again.

@@ -32,7 +32,7 @@ def fill(
     Raises CheckpointError for other layers than the store's, or for impossible blocks.
     """
     layers = store.layers()
-    if not layers.keys() - {"hits"} <= {*header.layers} <= layers.keys():  # optional
+    if not layers.keys() - {"hits"} <= {*header.layers} <= layers.keys():  # old maps lack `hits`
         raise CheckpointError(f"{path} is of another version: it has layers {header.layers}")
     checked = 0
     with SideThread() as side:

@@ -12,8 +12,7 @@ Blocks: `blocks` (n, 3) int32, and `tsdf`, `weight` (n, 8, 8, 8), `color` (n, 8,
 Dense: `tsdf`, `weight` (X, Y, Z), `color` (X, Y, Z, 3), and `origin` (3,) float64: the centre of voxel (i, j,
 k) is at origin + ((i, j, k) + 0.5) · voxel_size.
 
-OpenVDB: one grid, `tsdf` or `distance`. Its background value fills unseen voxels, or voxels far from
-surfaces.
+OpenVDB: one grid, `tsdf` or `distance`. Its background value fills voxels unseen or far from surfaces.
 """
 
 import tempfile

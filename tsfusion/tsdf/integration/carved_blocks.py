@@ -221,7 +221,7 @@ class CarvedBlocks:
 
 
 class _PatchImages:
-    """Clear depth of 8x8 pixel patches, and its minimum and maximum over squares of patches."""
+    """Clear depth of 3x3 pixel patches, and its minimum and maximum over squares of patches."""
 
     def __init__(self) -> None:
         self.pixels = 0, 0  # height, width of each image

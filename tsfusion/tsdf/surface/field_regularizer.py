@@ -2,9 +2,8 @@
 """Read signed distances of a surface from the map, raw or smoothed, and plan the smoothing (the field).
 
 `kernels/surface/field_smoothing.py` solves. The result is a function of the map's sums: the order of
-keyframes
-and threads has no effect. Blocks are solved with a halo of neighbours, which makes the values of a few blocks
-nearly equal to those of the whole map (docs/method.md has the error).
+keyframes and threads has no effect. Blocks are solved with a halo of neighbours, which makes the values of a
+few blocks nearly equal to those of the whole map (docs/method.md has the error).
 """
 
 import math
@@ -267,7 +266,7 @@ def index_of(keys: NDArray[np.int64], queries: NDArray[np.int64]) -> NDArray[np.
 
 
 class SurfaceView(Protocol):
-    """Function that reads signed distances from the map: `values_of`, or one of this module."""
+    """Function that reads signed distances of blocks from the map, such as `values_of`."""
 
     def __call__(
         self,

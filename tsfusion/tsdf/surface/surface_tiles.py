@@ -2,9 +2,9 @@
 """Keep values and meshes of a surface in cubes of 8³ blocks until the map changes, for later questions.
 
 The content of a cube depends only on the map, neither on earlier questions nor on the map's history. While
-the
-map changes, the last complete view stays available until a newer view is complete: the old meshes of changed
-cubes are kept in addition to the new ones. A second class keeps values block by block while the map grows.
+the map changes, the last complete view stays available until a newer view is complete: the old meshes of
+changed cubes are kept in addition to the new ones. A second class keeps values block by block while the map
+grows.
 """
 
 from collections import OrderedDict
@@ -48,9 +48,7 @@ class SurfaceTiles:
         self._settled_numbers = self._numbers
         self._changed: set[int] = set()  # cubes whose meshes have changed since then
         self._before: dict[int, _CubeMesh] = {}  # former meshes of some of these cubes
-        self._lacking: list[int] | None = (
-            None  # cubes still to mesh before the next complete state; None: unknown
-        )
+        self._lacking: list[int] | None = None  # cubes to mesh before the next complete state; None: unknown
 
     @property
     def values(self) -> SurfaceView:
