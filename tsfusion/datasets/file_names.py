@@ -146,7 +146,7 @@ def _read(parts: Sequence[tuple[str, str]], unit: int | None) -> NDArray[np.int6
 
 
 def _chosen(ways: dict[str, NDArray[np.int64]], name: str, is_stripped: bool) -> NDArray[np.int64]:
-    """Return the reading with clearly the most regular steps; else decimals, if they may lack last zeros."""
+    """Return the reading with clearly the most regular steps; else decimals, if last zeros can be missing."""
     best, *others = sorted(ways, key=lambda way: _unevenness(ways[way]))
     if not others or _unevenness(ways[others[0]]) > 2 * _unevenness(ways[best]) + 0.05:
         return ways[best]

@@ -125,7 +125,7 @@ def world_layout(name: str) -> Layout | None:
 
 
 def find(path: str | Path, *, unpack: bool = False) -> FoundDataset:
-    """Find the dataset at a path: a folder, a folder that holds exactly one, or a file that stands for it.
+    """Find the dataset at a path: its folder, a folder with only this one, or a file that stands for it.
 
     Args:
         unpack: True unpacks an archive beside itself. Otherwise the error names the command that does.
@@ -157,10 +157,11 @@ def find(path: str | Path, *, unpack: bool = False) -> FoundDataset:
 
 
 def open_as(name: str, opener: Callable[..., Dataset], options: dict[str, Any]) -> Dataset:
-    """Call a layout's opener. The options `posed` and `trajectory` work even if the opener lacks them.
+    """Call a layout's opener, which can lack the options `posed` and `trajectory`.
 
-    `poses` is another name of `trajectory`. All layouts have the options `origin` and `crs`, see
-    `Frames.take_off_origin`, and `depth_along_ray`: depth images hold distances along rays, which become z.
+    Without `posed` in the opener, the option has no effect. Without `trajectory`, the poses are added here.
+    `poses` is another name of `trajectory`. All layouts have the options `origin` and `crs` (see
+    `Frames.take_off_origin`) and `depth_along_ray`: depth images hold distances along rays, which become z.
 
     Raises:
         DatasetError: an option is unknown to the opener, or has the wrong type.
@@ -259,7 +260,7 @@ def _unpacked(path: Path, *, unpack: bool) -> Path:
 
 
 def _match(places: Iterable[Path], only: tuple[Layout, ...] = ()) -> list[FoundDataset]:
-    """Return the datasets at these paths, in any layout; PLAIN ones only if no other fits. Or in `only`."""
+    """Return the datasets at these paths: in the layouts `only`, or in all known ones with PLAIN last."""
     ranked = [] if only else [*_plugins(), *BUILT_IN]
     found = []
     for place in places:

@@ -87,9 +87,9 @@ def decode_image(file: BinaryIO, flags: int) -> NDArray[Any] | None:
     """Decode an image file by OpenCV's `flags`. Return None if it is damaged or far too large.
 
     Pixels come as stored, because calibrations and depth refer to stored pixels: an EXIF orientation is
-    ignored. OpenCV trusts an image of a few bytes that claims gigabytes of pixels; for PNG and JPEG the size
-    is checked here. libpng prints messages about what it does not like. So a PNG is checked first, and chunks
-    without pixels are not read.
+    ignored. OpenCV trusts an image of a few bytes that claims gigabytes of pixels. For PNG and JPEG the size
+    is checked here; for others the command sets a limit. libpng prints its complaints. So a PNG is checked
+    first, and chunks that its pixels do not need are not read.
     """
     is_png = file.read(len(_PNG)) == _PNG
     content = _png_of_pixels(file) if is_png else _whole(file)
@@ -226,7 +226,7 @@ def check_metres(depth: NDArray[np.float32], source: object) -> None:
 
 def check_byte_order(depth: NDArray[Any], source: object) -> None:
     """Raise DatasetError if (H, W) uint16 depth is far smoother after an exchange of its bytes."""
-    if depth.dtype != np.uint16 or not (depth & 0xFF).any():  # floats and 8-bit values have no such error
+    if depth.dtype != np.uint16 or not (depth & 0xFF).any():  # floats, or multiples of 256
         return
     rows = depth[::_EVERY]
     both = (rows[:, 1:] > 0) & (rows[:, :-1] > 0)

@@ -65,10 +65,10 @@ def time_field(names: Iterable[str]) -> str | None:
 def point_times(scan: Scan, stamp_ns: int, between_s: float = 1.0) -> PointTimes:
     """Read the times of a sweep's points.
 
-    The field's name may tell the unit (`time_us`). Otherwise it is the largest of s, ms, µs and ns that gives
-    a possible length of a sweep. Drivers write Ouster `t` and Livox `offset_time` in ns, Velodyne `time` in
-    s, Hesai `timestamp` in absolute s, Livox `timestamp` in absolute ns, LAS `gps_time` in s. Times that
-    count neither by the stamp's clock nor from the stamp are counted from the sweep's first point.
+    The field's name may give the unit (`time_us`). Otherwise the unit is the largest of s, ms, µs and ns that
+    gives a possible length of a sweep. Drivers write Ouster `t` and Livox `offset_time` in ns, Velodyne
+    `time` in s, Hesai `timestamp` in absolute s, Livox `timestamp` in absolute ns, LAS `gps_time` in s. Times
+    that count neither by the stamp's clock nor from the stamp are counted from the sweep's first point.
 
     Args:
         stamp_ns: stamp of the frame; 0 = no stamp.

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Quality of a map: the error of surfaces and trajectories, and whether poses and depth agree."""
+"""Measure the quality of a map: errors of surfaces and trajectories, and agreement of poses and depth."""

@@ -186,7 +186,7 @@ def _with_doubt(
 
 
 def _with_fault(report: PoseCheckReport, dataset: Dataset, frames: dict[int, SeenFrame]) -> PoseCheckReport:
-    """Add the place where the trajectory is surely wrong to the report, if there is any."""
+    """Add to the report the two frames between which the trajectory is surely wrong, if there are any."""
 
     def compare(first: int, second: int) -> FramePair | None:
         unread = [index for index in (first, second) if index not in frames]

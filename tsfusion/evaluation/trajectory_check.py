@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Check a whole trajectory for jumps between frames, and for drift between distant visits of one scene.
 
-`pose_check` compares neighbouring frames at a few times. It may not look at the two frames of a jump, and
-sees no drift. A step unlike the steps around it is a jump in two cases: the frames fit the usual motion
-clearly better, or they fit it equally well and no sensor accelerates like that. Two frames of one scene, seen
-again later, show drift if they fit only after a shift, and the frames beside them fit after the same shift.
+`pose_check` compares neighbouring frames at a few times. It can miss the two frames of a jump, and sees no
+drift. A step unlike the steps around it is a jump in two cases: the frames fit the usual motion clearly
+better, or they fit it equally well and no sensor accelerates like that. Two frames of one scene, seen again
+later, show drift if they fit only after a shift, and the frames beside them fit after the same shift.
 """
 
 from collections.abc import Callable, Iterator

@@ -12,7 +12,7 @@ from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
 
 INDOORS, OUTDOORS = 0.1, 2.0  # metres between keyframes
-_STRIDE = 16  # the overlap is computed for every 16th pixel of every 16th row
+_STRIDE = 16  # the overlap is computed for every 16th pixel in each direction
 
 
 class Selector(Protocol):
@@ -86,7 +86,7 @@ class EveryFrame:
 
 
 def _overlap(frame: Frame) -> Callable[[NDArray[np.float64]], float] | None:
-    """Return a function from `T_now_last` to the share of this frame's pixels that lie in the view then."""
+    """Return a function from `T_now_last` to the share of this frame's pixels that are in the new view."""
     K, depth = frame.intrinsics, frame.depth_m
     if depth is None or K is None:
         return None

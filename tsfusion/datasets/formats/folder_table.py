@@ -36,7 +36,7 @@ PLAIN_EXPECTED = (
     "camera_intrinsic.json; without poses, so for a scan, or with --trajectory"
 )
 KINECT = Intrinsics(585.0, 585.0, 320.0, 240.0)  # published with the data
-# The release has no colour camera. It was measured on RedKitchen by moving depth edges onto colour edges
+# The camera of colour: not in the release, but measured on RedKitchen by moving depth edges onto colour edges
 # (the mean gradient under them is 2.34 times the image's; 1.24 as released).
 KINECT_COLOR = Intrinsics(527.0, 527.0, 320.0, 237.5)
 KINECT_BASELINE = -0.025  # metres, x of the depth camera's origin in the colour camera's axes

@@ -310,10 +310,10 @@ def first_size(files: Sequence[Path], read: Callable[[Path], NDArray[Any]] = rea
 
 
 def color_images(depth: list[Path], root: Path, at: tuple[ImagesAt, ImagesAt], expected: str) -> list[Path]:
-    """Return the colour image of each depth image, by file name. Some of the files may be missing.
+    """Return the colour image of each depth image, by file name. Some of these files can be missing.
 
     Args:
-        at: where depth and colour are; in one common folder, all colour may be missing.
+        at: folders and names of depth and colour. If both are in one folder, all colour can be missing.
 
     Raises:
         DatasetError: most colour images are missing.

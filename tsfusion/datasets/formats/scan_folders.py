@@ -151,7 +151,7 @@ class ScanFolder(FolderFrames):
 
 
 class _Series(NamedTuple):
-    """Sorted files whose names differ only in numbers; number of files of their kind with other names."""
+    """Sorted files whose names differ only in numbers. `others` counts files of the kind with other names."""
 
     files: list[Path]
     others: int

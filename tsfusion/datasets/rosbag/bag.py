@@ -256,7 +256,7 @@ class Bag(Frames):
         self._others = [self._others[i] for i in chosen]
 
     def _register(self, poses: PoseFinder) -> Registration | None:
-        """Return the registration of a separate camera's colour to the depth; None without colour."""
+        """Return the registration of a separate colour camera to the depth; None if not needed or unknown."""
         chosen = self._chosen
         if chosen.color_camera is None or chosen.camera is None or not len(self):
             return None

@@ -83,7 +83,7 @@ class Localizer(Protocol):
         """Find the sensor's pose. Return Lost when it is not known (then try the next frame, or `reset`).
 
         Raises:
-            InvalidKeyframe: the frame has not what this localizer needs (colour, depth, a stereo pair).
+            InvalidKeyframe: the frame lacks data that this localizer needs (colour, depth, a stereo pair).
         """
 
     def prepare(self) -> None:

@@ -158,8 +158,8 @@ class RecordedSource(LiveSource):
     def __iter__(self) -> Iterator[Frame]:
         """Yield frames with the recording's timestamps, or with nominal ones if it has none.
 
-        With a rate, a late frame delays all later ones, as with a sensor. Each frame is read shortly before
-        its time. Reading it earlier would take a core while the server fuses the previous frame: on two cores
+        With a rate, a late frame delays all later frames, as with a sensor. Each frame is read shortly before
+        its time. Reading at once would take a core while the server fuses the previous frame: on two cores
         that adds a third to the delay.
         """
         due, ahead = -math.inf, math.inf  # the last frame's time; seconds from reading a frame to its time

@@ -246,7 +246,7 @@ class LoopConsensus:
         return any(self._has_twin(loop) for loop in loops)
 
     def _has_twin(self, loop: Loop) -> bool:
-        """Return True if the keyframe could as well be at another place that looks like the loop's."""
+        """Return True if the loop's place looks like another place where the keyframe could be as well."""
         for other, T_other_old in self._twins.get(loop.old, []):
             claim = T_other_old @ loop.T_old_new
             if (
