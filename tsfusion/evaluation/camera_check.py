@@ -2,9 +2,9 @@
 """Check the camera: with correct poses, do frames fit each other better with other intrinsics?
 
 The points of a frame depend on the intrinsics, and so do their projections into another frame. With correct
-poses, frames fit best with the true focal length, which is searched. For a stereo camera a wrong focal length
-looks like another scale of the poses. A principal point far from the image's centre has usual causes, which
-are tried: images of another size, exchanged numbers, a transposed matrix.
+poses, frames fit best with the true focal length: it is found by a search. For a stereo camera a wrong focal
+length looks like another scale of the poses. A principal point far from the image's centre has usual causes,
+which are tried: images of another size, exchanged numbers, a transposed matrix.
 """
 
 from collections.abc import Sequence

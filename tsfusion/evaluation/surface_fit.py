@@ -179,7 +179,7 @@ class SeenDepth:
     def looks(self, points: NDArray[np.float64]) -> tuple[int, int]:
         """Return how many of (n, 3) world points the camera looked through, and how many it saw.
 
-        Points out of view, hidden, or without a measured depth are not counted.
+        Points that are out of view, hidden, or at pixels without depth are not counted.
         """
         x, y, z = se3.apply(self._T_camera_world, points).T
         K, (height, width) = self._K, self._near.shape

@@ -82,7 +82,7 @@ def find_fault(
 
 
 def apart(range_m: float) -> float:
-    """Return the metres between two positions of one surface that good poses do not exceed by noise."""
+    """Return the distance, metres, above which two positions of one surface are not noise of good poses."""
     return 0.02 + 0.03 * range_m
 
 

@@ -130,8 +130,7 @@ def dataset_trajectory(dataset: Dataset) -> tuple[NDArray[np.int64] | None, Pose
 
     Returns:
         (n,) timestamps in nanoseconds, or None without timestamps; and (n, 4, 4) poses, NaN for frames
-        without a
-        pose.
+        without a pose.
 
     Raises:
         DatasetError: no frame has a pose.

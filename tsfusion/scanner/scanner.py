@@ -150,7 +150,7 @@ class Scanner:
 
     @property
     def first_rejection(self) -> str:
-        """Reason why a map rejected a keyframe, for the first one rejected; empty if none was."""
+        """Reason for the first rejection of a keyframe by a map; empty if there was none."""
         return next(filter(None, (submap.client.first_rejection for submap in self.submaps)), "")
 
     @property

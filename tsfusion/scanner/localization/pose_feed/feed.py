@@ -298,7 +298,7 @@ class MapDeformation:
         return unknown
 
     def new_corrections(self) -> PoseCorrections | None:
-        """Return all tracking keyframes' poses corrected, since `reset`, or None without new corrections."""
+        """Return corrected poses of all tracking keyframes since `reset`, or None without new corrections."""
         if not self._is_new:
             return None
         self._is_new, self._revision = False, self._revision + 1
